@@ -48,12 +48,12 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
 def _gate_code(judgements: Sequence[Judgement]) -> int:
     """Print the outcome of every gate and return the exit code: a tripped gate before an undecided one."""
     from s2a_bench.report.compare import gates as compare_gates
-    from s2a_bench.report.compare.shown import change_text, seen_text
+    from s2a_bench.report.compare.shown import change_text, detectable_text
 
     for one in judgements:
         line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {change_text(one.comparison)}"
         line += "" if one.comparison.p_holm is None else f", p = {one.comparison.p_holm:.2g}"
-        line += "; too few values for a test" if one.detectable is None else f", sees {seen_text(one.detectable)}"
+        line += "; too few values for a test" if one.detectable is None else f", sees {detectable_text(one.detectable)}"
         if one.outcome == compare_gates.UNDECIDED:
             line += "; measure more launches (--launches), compare less (--metric), or --strict"
         print_error(line)

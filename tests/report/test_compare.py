@@ -183,7 +183,7 @@ def test_another_machine_or_model_is_refused_unless_told(
     first, second = launch(1, n=6), launch(2, n=6, manifest=with_(MANIFEST, part, **facts))
     with pytest.raises(UnlikeRuns) as caught:
         opened(first, second)
-    assert str(caught.value) == f"the runs are unlike: {said}; `unlike` compares them all the same"
+    assert str(caught.value) == f"the runs are unlike: {said}; `unlike` compares them anyway"
     told = next(
         warning for warning in warnings_of(compared(first, second, "e2e", unlike=True)) if warning.code == "unlike"
     )

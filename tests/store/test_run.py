@@ -649,6 +649,6 @@ def test_without_pyarrow_the_run_stays_and_its_reader_is_told_the_way_out(
             patch.setitem(sys.modules, module, None)
         run = kept(tmp_path, sample())
         assert run.manifest["state"] == "finished"
-        with pytest.raises(MissingExtra, match=r"pyarrow does not load beside NumPy .*: the CSV files in .* are complete"):
+        with pytest.raises(MissingExtra, match=r"pyarrow does not load beside NumPy .*: the CSV files .* are complete"):
             _ = run.samples
     assert len(read_run(run.path).samples) == 1

@@ -404,7 +404,7 @@ def test_a_changed_configuration_another_machine_and_no_sweep_are_refused(folder
     manifest["environment"] |= {"host": "elsewhere", "cpu": "Z80"}
     path.write_text(json.dumps(manifest))
     with pytest.raises(
-        UsageError, match=r"was measured on another machine: host is .*, was elsewhere, cpu is .*, was Z80; resume it there"
+        UsageError, match=r"was measured on another machine: host is .*, was elsewhere, cpu is .*, was Z80; resume it"
     ):
         check_resume(folder, PLAN)
     with RunWriter.create(tmp_path, "latency", {}) as writer:

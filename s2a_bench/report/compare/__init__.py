@@ -1,4 +1,4 @@
-"""What changed between two runs, or two sets of launches: which are compared, by what, and which changes fail."""
+"""Compare two runs, or two sets of launches: options."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ class CompareConfig(Options):
     """Two sides, each a run folder or repeated launches with commas between them."""
 
     baseline: str = option(..., "run folder; repeated launches with commas", flag="a", argument=True)
-    other: str = option(..., "what is compared with A: one folder, or as above", flag="b", argument=True)
+    other: str = option(..., "compared with A: one folder, or several as above", flag="b", argument=True)
     metric: list[str] = option(
         [], "METRIC or METRIC.STATISTIC (median, mean, p90, p99), with commas; or all [default: a few]"
     )
     fail_if: list[str] = option(
         [], "gate, e.g. e2e.median>5%, tokens_per_s<-5%, ros/topic:e2e.p99>10%; may be repeated"
     )
-    strict: bool = option(False, "gates trip on the change itself, significant or not")
-    min_effect: float = option(5.0, "the smallest change that is called one, in per cent", ge=0)
-    unlike: bool = option(False, "compare other machines, models or settings too")
+    strict: bool = option(False, "gates trip on any change beyond the limit, significant or not")
+    min_effect: float = option(5.0, "the smallest relevant change, in per cent", ge=0)
+    unlike: bool = option(False, "also compare runs of different machines, models or settings")
     output: Path | None = option(None, "folder for table, figure and JSON")
 
     @property
@@ -29,6 +29,5 @@ class CompareConfig(Options):
         return [name for text in self.metric for name in listed(text)]
 
     def check(self) -> None:
-        """Refuse what makes no sense together; raises UsageError naming the fields."""
         if self.strict and not self.fail_if:
             raise UsageError("`strict`: there is no gate; add `fail_if`")

@@ -1,4 +1,4 @@
-"""What two runs do not have in common, and what of it forbids comparing them: machine and model, not versions."""
+"""Differences between two runs; those of machine and model forbid a comparison, those of versions do not."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ if TYPE_CHECKING:
 
 _KIND: Final = ("cpu", "machine", "board", "cores")
 _MACHINE: Final = (*_KIND, "affinity", "governor", "power_mode")
-"""Facts of the environment that make it another machine, or the same one in another state."""
+"""Facts of the environment that identify a machine and its state."""
 
 _MODEL: Final = ("engine", "dummy", "model_sha256", "mmproj_sha256", "profile", "gaps", "latency")
-"""Facts that make it another model, or none: emulated is not measured, dummy weights are no model."""
+"""Facts that identify a model; an emulated one and one of dummy weights are different models."""
 
 _ORIGIN: Final = ("engine", "weights", "tokens", "link", "clock")
-"""What of the provenance must be the same; the model's files are compared by their hashes."""
+"""Fields of the provenance that must be equal; files of models are compared by their hashes."""
 
 _PASSING: Final = ("host", "clock_id", "load", "gpus", "packages", "memory_bytes")
-"""Facts of the environment that say nothing about likeness, or that are looked at more closely."""
+"""Facts of the environment that are ignored, or compared separately."""
 
 SETTING: Final = "configuration "
-"""What the names of options begin with."""
+"""Prefix of the differences between options."""
 
-_TOLD: Final = 8
-"""So many differences are told in words; the JSON has all."""
+_LISTED: Final = 8
+"""Differences in a text; the JSON has all."""
 
 _ABSENT: Final = "not known"
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One fact that two runs do not share; ``fatal`` ones forbid to compare them."""
+    """One fact in which two runs differ; a ``fatal`` one forbids comparing them."""
 
     what: str
     baseline: str
@@ -47,17 +47,18 @@ class Difference:
 
 
 def differences(baseline: StoredRun, other: StoredRun) -> list[Difference]:
-    """List what differs, the fatal first. A fact that one run does not know is told, never fatal."""
+    """Return the differences, the fatal first. A fact that only one run knows is never fatal."""
     sides = baseline.manifest, other.manifest
     machines = [manifest.get("environment", {}) for manifest in sides]
     models = [manifest.get("model") or {} for manifest in sides]
+    others = [_flat({name: each[name] for name in each if name not in (*_MACHINE, *_PASSING)}) for each in machines]
     found = [
         *_of("", *({name: facts[name] for name in _MACHINE if name in facts} for facts in machines), fatal=True),
         *_of("", *(_gpus(facts, "name") for facts in machines), fatal=True),
         *_of("tuning ", *(_tuning(manifest) for manifest in sides), fatal=True),
         *_of("model ", *({name: facts[name] for name in _MODEL if name in facts} for facts in models), fatal=True),
         *_of("provenance ", *(_origin(manifest) for manifest in sides), fatal=True),
-        *_of("", *(_rest(facts, (*_MACHINE, *_PASSING)) for facts in machines), fatal=False),
+        *_of("", *others, fatal=False),
         *_of("", *(_gpus(facts, "driver") for facts in machines), fatal=False),
         *_of("package ", *(facts.get("packages", {}) for facts in machines), fatal=False),
         *_of(SETTING, *(_flat(manifest.get("configuration", {})) for manifest in sides), fatal=False),
@@ -66,26 +67,25 @@ def differences(baseline: StoredRun, other: StoredRun) -> list[Difference]:
 
 
 def is_other_machine(difference: Difference) -> bool:
-    """Whether a difference makes it another machine: no other state of it, no other version."""
+    """Return True for a difference of the machine itself, not of its state or of versions."""
     return difference.fatal and difference.what in {*_KIND, "GPU name"}
 
 
 def differing_names(found: Iterable[Difference]) -> str:
-    """Name what both sides know and differ in, machine, model and provenance aside, the first `_TOLD`."""
-    aside = "model ", "provenance "
+    """Return the names of the first differences that both sides know, without machine, model and provenance."""
     known = (one for one in found if _ABSENT not in {one.baseline, one.other} and not is_other_machine(one))
-    names = [*dict.fromkeys(one.what for one in known if not one.what.startswith(aside))]
-    return ", ".join(names[:_TOLD]) + (f", and {len(names) - _TOLD} more" if len(names) > _TOLD else "")
+    names = [*dict.fromkeys(one.what for one in known if not one.what.startswith(("model ", "provenance ")))]
+    return ", ".join(names[:_LISTED]) + (f", and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
 
 
 def as_line(found: Sequence[Difference]) -> str:
-    """Write differences as one line, the first `_TOLD` of them."""
-    more = f"; and {len(found) - _TOLD} more" if len(found) > _TOLD else ""
-    return "; ".join(map(str, found[:_TOLD])) + more
+    """Return the first differences as one line."""
+    more = f"; and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
+    return "; ".join(map(str, found[:_LISTED])) + more
 
 
 def _of(prefix: str, first: Mapping[str, Any], second: Mapping[str, Any], *, fatal: bool) -> Iterator[Difference]:
-    """Yield the facts that are not the same; an empty one and an absent one are."""
+    """Yield the facts that differ; an empty and an absent one are equal."""
     for name in dict.fromkeys((*first, *second)):
         one, two = first.get(name), second.get(name)
         if one == two or not (one or two):
@@ -96,7 +96,6 @@ def _of(prefix: str, first: Mapping[str, Any], second: Mapping[str, Any], *, fat
 
 
 def _tuning(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """Return whether the measuring process was tuned; the library's caller may not want that."""
     tuned = (manifest.get("tuning") or {}).get("process")
     return {} if tuned is None else {"process": "tuned" if tuned else "not tuned (the library's tune=False)"}
 
@@ -109,10 +108,6 @@ def _origin(manifest: Mapping[str, Any]) -> dict[str, Any]:
 def _gpus(facts: Mapping[str, Any], key: str) -> dict[str, Any]:
     gpus = facts.get("gpus") or []
     return {f"GPU {key}": ", ".join(str(gpu.get(key)) for gpu in gpus)} if gpus else {}
-
-
-def _rest(facts: Mapping[str, Any], known: tuple[str, ...]) -> dict[str, Any]:
-    return _flat({name: value for name, value in facts.items() if name not in known})
 
 
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

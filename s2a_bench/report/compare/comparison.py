@@ -1,4 +1,4 @@
-"""The comparison of two runs, or of two sets of launches: its cells, changes, test and warnings."""
+"""Compare two runs, or two sets of launches: cells, changes, test and warnings."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 LEVEL: Final = 0.05
-"""The chance to call any difference one where there is none, over all comparisons together."""
+"""The probability of any false difference, over all comparisons together."""
 
 SAME, UNCLEAR, TOO_FEW = "same", "unclear", "too few"
 
 
 @dataclass(frozen=True, slots=True)
 class CellPair:
-    """One cell as the launches of both sides have it; never empty."""
+    """One cell in the launches of both sides; never empty."""
 
     baseline: tuple[Subject, ...]
     other: tuple[Subject, ...]
@@ -40,9 +40,9 @@ class CellPair:
 
 @dataclass(frozen=True, slots=True)
 class CellComparison:
-    """One statistic of one cell: what changed, the p-value corrected for all comparisons, and the verdict.
+    """One statistic of one cell: its change, the p-value corrected for all comparisons, and the verdict.
 
-    ``detectable`` is the smallest rise, as a share, that the test would have found in `POWER` of repeats.
+    ``detectable`` is the smallest rise, as a share, that the test finds in `POWER` of repeats.
     """
 
     pair: CellPair
@@ -61,9 +61,9 @@ class CellComparison:
 
 @dataclass(frozen=True, slots=True)
 class ComparedRuns:
-    """Everything that is known of two sides: what their command declares, and what belongs together.
+    """Two sides: what their command declares, the pairs of cells, and the comparisons.
 
-    ``only`` lists the cells that have no partner, a side each.
+    ``only`` has the cells without a partner, of either side.
     """
 
     baseline: tuple[StoredRun, ...]
@@ -78,12 +78,12 @@ class ComparedRuns:
 
     @property
     def launches(self) -> bool:
-        """Return whether launches were repeated on both sides, so that they are what the test goes by."""
+        """Return True if launches were repeated on both sides; then they are the units of the test."""
         return len(self.pairs[0].baseline) > 1
 
     @property
     def one_launch(self) -> bool:
-        """Whether what differs from launch to launch is in no interval, and there is such a thing."""
+        """Return True if the intervals lack an existing variation between launches."""
         return not self.launches and any(pair.baseline[0].setting.get("mode") != "virtual" for pair in self.pairs)
 
     @property
@@ -98,57 +98,56 @@ class ComparedRuns:
 def open_comparison(
     baseline: Sequence[StoredRun], other: Sequence[StoredRun], *, unlike: bool, least: float
 ) -> ComparedRuns:
-    """Find what belongs together. ``least`` is the smallest share that is called a change.
+    """Pair the cells of two sides; ``least`` is the smallest relevant change, as a share.
 
-    Raises UnlikeRuns where machine, model or setting differ and ``unlike`` does not allow it, UsageError where the
-    runs are of different commands.
+    Raises UnlikeRuns if machine, model or settings differ and ``unlike`` does not allow it, UsageError if the runs are
+    of different commands.
     """
     runs = (*baseline, *other)
     commands = list(dict.fromkeys(str(run.manifest["command"]) for run in runs))
     if len(commands) > 1:
         raise UsageError(f"these are runs of {' and '.join(commands)}: name runs of one command")
-    by = _declared(commands[0])
+    by = _comparable(commands[0])
     with fits(*runs):
         sides = [[launch for run in side for launch in _launches(by.subjects(run))] for side in (baseline, other)]
         found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
-        own = by_name(metric for run in runs for metric in by.run_metrics(run))
+        metrics = {**by.metrics, **by_name(metric for run in runs for metric in by.run_metrics(run))}
     if (len(sides[0]) > 1) != (len(sides[1]) > 1):
         raise UsageError(
-            "name several launches on both sides, or one on each: the test goes by launches or by requests; "
+            "name several launches on both sides, or one on each: the test uses launches or requests; "
             "`launches` measures several in one run"
         )
     fatal = [difference for difference in found if difference.fatal]
     if fatal and not unlike:
-        raise UnlikeRuns(f"the runs are unlike: {as_line(fatal)}; `unlike` compares them all the same")
+        raise UnlikeRuns(f"the runs are unlike: {as_line(fatal)}; `unlike` compares them anyway")
     pairs, only, settings = _match(*sides)
     if settings and not unlike:
-        raise UnlikeRuns(f"cells of one name differ: {as_line(settings)}; `unlike` compares them all the same")
+        raise UnlikeRuns(f"cells of one name differ: {as_line(settings)}; `unlike` compares them anyway")
     if not pairs:
         raise UnlikeRuns(f"no cell is in every run: {', '.join(only[0])} against {', '.join(only[1])}")
-    metrics = {**by.metrics, **own}
     return ComparedRuns(tuple(baseline), tuple(other), by, metrics, (*settings, *found), tuple(pairs), only, least)
 
 
 def _launches(subjects: Iterable[Subject]) -> list[dict[str, Subject]]:
-    """Return the cells of a run by their names, launch by launch."""
+    """Return name -> cell of a run, for each launch."""
     found: dict[int, dict[str, Subject]] = {}
     for subject in subjects:
         found.setdefault(subject.launch, {})[subject.name] = subject
     return list(found.values()) or [{}]
 
 
-def _declared(command: str) -> Comparable:
-    """Return what runs of a command are compared by; raises UsageError where nothing is declared."""
+def _comparable(command: str) -> Comparable:
+    """Return the declaration of a command's comparisons; raises UsageError if there is none."""
     if (experiment := experiment_of(command)) and (by := experiment.compared_by()):
         return by
-    there = ", ".join(name for name, found in EXPERIMENTS.loaded() if found.compared)
-    raise UsageError(f"runs of {command} cannot be compared, only those of {there}")
+    known = ", ".join(name for name, found in EXPERIMENTS.loaded() if found.compared)
+    raise UsageError(f"runs of {command} cannot be compared, only those of {known}")
 
 
 def _match(
     baseline: list[dict[str, Subject]], other: list[dict[str, Subject]]
 ) -> tuple[list[CellPair], tuple[tuple[str, ...], tuple[str, ...]], list[Difference]]:
-    """Pair the cells that every launch has; also return the others, and how settings differ under one name."""
+    """Pair the cells that every launch has; also return the other cells, and the settings that differ in a pair."""
     everywhere = [name for name in baseline[0] if all(name in run for run in (*baseline, *other))]
     pairs = [CellPair(tuple(run[name] for run in baseline), tuple(run[name] for run in other)) for name in everywhere]
     left = [
@@ -167,23 +166,22 @@ def _match(
 
 def metrics_of(compared: ComparedRuns, names: Sequence[str]) -> list[tuple[Metric, str]]:
     """Return metric and statistic of each NAME or NAME.STATISTIC; ``all`` is every metric. Raises UsageError."""
-    metrics = compared.metrics
     wanted: dict[tuple[Metric, str], None] = {}
     for name in names:
         if name == "all":
-            wanted |= {(metric, metric.statistic): None for metric in metrics.values()}
+            wanted |= {(metric, metric.statistic): None for metric in compared.metrics.values()}
         else:
             wanted[metric_of(compared, name, "`metric`")] = None
     return list(wanted)
 
 
 def shown_metrics(compared: ComparedRuns) -> list[tuple[Metric, str]]:
-    """Return the metrics that are compared unless others are named."""
+    """Return the default metrics with their statistics."""
     return [(compared.metrics[name], compared.metrics[name].statistic) for name in compared.by.shown]
 
 
 def metric_of(compared: ComparedRuns, name: str, flag: str) -> tuple[Metric, str]:
-    """Read NAME or NAME.STATISTIC; raises UsageError listing what there is, also where no cell has it."""
+    """Parse NAME or NAME.STATISTIC; raises UsageError for an unknown metric, or if no cell has it."""
     metrics = compared.metrics
     metric, dot, statistic = name.rpartition(".")
     if name in metrics:
@@ -192,17 +190,17 @@ def metric_of(compared: ComparedRuns, name: str, flag: str) -> tuple[Metric, str
         found = metrics[metric]
     else:
         has = [one for one in metrics if any(_rows(pair, one) for pair in compared.pairs)]
-        said = f"the statistics are {', '.join(STATISTICS)}" if metric in metrics else f"there are {', '.join(has)}"
-        raise UsageError(f"{flag}: '{name}' is no metric of these {compared.command} runs; {said}")
+        known = f"the statistics are {', '.join(STATISTICS)}" if metric in metrics else f"there are {', '.join(has)}"
+        raise UsageError(f"{flag}: '{name}' is no metric of these {compared.command} runs; {known}")
     if not any(_rows(pair, found.name) for pair in compared.pairs):
         raise UsageError(f"{flag}: no cell has {found.name} on both sides")
     return found, statistic
 
 
 def compare(compared: ComparedRuns, wanted: Sequence[tuple[Metric, str]]) -> ComparedRuns:
-    """Compare every cell by every metric that it has on both sides, judge what changed, and tell what had been seen.
+    """Compare every cell by every metric that it has on both sides.
 
-    What could be seen is told for the first step of Holm's correction, whose level is the strictest.
+    The detectable change is that of the first step of Holm's correction, which has the strictest level.
     """
     with fits(*compared.baseline, *compared.other):
         found = [found for metric, statistic in dict.fromkeys(wanted) for found in changes(compared, metric, statistic)]
@@ -220,12 +218,12 @@ def compare(compared: ComparedRuns, wanted: Sequence[tuple[Metric, str]]) -> Com
 
 
 def detectable(change: Change, tests: int, *, falls: bool = False) -> float | None:
-    """Return the smallest rise (or fall) that one of so many tests would have found; None where it has no noise."""
+    """Return the smallest rise (or fall) that one of several tests finds; None for a change without noise."""
     return None if change.noise is None else change.noise.detectable(LEVEL / tests, falls=falls)
 
 
 def changes(compared: ComparedRuns, metric: Metric, statistic: str) -> Iterator[CellComparison]:
-    """Yield what changed in each cell that has the metric on both sides; not corrected, not judged."""
+    """Yield the change of each cell that has the metric on both sides, without correction and verdict."""
     for pair in compared.pairs:
         if rows := _rows(pair, metric.name):
             exact = all(subject.exact for subject in (*pair.baseline, *pair.other))
@@ -235,16 +233,16 @@ def changes(compared: ComparedRuns, metric: Metric, statistic: str) -> Iterator[
 
 
 def _rows(pair: CellPair, metric: str) -> tuple[list[Rows], list[Rows]] | None:
-    """Return the rows of every launch; None where one has none."""
+    """Return the rows of every launch, None if one has none."""
     sides = [[subject.rows(metric) for subject in side] for side in (pair.baseline, pair.other)]
     return (sides[0], sides[1]) if all(all(side) for side in sides) else None
 
 
 def verdict(change: Change, p_holm: float | None, metric: Metric, least: float) -> str:
-    """Say in a word what a change means.
+    """Return the verdict on a change.
 
-    A change is one where the corrected p is below `LEVEL` and its size reaches ``least``: better, worse, or for a
-    metric without a good side lower, higher. "same" where the whole interval lies within ``least``; else "unclear".
+    It is better or worse, or for a metric without a direction lower or higher, if the corrected p is below `LEVEL` and
+    the size reaches ``least``. It is "same" if the whole interval is within ``least``, else "unclear".
     """
     if p_holm is None:
         return TOO_FEW
@@ -258,7 +256,7 @@ def verdict(change: Change, p_holm: float | None, metric: Metric, least: float) 
 
 
 def read_side(text: str, flag: str) -> list[StoredRun]:
-    """Read a run folder, or several with commas between them; raises UsageError, StoreError."""
+    """Read one run folder, or several with commas; raises UsageError, StoreError."""
     folders = [part.strip() for part in text.split(",") if part.strip()]
     if not folders:
         raise UsageError(f"{flag}: name a run folder")
@@ -268,36 +266,31 @@ def read_side(text: str, flag: str) -> list[StoredRun]:
 
 
 def warnings_of(compared: ComparedRuns) -> list[RunWarning]:
-    """Return what a reader must know besides the numbers, each with what to do, the weightiest first."""
-    found = [RunWarning(*each) for each in (*_of_runs(compared), *_of_cells(compared))]
-    if harmless := [one for one in compared.differences if not one.fatal]:
-        found.append(RunWarning("differs", as_line(harmless), "this may be what you compare"))
-    return found
+    """Return the warnings about a comparison, the most important first."""
+    return [RunWarning(*each) for each in (*_of_runs(compared), *_of_cells(compared))]
 
 
 def _of_runs(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
-    """Yield code, message and advice."""
     if fatal := [one for one in compared.differences if one.fatal]:
-        yield "unlike", f"the runs are unlike: {as_line(fatal)}", "read a change as that of all this together"
+        yield "unlike", f"the runs are unlike: {as_line(fatal)}", "a change may come from any of them"
     for run in (*compared.baseline, *compared.other):
         if (state := run.manifest["state"]) != "finished":
             yield "state", f"{run.path} is {state}, not finished", "its samples so far count; run it again"
         if codes := sorted({warning["code"] for warning in run.manifest.get("warnings", [])}):
-            yield "warnings", f"{run.path} has warnings: {', '.join(codes)}", "look at them in its manifest"
+            yield "warnings", f"{run.path} has warnings: {', '.join(codes)}", "read them in its manifest"
     if compared.one_launch:
         yield (
             "one-launch",
-            "one launch a side: what differs from launch to launch alone is not in the intervals",
+            "one launch a side: the intervals do not include the variation between launches",
             "measure both with --launches 5, or repeat the launches, A and B in turn, and name them with commas",
         )
 
 
 def _of_cells(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
-    """Yield code, message and advice."""
     if names := sorted({one.pair.name for one in compared.comparisons if one.change.dependent}):
         yield (
             "dependent",
-            f"neighbouring requests are so alike that the intervals are too narrow ({', '.join(names)})",
+            f"neighbouring requests are correlated, and the intervals too narrow ({', '.join(names)})",
             "measure longer, or repeat the launches",
         )
     for side, cells in zip(("A", "B"), compared.only, strict=True):
@@ -308,3 +301,5 @@ def _of_cells(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
             if failed := sum(subject.errors for subject in subjects):
                 total = failed + sum(subject.n for subject in subjects)
                 yield "errors", f"{pair.name}: {failed} of {total} requests failed in {side}", "see samples.csv"
+    if harmless := [one for one in compared.differences if not one.fatal]:
+        yield "differs", as_line(harmless), "this may be what you compare"

@@ -1,7 +1,7 @@
 r"""Gates: conditions on a change under which a comparison fails, ``[CELL:]METRIC[.STATISTIC]>N%`` or ``<-N%``.
 
-``e2e.median>5%`` trips where the median of B is more than 5 % above that of A, ``tokens_per_s<-5%`` where it is more
-than 5 % below; ``ros/topic:`` or a pattern as ``http/*:`` in front narrows it to cells.
+``e2e.median>5%`` trips if the median of B is more than 5 % above that of A, ``tokens_per_s<-5%`` if it is more than 5 %
+below; a prefix ``ros/topic:`` or a pattern as ``http/*:`` restricts it to cells.
 """
 
 from __future__ import annotations
@@ -14,13 +14,7 @@ from typing import Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments import Metric
-from s2a_bench.report.compare.comparison import (
-    LEVEL,
-    CellComparison,
-    ComparedRuns,
-    detectable,
-    metric_of,
-)
+from s2a_bench.report.compare.comparison import LEVEL, CellComparison, ComparedRuns, detectable, metric_of
 
 _FLAG: Final = "`fail_if`"
 _FORM: Final = re.compile(r"(?:(?P<cells>.+):)?(?P<metric>[\w.]+)\s*(?P<sign>>|<\s*-)\s*(?P<limit>\d+(?:\.\d+)?)\s*%")
@@ -39,7 +33,7 @@ class Gate:
     limit: float
 
     def beyond(self, relative: float | None, rises: bool) -> bool:
-        """Give whether a change is past the limit; one that started from nothing has no size and is past every one."""
+        """Return True if a change is past the limit, as one from 0 is, which has no relative size."""
         if relative is None:
             return rises == self.rises
         return relative > self.limit if self.rises else relative < self.limit
@@ -47,17 +41,17 @@ class Gate:
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What a gate said of one cell."""
+    """The outcome of a gate in one cell."""
 
     gate: Gate
     comparison: CellComparison
     outcome: str
     detectable: float | None
-    """The smallest change towards the limit that the test would have found, as a share."""
+    """The smallest change towards the limit that the test finds, as a share."""
 
 
 def read_gate(text: str) -> Gate:
-    """Read a gate; raises UsageError."""
+    """Parse a gate; raises UsageError."""
     found = _FORM.fullmatch(text.strip())
     if not found:
         raise UsageError(f"{_FLAG}: '{text}' should look like e2e.median>5%, tokens_per_s<-5% or ros/topic:e2e.p99>10%")
@@ -67,16 +61,16 @@ def read_gate(text: str) -> Gate:
 
 
 def concerned(compared: ComparedRuns, gates: Sequence[Gate]) -> list[tuple[Metric, str]]:
-    """Return metric and statistic of each gate; raises UsageError for a metric that there is not."""
+    """Return metric and statistic of each gate; raises UsageError for an unknown metric."""
     return [metric_of(compared, gate.metric, _FLAG) for gate in gates]
 
 
 def judge(compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool) -> list[Judgement]:
-    """Judge every gate in every cell it is about, by the comparisons of what is `concerned`.
+    """Judge every gate in every cell that it selects, by the comparisons of the `concerned` metrics.
 
-    A gate trips where the change is past the limit *and* is one: its p-value, corrected with all comparisons, is below
-    `LEVEL`. It passes where a change of the limit's size would have been seen, or one the other way was; else it is
-    undecided. With ``strict`` the change itself decides. Raises UsageError for a cell that there is not.
+    A gate trips if the change is past the limit *and* its p-value, corrected for all comparisons, is below `LEVEL`. It
+    passes if the test finds a change of the limit's size, or found one in the other direction; else it is undecided.
+    With ``strict`` the change alone decides. Raises UsageError for an unknown cell.
     """
     judged = []
     for gate, wanted in zip(gates, concerned(compared, gates), strict=True):
@@ -86,13 +80,13 @@ def judge(compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool) -> lis
             names = ", ".join(one.pair.name for one in every)
             raise UsageError(f"{_FLAG}: no cell with {wanted[0].name} is called '{gate.cells}'; there are {names}")
         for one in found:
-            seen = detectable(one.change, len(compared.comparisons), falls=not gate.rises)
-            judged.append(Judgement(gate, one, _outcome(gate, one, seen, strict=strict), seen))
+            least = detectable(one.change, len(compared.comparisons), falls=not gate.rises)
+            judged.append(Judgement(gate, one, _outcome(gate, one, least, strict=strict), least))
     return judged
 
 
-def _outcome(gate: Gate, one: CellComparison, seen: float | None, *, strict: bool) -> str:
-    """Say in a word what a gate finds; ``seen`` is the smallest change that there was a fair chance to find."""
+def _outcome(gate: Gate, one: CellComparison, least: float | None, *, strict: bool) -> str:
+    """Return the outcome of a gate; ``least`` is the smallest detectable change."""
     change, p_holm = one.change, one.p_holm
     rises = change.other > change.baseline
     past = gate.beyond(change.relative, rises)
@@ -102,4 +96,4 @@ def _outcome(gate: Gate, one: CellComparison, seen: float | None, *, strict: boo
     if past and significant:
         return TRIPPED
     other_way = significant and rises != gate.rises
-    return PASSED if other_way or (seen is not None and seen <= abs(gate.limit)) else UNDECIDED
+    return PASSED if other_way or (least is not None and least <= abs(gate.limit)) else UNDECIDED

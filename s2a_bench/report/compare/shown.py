@@ -1,6 +1,6 @@
-"""How a comparison is shown: its table, CSV, figure, and the ``--json`` object.
+"""The views of a comparison: its table, CSV, figure, and the ``--json`` object.
 
-The object's classes are its schema, docs/schema/s2a-bench-compare-1.json: `tools/schema.py` writes that from them.
+`tools/schema.py` writes docs/schema/s2a-bench-compare-1.json from the classes of the object.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ if TYPE_CHECKING:
 
 _HEADER = ("cell", "n", "A", "B", "change [95 %]", "P(B > A)", "p", "sees", "verdict")
 _LEAST_P = 0.0005
-_MOST_SEEN = 10
+_LARGEST_DETECTABLE = 10
 
 
 def compare_table(compared: ComparedRuns) -> TextTable:
-    """Lay out a row a comparison below the name of its metric."""
+    """Make a table with a row a comparison, below the name of its metric."""
     groups = [
         [(_title(same[0]), *[""] * (len(_HEADER) - 1)), *((one.pair.name, *_row(one)) for one in same)]
         for same in (list(group) for _, group in groupby(compared.comparisons, lambda one: one.name))
@@ -48,27 +48,27 @@ def compare_table(compared: ComparedRuns) -> TextTable:
 
 
 def notes(compared: ComparedRuns) -> tuple[str, ...]:
-    """Return what A and B are, and how a verdict comes about."""
+    """Return the names of A and B, and the rules of the verdicts."""
     of_one = ", that of one launch a side" if compared.one_launch else ""
     unit = "launches" if compared.launches else f"{BATCHES} batches in time of each launch"
     return (
         title(compared),
         f"Welch's t on logarithms over {unit}; p corrected for {len(compared.comparisons)} comparisons (Holm).",
         f"better, worse: p < {LEVEL:g} and a change of at least {compared.least * 100:g} %.",
-        "same: the interval lies within that; unclear: neither; too few: no interval.",
+        "same: the interval is within that; unclear: neither; too few: no interval.",
         f"sees: the smallest change found in {POWER * 100:g} of 100 repeats at this noise{of_one}.",
     )
 
 
 def title(compared: ComparedRuns) -> str:
-    """Return what A and B are, and what did not really answer."""
+    """Return the names of A and B, and notes about emulated or dummy origins."""
     sides = (", ".join(run.path.resolve().name for run in side) for side in (compared.baseline, compared.other))
     origin = dict.fromkeys(note for run in (*compared.baseline, *compared.other) for note in compared.by.origin(run))
     return " ".join(("A: {}. B: {}.".format(*sides), *origin))
 
 
 def compare_csv(compared: ComparedRuns) -> str:
-    """Write a row a comparison, every digit kept."""
+    """Return a CSV with a row a comparison and every digit."""
     names = [each.name for each in fields(Row) if each.name not in {"setting", "better", "change"}]
     effects = ("ratio", "difference", "superiority")
     ends = {name: (name, f"{name}_low", f"{name}_high") if name in effects else (name,) for name in names}
@@ -80,13 +80,13 @@ def compare_csv(compared: ComparedRuns) -> str:
 
 
 def percent(share: float) -> str:
-    """Write a change in per cent with its sign; a decimal below 10 %."""
+    """Format a change in per cent with its sign; one decimal below 10 %."""
     text = f"{share * 100:+.0f}" if abs(share) >= 0.0995 else f"{share * 100:+.1f}"  # noqa: PLR2004 - 9.95 % rounds up
     return text.replace("-0.0", "0.0").replace("+0.0", "0.0")
 
 
 def change_text(one: CellComparison) -> str:
-    """Write a change in per cent with its interval."""
+    """Format a change in per cent with its interval."""
     relative, bounds = one.change.relative, one.change.bounds
     if relative is None:
         return "from 0"
@@ -94,11 +94,11 @@ def change_text(one: CellComparison) -> str:
     return f"{percent(relative)} %{interval}"
 
 
-def seen_text(share: float | None) -> str:
-    """Write the smallest change that could have been seen, in per cent."""
+def detectable_text(share: float | None) -> str:
+    """Format the smallest detectable change in per cent."""
     if share is None:
         return ABSENT
-    return "> 1000 %" if share > _MOST_SEEN else f"{percent(share).lstrip('+')} %"
+    return "> 1000 %" if share > _LARGEST_DETECTABLE else f"{percent(share).lstrip('+')} %"
 
 
 def _title(one: CellComparison) -> str:
@@ -110,11 +110,11 @@ def _row(one: CellComparison) -> tuple[str, ...]:
     change = one.change
     superiority = ABSENT if change.superiority.value is None else f"{change.superiority.value:.2f}"
     values = number(change.baseline), number(change.other)
-    return n, *values, change_text(one), superiority, _p(one.p_holm), seen_text(one.detectable), one.verdict
+    return n, *values, change_text(one), superiority, _p(one.p_holm), detectable_text(one.detectable), one.verdict
 
 
 def _p(value: float | None) -> str:
-    """Write a p-value with three decimals, a small one by its size."""
+    """Format a p-value with three decimals, a small one as a power of ten."""
     if value is None:
         return ABSENT
     return f"{value:.3f}" if value >= _LEAST_P or value == 0 else f"{value:.0e}"
@@ -124,10 +124,7 @@ Interval: TypeAlias = tuple[float, float] | None
 Probability: TypeAlias = Annotated[float | None, {"minimum": 0, "maximum": 1}]
 Detectable: TypeAlias = Annotated[
     float | None,
-    {
-        "minimum": 0,
-        "description": "The smallest change, as a share, that the test would have found; null where nothing tells it.",
-    },
+    {"minimum": 0, "description": "The smallest change, as a share, that the test finds; null: unknown."},
 ]
 Folders: TypeAlias = Annotated[list[str], {"minItems": 1}]
 Count: TypeAlias = Annotated[int, {"minimum": 1}]
@@ -135,7 +132,7 @@ Count: TypeAlias = Annotated[int, {"minimum": 1}]
 
 @dataclass(frozen=True, slots=True)
 class Effect:
-    """An effect size with its 95 % interval, null where there are too few values for one."""
+    """An effect size with its 95 % interval, null if there are too few values."""
 
     value: float | None
     ci95: Interval
@@ -147,7 +144,7 @@ class Effect:
 
 @dataclass(frozen=True, slots=True)
 class Test:
-    """The one test that all comparisons go by."""
+    """The test of all comparisons."""
 
     name: str
     unit: Literal["batch", "launch"]
@@ -155,7 +152,7 @@ class Test:
     correction: Literal["Holm"]
     level: float
     least_change: Annotated[float, {"minimum": 0}]
-    power: Annotated[float, {"description": "How often a change of the size `detectable` is found."}]
+    power: Annotated[float, {"description": "The share of repeats that find a change of the size `detectable`."}]
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,7 +205,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Gated:
-    """What a gate said of one cell; ``p_holm`` is that of its comparison."""
+    """The outcome of a gate in one cell; ``p_holm`` is that of its comparison."""
 
     gate: str
     cell: str
@@ -220,18 +217,18 @@ class Gated:
 
     @classmethod
     def of(cls, one: Judgement) -> Gated:
-        found, change = one.comparison, one.comparison.change
+        comparison, change = one.comparison, one.comparison.change
         outcome: Any = one.outcome
-        values = change.relative, change.bounds, found.p_holm, one.detectable
-        return cls(one.gate.text, found.pair.name, *values, outcome)
+        values = change.relative, change.bounds, comparison.p_holm, one.detectable
+        return cls(one.gate.text, comparison.pair.name, *values, outcome)
 
 
 @dataclass(frozen=True, slots=True)
 class CompareJson:
-    """What `compare --json` prints on stdout; docs/compare.md explains the words. A is the baseline, B the other.
+    """The object of `compare --json`, explained in docs/compare.md. A is the baseline, B the other.
 
-    Changes are shares (0.05 is 5 %), values have the unit beside them; an interval is null where there are too few
-    values for one.
+    Changes are shares (0.05 is 5 %), values have the unit beside them; an interval is null if there are too few
+    values.
     """
 
     schema: Literal["s2a-bench-compare/1"]
@@ -251,7 +248,7 @@ class CompareJson:
 def compare_json(
     compared: ComparedRuns, judgements: Sequence[Judgement], warnings: Sequence[RunWarning]
 ) -> dict[str, Any]:
-    """Return the object; shares are fractions, values have the unit of their metric."""
+    """Return the ``--json`` object."""
     unit: Literal["batch", "launch"] = "launch" if compared.launches else "batch"
     batches = None if compared.launches else BATCHES
     whole: dict[str, Any] = plain(
@@ -282,20 +279,19 @@ _STYLES: Final = {
     UNCLEAR: ("#777777", "D"),
     TOO_FEW: ("#777777", "x"),
 }
-"""Verdict -> colour and marker, so that colour alone tells nothing."""
+"""Verdict -> colour and marker, so that no meaning is in colour alone."""
 
 
 def build_forest(compared: ComparedRuns) -> Figure | None:
-    """Draw the changes in per cent; the band is what is too small to be called a change.
+    """Draw the changes in per cent on an axis a metric; the band marks changes below ``compared.least``.
 
-    Every metric has its own axis. Cells that are alike to the last digit are counted, not drawn; None where no row is
-    left.
+    Cells that are equal to the last digit are counted, not drawn. Return None if no row is left.
     """
     panels: dict[str, list[CellComparison]] = {}
-    alike: dict[str, int] = {}
+    equal: dict[str, int] = {}
     for one in compared.comparisons:
         if one.change.bounds and not any(one.change.bounds):
-            alike[one.name] = alike.get(one.name, 0) + 1
+            equal[one.name] = equal.get(one.name, 0) + 1
         elif one.change.relative is not None:
             panels.setdefault(one.name, []).append(one)
     if not panels:
@@ -310,16 +306,14 @@ def build_forest(compared: ComparedRuns) -> Figure | None:
     every = figure.subplots(len(panels), 1, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (name, rows) in zip(every, panels.items(), strict=True):
         _panel(axes, rows, compared.least)
-        more = f" (+{alike[name]} alike)" if name in alike else ""
+        more = f" (+{equal[name]} equal)" if name in equal else ""
         axes.set_title(f"{name}{more}", loc="left", pad=2)
     every[-1].set_xlabel("change (%)")
-    seen = list(dict.fromkeys(one.verdict for rows in panels.values() for one in rows))
+    verdicts = {one.verdict for rows in panels.values() for one in rows}
     handles = [
-        every[0].plot([], [], color=_STYLES[name][0], marker=_STYLES[name][1], linestyle="", markersize=4, label=name)[
-            0
-        ]
-        for name in _STYLES
-        if name in seen
+        every[0].plot([], [], color=colour, marker=marker, linestyle="", markersize=4, label=verdict)[0]
+        for verdict, (colour, marker) in _STYLES.items()
+        if verdict in verdicts
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=4, columnspacing=1.0)
     return figure
@@ -339,7 +333,7 @@ def _panel(axes: Axes, rows: list[CellComparison], least: float) -> None:
 
 
 def write_comparison(folder: Path, compared: ComparedRuns, whole: Mapping[str, Any]) -> list[Path]:
-    """Write compare.md, .tex, .csv, .json, .png and .pdf; no figure where nothing has a size. Raises StoreError."""
+    """Write compare.md, .tex, .csv, .json, and .png and .pdf if there is a figure; raises StoreError."""
     table = compare_table(compared)
     texts = {
         "compare.md": to_markdown(table),
