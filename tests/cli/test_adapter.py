@@ -85,8 +85,8 @@ def test_what_is_not_given_keeps_its_default() -> None:
 
 
 def test_flags_reach_their_fields_and_groups() -> None:
-    asked = run("--runs", "7", "--t-nom", "2", "--names", "x, y,x", "--lengths", "4,2", "--quick", "--threads", "3")
-    assert asked == Asked(runs=7, t_nom_s=2, names=["x", "y"], lengths=(4, 2), quick=True, engine=Engine(threads=3))
+    config = run("--runs", "7", "--t-nom", "2", "--names", "x, y,x", "--lengths", "4,2", "--quick", "--threads", "3")
+    assert config == Asked(runs=7, t_nom_s=2, names=["x", "y"], lengths=(4, 2), quick=True, engine=Engine(threads=3))
     assert run("--model", "m.gguf").engine.model == Path("m.gguf")
 
 
@@ -113,9 +113,9 @@ def test_of_a_group_only_some_fields_may_be_flags() -> None:
 
 
 def test_groups_beside_each_other_share_a_flag() -> None:
-    asked = run("--port", "7", "--own", options=Both)
+    config = run("--port", "7", "--own", options=Both)
     assert (
-        asked
+        config
         == Both(here=Here(port=7, own=True), there=There(port=7))
         == Both(**placed(Both, {"port": 7, "own": True}))
     )

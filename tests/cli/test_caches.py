@@ -1,4 +1,4 @@
-"""Servers that keep what they made of a picture: a second run is as slow as the first, and a hit is told."""
+"""Servers that keep what they made of a picture: a second run is as slow as the first, and a hit is a warning."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def caching(server: Caching) -> Iterator[str]:
 
 def run(url: str, *arguments: str, output: Path) -> dict[str, Any]:
     done = program("latency", "--transport", "http", "--url", url, *SMALL, *arguments, "--output", output)
-    return {**json.loads(done.stdout), "said": done.stderr}
+    return {**json.loads(done.stdout), "stderr": done.stderr}
 
 
 def codes(result: dict[str, Any]) -> set[str]:
@@ -135,9 +135,9 @@ def test_a_server_that_is_not_ours_is_asked_for_its_first_model_and_nothing_of_o
 ) -> None:
     with caching(Caching()) as url:
         result = run(url, "--transport", "http/as-deployed", output=tmp_path)
-    asked = json.loads((Path(result["run"]) / "manifest.json").read_text())["asked"]["http/as-deployed"]
-    assert asked["model"] == "first"
-    assert not [word for word in ("dummy", "starting", "model's headers") if word in result["said"]]
+    options = json.loads((Path(result["run"]) / "manifest.json").read_text())["asked"]["http/as-deployed"]
+    assert options["model"] == "first"
+    assert not [word for word in ("dummy", "starting", "model's headers") if word in result["stderr"]]
 
 
 @pytest.mark.slow
@@ -153,10 +153,10 @@ def test_identical_runs_against_one_llama_server_never_hit(tmp_path: Path) -> No
         try:
             assert server.stdout is not None
             url = server.stdout.readline().strip()
-            told = ["--transport", "http/as-deployed", "--size", "320x240", "--extra-body", '{"ignore_eos": true}']
-            first, second = (run(url, *told, output=tmp_path) for _ in range(2))
-            hit = run(url, *told, "--dialect", "openai", "--nonce", "n", output=tmp_path)
-            hit = run(url, *told, "--dialect", "openai", "--nonce", "n", output=tmp_path)
+            arguments = ["--transport", "http/as-deployed", "--size", "320x240", "--extra-body", '{"ignore_eos": true}']
+            first, second = (run(url, *arguments, output=tmp_path) for _ in range(2))
+            hit = run(url, *arguments, "--dialect", "openai", "--nonce", "n", output=tmp_path)
+            hit = run(url, *arguments, "--dialect", "openai", "--nonce", "n", output=tmp_path)
         finally:
             server.kill()
     for result in (first, second):

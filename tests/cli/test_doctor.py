@@ -40,14 +40,14 @@ def test_every_line_is_one_check_with_its_level() -> None:
 
 
 def test_json_is_one_object_that_the_schema_describes() -> None:
-    told = json.loads(s2a_bench("doctor", "--json").stdout)
-    jsonschema.Draft202012Validator(SCHEMA).validate(told)
-    assert told["command"] == "doctor"
+    facts = json.loads(s2a_bench("doctor", "--json").stdout)
+    jsonschema.Draft202012Validator(SCHEMA).validate(facts)
+    assert facts["command"] == "doctor"
     for key in ("checks", "worst"):
         with pytest.raises(jsonschema.ValidationError):
-            jsonschema.validate({name: value for name, value in told.items() if name != key}, SCHEMA)
-    levels = {check["code"]: check["level"] for check in told["checks"]}
-    assert {warning["code"] for warning in told["warnings"]} == {
+            jsonschema.validate({name: value for name, value in facts.items() if name != key}, SCHEMA)
+    levels = {check["code"]: check["level"] for check in facts["checks"]}
+    assert {warning["code"] for warning in facts["warnings"]} == {
         code for code, level in levels.items() if level in {"warning", "error"}
     }
 
@@ -81,18 +81,18 @@ def test_a_run_samples_resources_and_says_what_that_cost(tmp_path: Path) -> None
     done = s2a_bench(*ECHO, "--verbose", "--sample-resources", "50", "--output", str(tmp_path))
     assert "sampling takes" in done.stdout
     run = run_folder(tmp_path)
-    told = run.manifest["resources"]
-    assert told["hz"] == 50
-    assert {"cpu", "memory"} <= told["readers"].keys()
-    assert told["polls"] >= 1
-    assert told["core_share"] > 0
+    facts = run.manifest["resources"]
+    assert facts["hz"] == 50
+    assert {"cpu", "memory"} <= facts["readers"].keys()
+    assert facts["polls"] >= 1
+    assert facts["core_share"] > 0
     for cell, facts in zip(run.samples["cell"], run.samples["facts"], strict=True):
         spent = json.loads(facts)
         assert spent["client_cpu_ns"] > 0
         assert spent["server_cpu_ns"] >= (0 if cell == "loopback" else 1)
         assert spent["client_rss_bytes"] > 1 << 20
     table = run.table(RESOURCES)
-    assert set(table["reader"]) == set(told["readers"])
+    assert set(table["reader"]) == set(facts["readers"])
     edges = table[table["reader"] == "cpu"]["client_cpu_ns"]
     assert edges.is_monotonic_increasing
     assert len(edges) >= 2 * len(run.samples)

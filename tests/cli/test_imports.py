@@ -24,8 +24,8 @@ TYPES = "TYPE_CHECKING"
 
 def imported(code: str) -> list[str]:
     """Run code in a fresh Python; return the heavy packages that it imported."""
-    told = f"import sys\n{code}\nprint([name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", told], capture_output=True, text=True, check=True, timeout=120)
+    program = f"import sys\n{code}\nprint([name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=120)
     names: list[str] = ast.literal_eval(done.stderr)
     return names
 
@@ -63,7 +63,7 @@ LIBRARIES = {
 }
 LATE = {
     "s2a_bench.harness.config": "it loads every transport, those of other packages too",
-    "s2a_bench.library": "a name of the package's face is asked for",
+    "s2a_bench.library": "a name of the package is looked up",
 }
 """Modules that may be imported in a function though no heavy library stands behind them, and why."""
 TO_BE_MOVED = ("s2a_bench/experiments/", "s2a_bench/policy/", "s2a_bench/transport/")

@@ -41,7 +41,7 @@ def only_run(output: Path) -> StoredRun:
     """Return the run, all of whose facts are declared."""
     (folder,) = output.iterdir()
     kept = read_run(folder)
-    assert {name for told in kept.samples["facts"] for name in json.loads(told)} <= kept.manifest["facts"].keys()
+    assert {name for facts in kept.samples["facts"] for name in json.loads(facts)} <= kept.manifest["facts"].keys()
     return kept
 
 
@@ -54,12 +54,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[StoredRun, str]:
 
 
 def test_one_run_compares_all_pipelines(whole: tuple[StoredRun, str]) -> None:
-    kept, said = whole
+    kept, output = whole
     names = {"http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "loopback"}
     assert kept.manifest["state"] == "finished"
     assert set(kept.samples["cell"]) == names
-    assert all(name in said for name in ("as-deployed", "topic", "loopback", "residual", "a mark costs"))
-    assert str(kept.path) in said
+    assert all(name in output for name in ("as-deployed", "topic", "loopback", "residual", "a mark costs"))
+    assert str(kept.path) in output
     for name in ("samples.csv", "samples.parquet", "tokens.parquet", "manifest.json"):
         assert (kept.path / name).stat().st_size > 0
     assert len(list((kept.path / "figures").glob("*.png"))) == 3
@@ -245,13 +245,13 @@ def check_kept(folder: Path, state: str) -> StoredRun:
 def test_a_killed_server_ends_the_run_with_every_sample_kept(tmp_path: Path, transport: str) -> None:
     process, folder = start_long(tmp_path, "--transport", transport)
     os.kill(read_run(folder).manifest["servers"][transport]["pid"], signal.SIGKILL)
-    _, said = process.communicate(timeout=120)
+    _, output = process.communicate(timeout=120)
     assert process.returncode == 1
-    (line,) = (line for line in said.splitlines() if line.startswith("error:"))
+    (line,) = (line for line in output.splitlines() if line.startswith("error:"))
     assert f"the {transport} server" in line
     assert "killed by signal 9" in line
-    assert f"samples so far: {folder}" in said
-    assert "Traceback" not in said
+    assert f"samples so far: {folder}" in output
+    assert "Traceback" not in output
     errors = check_kept(folder, "failed").samples["error"]
     assert (errors.iloc[:-1] == "").all()  # the one that was under way is a row, too
     last = errors.iloc[-1]
@@ -263,10 +263,10 @@ def test_an_interrupt_keeps_the_samples_and_stops_the_servers(tmp_path: Path, nu
     process, folder = start_long(tmp_path, "--transport", "http,ros")
     servers = [server["pid"] for server in read_run(folder).manifest["servers"].values()]
     process.send_signal(number)
-    _, said = process.communicate(timeout=120)
+    _, output = process.communicate(timeout=120)
     assert process.returncode == 130
-    assert "interrupted" in said
-    assert "Traceback" not in said
+    assert "interrupted" in output
+    assert "Traceback" not in output
     check_kept(folder, "interrupted")
     for pid in servers:
         with pytest.raises(ProcessLookupError):
@@ -294,7 +294,7 @@ def test_a_run_beside_another_has_a_namespace_of_its_own_unless_it_is_told_that_
     try:
         run(*SMALL, "--transport", "ros/topic,ros/action,http/as-deployed", output=tmp_path / "second")
         taken = read_run(first).manifest["servers"]["ros"]["address"]
-        said = run(*SMALL, "--transport", "ros", "--namespace", taken, output=tmp_path / "third", code=1).stderr
+        output = run(*SMALL, "--transport", "ros", "--namespace", taken, output=tmp_path / "third", code=1).stderr
     finally:
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
@@ -302,7 +302,7 @@ def test_a_run_beside_another_has_a_namespace_of_its_own_unless_it_is_told_that_
     assert (second.samples["error"] == "").all()
     assert second.manifest["servers"]["ros"]["address"] != taken
     assert (check_kept(first, "interrupted").samples["error"].isin({"", INTERRUPTED})).all()
-    last = said.strip().splitlines()[-1]
+    last = output.strip().splitlines()[-1]
     assert last.startswith(f"error: another server answers under {taken} in DDS domain")
     assert last.endswith("ROS_DOMAIN_ID or another --namespace")
 
@@ -312,8 +312,8 @@ def test_a_port_in_use_is_one_clear_line(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        said = run(*SMALL, "--transport", "http", "--port", str(port), output=tmp_path, code=1).stderr
-    assert f"error: --port: {port} is in use" in said
+        output = run(*SMALL, "--transport", "http", "--port", str(port), output=tmp_path, code=1).stderr
+    assert f"error: --port: {port} is in use" in output
 
 
 @pytest.mark.parametrize(
@@ -380,8 +380,8 @@ def test_a_single_picture_is_another_one_in_every_sample_and_the_same_in_every_c
     (tmp_path / "pictures").mkdir()
     cv2.imwrite(str(tmp_path / "pictures" / "one.png"), np.zeros((48, 64, 3), np.uint8))
     source = ["--source", f"images:{tmp_path / 'pictures'}"]
-    said = run(*SMALL, *source, "--transport", "http", output=tmp_path / "results").stderr
-    assert "duplicate-frames" not in said
+    output = run(*SMALL, *source, "--transport", "http", output=tmp_path / "results").stderr
+    assert "duplicate-frames" not in output
     (folder,) = (tmp_path / "results").iterdir()
     samples = read_run(folder).samples
     assert samples["rgb_source"].nunique() == samples["block"].nunique() > 1

@@ -37,10 +37,10 @@ def test_it_is_measured_beside_our_own_cells(tmp_path: Path) -> None:
     assert set(theirs["engine"]) == {"llama-server"}
     assert (theirs["cache_n"] == 0).all()
     assert run.origins.of("http/llama-server").weights == "dummy"
-    server = next(told for told in run.manifest["servers"].values() if "version" in told)
+    server = next(each for each in run.manifest["servers"].values() if "version" in each)
     assert server["version"].startswith("xllamacpp ")
-    ours = next(told for told in run.manifest["servers"].values() if "version" not in told)
-    assert server["told"]["flash_attention"] == ours["engine"]["flash_attention"] == "auto"
+    native = next(each for each in run.manifest["servers"].values() if "version" not in each)
+    assert server["told"]["flash_attention"] == native["engine"]["flash_attention"] == "auto"
     assert "http/llama-server" in done.stdout
 
 
@@ -48,8 +48,8 @@ def test_throughput_lets_it_answer_in_turn_with_our_engine(tmp_path: Path) -> No
     few = (*SMALL, "--threads", "1", "--requests", "2", "--json", "--output", tmp_path)
     done = program("throughput", "--engine", "llama-server", *few)
     whole = json.loads(done.stdout)
-    theirs, ours = sorted(whole["cells"], key=lambda cell: str(cell["engine"]), reverse=True)
-    assert [(cell["cell"], cell["engine"], cell["t_eval"], cell["errors"]) for cell in (ours, theirs)] == [
+    theirs, native = sorted(whole["cells"], key=lambda cell: str(cell["engine"]), reverse=True)
+    assert [(cell["cell"], cell["engine"], cell["t_eval"], cell["errors"]) for cell in (native, theirs)] == [
         ("in-process", "llama", "engine", 0),
         ("http/llama-server", "llama-server", "engine", 0),
     ]
@@ -92,10 +92,10 @@ def test_killed_in_the_middle_is_one_line_and_keeps_the_samples(tmp_path: Path) 
         time.sleep(0.1)
     (server,) = read_run(kept[0].parent).manifest["servers"].values()
     os.kill(server["pid"], signal.SIGKILL)
-    _, said = process.communicate(timeout=120)
+    _, output = process.communicate(timeout=120)
     assert process.returncode == 1
-    assert "killed by signal 9" in said
-    assert "Traceback" not in said
+    assert "killed by signal 9" in output
+    assert "Traceback" not in output
     assert read_run(kept[0].parent).manifest["state"] == "failed"
 
 
@@ -109,9 +109,9 @@ def test_a_projector_that_is_none_is_one_line(tmp_path: Path) -> None:
 def test_layers_on_a_gpu_that_a_build_cannot_use_are_refused(cell: str, tmp_path: Path) -> None:
     if any("CPU" not in device["type"].name for device in pytest.importorskip("xllamacpp").get_device_info()):
         pytest.skip("a GPU is here")
-    said = refused("latency", *SMALL, "--output", tmp_path, "--transport", cell, "--gpu-layers", "-1")
-    assert "error: --gpu-layers: " in said
-    assert "is built for the CPU alone" in said
+    output = refused("latency", *SMALL, "--output", tmp_path, "--transport", cell, "--gpu-layers", "-1")
+    assert "error: --gpu-layers: " in output
+    assert "is built for the CPU alone" in output
 
 
 def test_a_port_in_use_is_not_taken_for_it(tmp_path: Path) -> None:

@@ -93,14 +93,14 @@ def test_capture_measures_this_machine_which_match_then_finds(home: Path) -> Non
     found = json_of(called("profile", "match", "--json"))
     assert [profile["name"] for profile in found["profiles"]] == ["here"]
     assert found["profiles"][0]["differences"] == []
-    said = refused("profile", "capture", "here", *flags)
-    assert "profiles/here.toml exists already; give another NAME or --output, or --force" in said
+    error = refused("profile", "capture", "here", *flags)
+    assert "profiles/here.toml exists already; give another NAME or --output, or --force" in error
 
 
 def test_where_nothing_can_be_written_nothing_is_measured(home: Path) -> None:
     (home / "file").write_text("")
-    said = refused("profile", "capture", "here", "--output", "file/profiles", code=1)
-    assert said == "error: --output: cannot write file/profiles/here.toml: Not a directory"
+    error = refused("profile", "capture", "here", "--output", "file/profiles", code=1)
+    assert error == "error: --output: cannot write file/profiles/here.toml: Not a directory"
 
 
 def test_a_server_that_replays_says_so() -> None:

@@ -50,10 +50,10 @@ def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[StoredRun, str]:
 
 
 def test_a_replay_behind_a_url_is_emulated_in_every_place(replayed: tuple[StoredRun, str], tmp_path: Path) -> None:
-    run, said = replayed
+    run, output = replayed
     (origin,) = run.origins.every
     assert (origin.engine, origin.tokens, origin.profile) == ("replay", "emulated", "rtx-4080")
-    assert "EMULATED" in said
+    assert "EMULATED" in output
     assert set(run.samples["engine"]) == {"replay"}
     assert set(run.samples["provenance"]) == {"replay/real/emulated"}
     for path in (run.path / "tables").iterdir():
@@ -72,8 +72,8 @@ def test_a_replay_behind_a_url_is_emulated_in_every_place(replayed: tuple[Stored
 
 def test_it_is_not_compared_with_a_measured_run(replayed: tuple[StoredRun, str], tmp_path: Path) -> None:
     own, _ = measured(tmp_path, "--transport", "http/as-deployed", "--engine", "echo", "--data-only")
-    said = refused("compare", own.path, replayed[0].path, code=1)
-    assert "provenance tokens: measured against emulated" in said
+    output = refused("compare", own.path, replayed[0].path, code=1)
+    assert "provenance tokens: measured against emulated" in output
 
 
 def test_a_replay_behind_an_action_is_emulated_too(tmp_path: Path) -> None:
@@ -87,17 +87,17 @@ def test_a_replay_behind_an_action_is_emulated_too(tmp_path: Path) -> None:
             f"{namespace}/generate_response",
             "--data-only",
         )
-        run, said = measured(tmp_path, *action)
+        run, output = measured(tmp_path, *action)
     assert run.origins.of("ros/action").code == "replay/real/emulated"
     assert set(run.samples["engine"]) == {"replay"}
-    assert "EMULATED" in said
+    assert "EMULATED" in output
 
 
 def test_a_server_that_does_not_tell_is_unknown_never_the_default(tmp_path: Path) -> None:
     with serving_socket(answering(Cloud(), RecordingHandler(["x", "y"]))) as url:
-        run, said = measured(
+        run, output = measured(
             tmp_path, "--transport", "http/as-deployed", "--url", url, "--dialect", "openai", "--data-only"
         )
     assert set(run.samples["engine"]) == {"unknown"}
     assert not any(origin.known for origin in run.origins.cells.values())
-    assert "engine UNKNOWN" in said
+    assert "engine UNKNOWN" in output

@@ -128,9 +128,9 @@ def test_a_server_that_died_is_started_again_once(start: Start, number: signal.S
     assert httpx.post(url, json=body).status_code == 200
     os.kill(child_of(process), number)
     assert process.wait(30) == 1
-    said = process.stderr.read().splitlines()
-    assert len(said) == 1
-    assert f"died, killed by signal {number}" in said[0]
+    lines = process.stderr.read().splitlines()
+    assert len(lines) == 1
+    assert f"died, killed by signal {number}" in lines[0]
 
 
 def test_a_ros_server_that_died_is_started_again_at_once(start: Start, dds_domain: int) -> None:
@@ -167,9 +167,9 @@ def test_a_signal_while_it_starts_leaves_nothing() -> None:
 
 def test_off_loopback_it_wants_a_key_or_to_be_told_that_there_is_none(start: Start) -> None:
     strangers = ("http", "--engine", "echo", "--port", "0", "--host", "0.0.0.0")  # noqa: S104 - what is tested
-    said = refused("serve", *strangers)
-    assert "--host: others reach 0.0.0.0" in said
-    assert "--api-key-env, or let everybody in with --no-auth" in said
+    error = refused("serve", *strangers)
+    assert "--host: others reach 0.0.0.0" in error
+    assert "--api-key-env, or let everybody in with --no-auth" in error
     _, line = start(*strangers, "--no-auth")
     assert "for all who reach it" in line
 
@@ -246,8 +246,8 @@ def test_ros_args_name_the_node_its_topics_and_its_parameters(start: Start, dds_
     try:
         type_name = "rcl_interfaces/srv/GetParameters"
         client = middleware.service_client("/robot/brain/get_parameters", type_name)
-        asked = ros.default(type_name + "_Request", names=["max_tokens", "max_waiting", "engine"])
-        values = client.call(asked, 20).values
+        request = ros.default(type_name + "_Request", names=["max_tokens", "max_waiting", "engine"])
+        values = client.call(request, 20).values
         assert [value.integer_value for value in values[:2]] == [3, 7]
         assert values[2].string_value == "echo"
         plotted = middleware.subscription("/robot/words", ros.TOKEN, QoS(0))

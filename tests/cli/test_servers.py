@@ -93,17 +93,17 @@ def test_a_run_that_is_refused_waits_as_asked_and_ends_with_the_reason(tmp_path:
 
 
 def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: Path) -> None:
-    asked, under_way, over = 0, Event(), Event()
+    requests, under_way, over = 0, Event(), Event()
     speaker = Cloud()
 
     def reply(received: Received) -> Iterator[bytes]:
-        nonlocal asked
+        nonlocal requests
         if received.method != "POST":
             yield head("404 Not Found")
             return
-        asked += 1
+        requests += 1
         yield head(kind=speaker.kind) + speaker.token(Token(0, "go"))
-        if asked == 3:
+        if requests == 3:
             under_way.set()
             over.wait(60)
         yield speaker.closing([Token(0, "go")])
@@ -123,25 +123,25 @@ def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: P
         process = subprocess.Popen([*command, "--url", url], stderr=subprocess.PIPE, text=True)
         assert under_way.wait(60)
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
+        _, output = process.communicate(timeout=60)
         over.set()
-    assert process.returncode == 130, said
+    assert process.returncode == 130, output
     (folder,) = tmp_path.iterdir()
     run = read_run(folder)
     assert run.manifest["state"] == "interrupted"
     *before, last = run.samples["error"]
     assert before == ["", ""]
     assert last.startswith("Interrupted: somebody ended the run while this request was under way")
-    assert "failed-samples" not in said
+    assert "failed-samples" not in output
 
 
 def test_throughput_of_a_server_that_does_not_tell_says_only_that(tmp_path: Path) -> None:
     reply = answering(Cloud(), RecordingHandler(["go", "_to", "x"]))
     with serving(reply) as url:
         done = program("throughput", *SMALL, "--url", url, "--output", tmp_path)
-    said = " ".join(done.stdout.split())
-    assert "http/as-deployed: the server does not tell T_eval, so decode stands in for N / T_eval." in said
-    assert "the engine's own figure" not in said
+    output = " ".join(done.stdout.split())
+    assert "http/as-deployed: the server does not tell T_eval, so decode stands in for N / T_eval." in output
+    assert "the engine's own figure" not in output
 
 
 @pytest.mark.parametrize(
@@ -153,7 +153,7 @@ def test_throughput_of_a_server_that_does_not_tell_says_only_that(tmp_path: Path
     ],
 )
 def test_bad_flags_are_named_before_anything_is_kept(arguments: list[str], says: str, tmp_path: Path) -> None:
-    said = refused("latency", *SMALL, *arguments, "--output", tmp_path / "results")
-    assert says in said
-    assert KEY not in said
+    output = refused("latency", *SMALL, *arguments, "--output", tmp_path / "results")
+    assert says in output
+    assert KEY not in output
     assert not (tmp_path / "results").exists()

@@ -17,7 +17,7 @@ LATENCY = ["latency", "--engine", "echo", "--transport", "http,loopback", "--siz
 
 
 def run(kind: int, limit: int, output: Path, *more: str) -> list[str]:
-    """Run latency below a limit; return what it said, which ends with one line of error."""
+    """Run latency below a limit; return its lines on stderr, the last of which is the error."""
     done = subprocess.run(
         [sys.executable, "-m", "s2a_bench", *LATENCY, *more, "--output", str(output)],
         capture_output=True,
@@ -28,27 +28,27 @@ def run(kind: int, limit: int, output: Path, *more: str) -> list[str]:
     )
     assert done.returncode == 1, done.stderr
     assert "Traceback" not in done.stderr
-    *said, last = done.stderr.splitlines()
+    *lines, last = done.stderr.splitlines()
     assert last.startswith("error: ")
-    return [*said, last]
+    return [*lines, last]
 
 
 @pytest.mark.parametrize("files", [10, 14, 63])
 def test_too_few_open_files_are_told_before_anything_begins(tmp_path: Path, files: int) -> None:
-    said = run(resource.RLIMIT_NOFILE, files, tmp_path)
-    assert said == [f"error: this process may open {files} files, and 64 are needed; raise `ulimit -n`"]
+    lines = run(resource.RLIMIT_NOFILE, files, tmp_path)
+    assert lines == [f"error: this process may open {files} files, and 64 are needed; raise `ulimit -n`"]
     assert not list(tmp_path.iterdir())
 
 
 def test_too_little_address_space_is_told_before_anything_begins(tmp_path: Path) -> None:
-    (said,) = run(resource.RLIMIT_AS, 400 * 2**20, tmp_path)
-    assert "may use 400 MiB of address space, and 1024 are needed; raise `ulimit -v`" in said
+    (line,) = run(resource.RLIMIT_AS, 400 * 2**20, tmp_path)
+    assert "may use 400 MiB of address space, and 1024 are needed; raise `ulimit -v`" in line
     assert not list(tmp_path.iterdir())
 
 
 def test_a_file_that_may_not_grow_ends_the_run_with_its_samples(tmp_path: Path) -> None:
-    said = run(resource.RLIMIT_FSIZE, 600_000, tmp_path, "--requests", "1000000")
-    assert "csv: File too large; samples so far are kept" in said[-1]
+    lines = run(resource.RLIMIT_FSIZE, 600_000, tmp_path, "--requests", "1000000")
+    assert "csv: File too large; samples so far are kept" in lines[-1]
     (folder,) = tmp_path.iterdir()
     kept = read_run(folder)
     assert kept.manifest["state"] == "failed"
@@ -57,7 +57,7 @@ def test_a_file_that_may_not_grow_ends_the_run_with_its_samples(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("error", "said"),
+    ("error", "line"),
     [
         (OSError(errno.EMFILE, "Too many open files"), "too many open files; raise `ulimit -n`"),
         (OSError(errno.ENOSPC, "No space left on device", "/a/b"), "/a/b'; free some space"),
@@ -66,8 +66,8 @@ def test_a_file_that_may_not_grow_ends_the_run_with_its_samples(tmp_path: Path) 
         (RuntimeError("can't start new thread"), "no more processes or threads"),
     ],
 )
-def test_what_there_is_too_little_of_is_named(error: Exception, said: str) -> None:
-    assert said in str(shortage(error))
+def test_what_there_is_too_little_of_is_named(error: Exception, line: str) -> None:
+    assert line in str(shortage(error))
 
 
 @pytest.mark.parametrize("error", [RuntimeError("x"), ImportError("no module"), OSError(errno.ENOENT, "x")])

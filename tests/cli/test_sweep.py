@@ -148,11 +148,11 @@ def test_killed_in_the_middle_it_goes_on_with_every_cell_exactly_once(many: Path
 def test_ctrl_c_leaves_a_folder_that_goes_on(many: Path) -> None:
     process, folder = begin(many, many.parent / "results", 2)
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does: to the sweep and to its workers
-    _, said = process.communicate(timeout=WAIT_S)
+    _, output = process.communicate(timeout=WAIT_S)
     assert process.returncode == 130
-    assert "Traceback" not in said
-    assert f"go on with: s2a-bench sweep --resume {folder}" in said
-    assert said.splitlines()[-1] == "interrupted"
+    assert "Traceback" not in output
+    assert f"go on with: s2a-bench sweep --resume {folder}" in output
+    assert output.splitlines()[-1] == "interrupted"
     assert read_run(folder).manifest["state"] == "interrupted"
     sweep("--resume", folder)
     found = read_sweep(folder)
@@ -253,8 +253,8 @@ def test_latencies_are_an_axis_as_numbers_and_as_families(tmp_path: Path) -> Non
     axis = 'latency = [20, "lognormal:mean_ms=20,cv=.5"]'
     file.write_text(f'command = "latency"\n[settings]\nengine = "echo"\n[grid]\n{axis}\n')
     lines = called("sweep", file, "--dry-run", "--output", tmp_path / "results").stdout.splitlines()
-    asked = {line.partition("--latency=")[2].split()[0] for line in lines if "--latency" in line}
-    assert asked == {"20", "lognormal:mean_ms=20,cv=.5"}
+    latencies = {line.partition("--latency=")[2].split()[0] for line in lines if "--latency" in line}
+    assert latencies == {"20", "lognormal:mean_ms=20,cv=.5"}
 
 
 def test_dry_run_prints_cells_and_time_and_leaves_nothing(many: Path) -> None:

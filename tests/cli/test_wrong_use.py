@@ -121,7 +121,7 @@ WRONG = {
         ("--bogus", "No such option: --bogus"),
     ],
 }
-"""Command -> the rest of the line, what is said, and the exit code where it is not 2."""
+"""Command -> the rest of the line, the message, and the exit code if it is not 2."""
 
 
 @pytest.mark.parametrize(("command", "case"), [(name, case) for name, cases in WRONG.items() for case in cases])
@@ -129,6 +129,6 @@ def test_it_is_one_line_and_leaves_nothing(
     command: str, case: tuple[str, str] | tuple[str, str, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    line, said, *code = case
-    assert said in refused(*command.split(), *shlex.split(line), code=code[0] if code else 2)
+    line, message, *code = case
+    assert message in refused(*command.split(), *shlex.split(line), code=code[0] if code else 2)
     assert not list(tmp_path.iterdir())

@@ -48,7 +48,7 @@ TOKENS = st.lists(st.tuples(WHOLE, TEXTS), max_size=3)
 def write(root: Path, samples: list[dict[str, Any]], tokens: list[tuple[int, str]], note: str) -> RunWriter:
     """Write a run in which some samples are as any other, and some as given; it stays open."""
     run = RunWriter.create(root, "latency", {"note": note, "asked": {note: {"url": note}}})
-    run.update(asked={note: {"dialect": note}, f"another {note}": {}})
+    run.update(flags={note: {"dialect": note}, f"another {note}": {}})
     for block in range(3):
         run.sample(row_of("http/as-deployed", BLACK_BOX, block, marks=marks_of(BLACK_BOX, 10**9), n_tokens=1))
     for block, facts in enumerate(samples, 3):
@@ -94,8 +94,8 @@ def test_it_can_be_reported_on(samples: list[dict[str, Any]], tokens: list[tuple
         with write(Path(root), samples, tokens, note) as run:
             pass
         files = {"output": "page.html", "csv": "csv", "latex": "latex", "markdown": "all.md"}
-        asked = [f"--{flag}={root}/{name}" for flag, name in files.items()]
-        command = [sys.executable, "-m", "s2a_bench", "report", str(run.path), *asked]
+        flags = [f"--{flag}={root}/{name}" for flag, name in files.items()]
+        command = [sys.executable, "-m", "s2a_bench", "report", str(run.path), *flags]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
         assert done.returncode == 0, done.stderr
         assert "left out" not in done.stderr + done.stdout

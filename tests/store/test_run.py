@@ -128,8 +128,8 @@ def test_derived_columns_are_the_budget_of_the_chain(tmp_path: Path) -> None:
 
 def test_a_llama_servers_model_time_is_what_it_reports(tmp_path: Path) -> None:
     marks = [("", 0), ("capture", 2_000_000), ("ingest", 12_000_000), ("inference", 50_000_000)]
-    told = {"half": 30.0, "none": None, "more than there was": 51.0, "nothing": 0.0}
-    rows = (sample(name, marks=marks, server_prompt_ms=prompt_ms) for name, prompt_ms in told.items())
+    model_ms = {"half": 30.0, "none": None, "more than there was": 51.0, "nothing": 0.0}
+    rows = (sample(name, marks=marks, server_prompt_ms=prompt_ms) for name, prompt_ms in model_ms.items())
     samples = kept(tmp_path, *rows).samples
     assert samples["e2e_without_inference_ns"].tolist() == [12_000_000] * 4
     assert samples["e2e_without_model_ns"].iloc[0] == 20_000_000
@@ -271,16 +271,16 @@ sys.stdin.read()
 
 
 @pytest.mark.parametrize(
-    ("where", "said"),
+    ("where", "message"),
     [
         ("file", "`output` .*file.*is not a folder"),
         ("file/below", "`output` .*file.*is not a folder"),
         ("/proc/s2a", "`output` /proc/s2a: cannot create"),
     ],
 )
-def test_an_output_where_no_folder_can_be_is_refused_by_name(tmp_path: Path, where: str, said: str) -> None:
+def test_an_output_where_no_folder_can_be_is_refused_by_name(tmp_path: Path, where: str, message: str) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match=said):
+    with pytest.raises(StoreError, match=message):
         RunWriter.create(tmp_path / where, "latency", {"stages": STAGES})
 
 
@@ -320,8 +320,8 @@ def test_a_disk_without_room_for_the_reserve_ends_the_run_before_it_begins(
 @pytest.mark.parametrize("wrong", [ZeroDivisionError, AttributeError, KeyError, TypeError, ValueError])
 def test_rows_that_do_not_fit_their_manifest_are_told_with_their_folders(wrong: type[Exception]) -> None:
     runs = [StoredRun(Path(name), {}) for name in ("one", "two")]
-    said = rf"^one, two: rows and manifest do not fit: {wrong.__name__}\('x'\)$"
-    with pytest.raises(StoreError, match=said), fits(*runs):
+    message = rf"^one, two: rows and manifest do not fit: {wrong.__name__}\('x'\)$"
+    with pytest.raises(StoreError, match=message), fits(*runs):
         raise wrong("x")
 
 
@@ -449,7 +449,7 @@ def test_rows_are_counted_in_files_of_either_kind_and_empty_tables_left_out(tmp_
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         (None, "no run folder"),
         ('{"schema": "s2a-bench/9"}', "s2a-bench/9.*s2a-bench/1"),
@@ -462,11 +462,11 @@ def test_rows_are_counted_in_files_of_either_kind_and_empty_tables_left_out(tmp_
     ],
 )
 def test_a_folder_that_is_no_run_or_anothers_is_refused_in_one_line(
-    tmp_path: Path, text: str | None, said: str
+    tmp_path: Path, text: str | None, message: str
 ) -> None:
     if text is not None:
         (tmp_path / "manifest.json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(StoreError, match=said) as error:
+    with pytest.raises(StoreError, match=message) as error:
         read_run(tmp_path)
     assert len(str(error.value).splitlines()) == 1
 
@@ -556,11 +556,11 @@ WRONG = {
 @pytest.mark.parametrize("key", WRONG)
 def test_a_manifest_of_the_wrong_shape_is_one_line_with_file_and_key(tmp_path: Path, key: str) -> None:
     path = kept(tmp_path).path / "manifest.json"
-    value, said = WRONG[key]
+    value, message = WRONG[key]
     path.write_text(json.dumps(json.loads(path.read_text()) | {key: value}))
     with pytest.raises(StoreError) as error:
         read_run(path.parent)
-    assert str(error.value) == f"{path} is damaged: {said}"
+    assert str(error.value) == f"{path} is damaged: {message}"
 
 
 def test_what_a_manifest_does_not_have_is_absent_and_not_wrong(tmp_path: Path) -> None:
@@ -633,12 +633,12 @@ def test_a_run_whose_parquet_files_cannot_be_written_has_failed_of_what_went_wro
 
     monkeypatch.setattr("s2a_bench.store.run.write_parquet", refuse)
     run = RunWriter.create(tmp_path, "latency", {"stages": STAGES})
-    said = str(first or f"cannot write {run.path / 'samples.parquet'}")
-    with pytest.raises(type(first or StoreError("")), match=re.escape(said)), run:  # noqa: PT012 - the block is tested
+    message = str(first or f"cannot write {run.path / 'samples.parquet'}")
+    with pytest.raises(type(first or StoreError("")), match=re.escape(message)), run:  # noqa: PT012 - the block is tested
         run.sample(sample())
         if first:
             raise first
-    assert (read_run(run.path).manifest["state"], read_run(run.path).manifest["error"]) == ("failed", said)
+    assert (read_run(run.path).manifest["state"], read_run(run.path).manifest["error"]) == ("failed", message)
 
 
 def test_without_pyarrow_the_run_stays_and_its_reader_is_told_the_way_out(

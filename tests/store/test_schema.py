@@ -75,15 +75,16 @@ def test_columns_that_an_older_run_does_not_have_are_null(tmp_path: Path) -> Non
 def test_a_request_is_of_the_first_launch_and_has_no_token_unless_it_says_so() -> None:
     names = ("cell", "pipeline", "variant", "payload", "connection", "engine", "mode", "size")
     row = SampleRow(*names, block=1, position=2, warmup=False, request_id="r", frame_index=3)
-    told = dict(zip((table := samples_table({})).columns, table.values(row), strict=True))
-    assert (told["launch"], told["n_tokens"], told["error"], told["marks"], told["facts"]) == (0, 0, "", "[]", "{}")
-    assert told["payload_bytes"] is told["last_token_ns"] is told["e2e_ns"] is None
+    found = dict(zip((table := samples_table({})).columns, table.values(row), strict=True))
+    names = ("launch", "n_tokens", "error", "marks", "facts")
+    assert [found[name] for name in names] == [0, 0, "", "[]", "{}"]
+    assert found["payload_bytes"] is found["last_token_ns"] is found["e2e_ns"] is None
 
 
 def test_a_row_says_itself_where_it_comes_from_else_its_cell_or_the_run(tmp_path: Path) -> None:
-    told = Origins(Provenance(), {name: Provenance(name) for name in ("echo", "llama")}).to_manifest()
+    values = Origins(Provenance(), {name: Provenance(name) for name in ("echo", "llama")}).to_manifest()
     cells = Table("cells", CellRow)
-    with RunWriter.create(tmp_path, "latency", {"provenance": told}) as run:
+    with RunWriter.create(tmp_path, "latency", {"provenance": values}) as run:
         run.append(cells, [CellRow("echo"), CellRow("llama"), CellRow("echo", "its own")])
     found = read_run(run.path).table(cells)["provenance"].tolist()
     assert found == ["echo/unknown/unknown", "llama/unknown/unknown", "its own"]
