@@ -1,4 +1,4 @@
-"""What a run of requests is asked to do, checked, and the pipelines that follow from it."""
+"""The options of a run of requests, their checks, and the pipelines that follow from them."""
 
 from __future__ import annotations
 
@@ -38,29 +38,19 @@ Rules: Output only numbered skill calls, one per line.
 Do not output any explanation."""
 """The paper's prompt (section IV-E)."""
 DEFAULT_TASK = "pick up the red block and place it in the box"
-"""What policies are told, which answer with actions."""
-
-
-def _options() -> type[Options]:
-    """Make a group of the options of each transport; what only concerns `serve` is no flag."""
-    fields: dict[str, Any] = {
-        name: (each.options, group(each.options, only=each.options.of_sides("", SERVER, EXTERNAL, PROGRAM)))
-        for name, each in TRANSPORTS.loaded()
-    }
-    return create_model("PerTransport", __base__=Options, **fields)
-
-
-def _with_url(url: str, options: Options | Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of transports, the one that a URL's scheme names told the URL."""
-    told = {name: own if isinstance(own, Mapping) else own.given_values() for name, own in dict(options).items()}
-    name = named_by(url)
-    return {**told, name: {**told.get(name, {}), "url": url}}
-
+"""The prompt of policies, which answer with actions."""
 
 if TYPE_CHECKING:
     TransportOptions: TypeAlias = Options
-else:
-    TransportOptions = _options()
+else:  # a group of options for each transport; options that only `serve` has are no flags
+    TransportOptions = create_model(
+        "PerTransport",
+        __base__=Options,
+        **{
+            name: (each.options, group(each.options, only=each.options.of_sides("", SERVER, EXTERNAL, PROGRAM)))
+            for name, each in TRANSPORTS.loaded()
+        },
+    )
 
 
 class RequestsConfig(Options):
@@ -68,17 +58,17 @@ class RequestsConfig(Options):
 
     PANEL: ClassVar[str] = "Requests"
     QUICK: ClassVar[dict[str, int]] = {"requests": 10, "warmup": 2, "max_tokens": 8}
-    """What ``quick`` sets, unless told."""
+    """The defaults under ``quick``."""
     COUNTS_TOKENS: ClassVar[str] = "this command counts tokens"
-    """Why answers of actions are no use here; empty: they are."""
+    """Why the command refuses answers of actions; empty: it accepts them."""
     OLD: ClassVar[Mapping[str, tuple[str, str]]] = {
         "runs": ("requests", ""),
         **{name: ("transports", f"{name}/") for name, each in TRANSPORTS.loaded() if each.variants},
     }
     EVERY_VARIANT: ClassVar[bool] = True
-    """Whether a transport whose name has no variant stands for all that it measures by default; else for the first."""
+    """Whether a transport named without a variant stands for all its default variants; else for its first."""
     OF_ENGINE: ClassVar[tuple[str, ...]] = ()
-    """The engine's options that names of pipelines may hold: so cells of one run have engines set differently."""
+    """The engine's options that names of pipelines may set, so that cells of one run have different engines."""
 
     transports: Names = option(
         COMPARED,
@@ -100,7 +90,7 @@ class RequestsConfig(Options):
     )
     resize: Square | None = option(
         None,
-        "WIDTHxHEIGHT, or 224 for 224x224: pictures are scaled to it before they travel [default: as captured]",
+        "WIDTHxHEIGHT, or 224 for 224x224: pictures are scaled to it before they are sent [default: as captured]",
         panel="Pictures",
     )
     state: int = option(
@@ -108,12 +98,12 @@ class RequestsConfig(Options):
     )
     payload: Payloads = option(
         (),
-        f"how a picture travels: {', '.join(PAYLOADS)}; several with commas, each in cells of its own [default: raw]",
+        f"how pictures are sent: {', '.join(PAYLOADS)}; several with commas, each in cells of its own [default: raw]",
         panel="Pictures",
         first=True,
     )
     options: TransportOptions = group(TransportOptions, first=())
-    """The options of every transport, for names that do not say them themselves."""
+    """The options of every transport, for names that do not set them."""
     url: str = option(
         "",
         "a server that runs already (a black box), of the transport that its scheme names: "
@@ -157,14 +147,17 @@ class RequestsConfig(Options):
     quick: bool = option(False, "fewer samples: a first look", first=True)
 
     def __init__(self, **given: Any) -> None:
-        """Keep what is given, few samples where a quick look is asked for, and of a URL alone the transport it names.
+        """Apply the defaults of ``quick``; ``url`` sets the option of the transport that its scheme names.
 
         Raises UsageError naming the field.
         """
         given = {**self.QUICK, **given} if given.get("quick") else given
-        if given.get("url"):
-            given["options"] = _with_url(given["url"], given.get("options") or {})
-            given.setdefault("transports", (named_by(given["url"]),))
+        if url := given.get("url"):
+            name, groups = named_by(url), dict(given.get("options") or {})
+            values = groups.get(name, {})
+            values = values.given_values() if isinstance(values, Options) else values
+            given["options"] = {**groups, name: {**values, "url": url}}
+            given.setdefault("transports", (name,))
         super().__init__(**given)
 
     @property
@@ -174,21 +167,26 @@ class RequestsConfig(Options):
 
     @cached_property
     def pipelines(self) -> list[Pipeline]:
-        """Return what is compared, a cell each; raises UsageError."""
-        told = {name: given.given_values() for name, given in self.options}
-        strict, every = bool(self.payload), self.EVERY_VARIANT
-        payloads = self.payload or self.usual_payloads
-        engine = self.engine.name, self.OF_ENGINE
-        return pipelines(self.names, told, *engine, every=every, payloads=payloads, strict=strict, mode=self.mode)
+        """Return the pipelines that are compared, one a cell; raises UsageError."""
+        return pipelines(
+            self.names,
+            {name: options.given_values() for name, options in self.options},
+            self.engine.name,
+            self.OF_ENGINE,
+            every=self.EVERY_VARIANT,
+            payloads=self.payload or self.usual_payloads,
+            strict=bool(self.payload),
+            mode=self.mode,
+        )
 
     @property
     def usual_payloads(self) -> tuple[str, ...]:
-        """Return how pictures travel unless told, over the pipelines that can carry it."""
+        """Return the default payloads, for the pipelines that can carry them."""
         return ("raw",)
 
     @cached_property
     def answer(self) -> str:
-        """Return what the answers of all cells are made of; raises UsageError."""
+        """Return the kind of the answers of all cells; raises UsageError."""
         return answer_over(self.engine.answer, self.pipelines)
 
     @property
@@ -198,25 +196,25 @@ class RequestsConfig(Options):
     @property
     def tuned(self) -> bool:
         """Whether this process and the servers keep large blocks of memory for the next picture."""
-        return all(given.tuned for _, given in self.options)
+        return all(options.tuned for _, options in self.options)
 
     @property
     def serves_engine(self) -> bool:
-        """Whether an engine of ours answers over any transport."""
+        """Whether a server of this package answers over any transport."""
         return not all(pipeline.black_box for pipeline in self.pipelines)
 
     @property
     def starts_program(self) -> bool:
-        """Whether somebody else's server is started on the model's files."""
+        """Whether an external server program is started on the model's files."""
         return any(pipeline.options.program for pipeline in self.pipelines)
 
     @property
     def foreign(self) -> str:
-        """Return the first option that says that a server is not ours, or nothing."""
+        """Return the first option that names an external server, or nothing."""
         return next(filter(None, (each.options.external for each in self.pipelines)), "")
 
     def answered(self, say: Callable[[str], None]) -> RequestsConfig:
-        """Return it with the engine that can answer where none is named, and ``say`` which if that is not llama."""
+        """Choose the engine if none is named, and ``say`` which if it is not llama."""
         if "name" in self.engine.model_fields_set or not self.serves_engine:
             return self
         if self.answer == ACTIONS and not self.engine.of_model:
@@ -230,7 +228,7 @@ class RequestsConfig(Options):
         return chosen
 
     def _without_our_engine(self, say: Callable[[str], None]) -> RequestsConfig:
-        """Return it with the cells that need no engine of ours, and ``say`` so; raises UsageError for a named other."""
+        """Keep the cells of external servers, and ``say`` so; raises UsageError if the user named another cell."""
         kept = [each for each in self.pipelines if each.black_box]
         missing = f"our own servers have no engine here; {{}}{extras.how_to_install(*self.engine.kind.needs[:1])}"
         if named := [each.name for each in self.pipelines if each not in kept and self._is_named(each, kept)]:
@@ -250,9 +248,8 @@ class RequestsConfig(Options):
 
     @property
     def sent_prompt(self) -> str:
-        """Return the prompt; unless one was given, policies are told a task."""
-        given = "prompt" in self.model_fields_set or self.answer != ACTIONS
-        return self.prompt if given else DEFAULT_TASK
+        """Return the prompt; the default for policies is a task."""
+        return DEFAULT_TASK if self.answer == ACTIONS and "prompt" not in self.model_fields_set else self.prompt
 
     @property
     def reads_model(self) -> bool:
@@ -287,9 +284,8 @@ class RequestsConfig(Options):
             raise UsageError(f"`resize`: {pipeline.payload} is what the camera gave; use `payload` raw, jpeg or png")
         if self.state and not pipeline.capabilities.accepts_state:
             raise UsageError(f"`state`: a request of {pipeline.name} has no place for it; leave one of them out")
-        choice = Choice(
-            pipeline.options, pipeline.variant, mode=self.mode, engine=self.engine.name, cameras=self.cameras
-        )
+        options, engine = pipeline.options, self.engine.name
+        choice = Choice(options, pipeline.variant, mode=self.mode, engine=engine, cameras=self.cameras)
         pipeline.transport.require(choice)
         require_payload(pipeline)
         self.served_engine.but(**dict(pipeline.engine))  # raises UsageError for a value in its name
@@ -314,10 +310,10 @@ class RequestsConfig(Options):
             raise UsageError(f"`resize`: {self.resize[0]}x{self.resize[1]} should be 1x1 to {LARGEST}x{LARGEST}")
         if self.mode == "stream" and (self.cameras > 1 or self.resize):
             name = "cameras" if self.cameras > 1 else "resize"
-            raise UsageError(f"`{name}`: in `mode` stream one camera runs, whose frames travel as they are")
+            raise UsageError(f"`{name}`: in `mode` stream one camera runs, whose frames are sent as they are")
 
     def _check_unused(self) -> None:
-        """Refuse a server of somebody else's that no cell asks, and a model that no server loads."""
+        """Refuse an external server that no cell uses, and a model that no server loads."""
         used = {(each.transport.name, each.options.external) for each in self.pipelines}
         for name, given in self.options:
             transport, field = TRANSPORTS[name], given.external
@@ -330,29 +326,36 @@ class RequestsConfig(Options):
             raise UsageError(f"`{given}`: no server of this run loads a model; leave it out with `{self.foreign}`")
 
     def risks(self) -> Iterator[tuple[str, str, str]]:
-        """Yield those of the options, in the names of pipelines too."""
         yield from super().risks()
         for pipeline in self.pipelines:
             yield from pipeline.risks()
 
     def to_manifest(self) -> dict[str, Any]:
-        """Return the settings as plain data, with what every pipeline came to be told."""
-        told = {
+        """Return the settings as plain data, with the options of every pipeline."""
+        settings = {
             each.name: {**each.options.model_dump(mode="json", exclude_defaults=True), **dict(each.engine)}
             for each in self.pipelines
         }
-        own = self.model_dump(exclude={"quick", "nonce"})  # the nonce stands with the seeds
+        fields = self.model_dump(exclude={"quick", "nonce"})  # the nonce stands with the seeds
         width, height = self.size
         size = f"{width}x{height}"
         observation = f"{self.cameras} x {size}" if self.cameras > 1 else size
         observation += f" as {self.resize[0]}x{self.resize[1]}" if self.resize else ""
         observation += f", state of {self.state}" if self.state else ""
-        more = {"prompt": self.sent_prompt, "observation": observation, "tuned": self.tuned}
-        more |= {"width": width, "height": height, "size": size}
-        return {**own, **more, "engine": self.served_engine.to_manifest(), "pipelines": told}
+        return {
+            **fields,
+            "prompt": self.sent_prompt,
+            "observation": observation,
+            "tuned": self.tuned,
+            "width": width,
+            "height": height,
+            "size": size,
+            "engine": self.served_engine.to_manifest(),
+            "pipelines": settings,
+        }
 
 
 class FirstVariants(RequestsConfig):
-    """The settings of a run in which a transport whose name has no variant stands for its first."""
+    """The settings of a run in which a transport named without a variant stands for its first variant."""
 
     EVERY_VARIANT: ClassVar[bool] = False

@@ -24,7 +24,7 @@ class RequestFeed:
     def __init__(
         self, source: FrameSource, *, preencoded: bool, cameras: int = 1, size: tuple[int, int] | None = None
     ) -> None:
-        """Take ``cameras`` frames a request from ``source``, and scale them to ``size`` (width, height) if given."""
+        """Take ``cameras`` frames a request from ``source``, scaled to ``size`` (width, height) if given."""
         self._source = source
         self._preencoded = preencoded
         self._cameras = cameras
@@ -32,7 +32,7 @@ class RequestFeed:
         self._ready: tuple[Frame, ...] = ()
 
     def get_ready(self) -> None:
-        """Encode ahead, where JPEGs are to be at hand."""
+        """Encode the pictures beforehand if the camera is one that delivers JPEG."""
         if self._preencoded:
             self._ready = tuple(
                 replace(frame, encoding="jpeg", data=encode_jpeg(to_bgr(frame), JPEG_QUALITY)) for frame in self._read()
@@ -66,18 +66,18 @@ class StreamedFrame:
     """ROS-time stamp if it was published, else -1."""
     used_by: str = ""
     sequence: int = 0
-    """How many frames had been published with this one."""
+    """Frames published so far, this one included."""
 
     @property
     def key(self) -> int:
-        """Return what names the frame: its ROS-time stamp, or its tick where it was not published."""
+        """Return the frame's ROS-time stamp, or its tick if it was not published."""
         return self.stamp_ns if self.stamp_ns >= 0 else self.intended_ns
 
 
 class Camera:
-    """Reads a source at its rate on a thread of its own and gives every frame to the sink of the moment.
+    """Reads a source at its rate on a separate thread and gives every frame to the current sink.
 
-    The ticks are fixed beforehand, so a late frame does not delay the ones after it, and its lateness shows.
+    The ticks are fixed beforehand: a late frame does not delay the next, and its lateness shows.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Camera:
         clock: Clock | None = None,
         on_frame: Callable[[Frame], None] | None = None,
     ) -> None:
-        """Prepare; `start` starts. ``on_frame`` is told every frame after it was sent."""
+        """Prepare; `start` starts. ``on_frame`` is called with every frame after it was sent."""
         self._source = source
         self._period_ns = int(1e9 / fps)
         self._clock = clock or SystemClock()
@@ -110,13 +110,13 @@ class Camera:
             self._thread.join()
 
     def use(self, sink: CameraSink | None) -> None:
-        """Give every frame to ``sink`` from now on, or with None just keep the newest, converted to BGR."""
+        """Give every frame to ``sink``; None: keep the newest, converted to BGR."""
         with self._changed:
             if self._sink is not sink:
                 self._sink, self._newest, self._frames = sink, None, []
 
     def next_frame(self, after: int, timeout_s: float = 10.0) -> int:
-        """Wait for a frame whose index is above ``after`` and return its index; raises what the source raised."""
+        """Wait for a frame with an index above ``after`` and return its index; raises what the source raised."""
         with self._changed:
             self._changed.wait_for(lambda: self._failure or (self._newest and self._newest[0].index > after), timeout_s)
             if self._failure is not None:
@@ -175,10 +175,12 @@ class Camera:
 
 
 class StreamFeed:
-    """Prompts about the camera's newest frame, at a random moment between two frames."""
+    """Prompts about the camera's newest frame, at a random moment between two frames.
+
+    ``sink`` is for pipelines whose server keeps the newest frame itself.
+    """
 
     def __init__(self, camera: Camera, sink: CameraSink | None, period_ns: int, random: Random) -> None:
-        """Use ``sink`` for pipelines whose server keeps the newest frame itself."""
         self.camera = camera
         self.sink = sink
         self._period_ns = period_ns
@@ -187,7 +189,7 @@ class StreamFeed:
         self.last: StreamedFrame | None = None
 
     def get_ready(self) -> None:
-        """Wait for two new frames, so that the server has one, and then for a random part of the period."""
+        """Wait for two new frames, so that the server has one, then for a random part of the period."""
         self.camera.use(self.sink)
         newest = self.camera.newest()
         first = self.camera.next_frame(newest[0].index if newest else -1)
@@ -195,7 +197,7 @@ class StreamFeed:
         self._clock.sleep_until_ns(self._clock.now_ns() + self._random.randrange(self._period_ns))
 
     def capture(self, trace: Trace) -> tuple[Frame, ...]:
-        """Start the prompt's clock and take the newest frame; none where the server has it."""
+        """Start the prompt's clock and take the newest frame; none if the server has it."""
         newest = self.camera.newest()
         trace.mark(RESIDUAL)
         if newest is None:
@@ -205,4 +207,4 @@ class StreamFeed:
 
 
 Feed: TypeAlias = RequestFeed | StreamFeed
-"""Gets ready what need not be timed, then captures the frames that go with a prompt, which marks the trace."""
+"""`get_ready` does what is not timed; `capture` returns the frames of a prompt and marks the trace."""

@@ -1,7 +1,7 @@
-"""llama.cpp's own HTTP server out of the wheel xllamacpp: ``python -m s2a_bench.harness.llama_wheel``.
+"""llama.cpp's own HTTP server from the wheel xllamacpp: ``python -m s2a_bench.harness.llama_wheel``.
 
-It reads one JSON line from standard input, `told`, answers with one, ``{"address": ..., "version": ...}`` or
-``{"error": ...}``, and serves until standard input ends.
+It reads one JSON line from standard input (`server_settings`), answers with ``{"address": ..., "version": ...}`` or
+``{"error": ...}`` on one line, and serves until standard input ends.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from s2a_bench.errors import UsageError
 from s2a_bench.inference import EngineConfig
 
 
-def told(engine: EngineConfig, port: int, *, ignore_end: bool) -> dict[str, Any]:
-    """Return what makes the server compute as our own engine does, as `llama_flags` says it to a program."""
+def server_settings(engine: EngineConfig, port: int, *, ignore_end: bool) -> dict[str, Any]:
+    """Return settings under which the server computes as the llama engine does, like `llama_flags` of a program."""
     return {
         "model": str(engine.model),
         "mmproj": str(engine.mmproj),
@@ -33,30 +33,30 @@ def told(engine: EngineConfig, port: int, *, ignore_end: bool) -> dict[str, Any]
 
 
 def main() -> int:
-    """Serve as told."""
+    """Serve until standard input ends."""
     line = sys.stdin.readline()
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what llama.cpp prints belongs in the log
-    if not line:  # who started this process has gone
+    if not line:  # the parent process has ended
         return 0
     llama = extras.require("xllamacpp", "llama-server")
-    asked = json.loads(line)
-    wanted = llama.CommonParams()
-    wanted.model.path, wanted.mmproj.path = asked["model"], asked["mmproj"]
-    wanted.n_ctx, wanted.n_parallel, wanted.fit_params = asked["context"], 1, False
-    wanted.n_batch = wanted.n_ubatch = asked["batch"]
-    wanted.cpuparams.n_threads = wanted.cpuparams_batch.n_threads = asked["threads"]
-    wanted.n_gpu_layers, wanted.mmproj_use_gpu = asked["gpu_layers"], asked["gpu_layers"] != 0
-    wanted.cache_type_k = wanted.cache_type_v = getattr(llama.ggml_type, f"GGML_TYPE_{asked['kv_type'].upper()}")
-    flash = {"auto": "AUTO", "on": "ENABLED", "off": "DISABLED"}[asked["flash_attention"]]
-    wanted.flash_attn_type = getattr(llama.llama_flash_attn_type, f"LLAMA_FLASH_ATTN_TYPE_{flash}")
-    wanted.sampling.ignore_eos = asked["ignore_end"]
-    wanted.hostnames, wanted.port, wanted.endpoint_metrics = ["127.0.0.1"], asked["port"], True
+    settings = json.loads(line)
+    params = llama.CommonParams()
+    params.model.path, params.mmproj.path = settings["model"], settings["mmproj"]
+    params.n_ctx, params.n_parallel, params.fit_params = settings["context"], 1, False
+    params.n_batch = params.n_ubatch = settings["batch"]
+    params.cpuparams.n_threads = params.cpuparams_batch.n_threads = settings["threads"]
+    params.n_gpu_layers, params.mmproj_use_gpu = settings["gpu_layers"], settings["gpu_layers"] != 0
+    params.cache_type_k = params.cache_type_v = getattr(llama.ggml_type, f"GGML_TYPE_{settings['kv_type'].upper()}")
+    flash = {"auto": "AUTO", "on": "ENABLED", "off": "DISABLED"}[settings["flash_attention"]]
+    params.flash_attn_type = getattr(llama.llama_flash_attn_type, f"LLAMA_FLASH_ATTN_TYPE_{flash}")
+    params.sampling.ignore_eos = settings["ignore_end"]
+    params.hostnames, params.port, params.endpoint_metrics = ["127.0.0.1"], settings["port"], True
     try:
-        if asked["gpu_layers"] and not any("CPU" not in device["type"].name for device in llama.get_device_info()):
+        if settings["gpu_layers"] and all("CPU" in device["type"].name for device in llama.get_device_info()):
             raise UsageError("`gpu_layers`: xllamacpp is built for the CPU alone; name another `llama_server`")
-        server = llama.Server(wanted)
-    except Exception as error:  # noqa: BLE001 - whatever llama.cpp says, who started it must hear of it
+        server = llama.Server(params)
+    except Exception as error:  # noqa: BLE001 - the parent process reports whatever llama.cpp raises
         kind, where = ("UsageError", "") if isinstance(error, UsageError) else ("EngineError", "llama-server: ")
         print(json.dumps({"error": f"{where}{error}", "kind": kind}), file=answers, flush=True)
         return 1

@@ -1,7 +1,7 @@
-"""Checksums of pictures: to notice one that comes twice, and one that changed on its way.
+"""Checksums of pictures, to detect a repeated picture and one that changed between camera and engine.
 
-They are computed outside all marks, after an answer's last token, and in some 50 us for 640x480: whatever a server
-does then competes with the sending of the tokens, and a pause before it would let the processor fall asleep.
+They are computed outside all marks, after an answer's last token, and take some 50 us for 640x480: a server that
+computes then competes with the sending of the tokens, and a pause before it would let the processor fall asleep.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from s2a_bench.frames.convert import to_rgb
 from s2a_bench.types import Frame, Pixels
 
 RGB_ENGINE = Fact("rgb_engine", "", "checksum of the engine's pixels")
-"""What a server tells besides; it becomes a column of its own."""
+"""A server's fact that becomes a column."""
 
 
 def fingerprint(frame: Frame) -> int:
-    """Return a checksum, of 52 bits, of a picture as it lies in memory."""
+    """Return a checksum, of 52 bits, of a picture's bytes in memory."""
     return _checksum(frame.data)
 
 
 def together(checksums: Iterable[int]) -> int:
-    """Return one checksum, of 52 bits, of several in order; that of a single one is itself."""
+    """Combine several checksums, in order, to one of 52 bits; a single one stays as it is."""
     first, *others = checksums
     for each in others:
         first = ((first * _ODD + each) * _ODD) % 2**64 >> 12
@@ -39,15 +39,15 @@ def rgb_fingerprint(frame: Frame) -> int:
 
 
 def _checksum(pixels: Pixels) -> int:
-    """Weigh each word of eight bytes by an odd number of its own and add them up, modulo 2^64; fold to 52 bits.
+    """Weight each group of eight bytes by a different odd number and sum, modulo 2^64; fold to 52 bits.
 
-    So any other word changes the sum, and so do words that change places. It is no defence against forgery.
+    A changed group changes the sum, and so do groups that change places. It is no defence against forgery.
     """
     data = pixels.reshape(-1)
     whole = data.size // 8 * 8
-    words = data[:whole].view(np.uint64)
+    groups = data[:whole].view(np.uint64)
     tail = int.from_bytes(data[whole:].tobytes(), "little")
-    total = int(np.dot(words, _weights(words.size))) + (tail + 1) * _ODD
+    total = int(np.dot(groups, _weights(groups.size))) + (tail + 1) * _ODD
     return ((total + data.size) * _ODD) % 2**64 >> 12
 
 

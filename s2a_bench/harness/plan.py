@@ -1,4 +1,4 @@
-"""The plan of a run of requests: all that follows from its configuration, decided once, and handed out in parts."""
+"""The plan of a run of requests: all that follows from its configuration, decided once."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LARGE_PICTURE = 640 * 480
 
 @dataclass(frozen=True, slots=True)
 class BlocksPlan:
-    """How often every cell has its turn, and the order."""
+    """How often every cell is measured, and in which order."""
 
     requests: int
     warmup: int
@@ -35,7 +35,7 @@ class BlocksPlan:
 
 @dataclass(frozen=True, slots=True)
 class FeedPlan:
-    """Where pictures come from, and how they come to a request."""
+    """Where pictures come from, and how a request gets them."""
 
     source: str
     size: tuple[int, int]
@@ -44,7 +44,7 @@ class FeedPlan:
     seed: int
     nonce: str
     stream: bool
-    """Whether a camera runs; else a request captures its own."""
+    """Whether a camera runs; else every request captures its pictures."""
     cameras: int
     resize: tuple[int, int] | None
     """Width and height as sent; None: as captured."""
@@ -55,7 +55,7 @@ class FeedPlan:
 
 @dataclass(frozen=True, slots=True)
 class RequestPlan:
-    """What a request says, and what its row says of it."""
+    """The fields of a request, and those of its row."""
 
     prompt: str
     grammar: str
@@ -63,7 +63,7 @@ class RequestPlan:
     """The most tokens, or actions, of an answer."""
     seed: int
     state: int
-    """Numbers of the robot's state."""
+    """Length of the robot's state."""
     mode: str
     size: str
     stages: Mapping[str, str]
@@ -72,10 +72,10 @@ class RequestPlan:
 
 @dataclass(frozen=True, slots=True)
 class ServersPlan:
-    """What servers and clients are told."""
+    """Settings of servers and clients."""
 
     engine: EngineConfig
-    """Of all cells, but for what a cell's name says of it."""
+    """Of all cells; a cell's name may change some of its options."""
     grammar: bool
     """Whether answers obey a grammar."""
     tuned: bool
@@ -90,7 +90,6 @@ class RunPlan:
     """One run of requests."""
 
     cells: tuple[Pipeline, ...]
-    """What is compared."""
     blocks: BlocksPlan
     feed: FeedPlan
     request: RequestPlan
@@ -100,21 +99,21 @@ class RunPlan:
     sample_resources_hz: float
     record: Path | None
     namespace: str
-    """Of the topics that are recorded."""
+    """Of the recorded topics."""
     checks: Mapping[str, str]
-    """Code -> check of the doctor's, of those that concern the transports."""
+    """Code -> the doctor's checks that concern the transports."""
     manifest: Mapping[str, Any]
-    """What the manifest says of the plan."""
+    """The manifest's entries about the plan."""
 
     def with_manifest(self, **facts: Any) -> RunPlan:
-        """Return it with more in the manifest, or in place of what was there."""
+        """Return a copy with entries of the manifest added or replaced."""
         return replace(self, manifest={**self.manifest, **facts})
 
 
 def resolve(config: RequestsConfig) -> RunPlan:
-    """Decide what follows from a configuration; nothing is opened, started or asked.
+    """Decide what follows from a configuration; opens and starts nothing.
 
-    Raises MissingExtra where what an engine of ours, or somebody else's server, needs is not installed.
+    Raises MissingExtra if a library that the engine or a server program needs is not installed.
     """
     if config.serves_engine:
         need_engine(config.engine)
@@ -130,19 +129,16 @@ def resolve(config: RequestsConfig) -> RunPlan:
     facts += (FRAMES_PUBLISHED, FRAMES_LOST) if stream else ()
     facts += SPENT if config.sample_resources_hz else ()
     max_pieces = engine.horizon if config.answer == ACTIONS else config.max_tokens
-    nonce, size = config.nonce or new_nonce(), "{}x{}".format(*config.size)
+    seed, nonce, size = config.seed, config.nonce or new_nonce(), "{}x{}".format(*config.size)
+    timeouts_s = config.timeout_s, config.deadline_s
     return RunPlan(
         cells=cells,
-        blocks=BlocksPlan(config.requests, config.warmup, config.launches, config.seed),
-        feed=FeedPlan(
-            config.source, config.size, config.fps, config.seed, nonce, stream, config.cameras, config.resize
-        ),
+        blocks=BlocksPlan(config.requests, config.warmup, config.launches, seed),
+        feed=FeedPlan(config.source, config.size, config.fps, seed, nonce, stream, config.cameras, config.resize),
         request=RequestPlan(
-            config.sent_prompt, config.grammar, max_pieces, config.seed, config.state, config.mode, size, stages
+            config.sent_prompt, config.grammar, max_pieces, seed, config.state, config.mode, size, stages
         ),
-        servers=ServersPlan(
-            engine, bool(config.grammar), config.tuned, config.timeout_s, config.deadline_s, max_pieces
-        ),
+        servers=ServersPlan(engine, bool(config.grammar), config.tuned, *timeouts_s, max_pieces),
         finds_model=config.reads_model and engine.kind.needs_model,
         sample_resources_hz=config.sample_resources_hz,
         record=config.record,
@@ -152,7 +148,7 @@ def resolve(config: RequestsConfig) -> RunPlan:
             "configuration": config.to_manifest(),
             "stages": stages,
             "facts": facts_json(facts),
-            "seeds": {**dict.fromkeys(("order", "sampling", "source", "bootstrap"), config.seed), "nonce": nonce},
+            "seeds": {**dict.fromkeys(("order", "sampling", "source", "bootstrap"), seed), "nonce": nonce},
             "cadence": f"closed loop over an open-loop camera at {config.fps:g} Hz, prompts at random moments"
             if stream
             else "closed loop, the next request when the last is done",

@@ -1,4 +1,4 @@
-"""Server processes seen from the harness: start, wait until ready, notice death, stop."""
+"""Server processes of the harness: start, wait until ready, detect their end, stop."""
 
 from __future__ import annotations
 
@@ -30,18 +30,18 @@ from s2a_bench.machine.tuning import start_child
 from s2a_bench.transport import Program
 
 READY_TIMEOUT_S = 600.0
-"""A model of several GB may have to come from a slow disk."""
+"""A model of several GB may load from a slow disk."""
 NOT_READY = f"was not ready after {READY_TIMEOUT_S:.0f} s"
 STOP_TIMEOUT_S = 3.0
-LOOK_S = 1.0
-"""How long the end of a process is waited for in one go."""
+POLL_S = 1.0
+"""Longest single wait for the end of a process."""
 
 
 class ServerProcess(AbstractContextManager["ServerProcess"]):
     """A child process that serves; use as a context manager."""
 
     def __init__(self, name: str, command: list[str], log: Path | None) -> None:
-        """Start ``command``; whatever it prints goes to ``log``, without one to this process's standard error."""
+        """Start ``command``; its output goes to ``log``, without one to this process's standard error."""
         self.name = name
         self.log = log
         self.address = ""
@@ -60,7 +60,7 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
 
     @abstractmethod
     def wait_ready(self) -> None:
-        """Return when requests can be sent; raises ServerDied, or what the server says is wrong."""
+        """Return when requests can be sent; raises ServerDied, or the error that the server reports."""
 
     @property
     def pid(self) -> int:
@@ -70,7 +70,6 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
         return self._process.poll() is None
 
     def ends_within(self, timeout_s: float) -> bool:
-        """Give a process a moment to end, or to be seen as ended where its connections broke."""
         try:
             self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
@@ -80,13 +79,13 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
     def wait_end(self, interrupted: Callable[[], object]) -> None:
         """Wait until the process has ended; raises KeyboardInterrupt.
 
-        Popen's own wait would keep its lock where a signal comes as it takes it, and so could never be called again.
-        No wait is without end, as a signal that comes just before one does not break it off, and ``interrupted`` is
-        asked, as Python drops what a signal's handler raises in a destructor, or in what runs after a fork.
+        Popen.wait keeps its lock if a signal arrives while it takes it, and then can never be called again. Every wait
+        has an end, as a signal just before a wait does not interrupt it. ``interrupted`` is called each time, as Python
+        drops what a signal's handler raises in a destructor, or in what runs after a fork.
         """
         ended = os.pidfd_open(self.pid)
         try:
-            while not interrupted() and not select.select([ended], [], [], LOOK_S)[0]:
+            while not interrupted() and not select.select([ended], [], [], POLL_S)[0]:
                 pass
         finally:
             os.close(ended)
@@ -95,11 +94,11 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
         self._process.wait()
 
     def death(self) -> ServerDied:
-        """Describe how the process ended, with the last line it wrote."""
+        """Describe how the process ended, with the last line of its output."""
         return ServerDied(f"the {self.name} server (pid {self.pid}) died, {self._end()}{self._last_lines(1)}")
 
     def no_start(self, why: str = "") -> ServerDied:
-        """Describe why it never was ready, with the last lines it wrote."""
+        """Describe a failed start by the last lines of its output."""
         return ServerDied(f"the {self.name} server {why or f'did not start, {self._end()}'}{self._last_lines(4)}")
 
     def _end(self) -> str:
@@ -114,7 +113,7 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
         return f"{shown}; its log is {self.log}"
 
     def stop(self) -> None:
-        """Ask the process to stop, then make it; an impatient second Ctrl-C makes it at once."""
+        """End the process, by force after `STOP_TIMEOUT_S` or at a second Ctrl-C."""
         try:
             self._ask_to_stop()
             self._process.wait(STOP_TIMEOUT_S)
@@ -134,7 +133,7 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
 
 
 class OwnProcess(ServerProcess):
-    """A module of ours that is told its job in one line, answers with one, and serves until its input ends."""
+    """A module of this package: it reads its job as one line, answers with one, and serves until its input ends."""
 
     def __init__(self, name: str, module: str, job: str, log: Path | None) -> None:
         super().__init__(name, [sys.executable, "-m", module], log)
@@ -143,7 +142,6 @@ class OwnProcess(ServerProcess):
         self._process.stdin.flush()
 
     def _ask_to_stop(self) -> None:
-        """End its standard input."""
         if self._process.stdin is not None:
             self._process.stdin.close()
 
@@ -170,17 +168,17 @@ class OwnProcess(ServerProcess):
 
 
 class OwnServer(OwnProcess):
-    """Our instrumented server."""
+    """The instrumented server, `harness.serving`."""
 
     def __init__(self, name: str, job: ServerJob, log: Path | None = None) -> None:
         super().__init__(name, "s2a_bench.harness.serving", job.to_json(), log)
 
 
 def keep_serving(job: ServerJob, ready: Callable[[ServerProcess], None], died: Callable[[str], None]) -> None:
-    """Serve until a signal comes; raises ServerDied at the second death.
+    """Serve until a signal arrives, restarting the server once; raises ServerDied when it dies again.
 
-    ``ready`` is called whenever the server has started, ``died`` with one line after the first death. The server that
-    is started again has the first one's address.
+    ``ready`` is called after every start, ``died`` with one line after the first death. The second server keeps the
+    first one's address.
     """
     signals: list[int] = []
 
@@ -189,7 +187,11 @@ def keep_serving(job: ServerJob, ready: Callable[[ServerProcess], None], died: C
         raise KeyboardInterrupt
 
     def serve(job: ServerJob) -> tuple[str, ServerDied]:
-        return _serve(job, ready, lambda: signals)
+        with OwnServer(job.wiring.transport, job) as server:
+            server.wait_ready()
+            ready(server)
+            server.wait_end(lambda: signals)
+            return server.address, server.death()
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, interrupt)
@@ -200,26 +202,15 @@ def keep_serving(job: ServerJob, ready: Callable[[ServerProcess], None], died: C
         raise death
 
 
-def _serve(
-    job: ServerJob, ready: Callable[[ServerProcess], None], interrupted: Callable[[], object]
-) -> tuple[str, ServerDied]:
-    """Serve until the process ends; return its address, and how it ended."""
-    with OwnServer(job.wiring.transport, job) as server:
-        server.wait_ready()
-        ready(server)
-        server.wait_end(interrupted)
-        return server.address, server.death()
-
-
 ALL_LAYERS = 999
 NO_GPU = "no usable GPU found"
-"""What llama.cpp says of itself where it leaves --n-gpu-layers out."""
+"""llama.cpp's log line when it ignores --n-gpu-layers."""
 
 
 def llama_flags(engine: EngineConfig) -> list[str]:
-    """Return flags that make ``llama-server`` and ``llama-bench`` compute as our own engine does.
+    """Return flags under which ``llama-server`` and ``llama-bench`` compute as the llama engine does.
 
-    Every CPU this process may use, and nothing on a GPU unless told.
+    By default they use every CPU of this process, and no GPU.
     """
     batch = str(min(engine.batch, engine.context))
     flags = {
@@ -232,7 +223,7 @@ def llama_flags(engine: EngineConfig) -> list[str]:
         "--cache-type-v": engine.kv_type,
         "--flash-attn": engine.flash_attention,
     }
-    return [word for pair in flags.items() for word in pair]
+    return [text for pair in flags.items() for text in pair]
 
 
 class LlamaServerProcess(ServerProcess):
@@ -244,7 +235,7 @@ class LlamaServerProcess(ServerProcess):
     def __init__(self, program: Program, engine: EngineConfig, log: Path, *, has_grammar: bool) -> None:
         """Start the program on its port, or any free one for 0.
 
-        Without a grammar dummy weights, which end at random, are kept going to the token limit, as by our own engine.
+        Dummy weights end at random: without a grammar they generate up to the token limit, as in the llama engine.
         """
         port = _free_port(program.port)
         command = [str(program.path.absolute()), *llama_flags(engine), "--mmproj", str(engine.mmproj)]
@@ -279,14 +270,13 @@ class LlamaServerProcess(ServerProcess):
 
 
 class WheelServer(OwnProcess):
-    """llama.cpp's own server out of the wheel xllamacpp: a black box in a process of ours."""
+    """llama.cpp's own server from the wheel xllamacpp: a black box in a process of this package."""
 
     _cure = COMPILE_AGAIN
 
     def __init__(self, program: Program, engine: EngineConfig, log: Path, *, has_grammar: bool) -> None:
-        """Start it on its port, or any free one for 0; the rest as `LlamaServerProcess`."""
         files = load_headers(engine)
-        job = llama_wheel.told(engine, program.port, ignore_end=files.dummy and not has_grammar)
+        job = llama_wheel.server_settings(engine, program.port, ignore_end=files.dummy and not has_grammar)
         super().__init__("llama-server", llama_wheel.__name__, json.dumps(job), log)
         self._files, self._job = files, job
 
@@ -304,7 +294,7 @@ PROGRAMS: dict[str, Callable[..., ServerProcess]] = {
 
 
 def _described(files: ModelFiles) -> dict[str, Any]:
-    """Return what the manifest says about the model files of a server that says nothing itself."""
+    """Return the manifest's entry about the model files of a server that reports none."""
     return {
         "name": str(files.model.fields.get("general.name", "")),
         "model": str(files.model.path),

@@ -1,4 +1,4 @@
-"""`--record`: what travelled in a run, as ROS 2 topics in MCAP, whatever transport carried it.
+"""`--record`: frames, requests and tokens of a run of any transport, as ROS 2 topics in MCAP.
 
 Frames go to ``<namespace>/camera/image_raw`` as they were captured, each cell's requests (without their pictures) to
 ``<namespace>/<cell>/request`` and its tokens to ``<namespace>/<cell>/token``, stamped with ROS time. Nothing is written
@@ -46,17 +46,16 @@ class RunRecorder(AbstractContextManager["RunRecorder"]):
             message = ros.compressed_image_message(frame.data, stamp_ns, FRAME_ID, frame.encoding)
             self._recorder.write(self._namespace + COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE, message, stamp_ns)
 
-    def answer(self, cell: str, request: Request, asked_ns: int, tokens: list[tuple[Piece, int]], error: str) -> None:
-        """Note a request and its tokens with the times at which the client saw them (CLOCK_MONOTONIC)."""
+    def answer(self, cell: str, request: Request, sent_ns: int, tokens: list[tuple[Piece, int]], error: str) -> None:
+        """Record a request and its tokens with the times at which the client received them (CLOCK_MONOTONIC)."""
         topic = f"{self._namespace}/{re.sub('[^A-Za-z0-9/]', '_', cell)}"
-        self._recorder.write(topic + "/request", ros.REQUEST, request_message(request), asked_ns + self._offset_ns)
+        self._recorder.write(topic + "/request", ros.REQUEST, request_message(request), sent_ns + self._offset_ns)
         for place, (token, seen_ns) in enumerate(tokens, 1):
             last = place == len(tokens)
             message = token_message(request.id, token, last=last, error=error if last else "")
             self._recorder.write(topic + "/token", ros.TOKEN, message, seen_ns + self._offset_ns)
 
     def flush(self) -> None:
-        """Write what waits; called between samples."""
         self._recorder.flush()
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:

@@ -1,4 +1,4 @@
-"""The main job of a measuring command: every cell in randomised, interleaved blocks, each sample kept at once."""
+"""Measure every cell of a run in randomised, interleaved blocks; each sample is written at once."""
 
 from __future__ import annotations
 
@@ -37,32 +37,32 @@ from s2a_bench.transport import Client
 GIVE_UP_AFTER = 5
 """Failures of one cell in a row, after which the run ends."""
 LONGEST_WAIT_S = 60.0
-"""The longest wait that a server gets; one that wants more refuses again after it, and soon ends the run that way."""
+"""Limit on a server's ``retry_after_s``; a server that needs longer refuses again and soon ends the run."""
 
 
 Slot: TypeAlias = Callable[[Place], None]
-"""A callable run once per block: it measures and keeps what it measured."""
+"""Measures once and writes the result; called once per block."""
 
 
 @dataclass(frozen=True, slots=True)
 class RunningLaunch:
-    """One set of servers that runs, and what asks them."""
+    """One running set of servers, and their clients."""
 
     number: int
     plan: RunPlan
-    """With the model files that were found."""
+    """With the paths of the model files."""
     writer: RunWriter
     sessions: Sequence[Session]
-    """One a cell, in the order of the cells; of a `Task` with more clients so many of each, one after the other."""
+    """In the order of the cells, `Task.clients` of each cell one after the other."""
     keep: Callable[[Session, Measured], None]
-    """Writes down a request, and raises what makes the next one useless; not thread-safe."""
+    """Writes a request, and raises what makes the next one useless; not thread-safe."""
     progress: Progress
     warnings: list[RunWarning]
-    """What the run warns of besides what is seen of its requests."""
+    """Warnings of the run besides those about its requests."""
 
 
 def in_blocks(launch: RunningLaunch, others: Sequence[Slot] = ()) -> None:
-    """Measure every cell in turn; ``others`` is what else has a turn in every block."""
+    """Measure every cell, and call each of ``others``, once per block."""
 
     def slot(session: Session) -> Slot:
         return lambda place: launch.keep(session, session.measure(place))
@@ -73,23 +73,23 @@ def in_blocks(launch: RunningLaunch, others: Sequence[Slot] = ()) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What a measuring command asks for besides the requests themselves."""
+    """How a measuring command differs from others with the same plan."""
 
     command: str
     drive: Callable[[RunningLaunch], None] = in_blocks
-    """Asks the servers of a launch."""
+    """Makes the requests of a launch."""
     clients: int = 1
-    """How many clients a cell has."""
+    """Clients of a cell."""
     tables: Sequence[Table[Any]] = ()
-    """Those whose files are there from the start, besides those of requests."""
+    """Tables whose files exist from the start, besides those of requests."""
     source: Callable[[FeedPlan], FrameSource] | None = None
-    """Opens the one camera, whose pictures are stamped already; None: those that the plan names, a stamp a cell."""
+    """Opens the one camera, whose pictures are stamped already; None: the plan's source, stamped for each cell."""
 
 
 def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) -> Path:
-    """Measure and return the run folder; whatever happens, the samples so far are in it.
+    """Measure and return the run folder, which holds the samples so far if the run fails.
 
-    Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
+    Raises S2AError for what a user can fix; KeyboardInterrupt passes through.
     """
     limit_threads()
     tuning = {
@@ -106,7 +106,7 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
         for table in task.tables:
             writer.append(table, [])
         progress.opened(writer.path)
-        if plan.finds_model and extras.installed("gguf"):  # without gguf no file is read here
+        if plan.finds_model and extras.installed("gguf"):  # without gguf no file is read
             engine = on_files(plan.servers.engine, progress)
             plan = replace(plan, servers=replace(plan.servers, engine=engine))
         guard = SampleGuard({cell.name: cell.options.against_loss for cell in plan.cells})
@@ -120,7 +120,7 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
 class _Sources:
     """Frame sources: one a cell, with the same frames; a device can be opened only once and is shared.
 
-    Cells of a server that is not ours differ in their stamps, as it may keep what it made of a picture.
+    Cells of an external server differ in their stamps, as it may cache what it computed for a picture.
     """
 
     def __init__(self, task: Task, plan: FeedPlan, stack: ExitStack) -> None:
@@ -128,11 +128,11 @@ class _Sources:
         self._plan = plan
         self._stack = stack
         self._shared = plan.source.startswith("v4l2")
-        self._ready: FrameSource | None = self._new()  # what is wrong with a source shows before anything starts
+        self._ready: FrameSource | None = self._new()  # a wrong source fails before anything starts
         self._open: dict[str, FrameSource] = {}
 
     def of(self, user: str, stamp: str = "") -> FrameSource:
-        """Return the source of ``user``, which goes on in the next launch; one source is shared by all or by nobody."""
+        """Return the source of ``user``, which continues in the next launch; all users share a device."""
         if user not in self._open:
             source = self._ready or self._new()
             self._ready = source if self._shared else None
@@ -147,7 +147,7 @@ class _Sources:
 
 @dataclass(slots=True)
 class _Run:
-    """One run under way: what its launches share."""
+    """The state that the launches of one run share."""
 
     task: Task
     plan: RunPlan
@@ -159,7 +159,7 @@ class _Run:
     warnings: list[RunWarning] = field(default_factory=list)
 
     def measure(self) -> None:
-        """Measure every launch, and write down what there is to warn of."""
+        """Measure every launch and write the warnings."""
         plan, warnings = self.plan, self.warnings
         watches_udp = any(cell.transport.udp_checks for cell in plan.cells)
         warnings += before_run(plan.checks, Machine(output=self.writer.path))
@@ -187,9 +187,9 @@ class _Run:
         pids = [server["pid"] for server in facts.values()]
         sampler = stack.enter_context(open_sampler(self.plan.sample_resources_hz, pids))
         sessions = list(self._sessions(servers, sampler, stack))
-        asked = {session.cell.name: how for session in sessions if (how := session.client.describe())}
+        requests = {session.cell.name: facts for session in sessions if (facts := session.client.describe())}
         origins = {session.cell.name: session.origin for session in sessions}
-        writer.update(asked=asked, provenance=Origins(Provenance.of_engine(model), origins).to_manifest())
+        writer.update(asked=requests, provenance=Origins(Provenance.of_engine(model), origins).to_manifest())
         hits = servers.cache_hits()
         keep = partial(self._keep, servers, sampler)
         try:
@@ -233,7 +233,7 @@ class _Run:
             yield made[0]
 
     def _keep(self, servers: ServerSet, sampler: ResourceSampler, session: Session, measured: Measured) -> None:
-        """Keep a request, and look whether the run can go on."""
+        """Write a request; raises if the run cannot go on."""
         name, sample, writer = session.cell.name, measured.sample, self.writer
         keep_origin(writer, name, session.origin)
         writer.sample(sample)
@@ -249,7 +249,7 @@ class _Run:
 
 
 def _close_idle(client: Client, sessions: Sequence[Session]) -> None:
-    """Close a client, unless a thread still waits for an answer of its: that ends with the process."""
+    """Close a client unless a thread still waits for its answer; that thread ends with the process."""
     if not any(session.busy for session in sessions):
         client.close()
 
@@ -259,29 +259,29 @@ def run_blocks(
 ) -> None:
     """Run every slot once a block, in a new random order each time; in a launch's first block the others come last.
 
-    So that what is compared with the requests can learn from the first of them how long their prompts are.
+    The others can so learn from the first requests how long their prompts are.
     """
-    everyone = [*slots, *others]
+    both = [*slots, *others]
     blocks = plan.warmup + plan.requests
-    progress.expect(len(everyone) * blocks * plan.launches)
+    progress.expect(len(both) * blocks * plan.launches)
     random = Random(plan.seed + launch)  # noqa: S311 - an order, not a secret
     which = f", launch {launch + 1} of {plan.launches}" if plan.launches > 1 else ""
     for block in range(blocks):
         progress.stage(f"{'warming up' if block < plan.warmup else 'measuring'}{which}")
-        order = random.sample(everyone, len(everyone))
+        order = random.sample(both, len(both))
         for position, slot in enumerate(order if block else sorted(order, key=lambda slot: slot in others)):
             slot(Place(launch * blocks + block, position, block < plan.warmup, launch))
             progress.advance()
 
 
 def keep_origin(writer: RunWriter, cell: str, origin: Provenance) -> None:
-    """Write down who answers a cell's requests, where an answer told more than was known."""
+    """Write the provenance of a cell's answers, if an answer reported another than the manifest has."""
     if writer.manifest["provenance"]["cells"].get(cell) != origin.to_dict():
         writer.update(provenance={"cells": {cell: origin.to_dict()}})
 
 
 def back_off(cell: str, retry_after_s: float, clock: Clock, say: Callable[[str], None]) -> None:
-    """Let ``retry_after_s`` pass, or `LONGEST_WAIT_S` if that is less, before the next request; nothing for 0."""
+    """Wait ``retry_after_s``, at most `LONGEST_WAIT_S`, before the next request."""
     if wait_s := min(retry_after_s, LONGEST_WAIT_S):
         say(f"waiting {wait_s:g} s, as the server of {cell} asks")
         clock.sleep_until_ns(clock.now_ns() + int(wait_s * 1e9))

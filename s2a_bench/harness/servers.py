@@ -1,8 +1,9 @@
-"""The servers of a run: one process for cells that can share it, asked whether they live, stopped at the end."""
+"""The servers of a run: one process for cells that can share it, checked while it runs, stopped at the end."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,14 +25,14 @@ from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import Pipeline
 
 LAST_MOMENT_S = 0.5
-"""A process that was killed breaks its connections before it is seen as ended: on a busy machine, long before."""
+"""A killed process breaks its connections before the kernel reports its end: on a busy machine, long before."""
 
 RUN_LIMITS = Limits(answer_s=86_400, answer_tokens=1 << 20)
-"""In a run it is the client who says how long an answer may be and take: a slow model is a result."""
+"""In a run the client limits the length and time of an answer: a slow model is a result."""
 
 
 def on_files(engine: EngineConfig, progress: Progress) -> EngineConfig:
-    """Find or make the model files, so that every server gets the same."""
+    """Find or make the model files, so that every server loads the same."""
     progress.stage("reading the model's headers" if engine.model else "the tiny dummy model, made on first use")
     model, mmproj = resolve(engine)
     return engine.but(model=model, mmproj=mmproj)
@@ -39,7 +40,7 @@ def on_files(engine: EngineConfig, progress: Progress) -> EngineConfig:
 
 @dataclass(slots=True)
 class _Running:
-    """One server: ``process`` is None where it lives in this process or is somebody else's."""
+    """One server: ``process`` is None if it runs in this process or is external."""
 
     name: str
     address: str
@@ -47,12 +48,12 @@ class _Running:
 
 
 class ServerSet:
-    """The servers of a run; cells whose server would be told the same share one."""
+    """The servers of a run; cells whose server would get the same settings share one."""
 
     def __init__(
         self, cells: Sequence[Pipeline], plan: ServersPlan, stack: ExitStack, folder: Path, launch: int = 0
     ) -> None:
-        """Start what ``cells`` need; `ExitStack` stops it. Later launches than 0 show in the servers' names."""
+        """Prepare; ``stack`` stops the servers. The names of servers of a later launch than 0 contain its number."""
         self._cells = cells
         self._plan = plan
         self._suffix = f"-launch-{launch + 1}" if launch else ""
@@ -68,7 +69,7 @@ class ServerSet:
         return len({each.server for each in self._cells if not each.options.external_address})
 
     def start(self) -> dict[str, Any]:
-        """Start all servers and wait until they are ready; return what they say about themselves."""
+        """Start all servers and wait until they are ready; return the facts that each reports."""
         for pipeline in self._cells:
             if pipeline.server not in self._servers:
                 self._servers[pipeline.server] = self._launch(pipeline)
@@ -92,7 +93,7 @@ class ServerSet:
         bound.append(address)
         engine = plan.engine.but(**dict(pipeline.engine))
         if transport.in_process:
-            return _Running(name, self._serve_here(self._wiring(pipeline, address), engine))
+            return _Running(name, self._serve_in_process(self._wiring(pipeline, address), engine))
         log = self._folder / f"server-{name}.log"
         if program := pipeline.options.program:
             process = PROGRAMS[program.kind](program, engine, log, has_grammar=plan.grammar)
@@ -100,8 +101,8 @@ class ServerSet:
             process = OwnServer(name, ServerJob(self._wiring(pipeline, address), engine, tuned=plan.tuned), log)
         return _Running(name, address, self._stack.enter_context(process))
 
-    def _serve_here(self, wiring: Wiring[Any], told: EngineConfig) -> str:
-        engine = open_engine(told, self._local_engine)
+    def _serve_in_process(self, wiring: Wiring[Any], config: EngineConfig) -> str:
+        engine = open_engine(config, self._local_engine)
         self._stack.callback(engine.close)
         self._local_engine, self._local_facts = self._local_engine or engine, engine.describe()
         server = open_server(wiring, engine_handler(engine, limits=wiring.limits))
@@ -111,51 +112,46 @@ class ServerSet:
 
     def _wiring(self, pipeline: Pipeline, address: str) -> Wiring[Any]:
         plan = self._plan
-        told = {"timeout_s": plan.timeout_s, "deadline_s": plan.deadline_s, "max_tokens": plan.max_tokens}
-        return pipeline.wiring(address, limits=RUN_LIMITS, **told)
+        timeouts_s = {"timeout_s": plan.timeout_s, "deadline_s": plan.deadline_s}
+        return pipeline.wiring(address, limits=RUN_LIMITS, **timeouts_s, max_tokens=plan.max_tokens)
 
-    def cache_hits(self) -> dict[str, float]:
-        """Return counter -> hits of caches that the servers which are not ours have counted so far."""
-        asked = {pipeline.server: pipeline for pipeline in self._cells}
-        found: dict[str, float] = {}
-        for server, pipeline in asked.items():
-            if not (pipeline.black_box and (hits_of := pipeline.transport.urls.cache_hits)):
-                continue
-            wiring = self._wiring(pipeline, self._servers[server].address)
-            for name, hits in resolve_name(hits_of)(wiring).items():
-                found[name] = found.get(name, 0.0) + hits
-        return found
+    def cache_hits(self) -> Mapping[str, float]:
+        """Return counter -> cache hits that the external servers have counted so far."""
+        hits: Counter[str] = Counter()
+        for server, pipeline in {each.server: each for each in self._cells}.items():
+            if pipeline.black_box and (hits_of := pipeline.transport.urls.cache_hits):
+                hits.update(resolve_name(hits_of)(self._wiring(pipeline, self._servers[server].address)))
+        return hits
 
     def model(self, facts: dict[str, Any]) -> dict[str, Any]:
-        """Return what our engine says about the model, the same in every server of ours; else what others' is known."""
-        own = {server.name for server in self._servers.values() if isinstance(server.process, OwnServer)}
-        names = sorted(facts, key=lambda name: name not in own)
-        told = self._local_facts or next((facts[name]["engine"] for name in names if "engine" in facts[name]), {})
+        """Return the engine's facts about the model that all cells share: a started server's, else a program's."""
+        started = {server.name for server in self._servers.values() if isinstance(server.process, OwnServer)}
+        names = sorted(facts, key=lambda name: name not in started)
+        known = self._local_facts or next((facts[name]["engine"] for name in names if "engine" in facts[name]), {})
         differs = {name for pipeline in self._cells for name, _ in pipeline.engine}
-        return {name: fact for name, fact in told.items() if name not in differs}
+        return {name: fact for name, fact in known.items() if name not in differs}
 
     def origin(self, pipeline: Pipeline) -> Provenance:
-        """Return where a cell's numbers come from: what its engine says of itself; a server of others is unknown."""
+        """Return the provenance of a cell's answers, as its engine reports it; unknown for an external server."""
         process = self._servers[pipeline.server].process
         if pipeline.transport.in_process:
             return Provenance.of_engine(self._local_facts, link=NONE)
         return Provenance.of_engine(process.facts.get("engine", {}) if process else {})
 
     def client(self, pipeline: Pipeline) -> Client:
-        """Open a client of a cell, whose server is ready."""
         server = self._servers[pipeline.server]
         with self.death_explained(pipeline):
             alive = server.process.alive if server.process else lambda: True
             return open_client(self._wiring(pipeline, server.address), alive)
 
     def raise_if_dead(self, pipeline: Pipeline, *, suspect: bool = False) -> None:
-        """Raise ServerDied with the whole story if the process has ended; a suspect is given a moment to end."""
+        """Raise ServerDied, with the log's end, if the process has ended; wait a moment for a ``suspect``."""
         process = self._servers[pipeline.server].process
         if process is not None and process.ends_within(LAST_MOMENT_S if suspect else 0):
             raise process.death()
 
     def raise_if_over(self, pipeline: Pipeline, measured: Measured) -> None:
-        """Raise what makes the next request useless: Ctrl-C, the server's end, an error that will come again."""
+        """Raise what makes the next request useless: Ctrl-C, the server's end, an error that will repeat."""
         if isinstance(measured.fatal, KeyboardInterrupt):
             raise measured.fatal
         self.raise_if_dead(pipeline, suspect=bool(measured.sample.error))
@@ -164,7 +160,7 @@ class ServerSet:
 
     @contextmanager
     def death_explained(self, pipeline: Pipeline) -> Iterator[None]:
-        """Let ServerDied carry how the process ended."""
+        """Add how the process ended to ServerDied."""
         try:
             yield
         except ServerDied:

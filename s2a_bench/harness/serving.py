@@ -1,8 +1,8 @@
-"""The server process: one transport around one engine, started, awaited and stopped by the harness.
+"""The server process: one transport around one engine, started and stopped by the harness.
 
 ``python -m s2a_bench.harness.serving`` reads one JSON line (`ServerJob`) from standard input and answers with one JSON
 line on standard output: ``{"address": ..., "engine": {...}, "transport": {...}}`` when it is ready, or ``{"error": ...,
-"exit_code": ...}``. It stops when standard input ends, so it never outlives the harness, and on SIGTERM.
+"kind": ...}``. It stops on SIGTERM and when standard input ends, so it never outlives the harness.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from s2a_bench.transport.serving import Queued, Turn
 from s2a_bench.types import Piece, Request
 
 GRACE_S = 4.0
-"""Time to end after being told to; the engine may be in the middle of a long prompt."""
+"""Time to end after a stop; the engine may be in the middle of a long prompt."""
 
 
 def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMITS) -> Queued:
     """Make the handler that lets one request at a time into the engine and marks `queue`, `preprocess`, `inference`.
 
-    `preprocess` is there where the engine tells ``preprocess_ms`` by its first token. ``limits`` bound the queue and
-    the time of an answer. With ``pixels`` it also tells the checksum of the pictures, which is found once the answer is
-    on its way and the engine is free.
+    `preprocess` is marked if the engine reports ``preprocess_ms`` by its first token. ``limits`` bound the queue and
+    the time of an answer. With ``pixels`` the handler adds the checksum of the pictures, computed once the answer is
+    sent and the engine is free.
     """
 
     def answer(request: Request, trace: Trace, turn: Turn) -> Generator[Piece, None, None]:
@@ -67,7 +67,7 @@ def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMI
 
 @dataclass(frozen=True, slots=True)
 class ServerJob:
-    """What a server process is told: which pipeline, which engine, whether memory is tuned, pixels are checked."""
+    """The settings of a server process: pipeline, engine, whether memory is tuned, whether pixels are checked."""
 
     wiring: Wiring[Any]
     engine: EngineConfig
@@ -75,9 +75,8 @@ class ServerJob:
     pixels: bool = True
 
     def to_json(self) -> str:
-        told = {"tuned": self.tuned, "pixels": self.pixels}
-        engine = self.engine.model_dump(mode="json")
-        return json.dumps({"wiring": self.wiring.to_json(), "engine": engine, **told})
+        wiring, engine = self.wiring.to_json(), self.engine.model_dump(mode="json")
+        return json.dumps({"wiring": wiring, "engine": engine, "tuned": self.tuned, "pixels": self.pixels})
 
     @staticmethod
     def from_json(line: str) -> ServerJob:
@@ -92,11 +91,11 @@ def stop_soon(server: Server) -> None:
     def stop() -> None:
         server.stop()
         SystemClock().sleep_until_ns(now_ns() + round(GRACE_S * 1e9))
-        sys.stderr.write(f"not over {GRACE_S:g} s after being told to stop: broken off\n")
+        sys.stderr.write(f"the server still runs {GRACE_S:g} s after its stop: killed\n")
         sys.stderr.flush()
         os._exit(0)
 
-    Thread(target=stop, daemon=True).start()  # not here: a signal may have interrupted a lock's holder
+    Thread(target=stop, daemon=True).start()  # a signal's handler may have interrupted a lock's holder
 
 
 def main() -> int:
@@ -104,7 +103,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the harness decides
     limit_threads()
     line = sys.stdin.readline()
-    if not line:  # who started this process has gone
+    if not line:  # the parent process has ended
         return 0
     job = ServerJob.from_json(line)
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")

@@ -1,4 +1,4 @@
-"""One request, measured: capture, ask, collect tokens, and turn the trace into rows."""
+"""Measure one request: capture, send, collect tokens, and turn the trace into rows."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from s2a_bench.harness.plan import RequestPlan
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.inference import swing
 from s2a_bench.machine.resources.sampler import ResourceSampler
-from s2a_bench.provenance import UNKNOWN, Provenance
+from s2a_bench.provenance import Provenance
 from s2a_bench.secrets import struck_pieces
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import STAGES, Mark, Trace
@@ -36,12 +36,12 @@ from s2a_bench.types import Frame, Piece, Request, Token
 FATAL = (ServerDied, SourceError, UsageError, EngineError)
 """Errors after which the next request cannot succeed either."""
 
-INTERRUPTED = "Interrupted: somebody ended the run while this request was under way"
+INTERRUPTED = "Interrupted: the run was ended during this request"
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where in the run a request stands."""
+    """The position of a request in the run."""
 
     block: int
     position: int
@@ -51,10 +51,10 @@ class Place:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """The rows of one request; ``fingerprint`` tells its picture from others.
+    """The rows of one request; ``fingerprint`` identifies its picture.
 
-    ``fatal`` ends the run: KeyboardInterrupt where somebody did while the request was under way. ``retry_after_s`` is
-    how long a server that refused asks to be left alone.
+    ``fatal`` ends the run, as a KeyboardInterrupt during the request. ``retry_after_s`` is the wait that a server
+    demands when it refuses.
     """
 
     sample: SampleRow
@@ -63,19 +63,19 @@ class Measured:
     fatal: S2AError | KeyboardInterrupt | None = None
     retry_after_s: float = 0.0
     odd: frozenset[str] = frozenset()
-    """What the server said of itself that can be no fact."""
+    """Names of the server's facts with impossible values."""
 
 
 @dataclass(frozen=True, slots=True)
 class RequestContext:
-    """What one request is told that others of the run are not, and who hears of its pieces as they arrive."""
+    """How one request differs from others of the run, and the receivers of its pieces as they arrive."""
 
     state: tuple[float, ...] | None = None
-    """Of the robot; None: of a robot that nobody has."""
+    """The robot's; None: a synthetic state."""
     on_piece: Callable[[Piece, int], None] | None = None
-    """Called on the thread that measures, with each piece and the time, in ns, at which it was there."""
+    """Called on the measuring thread with each piece and its time of arrival in ns."""
     plan: PlanFeed | None = None
-    """Told the answer as it arrives, from the start of the capture."""
+    """Receives the answer as it arrives, from the start of the capture."""
     request: RequestPlan | None = None
     """None: the run's."""
 
@@ -83,7 +83,7 @@ class RequestContext:
 PLAIN = RequestContext()
 UNKNOWN_ORIGIN = Provenance()
 KEPT_FRAMES = 90
-"""Frames kept until an answer may name them: three seconds at 30 Hz."""
+"""Frames that a later answer may name: three seconds at 30 Hz."""
 
 
 class Session:
@@ -99,10 +99,7 @@ class Session:
         sampler: ResourceSampler | None = None,
         origin: Provenance = UNKNOWN_ORIGIN,
     ) -> None:
-        """Measure ``cell`` with an open client, recording what travels if there is a recorder.
-
-        ``origin`` is what is known of who answers; a server that tells in its answers knows better.
-        """
+        """Measure ``cell`` with an open client. ``origin`` is replaced by the provenance that an answer carries."""
         self.origin = origin
         self.cell = cell
         self.client = client
@@ -112,34 +109,34 @@ class Session:
         self._sampler = sampler or ResourceSampler({}, 1)
         self._frames: dict[int, StreamedFrame] = {}
         self.busy = False
-        """Whether a request is under way, so that nobody else may touch the client."""
+        """Whether a request is under way, so that no other thread may use the client."""
         self.prompt_n = 0
-        """Tokens of the last prompt, pictures included; 0 where nobody says."""
+        """Tokens of the last prompt, pictures included; 0 if no server reports it."""
 
-    def measure(self, place: Place, asked: RequestContext = PLAIN) -> Measured:
-        """Make one request; a failure becomes a row with its error, and says whether it is the run's end."""
+    def measure(self, place: Place, context: RequestContext = PLAIN) -> Measured:
+        """Make one request; a failure becomes a row with its error, and `Measured.fatal` if it ends the run."""
         self.busy = True
         try:
-            return self._measure(place, asked)
+            return self._measure(place, context)
         finally:
             self.busy = False
 
-    def _measure(self, place: Place, asked: RequestContext) -> Measured:
+    def _measure(self, place: Place, context: RequestContext) -> Measured:
         self.feed.get_ready()
         request_id = f"{self.cell.name}-{place.block}"
         seen: list[tuple[Piece, int]] = []
         trace = Trace()
         error, retry_after_s = "", 0.0
         fatal: S2AError | KeyboardInterrupt | None = None
-        told, state = asked.request or self.request, asked.state
+        plan, state = context.request or self.request, context.state
         if state is None:  # another one in each block, float32
-            state = tuple(swing(1, told.state, place.block)[0].tolist()) if told.state else ()
+            state = tuple(swing(1, plan.state, place.block)[0].tolist()) if plan.state else ()
         started_ns = now_ns()
         self._sampler.edge()
         frames = self.feed.capture(trace)
-        request = Request(request_id, told.prompt, frames, told.max_pieces, told.grammar, told.seed, state=state)
+        request = Request(request_id, plan.prompt, frames, plan.max_pieces, plan.grammar, plan.seed, state=state)
         try:
-            for piece_at in self._pieces(request, trace, asked):
+            for piece_at in self._pieces(request, trace, context):
                 seen.append(piece_at)  # noqa: PERF402 - what came before an error is kept
         except S2AError as failure:
             error = f"{type(failure).__name__}: {failure}"
@@ -155,7 +152,7 @@ class Session:
         if not error and not seen:
             error = "RequestFailed: the answer was empty"
         if self._recorder is not None:
-            if told.mode == "request":  # in stream mode the camera records its frames
+            if plan.mode == "request":  # in stream mode the camera records its frames
                 for frame in frames:
                     self._recorder.frame(frame)
             self._recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
@@ -163,16 +160,16 @@ class Session:
         rows = self._rows(place, request_id, frames, trace, seen, error)
         return replace(rows, fatal=fatal, retry_after_s=retry_after_s)
 
-    def _pieces(self, request: Request, trace: Trace, asked: RequestContext) -> Iterator[tuple[Piece, int]]:
-        """Yield the pieces with the times, in ns, at which they are there, and tell who listens."""
-        plan = asked.plan
+    def _pieces(self, request: Request, trace: Trace, context: RequestContext) -> Iterator[tuple[Piece, int]]:
+        """Yield the pieces with their times of arrival in ns, and pass them to the receivers of ``context``."""
+        plan = context.plan
         if plan is not None:
             plan.requested(trace.marks[0][1])
         try:
             for piece in self.client.request(request, trace):
                 at_ns = now_ns()
-                if asked.on_piece is not None:
-                    asked.on_piece(piece, at_ns)
+                if context.on_piece is not None:
+                    context.on_piece(piece, at_ns)
                 if plan is not None:
                     plan.token(piece.text, at_ns)
                 yield piece, at_ns
@@ -193,9 +190,9 @@ class Session:
         error: str,
     ) -> Measured:
         facts = trace.facts
-        told = trace.provenance or (trace.remote.provenance if trace.remote else {})
-        if told.get("engine", UNKNOWN) != UNKNOWN:
-            self.origin = replace(Provenance.from_dict(told), link=self.origin.link)
+        origin = Provenance.from_dict(trace.provenance or (trace.remote.provenance if trace.remote else {}))
+        if origin.known:
+            self.origin = replace(origin, link=self.origin.link)
         streamed = self._streamed(trace, request_id)
         if streamed:
             index, captured_ns, picture = streamed.index, streamed.captured_ns, streamed.index
@@ -252,7 +249,7 @@ class Session:
         return Measured(sample, tokens, picture, odd=frozenset(trace.odd))
 
     def _doubt(self, trace: Trace, rgb_source: int | None, rgb_engine: int | None) -> str:
-        """Return why a request that was answered is none that counts, or nothing."""
+        """Return why an answered request does not count, or nothing."""
         if unknown := {stage for stage, _ in trace.chain() if stage} - self.request.stages.keys():
             return f"TransportError: {self.cell.transport.name} does not declare the stage {', '.join(sorted(unknown))}"
         if self.cell.payload in LOSSLESS and None not in {rgb_source, rgb_engine} and rgb_source != rgb_engine:
@@ -277,7 +274,7 @@ class Session:
         return used
 
     def frames(self, keep: int = KEPT_FRAMES) -> list[FrameRow]:
-        """Return the rows of the camera's frames so far, the newest ``keep`` held back as an answer may name them."""
+        """Return the rows of the camera's frames so far, except the newest ``keep``, which an answer may name."""
         rows = []
         while len(self._frames) > keep:
             frame = self._frames.pop(next(iter(self._frames)))
@@ -286,7 +283,7 @@ class Session:
 
 
 def inference_start_ns(trace: Trace) -> int | None:
-    """Return when the request was handed to the engine: the mark before the first of `inference`'s group."""
+    """Return when the engine got the request: the mark before the first of `inference`'s group."""
     chain: list[Mark] = trace.chain()
     for (_, before_ns), (stage, _) in pairwise(chain):
         if STAGES.get(stage) == "inference":

@@ -1,4 +1,4 @@
-"""What is seen of a run that bears on its validity, as typed warnings that say what to do next."""
+"""Doubts about a run's validity, as typed warnings that say what to do next."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ SURELY_OFF_MS, SURELY_OFF_SHARE = 20.0, 0.25
 
 
 def before_run(checks: Mapping[str, str] | None = None, machine: Machine | None = None) -> list[RunWarning]:
-    """Return the doctor's warnings that concern any run, and those of ``checks``, as a plan has them."""
+    """Return the doctor's warnings that concern any run, and those of a plan's ``checks``."""
     return warnings_of(examine(machine or Machine(), {code: CHECKS[code] for code in BEFORE_RUN} | dict(checks or {})))
 
 
 class Counters(NamedTuple):
-    """Machine counters whose rise during a run is a reason to warn; an unreadable one is None."""
+    """Machine counters; a rise during a run raises a warning, an unreadable one is None."""
 
     receive_buffer_errors: int | None = None
     throttles: int | None = None
@@ -39,7 +39,7 @@ class Counters(NamedTuple):
 
     @staticmethod
     def read(*, watches_udp: bool = True) -> Counters:
-        """Read them all; without a transport on UDP the packets that the machine dropped were somebody else's."""
+        """Read all counters; without a transport on UDP, dropped packets are another program's."""
         machine = Machine()
         lines = (machine.read("proc/net/snmp") or "").splitlines() if watches_udp else []
         udp = [line.split() for line in lines if line.startswith("Udp:")]  # names, then values
@@ -53,11 +53,11 @@ class Counters(NamedTuple):
         )
 
     def warnings_since(self, before: Counters, against_loss: str = "") -> list[RunWarning]:
-        """Compare with an earlier reading; ``against_loss`` is what transports advise where packets are lost."""
+        """Compare with an earlier reading; ``against_loss`` is the transports' advice about lost packets."""
         rises = [0 if old is None or new is None else new - old for old, new in zip(before, self, strict=True)]
         dropped, throttles, suspended_ns, set_ns = rises
         late = "for want of receive buffer: DDS had to send them again, 200 ms later"
-        seen = (
+        findings = (
             (
                 dropped > 0,
                 "udp-receive-buffer",
@@ -73,16 +73,16 @@ class Counters(NamedTuple):
                 "let NTP settle, and run again",
             ),
         )
-        return [RunWarning(*warning) for happened, *warning in seen if happened]
+        return [RunWarning(*warning) for happened, *warning in findings if happened]
 
 
 class Doubt(NamedTuple):
-    """What requests may do that bears on their numbers, and the way out."""
+    """A reason to doubt the numbers of requests, and the way out."""
 
     code: str
     what: str
     advice: str = ""
-    """Empty where the transports of the cells advise."""
+    """Empty: the transports of the cells advise."""
 
 
 REPEATED = Doubt(
@@ -94,12 +94,12 @@ CACHED = Doubt(
     "prompt-cache",
     "answers had up to {cached_share:.0%} of their prompt from the server's cache: time to first token is too good",
     "start llama-server with --no-cache-prompt --cache-ram 0, vLLM with --no-enable-prefix-caching; "
-    "where --dialect was given, leave it out: a server that is known is asked without its cache",
+    "where --dialect was given, leave it out: requests to a known server bypass its cache",
 )
 HITS = Doubt(
     "server-cache",
     "the server's metrics count hits of its caches during the run: times may be too good",
-    "see that nobody else asks it; leave --nonce out; start vLLM with --no-enable-prefix-caching and "
+    "stop other clients of the server; leave --nonce out; start vLLM with --no-enable-prefix-caching and "
     "--mm-processor-cache-gb 0",
 )
 RESIDUAL = Doubt(
@@ -121,35 +121,35 @@ HEADERS_LATE = Doubt(
 )
 UNCOUNTED = Doubt(
     "usage-zero",
-    "answers came with a usage of zero tokens: it is left out, and what is cached cannot be known",
-    "a gateway may drop the counts: ask the server behind it",
+    "answers came with a usage of zero tokens: it is left out, and the cached share is unknown",
+    "a gateway may drop the counts: measure the server behind it",
 )
 OVERTAKEN = Doubt(
     "lost-frames", "camera frames did not reach the server, or were overtaken there by the next (over the whole run)"
 )
 STALE = Doubt(
     "stale-frames",
-    "requests failed, as the camera's newest frame had come to the server too long ago",
-    "see why frames did not come (--fps, lost-frames); --max-frame-age says how old one may be",
+    "requests failed, as the server's newest camera frame was too old",
+    "find out why frames did not arrive (--fps, lost-frames); --max-frame-age sets the limit",
 )
 LOST = Doubt("lost-messages", "requests lost messages on the way")
 FAILED = Doubt("failed-samples", "requests failed", "see the column error of samples.csv")
 DOUBTS: Final = (
     *(REPEATED, CACHED, HITS, RESIDUAL, HEADERS_EARLY, HEADERS_LATE, UNCOUNTED, OVERTAKEN, STALE, LOST, FAILED),
 )
-"""In the order in which they are told."""
+"""In the order of the warnings."""
 
 
 class SampleGuard:
-    """Watches the samples of a run as they come; ``against_loss`` is cell -> what its transport advises then."""
+    """Checks the samples of a run as they arrive; ``against_loss`` is cell -> its transport's advice about loss."""
 
     def __init__(self, against_loss: Mapping[str, str] | None = None) -> None:
         self.succeeded: Counter[str] = Counter()
-        """A cell's samples that took part in its numbers."""
+        """Samples that count, by cell."""
         self.in_a_row: Counter[str] = Counter()
-        """A cell's failures since its last success."""
+        """Failures since the last success, by cell."""
         self.last_error: dict[str, str] = {}
-        """What went wrong last in a cell."""
+        """The last error, by cell."""
         self._against_loss = against_loss or {}
         self._counts: dict[Doubt, Counter[str]] = {doubt: Counter() for doubt in DOUBTS}
         self._frames: dict[tuple[str, int], str] = {}
@@ -159,7 +159,7 @@ class SampleGuard:
         self._launches: set[int] = set()
 
     def see(self, row: SampleRow, fingerprint: int, odd: Iterable[str] = ()) -> None:
-        """Look at one sample, the fingerprint of its picture, and the names of what can be no fact."""
+        """Check one sample, the fingerprint of its picture, and the names of its impossible facts."""
         cell, counts = row.cell, self._counts
         self._odd[cell].update(odd)
         if self._frames.setdefault((cell, fingerprint), row.request_id) != row.request_id:
@@ -192,7 +192,7 @@ class SampleGuard:
         self._times_ns[cell].append(spent.e2e_ns if whole_ns is None else whole_ns)
 
     def see_hits(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
-        """Look at what servers count of their caches' hits before the run and after it."""
+        """Compare the servers' counters of cache hits before the run and after it."""
         self._counts[HITS] += Counter({name: round(after[name] - before.get(name, 0.0)) for name in after})
 
     def warnings(self) -> list[RunWarning]:
@@ -204,29 +204,26 @@ class SampleGuard:
                 where = ", ".join(f"{cell}: {count}" for cell, count in cells.items())
                 what = doubt.what.format(cached_share=self._cached_share)
                 found.append(RunWarning(doubt.code, f"{what} ({where})", doubt.advice or self.advice(cells)))
-        return [*found, *(self._alike() if len(self._launches) == 1 else ())]
+        return [*found, *(self._correlated() if len(self._launches) == 1 else ())]
 
     def _odd_facts(self) -> list[RunWarning]:
-        """Look at what servers said that can be no fact."""
         where = "; ".join(f"{cell}: {', '.join(sorted(odd))}" for cell, odd in self._odd.items() if odd)
-        what = f"a server told what is no number, or none that can be ({where})"
-        advice = "these facts are absent where they were odd: ask whoever runs the server"
+        what = f"a server reported facts that are no number, or an impossible one ({where})"
+        advice = "these facts are absent where they were odd: report it to the operator of the server"
         return [RunWarning("odd-facts", what, advice)] if where else []
 
     def advice(self, cells: Iterable[str]) -> str:
-        """Return what the transports of cells advise against loss, each once."""
+        """Return the advice against loss of the cells' transports, each once."""
         return "; ".join(dict.fromkeys(self._against_loss[cell] for cell in cells if cell in self._against_loss))
 
-    def _alike(self) -> list[RunWarning]:
-        """Look at whether neighbouring samples are too much alike; over several launches no interval asks for more."""
-        memories = {
-            cell: RowCorrelation.of(np.array(times_ns, np.float64)) for cell, times_ns in self._times_ns.items()
-        }
+    def _correlated(self) -> list[RunWarning]:
+        """Check whether neighbouring samples are correlated; intervals over several launches do not depend on it."""
+        correlations = {cell: RowCorrelation.of(np.array(times, np.float64)) for cell, times in self._times_ns.items()}
         where = ", ".join(
-            f"{cell}: {memory.n} samples tell as much as {memory.effective:.0f}"
-            for cell, memory in memories.items()
-            if memory.dependent
+            f"{cell}: {found.n} samples are worth {found.effective:.0f}"
+            for cell, found in correlations.items()
+            if found.dependent
         )
-        what = f"neighbouring samples are alike: intervals of this launch may be too narrow ({where})"
+        what = f"neighbouring samples are correlated: intervals of this launch may be too narrow ({where})"
         advice = "measure several launches, --launches 5, or more --requests"
         return [RunWarning("autocorrelation", what, advice)] if where else []

@@ -131,7 +131,7 @@ def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: P
     assert run.manifest["state"] == "interrupted"
     *before, last = run.samples["error"]
     assert before == ["", ""]
-    assert last.startswith("Interrupted: somebody ended the run while this request was under way")
+    assert last.startswith("Interrupted: the run was ended during this request")
     assert "failed-samples" not in output
 
 

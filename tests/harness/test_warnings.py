@@ -132,7 +132,7 @@ def test_neighbours_that_are_alike_are_a_warning_with_the_way_out() -> None:
         guard.see(sample, place)
     (warning,) = guard.warnings()
     assert warning.code == "autocorrelation"
-    assert re.search(r"ros/topic: 100 samples tell as much as \d+\b", warning.message)
+    assert re.search(r"ros/topic: 100 samples are worth \d+\b", warning.message)
     assert "--launches 5" in warning.advice
 
 
