@@ -1,4 +1,4 @@
-"""What answers: an Engine turns a request with RGB pictures into a stream of tokens, or of actions; and its options."""
+"""Engines, which turn a request with RGB pictures into a stream of tokens or of actions; and their options."""
 
 from __future__ import annotations
 
@@ -25,49 +25,47 @@ if TYPE_CHECKING:
 
 
 class Engine(Protocol):
-    """A model, or something that behaves like one. One request at a time; not thread-safe.
-
-    A subclass declares what is known of it before it is opened.
-    """
+    """A model, or something that behaves like one. One request at a time; not thread-safe."""
 
     acts: ClassVar[bool] = False
     """Whether it can answer with actions."""
     needs_model: ClassVar[bool] = True
-    """Whether it loads a model's files, the tiny dummy's unless told: `OF_MODEL` are options of such engines."""
+    """Whether it loads a model's files, by default the tiny dummy's: `OF_MODEL` are options of such engines."""
     computes: ClassVar[bool] = True
-    """Whether its answers take the time of a model's: a rate, and a plan in them, say something."""
+    """Whether its answers take a model's time, so that a rate, and a plan in them, have a meaning."""
     plays: ClassVar[tuple[str, int] | None] = None
-    """The skill set of the plans that it writes, and their tokens a skill, where those of a recording are played."""
+    """The skill set and the tokens a skill of the plans that it plays; None: it plays no recording."""
     needs: ClassVar[tuple[str, ...]] = ()
-    """The extra of this package that it needs, and the modules that this brings."""
+    """The extra of this package that it needs, and the modules of that extra."""
     exclusive_options: ClassVar[tuple[str, ...]] = ()
     """The options that no other engine honours."""
     declared_facts: ClassVar[Sequence[Fact]] = ()
-    """The facts that it may tell."""
+    """The facts that it may report."""
     honours: ClassVar[Sequence[str]] = ()
     """The names in `Request.sampling` that it honours."""
 
     def __init__(self, config: EngineConfig) -> None:
-        """Open it; raises EngineError, and UsageError for what `check` refuses."""
+        """Open the engine; raises EngineError, and UsageError for what `check` refuses."""
 
     @classmethod
     def check(cls, config: EngineConfig) -> None:  # noqa: ARG003 - for subclasses
-        """Raise UsageError where its own options do not go together."""
+        """Raise UsageError if the engine's options contradict each other."""
         return
 
     @classmethod
     def facts_for(cls, config: EngineConfig) -> Sequence[Fact]:  # noqa: ARG003 - for subclasses
-        """Return the facts that it tells, set like this."""
+        """Return the facts that it reports under this configuration."""
         return cls.declared_facts
 
     def open_beside(self, config: EngineConfig) -> Engine:
-        """Open one like it in this process, which takes turns with it and is closed before it."""
+        """Open an engine of this kind in this process, which takes turns with it and is closed before it."""
         return config.kind(config)
 
     @property
     def facts(self) -> dict[str, float]:
-        """Return what it tells of the last request, as llama.cpp's ``timings``: those that its class declares."""
-        return {}
+        """Return the declared facts about the last request, as llama.cpp's ``timings``."""
+        facts: dict[str, float] = getattr(self, "_facts", {})
+        return facts
 
     def generate(self, request: Request) -> Iterator[Piece]:
         """Yield the answer's pieces, at most ``request.max_tokens``; closing the iterator cancels the rest.
@@ -78,7 +76,7 @@ class Engine(Protocol):
         raise NotImplementedError
 
     def describe(self) -> dict[str, str | int | float | bool]:
-        """Return what answers, for the manifest: engine, model file, hash, whether the weights are dummies."""
+        """Return facts for the manifest: engine, model file, hash, whether the weights are dummies."""
         raise NotImplementedError
 
     def close(self) -> None:
@@ -95,24 +93,22 @@ ENGINES: Final[Registry[type[Engine]]] = Registry(
         "replay": "s2a_bench.inference.replay:ReplayEngine",
     },
 )
-"""Name -> what is declared of an engine, and opens it from its configuration: its class."""
+"""Name -> the engine's class."""
 
 MODEL, STAND_IN = "llama", "echo"
-"""The engine that answers unless told, and the one that does where its library is not installed."""
+"""The default engine, and the one without its library."""
 
 CHECKS: dict[str, str] = {"llama-build": "s2a_bench.inference.smoke:llama_build"}
-"""Code -> ``module:function`` of the doctor's checks that are about engines."""
-
+"""Code -> ``module:function`` of the doctor's checks of engines."""
 
 PERIOD = 50
 """Control ticks of one swing: a second at 50 Hz."""
 
 ANSWERS: Final = ("answer", "horizon", "action_dim")
-"""The options that say what an answer is made of."""
+"""The options about the kind of an answer."""
 
 OF_MODEL: Final = ("model", "mmproj", "gpu_layers")
 """The options that only an engine with a model can honour."""
-
 
 KV_TYPES = {"f32": 0, "f16": 1, "q8_0": 8, "q4_0": 2}
 """Type of the KV cache -> ggml's number (``ggml_type``)."""
@@ -128,7 +124,7 @@ SAMPLINGS: dict[str, dict[str, float]] = {
 structured output; ``greedy`` takes the likeliest token."""
 
 PENALTY_LAST_N, LAST_N = "penalty_last_n", 64
-"""Of how many last tokens repetition is punished: its name in `Request.sampling`, and what it is unless told."""
+"""The number of last tokens whose repetition is penalised: its name in `Request.sampling`, and its default."""
 
 SAMPLER_ARGUMENTS = {
     **{name: name for name in ("temp", "top_k", "top_p", "min_p", "typical_p", "mirostat_eta", "mirostat_tau")},
@@ -147,7 +143,7 @@ def _written(value: Any) -> Any:
 
 
 class EngineConfig(Options):
-    """Which engine, on which files, with which settings; plain data, so that a server process can be told."""
+    """Which engine, on which files, with which settings."""
 
     PANEL: ClassVar[str] = "Model"
 
@@ -161,7 +157,7 @@ class EngineConfig(Options):
     gaps: str = option("", "replay: trace, parametric, constant [default: trace if recorded]")
     latency: Annotated[str, BeforeValidator(_written, json_schema_input_type=str | float)] = option(
         "",
-        "echo: how long until an answer is there, whole: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: at once]",
+        "echo: time to the whole answer: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: at once]",
     )
     model: Path | None = option(None, "GGUF model [default: the tiny dummy]", first=True)
     mmproj: Path | None = option(None, "GGUF vision tower that goes with --model")
@@ -186,7 +182,6 @@ class EngineConfig(Options):
     )
 
     def check(self) -> None:
-        """Refuse a cache that no kernel reads."""
         if self.kv_type in {"q8_0", "q4_0"} and self.flash_attention == "off":
             raise UsageError(
                 f"`kv_type` {self.kv_type} needs flash attention, which alone reads a quantised V cache; "
@@ -201,7 +196,7 @@ class EngineConfig(Options):
 
     @property
     def kind(self) -> type[Engine]:
-        """Return what is declared of the engine; raises UsageError for an unknown name."""
+        """Return the engine's class; raises UsageError for an unknown name."""
         return ENGINES[self.name]
 
     @property
@@ -211,11 +206,13 @@ class EngineConfig(Options):
         return next((name for name in OF_MODEL if getattr(self, name) != fields[name].default), "")
 
     def default_name(self, say: Callable[[str], None]) -> str:
-        """Return llama where it is installed, or a model is named; else echo, and ``say`` so."""
+        """Return llama if it is installed, or a model is named; else echo, and ``say`` so."""
         if self.of_model or extras.installed("llama_cpp"):
             return MODEL
-        missing = extras.how_to_install("llama")
-        say(f"no llama-cpp-python here, so the echo engine answers, without a model; {missing}")
+        say(
+            "llama-cpp-python is not installed, so the echo engine answers, without a model; "
+            f"{extras.how_to_install('llama')}"
+        )
         return STAND_IN
 
     @property
@@ -228,7 +225,7 @@ class EngineConfig(Options):
 
 
 class _UndeclaredEngine(Engine):
-    """What is assumed of who answered an old run, and is not here."""
+    """The engine of an old run that is not installed."""
 
 
 def acting() -> str:
@@ -238,7 +235,7 @@ def acting() -> str:
 
 @cache
 def declared_engine(name: str) -> type[Engine]:
-    """Return what is declared of an engine, for showing a run; one that is not installed is like any model's."""
+    """Return the class of a run's engine; one that is not installed counts as a model's."""
     try:
         return ENGINES[name]
     except UsageError:
@@ -246,7 +243,7 @@ def declared_engine(name: str) -> type[Engine]:
 
 
 def check_engine(config: EngineConfig) -> None:
-    """Raise UsageError where an engine's own options, and the engine, do not go together."""
+    """Raise UsageError for an option of another engine, and for options that contradict each other."""
     for name, kind in ENGINES.loaded():
         given = next((option for option in kind.exclusive_options if getattr(config, option)), "")
         if given and name != config.name:
@@ -255,7 +252,7 @@ def check_engine(config: EngineConfig) -> None:
 
 
 def need_engine(config: EngineConfig) -> None:
-    """Raise MissingExtra, naming the model's option if one is given, where what an engine needs is not installed."""
+    """Raise MissingExtra, naming the model's option if one is given, if the engine's libraries are not installed."""
     if not config.kind.needs:
         return
     try:
@@ -265,20 +262,19 @@ def need_engine(config: EngineConfig) -> None:
 
 
 def cancel(tokens: object) -> None:
-    """Cancel what an engine's iterator has not yielded."""
-    close = getattr(tokens, "close", None)
-    if close is not None:
+    """Close an engine's iterator if it can be closed."""
+    if close := getattr(tokens, "close", None):
         close()
 
 
 class PacedEngine(Engine):
-    """Lets the first token go when it is there, and each further one no sooner than its place in the rate.
+    """Holds an engine's tokens back to a rate above 0.
 
-    Deadlines count from the first token, so that late wake-ups do not add up; tokens later than that go at once.
+    Token k leaves k / rate after the first one, or later, at once: deadlines count from the first token, so that late
+    wake-ups do not add up.
     """
 
     def __init__(self, engine: Engine, tokens_per_s: float, clock: Clock | None = None) -> None:
-        """Take over ``engine``; ``tokens_per_s`` is above 0."""
         self._engine = engine
         self._rate = tokens_per_s
         self._clock = clock or SystemClock()
@@ -288,7 +284,6 @@ class PacedEngine(Engine):
         return self._engine.facts
 
     def generate(self, request: Request) -> Iterator[Piece]:
-        """Yield the engine's tokens, each at its time or later."""
         first_ns = 0
         tokens = self._engine.generate(request)
         try:
@@ -308,19 +303,17 @@ class PacedEngine(Engine):
 
 
 def open_engine(config: EngineConfig, beside: Engine | None = None) -> Engine:
-    """Start the engine that ``config`` names; raises UsageError for an unknown name, EngineError otherwise.
+    """Open the engine that ``config`` names; raises UsageError for an unknown name, EngineError otherwise.
 
-    ``beside`` is one like it in this process, which takes turns with it and is closed after it.
+    ``beside`` is an open engine in this process that takes turns with it and is closed after it.
     """
     engine = config.kind(config) if beside is None else beside.open_beside(config)
-    if config.pace:
-        return PacedEngine(engine, config.pace)
-    return engine
+    return PacedEngine(engine, config.pace) if config.pace else engine
 
 
 @lru_cache(8)
 def swing(horizon: int, dims: int, seed: int) -> NDArray[np.float32]:
-    """Return sines of amplitude 1, a phase for each joint and seed: float32 (horizon, dims)."""
+    """Return sines of amplitude 1, with a phase by joint and seed: float32 (horizon, dims)."""
     import numpy as np
 
     ticks, joints = np.arange(horizon)[:, None], np.arange(dims)[None, :]
@@ -330,7 +323,7 @@ def swing(horizon: int, dims: int, seed: int) -> NDArray[np.float32]:
 
 
 def chunk(config: EngineConfig, request: Request) -> Iterator[Action]:
-    """Yield the actions of an engine without a policy: smooth motion, as many as it is told and as a request takes."""
+    """Yield the actions of an engine without a policy: smooth motion, at most ``request.max_tokens``."""
     values = swing(config.horizon, config.action_dim, request.seed)
     for index in range(max(0, min(config.horizon, request.max_tokens))):
         yield Action(index, values[index])
@@ -342,7 +335,7 @@ Quant: TypeAlias = Literal["f16", "q8_0", "q4_0"]
 
 
 class FetchConfig(Options):
-    """Which model is fetched."""
+    """The options of `model fetch`."""
 
     what: str = option(..., "minicpm-v-2.6, or ORG/REPO:FILE", flag="name", argument=True)
     quant: str | None = option(None, "quantisation of the language model, as Q8_0 [default: Q4_K_M]")
@@ -350,14 +343,14 @@ class FetchConfig(Options):
 
 
 class InfoConfig(Options):
-    """Which file is looked into."""
+    """The options of `model info`."""
 
     what: str = option(..., "a GGUF file, or minicpm-v-2.6 once it is fetched", flag="file", argument=True)
-    hash: bool = option(False, "compute the SHA-256; else it is shown where it is known already")
+    hash: bool = option(False, "compute the SHA-256; without it, a known one is shown")
 
 
 class DummyConfig(Options):
-    """Which dummy weights are written, and where."""
+    """The options of `model dummy`."""
 
     size: Size = option("tiny", "tiny: 13 MB, for tests; full: the shapes of MiniCPM-V 2.6")
     quant: Quant | None = option(

@@ -4,9 +4,9 @@ Token speed depends on shapes and types, not on values. The language model is Qw
 at 980 pixels' positions with a `resampler` of 64 queries (minicpmv_version 3). Names and keys are those that llama.cpp
 reads (``src/models/qwen2.cpp``, ``tools/mtmd/clip.cpp``) and its converter writes (``tools/mtmd/legacy-models``).
 
-Weights are drawn as bytes of each type's blocks, nothing is quantised from floats: from a generator of 64-bit integers,
-so that a seed gives the same bytes with every numpy. Only the spread matters: a matrix has about ``1 / sqrt(columns)``,
-so that activations keep their size through the layers.
+Weights are drawn as bytes of each type's blocks, not quantised from floats, from a generator of 64-bit integers: a seed
+gives the same bytes with every numpy. A matrix has a spread of about ``1 / sqrt(columns)``, so that activations keep
+their size through the layers.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 Kind: TypeAlias = Literal["f32", "f16", "q8_0", "q4_0", "q6_k"]
 Bytes: TypeAlias = NDArray[np.uint8]
 
-CHUNK_BYTES = 1 << 24
+PART_BYTES = 1 << 24
 
 _F16_SPREAD = math.sqrt(7 / 3)  # of a number uniform in +-[1, 2)
 _Q4_SPREAD = math.sqrt((16**2 - 1) / 12)
@@ -48,7 +48,7 @@ _Q6_SCALE = 8  # keeps the half-precision factor beside it a normal number
 
 @dataclass(frozen=True, slots=True)
 class Tensor:
-    """One tensor: its shape as numpy writes it (columns last); a ``value``, or one for each, where it is not random."""
+    """One tensor: its shape in numpy's order (columns last); a ``value``, or one for each, if it is not random."""
 
     name: str
     shape: tuple[int, ...]
@@ -64,13 +64,13 @@ class Tensor:
     def spread(self) -> float:
         return 1 / math.sqrt(math.prod(self.shape[1:])) if len(self.shape) > 1 else 0.02
 
-    def chunks(self, seed: int) -> Iterator[Bytes]:
-        """Yield the tensor's bytes; the same for the same seed and name."""
+    def parts(self, seed: int) -> Iterator[Bytes]:
+        """Yield the tensor's bytes, which depend on the seed and the name."""
         block, size, draw = KINDS[self.kind]
         left = math.prod(self.shape) // block
         generator = np.random.Generator(np.random.SFC64([seed, zlib.crc32(self.name.encode())]))
         while left:
-            blocks = min(left, CHUNK_BYTES // size)
+            blocks = min(left, PART_BYTES // size)
             left -= blocks
             if self.value is None:
                 yield draw(_random_bytes(generator, blocks * size), self.spread)
@@ -79,8 +79,7 @@ class Tensor:
 
 
 def _random_bytes(generator: np.random.Generator, size: int) -> Bytes:
-    words = generator.integers(0, 2**64 - 1, -(-size // 8), np.uint64, endpoint=True)
-    return words.view(np.uint8)[:size]
+    return generator.integers(0, 2**64 - 1, -(-size // 8), np.uint64, endpoint=True).view(np.uint8)[:size]
 
 
 def _f32(raw: Bytes, spread: float) -> Bytes:
@@ -97,27 +96,25 @@ def _f16(raw: Bytes, spread: float) -> Bytes:
     return raw
 
 
-def _alternating(blocks: NDArray[np.void], field: str, value: float) -> None:
-    """Turn every second block's sign, so that codes that are not symmetric about 0 average to 0."""
-    blocks[field][0::2] = value
-    blocks[field][1::2] = -value
+def _set_factor(raw: Bytes, layout: list[Any], factor: float) -> Bytes:
+    """Set a block's factor, ``d``, negated in every second block: asymmetric codes then average to 0."""
+    factors = raw.view(layout)["d"]
+    factors[0::2], factors[1::2] = factor, -factor
+    return raw
 
 
 def _q8_0(raw: Bytes, spread: float) -> Bytes:
-    _alternating(raw.view([("d", "<f2"), ("q", "i1", 32)]), "d", spread / _Q8_SPREAD)
-    return raw
+    return _set_factor(raw, [("d", "<f2"), ("q", "i1", 32)], spread / _Q8_SPREAD)
 
 
 def _q4_0(raw: Bytes, spread: float) -> Bytes:
-    _alternating(raw.view([("d", "<f2"), ("q", "u1", 16)]), "d", spread / _Q4_SPREAD)
-    return raw
+    return _set_factor(raw, [("d", "<f2"), ("q", "u1", 16)], spread / _Q4_SPREAD)
 
 
 def _q6_k(raw: Bytes, spread: float) -> Bytes:
-    blocks = raw.view([("ql", "u1", 128), ("qh", "u1", 64), ("scales", "i1", 16), ("d", "<f2")])
-    blocks["scales"] = _Q6_SCALE
-    _alternating(blocks, "d", spread / _Q6_SPREAD / _Q6_SCALE)
-    return raw
+    layout: list[Any] = [("ql", "u1", 128), ("qh", "u1", 64), ("scales", "i1", 16), ("d", "<f2")]
+    raw.view(layout)["scales"] = _Q6_SCALE
+    return _set_factor(raw, layout, spread / _Q6_SPREAD / _Q6_SCALE)
 
 
 KINDS: dict[Kind, tuple[int, int, Callable[[Bytes, float], Bytes]]] = {
@@ -127,16 +124,15 @@ KINDS: dict[Kind, tuple[int, int, Callable[[Bytes, float], Bytes]]] = {
     "q4_0": (32, 18, _q4_0),
     "q6_k": (256, 210, _q6_k),
 }
-"""Tensor type -> (numbers in a block, bytes of a block, what makes random bytes into blocks)."""
+"""Tensor type -> (numbers in a block, bytes of a block, function that turns random bytes into blocks)."""
 
 _FLOATS: dict[Kind, str] = {"f32": "<f4", "f16": "<f2"}
-
 
 NORMAL, CONTROL = 1, 3
 """Token types of GGUF (``gguf.TokenType``)."""
 
 FULL_BASE = 151_643
-"""Qwen2's byte-level tokens and merges; the special tokens follow."""
+"""The number of Qwen2's byte-level tokens and merges; the special tokens follow."""
 
 FULL_UNKNOWN = 128_244
 """MiniCPM-V 2.6 keeps ``<unk>`` within Qwen2's range."""
@@ -156,7 +152,7 @@ SPECIAL = _QWEN_SPECIAL + _IMAGE_SPECIAL + _RESERVED
 
 @dataclass(frozen=True, slots=True)
 class Vocab:
-    """Tokens by index with their GGUF types, merges by rank, and the indices that the file's keys name."""
+    """Tokens by index with their GGUF types, merges by rank, and the indices of tokens with a role."""
 
     tokens: list[str]
     types: list[int]
@@ -167,7 +163,7 @@ class Vocab:
     unknown: int
 
     def texts(self) -> list[bool]:
-        """Return of each token whether it is text by itself: no control token, no byte of a longer character."""
+        """Return for each token whether it is a text: no control token, no byte of a longer character."""
         unreadable = {name for byte, name in byte_names().items() if chr(byte) not in TEXT}
         return [kind == NORMAL and token not in unreadable for token, kind in zip(self.tokens, self.types, strict=True)]
 
@@ -181,10 +177,9 @@ def byte_names() -> dict[int, str]:
 
 def make_vocab(*, full: bool) -> Vocab:
     """Make the vocabulary of Qwen2's size, or the byte-level one of the tiny model."""
-    alphabet = byte_names().values()
-    tokens, merges = list(alphabet), ["\u0120 t"]  # llama.cpp wants at least one merge; \u0120 stands for a space
+    tokens, merges = list(byte_names().values()), ["\u0120 t"]  # at least one for llama.cpp; \u0120 stands for a space
     if full:
-        merges = _letter_merges(FULL_BASE - len(alphabet))
+        merges = _letter_merges(FULL_BASE - len(tokens))
     tokens += [merge.replace(" ", "") for merge in merges]
     types = [NORMAL] * len(tokens) + [CONTROL] * len(SPECIAL)
     first = len(tokens)
@@ -200,7 +195,7 @@ def make_vocab(*, full: bool) -> Vocab:
 
 
 def _letter_merges(count: int) -> list[str]:
-    """Return ``count`` merges, shorter words first: pairs of letters, the same after a space, triples, fours."""
+    """Return ``count`` merges, the shorter texts first: pairs of letters, the same after a space, triples, fours."""
     pairs = [first + second for first, second in product(_LETTERS, repeat=2)]
     merges = [f"{pair[0]} {pair[1]}" for pair in pairs]
     merges += [f"\u0120 {pair}" for pair in pairs]
@@ -212,20 +207,20 @@ def _letter_merges(count: int) -> list[str]:
 
 
 Progress: TypeAlias = Callable[[int, int], None]
-"""Called with (bytes written, bytes in all)."""
+"""(bytes written, total bytes) -> None."""
 
 REVISION = 3
-"""Part of the file names; raise it when the bytes change, so that old files in caches are not used."""
+"""Part of the file names; increase it when the bytes change, so that old files in caches are not used."""
 
 DUMMY_KEY = "s2a_bench.dummy"
-_CHAT_TEMPLATE = (  # Qwen2's, with its system message: the same prompt in llama-server as in our engine
+_CHAT_TEMPLATE = (  # Qwen2's, with its system message: the same prompt in llama-server as in the llama engine
     "{% for message in messages %}{% if loop.first and messages[0]['role'] != 'system' %}"
     "{{ '<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n' }}{% endif %}"
     "{{'<|im_start|>' + message['role'] + '\n' + message['content'] + '<|im_end|>' + '\n'}}{% endfor %}"
     "{% if add_generation_prompt %}{{ '<|im_start|>assistant\n' }}{% endif %}"
 )
 _NEVER = -1e4
-"""Added to the logits of tokens that are no text: servers send nothing for those, so their first would come late."""
+"""Added to the logits of tokens that are no text: servers send nothing for those, so that the first would be late."""
 _POSITIONS = 70 * 70
 _PATCH = 14
 _QUERIES = 64
@@ -235,7 +230,7 @@ _FILE_TYPES = {"f16": 1, "q4_0": 2, "q8_0": 7}  # llama_ftype
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """The lengths that make a MiniCPM-V of one size."""
+    """The dimensions of a MiniCPM-V of one size."""
 
     layers: int
     width: int
@@ -257,7 +252,7 @@ SHAPES: dict[Size, Shape] = {
 
 
 class DummyFiles(NamedTuple):
-    """Where the two files of a model are."""
+    """The paths of a model's two files."""
 
     model: Path
     mmproj: Path
@@ -272,10 +267,10 @@ def dummy_files(folder: Path, size: Size, quant: Quant, seed: int = 0) -> DummyF
 def write_dummy(
     folder: Path, size: Size = "tiny", quant: Quant = "f16", *, seed: int = 0, progress: Progress | None = None
 ) -> DummyFiles:
-    """Write both files into ``folder``, each in one step at its end, so that a crash leaves no half file.
+    """Write both files into ``folder``; each gets its name once it is complete.
 
     Two processes may write the same files at once. Raises UsageError for an unknown size or type, ModelError
-    where the folder cannot be written.
+    if the folder cannot be written.
     """
     if size not in SHAPES:
         raise UsageError(f"`size`: {none_of(size, SHAPES)}")
@@ -286,12 +281,11 @@ def write_dummy(
     vocab = make_vocab(full=size == "full")
     model, mmproj = list(_model_tensors(shape, len(vocab.tokens), quant)), list(_mmproj_tensors(shape))
     if size == "tiny":  # half of its few tokens are no text
-        model.append(
-            Tensor("output.bias", (len(vocab.tokens),), value=[0 if text else _NEVER for text in vocab.texts()])
-        )
+        biases = [0 if text else _NEVER for text in vocab.texts()]
+        model.append(Tensor("output.bias", (len(vocab.tokens),), value=biases))
     done, total = 0, sum(tensor.nbytes for tensor in (*model, *mmproj))
 
-    def tell(count: int) -> None:
+    def written(count: int) -> None:
         nonlocal done
         done += count
         if progress is not None:
@@ -301,10 +295,10 @@ def write_dummy(
         folder.mkdir(parents=True, exist_ok=True)
         with _writer(files.mmproj, "clip") as writer:
             _mmproj_keys(writer, shape, size)
-            _write(writer, mmproj, seed, tell)
+            _write(writer, mmproj, seed, written)
         with _writer(files.model, "qwen2") as writer:
             _model_keys(writer, shape, size, quant, vocab)
-            _write(writer, model, seed, tell)
+            _write(writer, model, seed, written)
     except OSError as error:
         raise ModelError(
             f"`output` {folder}: cannot write the dummy model ({error.strerror or error}); "
@@ -315,7 +309,7 @@ def write_dummy(
 
 @contextmanager
 def _writer(path: Path, architecture: str) -> Iterator[GGUFWriter]:
-    """Open a file that takes its name when it is whole."""
+    """Open a temporary file, which gets its name once it is complete."""
     gguf = extras.require("gguf", "model")
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     os.close(handle)
@@ -331,8 +325,8 @@ def _writer(path: Path, architecture: str) -> Iterator[GGUFWriter]:
         temporary.unlink(missing_ok=True)
 
 
-def _write(writer: GGUFWriter, tensors: Iterable[Tensor], seed: int, tell: Callable[[int], None]) -> None:
-    """Write one file: gguf-py writes header and keys, the tensors are streamed behind them."""
+def _write(writer: GGUFWriter, tensors: Iterable[Tensor], seed: int, written: Callable[[int], None]) -> None:
+    """Write header and keys with gguf-py, then stream the tensors."""
     kinds = extras.require("gguf", "model").GGMLQuantizationType
     for tensor in tensors:
         kind = kinds[tensor.kind.upper()]
@@ -343,14 +337,14 @@ def _write(writer: GGUFWriter, tensors: Iterable[Tensor], seed: int, tell: Calla
     (file,) = writer.fout
     writer.write_padding(file, file.tell())
     for tensor in tensors:
-        for chunk in tensor.chunks(seed):
-            file.write(chunk.data)
-            tell(chunk.nbytes)
+        for part in tensor.parts(seed):
+            file.write(part.data)
+            written(part.nbytes)
         writer.write_padding(file, tensor.nbytes)
 
 
-def _general_keys(writer: GGUFWriter, size: Size, quant: Quant, part: str) -> None:
-    writer.add_name(f"MiniCPM-V 2.6 {part}, DUMMY random weights ({size})")
+def _general_keys(writer: GGUFWriter, size: Size, quant: Quant, content: str) -> None:
+    writer.add_name(f"MiniCPM-V 2.6 {content}, DUMMY random weights ({size})")
     writer.add_description("Random weights in the shapes of MiniCPM-V 2.6, for timing only; written by s2a-bench.")
     writer.add_bool(DUMMY_KEY, val=True)
     writer.add_string("s2a_bench.dummy_size", size)

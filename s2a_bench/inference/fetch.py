@@ -1,9 +1,8 @@
-"""Fetch model files from the hub into its own cache: resumed where they broke off, checked before they count.
+"""Fetch model files from the hub into the hub library's cache: resumed after an interruption, and checked.
 
-The hub library downloads to a file of its own that it deletes when it is interrupted, so gigabytes would start again.
-Here its transfer routine appends to a file that stays, named by the SHA-256 that the hub gives for the content. Only
-when the content has that hash does it become the blob of the hub's cache; the library then links it where every tool
-finds it.
+The hub library downloads to a temporary file that it deletes when it is interrupted, so gigabytes would start again.
+Here its transfer routine appends to a file that stays, named by the SHA-256 that the hub lists for the content. Content
+with that hash becomes the blob of the hub's cache; the library then links it where every tool finds it.
 """
 
 from __future__ import annotations
@@ -27,18 +26,18 @@ from s2a_bench.inference.models import HUB_MODELS, digest, remember_sha256, sha2
 from s2a_bench.store.schema import Count, about
 
 Progress: TypeAlias = Callable[[str, int, int], None]
-"""Called with (file, bytes that are there, bytes in all)."""
+"""(file, bytes present, total bytes) -> None."""
 
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 _SPARE_BYTES = 100 << 20
-"""Left free on the disk, for everything else."""
+"""Left free on the disk."""
 _REFUSED = (401, 403, 404)
-"""What a hub answers to a wrong name, a wrong token, or none."""
+"""A hub's status codes for a wrong name, and for a wrong or missing token."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What to fetch: a repository of the hub and the names of its files, the language model's first."""
+    """The files to fetch: a repository of the hub and the names of its files, the language model's first."""
 
     repository: str
     files: tuple[str, ...]
@@ -46,7 +45,7 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class HubFile:
-    """One file as the hub lists it, and where the hub's cache keeps its content (its documented layout)."""
+    """One file as the hub lists it, and the path of its content in the hub's cache (a documented layout)."""
 
     name: str
     nbytes: int
@@ -55,13 +54,13 @@ class HubFile:
 
     @property
     def part(self) -> Path:
-        """Return where it grows until it is whole."""
+        """Return the path of the incomplete file."""
         return self.blob.with_name(f"{self.blob.name}.s2a-bench.part")
 
 
 @dataclass(frozen=True, slots=True)
 class FetchedFile:
-    """One file that was fetched."""
+    """One fetched file."""
 
     path: Path
     bytes: Count
@@ -71,7 +70,7 @@ class FetchedFile:
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """What `fetch` fetched, from which commit of which hub."""
+    """The fetched files, with the hub and the commit."""
 
     endpoint: str
     repository: str
@@ -80,7 +79,7 @@ class Fetched:
 
 
 def wanted(what: str, quant: str | None, mmproj: str | None) -> Wanted:
-    """Read ``NAME`` or ``ORG/REPO:FILE`` and the flags beside it; raises UsageError where they make no sense."""
+    """Read ``NAME`` or ``ORG/REPO:FILE`` and its flags; raises UsageError if they make no sense."""
     if what in HUB_MODELS:
         known = HUB_MODELS[what]
         return Wanted(known.repository, (known.model_file(quant or known.quant), mmproj or known.mmproj))
@@ -98,12 +97,12 @@ def wanted(what: str, quant: str | None, mmproj: str | None) -> Wanted:
 
 
 def fetch(want: Wanted, progress: Progress | None = None) -> Fetched:
-    """Fetch the files that are not there yet and check all of them against the hub's SHA-256.
+    """Fetch the missing files and check all of them against the hub's SHA-256.
 
-    Raises ModelError, one line, for whatever is in the way: no network, no such file, gated, disk full, wrong content.
+    Raises ModelError, one line, if that fails: no network, no such file, gated, disk full, wrong content.
     """
     extras.require("huggingface_hub.utils", "model").disable_progress_bars()
-    getLogger("huggingface_hub").setLevel(ERROR)  # it tells of each retry with the whole, signed address
+    getLogger("huggingface_hub").setLevel(ERROR)  # it logs each retry with the whole, signed address
     with _one_line(want):
         commit, files = _listing(want)
         _check_space(want.repository, files)
@@ -116,7 +115,7 @@ def _endpoint() -> str:
 
 
 def _listing(want: Wanted) -> tuple[str, tuple[HubFile, ...]]:
-    """Ask the hub for its commit and the files' sizes and checksums; a file's case is forgiven."""
+    """Return the hub's commit and the files' sizes and checksums; file names match in any case."""
     hub = extras.require("huggingface_hub", "model")
     timeout_s = extras.require("huggingface_hub.constants", "model").HF_HUB_ETAG_TIMEOUT
     try:
@@ -143,11 +142,9 @@ def _hub_file(repository: str, name: str, siblings: dict[str, Any]) -> HubFile:
 
 
 def _check_space(repository: str, files: tuple[HubFile, ...]) -> None:
-    """Refuse before the first byte where the disk cannot hold what is missing."""
-    missing = 0
-    for file in files:
-        if not file.blob.is_file():
-            missing += file.nbytes - (file.part.stat().st_size if file.part.is_file() else 0)
+    """Raise ModelError before the first byte if the disk cannot hold the missing ones."""
+    absent = [file for file in files if not file.blob.is_file()]
+    missing = sum(file.nbytes - (file.part.stat().st_size if file.part.is_file() else 0) for file in absent)
     folder = files[0].blob.parent
     there = next(parent for parent in (folder, *folder.parents) if parent.exists())
     free = shutil.disk_usage(there).free
@@ -173,20 +170,20 @@ def _fetch_file(repository: str, commit: str, file: HubFile, progress: Progress 
 
 
 class _Part(io.BufferedWriter):
-    """A file that grows at its end and tells how far it is."""
+    """A file that is appended to, and reports its size."""
 
-    def __init__(self, path: Path, tell: Callable[[int], None]) -> None:
+    def __init__(self, path: Path, report: Callable[[int], None]) -> None:
         super().__init__(io.FileIO(path, "a"))
-        self._tell = tell
+        self._report = report
 
     def write(self, data: Any, /) -> int:
         written = super().write(data)
-        self._tell(self.tell())
+        self._report(self.tell())
         return written
 
 
 def _download(repository: str, commit: str, file: HubFile, progress: Progress | None) -> int:
-    """Append what is missing, check all of it, and make it the blob; return how much was there before."""
+    """Append the missing bytes, check the file, and make it the blob; return the size before."""
     hub = extras.require("huggingface_hub", "model")
     http_get = extras.require("huggingface_hub.file_download", "model").http_get
     headers = extras.require("huggingface_hub.utils", "model").build_hf_headers()
@@ -200,10 +197,10 @@ def _download(repository: str, commit: str, file: HubFile, progress: Progress | 
         if content.tell() > file.nbytes:
             content.seek(0)
             content.truncate()
-        there = content.tell()
-        # the resolve address, not where it leads: a signed address runs out while a large file is under way
+        size_before = content.tell()
+        # the resolve address, without its redirection: a signed address expires during a long download
         url = hub.hf_hub_url(repository, file.name, revision=commit)
-        http_get(url, content, resume_size=there, headers=headers, expected_size=file.nbytes)
+        http_get(url, content, resume_size=size_before, headers=headers, expected_size=file.nbytes)
         content.flush()
         found = digest(file.part)
         if found != file.sha256:
@@ -213,7 +210,7 @@ def _download(repository: str, commit: str, file: HubFile, progress: Progress | 
             )
         file.part.replace(file.blob)
     remember_sha256(file.blob, found)
-    return there
+    return size_before
 
 
 def _by_hand(want: Wanted) -> str:
@@ -226,9 +223,9 @@ def _no_hub(want: Wanted) -> str:
 
 def _status(error: Any, want: Wanted) -> str:
     status = int(error.response.status_code)
-    said = f": {error.server_message}" if error.server_message else ""
+    message = f": {error.server_message}" if error.server_message else ""
     way_out = "check the name, or set HF_TOKEN" if status in _REFUSED else f"try again later, or {_by_hand(want)}"
-    return f"{_endpoint()} answered {status}{said}; {way_out}"
+    return f"{_endpoint()} answered {status}{message}; {way_out}"
 
 
 def _unreachable(error: Any, want: Wanted) -> str:
@@ -244,9 +241,9 @@ def _unreachable(error: Any, want: Wanted) -> str:
 
 @contextmanager
 def _one_line(want: Wanted) -> Iterator[None]:
-    """Turn what the hub library raises into a ModelError of one line that names the way out."""
+    """Translate the hub library's exceptions to ModelError, one line that names the way out."""
     errors = extras.require("huggingface_hub.errors", "model")
-    # the hub library has changed its HTTP client twice, so the client's base error cannot be named by import
+    # the hub library has changed its HTTP client twice: the client's base error is found through the library
     client_error: Any = errors.HfHubHTTPError.__mro__[1]
     try:
         yield

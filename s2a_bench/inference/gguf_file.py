@@ -1,7 +1,7 @@
-"""Read a GGUF file's header, see whether the file is complete, and say what is in it, without reading the weights.
+"""Read a GGUF file's header, check that the file is complete, and describe its content, without reading the weights.
 
-llama.cpp notices a truncated language model, not a truncated mmproj, and its reasons go to a log; gguf-py takes
-7 s for a vocabulary of 300000, this a fraction of one. The layout is that of ggml's ``docs/gguf.md``, versions 2 and 3.
+llama.cpp detects a truncated language model, not a truncated mmproj, and logs its reasons; gguf-py takes 7 s for a
+vocabulary of 300000, this a fraction of one. The layout is that of ggml's ``docs/gguf.md``, versions 2 and 3.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import os
 import re
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,7 +27,7 @@ _SCALARS = {0: "<B", 1: "<b", 2: "<H", 3: "<h", 4: "<I", 5: "<i", 6: "<f", 7: "<
 _STRING, _ARRAY = 8, 9
 _MAX_DIMS = 4
 _MAX_FIELDS, _MAX_TENSORS, _MAX_STRINGS = 2**16, 2**20, 2**24
-"""Ten times what the largest models have; a damaged count must not be read for minutes."""
+"""Ten times the counts of the largest models; a damaged count must not be read for minutes."""
 
 _CONTROL = 3
 """``gguf.TokenType.CONTROL``."""
@@ -38,8 +38,7 @@ _MERGES = "tokenizer.ggml.merges"
 _SPECIAL = re.compile(r"tokenizer\.ggml\.(\w+)_token_id")
 _CHAT_TEMPLATE = "tokenizer.chat_template"
 _GENERAL = ("name", "basename", "size_label", "description", "license", "author", "organization", "version", "url")
-"""Keys below ``general.`` that are shown as they are; the others are shown in other words, or say nothing to people."""
-
+"""Keys below ``general.`` that are shown unchanged; other fields replace the rest."""
 
 Value: TypeAlias = str | int | float | bool
 
@@ -54,7 +53,7 @@ class TensorInfo(NamedTuple):
 
 
 class ArrayPlace(NamedTuple):
-    """Where an array lies in the file: the type of its items, how many there are, the offset of the first."""
+    """The type of an array's items, their number, and the offset of the first in the file."""
 
     kind: int
     length: int
@@ -63,12 +62,12 @@ class ArrayPlace(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class GgufHeader:
-    """What the header says: its scalar and string keys, where its arrays lie, and its tensors without their data."""
+    """A header: scalar and string fields, the places of arrays, and tensors without their data."""
 
     path: Path
     version: int
     nbytes: int
-    """Size of the whole file."""
+    """Size of the file."""
     fields: dict[str, Value]
     arrays: dict[str, ArrayPlace]
     tensors: tuple[TensorInfo, ...]
@@ -79,7 +78,7 @@ class GgufHeader:
 
     @property
     def is_mmproj(self) -> bool:
-        """Return whether this is a vision tower with its projector, and not a language model."""
+        """Whether this is a vision tower with its projector, and not a language model."""
         return self.architecture == "clip"
 
     @property
@@ -92,7 +91,7 @@ class GgufHeader:
 
 
 class _Cursor:
-    """A place in the mapped file; every read moves it."""
+    """A position in the mapped file; every read moves it."""
 
     __slots__ = ("at", "data")
 
@@ -132,7 +131,7 @@ class _Cursor:
 def read_header(path: Path, flag: str) -> GgufHeader:
     """Read the header of ``path`` and check that every tensor lies within the file.
 
-    Raises ModelError, which names ``flag``, where the file is missing, no GGUF, damaged or cut short.
+    Raises ModelError, which names ``flag``, if the file is missing, no GGUF, damaged or truncated.
     """
     with _mapped(path, flag) as data:
         if data[: len(MAGIC)] != MAGIC:
@@ -142,7 +141,7 @@ def read_header(path: Path, flag: str) -> GgufHeader:
 
 @contextmanager
 def _mapped(path: Path, flag: str) -> Iterator[mmap.mmap]:
-    """Map a file, and turn what reading it runs into into a ModelError."""
+    """Map a file, and translate errors of reading it to ModelError."""
     try:
         if path.is_fifo() or path.is_char_device():
             raise ModelError(f"{flag} {path}: not a GGUF file; give one that llama.cpp can load")
@@ -183,7 +182,7 @@ def _parse(path: Path, data: mmap.mmap, flag: str) -> GgufHeader:
 
 
 def _tensors(cursor: _Cursor, count: int) -> tuple[tuple[TensorInfo, ...], int]:
-    """Return the tensors, and the offset within the data at which the last of them ends."""
+    """Return the tensors, and the offset within the data of the last one's end."""
     sizes = extras.require("gguf.constants", "model").GGML_QUANT_SIZES
     tensors, last = [], 0
     for _ in range(count):
@@ -206,7 +205,7 @@ def _at_most(count: int, most: int) -> int:
 
 
 def read_array(header: GgufHeader, key: str, flag: str) -> list[Value]:
-    """Read one array of a file; empty where it has no such key. Raises ModelError, which names ``flag``."""
+    """Read one array of a file, empty if the key is absent. Raises ModelError, which names ``flag``."""
     place = header.arrays.get(key)
     if place is None:
         return []
@@ -224,7 +223,7 @@ Scalars: TypeAlias = dict[str, str | float | bool]
 
 @dataclass(frozen=True, slots=True)
 class TypeShare:
-    """How much of the file one tensor type takes."""
+    """The share of one tensor type in the file."""
 
     kind: str
     tensors: Count
@@ -245,7 +244,7 @@ class TensorGroup:
 
 @dataclass(frozen=True, slots=True)
 class SpecialToken:
-    """A token with a role, as the end of an answer."""
+    """A token with a role, for instance the end of an answer."""
 
     id: Count
     text: str
@@ -253,7 +252,7 @@ class SpecialToken:
 
 @dataclass(frozen=True, slots=True)
 class Vocabulary:
-    """How long the tokeniser's lists are, and which tokens are special, by their role."""
+    """The lengths of the tokeniser's lists, and the special tokens by their role."""
 
     tokens: Count
     merges: Count
@@ -263,7 +262,7 @@ class Vocabulary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GgufInfo:
-    """What is in a GGUF file."""
+    """The content of a GGUF file."""
 
     path: Path
     bytes: Count
@@ -288,8 +287,11 @@ class GgufInfo:
 def describe(path: Path, flag: str, sha256: Callable[[Path], str | None] = lambda _path: None) -> GgufInfo:
     """Read a language model's or an mmproj's header; raises ModelError, which names ``flag``, as `read_header` does."""
     header = read_header(path, flag)
-    fields = header.fields
-    own = f"{header.architecture}."
+    fields, prefix = header.fields, f"{header.architecture}."
+
+    def below(prefix: str, keys: Iterable[str]) -> Scalars:
+        return {key: _plain(fields[prefix + key]) for key in keys if prefix + key in fields}
+
     return GgufInfo(
         path=path,
         bytes=header.nbytes,
@@ -298,31 +300,27 @@ def describe(path: Path, flag: str, sha256: Callable[[Path], str | None] = lambd
         architecture=header.architecture,
         mmproj=header.is_mmproj,
         dummy=header.is_dummy,
-        general={key: _plain(fields[f"general.{key}"]) for key in _GENERAL if f"general.{key}" in fields},
+        general=below("general.", _GENERAL),
         file_type=_file_type(fields.get("general.file_type")),
         parameters=sum(math.prod(tensor.shape) for tensor in header.tensors),
         types=_types(header.tensors),
         groups=_groups(header.tensors),
-        settings={key.removeprefix(own): _plain(value) for key, value in fields.items() if key.startswith(own)},
-        tokenizer={
-            key: _plain(fields[f"tokenizer.ggml.{key}"])
-            for key in ("model", "pre")
-            if f"tokenizer.ggml.{key}" in fields
-        },
+        settings=below(prefix, [key.removeprefix(prefix) for key in fields if key.startswith(prefix)]),
+        tokenizer=below("tokenizer.ggml.", ("model", "pre")),
         vocabulary=_vocabulary(header, flag),
         chat_template=str(fields[_CHAT_TEMPLATE]) if _CHAT_TEMPLATE in fields else None,
     )
 
 
 def _plain(value: Value) -> Value:
-    """Write a float of single precision as it was meant (1e-06); what is no number becomes text, as JSON has none."""
+    """Round a float of single precision to its decimal form (1e-06); NaN and infinity become text, for JSON."""
     if not isinstance(value, float):
         return value
     return float(f"{value:.7g}") if math.isfinite(value) else str(value)
 
 
 def _file_type(number: Value | None) -> str | None:
-    """Name the mixture of types that the converter or ``llama-quantize`` was asked for."""
+    """Name the mixture of types that the converter or ``llama-quantize`` was started with."""
     kinds = extras.require("gguf.constants", "model").LlamaFileType
     names = {int(kind): kind.name.removeprefix("MOSTLY_").removeprefix("ALL_") for kind in kinds}
     return names.get(int(number)) if isinstance(number, int) else None
@@ -333,17 +331,17 @@ def _type_name(kind: int) -> str:
 
 
 def _types(tensors: Sequence[TensorInfo]) -> list[TypeShare]:
-    """Add up by type, the largest first."""
+    """Sum by type, the largest first."""
     shares = []
     for kind in {tensor.kind for tensor in tensors}:
-        own = [tensor for tensor in tensors if tensor.kind == kind]
-        parameters = sum(math.prod(tensor.shape) for tensor in own)
-        shares.append(TypeShare(_type_name(kind), len(own), parameters, sum(tensor.nbytes for tensor in own)))
+        members = [tensor for tensor in tensors if tensor.kind == kind]
+        parameters = sum(math.prod(tensor.shape) for tensor in members)
+        shares.append(TypeShare(_type_name(kind), len(members), parameters, sum(each.nbytes for each in members)))
     return sorted(shares, key=lambda share: (-share.bytes, share.kind))
 
 
 def _groups(tensors: Sequence[TensorInfo]) -> list[TensorGroup]:
-    """Put the same tensor of all layers together, in the file's order."""
+    """Group the same tensor of all layers, in the file's order."""
     members: dict[tuple[str, tuple[int, ...]], list[TensorInfo]] = {}
     for tensor in tensors:
         members.setdefault((re.sub(r"\.\d+\.", ".N.", tensor.name), tensor.shape[::-1]), []).append(tensor)
@@ -351,11 +349,11 @@ def _groups(tensors: Sequence[TensorInfo]) -> list[TensorGroup]:
         TensorGroup(
             name,
             list(shape),
-            [_type_name(kind) for kind, _ in Counter(tensor.kind for tensor in own).most_common()],
-            len(own),
-            sum(tensor.nbytes for tensor in own),
+            [_type_name(kind) for kind, _ in Counter(tensor.kind for tensor in group).most_common()],
+            len(group),
+            sum(tensor.nbytes for tensor in group),
         )
-        for (name, shape), own in members.items()
+        for (name, shape), group in members.items()
     ]
 
 

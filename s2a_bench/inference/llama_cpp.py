@@ -1,4 +1,4 @@
-"""llama.cpp as an engine: llama-cpp-python's MiniCPM-V 2.6 handler, given RGB pixels and read token by token."""
+"""llama.cpp as an engine: llama-cpp-python's MiniCPM-V 2.6 handler, with RGB pixels as input, token by token."""
 
 from __future__ import annotations
 
@@ -54,11 +54,11 @@ _URL = "s2a-bench:image/{:04d}/"
 _MS_NS = 1_000_000
 _DESCRIBED = ("gpu_layers", "context", "batch", "kv_type", "flash_attention", "sampling")
 _GRAMMARS = 64
-"""How many are remembered as checked: each can be a MiB."""
+"""Limit on cached results of checks: a grammar can be a MiB."""
 
 
 class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the library has no types
-    """A Llama that stops where the library's handler would start to generate, and keeps the evaluated prompt."""
+    """A Llama that keeps the evaluated prompt and leaves the generation of tokens to `TokenBatch`."""
 
     prompt: list[int]
 
@@ -68,7 +68,7 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
 
     @property
     def context_params(self) -> Any:
-        """The library's settings for llama.cpp, which know flash attention on and off only, with ours in them."""
+        """The library's settings for llama.cpp with this type of flash attention; it knows on and off only."""
         self._context_params.flash_attn_type = self._flash_attention
         return self._context_params
 
@@ -76,26 +76,23 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
     def context_params(self, params: Any) -> None:
         self._context_params = params
 
-    def sampler(self, name: str, grammar: str, wanted: Mapping[str, float]) -> TokenSampler:
-        """Build the library's chain of samplers, and let a grammar judge what comes out of it.
-
-        ``wanted`` replaces what ``name`` says.
-        """
-        if name == "greedy" and not grammar and not wanted:
+    def sampler(self, name: str, grammar: str, settings: Mapping[str, float]) -> TokenSampler:
+        """Build the sampling ``name``, with some ``settings`` replaced, as a chain of samplers under a grammar."""
+        if name == "greedy" and not grammar and not settings:
             return GreedySampler(self._n_vocab)
-        last_n = int(wanted.get(PENALTY_LAST_N, LAST_N))
+        last_n = int(settings.get(PENALTY_LAST_N, LAST_N))
         self.last_n_tokens_size = self.n_ctx() if last_n < 0 else last_n
-        told = {SAMPLER_ARGUMENTS[key]: value for key, value in wanted.items() if key in SAMPLER_ARGUMENTS}
-        chain: TokenSampler = self._init_sampler(**SAMPLINGS[name] | told)
+        arguments = {SAMPLER_ARGUMENTS[key]: value for key, value in settings.items() if key in SAMPLER_ARGUMENTS}
+        chain: TokenSampler = self._init_sampler(**SAMPLINGS[name] | arguments)
         return GrammarSampler(chain, self._model.vocab, grammar, self._candidates) if grammar else chain
 
     def eval(self, tokens: list[int]) -> None:
-        """Evaluate, and wait: a GPU's queue would otherwise be counted as the vision tower's time, or the reverse."""
+        """Evaluate, and wait: a GPU's queue would else count as the vision tower's time, or the reverse."""
         super().eval(tokens)
         llama_cpp.llama_synchronize(self.ctx)
 
     def create_completion(self, prompt: list[int], **_settings: Any) -> Iterator[Any]:
-        """Keep the prompt; the library's own loop joins tokens into characters and drops their indices."""
+        """Keep the prompt; the library's loop joins tokens into characters and drops their indices."""
         self.prompt = prompt
         return iter(())
 
@@ -103,10 +100,10 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
 class LlamaCppEngine(Engine):
     """A GGUF model on this machine. ``facts`` holds numbers of the last request, under llama-server's names.
 
-    ``prompt_n`` is what llama.cpp says it evaluated, pictures included; ``prompt_ms`` is the time from the request to
-    the first token's logits, of which ``preprocess_ms`` went before the model (slicing, resizing, tokenising),
-    ``vision_encode_ms`` into the vision tower and ``prompt_eval_ms`` into the language model. ``predicted_n`` tokens
-    took ``predicted_ms`` from there to the last, ``first_decode_ms`` of it from the first to the second.
+    ``prompt_n`` is llama.cpp's count of evaluated tokens, pictures included; ``prompt_ms`` is the time from the request
+    to the first token's logits, of which ``preprocess_ms`` passed before the model (slicing, resizing, tokenising),
+    ``vision_encode_ms`` in the vision tower and ``prompt_eval_ms`` in the language model. ``predicted_n`` tokens took
+    ``predicted_ms`` from there to the last, ``first_decode_ms`` of it from the first to the second.
     """
 
     def __init__(self, config: EngineConfig) -> None:
@@ -121,7 +118,7 @@ class LlamaCppEngine(Engine):
         self._config = config
         self._threads = config.threads or len(os.sched_getaffinity(0))
         self._turn = 0
-        self._grammar_errors: dict[str, str] = {}  # checked once each: an answer's grammar rarely changes
+        self._grammar_errors: dict[str, str] = {}  # a request's grammar rarely changes
         self._llama: _Prefilled | None = None
         llama_log.silence()
         llama_log.reason()
@@ -129,21 +126,18 @@ class LlamaCppEngine(Engine):
         self._llama = self._load(self._files)
         self._batch = TokenBatch()
 
-    @property
-    def facts(self) -> dict[str, float]:
-        return self._facts
-
     def _load(self, files: ModelFiles) -> _Prefilled:
+        config, kv_type = self._config, KV_TYPES[self._config.kv_type]
         try:
             llama = _Prefilled(
                 str(files.model.path),
-                n_ctx=self._config.context,
-                n_batch=self._config.batch,
-                n_ubatch=self._config.batch,
-                type_k=KV_TYPES[self._config.kv_type],
-                type_v=KV_TYPES[self._config.kv_type],
-                flash_attention=FLASH_ATTENTION[self._config.flash_attention],
-                n_gpu_layers=self._config.gpu_layers,
+                n_ctx=config.context,
+                n_batch=config.batch,
+                n_ubatch=config.batch,
+                type_k=kv_type,
+                type_v=kv_type,
+                flash_attention=FLASH_ATTENTION[config.flash_attention],
+                n_gpu_layers=config.gpu_layers,
                 n_threads=self._threads,
                 n_threads_batch=self._threads,
                 chat_handler=self._handler,
@@ -161,7 +155,7 @@ class LlamaCppEngine(Engine):
         return llama
 
     def generate(self, request: Request) -> Iterator[Token]:
-        """Yield one `Token` per token of the model; bytes of a character not yet complete come with its last token.
+        """Yield one `Token` per token of the model; the last token of a character carries all its bytes.
 
         Raises BadRequest for a bad grammar, pictures that are not ``rgb8``, and a request longer than the context.
         """
@@ -195,10 +189,10 @@ class LlamaCppEngine(Engine):
             for index in range(request.max_tokens):
                 if turn != self._turn:
                     raise EngineError("llama: a later request took over the engine; one request at a time")
-                asked_ns = now_ns()
+                started_ns = now_ns()
                 token = next(ids)
                 if index == 1:
-                    self._facts[FIRST_DECODE_MS] = (now_ns() - asked_ns) / _MS_NS
+                    self._facts[FIRST_DECODE_MS] = (now_ns() - started_ns) / _MS_NS
                 if not ignore_end and llama_cpp.llama_vocab_is_eog(llama._model.vocab, token):  # noqa: SLF001
                     return
                 text = decode(pieces[token], index + 1 == request.max_tokens)
@@ -212,7 +206,7 @@ class LlamaCppEngine(Engine):
                 self._facts[PREDICTED_MS] = (last_ns - prompt_done) / _MS_NS
 
     def _evaluate(self, llama: _Prefilled, request: Request) -> None:
-        """Run pictures and prompt through the model, on an empty KV cache, up to the first token's logits."""
+        """Evaluate pictures and prompt, on an empty KV cache, up to the first token's logits."""
         pictures = [{"type": "image_url", "image_url": _URL.format(index)} for index in range(len(request.images))]
         content = [*pictures, {"type": "text", "text": request.prompt}]
         self._handler.frames = request.images
@@ -237,7 +231,7 @@ class LlamaCppEngine(Engine):
         )
 
     def _check(self, llama: _Prefilled, request: Request) -> None:
-        """Refuse what llama.cpp would not survive: pictures that are not what they say, grammars it cannot read."""
+        """Refuse requests that would crash llama.cpp: pictures of another size than declared, damaged grammars."""
         for frame in request.images:
             if frame.encoding != "rgb8":
                 raise BadRequest(f"llama: request {request.id} has a {frame.encoding} picture; engines take rgb8")
@@ -256,7 +250,7 @@ class LlamaCppEngine(Engine):
             raise BadRequest(f"llama: the grammar of request {request.id} is not valid GBNF: {wrong}")
 
     def describe(self) -> dict[str, str | int | float | bool]:
-        """Return what answers; the first call hashes the files, which takes seconds for gigabytes."""
+        """Describe the model; the first call hashes the files, which takes seconds for gigabytes."""
         model, mmproj = self._files.model, self._files.mmproj
         facts: dict[str, str | int | float | bool] = {
             "engine": "llama",
@@ -285,7 +279,6 @@ class LlamaCppEngine(Engine):
         return facts
 
     def close(self) -> None:
-        """Free the model; may be called twice."""
         self._turn += 1
         if self._llama is not None:
             self._llama.close()

@@ -1,7 +1,7 @@
-"""How an answer is written token by token, with little between two calls of ``llama_decode``; and its grammar.
+"""Decode an answer token by token, with little work between two calls of ``llama_decode``; and check its grammar.
 
-llama-cpp-python's own loop (``Llama.generate``) trims the KV cache, fills a batch and copies tokens for every one; with
-a small model that is a tenth of the time.
+llama-cpp-python's loop (``Llama.generate``) trims the KV cache, fills a batch and copies tokens for every one; with a
+small model that is a tenth of the time.
 """
 
 from __future__ import annotations
@@ -24,33 +24,32 @@ from s2a_bench.inference import llama_log
 llama_cpp = extras.require("llama_cpp", "llama")
 bindings = llama_cpp.llama_cpp
 
-_logits_address = bindings._lib["llama_get_logits_ith"]  # noqa: SLF001 a function object of our own: a plain address
+_logits_address = bindings._lib["llama_get_logits_ith"]  # noqa: SLF001 a separate function object: a plain address
 _logits_address.argtypes = [ctypes.c_void_p, ctypes.c_int32]
 _logits_address.restype = ctypes.c_void_p
 
-
 _PIECE_BYTES = 1024
-
-
 _STDERR = 2
 GRAMMAR_BYTES = 1 << 20
 DEPTH = 200
-"""Of parentheses in each other."""
+"""Limit of nested parentheses."""
 RULES = 5_000
 """llama.cpp also recurses along rules that name each other."""
 REPETITIONS = 10_000
-"""Of braces in each other, multiplied: llama.cpp writes out what is repeated."""
+"""Limit of nested braces, multiplied: llama.cpp expands repetitions."""
 
 _DIGITS = 6
 _LEXEME = re.compile(r'"(?:\\.|[^"\\])*"?|\[(?:\\.|[^\]\\])*\]?|#[^\n]*|\{([^}]*)\}?|[()]', re.DOTALL)
-"""What is left open goes on to the end, so that no text is read twice."""
+"""An open text or bracket extends to the end, so that nothing is read twice."""
 
 
 class TokenBytes(dict[int, bytes]):
-    """The bytes of each token written so far; the library's `detokenize` cuts at 32. Special tokens have none."""
+    """The bytes of each token; the library's `detokenize` truncates at 32. Special tokens have none.
+
+    llama.cpp's ``vocab`` must live as long.
+    """
 
     def __init__(self, vocab: Any) -> None:
-        """Look tokens up in llama.cpp's ``vocab``, which must live as long."""
         self._vocab = vocab
         self._piece = ctypes.create_string_buffer(_PIECE_BYTES)
 
@@ -65,14 +64,13 @@ class TokenSampler(Protocol):
 
     def sample(self, ctx: Any, idx: int = -1) -> int:
         """Return the token that follows output ``idx`` of the library's context."""
-        ...
 
 
 class GreedySampler:
-    """Takes the likeliest token, the first of equals, from the logits where they lie.
+    """Takes the likeliest token, the first of equals, from llama.cpp's buffer of logits.
 
-    llama.cpp's greedy sampler gives the same, after it has written the vocabulary down as candidates: 160 us against
-    10 with Qwen2's 151666 on the machine this was written on.
+    llama.cpp's greedy sampler returns the same after copying the vocabulary to a list of candidates: 160 us against
+    10 with Qwen2's 151666 tokens on the development machine.
     """
 
     def __init__(self, n_vocab: int) -> None:
@@ -81,8 +79,7 @@ class GreedySampler:
         self._logits: NDArray[np.float32] = np.zeros(0, np.float32)
 
     def sample(self, ctx: Any, idx: int = -1) -> int:
-        """Return the index of the largest logit; waits for the device to have computed it."""
-        address = _logits_address(ctx.ctx, idx)
+        address = _logits_address(ctx.ctx, idx)  # waits for the device
         if address != self._address:  # llama.cpp moves its buffer only when it needs a larger one
             if not address:
                 raise RuntimeError("there are no logits")
@@ -102,9 +99,9 @@ class TokenBatch:
         self._batch.logits[0] = 1
 
     def answer(self, ctx: Any, sampler: TokenSampler, position: int) -> Iterator[int]:
-        """Yield tokens for ever, the first from the logits that are there; ``position`` is the prompt's length.
+        """Yield tokens without end, the first from the present logits; ``position`` is the prompt's length.
 
-        Raises RuntimeError where llama.cpp cannot decode.
+        Raises RuntimeError if llama.cpp cannot decode.
         """
         batch, handle = self._batch, ctx.ctx
         tokens, positions, decode = batch.token, batch.pos, bindings.llama_decode
@@ -124,26 +121,22 @@ class TokenBatch:
             self._batch = None
 
 
-llama_cpp = extras.require("llama_cpp", "llama")
-
-
 class GrammarSampler:
-    """Stands in for the library's `LlamaSampler` where a request has a grammar, as llama-server applies it.
+    """Samples from ``chain``, the library's `LlamaSampler`, under a grammar, as llama-server applies it.
 
-    llama-cpp-python puts a grammar at the head of its chain of samplers, where it judges every token of the vocabulary:
-    9 ms a token with Qwen2's 151666 on the machine this was written on. llama.cpp's own programs ask it about the token
-    that was sampled, and about all only where it refuses that one (``common/sampling.cpp``); so does this.
+    llama-cpp-python puts a grammar at the head of its chain of samplers, where it checks every token of the vocabulary:
+    9 ms a token with Qwen2's 151666 on the development machine. llama.cpp's programs check the sampled token first, and
+    all tokens only if the grammar refuses that one (``common/sampling.cpp``); so does this. ``candidates`` is scratch
+    space for the vocabulary.
     """
 
     def __init__(self, chain: Any, vocab: Any, grammar: str, candidates: Any) -> None:
-        """Sample from ``chain``, a sampler without grammar; ``candidates`` is scratch space for the vocabulary."""
         self._chain = chain
         self._grammar = llama_cpp.llama_sampler_init_grammar(vocab, grammar.encode(), b"root")
         self._candidates = candidates
         weakref.finalize(self, llama_cpp.llama_sampler_free, self._grammar)
 
     def sample(self, ctx: Any, idx: int = -1) -> int:
-        """Return a token that the grammar allows, and move the grammar on."""
         token = self._chain.sample(ctx, idx)
         if not self._allows(token):
             token = self._among_allowed(ctx, idx)
@@ -167,9 +160,9 @@ class GrammarSampler:
 
 
 def grammar_error(vocab: Any, grammar: str) -> str:
-    """Return what is wrong with a GBNF grammar, "" if nothing is.
+    """Return the error of a GBNF grammar, or "".
 
-    llama.cpp's parser writes to stderr directly, so that is redirected for the moment, for the whole process.
+    llama.cpp's parser writes to stderr, which is therefore redirected meanwhile, for the whole process.
     """
     llama_log.reason()
     with tempfile.TemporaryFile() as file:
@@ -181,28 +174,28 @@ def grammar_error(vocab: Any, grammar: str) -> str:
             os.dup2(saved, _STDERR)
             os.close(saved)
         file.seek(0)
-        said = file.read().decode(errors="replace").strip().splitlines()
+        lines = file.read().decode(errors="replace").strip().splitlines()
     if sampler:
         llama_cpp.llama_sampler_free(sampler)
         return ""
     logged = llama_log.reason()
-    return re.sub(r"^[a-z_]+: (error parsing grammar: )?", "", said[0]) if said else logged or "llama.cpp refuses it"
+    return re.sub(r"^[a-z_]+: (error parsing grammar: )?", "", lines[0]) if lines else logged or "llama.cpp refuses it"
 
 
 def beyond_limits(grammar: str) -> str:
-    """Return by what a grammar is beyond what llama.cpp's recursive parser survives; "" if it is not."""
+    """Return the limit beyond which a grammar would crash llama.cpp's recursive parser, or ""."""
     if len(grammar) > GRAMMAR_BYTES or len(grammar.encode(errors="replace")) > GRAMMAR_BYTES:
         return f"it is longer than {GRAMMAR_BYTES} bytes"
     if "\0" in grammar:
         return "it has a NUL"
     if grammar.count("::=") > RULES:
         return f"it has more than {RULES} rules"
-    repeated, last = [1], 1  # the most that anything is repeated in each open parenthesis, and the last thing was
+    repeated, last = [1], 1  # the most repetitions in each open parenthesis, and those of the last lexeme
     for lexeme in _LEXEME.finditer(grammar):
-        said, times = lexeme[0], 1
-        if said == "(":
+        text, times = lexeme[0], 1
+        if text == "(":
             repeated.append(1)
-        elif said == ")" and len(repeated) > 1:
+        elif text == ")" and len(repeated) > 1:
             times = repeated.pop()
         elif lexeme[1] is not None:
             times = last * _most(lexeme[1])

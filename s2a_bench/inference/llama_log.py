@@ -1,4 +1,4 @@
-"""Keep llama.cpp quiet: its messages go to memory, where errors find their reason, not to stderr."""
+"""Keep llama.cpp's log in memory, for the reasons of errors, instead of on stderr."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ llama_cpp = extras.require("llama_cpp", "llama")
 mtmd_cpp = extras.require("llama_cpp.mtmd_cpp", "llama")
 
 VARIABLE = "S2A_BENCH_LLAMA_LOG"
-"""Set to 1, llama.cpp writes to stderr as usual."""
+"""If it is 1, llama.cpp writes to stderr."""
 
 _ERROR = 4  # GGML_LOG_LEVEL_ERROR of ggml.h; the bindings' own list is out of date
 _lines: deque[str] = deque(maxlen=20)
@@ -29,12 +29,12 @@ _callback = llama_cpp.llama_log_callback(_keep)  # must outlive the library's us
 
 
 def verbose() -> bool:
-    """Return whether the user wants llama.cpp's log."""
+    """Return True if the user wants llama.cpp's log."""
     return os.environ.get(VARIABLE) == "1"
 
 
 def silence() -> None:
-    """Send the log of llama.cpp, ggml and MTMD to memory, unless the user wants to see it."""
+    """Keep the log of llama.cpp, ggml and MTMD in memory, unless it is `verbose`."""
     if verbose():
         return
     nothing = ctypes.c_void_p(0)

@@ -1,4 +1,4 @@
-"""Pictures on their way into llama.cpp: llama-cpp-python's MiniCPM-V 2.6 handler, given RGB pixels."""
+"""Pictures for llama.cpp: llama-cpp-python's MiniCPM-V 2.6 handler with RGB pixels as input."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _NO_CALLBACK = mtmd_cpp.mtmd_helper_post_decode_callback()
 
 
 class Steps:
-    """MTMD's bindings, except that what the library's handler does in one call is done and timed step by step.
+    """MTMD's bindings, except that a call of the library's handler is split into steps, each timed.
 
-    ``prepared_ns`` is when the last prompt was tokens and its pictures slices, ready for the model; ``encode_ns`` is
-    what the vision tower took for them so far.
+    ``prepared_ns`` is the time at which the last prompt was tokenised and its pictures sliced; ``encode_ns`` is the
+    vision tower's time for them so far.
     """
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class Steps:
         return getattr(mtmd_cpp, name)
 
     def mtmd_tokenize(self, *arguments: Any) -> int:
-        """Slice, resize and tokenise: all that comes before the model."""
+        """Slice, resize and tokenise: all work before the model."""
         failed: int = mtmd_cpp.mtmd_tokenize(*arguments)
         self.prepared_ns, self.encode_ns = now_ns(), 0
         return failed
@@ -42,15 +42,15 @@ class Steps:
     def mtmd_helper_eval_chunk_single(
         self, mtmd: Any, llama: Any, chunk: Any, n_past: Any, sequence: Any, n_batch: int, _last: bool, past: Any
     ) -> int:
-        """Run a slice through the vision tower, then through the language model, and wait for each."""
+        """Evaluate a slice in the vision tower, then in the language model, and wait for each."""
         started_ns = now_ns()
         failed: int = mtmd_cpp.mtmd_encode_chunk(mtmd, chunk)
         self.encode_ns += now_ns() - started_ns
         if failed:
             return failed
-        made = mtmd_cpp.mtmd_get_output_embd(mtmd)
+        embedding = mtmd_cpp.mtmd_get_output_embd(mtmd)
         failed = mtmd_cpp.mtmd_helper_decode_image_chunk(
-            mtmd, llama, chunk, made, n_past, sequence, n_batch, past, _NO_CALLBACK, None
+            mtmd, llama, chunk, embedding, n_past, sequence, n_batch, past, _NO_CALLBACK, None
         )
         llama_cpp.llama_synchronize(llama)
         return failed
@@ -60,7 +60,7 @@ class PixelHandler(chat_format.MiniCPMv26ChatHandler):  # type: ignore[misc, nam
     """The library's handler, except that a picture is an RGB array and not the bytes of a JPEG."""
 
     def __init__(self, mmproj: str, *, use_gpu: bool) -> None:
-        """Prepare; the vision tower is loaded with the model that it belongs to."""
+        """Prepare; `_init_mtmd_context` loads the vision tower."""
         super().__init__(clip_model_path=mmproj, verbose=False)
         self._mtmd_cpp = self.steps = Steps()
         self.mtmd_ctx: Any = None
@@ -80,7 +80,7 @@ class PixelHandler(chat_format.MiniCPMv26ChatHandler):  # type: ignore[misc, nam
         self.mtmd_ctx = mtmd.mtmd_init_from_file(self.clip_model_path.encode(), llama_model.model, params)
         if self.mtmd_ctx is None:
             raise ValueError(llama_log.reason() or "MTMD cannot load it")
-        llama_model._stack.callback(self._free)  # noqa: SLF001 the library's own way to tie the two together
+        llama_model._stack.callback(self._free)  # noqa: SLF001 as the library does
 
     def _free(self) -> None:
         self._mtmd_cpp.mtmd_free(self.mtmd_ctx)

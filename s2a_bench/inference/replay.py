@@ -1,7 +1,7 @@
-"""An engine that plays a hardware profile: tokens come when that board would have sent them. Emulated, never measured.
+"""An engine that plays a hardware profile: its tokens arrive at that board's times. Emulated, never measured.
 
-The first token comes ``prompt_s`` (with its spread) and one mean gap after the request, the others at the gaps that
-``--gaps`` names. Every token has an absolute deadline, so that late wake-ups do not add up to another rate.
+The first token arrives ``prompt_s`` (with its spread) and one mean gap after the request, the others at the gaps that
+``--gaps`` names. Every token has an absolute deadline, so that late wake-ups do not change the rate.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
     import numpy as np
 
 Draw: TypeAlias = "Callable[[np.random.Generator, int, int], list[float]]"
-"""Called with random numbers, how many gaps, and how many gaps were played before: gaps in s."""
+"""(generator, number of gaps, number of gaps played before) -> gaps in s."""
 
 _PLACES = ("kitchen", "table", "shelf", "sofa")
 _OBJECTS = ("cup", "box", "bottle", "jar")
 _ARGUMENTS = {"go_to": _PLACES, "open": _OBJECTS, "close": _OBJECTS, "pick": _OBJECTS}
-"""Skills of the household set with one argument, so that its parser understands what is said here."""
+"""Skills of the household set with one argument, so that its parser accepts the plans."""
 
 
 def _trace(profile: Profile) -> Draw:
@@ -65,10 +65,10 @@ def _settings(config: EngineConfig) -> tuple[Profile, str, Draw]:
 
 
 class ReplayEngine(Engine):
-    """Says numbered skill calls of six tokens each, or actions, at a profile's speed; the rest is ignored.
+    """Writes numbered skill calls of six tokens each, or actions, at a profile's speed; ignores the rest.
 
-    Text depends on ``request.seed`` alone. Times are drawn from the seed and the number of requests before, as equal
-    times for all requests of a run would hide the spread; a recording goes on where the request before ended.
+    Text depends on ``request.seed`` alone. Times are drawn from the seed and the number of earlier requests, as equal
+    times for all requests of a run would hide the spread; a recording continues where the last request ended.
     """
 
     declared_facts = (PROMPT_MS, PREDICTED_N, PREDICTED_MS)
@@ -79,11 +79,9 @@ class ReplayEngine(Engine):
 
     @classmethod
     def check(cls, config: EngineConfig) -> None:
-        """Raise UsageError where the profile and --gaps do not go together, or the profile is not there."""
         _settings(config)
 
     def __init__(self, config: EngineConfig, clock: Clock | None = None) -> None:
-        """Load the profile; raises UsageError for what `check` refuses."""
         self._facts: dict[str, float] = {}
         self._profile, self._gaps, self._draw = _settings(config)
         self._config = config
@@ -92,12 +90,7 @@ class ReplayEngine(Engine):
         self._played = 0
         self._closed = False
 
-    @property
-    def facts(self) -> dict[str, float]:
-        return self._facts
-
     def generate(self, request: Request) -> Iterator[Piece]:
-        """Yield pieces, each at the time of a token, until ``max_tokens``."""
         if self._closed:
             raise EngineError("replay: the engine is closed; open a new one")
         if request.max_tokens <= 0:
@@ -119,7 +112,7 @@ class ReplayEngine(Engine):
             yield piece
 
     def _gaps_s(self, rng: np.random.Generator, prompt_s: float, pieces: int) -> Iterator[float]:
-        """Yield the time to the first piece, and the gaps, all drawn together when the second is asked for."""
+        """Yield the time to the first piece, then the gaps, all drawn together when the second is needed."""
         yield prompt_s + self._profile.gaps.mean_s
         yield from self._draw(rng, pieces - 1, self._played)
 
@@ -135,12 +128,11 @@ class ReplayEngine(Engine):
         return float(Lognormal(profile.prompt_s, profile.prompt_cv).sample(rng, 1, 1)[0, 0])
 
     def describe(self) -> dict[str, str | int | float | bool]:
-        """Return which profile is played and how; ``dummy`` is that of the recorded model."""
         profile = self._profile
         return {
             "engine": "replay",
             "emulated": True,
-            "dummy": profile.dummy,
+            "dummy": profile.dummy,  # of the recorded model
             "profile": profile.name,
             "title": profile.title,
             "origin": profile.origin,

@@ -7,9 +7,9 @@ import pytest
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import dummy
 from s2a_bench.inference.dummy import (
-    CHUNK_BYTES,
     FULL_UNKNOWN,
     KINDS,
+    PART_BYTES,
     DummyFiles,
     Kind,
     Tensor,
@@ -39,7 +39,7 @@ def test_the_numbers_are_those_of_this_revision() -> None:
     shape, digest = dummy.SHAPES["tiny"], hashlib.sha256()
     for tensor in (*dummy._model_tensors(shape, 281, "f16"), *dummy._mmproj_tensors(shape)):
         digest.update(tensor.name.encode())
-        for chunk in tensor.chunks(0):
+        for chunk in tensor.parts(0):
             digest.update(chunk)
     assert digest.hexdigest()[:16] == "95728bf57f26e584"
 
@@ -120,9 +120,9 @@ def test_the_byte_alphabet_is_gpt_2s() -> None:
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_a_tensor_has_as_many_bytes_as_it_says_however_it_is_cut(kind: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.inference.dummy.CHUNK_BYTES", 1000)
+    monkeypatch.setattr("s2a_bench.inference.dummy.PART_BYTES", 1000)
     tensor = Tensor("t", (6, 512), kind)
-    assert sum(chunk.nbytes for chunk in tensor.chunks(0)) == tensor.nbytes
+    assert sum(chunk.nbytes for chunk in tensor.parts(0)) == tensor.nbytes
     assert tensor.nbytes == 6 * 512 // KINDS[kind][0] * KINDS[kind][1]
 
 
@@ -130,7 +130,7 @@ def test_the_largest_tensors_come_in_small_pieces() -> None:
     # the full model is written with about 0.13 GB of memory because of this
     for tensor in dummy._model_tensors(dummy.SHAPES["full"], 151_666, "f16"):
         if tensor.nbytes > 1e9:
-            assert next(tensor.chunks(0)).nbytes <= CHUNK_BYTES == 1 << 24
+            assert next(tensor.parts(0)).nbytes <= PART_BYTES == 1 << 24
             break
     else:
         pytest.fail("no tensor above 1 GB: the full model should have two")

@@ -99,7 +99,7 @@ def test_each_answer_tells_its_latency() -> None:
 def test_an_echo_that_answers_at_once_tells_and_emulates_nothing() -> None:
     engine, clock = echo("")
     assert times_ns(engine, clock) == [0, 0, 0]
-    assert (engine.facts, EchoEngine.told(EngineConfig(name="echo"))) == ({}, ())
+    assert (engine.facts, EchoEngine.facts_for(EngineConfig(name="echo"))) == ({}, ())
     assert "emulated" not in engine.describe()
     engine, _ = echo("80")
     assert (engine.describe()["emulated"], engine.describe()["latency"]) == (True, "80")
@@ -110,7 +110,7 @@ def test_an_echo_that_answers_at_once_tells_and_emulates_nothing() -> None:
     [
         ({"name": "llama", "latency": "80"}, "`latency` needs `engine` echo; `engine` llama answers at its own speed"),
         ({"name": "replay", "latency": "80"}, "`latency` needs `engine` echo"),
-        ({"name": "echo", "latency": "80", "pace": 5}, "`pace`: with `latency` the whole answer comes at once"),
+        ({"name": "echo", "latency": "80", "pace": 5}, "`pace`: with `latency` the whole answer arrives at once"),
         ({"name": "echo", "latency": "fast"}, "`latency`: 'fast' should be a number of ms, a family, or a .csv file"),
         ({"name": "echo", "latency": "-1"}, "`latency`: -1 should be between 0"),
         ({"name": "echo", "latency": "normal:mean_ms=80"}, "`latency`: 'normal' is none of the families"),
