@@ -1,1 +1,1 @@
-"""Hardware profiles: what a board is, its file, where files are found; the families of its gaps, and fitting."""
+"""Hardware profiles: boards, their files and where they are found; families of gaps between tokens, and fitting."""

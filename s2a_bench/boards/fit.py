@@ -1,8 +1,8 @@
-"""Which family of `jitter` describes recorded gaps: each is fitted to one half and judged on the other.
+"""Choose the family of `gaps` that describes recorded gaps: each is fitted to one half and compared with the other.
 
-The distance is Kolmogorov and Smirnov's, of single gaps and of sums over a skill's tokens, whichever is larger: the
-sums tell pauses that come together from pauses that come alone. A family with fewer parameters is taken unless a
-richer one is nearer by more than the noise of a sample of this size.
+The distance is Kolmogorov and Smirnov's, of single gaps and of sums over a skill's tokens, whichever is larger: only
+the sums distinguish grouped pauses from single ones. A family with fewer parameters is chosen unless a richer one is
+nearer by more than the noise of a sample of this size.
 """
 
 from __future__ import annotations
@@ -30,14 +30,13 @@ _LEAST_GAPS = 40
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """The family that was chosen, fitted to all gaps, and how far each was from gaps it had not seen."""
+    """The chosen family, fitted to all gaps, and each family's distance from the half it was not fitted to."""
 
     gaps: Gaps
     family: str
     distances: dict[str, tuple[float, float]]
-    """Family -> that of single gaps, that of sums over a skill."""
+    """Family -> (of single gaps, of sums over a skill)."""
     lag1: float
-    """Correlation of a gap with the next, within requests."""
 
 
 def fit_gaps(rows: Rows) -> Fit:
@@ -56,14 +55,14 @@ def fit_gaps(rows: Rows) -> Fit:
 
 
 def lag1(rows: Rows) -> float:
-    """Return the correlation of a gap with the next within requests; 0 where gaps do not vary."""
+    """Return the correlation of a gap with the next within requests; 0 if gaps do not vary."""
     centred = [np.asarray(row) - np.mean(row) for row in rows if len(row) > 1]
     power = sum(float(row @ row) for row in centred)
     return sum(float(row[1:] @ row[:-1]) for row in centred) / power if power else 0.0
 
 
 def fit_lognormal(rows: Rows) -> Lognormal:
-    """Fit by maximum likelihood, the mean being that of the gaps."""
+    """Fit by maximum likelihood, with the mean of the gaps."""
     gaps = _flat(rows)
     mean = float(gaps.mean())
     square = float(np.mean(np.log(gaps / mean) ** 2))
@@ -72,7 +71,7 @@ def fit_lognormal(rows: Rows) -> Lognormal:
 
 
 def fit_markov(rows: Rows) -> Markov:
-    """Fit two lognormal states by expectation maximisation, then how long pauses last from how states follow."""
+    """Fit two lognormal states by expectation maximisation, then the length of pauses by the sequence of states."""
     logs = np.log(_flat(rows))
     low, high = np.quantile(logs, (0.5, 0.99))
     share, variance = 0.05, max(float(logs.var()) / 4, 1e-9)
@@ -103,7 +102,7 @@ def fit_markov(rows: Rows) -> Markov:
 def fit_quantiles(rows: Rows) -> Quantiles:
     """Take the gaps' quantiles in steps of 2 %, in smaller ones where lines miss the gaps' sum most, as at pauses.
 
-    What still misses goes into the largest, so that keeping the mean does not move the body.
+    The rest of the sum is added to the largest quantile, so that the right mean does not move the body.
     """
     gaps = np.sort(_flat(rows))
     last = len(gaps) - 1
@@ -126,11 +125,11 @@ FITS: dict[str, Callable[[Rows], Gaps]] = {
     "markov": fit_markov,
     "quantiles": fit_quantiles,
 }
-"""Family -> how it is fitted, the one with the fewest parameters first."""
+"""Family -> its fit, the one with the fewest parameters first."""
 
 
 def _distances(gaps: Gaps, rows: Rows) -> tuple[float, float]:
-    """Return the distance of single gaps and that of sums over a skill; 0 where no request is that long."""
+    """Return the distance of single gaps and that of sums over a skill, 0 if no request is that long."""
     from scipy.stats import ks_2samp
 
     drawn = gaps.sample(np.random.default_rng(0), SKILL_TOKENS, _DRAWS)

@@ -1,7 +1,7 @@
 """Gaps between tokens: families of random gaps that profiles, the replay engine and the policy studies share.
 
-A gap is the time from one token to the next, in seconds. Every family is scaled to its mean, so that a rate stays a
-rate whatever the jitter. A family is a row of FAMILIES; `from_table` and `to_table` are its form in a profile.
+A gap is the time from one token to the next, in seconds. Every family is scaled to its mean, so that jitter does not
+change the rate. A family is a row of FAMILIES; `from_table` and `to_table` are its form in a profile.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class Gaps(Protocol):
 
 @dataclass(frozen=True, slots=True, config=STRICT)
 class Constant:
-    """No jitter."""
+    """No jitter; a mean of 0 is an answer at once."""
 
-    mean_s: Mean
+    mean_s: Number
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:  # noqa: ARG002 - nothing is random
         import numpy as np
@@ -65,7 +65,7 @@ class Lognormal:
 
 @dataclass(frozen=True, slots=True, config=STRICT)
 class Markov:
-    """Two states, normal and pause, each with lognormal gaps: a machine that is sometimes kept from working.
+    """Two states, normal and pause, each with lognormal gaps: a machine with interruptions.
 
     A token's gap keeps the state of the gap before it or draws a new one, so that a stretch starts stationary and the
     correlation of states falls geometrically.
@@ -77,9 +77,9 @@ class Markov:
     pause_share: Annotated[float, Field(ge=0, le=0.999)]
     """Share of the tokens whose gap is a pause."""
     pause_ratio: Number
-    """Mean gap of a pause over the mean normal gap."""
+    """Mean gap of a pause / mean normal gap."""
     pause_tokens: Number
-    """Mean number of gaps that pauses last for; 1 / (1 - pause_share), its least, means independent gaps."""
+    """Mean length of pauses in gaps; the least, 1 / (1 - pause_share), means independent gaps."""
 
     def __post_init__(self) -> None:
         if self.pause_tokens < (least := 1 / (1 - self.pause_share)):
@@ -105,7 +105,7 @@ class Markov:
 
 @dataclass(frozen=True, slots=True, config=STRICT)
 class Bursty:
-    """Tokens that travel together, as through a network or proxy that batches: one long gap, then short ones.
+    """Tokens that arrive together, as through a network or proxy that batches: one long gap, then short ones.
 
     A stretch starts anywhere within a burst.
     """
@@ -116,7 +116,7 @@ class Bursty:
     burst_tokens: Annotated[int, Field(ge=1)]
     """Tokens a burst."""
     within: Annotated[float, Field(ge=0, le=1)]
-    """Mean gap inside a burst over the mean of all gaps."""
+    """Mean gap inside a burst / mean of all gaps."""
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
         import numpy as np
@@ -151,7 +151,6 @@ class Quantiles:
             raise UsageError("values: should be finite, none negative, not all 0")
 
     def quantiles_s(self) -> Floats:
-        """Return the quantiles at ``levels`` in s."""
         import numpy as np
 
         values = np.asarray(self.values, dtype=np.float64)
@@ -166,7 +165,7 @@ class Quantiles:
 
 @dataclass(frozen=True, slots=True, config=STRICT)
 class Recorded:
-    """A recording, played from a random place in each stretch and from its start again at its end."""
+    """A recording, played from a random place in each stretch; after its end it starts again."""
 
     mean_s: Mean
     trace: Numbers
@@ -181,11 +180,10 @@ class Recorded:
         return Recorded(_mean(trace_s), trace_s)
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
-        """Cut stretches out of the recording, each from a random place."""
         return self._at(rng.integers(len(self.trace), size=plans), tokens)
 
     def in_order(self, tokens: int, start: int = 0) -> Floats:
-        """Return the gaps from number ``start`` on, of shape (tokens,): one plan after another, exactly as recorded."""
+        """Return the gaps from number ``start`` on, of shape (tokens,), as recorded."""
         import numpy as np
 
         return self._at(np.array([start]), tokens)[:, 0]
@@ -209,9 +207,9 @@ FAMILIES: dict[str, type[Constant | Lognormal | Markov | Bursty | Quantiles | Re
 
 
 def from_table(table: Mapping[str, Any], mean_s: float) -> Gaps:
-    """Make gaps from a TOML table: ``family`` and that family's parameters, all of them, but for the mean.
+    """Make gaps from a TOML table: ``family`` and all of that family's parameters except the mean.
 
-    Raises UsageError, naming the key, for a family or key that there is not and a value of the wrong type or size.
+    Raises UsageError, naming the key, for an unknown family or key and a value of the wrong type or size.
     """
     name = table.get("family")
     if not isinstance(name, str) or name not in FAMILIES:
@@ -232,25 +230,23 @@ def read_family(written: str, field: str) -> dict[str, str | int | float]:
     """Read ``FAMILY:key=number,...`` as a table; raises UsageError naming the ``field``."""
     family, _, rest = written.partition(":")
     table: dict[str, str | int | float] = {"family": family}
-    for part in filter(None, rest.split(",")):
-        key, _, value = part.partition("=")
+    for pair in filter(None, rest.split(",")):
+        key, _, value = pair.partition("=")
         try:
             number = float(value)
         except ValueError:
-            wanted = f"'{part}' should be key=number, as in lognormal:cv=0.5"
-            raise UsageError(f"`{field}`: {written}: {wanted}") from None
+            form = f"'{pair}' should be key=number, as in lognormal:cv=0.5"
+            raise UsageError(f"`{field}`: {written}: {form}") from None
         table[key.strip()] = int(number) if number.is_integer() else number
     return table
 
 
 def to_table(gaps: Gaps) -> dict[str, Any]:
-    """Return the table that `from_table` reads; the mean is not part of it."""
-    names = {family: name for name, family in FAMILIES.items()}
+    """Return the table that `from_table` reads, which has no mean."""
     family: Any = type(gaps)
+    name = next(name for name, each in FAMILIES.items() if each is family)
     values = {field.name: getattr(gaps, field.name) for field in fields(family) if field.name != "mean_s"}
-    return {"family": names[family]} | {
-        key: list(value) if isinstance(value, tuple) else value for key, value in values.items()
-    }
+    return {"family": name} | {key: list(each) if isinstance(each, tuple) else each for key, each in values.items()}
 
 
 def _mean(values: tuple[float, ...]) -> float:
@@ -258,11 +254,10 @@ def _mean(values: tuple[float, ...]) -> float:
 
 
 def _lognormal(rng: np.random.Generator, mean_s: float, cv: float, shape: tuple[int, int]) -> Floats:
-    """Draw lognormal values of a mean and a coefficient of variation."""
     import numpy as np
 
     variance = np.log1p(cv**2)
-    gaps = rng.standard_normal(shape)  # and in place: a third faster than rng.lognormal, whose values these are
+    gaps = rng.standard_normal(shape)  # then in place: the values of rng.lognormal, a third faster
     gaps *= np.sqrt(variance)
     gaps += np.log(mean_s) - variance / 2
     return np.exp(gaps, out=gaps)

@@ -1,9 +1,8 @@
-"""Latencies as people write them: a number of ms, a family of random ones, a CSV file.
+"""Latencies as users write them: a number of ms, a family of random ones, a CSV file.
 
-A family is one of `boards.gaps.FAMILIES`, written ``FAMILY:mean_ms=80,key=value,...``; ``bimodal`` is `markov` whose
-pauses come alone. Successive values of a family that remembers (markov, bursty) follow one another. A CSV file has
-the columns ``observation_ns`` and ``received_ns``, or one of ``latency_ns``, ``latency_ms`` and ``latency_s``; others
-are passed over.
+A family is one of `boards.gaps.FAMILIES`, written ``FAMILY:mean_ms=80,key=value,...``; ``bimodal`` is `markov` with
+single pauses. Successive values of a family with memory (markov, bursty) follow one another. A CSV file has the columns
+``observation_ns`` and ``received_ns``, or one of ``latency_ns``, ``latency_ms`` and ``latency_s``; others are ignored.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, cycle, repeat
 from pathlib import Path
@@ -31,25 +31,26 @@ UNITS_NS: Final = {"latency_ns": 1, "latency_ms": 1_000_000, "latency_s": 1_000_
 """Column -> ns in its unit."""
 LONGEST_MS: Final = 3_600_000.0
 SEED: Final = 0
-"""Of every sequence of latencies, so that whoever knows what was written knows all of them."""
+"""Of every sequence of latencies, so that the option determines all of them."""
 STRETCH: Final = 65_536
 """Latencies that are drawn together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Latencies:
-    """Latencies to be drawn from ``gaps``, or ``recorded_ns``, whichever there is."""
+    """Latencies to be drawn from ``gaps``, or ``recorded_ns``; the other is None."""
 
     gaps: Gaps | None = None
     recorded_ns: Ints | None = None
 
 
 def read_latency(written: str) -> Latencies | None:
-    """Read latencies as people write them, None for what it does not know; raises UsageError naming the field."""
-    if (constant := _number(written)) is not None:
+    """Read latencies as users write them, None for an unknown form; raises UsageError naming the field."""
+    with suppress(ValueError):
+        constant = float(written)
         if not 0 <= constant <= LONGEST_MS:
             raise UsageError(f"`latency`: {written} should be between 0 and {LONGEST_MS:g} ms")
-        return Latencies(Constant(constant / 1e3) if constant else _Nothing())
+        return Latencies(Constant(constant / 1e3))
     if ":" in written and "/" not in written:
         return Latencies(family(written))
     if written.endswith(".csv"):
@@ -58,15 +59,15 @@ def read_latency(written: str) -> Latencies | None:
 
 
 def draw_ns(gaps: Gaps, rng: np.random.Generator, count: int) -> Ints:
-    """Draw successive latencies of shape (count,), in ns."""
+    """Draw successive latencies in ns, shape (count,)."""
     return whole_ns(gaps.sample(rng, count, 1)[:, 0])
 
 
 def sequence_ns(latencies: Latencies) -> Iterator[int]:
-    """Return an iterator over the latencies of requests 0, 1, ... in ns, without end and each time the same.
+    """Return the endless latencies of requests 0, 1, ... in ns, the same in every call.
 
-    A recording is played in its order and starts over at its end. A family that remembers does so for `STRETCH`
-    latencies, and starts afresh then.
+    A recording is played in its order and starts again after its end. A family with memory keeps it for `STRETCH`
+    latencies.
     """
     import numpy as np
 
@@ -76,7 +77,7 @@ def sequence_ns(latencies: Latencies) -> Iterator[int]:
         raise TypeError("no latencies")
     rng = np.random.default_rng(SEED)
     stretches = (draw_ns(gaps, rng, STRETCH).tolist() for gaps in repeat(latencies.gaps))
-    return chain(next(stretches), chain.from_iterable(stretches))  # the first is drawn before anybody waits for it
+    return chain(next(stretches), chain.from_iterable(stretches))  # the first is drawn now, before a request waits
 
 
 def whole_ns(latency_s: NDArray[np.float64]) -> Ints:
@@ -122,7 +123,7 @@ def read_delays(path: Path) -> Ints:
 
 
 def _reader(names: Sequence[str], path: Path) -> Callable[[Mapping[str, str]], float]:
-    """Return what makes a latency of a row."""
+    """Return the function from a row to its latency in ns."""
     for column, unit_ns in UNITS_NS.items():
         if column in names:
             return lambda row: float(row[column]) * unit_ns
@@ -142,21 +143,3 @@ def _latency(row: Mapping[str, str], latency_of: Callable[[Mapping[str, str]], f
     if not (math.isfinite(latency_ns) and 0 <= latency_ns <= LONGEST_MS * 1e6):
         raise UsageError(f"{where}: a latency of {latency_ns:g} ns should be between 0 and an hour")
     return round(latency_ns)
-
-
-class _Nothing:
-    """Answers at once: a constant family has to have a mean above 0."""
-
-    mean_s = 0.0
-
-    def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> NDArray[np.float64]:  # noqa: ARG002
-        import numpy as np
-
-        return np.zeros((tokens, plans))
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None

@@ -1,4 +1,4 @@
-"""A hardware profile: how fast and evenly a board streams tokens, its TOML file, and where files are found."""
+"""A hardware profile: the rate and jitter of a board's tokens, its TOML file, and where files are found."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SHIPPED: Final = Path(__file__).parent.parent / "profiles"
 """A link to profiles/ at the top of the repository; files in an installed package."""
 
 FACTS: Final = ("board", "model", "capture", "fit", "environment", "source")
-"""Tables for people and for `profile match`; what is in them is free."""
+"""Tables for people and for `profile match`; their content is free."""
 
 _RATE_TOLERANCE: Final = 0.01
 
@@ -39,7 +39,7 @@ class Profile:
 
     name: str
     title: str
-    """What figures and tables call it."""
+    """The name in figures and tables."""
     origin: Literal["paper", "measured"]
     tokens_per_s: float
     prompt_s: float
@@ -48,9 +48,9 @@ class Profile:
     gaps: Gaps
     """The parametric form of the gaps; its mean is 1 / tokens_per_s."""
     trace_s: tuple[float, ...] = ()
-    """Recorded gaps in their order, warm-ups left out; empty where there is no recording."""
+    """Recorded gaps in their order, without warm-ups; empty if there is no recording."""
     assumed: tuple[str, ...] = ()
-    """Which of the values are assumptions of ours, for figures to say so."""
+    """The values that are assumptions, for notes in figures."""
     facts: dict[str, Any] = field(default_factory=dict)
     """Board, model, power mode, environment: the file's tables as they are."""
     rate_cv: float = 0.0
@@ -63,7 +63,7 @@ class Profile:
 
     @property
     def weights(self) -> str:
-        """Return what the model's weights were, as `Provenance` has it."""
+        """Return `Provenance.weights` of the model."""
         return "dummy" if self.dummy else "real"
 
 
@@ -96,7 +96,7 @@ class _Trace(TomlTable):
 
 
 class _ProfileFile(TomlTable):
-    """What the file may hold."""
+    """The schema of the file."""
 
     title: Line
     origin: Literal["paper", "measured"]
@@ -116,7 +116,7 @@ class _ProfileFile(TomlTable):
 
 
 def read_profile(path: Path) -> Profile:
-    """Read a file; the profile's name is the file's. Raises UsageError naming file and key."""
+    """Read a file, whose name is the profile's. Raises UsageError naming file and key."""
     try:
         text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
@@ -146,23 +146,12 @@ def _profile(name: str, file: _ProfileFile) -> Profile:
         raise UsageError(
             f"tokens_per_s: {file.tokens_per_s:g}, but the gaps of [trace] make {rate:g}; correct one of them"
         )
-    return Profile(
-        name=name,
-        title=file.title,
-        origin=file.origin,
-        tokens_per_s=file.tokens_per_s,
-        prompt_s=file.prompt_s,
-        prompt_cv=file.prompt_cv,
-        rate_cv=file.rate_cv,
-        gaps=gaps,
-        trace_s=trace_s,
-        assumed=tuple(file.assumed),
-        facts=facts,
-    )
+    values = file.model_dump(include={"title", "origin", "tokens_per_s", "prompt_s", "prompt_cv", "rate_cv"})
+    return Profile(name=name, gaps=gaps, trace_s=trace_s, assumed=tuple(file.assumed), facts=facts, **values)
 
 
 def _check_fact(key: str, value: object) -> None:
-    """Refuse numbers that JSON cannot say, wherever they are."""
+    """Refuse numbers that JSON does not have, at any depth."""
     if isinstance(value, float) and not math.isfinite(value):
         raise UsageError(f"{key}: {value} should be finite")
     if isinstance(value, dict):
@@ -177,23 +166,22 @@ def to_toml(document: Mapping[str, Any]) -> str:
     """Write nested tables of texts, numbers, booleans and lists as TOML 1.0; None is left out."""
     import tomli_w
 
-    return tomli_w.dumps(_told(document))
+    return tomli_w.dumps(_without_none(document))
 
 
-def _told(table: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        key: _told(value) if isinstance(value, Mapping) else value for key, value in table.items() if value is not None
-    }
+def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
+    given = {key: value for key, value in table.items() if value is not None}
+    return {key: _without_none(value) if isinstance(value, Mapping) else value for key, value in given.items()}
 
 
 def search_path() -> list[Path]:
-    """Return the folders that are searched for a name, the first first."""
+    """Return the folders that are searched for a name, in their order."""
     config = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     return [Path("profiles"), config / "s2a-bench" / "profiles", SHIPPED]
 
 
 def profile_files() -> dict[str, Path]:
-    """Return the file of every name that can be given, sorted by name; a name found twice is the first folder's."""
+    """Return name -> file of every profile, sorted; the first folder with a name wins."""
     found: dict[str, Path] = {}
     for folder in search_path():
         for path in sorted(folder.glob("*.toml")):
@@ -202,7 +190,7 @@ def profile_files() -> dict[str, Path]:
 
 
 def find_profile(name: str) -> Path:
-    """Return the file of a profile, given by name or as a path; raises UsageError naming what there is."""
+    """Return the file of a profile, given by name or as a path; raises UsageError naming the known ones."""
     if "/" in name or name.endswith(".toml"):
         if not Path(name).is_file():
             raise UsageError(f"`profile`: there is no file {name}")

@@ -34,26 +34,26 @@ class Board:
     """The profile's; empty for a rate."""
     title: str
     origin: str
-    """Where the rate is from: paper, measured or given."""
+    """The rate's: paper, measured or given."""
     tokens_per_s: float
     prompt_s: float
-    """c: tokens come evenly from there on, so that the time to first token is c + 1 / R."""
+    """c: tokens arrive evenly from then on, so that the time to first token is c + 1 / R."""
     prompt_origin: str
-    """Where c is from: assumed, measured or given."""
+    """c's: assumed, measured or given."""
     gaps: Gaps
     prompt_cv: float = 0.0
     rate_cv: float = 0.0
     weights: str = NONE
-    """Of the model that the rate was measured with: real, dummy; none for a bare rate."""
+    """Of the measured model: real, dummy; none for a bare rate."""
 
     @property
     def provenance(self) -> Provenance:
-        """Return where numbers come from that are computed with its tokens."""
+        """Return the provenance of numbers computed with its tokens."""
         return Provenance.computed(self.name or self.title, self.weights)
 
     @property
     def even(self) -> bool:
-        """Return whether every plan's tokens come at the same times."""
+        """Whether every plan's tokens arrive at the same times."""
         return isinstance(self.gaps, Constant) and self.prompt_cv == self.rate_cv == 0
 
     def tokens(self, count: int, rng: np.random.Generator, plans: int) -> Floats:
@@ -68,7 +68,7 @@ class Board:
 
 
 def board_of_profile(profile: Profile, jitter: str, prompt_s: float | None) -> Board:
-    """Take a profile's rate and, unless ``prompt_s`` is given, its c; its spreads only with ``--jitter profile``."""
+    """Make a board of a profile; ``prompt_s`` replaces its c, and ``--jitter profile`` adds its spreads."""
     assumed = "assumed" if "prompt_s" in profile.assumed else "measured"
     gaps = _gaps(jitter, profile)
     recorded = isinstance(gaps, Recorded)  # it holds each answer's own rate already
@@ -87,7 +87,7 @@ def board_of_profile(profile: Profile, jitter: str, prompt_s: float | None) -> B
 
 
 def board_of_rate(tokens_per_s: float, jitter: str, prompt_s: float | None) -> Board:
-    """Make a board of a bare rate; raises UsageError where only a profile could tell its jitter."""
+    """Make a board of a bare rate; raises UsageError for the jitter of a profile."""
     if jitter == AS_PROFILE:
         raise UsageError(f"`jitter`: {AS_PROFILE} needs `profiles`; `rates` alone takes a family, as lognormal:cv=0.2")
     return Board(

@@ -266,13 +266,13 @@ class GgufInfo:
 
     path: Path
     bytes: Count
-    sha256: Annotated[Sha256 | None, about("Absent where it is neither asked for nor known.")] = None
+    sha256: Annotated[Sha256 | None, about("Absent if it is neither requested nor known.")] = None
     gguf_version: int
     architecture: Annotated[str, about("`clip` is an mmproj; empty where the file names none.")]
     mmproj: bool
     dummy: Annotated[bool, about("Random weights, written by `model dummy`.")]
     general: Annotated[Scalars, about("The file's general.* keys for people: name, license, ...")]
-    file_type: Annotated[str | None, about("The mixture of types that was asked for, as Q4_K_M.")] = None
+    file_type: Annotated[str | None, about("The name of the mixture of types, as Q4_K_M.")] = None
     parameters: Count
     types: list[TypeShare]
     groups: list[TensorGroup]

@@ -1,4 +1,4 @@
-"""Find the two files of a model, checked: the user's own, a known name's, or the tiny dummy, made on first use."""
+"""Find and check the two files of a model: the user's, a known name's, or the tiny dummy, made on first use."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ CACHE_VARIABLE = "S2A_BENCH_CACHE"
 
 @dataclass(frozen=True, slots=True)
 class HubModel:
-    """Where a model's two files lie on the hub."""
+    """The names of a model's two files on the hub."""
 
     repository: str
     model: str
     """File name of the language model with ``{quant}`` in it."""
     mmproj: str
     quant: str
-    """Quantisation that is fetched unless the user names one."""
+    """The default quantisation."""
 
     def model_file(self, quant: str) -> str:
         return self.model.format(quant=quant)
@@ -43,9 +43,9 @@ HUB_MODELS: dict[str, HubModel] = {
 
 
 def fetched(name: str, flag: str) -> tuple[Path, Path]:
-    """Return the paths of a known model's fetched language model and mmproj, in the hub's own cache.
+    """Return the paths of a known model's fetched language model and mmproj, in the hub's cache.
 
-    Raises ModelError where it is not fetched yet, or where several quantisations are there.
+    Raises ModelError if it is not fetched yet, or if several quantisations are.
     """
     hub = extras.require("huggingface_hub", "model")
     known = HUB_MODELS[name]
@@ -74,24 +74,22 @@ class ModelFiles:
 
 
 def cache_folder() -> Path:
-    """Return the user's cache folder of s2a-bench; the variable S2A_BENCH_CACHE replaces it."""
+    """Return the user's cache folder of s2a-bench, or that of the variable S2A_BENCH_CACHE."""
     if chosen := os.environ.get(CACHE_VARIABLE):
         return Path(chosen)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "s2a-bench"
 
 
 def dummy_folder(size: Size) -> Path:
-    """Return where dummy models of a size are kept unless the user says otherwise."""
+    """Return the default folder of dummy models of a size."""
     return cache_folder() / "models" / f"dummy-{size}"
 
 
 def tiny_dummy() -> tuple[Path, Path]:
-    """Return the tiny dummy's two files, written first if they are not in the cache; processes may race."""
+    """Return the tiny dummy's two files, written first if they are not in the cache; several processes may do so."""
     folder = dummy_folder("tiny")
     files = dummy_files(folder, "tiny", "f16")
-    if not all(file.is_file() for file in files):
-        write_dummy(folder, "tiny", "f16")
-    return files
+    return files if all(file.is_file() for file in files) else write_dummy(folder, "tiny", "f16")
 
 
 def resolve(config: EngineConfig) -> tuple[Path, Path]:
@@ -103,8 +101,8 @@ def resolve(config: EngineConfig) -> tuple[Path, Path]:
 def load_headers(config: EngineConfig) -> ModelFiles:
     """Read and check both headers.
 
-    A name of `HUB_MODELS` instead of a path stands for its fetched files. Raises ModelError where a file is missing,
-    damaged or of the wrong kind, or where no mmproj is found.
+    A name of `HUB_MODELS` instead of a path stands for its fetched files. Raises ModelError if a file is missing,
+    damaged or of the wrong kind, or if no mmproj is found.
     """
     model_path, mmproj_path = config.model, config.mmproj
     if model_path is None:
@@ -112,8 +110,8 @@ def load_headers(config: EngineConfig) -> ModelFiles:
             raise ModelError(f"`mmproj` {mmproj_path}: needs the language model too; give `model`, or leave out both")
         model_path, mmproj_path = tiny_dummy()
     elif str(model_path) in HUB_MODELS and not model_path.is_file():
-        model_path, own_mmproj = fetched(str(model_path), "`model`")
-        mmproj_path = mmproj_path or own_mmproj
+        model_path, fetched_mmproj = fetched(str(model_path), "`model`")
+        mmproj_path = mmproj_path or fetched_mmproj
     model = read_header(model_path, "`model`")
     if model.is_mmproj:
         raise ModelError(f"`model` {model_path}: this is an mmproj (vision tower); give it as `mmproj`")
@@ -130,22 +128,22 @@ def load_headers(config: EngineConfig) -> ModelFiles:
 
 def _mmproj_beside(model: Path) -> Path:
     found = sorted(model.parent.glob("mmproj*.gguf"))
-    if len(found) == 1:
-        return found[0]
     if not found:
         raise ModelError(
-            f"`model` {model}: not multimodal by itself, and no mmproj*.gguf lies beside it; give `mmproj`"
+            f"`model` {model}: it is no multimodal model, and its folder has no mmproj*.gguf; give `mmproj`"
         )
-    names = ", ".join(path.name for path in found)
-    raise ModelError(f"`model` {model}: several mmproj files lie beside it ({names}); choose one with `mmproj`")
+    if len(found) > 1:
+        names = ", ".join(path.name for path in found)
+        raise ModelError(f"`model` {model}: several mmproj files lie beside it ({names}); choose one with `mmproj`")
+    return found[0]
 
 
 def sha256(path: Path) -> str:
-    """Return a file's SHA-256; remembered in the cache by path, size and time of change, as models are large."""
-    if known := remembered_sha256(path):
-        return known
-    value = digest(path)
-    remember_sha256(path, value)
+    """Return a file's SHA-256, cached by path, size and time of change, as models are large."""
+    value = remembered_sha256(path)
+    if value is None:
+        value = digest(path)
+        remember_sha256(path, value)
     return value
 
 
@@ -159,15 +157,15 @@ def digest(path: Path) -> str:
 
 
 def remembered_sha256(path: Path) -> str | None:
-    """Return a file's SHA-256 if it was computed before and the file has not changed since."""
+    """Return a file's cached SHA-256, None if there is none or the file has changed since."""
     try:
         return str(json.loads(_note(path).read_text())["sha256"])
     except (OSError, ValueError, KeyError, TypeError):
-        return None  # not there yet, or damaged: to be computed
+        return None  # absent or damaged: to be computed
 
 
 def remember_sha256(path: Path, value: str) -> None:
-    """Write the note in one step; a cache that cannot be written costs time, nothing else."""
+    """Cache a file's SHA-256 in one step; a cache that cannot be written costs time, nothing else."""
     note = _note(path)
     with suppress(OSError):
         note.parent.mkdir(parents=True, exist_ok=True)

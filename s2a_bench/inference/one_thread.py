@@ -1,11 +1,11 @@
-"""An engine around an engine keeps it on one thread, whichever threads ask.
+"""Run an engine on one thread, whichever threads call it.
 
-llama.cpp computes with OpenMP, and libgomp keeps a team of threads for every thread that ever asked. Where a server's
-threads take turns, teams add up, libgomp sees more threads than cores and stops spinning between operations: half the
-speed for a small model. So all of an engine's work is done on one thread, which engines that take turns in one process
-share; changing to it is part of `inference`.
+llama.cpp computes with OpenMP, and libgomp keeps a team of threads for every calling thread. If a server's threads take
+turns, teams add up, libgomp finds more threads than cores and stops spinning between operations: half the speed for a
+small model. So all of an engine's work is done on one thread, which engines that take turns in one process share;
+changing to it is part of `inference`.
 
-Changing threads costs some 50 us, a sixth of a small model's token. So the engine does not wait for who reads: it
+Changing threads costs some 50 us, a sixth of a small model's token. So the engine does not wait for the reader: it
 computes the next token while the last one is sent, as llama-server does, and is at most `AHEAD` tokens ahead.
 """
 
@@ -22,11 +22,11 @@ from s2a_bench.inference import PENALTY_LAST_N, SAMPLER_ARGUMENTS, Engine, Engin
 from s2a_bench.types import Piece, Request
 
 AHEAD = 8
-"""Tokens that may wait for who reads, before the engine waits too."""
+"""Tokens that may wait for the reader before the engine waits too."""
 
 
 class _Answer:
-    """The tokens of one request on their way from the engine's thread to the one that asked."""
+    """The tokens of one request between the engine's thread and the reader's."""
 
     def __init__(self) -> None:
         self.wanted = True
@@ -36,16 +36,16 @@ class _Answer:
             self._places.put(None)
 
     def write(self, tokens: Iterator[Piece]) -> None:
-        """Compute tokens while they are wanted; raises what the engine raises."""
+        """Compute tokens while they are wanted; raises the engine's exception."""
         try:
-            while self._room() and (token := next(tokens, None)) is not None:
+            while self._wait_for_place() and (token := next(tokens, None)) is not None:
                 self._tokens.put(token)
         finally:
             cancel(tokens)
             self._tokens.put(None)
 
-    def _room(self) -> bool:
-        """Wait for a place, and tell whether a token is still wanted."""
+    def _wait_for_place(self) -> bool:
+        """Return True if a token is still wanted after the wait."""
         self._places.get()
         return self.wanted
 
@@ -60,10 +60,10 @@ class _Answer:
 
 
 class OneThreadEngine(Engine):
-    """Does everything an engine does on a thread of its own; behaves like the engine otherwise."""
+    """Calls an engine on a separate thread, or on another engine's ``thread``."""
 
     def __init__(self, make: Callable[[], Engine], thread: ThreadPoolExecutor | None = None) -> None:
-        """Make the engine on a thread of its own, or on another engine's ``thread``; raises what ``make`` raises."""
+        """Call ``make`` on the thread; raises its exception."""
         self._closed = False
         self._answer = _Answer()
         self._thread = thread or ThreadPoolExecutor(1, "engine")
@@ -79,7 +79,7 @@ class OneThreadEngine(Engine):
         return self._engine.facts
 
     def generate(self, request: Request) -> Generator[Piece, None, None]:
-        """Yield the engine's tokens, which it computes ahead; a later request ends this one, as does leaving early."""
+        """Yield the engine's tokens, which it computes ahead; a later request ends this one, as does closing it."""
         self._answer.cancel()
         answer = self._answer = _Answer()
         writing = self._submit(lambda: answer.write(self._engine.generate(request)))
@@ -110,14 +110,13 @@ class OneThreadEngine(Engine):
             self._thread.shutdown()
 
     def _submit(self, work: Callable[[], Any]) -> Future[Any]:
-        """Do one thing on the engine's thread, after what it is doing."""
         if self._closed:
             raise EngineError("the engine is closed; open a new one")
         return self._thread.submit(work)
 
 
 class Llama(OneThreadEngine):
-    """The llama engine, on a thread of its own or of another one."""
+    """The llama engine, on a separate thread or on that of another one."""
 
     needs = ("llama", "llama_cpp", "gguf")
     declared_facts = LLAMA
@@ -132,5 +131,4 @@ class Llama(OneThreadEngine):
         super().__init__(make, thread)
 
     def open_beside(self, config: EngineConfig) -> Llama:
-        """Return another engine that computes on this one's thread; one answers at a time, and this one closes last."""
         return Llama(config, self._thread)

@@ -1,9 +1,9 @@
-"""See how llama.cpp was built, and whether it answers: the tiny dummy in every type of weights, in its own process.
+"""Test llama.cpp's build: the tiny dummy in every type of weights answers, in a child process.
 
-A build for another processor, or by a compiler whose code for AMX does not work, dies by an illegal instruction, and
-perhaps with quantised weights only. So ``python -m s2a_bench.inference.smoke`` is what `make setup`, the doctor and
-the tests start; it ends with 0, or with one line on standard error and, where the process was killed, 128 and its
-signal.
+A build for another processor, or by a compiler whose code for AMX does not work, dies of an illegal instruction, and
+perhaps with quantised weights only. `make setup`, the doctor and the tests therefore start
+``python -m s2a_bench.inference.smoke``; it ends with 0, or with one line on standard error and, if the child was
+killed, 128 plus its signal.
 """
 
 from __future__ import annotations
@@ -12,10 +12,9 @@ import platform
 import re
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -28,21 +27,20 @@ from s2a_bench.machine.doctor.gpu import has_nvidia
 from s2a_bench.types import Frame, Request
 
 CHILD = [sys.executable, "-m", "s2a_bench.inference.smoke"]
-"""The process that may die; it gets a folder for the dummies."""
+"""The command of the child process; its argument is a folder for the dummies."""
 LONGEST_S = 600.0
 TOKENS = 6
 CUDA_BUILD = (
-    "make setup CUDA=1, or CMAKE_ARGS=-DGGML_CUDA=on pip install --no-binary llama-cpp-python --force-reinstall"
+    "make setup CUDA=1, or CMAKE_ARGS=-DGGML_CUDA=on pip install --no-binary llama-cpp-python --force-reinstall "
+    "--no-cache-dir llama-cpp-python"
 )
-CUDA_BUILD += " --no-cache-dir llama-cpp-python"
 AMX_BUILD = "CC=gcc-14 CXX=g++-14 make clean setup, with GCC 13.3 or newer or clang"
 BUILT_FOR = f"{sys.prefix}/s2a-bench-llama".lstrip("/")
-"""Where `make setup` notes what it built llama-cpp-python for."""
+"""The file in which `make setup` notes the processor features of its build."""
 
 
-@dataclass(frozen=True, slots=True)
-class Smoke:
-    """What was seen: the child's return code, and one line with the way out unless that is 0."""
+class Smoke(NamedTuple):
+    """The child's return code, and one line with the way out unless that is 0."""
 
     code: int
     message: str = ""
@@ -56,17 +54,17 @@ def smoke_test() -> Smoke:
                 [*CHILD, folder], capture_output=True, text=True, errors="replace", check=False, timeout=LONGEST_S
             )
         except subprocess.TimeoutExpired:
-            return Smoke(1, f"llama.cpp gave no answer within {LONGEST_S:.0f} s; stop what else runs, and try again")
+            return Smoke(1, f"llama.cpp gave no answer within {LONGEST_S:.0f} s; stop other programs, and try again")
     if not done.returncode:
         return Smoke(0)
     quant = (done.stdout.split() or ["no"])[-1]
     how = how_it_ended(done.returncode)
-    said = done.stderr.strip().splitlines() if done.returncode > 0 else []
-    return Smoke(done.returncode, ": ".join([f"llama.cpp failed its test with {quant} weights", how, *said[-1:]]))
+    lines = done.stderr.strip().splitlines() if done.returncode > 0 else []
+    return Smoke(done.returncode, ": ".join([f"llama.cpp failed its test with {quant} weights", how, *lines[-1:]]))
 
 
 def answer(folder: Path) -> None:
-    """Let a dummy of every type answer about a picture, naming each type on standard output before it may die."""
+    """Let a dummy of every type answer about a picture; print each type first, as the process may die."""
     from s2a_bench.inference.llama_cpp import LlamaCppEngine
 
     frame = Frame(0, 0, 64, 48, "rgb8", np.zeros((48, 64, 3), np.uint8))
@@ -81,12 +79,11 @@ def answer(folder: Path) -> None:
 
 
 def llama_build(machine: Machine) -> Finding | None:
-    """Return what llama-cpp-python was built for, whether GPU or AMX lie idle because of it, and whether it works."""
+    """Report the features of llama-cpp-python's build, unused ones of this machine, and whether it works."""
     if not machine.finds("llama_cpp"):
         return None
-    seen = smoke_test()
-    if seen.message:
-        return Finding("llama-build", "error", seen.message, "make clean setup")
+    if message := smoke_test().message:
+        return Finding("llama-build", "error", message, "make clean setup")
     llama_cpp = extras.require("llama_cpp", "llama")
     from s2a_bench.inference.llama_log import silence
 
@@ -97,20 +94,19 @@ def llama_build(machine: Machine) -> Finding | None:
     offload = bool(llama_cpp.llama_supports_gpu_offload())
     cpuinfo = machine.read("proc/cpuinfo") or ""
     amx = _amx(machine, cpuinfo, flags)
-    told = f"llama-cpp-python {llama_cpp.__version__}, {'with' if offload else 'without'} GPU; {' '.join(flags)}; {amx}"
+    gpu = "with" if offload else "without"
+    build = f"llama-cpp-python {llama_cpp.__version__}, {gpu} GPU; {' '.join(flags)}; {amx}"
     if has_nvidia(machine) and not offload:
-        return Finding("llama-build", "warning", f"{told}: the NVIDIA GPU of this machine is not used", CUDA_BUILD)
+        return Finding("llama-build", "warning", f"{build}: the NVIDIA GPU of this machine is not used", CUDA_BUILD)
     if platform.machine() == "x86_64" and " avx2" in cpuinfo and "AVX2" not in flags:
-        return Finding(
-            "llama-build", "warning", f"{told}: built without this CPU's AVX2, far slower", "make clean setup"
-        )
+        slow = f"{build}: built without this CPU's AVX2, far slower"
+        return Finding("llama-build", "warning", slow, "make clean setup")
     if amx.startswith("AMX off"):
-        return Finding("llama-build", "advice", told, AMX_BUILD)
-    return Finding("llama-build", "state", told)
+        return Finding("llama-build", "advice", build, AMX_BUILD)
+    return Finding("llama-build", "state", build)
 
 
 def _amx(machine: Machine, cpuinfo: str, flags: list[str]) -> str:
-    """Return whether this CPU has AMX and llama.cpp uses it."""
     if " amx_tile" not in cpuinfo:
         return "no AMX in this CPU"
     if "AMX_INT8" in flags:
@@ -120,14 +116,14 @@ def _amx(machine: Machine, cpuinfo: str, flags: list[str]) -> str:
 
 
 def main() -> int:
-    """Run the test, or with a folder as argument be its child."""
+    """Run the test; with a folder as argument, as its child."""
     if len(sys.argv) > 1:
         answer(Path(sys.argv[1]))
         return 0
-    seen = smoke_test()
-    if seen.message:
-        print(seen.message, file=sys.stderr)  # noqa: T201 - for `make setup` and for shells
-    return 128 - seen.code if seen.code < 0 else seen.code
+    code, message = smoke_test()
+    if message:
+        print(message, file=sys.stderr)  # noqa: T201 - for `make setup` and for shells
+    return 128 - code if code < 0 else code
 
 
 if __name__ == "__main__":

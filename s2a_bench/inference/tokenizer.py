@@ -1,4 +1,4 @@
-"""Count tokens as a model does: its own tokenizer, loaded from the GGUF file without the weights."""
+"""A model's tokenizer, loaded from the GGUF file without the weights."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ llama_cpp = extras.require("llama_cpp", "llama")
 
 
 class Tokenizer:
-    """A model's vocabulary and merges. Call it with text to get token ids; nothing is added, no mark is special.
+    """Turns text into token ids; adds no tokens, and reads special tokens as text.
 
     The ids are those of text at the start of a line: some tokenizers (SentencePiece's) put a blank before other text.
     """
@@ -38,7 +38,7 @@ class Tokenizer:
         self._vocab = llama_cpp.llama_model_get_vocab(self._model)
         self.size = int(llama_cpp.llama_vocab_n_tokens(self._vocab))
         self.name = str(header.fields.get("general.name", path.name))
-        """What the file calls the model."""
+        """The model's name in the file."""
         self._pieces = TokenBytes(self._vocab)
         self._newline = self._tokenize("\n")
 
@@ -49,13 +49,13 @@ class Tokenizer:
 
     def _tokenize(self, text: str) -> list[int]:
         data = text.encode()
-        room = len(data) + 1  # a token has a byte or more, and some tokenizers put a blank in front
-        ids = (llama_cpp.llama_token * room)()
-        count = llama_cpp.llama_tokenize(self._vocab, data, len(data), ids, room, False, False)
+        most = len(data) + 1  # a token has a byte or more, and some tokenizers put a blank in front
+        ids = (llama_cpp.llama_token * most)()
+        count = llama_cpp.llama_tokenize(self._vocab, data, len(data), ids, most, False, False)
         if count < 0:
-            raise ModelError(f"{self.name}: llama.cpp wants room for {-count} tokens for {len(data)} bytes")
+            raise ModelError(f"{self.name}: llama.cpp needs {-count} tokens for {len(data)} bytes")
         return list(ids[:count])
 
     def piece(self, token: int) -> bytes:
-        """Return the bytes of a token; none for a special one."""
+        """Return the bytes of a token, none for a special one."""
         return self._pieces[token]
