@@ -129,9 +129,7 @@ def load_headers(config: EngineConfig) -> ModelFiles:
 def _mmproj_beside(model: Path) -> Path:
     found = sorted(model.parent.glob("mmproj*.gguf"))
     if not found:
-        raise ModelError(
-            f"`model` {model}: it is no multimodal model, and its folder has no mmproj*.gguf; give `mmproj`"
-        )
+        raise ModelError(f"`model` {model}: it is not multimodal, and no mmproj*.gguf lies beside it; give `mmproj`")
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
         raise ModelError(f"`model` {model}: several mmproj files lie beside it ({names}); choose one with `mmproj`")
