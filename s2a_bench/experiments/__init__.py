@@ -1,4 +1,4 @@
-"""What can be measured or tried: one folder each, with what it is asked, how it runs and how it is shown.
+"""What can be measured or tried: one folder each, with its options, its run and its view.
 
 An experiment's ``__init__`` holds its declaration, which imports nothing heavy:
 
@@ -129,9 +129,9 @@ class Shown:
 
 
 class View(Protocol):
-    """How an experiment's runs are shown; ``asked`` are its view options."""
+    """How an experiment's runs are shown; ``options`` are its view options."""
 
-    def __call__(self, run: StoredRun, **asked: Any) -> Shown:
+    def __call__(self, run: StoredRun, **options: Any) -> Shown:
         """Return what a run shows; reads the store and measures nothing."""
         ...
 
@@ -183,11 +183,11 @@ class Experiment:
         folder: Path = resolve_name(self.run)(config, output, progress)
         return folder
 
-    def show(self, run: StoredRun, **asked: Any) -> Shown:
+    def show(self, run: StoredRun, **options: Any) -> Shown:
         """Return what one of its runs shows; every table and figure says where its numbers come from."""
         from s2a_bench.writers.figures import marked
 
-        shown: Shown = resolve_name(self.view)(run, **asked)
+        shown: Shown = resolve_name(self.view)(run, **options)
         line = run.origins.line
         tables = {name: replace(table, provenance=table.provenance or line) for name, table in shown.tables.items()}
         figures = {name: partial(marked, build, run) for name, build in shown.figures.items()}

@@ -1,4 +1,4 @@
-"""The paper's claims, as data; drawn only when asked for, and never as a measurement of ours."""
+"""The paper's claims, as data; drawn only on request, and never as a measurement of ours."""
 
 from __future__ import annotations
 

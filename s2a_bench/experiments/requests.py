@@ -1,6 +1,6 @@
 """The cells of a run of requests: the samples that count, the metrics, JSON, CSV and comparison made of them.
 
-Warm-ups and failed samples are counted and take part in no summary. The rate of a request is told twice.
+Warm-ups and failed samples are counted and take part in no summary. The rate of a request is given twice.
 ``tokens_per_s`` is the paper's (section V-D): N_tokens / T_eval, T_eval being the engine's own time from the end of the
 prompt to the last token; where a server does not tell it, the other stands in. ``decode_tokens_per_s`` is what the
 client saw: (n - 1) / (t_last - t_first), so that sending counts.
@@ -91,7 +91,7 @@ class RequestCell:
     emulated: bool
     """Whether the engine's times come from a profile, or from latencies that were given."""
     mixed: bool = False
-    """Whether the run was asked to compare payloads, by naming one in a pipeline's name."""
+    """Whether a pipeline of the run names its payload: then payloads are compared."""
 
     @property
     def n(self) -> int:
@@ -192,7 +192,7 @@ class RequestCell:
 
     @property
     def has_engine_time(self) -> bool:
-        """Return whether the engine said how long it evaluated; else the paper's rate is the client's."""
+        """Return whether the engine reports T_eval; else the client's rate stands for the paper's."""
         return bool(_some(self.fact(PREDICTED_MS)).notna().any())
 
     @cached_property
@@ -218,7 +218,7 @@ def decode_rate(cell: RequestCell) -> pd.Series[Any]:
 
 
 def _engine_rate(cell: RequestCell) -> pd.Series[Any]:
-    """Return N_tokens / T_eval; ``predicted_steps`` is told where the engine's time covers another number (vLLM)."""
+    """Return N_tokens / T_eval; ``predicted_steps`` is present where the engine's time covers another number (vLLM)."""
     steps = cell.fact(PREDICTED_STEPS).fillna(cell.n_tokens)
     return (steps / _some(cell.fact(PREDICTED_MS)) * 1e3).fillna(decode_rate(cell))
 
@@ -285,7 +285,7 @@ ANSWER_METRICS: Final = (
         lambda cell: cell.n_tokens / _some(cell.fact(ENERGY_J)),
     ),
 )
-"""What follows from the tokens of a request and the facts that are told of it."""
+"""Metrics of the tokens and the facts of a request."""
 
 TOKEN_METRICS: Final = (
     _ms(
@@ -345,8 +345,8 @@ def _cells(run: StoredRun, samples: pd.DataFrame) -> list[RequestCell]:
     mixed = any("payload=" in name for name in run.manifest["configuration"].get("transports", ()))
     cells = []
     for name in map(str, samples["cell"].unique()):
-        mine, told = (rows[rows["cell"] == name] for rows in (samples, tokens))
-        cells.append(_cell(name, mine, told, stages, run.origins.of(name), mixed))
+        counted, streamed = (rows[rows["cell"] == name] for rows in (samples, tokens))
+        cells.append(_cell(name, counted, streamed, stages, run.origins.of(name), mixed))
     return sorted(cells, key=_place)
 
 
@@ -433,21 +433,21 @@ def stand_ins(runs: Split) -> list[str]:
 
 
 def _replayed(run: StoredRun, cells: list[RequestCell]) -> dict[str, Any]:
-    """Return what is known of the profile that was played: by a server of ours, or by one that told in its answers."""
+    """Return the facts of the replayed profile: of our own server, or from the answers of another."""
     model: dict[str, Any] = run.manifest.get("model") or {}
     if declared_engine(model.get("engine", "")).plays:
         return model
-    told = next((origin for cell in cells if declared_engine((origin := run.origins.of(cell.name)).engine).plays), None)
-    return {"profile": told.profile, "dummy": told.weights == "dummy"} if told else model
+    origin = next((found for cell in cells if declared_engine((found := run.origins.of(cell.name)).engine).plays), None)
+    return {"profile": origin.profile, "dummy": origin.weights == "dummy"} if origin else model
 
 
 def _emulated(model: dict[str, Any]) -> Note:
     note = f"EMULATED: replayed profile {model.get('profile', '')}".rstrip()
-    said = [Note(f"{model['gaps']} gaps")] if "gaps" in model else []
-    said += [Note("the paper's rate", PAPERS)] if model.get("origin") == "paper" else []
-    said += [Note("recorded with dummy weights", DUMMY)] if model.get("dummy") else []
-    labels = (label for more in said for label in more.labels)
-    return Note(f"{note} ({', '.join(said)})" if said else note, EMULATED, *labels)
+    remarks = [Note(f"{model['gaps']} gaps")] if "gaps" in model else []
+    remarks += [Note("the paper's rate", PAPERS)] if model.get("origin") == "paper" else []
+    remarks += [Note("recorded with dummy weights", DUMMY)] if model.get("dummy") else []
+    labels = (label for more in remarks for label in more.labels)
+    return Note(f"{note} ({', '.join(remarks)})" if remarks else note, EMULATED, *labels)
 
 
 def groups_present(cells: list[RequestCell]) -> list[str]:
@@ -581,14 +581,14 @@ def compared_by(metrics: Iterable[RequestMetric], shown: tuple[str, ...], **more
 
 def launches_note(ratios: Iterable[Ratio]) -> tuple[str, ...]:
     """Return for what the intervals of ratios hold, one launch or any like those measured; nothing without them."""
-    told = [ratio for ratio in ratios if ratio.low is not None]
-    if not told:
+    bounded = [ratio for ratio in ratios if ratio.low is not None]
+    if not bounded:
         return ()
-    spreads = sorted(ratio.launch_sd for ratio in told if ratio.launch_sd is not None)
+    spreads = sorted(ratio.launch_sd for ratio in bounded if ratio.launch_sd is not None)
     if not spreads:
         return ("The intervals hold for this launch only, the next may differ by more: measure with --launches 5.",)
     span = " to ".join(dict.fromkeys(f"{spread * 100:.2g}" for spread in (spreads[0], spreads[-1])))
-    launches = max(ratio.launches for ratio in told)
+    launches = max(ratio.launches for ratio in bounded)
     differ = f"Ratios are over {launches} launches, which differ by a standard deviation of {span} %"
     return (f"{differ}; the intervals (Student's t) hold for launches like these.",)
 
@@ -616,5 +616,5 @@ def caption_for(
     run: StoredRun, cells: list[RequestCell], what: str, facts: Sequence[str], notes: Sequence[str] = ()
 ) -> tuple[str, ...]:
     """Return what a figure draws, from how many samples of what, and what did not really answer."""
-    said = ", ".join((f"n = {span_of(cell.n for cell in cells)} a cell", *facts))
-    return (what, f"{said}.", *notes, *engine_notes(run, cells))
+    counts = ", ".join((f"n = {span_of(cell.n for cell in cells)} a cell", *facts))
+    return (what, f"{counts}.", *notes, *engine_notes(run, cells))

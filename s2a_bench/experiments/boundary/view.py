@@ -69,7 +69,7 @@ def grid_of(run: StoredRun, duration: str) -> pd.DataFrame:
 
 
 def marks_of(run: StoredRun) -> list[tuple[str, float, pd.DataFrame]]:
-    """Return title and rate of each board with its points, in the order asked for."""
+    """Return title and rate of each board with its points, in the order of the options."""
     rows = run.table(BOUNDARY)
     boards = run.manifest["boards"]
     return [(board["title"], board["tokens_per_s"], rows[rows["board"] == board["name"]]) for board in boards]
@@ -120,14 +120,16 @@ def boundary_csv(run: StoredRun) -> dict[str, CsvTable]:
 def boundary_sentences(run: StoredRun) -> list[str]:
     """Return whether the formula holds, and what the paper's line leaves out."""
     points = len(run.table(BOUNDARY))
-    said = [f"Naive execution was tried at {points} points of rate and tokens per skill."]
+    sentences = [f"Naive execution was tried at {points} points of rate and tokens per skill."]
     if is_random(run):
         shares = grid_of(run, DURATIONS[0])["p_stall"]
-        said.append(f"A plan stalls at {int((shares > 0).sum())} of {len(shares)} points of the grid, run for T_nom.")
+        sentences.append(
+            f"A plan stalls at {int((shares > 0).sum())} of {len(shares)} points of the grid, run for T_nom."
+        )
     else:
         agree = points - disagreements(run)
-        said.append(f"The formula R >= L/T says whether it stalls, and is right at {agree} of {points} points.")
-    return said
+        sentences.append(f"The formula R >= L/T says whether it stalls, and is right at {agree} of {points} points.")
+    return sentences
 
 
 def disagreements(run: StoredRun) -> int:
@@ -145,8 +147,8 @@ def _cells(run: StoredRun) -> Iterator[dict[str, Any]]:
 
 
 def _verdict(point: dict[Any, Any], *, random: bool) -> str:
-    said = "stall-free" if point["stall_free"] else "stalls"
-    return f"{said}, P = {point['p_stall']:.1%}" if random else said
+    verdict = "stall-free" if point["stall_free"] else "stalls"
+    return f"{verdict}, P = {point['p_stall']:.1%}" if random else verdict
 
 
 def _notes(run: StoredRun) -> tuple[str, ...]:
@@ -216,8 +218,8 @@ def _shade_regions(axes: Axes, tokens: np.ndarray, lines: dict[str, float], low:
 def _mark_trials(axes: Axes, run: StoredRun) -> None:
     points = grid_of(run, "t_nom")
     free = points["p_stall"] == 0
-    for chosen, (label, look) in zip((points[free], points[~free]), _TRIALS.items(), strict=True):
-        axes.scatter(chosen["tokens_per_skill"], chosen["tokens_per_s"], 7, linewidths=0.5, label=label, **look)
+    for chosen, (label, style) in zip((points[free], points[~free]), _TRIALS.items(), strict=True):
+        axes.scatter(chosen["tokens_per_skill"], chosen["tokens_per_s"], 7, linewidths=0.5, label=label, **style)
 
 
 def _shade_shares(figure: Figure, axes: Axes, run: StoredRun) -> None:
@@ -256,10 +258,10 @@ def _mark_boards(axes: Axes, run: StoredRun) -> None:
 
 
 def _caption(run: StoredRun) -> tuple[str, ...]:
-    asked = run.manifest["configuration"]
-    t_nom_s = asked["t_nom_s"]
-    facts = [f"N = {asked['n_skills']}", f"T_nom = {t_nom_s:g} s", f"T_min = {asked['t_min'] * t_nom_s:g} s"]
-    jitter = f"{asked['plans']} plans a point, jitter {asked['jitter']}"
+    settings = run.manifest["configuration"]
+    t_nom_s = settings["t_nom_s"]
+    facts = [f"N = {settings['n_skills']}", f"T_nom = {t_nom_s:g} s", f"T_min = {settings['t_min'] * t_nom_s:g} s"]
+    jitter = f"{settings['plans']} plans a point, jitter {settings['jitter']}"
     facts.append(jitter if is_random(run) else "tokens come evenly")
     paper = any(board["origin"] == "paper" for board in run.manifest["boards"])
     whose = " at the paper's rates (not measured here)" if paper else ""

@@ -126,17 +126,17 @@ class CcrbConfig(Options):
         """Return the live timeline whose one plan is driven; raises UsageError naming the field."""
         from s2a_bench.harness.timelines.config import TimelineConfig
 
-        asked = self.plan_request
-        played = asked.engine.kind.plays
+        plan_request = self.plan_request
+        played = plan_request.engine.kind.plays
         skills, tokens = played or (SKILL_SET, self.tokens_per_skill)
         if self.tokens_per_skill != tokens:
             raise UsageError(
-                f"`engine` {asked.engine.name} writes {tokens} tokens a skill; leave out `tokens_per_skill`"
+                f"`engine` {plan_request.engine.name} writes {tokens} tokens a skill; leave out `tokens_per_skill`"
             )
         return TimelineConfig(
             live=True,
-            transport=asked.transport,
-            engine=asked.engine,
+            transport=plan_request.transport,
+            engine=plan_request.engine,
             profiles=(self.profile,) if played else (),
             skills=skills,
             policies=self.policies,
@@ -172,7 +172,7 @@ class CcrbConfig(Options):
         return {**own, "t_nom_s": self.scenario.durations.nominal_s, "time": "virtual"}
 
     def _check_live(self) -> None:
-        """Refuse what is about tokens that are modelled, and what the model cannot be asked."""
+        """Refuse options of modelled tokens, and requests that the model cannot answer."""
         for name in MODELLED if self.plan_request.engine.kind.plays else (*MODELLED, "profile"):
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise UsageError(f"`{name}` is about tokens that are modelled; leave it out with `live`")

@@ -54,7 +54,7 @@ class Prepared:
     plans: Plans
     schedules: dict[str, Schedule]
     late: bool | None
-    """Whether s2a-ttc missed its deadline; None where it was not asked for."""
+    """Whether s2a-ttc missed its deadline; None without `ttc`."""
 
 
 def prepare(config: CcrbConfig) -> Prepared:
@@ -70,13 +70,13 @@ def complete(
     config: CcrbConfig, setting: PlanSetting, request_id: str, plans: Plans, policies: Mapping[str, Policy]
 ) -> Prepared:
     """Ask the policies about a plan, drawn or heard."""
-    asked = config.scenario
-    if asked.lane_change:
-        plans = with_lane_change(plans, asked.lane_durations)
+    scenario = config.scenario
+    if scenario.lane_change:
+        plans = with_lane_change(plans, scenario.lane_durations)
     schedules = {name: policy.schedule(plans) for name, policy in policies.items()}
     late = None
     if config.ttc:
-        timed = ttc_aware(plans, asked.deadline_s)
+        timed = ttc_aware(plans, scenario.deadline_s)
         schedules[TTC], late = timed.schedule, bool(timed.late[0])
     return Prepared(setting, request_id, plans, schedules, late)
 
@@ -91,36 +91,36 @@ def with_lane_change(plans: Plans, lane: Durations) -> Plans:
 
 def drive_point(config: CcrbConfig, ready: Prepared, world: Simulator, writer: RunWriter) -> None:
     """Drive the policies one after the other, and keep everything."""
-    asked = config.scenario
+    scenario = config.scenario
     for name, schedule in ready.schedules.items():
-        driven = drive(world, asked.cars, asked.driving, schedule, record=True)
+        driven = drive(world, scenario.cars, scenario.driving, schedule, record=True)
         path = driven.trajectory
-        assert path is not None  # noqa: S101 - as asked for
-        cell = f"{ready.setting.name}/{asked.gap}/{name}"
+        assert path is not None  # noqa: S101 - recorded
+        cell = f"{ready.setting.name}/{scenario.gap}/{name}"
         late = ready.late if name == TTC else None
         about = {**_about(config, ready, world), "cell": cell, "policy": name, "late": late}
         writer.append(ROLLOUTS, rollout_rows(about, schedule, driven.outcomes, motion=motion_of(path)))
-        writer.append(SKILLS, skill_rows(cell, ready.plans, schedule, [ready.request_id], texts=[asked.texts]))
+        writer.append(SKILLS, skill_rows(cell, ready.plans, schedule, [ready.request_id], texts=[scenario.texts]))
         writer.append(TRAJECTORIES, trajectory_rows(cell, path))
 
 
 def _about(config: CcrbConfig, ready: Prepared, world: Simulator) -> dict[str, Any]:
     """Return what the roll-outs of the operating point have in common."""
-    setting, asked = ready.setting, config.scenario
+    setting, scenario = ready.setting, config.scenario
     of_setting = ("board", "title", "emulated", "tokens_per_s", "prompt_s", "n_skills", "t_nom_s")
     of_scenario = ("follower", "reflex", "lane_change", "front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s")
     return {
         "study": "point",
         "draw": 0,
         "simulator": world.name,
-        "gap_behaviour": asked.gap,
+        "gap_behaviour": scenario.gap,
         "tokens_per_skill": config.tokens_per_skill,
-        "speed_mps": float(asked.driving.set_point_mps[0, 0]),
-        "plan_decel_mps2": asked.decel_mps2,
-        "follower_survives": asked.follower_survives,
-        "deadline_ns": to_ns(asked.deadline_s),
+        "speed_mps": float(scenario.driving.set_point_mps[0, 0]),
+        "plan_decel_mps2": scenario.decel_mps2,
+        "follower_survives": scenario.follower_survives,
+        "deadline_ns": to_ns(scenario.deadline_s),
         **{name: getattr(setting, name) for name in of_setting},
-        **{name: getattr(asked, name) for name in of_scenario},
+        **{name: getattr(scenario, name) for name in of_scenario},
     }
 
 
@@ -155,7 +155,7 @@ def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
 
 
 def _drive_studies(config: CcrbConfig, writer: RunWriter, progress: Progress) -> None:
-    """Drive what is asked for besides the operating point, and say how fast that went."""
+    """Drive the studies beside the operating point, and record their speed."""
     work = list(_work(config))
     if not work:
         return

@@ -121,7 +121,7 @@ VARIED: Final[dict[str, tuple[float, ...]]] = {
 
 
 def studies(config: CcrbConfig) -> Iterator[tuple[str, Scenes]]:
-    """Yield the studies that are asked for besides the operating point, with their scenarios."""
+    """Yield the studies beside the operating point, with their scenarios."""
     if config.phase:
         yield (
             "phase",
@@ -156,11 +156,11 @@ def pieces(scenes: Scenes) -> int:
 
 def _piece(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[AboutRollout]]:
     """Drive some scenarios in lock step: naive with each gap behaviour, the others once."""
-    asked = config.scenario
-    cases = [(name, gap) for name, form in FORMS.items() for gap in (GAPS if form.stalls else (asked.gap,))]
+    scenario = config.scenario
+    cases = [(name, gap) for name, form in FORMS.items() for gap in (GAPS if form.stalls else (scenario.gap,))]
     gaps = np.repeat([gap for _, gap in cases], len(scenes))
     every = scenes.times(len(cases))
-    cars = every.cars(gaps, asked)
+    cars = every.cars(gaps, scenario)
     schedule = schedules(config, scenes, [name for name, _ in cases])
     deadline_s = start_deadline(cars, every.numbers["plan_decel_mps2"])
     about: dict[str, Any] = {
@@ -171,11 +171,11 @@ def _piece(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[Ab
         "board": "",
         "title": "",
         "emulated": True,
-        "follower_survives": np.tile(survived(scenes, scenes.cars(gaps[: len(scenes)], asked)), len(cases)),
+        "follower_survives": np.tile(survived(scenes, scenes.cars(gaps[: len(scenes)], scenario)), len(cases)),
         "simulator": Longitudinal.name,
-        "follower": asked.follower,
+        "follower": scenario.follower,
         "gap_behaviour": gaps,
-        "reflex": asked.reflex,
+        "reflex": scenario.reflex,
         "lane_change": False,
         "deadline_ns": np.rint(deadline_s * 1e9).astype(np.int64),
         "late": None,
@@ -184,7 +184,7 @@ def _piece(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[Ab
     again = [
         replace(row, gap_behaviour=gap, cell=f"{study}/{gap}/{row.policy}")
         for gap in GAPS
-        if gap != asked.gap
+        if gap != scenario.gap
         for row in rows
         if not FORMS[row.policy].stalls
     ]
@@ -216,9 +216,9 @@ def follower_rows(config: CcrbConfig) -> Iterator[tuple[int, list[FollowerRow]]]
     """Drive every follower in Euro NCAP's combinations: roll-outs and rows, combination by combination."""
     for follower, front_m, decel in product(FOLLOWERS, NCAP_GAPS_M, NCAP_DECELS_MPS2):
         changed: dict[str, Any] = {"follower": follower, "front_gap_m": front_m, "lead_decel_mps2": decel}
-        asked = config.scenario.but(lane_change=False, **changed)
-        seeds, scenes = _points(config, asked)
-        cars = scenes.cars(_gaps(scenes, asked), asked)
+        scenario = config.scenario.but(lane_change=False, **changed)
+        seeds, scenes = _points(config, scenario)
+        cars = scenes.cars(_gaps(scenes, scenario), scenario)
         safe = survived(scenes, cars)
         codes = _codes(config, scenes, cars)
         paper = _paper(codes)
@@ -228,7 +228,7 @@ def follower_rows(config: CcrbConfig) -> Iterator[tuple[int, list[FollowerRow]]]
                 FollowerRow(
                     cell=f"followers/{follower}/{policy}",
                     policy=policy,
-                    gap_behaviour=asked.gap,
+                    gap_behaviour=scenario.gap,
                     seed=None if seed < 0 else int(seed),
                     points=int(mine.sum()),
                     survived=int(safe[mine].sum()),
@@ -247,14 +247,14 @@ def follower_rows(config: CcrbConfig) -> Iterator[tuple[int, list[FollowerRow]]]
 
 def sensitivity_rows(config: CcrbConfig) -> Iterator[tuple[int, list[SensitivityRow]]]:
     """Drive the plane with one number changed at a time: roll-outs and rows, value by value."""
-    asked = config.scenario.but(lane_change=False)
-    seeds, scenes = _points(config, asked)
+    scenario = config.scenario.but(lane_change=False)
+    seeds, scenes = _points(config, scenario)
     drawn = seeds >= 0
     seeds, scenes = seeds[drawn], Scenes({name: values[drawn] for name, values in scenes.numbers.items()})
     for varied, values in VARIED.items():
         for value in values:
             changed: dict[str, Any] = {varied: np.full(len(scenes), value)}
-            cars = replace(scenes.cars(_gaps(scenes, asked), asked), **changed)
+            cars = replace(scenes.cars(_gaps(scenes, scenario), scenario), **changed)
             paper = _paper(_codes(config, scenes, cars))
             yield (
                 len(FORMS) * len(scenes),
@@ -263,8 +263,8 @@ def sensitivity_rows(config: CcrbConfig) -> Iterator[tuple[int, list[Sensitivity
                         cell=f"sensitivity/{varied}",
                         varied=varied,
                         value=value,
-                        follower=asked.follower,
-                        gap_behaviour=asked.gap,
+                        follower=scenario.follower,
+                        gap_behaviour=scenario.gap,
                         seed=int(seed),
                         points=int((seeds == seed).sum()),
                         paper=int(paper[seeds == seed].sum()),
@@ -274,7 +274,7 @@ def sensitivity_rows(config: CcrbConfig) -> Iterator[tuple[int, list[Sensitivity
             )
 
 
-def _points(config: CcrbConfig, asked: CcrbOptions) -> tuple[NDArray[np.int64], Scenes]:
+def _points(config: CcrbConfig, scenario: CcrbOptions) -> tuple[NDArray[np.int64], Scenes]:
     """Return drawn points and whose seed's they are; the last is the operating point, of seed -1."""
     from scipy.stats import qmc
 
@@ -282,7 +282,7 @@ def _points(config: CcrbConfig, asked: CcrbOptions) -> tuple[NDArray[np.int64], 
     draws = [qmc.Sobol(2, rng=generator(seed, "ccrb", "plane")).random(config.seed_points) for seed in seeds]
     board, point = config.timeline.boards[0], np.zeros((1, 2))
     scenes = spread(
-        asked,
+        scenario,
         config.phase_rates,
         config.phase_gaps_m,
         np.concatenate([*draws, point]),
@@ -290,12 +290,12 @@ def _points(config: CcrbConfig, asked: CcrbOptions) -> tuple[NDArray[np.int64], 
         tokens_per_skill=config.tokens_per_skill,
     )
     scenes.numbers["tokens_per_s"][-1] = board.tokens_per_s
-    scenes.numbers["rear_gap_m"][-1] = asked.rear_gap_m
+    scenes.numbers["rear_gap_m"][-1] = scenario.rear_gap_m
     return np.append(np.repeat(np.array(seeds), config.seed_points), -1), scenes
 
 
-def _gaps(scenes: Scenes, asked: CcrbOptions) -> NDArray[np.str_]:
-    return np.full(len(scenes), asked.gap)
+def _gaps(scenes: Scenes, scenario: CcrbOptions) -> NDArray[np.str_]:
+    return np.full(len(scenes), scenario.gap)
 
 
 def _codes(config: CcrbConfig, scenes: Scenes, cars: Cars) -> dict[str, NDArray[np.int64]]:

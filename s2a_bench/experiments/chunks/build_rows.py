@@ -147,9 +147,9 @@ def reaction_rows(
     if not reaction_s.size:
         return
     period_s = setting.period_ns / 1e9
-    told = closed(cell.acting, latency_ns, setting).reaction_ticks(SHARES)
+    form = closed(cell.acting, latency_ns, setting).reaction_ticks(SHARES)
     found = np.quantile(reaction_s, SHARES).tolist()
-    closed_s = [None] * SHARES.size if told is None else (told * period_s).tolist()
+    closed_s = [None] * SHARES.size if form is None else (form * period_s).tolist()
     for share, simulated_s, expected_s in zip(SHARES.tolist(), found, closed_s, strict=True):
         yield ReactionRow(cell.cell, share, simulated_s, expected_s)
 

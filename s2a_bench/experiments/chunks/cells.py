@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 FIXED: Final = ("calibrated", "oracle")
 """The rules that choose one trigger for all requests, and may slow actions down."""
 GIVEN: Final = "given"
-"""The rule of a mode that is tried as it was asked for."""
+"""The rule of a mode with its own parameters."""
 _ORACLE_DRAWS: Final = 1_000_000
 
 

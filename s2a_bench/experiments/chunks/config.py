@@ -54,7 +54,7 @@ class LiveRequests(FirstVariants):
     )
 
     def check(self) -> None:
-        """Refuse what makes no sense; nothing where nobody is asked for anything, as in virtual time."""
+        """Refuse contradictory options; in virtual time, without requests, nothing."""
         if self.model_fields_set:
             super().check()
 
@@ -143,10 +143,12 @@ class ChunksConfig(Options):
     @cached_property
     def live_requests(self) -> LiveRequests:
         """Return what the control loop asks for, live; raises UsageError naming the field."""
-        told: dict[str, Any] = {"answer": "actions", "horizon": self.horizon}
+        engine_settings: dict[str, Any] = {"answer": "actions", "horizon": self.horizon}
         if self.known:
-            told |= {"latency": self.known} | ({"name": STAND_IN} if not self.requests.engine.model_fields_set else {})
-        return self.requests.but(engine=self.requests.engine.but(**told), seed=self.seed, requests=1)
+            engine_settings |= {"latency": self.known} | (
+                {"name": STAND_IN} if not self.requests.engine.model_fields_set else {}
+            )
+        return self.requests.but(engine=self.requests.engine.but(**engine_settings), seed=self.seed, requests=1)
 
     @property
     def known(self) -> str:
@@ -265,13 +267,13 @@ class ChunksConfig(Options):
             raise UsageError(f"`rules`: {self.too_few}; raise `epsilon`, or take `rules` {others}")
 
     def _check_live(self) -> None:
-        """Refuse what only virtual time has, and what no server could be told."""
+        """Refuse what only virtual time has, and what no server accepts."""
         from s2a_bench.act import ActionKind, kind
 
         if self.robot:
             kind(self.robot, ActionKind)
-        said = self.model_fields_set
-        if alone := next((field for field in VIRTUAL if field in said), ""):
+        given = self.model_fields_set
+        if alone := next((field for field in VIRTUAL if field in given), ""):
             raise UsageError(f"`{alone}` is for virtual time; live there are `seconds` and `warmup`")
         self._check_ticks()
         self._check_learning()

@@ -74,10 +74,10 @@ class LiveResult:
         """Return the share of the ticks in which it did what virtual time says of the same arrivals."""
         acted = self.acted
         arrival_ns = np.where(acted.arrival_ns < 0, NEVER, acted.arrival_ns)
-        _, said = follow(self.cell.acting, arrival_ns, self.setting, acted.chunk.size)
-        both = min(said.chunk.size, acted.chunk.size)
-        alike = (acted.chunk[:both] == said.chunk[:both]) & (acted.index[:both] == said.index[:both])
-        return float(alike.sum()) / acted.chunk.size
+        _, computed = follow(self.cell.acting, arrival_ns, self.setting, acted.chunk.size)
+        length = min(computed.chunk.size, acted.chunk.size)
+        agreed = (acted.chunk[:length] == computed.chunk[:length]) & (acted.index[:length] == computed.index[:length])
+        return float(agreed.sum()) / acted.chunk.size
 
     def smooth(self) -> dict[str, float]:
         """Return how smoothly the robot moved, where that is known. Nobody knows what the policy follows."""
@@ -125,8 +125,8 @@ def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
     """Act and return the run folder; raises S2AError for what a user can mend."""
     plan = resolve(config.live_requests.answered(progress.say))
     several = any(each.several for each in config.made.values())
-    asked = {**plan.manifest["configuration"], **config.to_manifest()}
-    plan = plan.with_manifest(configuration=asked, cadence=f"a control loop at {config.control_hz:g} Hz")
+    settings = {**plan.manifest["configuration"], **config.to_manifest()}
+    plan = plan.with_manifest(configuration=settings, cadence=f"a control loop at {config.control_hz:g} Hz")
     task = Task("chunks", drive=partial(_drive, config), clients=CLIENTS if several else 1)
     folder = run_requests(task, plan, output, progress)
     if config.export_delays is not None:
@@ -197,7 +197,7 @@ def _act(
 ) -> LiveResult:
     """Act in one mode, and write down every request as it is measured."""
     setting = config.setting.slowed(cell.slower)
-    told = robot is not None and _accepts_state(config, sessions[0], robot)
+    sends_state = robot is not None and _accepts_state(config, sessions[0], robot)
 
     def heard(request: int, actions: Sequence[Any], at_ns: int) -> None:
         loop.arrived(request, actions, at_ns)
@@ -205,7 +205,7 @@ def _act(
     requester = ChunkRequester(sessions, config.horizon, config.seed, cell.mode.streams, heard, blocks)
 
     def ask(request: int, tick: int) -> None:
-        requester.jobs.put(Job(request, tick, robot.state() if robot is not None and told else ()))
+        requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else ()))
 
     send = _nowhere if robot is None else robot.send
     loop = ControlLoop(cell.acting, setting, send, ask, max(2, round(config.seconds * 1e9 / setting.period_ns)))
@@ -227,7 +227,7 @@ def _nowhere(action: Vector | None, at_ns: int) -> None:
 
 
 def _accepts_state(config: ChunksConfig, session: Session, robot: ActionRobot) -> bool:
-    """Return whether requests tell the policy of the robot; raises UsageError for another state than was asked for."""
+    """Return whether requests carry the robot's state; raises UsageError where its size contradicts `state`."""
     cell, numbers, wanted = session.cell, len(robot.state()), config.requests.state
     if numbers and wanted and numbers != wanted:
         raise UsageError(f"`state`: `robot` {config.robot} has {numbers} numbers, not {wanted}; leave it out")

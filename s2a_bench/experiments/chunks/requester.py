@@ -131,7 +131,7 @@ def warm_up(session: Session, place: Place, horizon: int) -> tuple[Measured, int
 
 
 def check(session: Session, actions: int, horizon: int) -> None:
-    """Refuse answers of another length than the modes were told; raises UsageError, RequestFailed for no actions."""
+    """Raise UsageError for chunks that are not `horizon` long, RequestFailed for answers without actions."""
     cell = session.cell.name
     if not actions:
         raise RequestFailed(f"{cell} answers with tokens; acting needs a server that answers with chunks of actions")

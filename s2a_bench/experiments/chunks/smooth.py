@@ -77,7 +77,7 @@ class TrackingPlant:
     def measure(self, mode: Mode, cycles: Cycles, ticks: Ticks) -> Mapping[str, float]:
         """Return the metrics of smoothness by their names; none where nothing was executed.
 
-        ``..._ideal`` is of the plant alone: asked in every tick, and answered at once.
+        ``..._ideal`` is of the plant alone: with a request in every tick and no latency.
         """
         target, period_s = self.target, self.target.period_s
         chunk = ticks.chunk[: target.position.size]
@@ -92,7 +92,7 @@ class TrackingPlant:
 
 
 def follower(config: ChunksConfig) -> TrackingPlant | None:
-    """Return what follows, the same target for all cells of a seed; None where no robot is asked for.
+    """Return what follows, the same target for all cells of a seed; None without a robot.
 
     Nor where all actions are slowed down: no target waits for them.
     """
@@ -108,8 +108,8 @@ def executed(mode: Mode, cycles: Cycles, ticks: Ticks, target: TargetPath) -> Fl
     found = np.full(length, np.nan)
     for tick, chunk, index, share in mode.blend(cycles, ticks):
         early = tick < length
-        at, asked = tick[early], cycles.request_tick[chunk[early]]
-        found[at] = np.nan_to_num(found[at]) + share[early] * target.forecast(asked, index[early])
+        at, request_tick = tick[early], cycles.request_tick[chunk[early]]
+        found[at] = np.nan_to_num(found[at]) + share[early] * target.forecast(request_tick, index[early])
     return found
 
 

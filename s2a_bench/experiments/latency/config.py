@@ -1,4 +1,4 @@
-"""What a latency run is asked."""
+"""The options of a latency run."""
 
 from __future__ import annotations
 

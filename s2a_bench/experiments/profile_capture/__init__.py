@@ -1,4 +1,4 @@
-"""This machine measured as a hardware profile: what is asked of the model, and profiles as ``--json`` objects."""
+"""This machine measured as a hardware profile: the options, and profiles as ``--json`` objects."""
 
 from __future__ import annotations
 

@@ -107,18 +107,18 @@ def capture(config: CaptureConfig, progress: Progress) -> dict[str, Any]:
         engine = open_model(config.engine.but(model=model, mmproj=mmproj))
         stack.callback(engine.close)
         before = Counters.read(watches_udp=False)
-        asked = answers(engine, config)
-        stack.callback(asked.close)  # type: ignore[attr-defined]  # a generator
+        timed = answers(engine, config)
+        stack.callback(timed.close)  # type: ignore[attr-defined]  # a generator
         recorded = []
         for number in range(config.warmup + config.requests):
             progress.stage("warming up" if number < config.warmup else "measuring")
-            recorded.append(next(asked))
+            recorded.append(next(timed))
             progress.advance()
         warnings += Counters.read(watches_udp=False).warnings_since(before)
         described = engine.describe()
     progress.stage("fitting the gaps")
-    said = [f"{warning.code}: {warning.message}; {warning.advice}" for warning in warnings]
-    return document(config, recorded, described, said)
+    warning_lines = [f"{warning.code}: {warning.message}; {warning.advice}" for warning in warnings]
+    return document(config, recorded, described, warning_lines)
 
 
 def document(

@@ -1,4 +1,4 @@
-"""What a throughput run is asked: requests, an engine that computes, and a reference beside it."""
+"""The options of a throughput run: requests, an engine that computes, and a reference program."""
 
 from __future__ import annotations
 
@@ -92,9 +92,9 @@ class ThroughputConfig(FirstVariants):
 
     @property
     def greedy(self) -> bool:
-        """Whether the likeliest token is taken: beside a reference, which samples nothing, unless told."""
-        told = "sampling" in self.engine.model_fields_set or self.reference is None
-        return self.engine.sampling == "greedy" if told else True
+        """Whether sampling is greedy: by default with a reference, which samples nothing."""
+        chosen = "sampling" in self.engine.model_fields_set or self.reference is None
+        return self.engine.sampling == "greedy" if chosen else True
 
     @property
     def reads_model(self) -> bool:

@@ -83,7 +83,7 @@ ThroughputCell: Final = cell_class(
     METRICS,
     t_eval=Annotated[
         Literal["engine", "client"],
-        about("Who told T_eval: the engine, or nobody, so that decode_tokens_per_s stands for tokens_per_s."),
+        about("Source of T_eval: the engine; or the client, where tokens_per_s is decode_tokens_per_s."),
     ],
     positions=Annotated[list[Position], about("Decode rate by the place in the answer.")],
 )

@@ -91,10 +91,10 @@ class LlamaBench:
             )
         except (OSError, subprocess.TimeoutExpired) as error:
             raise EngineError(f"--reference {self._program}: {error}") from error
-        said = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1][:200]
+        last_line = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1][:200]
         if done.returncode:
             how = how_it_ended(done.returncode, COMPILE_AGAIN)
-            raise EngineError(f"--reference {self._program}: {how}: {said}")
+            raise EngineError(f"--reference {self._program}: {how}: {last_line}")
         try:
             (test,) = json.loads(done.stdout)
             if not (test["n_gen"] > 0 and test["samples_ns"][0] > 0):

@@ -60,18 +60,18 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
 
 def throughput_sentences(run: StoredRun) -> list[str]:
     """Return how many tokens a second each cell generates."""
-    said, cells = [], throughput_cells(run)
+    sentences, cells = [], throughput_cells(run)
     for cell in cells:
         if found := summary_of(cell.values(ENGINE_METRIC)):
             source = "the engine's own figure" if cell.has_engine_time else "as the client saw it"
             times = span_of([found.n], "request")
-            said.append(f"{cell.name}: {mean_sd(found)} tokens/s (mean ± sd of {times}, {source}).")
-    said += [
+            sentences.append(f"{cell.name}: {mean_sd(found)} tokens/s (mean ± sd of {times}, {source}).")
+    sentences += [
         f"By their own figures the engine of {of} has {interval(ratio)} of the rate of {to}."
         for metric, of, to, ratio in ratios_of(run, cells)
         if metric == ENGINE_METRIC
     ]
-    return said or ["No request was answered; samples.csv says why."]
+    return sentences or ["No request was answered; samples.csv says why."]
 
 
 def throughput_tables(run: StoredRun) -> dict[str, TextTable]:
@@ -163,11 +163,11 @@ def position_table(run: StoredRun) -> TextTable | None:
 
 
 def _notes(run: StoredRun, cells: list[RequestCell], launches: tuple[str, ...]) -> list[str]:
-    untold = [cell.name for cell in cells if not cell.has_engine_time]
-    notes = ["N / T_eval is the engine's own figure, as in the paper."] if len(untold) < len(cells) else []
+    without_time = [cell.name for cell in cells if not cell.has_engine_time]
+    notes = ["N / T_eval is the engine's own figure, as in the paper."] if len(without_time) < len(cells) else []
     notes.append("decode is (n - 1) / (t_last - t_first) at the client.")
-    if untold:
-        notes.append(f"{', '.join(untold)}: the server does not tell T_eval, so decode stands in for N / T_eval.")
+    if without_time:
+        notes.append(f"{', '.join(without_time)}: the server does not tell T_eval, so decode stands in for N / T_eval.")
     facts = sorted({cell.about["size"] for cell in cells})
     if sampling := (run.manifest.get("model") or {}).get("sampling"):
         facts.append(f"sampling of our engine: {sampling}")
@@ -183,7 +183,7 @@ def _notes(run: StoredRun, cells: list[RequestCell], launches: tuple[str, ...]) 
 
 
 def throughput_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
-    """Return every figure by its file's name; the paper's values only when asked for. No rates, no figures."""
+    """Return every figure by its file's name; the paper's values where `against_paper`. No rates, no figures."""
     if not any(cell.values(RATIO_METRIC).size for cell in throughput_cells(run)):
         return {}
     return {

@@ -46,7 +46,7 @@ def timeline_rows(
     observed_s: float = 0.0,
     tolerance_s: float = TOLERANCE_S,
 ) -> list[PlanRow]:
-    """Describe M timelines; ``tolerance_s`` is the longest gap that is no stall for ``any_stall`` (1 us unless told).
+    """Describe M timelines; ``tolerance_s`` is the longest gap that is no stall for ``any_stall`` (default 1 us).
 
     ``caution`` is one lambda, or one a plan. Motion is computed for plans below `KEPT_PLANS`. ``observed_s`` is when
     the picture was taken, from the request.

@@ -33,7 +33,7 @@ SWITCH_S: Final = 0.0005
 
 
 class SideBySide:
-    """One executor a policy, all told the same. Use as a context manager; leaving it early aborts them."""
+    """One executor a policy; all receive the same events. Use as a context manager; leaving it early aborts them."""
 
     def __init__(
         self, policies: Mapping[str, Policy], shape: PlanShape, gap: Gap, robots: Sequence[SkillRobot], silence_s: float

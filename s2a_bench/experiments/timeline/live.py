@@ -1,7 +1,7 @@
 """Live timelines: a model writes plans, over a real transport, and every policy executes them as they arrive.
 
 Tokens, parsing and execution are real. With ``--pace`` the server holds the tokens back to a rate: then the rate is
-set, and said to be; nothing is emulated unless the engine is the replay of a profile.
+set, and labelled as set; nothing is emulated unless the engine is the replay of a profile.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
 def _drive(
     config: TimelineConfig, asks: Sequence[PlanPrompt], robots: Sequence[SkillRobot], launch: RunningLaunch
 ) -> None:
-    """Let every policy execute every plan that is asked for."""
+    """Let every policy execute every plan."""
     link, records, progress = ModelLink(config, launch, config.robot), list[Record](), launch.progress
     progress.expect(config.warmup + len(asks) * config.plans_a_cell)
     try:

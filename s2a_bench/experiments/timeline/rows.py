@@ -15,7 +15,7 @@ from s2a_bench.store.schema import Table, with_fields
 
 @dataclass(frozen=True, slots=True)
 class TimelineMetric(Metric):
-    """A metric of plans, 0 or more unless told otherwise."""
+    """A metric of plans, with values of 0 or more by default."""
 
     bounds: tuple[float | None, float | None] = (0, None)
 

@@ -200,7 +200,7 @@ def run_real_time(config: TimelineConfig, output: Path, progress: Progress) -> P
 
 @dataclass(slots=True)
 class _RealTime:
-    """A run under way, and what is said of the whole at its end, however it ends."""
+    """A run in progress, and the facts that it writes when it ends."""
 
     config: TimelineConfig
     answers: Sequence[Floats]
@@ -248,7 +248,7 @@ class _RealTime:
         following.learn(executors.records)
 
     def conclude(self) -> None:
-        """Write what is said of the whole run."""
+        """Write the facts of the whole run."""
         warnings = [*self.warnings, *calibration_warnings(self.calibrations)]
         self.writer.update(
             calibrations=self.calibrations,

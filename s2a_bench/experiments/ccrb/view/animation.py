@@ -93,9 +93,9 @@ class RoadPanel:
             f"{float(now['time_s']):5.2f} s   ego {float(now['ego_speed_kmh']):4.1f} km/h   "
             f"front gap {max(float(now['front_gap_m']), 0):4.1f} m   rear gap {max(float(now['rear_gap_m']), 0):4.1f} m"
         )
-        return picture, f"{self._row['policy']}   {facts}", self._said(now, hit=hit), hit
+        return picture, f"{self._row['policy']}   {facts}", self._event(now, hit=hit), hit
 
-    def _said(self, now: Any, *, hit: bool) -> str:
+    def _event(self, now: Any, *, hit: bool) -> str:
         if hit:
             speed = self._row["rear_impact_mps" if self._row["outcome"] in {"rear", "both"} else "front_impact_mps"]
             first = "rear" if self._row["outcome"] == "both" else self._row["outcome"]
@@ -113,9 +113,9 @@ def _frame(panels: list[RoadPanel], at_s: float, foot: str) -> Image:
     pen = ImageDraw.Draw(frame)
     for place, panel in enumerate(panels):
         top = place * (TEXT_HEIGHT + ROAD_HEIGHT)
-        picture, facts, said, hit = panel.draw(at_s)
+        picture, facts, event, hit = panel.draw(at_s)
         pen.text((8, top + 5), facts, _INK, font=_font(14))
-        pen.text((8, top + 25), said, _RED if hit or said.startswith("STALL") else _FAINT, font=_font(14))
+        pen.text((8, top + 25), event, _RED if hit or event.startswith("STALL") else _FAINT, font=_font(14))
         frame.paste(Image.fromarray(picture), (0, top + TEXT_HEIGHT))
     pen.text((8, height - FOOT_HEIGHT + 6), foot, _FAINT, font=_font(11))
     return frame

@@ -175,10 +175,10 @@ def _verdict(row: dict[Any, Any], survives: bool) -> str:
 
 
 def _title(run: StoredRun) -> str:
-    asked = configuration(run)
+    settings = configuration(run)
     return (
-        f"CCRB with a car behind ({asked['simulator']} simulator): {operating_point(asked)}, "
-        f"N = {asked['n_skills']}, L = {asked['tokens_per_skill']}"
+        f"CCRB with a car behind ({settings['simulator']} simulator): {operating_point(settings)}, "
+        f"N = {settings['n_skills']}, L = {settings['tokens_per_skill']}"
     )
 
 
@@ -213,17 +213,16 @@ def build_phase(run: StoredRun) -> Figure:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    asked = configuration(run)
-    scene = (
-        f"{ahead(asked)}, reaction {asked['reaction_s']:g} s, N = {asked['n_skills']}, L = {asked['tokens_per_skill']}"
-    )
+    settings = configuration(run)
+    plan = f"N = {settings['n_skills']}, L = {settings['tokens_per_skill']}"
+    scene = f"{ahead(settings)}, reaction {settings['reaction_s']:g} s, {plan}"
     survives = scenes_of(run, "phase", GAPS[0])["survives"]
     check = f" It survives an ego with fast tokens at {survives.mean():.0%}." if survives.notna().all() else ""
     caption = (
         "Who has an impact, for each behaviour of the ego while no skill is valid",
         f"{scene[0].upper()}{scene[1:]}.",
         f"{ORDERING} The percentages are its shares of the plane.",
-        f"Rear: {law(asked)}.{check}",
+        f"Rear: {law(settings)}.{check}",
         "EMULATED: tokens come evenly.",
     )
     figure = new_figure(4.6, caption, WIDE_IN)
@@ -231,9 +230,9 @@ def build_phase(run: StoredRun) -> Figure:
     seen: set[str] = set()
     for axes, gap in zip(grid.flat, GAPS, strict=True):
         scenes = scenes_of(run, "phase", gap)
-        seen |= _draw_panel(axes, scenes, asked, run)
+        seen |= _draw_panel(axes, scenes, settings, run)
         share = share_of(scenes, "paper").value
-        axes.set_title(f"{gap}: the paper's ordering {share:.1%}, {_here(run, gap, asked)}", loc="left")
+        axes.set_title(f"{gap}: the paper's ordering {share:.1%}, {_here(run, gap, settings)}", loc="left")
     for axes in grid[-1]:
         axes.set_xlabel("R (tokens/s)")
     for axes in grid[:, 0]:
@@ -248,7 +247,7 @@ def build_phase(run: StoredRun) -> Figure:
     return figure
 
 
-def _draw_panel(axes: Axes, scenes: pd.DataFrame, asked: dict[str, Any], run: StoredRun) -> set[str]:
+def _draw_panel(axes: Axes, scenes: pd.DataFrame, settings: dict[str, Any], run: StoredRun) -> set[str]:
     from matplotlib.colors import ListedColormap
 
     named = region_of(scenes)
@@ -271,31 +270,32 @@ def _draw_panel(axes: Axes, scenes: pd.DataFrame, asked: dict[str, Any], run: St
     axes.set_xticks(ticks, [f"{rate:g}" for rate in ticks])
     axes.set_xticks([], minor=True)
     rate = run.manifest["boards"][0]["tokens_per_s"]
-    axes.plot(rate, asked["rear_gap_m"], **_POINT)
+    axes.plot(rate, settings["rear_gap_m"], **_POINT)
     return set(np.unique(named))
 
 
-def _here(run: StoredRun, gap: str, asked: dict[str, Any]) -> str:
+def _here(run: StoredRun, gap: str, settings: dict[str, Any]) -> str:
     span = rate_span_here(run, gap)
     where = f"R {span[0]:.1f}\N{EN DASH}{span[1]:.1f}" if span else "no R"
-    return f"at {asked['rear_gap_m']:g} m: {where}"
+    return f"at {settings['rear_gap_m']:g} m: {where}"
 
 
 def build_sensitivity(run: StoredRun) -> Figure:
     """Draw the ordering's share of the plane over each varied number, the range over the seeds as a band."""
-    found, asked = run.table(SENSITIVITY), configuration(run)
+    found, settings = run.table(SENSITIVITY), configuration(run)
     shares = found.assign(share=100 * found["paper"] / found["points"])
     seeds, points = found["seed"].nunique(), int(found["points"].iloc[0])
+    scene = f"{ahead(settings)}, gap behaviour {settings['gap']}"
     caption = (
-        f"The paper's ordering as a share of {plane_words(asked)}: {ahead(asked)}, gap behaviour {asked['gap']}",
+        f"The paper's ordering as a share of {plane_words(settings)}: {scene}",
         f"Mean, least and most of {seeds} seeds of {points} points; dotted: the default.",
-        f"Rear: {law(asked)}.",
+        f"Rear: {law(settings)}.",
         f"EMULATED: tokens come evenly. {NO_SCORE}",
     )
     figure = new_figure(3.3, caption, WIDE_IN)
     grid = figure.subplots(2, 3, sharey=True)
     for axes, varied in zip(grid.flat, VARIED_TITLES, strict=True):
-        _draw_share(axes, shares[shares["varied"] == varied], float(asked.get(varied, getattr(Cars(), varied))))
+        _draw_share(axes, shares[shares["varied"] == varied], float(settings.get(varied, getattr(Cars(), varied))))
         axes.set_xlabel(VARIED_TITLES[varied])
     for axes in grid[:, 0]:
         axes.set_ylabel("paper's ordering (%)")

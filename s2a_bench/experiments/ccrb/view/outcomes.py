@@ -120,7 +120,7 @@ def has(run: StoredRun, study: str) -> bool:
 
 
 def configuration(run: StoredRun) -> dict[str, Any]:
-    """Return what was asked for."""
+    """Return the options that the run was started with."""
     found: dict[str, Any] = run.manifest["configuration"]
     return found
 
@@ -153,12 +153,12 @@ def _compared(theirs: pd.DataFrame, mine: pd.DataFrame, column: str) -> tuple[pd
 
 def origin_notes(run: StoredRun) -> tuple[str, ...]:
     """Return what the numbers are made of, and which laws they hang on."""
-    asked = configuration(run)
+    settings = configuration(run)
     notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
-    notes.append(f"Rear: {law(asked)}.")
-    notes.append(follower_check(asked, survives_of(rollouts_of(run, "point"))))
-    reflex = "on" if asked["reflex"] else "off"
-    notes.append(f"Front: while no skill is valid the ego does '{asked['gap']}'; the reflex layer is {reflex}.")
+    notes.append(f"Rear: {law(settings)}.")
+    notes.append(follower_check(settings, survives_of(rollouts_of(run, "point"))))
+    reflex = "on" if settings["reflex"] else "off"
+    notes.append(f"Front: while no skill is valid the ego does '{settings['gap']}'; the reflex layer is {reflex}.")
     return tuple(notes)
 
 
@@ -197,7 +197,7 @@ def _emulated_notes(run: StoredRun) -> list[str]:
     return notes
 
 
-def plane_words(asked: dict[str, Any]) -> str:
+def plane_words(settings: dict[str, Any]) -> str:
     """Return the plane's sides in words."""
-    (slow, fast), (near, far) = asked["phase_rates"], asked["phase_gaps_m"]
+    (slow, fast), (near, far) = settings["phase_rates"], settings["phase_gaps_m"]
     return f"the plane of R {slow:g} to {fast:g} tokens/s, rear gap {near:g} to {far:g} m"

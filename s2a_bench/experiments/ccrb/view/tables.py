@@ -64,7 +64,7 @@ if TYPE_CHECKING:
 
 
 def show(run: StoredRun, *, animation: bool = False, **_: Any) -> Shown:
-    """Return what a CCRB run shows; the animation where it is asked for."""
+    """Return what a CCRB run shows."""
     tables = ccrb_tables(run)
     return Shown(
         sentences=ccrb_sentences(run),
@@ -81,18 +81,18 @@ def ccrb_sentences(run: StoredRun) -> list[str]:
     """Return what became of the cars, where that ordering of the policies holds, and the studies' speed."""
     rows = rollouts_of(run, "point")
     survives = survives_of(rows)
-    told = [
+    sentences = [
         f"{row['policy']}: {outcome_label(row['outcome'], survives)}, "
         f"{row['stalls']} stalls of {row['stall_ns'] / 1e9:.2f} s."
         for row in rows.to_dict("records")
     ]
-    told += [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
+    sentences += [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
     if len(run.table(SENSITIVITY)):
-        told.append(_sensitivity(run))
+        sentences.append(_sensitivity(run))
     if studies := run.manifest.get("studies"):
         speed = studies["rollouts_per_cpu_s"]
-        told.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time.")
-    return told
+        sentences.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time.")
+    return sentences
 
 
 def findings(run: StoredRun) -> list[str]:
@@ -102,13 +102,13 @@ def findings(run: StoredRun) -> list[str]:
 
 def _finding(run: StoredRun, gap: str) -> str:
     share = share_of(scenes_of(run, "phase", gap), "paper")
-    said = f"{gap}: the paper's ordering holds at {share.value:.1%} of the diagram"
+    sentence = f"{gap}: the paper's ordering holds at {share.value:.1%} of the diagram"
     span, here = rate_span(run, gap), rate_span_here(run, gap)
     if span is None:
         return f"{gap}: the paper's ordering holds nowhere in the diagram."
     at = f"at a rear gap of {configuration(run)['rear_gap_m']:g} m"
     where = f"{at} for {here[0]:.1f} to {here[1]:.1f}" if here else f"{at} nowhere"
-    return f"{said}, for R = {span[0]:.1f} to {span[1]:.1f} tokens/s; {where}."
+    return f"{sentence}, for R = {span[0]:.1f} to {span[1]:.1f} tokens/s; {where}."
 
 
 def _sensitivity(run: StoredRun) -> str:
@@ -118,8 +118,8 @@ def _sensitivity(run: StoredRun) -> str:
     share = 100 * summed["paper"] / summed["points"]
     spans = share.groupby("varied", sort=False).agg(["min", "max"])
     names = {varied: title.split(" (")[0] for varied, title in VARIED_TITLES.items()}
-    said = ", ".join(f"{names[varied]} {least:.0f} to {most:.0f} %" for varied, least, most in spans.itertuples())
-    return f"Sensitivity, the paper's ordering in the plane: {said}."
+    spans_text = ", ".join(f"{names[varied]} {least:.0f} to {most:.0f} %" for varied, least, most in spans.itertuples())
+    return f"Sensitivity, the paper's ordering in the plane: {spans_text}."
 
 
 ORDERINGS: Final = {
@@ -205,8 +205,8 @@ def outcome_table(run: StoredRun) -> TextTable:
     for cell in cells_of(run):
         outcome = outcome_label(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
         rows.append((cell["policy"], outcome, *(_entry(cell, metric) for metric in shown)))
-    asked = configuration(run)
-    title = f"CCRB with a car behind, {asked['simulator']} simulator: {operating_point(asked)}"
+    settings = configuration(run)
+    title = f"CCRB with a car behind, {settings['simulator']} simulator: {operating_point(settings)}"
     header = ("policy", "outcome", *map(_title, shown))
     return TextTable(title, header, rows, 2, notes=(*origin_notes(run), *_deadline_note(run), NO_SCORE))
 
@@ -224,21 +224,21 @@ def margin_table(run: StoredRun) -> TextTable:
 def phase_table(run: StoredRun) -> TextTable:
     """Lay out at which share of the diagram each ordering holds, a column a gap behaviour."""
     rows = _share_rows(run, "phase", lambda share: f"{share.value:.1%}")
-    asked = configuration(run)
+    settings = configuration(run)
     rows.append(("R of the paper's ordering", *(_span(rate_span(run, gap)) for gap in GAPS)))
-    rows.append((f"  at a rear gap of {asked['rear_gap_m']:g} m", *(_span(rate_span_here(run, gap)) for gap in GAPS)))
-    (low, high), (near, far) = asked["phase_rates"], asked["phase_gaps_m"]
-    title = (
-        f"Phase diagram: R {low:g} to {high:g} tokens/s, rear gap {near:g} to {far:g} m, {asked['follower']} follower"
-    )
+    here = (_span(rate_span_here(run, gap)) for gap in GAPS)
+    rows.append((f"  at a rear gap of {settings['rear_gap_m']:g} m", *here))
+    (low, high), (near, far) = settings["phase_rates"], settings["phase_gaps_m"]
+    spans = f"R {low:g} to {high:g} tokens/s, rear gap {near:g} to {far:g} m"
+    title = f"Phase diagram: {spans}, {settings['follower']} follower"
     rules = frozenset({len(rows) - 2})
     return TextTable(title, ("share of the diagram", *GAPS), rows, 1, rules, _ORDERING_NOTES)
 
 
 def random_table(run: StoredRun) -> TextTable:
     """Lay out in which share of random scenarios each ordering holds, with its interval."""
-    asked = configuration(run)
-    title = f"{asked['random']} random scenarios: % [95 % Clopper-Pearson], {asked['follower']} follower"
+    settings = configuration(run)
+    title = f"{settings['random']} random scenarios: % [95 % Clopper-Pearson], {settings['follower']} follower"
     return TextTable(title, ("ordering", *GAPS), _share_rows(run, "random", _with_interval), 1, notes=_ORDERING_NOTES)
 
 
@@ -252,20 +252,20 @@ def _share_rows(run: StoredRun, study: str, written: Callable[[Share], str]) -> 
 
 def follower_tables(run: StoredRun) -> dict[str, TextTable]:
     """Lay out each follower at Euro NCAP's combinations: what came of the operating point, and shares of the plane."""
-    found, asked = run.table(FOLLOWER_STUDY), configuration(run)
+    found, settings = run.table(FOLLOWER_STUDY), configuration(run)
     rate = run.manifest["boards"][0]["tokens_per_s"]
-    where = f"R = {rate:g} tokens/s, rear gap {asked['rear_gap_m']:g} m, gap behaviour {asked['gap']}"
+    where = f"R = {rate:g} tokens/s, rear gap {settings['rear_gap_m']:g} m, gap behaviour {settings['gap']}"
     drawn = found[found["seed"].notna()]
     seeds, points = drawn["seed"].nunique(), int(drawn["points"].iloc[0])
     notes = (
         "Survives: the follower stops behind an ego whose tokens come at once, at the same gap.",
         f"{MARK} It does not: a rear outcome says nothing of the policy.",
-        *(f"{law({**asked, 'follower': follower})}." for follower in dict.fromkeys(found["follower"])),
+        *(f"{law({**settings, 'follower': follower})}." for follower in dict.fromkeys(found["follower"])),
         NO_SCORE,
     )
     shares = (
         Note(ORDERING, PAPERS),
-        f"Mean [least, most] of {seeds} seeds that draw {points} points of {plane_words(asked)} each.",
+        f"Mean [least, most] of {seeds} seeds that draw {points} points of {plane_words(settings)} each.",
         "naive*: of the points where the follower survives; nobody without stalls is hit there, as it brakes alike.",
         "A front impact ends a roll-out.",
         *notes,

@@ -37,7 +37,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
 
 def chunk_sentences(run: StoredRun) -> list[str]:
     """Return what calibration costs over the oracle, what the other rules do, and how a control loop kept time."""
-    said = []
+    sentences = []
     epsilon = float(run.manifest["configuration"]["epsilon"])
     for name, rows in sources_of(rows_of(run)):
         by_rule = {row["rule"]: row for row in rows if row["p_stall_cycle"] is not None}
@@ -47,14 +47,16 @@ def chunk_sentences(run: StoredRun) -> list[str]:
             if rule != "given"
         ]
         if parts:
-            said.append(f"Stalled cycles of queue @ {name}, for at most {epsilon:.2%}: {', '.join(parts)} ticks.")
+            sentences.append(f"Stalled cycles of queue @ {name}, for at most {epsilon:.2%}: {', '.join(parts)} ticks.")
         if live(run):
             least, worst = min(row["agreement"] for row in rows), max(row["jitter_s_p99"] for row in rows)
-            said.append(
+            sentences.append(
                 f"Control loop @ {name}: {least:.2%} of the ticks and more are as virtual time has them; "
                 f"p99 of the jitter {number(worst * 1e3)} ms at most."
             )
         slower = max((row["slow_down"] or 1 for row in rows if row["mode"].startswith("queue")), default=1)
         if slower > 1:
-            said.append(f"@ {name} no trigger of queue is enough: actions would have to be {slower:.2f} times slower.")
-    return said
+            sentences.append(
+                f"@ {name} no trigger of queue is enough: actions would have to be {slower:.2f} times slower."
+            )
+    return sentences

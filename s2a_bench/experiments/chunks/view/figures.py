@@ -63,8 +63,8 @@ def lanes_of(run: StoredRun) -> list[CellTicks]:
     for row in rows_of(run):
         mine = ticks[ticks["cell"] == row["cell"]]
         if len(mine) and row["rule"] in {"given", "calibrated"}:
-            asked = requests[requests["cell"] == row["cell"]]
-            found.append(CellTicks(row["mode"], row["rule"], row["latency"], mine, asked, row["delta_t_s"]))
+            sent = requests[requests["cell"] == row["cell"]]
+            found.append(CellTicks(row["mode"], row["rule"], row["latency"], mine, sent, row["delta_t_s"]))
     return found[:MOST_LANES]
 
 
@@ -189,7 +189,7 @@ def build_stability(run: StoredRun) -> Figure:
 
 
 def build_smoothness(run: StoredRun) -> Figure:
-    """Draw tracking error and jerk over mean latency; dashed what the plant alone does, asked in every tick."""
+    """Draw tracking error and jerk over mean latency; dashed: the plant with a request in every tick."""
     panels = {"tracking_rms": "tracking error (sd)", "jerk_rms": "jerk (sd/s$^3$)"}
     return _over_means(run, "Following a target", panels)
 
@@ -213,7 +213,7 @@ def _over_means(run: StoredRun, what: str, shown: Mapping[str, str]) -> Figure:
             axes.plot(latency_ms[mine], values[mine], color=colour, label=short(mode, LINE_CHARS - 8))
         if f"{name}_ideal" in rows:
             ideal = rows.groupby("latency_s")[f"{name}_ideal"].mean().to_numpy(dtype="float64")
-            axes.plot(np.unique(latency_ms), ideal, "--", color="black", label="asked in every tick, answered at once")
+            axes.plot(np.unique(latency_ms), ideal, "--", color="black", label="a request in every tick, no latency")
         axes.set_ylim(bottom=0)
         axes.ticklabel_format(axis="y", scilimits=(-3, 5))
         axes.set_ylabel(label)
@@ -237,9 +237,9 @@ def build_triggers(run: StoredRun) -> Figure:
     for place, (name, cells) in enumerate(groups):
         colour = LOOKS[place % len(LOOKS)]
         mine = rows[rows["latency"] == name]
-        told = mine[mine["p_stall_closed"].notna()]
-        closed = np.maximum(told["p_stall_closed"].to_numpy(dtype="float64"), floor)
-        axes.plot(told["trigger"].to_numpy(dtype="float64"), closed, color=colour, linewidth=0.9)
+        with_form = mine[mine["p_stall_closed"].notna()]
+        closed = np.maximum(with_form["p_stall_closed"].to_numpy(dtype="float64"), floor)
+        axes.plot(with_form["trigger"].to_numpy(dtype="float64"), closed, color=colour, linewidth=0.9)
         label = short(name, LINE_CHARS - 8)
         sources += axes.plot([], [], color=colour, label=label)
         share = mine["p_stall_cycle"].to_numpy(dtype="float64")
@@ -286,10 +286,10 @@ def build_reactions(run: StoredRun) -> Figure:
     for axes, (source, cells) in zip(panels, groups, strict=True):
         for cell in filter(_drawn, cells):
             mine = rows[rows["cell"] == cell["cell"]]
-            told = mine[mine["closed_s"].notna()]
+            with_form = mine[mine["closed_s"].notna()]
             colour = LOOKS[names.index(_who(cell)) % len(LOOKS)]
             axes.step(mine["reaction_s"] * 1e3, mine["share"], where="post", color=colour)
-            axes.plot(told["closed_s"] * 1e3, told["share"], ":", color="black", linewidth=0.8)
+            axes.plot(with_form["closed_s"] * 1e3, with_form["share"], ":", color="black", linewidth=0.8)
         axes.set_title(short(source, LINE_CHARS), loc="left", pad=2)
         axes.set_ylim(0, 1)
         shown = rows[rows["cell"].isin([cell["cell"] for cell in cells if _drawn(cell)]) & (rows["share"] <= _BULK)]
@@ -314,6 +314,6 @@ def _who(cell: dict[str, Any]) -> str:
 
 
 def _caption(run: StoredRun, what: str, *notes: str) -> tuple[str, ...]:
-    asked = run.manifest["configuration"]
-    setting = f"H = {asked['horizon']}, {asked['control_hz']:g} Hz, d by {asked['rounding']}"
+    settings = run.manifest["configuration"]
+    setting = f"H = {settings['horizon']}, {settings['control_hz']:g} Hz, d by {settings['rounding']}"
     return (f"{what}, {setting}", *notes)

@@ -61,8 +61,8 @@ def rows_of(run: StoredRun) -> list[Row]:
     table = run.table(CHUNKS).drop(columns=PROVENANCE)
     whole = table.astype(object).where(table.notna(), None)
     rows = [{str(name): value for name, value in row.items()} for row in whole.to_dict("records")]
-    asked = run.manifest["configuration"]
-    order = [*((name, "given") for name in asked["modes"]), *((None, rule) for rule in asked["rules"])]
+    settings = run.manifest["configuration"]
+    order = [*((name, "given") for name in settings["modes"]), *((None, rule) for rule in settings["rules"])]
 
     def place(row: Row) -> tuple[str, int]:
         return row["latency"], order.index((row["mode"] if row["rule"] == "given" else None, row["rule"]))
@@ -71,7 +71,7 @@ def rows_of(run: StoredRun) -> list[Row]:
 
 
 def sources_of(rows: list[Row]) -> list[tuple[str, list[Row]]]:
-    """Return the rows of each source of latencies, in the order asked for."""
+    """Return the rows of each source of latencies, in the order of the options."""
     names = dict.fromkeys(row["latency"] for row in rows)
     return [(name, [row for row in rows if row["latency"] == name]) for name in names]
 
@@ -110,7 +110,7 @@ def smoothness_table(run: StoredRun) -> TextTable:
         return _table(run, "Smoothness", _MOTION, (_convention(run), note))
     note = (
         f"Tracking error and jerk (root mean squares) of {robot}, in the target's standard deviation and s; ideal: "
-        f"asked in every tick and answered at once. {jump}"
+        f"with a request in every tick and no latency. {jump}"
     )
     return _table(run, "Smoothness", _FOLLOWING, (_convention(run), note, _EMULATED))
 
@@ -166,10 +166,10 @@ def _table(run: StoredRun, title: str, names: Sequence[str], notes: Iterable[str
         ]
         for place, (_, group) in enumerate(found, 1)
     ]
-    asked = run.manifest["configuration"]
+    settings = run.manifest["configuration"]
     of = "" if several else f" @ {found[0][0]}" if found else ""
-    slower = f" / {asked['slow_down']:g}" if asked.get("slow_down", 1) > 1 else ""
-    what = f"{title}{of}, H = {asked['horizon']}, {asked['control_hz']:g}{slower} Hz, d by {_rounding(run)}"
+    slower = f" / {settings['slow_down']:g}" if settings.get("slow_down", 1) > 1 else ""
+    what = f"{title}{of}, H = {settings['horizon']}, {settings['control_hz']:g}{slower} Hz, d by {_rounding(run)}"
     header = (*("L",) * several, *named, *(_TITLES[name] for name in names))
     return TextTable.grouped(what, header, groups, several + len(named), _notes(run) if notes is None else notes)
 
@@ -222,10 +222,10 @@ def _notes(run: StoredRun) -> Iterator[str]:
     if any(row["slow_down"] is not None and row["slow_down"] > 1 for row in rows):
         yield "Where no trigger is enough, actions have to be slower by beta (chunks.csv: slow_down)."
     if any(row["rule"] != "given" for row in rows):
-        asked = run.manifest["configuration"]
+        settings = run.manifest["configuration"]
         seen = "an oracle that knows the distribution. All others saw the same cycles before."
         yield (
-            f"Rules choose m of queue: calibrated for P(stall) <= {asked['epsilon']:.2%}, tracked from there, "
+            f"Rules choose m of queue: calibrated for P(stall) <= {settings['epsilon']:.2%}, tracked from there, "
             f"lerobot's maximum, the mean, {'each after the same warm-up.' if live(run) else seen}"
         )
     if live(run):

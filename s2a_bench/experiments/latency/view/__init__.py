@@ -66,7 +66,7 @@ def latency_sentences(run: StoredRun) -> list[str]:
     names = ", ".join(dict.fromkeys(cell.label for cell in cells))
     requests = span_of((cell.n for cell in cells), "request")
     pictures = " ".join((" and ".join(payloads_of(cells)), "frames")).lstrip()
-    said = [f"{requests} a cell over {names}; {pictures} of {observation_of(run, cells)}, {about['mode']} mode."]
+    sentences = [f"{requests} a cell over {names}; {pictures} of {observation_of(run, cells)}, {about['mode']} mode."]
     comparable = any(cell.values_ms("e2e_without_inference").size for cell in cells)
     metric = "e2e_without_inference" if comparable else "e2e"
     for payload in dict.fromkeys(cell.payload for cell in cells):
@@ -76,7 +76,7 @@ def latency_sentences(run: StoredRun) -> list[str]:
             if cell.payload == payload and (middle := summary_of(cell.values_ms(metric)))
         ]
         if medians:
-            said.append(f"{metric_phrase(metric)}{_of(payload)}, medians: {', '.join(medians)}.")
+            sentences.append(f"{metric_phrase(metric)}{_of(payload)}, medians: {', '.join(medians)}.")
     found: list[str] = []
     beside: list[str] = []
     for of, cell, base, ratio in ratios(cells, run.bootstrap_seed):
@@ -86,7 +86,7 @@ def latency_sentences(run: StoredRun) -> list[str]:
             found.append(_times(cell, base, ratio))
         if of == "e2e_without_model" and cell.has_ingest:
             beside.append(f"Without model, {_times(cell, base, ratio)}")
-    return said + found[:_MOST] + beside[:_MOST]
+    return sentences + found[:_MOST] + beside[:_MOST]
 
 
 def _of(payload: str) -> str:
@@ -187,8 +187,8 @@ def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> Text
     rows = []
     found: list[Ratio] = []
     for cell in cells:
-        alike = [next((base for base in each if cell.is_compared_with(base)), None) for each in bases.values()]
-        over = [ratio_between(cell, base, metric, run.bootstrap_seed) if base else None for base in alike]
+        matching = [next((base for base in each if cell.is_compared_with(base)), None) for each in bases.values()]
+        over = [ratio_between(cell, base, metric, run.bootstrap_seed) if base else None for base in matching]
         found += filter(None, over)
         ratios = ("1" if cell in each else interval(ratio) for each, ratio in zip(bases.values(), over, strict=True))
         rows.append((str(cell.n), str(cell.errors), *entries(cell.values_ms(metric), *figures), *ratios))
@@ -210,12 +210,12 @@ def token_table(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> T
 
 
 def fact_table(run: StoredRun) -> TextTable | None:
-    """Lay out what was told of the requests besides their marks; None where nothing was."""
+    """Lay out the facts of the requests; None without facts."""
     cells = cells_of(run) if run.facts else []
-    told = [[json.loads(str(facts)) for facts in cell.good["facts"]] for cell in cells]
+    facts_of = [[json.loads(str(facts)) for facts in cell.good["facts"]] for cell in cells]
     rows = []
     for fact, meant in run.facts.items():
-        values = [[facts[fact] for facts in of_cell if fact in facts] for of_cell in told]
+        values = [[facts[fact] for facts in of_cell if fact in facts] for of_cell in facts_of]
         if any(values):
             entries = (number(median(found)) if found else ABSENT for found in values)
             rows.append((fact, meant["unit"], *entries))
@@ -225,8 +225,8 @@ def fact_table(run: StoredRun) -> TextTable | None:
 
 def _foot(cells: list[RequestCell]) -> list[str]:
     """List what stands below the stages: preprocessing and e2e without model only where somebody tells them."""
-    told = {"preprocess", "e2e_without_model"}
-    return [name for name in _FOOT if name not in told or any(cell.values_ms(name).size for cell in cells)]
+    optional = {"preprocess", "e2e_without_model"}
+    return [name for name in _FOOT if name not in optional or any(cell.values_ms(name).size for cell in cells)]
 
 
 def _entry(values: Floats, *, full: bool = False) -> str:

@@ -73,18 +73,18 @@ def against_bytes(runs: Split) -> list[FittedPipeline]:
 
 def _pipeline(name: str, payload: str, cells: Sequence[tuple[float, RequestCell]]) -> FittedPipeline:
     groups = tuple((pixels / MB, cell.values_ms(METRIC)) for pixels, cell in cells)
-    told = [
+    shares = [
         float(sent.median()) / pixels for pixels, cell in cells if (sent := cell.good["payload_bytes"].dropna()).size
     ]
-    travels = float(np.median(told)) if told else None
+    travels = float(np.median(shares)) if shares else None
     return FittedPipeline(name, payload, cells[0][1].path, groups, fit_line(groups), travels)
 
 
 def _pixels(run: StoredRun) -> int:
     """Return the bytes of a request's pictures as pixels, scaled if they are before they travel."""
-    asked: Mapping[str, Any] = run.manifest["configuration"]
-    width, height = asked.get("resize") or (asked.get("width", 0), asked.get("height", 0))
-    return int(width) * int(height) * 3 * int(asked.get("cameras") or 1)
+    settings: Mapping[str, Any] = run.manifest["configuration"]
+    width, height = settings.get("resize") or (settings.get("width", 0), settings.get("height", 0))
+    return int(width) * int(height) * 3 * int(settings.get("cameras") or 1)
 
 
 def crossings(pipelines: Sequence[FittedPipeline]) -> list[tuple[FittedPipeline, FittedPipeline, Estimate]]:
@@ -124,7 +124,7 @@ def crossing_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str])
     """Lay out where lines cross, with loopback, which no picture travels over, left out; None where none do."""
     wired = [each for each in pipelines if not declared_transport(each.path[0]).in_process]
     rows: list[tuple[str, ...]] = [
-        (_said(below), _said(above), _estimate(met))
+        (_label(below), _label(above), _estimate(met))
         for below, above, met in sorted(crossings(wired), key=lambda found: found[2].value)
     ]
     if not rows:
@@ -137,7 +137,7 @@ def crossing_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str])
     return TextTable("Where one becomes faster than another", header, rows, 2, notes=notes)
 
 
-def _said(each: FittedPipeline) -> str:
+def _label(each: FittedPipeline) -> str:
     return f"{each.name}, {each.payload}"
 
 

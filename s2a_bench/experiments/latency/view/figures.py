@@ -113,7 +113,7 @@ def build_latency_distribution(run: StoredRun) -> Figure:
 
 
 def latency_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
-    """Return every figure by its file's name; the paper's values only when asked for. No samples, no figures."""
+    """Return every figure by its file's name; the paper's values where `against_paper`. No samples, no figures."""
     if not _shown(run)[0]:
         return {}
     return {
@@ -145,7 +145,7 @@ def _axis_label(metric: str) -> str:
 
 
 def _label(cell: RequestCell) -> str:
-    """Name a row by its cell, and by what travels where that is not said yet."""
+    """Return the label of a row: the cell, and its payload on a second line."""
     name = cell.label.replace("?", "\n?")
     return f"{name}\n({cell.payload})" if cell.payload else name
 

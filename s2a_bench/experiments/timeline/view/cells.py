@@ -192,14 +192,14 @@ def timelines_json(run: StoredRun) -> dict[str, Any]:
 
 def _cell(cell: Timelines) -> dict[str, Any]:
     """Return one cell: means over its plans; a metric that no plan has is an absent key."""
-    told = {name: cell.about(name) for name in ("cell", "policy", "caution", *_SETTING)}
-    told |= {"rate_tokens_per_s": told.pop("tokens_per_s"), "profile": cell.about("board") or None, "plans": cell.n}
-    return present(TimelineCell(**told, **{name: cell.mean(name) for name in METRICS}))
+    facts = {name: cell.about(name) for name in ("cell", "policy", "caution", *_SETTING)}
+    facts |= {"rate_tokens_per_s": facts.pop("tokens_per_s"), "profile": cell.about("board") or None, "plans": cell.n}
+    return present(TimelineCell(**facts, **{name: cell.mean(name) for name in METRICS}))
 
 
 def _subjects(run: StoredRun) -> list[Subject]:
-    asked = run.manifest.get("configuration", {})
-    even = asked.get("jitter") == "none" and not asked.get("t_nom_cv")
+    settings = run.manifest.get("configuration", {})
+    even = settings.get("jitter") == "none" and not settings.get("t_nom_cv")
     return [
         Subject(
             str(cell.about("cell")),

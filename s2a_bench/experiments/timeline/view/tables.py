@@ -50,8 +50,8 @@ def timeline_sentences(run: StoredRun) -> list[str]:
     settings = len({cell.setting for cell in cells})
     counts = sorted({cell.n for cell in cells})
     plans = f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} plan{'s' * (counts[-1] != 1)}"
-    said = [f"{settings} setting{'s' * (settings != 1)} of board and granularity, {plans} a policy in each."]
-    return said + [_policy_sentence(policy, mine) for policy, mine in by_policy.items()]
+    sentences = [f"{settings} setting{'s' * (settings != 1)} of board and granularity, {plans} a policy in each."]
+    return sentences + [_policy_sentence(policy, mine) for policy, mine in by_policy.items()]
 
 
 def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
