@@ -21,7 +21,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, TypeVar
 
 from s2a_bench.registry import Registry
 from s2a_bench.store.schema import Facts
@@ -45,12 +45,11 @@ Rows: TypeAlias = "list[NDArray[np.float64]]"
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A number that cells of runs have: its unit, which way is better, and the statistic it is judged by.
+    """A number that cells of runs have; rows, JSON, CSV, tables and comparison follow from it.
 
     ``title`` is the heading of its columns, ``statistic`` median or mean, ``about`` its description in the schema,
-    ``bounds`` between what it lies. ``kind`` is `TIME` (in s, kept in whole nanoseconds), `COUNT`, `FLAG` (true or
-    false of a plan: its mean is the share of the plans), `SHARE` (shown in percent) or `NUMBER`; a row may be without
-    an ``optional`` one. Rows, JSON, CSV, tables and comparison follow from it.
+    ``bounds`` its least and greatest value. ``kind`` is `TIME` (in s, stored in whole nanoseconds), `COUNT`, `FLAG`
+    (its mean is the share of the plans), `SHARE` (shown in percent) or `NUMBER`; rows may lack an ``optional`` metric.
     """
 
     name: str
@@ -65,7 +64,7 @@ class Metric:
 
     @property
     def column(self) -> str:
-        """Return the name of its column in the rows of a run folder."""
+        """Name of its column in the rows of a run folder."""
         if self.kind == TIME:
             return f"{self.name.removesuffix('_s')}_ns"
         return self.name.removeprefix("p_") if self.kind == FLAG else self.name
@@ -77,7 +76,7 @@ class Metric:
 
     @property
     def schema(self) -> dict[str, Any]:
-        """Return what an annotation says of it, in the words of JSON Schema."""
+        """Its JSON Schema: description and bounds."""
         facts = {"description": self.about or None, "minimum": self.bounds[0], "maximum": self.bounds[1]}
         return {key: value for key, value in facts.items() if value is not None}
 
@@ -86,7 +85,7 @@ AnyMetric = TypeVar("AnyMetric", bound=Metric)
 
 
 def columns(metrics: Iterable[Metric]) -> dict[str, Any]:
-    """Return the columns of metrics with their annotations, for the dataclass of a row."""
+    """Return column -> annotated type, for the dataclass of a row."""
     kinds = {metric: metric.column_type | None if metric.optional else metric.column_type for metric in metrics}
     return {metric.column: Annotated[kind, Facts(metric.schema)] for metric, kind in kinds.items()}
 
@@ -95,9 +94,9 @@ def columns(metrics: Iterable[Metric]) -> dict[str, Any]:
 class Subject:
     """One cell of one run as it is compared.
 
-    ``setting`` is what must be the same on both sides besides the name. ``rows`` gives a metric's values, a row a
-    request (or plan) in the order in which they were made, none where the cell does not have the metric. ``exact``
-    values are computed without chance. ``launch`` counts the launches of a run, each of which has every cell.
+    Besides the name, ``setting`` must be equal on both sides. ``rows`` returns a metric's values, one row a request or
+    plan in time order, none for a missing metric. ``exact`` values are computed without chance. ``launch`` counts the
+    launches of a run; each of them has every cell.
     """
 
     name: str
@@ -111,11 +110,11 @@ class Subject:
 
 @dataclass(frozen=True, slots=True)
 class Shown:
-    """What a run shows, each part by its file's name.
+    """What a run shows, each item by its file's name.
 
-    ``main`` are the tables that stand open on the page; a terminal shows the first of them, and without any all tables.
-    ``csvs`` are tables for programs, ``figures`` are drawn when called, ``files`` write themselves into the run folder.
-    ``json`` gives the ``--json`` object. ``lanes`` are timelines to look into.
+    ``main`` are the tables that are open on the page; a terminal shows the first of them, or all tables if it is empty.
+    ``figures`` are drawn when called, ``files`` write themselves into the run folder, ``json`` returns the ``--json``
+    object, ``lanes`` are the timelines of the page's interactive view.
     """
 
     sentences: Sequence[str] = ()
@@ -128,20 +127,12 @@ class Shown:
     lanes: Sequence[Any] = ()
 
 
-class View(Protocol):
-    """How an experiment's runs are shown; ``options`` are its view options."""
-
-    def __call__(self, run: StoredRun, **options: Any) -> Shown:
-        """Return what a run shows; reads the store and measures nothing."""
-        ...
-
-
 @dataclass(frozen=True, slots=True)
 class Comparable:
-    """What the runs of an experiment can be compared by.
+    """The metrics and cells that runs of an experiment are compared by.
 
-    ``origin`` says what did not really answer; ``shown`` are the metrics that are compared unless others are named.
-    ``run_metrics`` gives the metrics that only some runs have, as the stages of a transport from elsewhere.
+    ``origin`` names what stood in for a model; ``shown`` are the metrics that are compared by default.
+    ``run_metrics`` returns the metrics of one run alone, such as the stages of a plug-in's transport.
     """
 
     metrics: Mapping[str, Metric]
@@ -152,7 +143,7 @@ class Comparable:
 
 
 def by_name(metrics: Iterable[AnyMetric]) -> dict[str, AnyMetric]:
-    """Index metrics by their names."""
+    """Return name -> metric."""
     return {metric.name: metric for metric in metrics}
 
 
@@ -162,29 +153,29 @@ class Experiment:
 
     name: str
     about: str
-    """What ``--help`` says of it: a sentence."""
+    """One sentence for ``--help``."""
     config: str
     """Class of its options, an `options.Options`."""
     run: str
     """Function ``(config, output, progress) -> run folder``."""
     view: str
-    """Function, a `View`."""
+    """Function ``(run, **view options) -> Shown``; it reads the store and measures nothing."""
     view_options: str = ""
-    """Class of the options that change what is shown and not what is measured."""
+    """Class of the options that change what is shown, not what is measured."""
     compared: str = ""
-    """A `Comparable`; without it, its runs are not compared."""
+    """A `Comparable`; empty: its runs are not compared."""
     cell: str = ""
-    """Class of a cell of its ``--json``, a dataclass, from which docs/schema follows; not declared: any object."""
+    """Dataclass of a cell of its ``--json``, from which docs/schema follows; empty: any object."""
     unit: str = "samples"
-    """What progress counts, and what is kept of a run that breaks off."""
+    """What progress counts, and what is kept of an interrupted run."""
 
     def run_with(self, config: Options, output: Path, progress: Progress) -> Path:
-        """Run it and return the run folder; raises S2AError for what a user can mend."""
+        """Run it and return the run folder; raises S2AError."""
         folder: Path = resolve_name(self.run)(config, output, progress)
         return folder
 
     def show(self, run: StoredRun, **options: Any) -> Shown:
-        """Return what one of its runs shows; every table and figure says where its numbers come from."""
+        """Return what one of its runs shows; every table and figure names the origin of its numbers."""
         from s2a_bench.writers.figures import marked
 
         shown: Shown = resolve_name(self.view)(run, **options)
@@ -194,12 +185,12 @@ class Experiment:
         return replace(shown, tables=tables, figures=figures)
 
     def cell_class(self) -> type | None:
-        """Return the class of a cell of its ``--json``; None where it is not declared."""
+        """Return the class of a cell of its ``--json``; None if not declared."""
         cell: type | None = resolve_name(self.cell) if self.cell else None
         return cell
 
     def compared_by(self) -> Comparable | None:
-        """Return what its runs are compared by; None where they are not."""
+        """Return what its runs are compared by; None if they are not."""
         compared: Comparable | None = resolve_name(self.compared) if self.compared else None
         return compared
 
@@ -216,11 +207,10 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
         "timeline": "s2a_bench.experiments.timeline:EXPERIMENT",
     },
 )
-"""The experiments by their commands."""
 
 
 def write_shown(run: StoredRun, shown: Shown) -> None:
-    """Write tables, figures and what else a run shows into its folder; raises StoreError."""
+    """Write tables, figures and files into the run folder; raises StoreError."""
     from s2a_bench.writers.csv_text import write_texts
 
     write_texts(run, shown.tables, shown.csvs)
@@ -233,5 +223,5 @@ def write_shown(run: StoredRun, shown: Shown) -> None:
 
 
 def experiment_of(command: str) -> Experiment | None:
-    """Return the experiment whose runs name this command; None if there is none, or it is not installed."""
+    """Return the experiment of a command; None if there is none, or it is not installed."""
     return next((each for _, each in EXPERIMENTS.loaded() if each.name == command), None)

@@ -17,7 +17,7 @@ else:
 
 
 class AgainstPaper(Options):
-    """Whether the paper's values are drawn beside those of a run."""
+    """The options of views with the paper's values."""
 
     against: str = option("", "paper: draw the paper's values beside ours")
 
@@ -27,8 +27,6 @@ class AgainstPaper(Options):
 
 
 LABEL = "paper (Jetson AGX Orin), another machine"
-"""How the paper's values are called wherever they are shown."""
-
 CAVEAT = "The paper does not say that inference is left out; its figures allow nothing else."
 
 

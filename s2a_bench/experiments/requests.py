@@ -1,9 +1,9 @@
 """The cells of a run of requests: the samples that count, the metrics, JSON, CSV and comparison made of them.
 
-Warm-ups and failed samples are counted and take part in no summary. The rate of a request is given twice.
-``tokens_per_s`` is the paper's (section V-D): N_tokens / T_eval, T_eval being the engine's own time from the end of the
-prompt to the last token; where a server does not tell it, the other stands in. ``decode_tokens_per_s`` is what the
-client saw: (n - 1) / (t_last - t_first), so that sending counts.
+Warm-ups and failed samples are counted, and excluded from every summary. A request has two rates.
+``tokens_per_s`` is the paper's (section V-D): N_tokens / T_eval, T_eval being the engine's time from the end of the
+prompt to the last token; without T_eval the other rate stands in. ``decode_tokens_per_s`` is the client's, sending
+included: (n - 1) / (t_last - t_first).
 """
 
 from __future__ import annotations
@@ -54,31 +54,30 @@ if TYPE_CHECKING:
     Split: TypeAlias = Sequence[tuple[StoredRun, list["RequestCell"]]]
 
 RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
-"""What cells are compared by: columns of the samples, less the unit."""
-
+"""What cells are compared by: columns of the samples without their unit."""
 _NS_PER_MS = 1e6
 
 
 @dataclass(frozen=True, slots=True)
 class RequestMetric(Metric):
-    """A metric of requests: ``of`` a cell it has a row a request, or a token where the index is ``request_id``.
+    """A metric of requests, times in ms; without ``of`` the column of the samples that has its name.
 
-    Times are in ms. Without ``of`` it is the column of the samples that has its name.
+    ``of`` maps a cell to one row a request, or to one a token with the index ``request_id``.
     """
 
     of: Of | None = None
     shown: tuple[str, ...] = ()
-    """The statistics of it in the table of tokens."""
+    """Its statistics in the table of tokens."""
 
     @property
     def key(self) -> str:
-        """Return its name in JSON and CSV, which says the unit where that is ms."""
+        """Its name in JSON and CSV, with the unit if that is ms."""
         return self.name if self.unit != "ms" else f"{self.name.removesuffix('_ms')}_ms"
 
 
 @dataclass(frozen=True)
 class RequestCell:
-    """One cell of a run; ``good`` holds the samples that count, in the order in which they were taken."""
+    """One cell of a run; ``good`` holds the samples that count, in time order."""
 
     name: str
     about: dict[str, str]
@@ -89,7 +88,7 @@ class RequestCell:
     stages: Mapping[str, str]
     """Stage -> group of the run, in the order of the path."""
     emulated: bool
-    """Whether the engine's times come from a profile, or from latencies that were given."""
+    """Whether the engine's times come from a profile, or from given latencies."""
     mixed: bool = False
     """Whether a pipeline of the run names its payload: then payloads are compared."""
 
@@ -107,33 +106,33 @@ class RequestCell:
 
     @property
     def payload(self) -> str:
-        """Return how its pictures travel; nothing where they do not."""
+        """The payload of its pictures; empty in process."""
         return self.about["payload"].removeprefix("none")
 
     @property
     def label(self) -> str:
-        """Return its name without the payload, which stands beside it."""
+        """Its name without the payload."""
         return without(self.name, "payload")
 
     def is_compared_with(self, base: RequestCell) -> bool:
-        """Whether its transport declares that its cells are divided by those of another, and both have one payload."""
-        alike = self.mixed or not (self.payload and base.payload) or self.payload == base.payload
-        return alike and base.pipeline in declared_transport(self.pipeline).compared_with
+        """Return True if its transport is compared with that of ``base``, and their payloads match."""
+        matching = self.mixed or not (self.payload and base.payload) or self.payload == base.payload
+        return matching and base.pipeline in declared_transport(self.pipeline).compared_with
 
     def values(self, metric: RequestMetric | str) -> Floats:
-        """Return a metric's values, times in ms: one a request that has it, or one a token."""
+        """Return a metric's values, times in ms: one a request or token that has it."""
         return _numbers(self.column(metric))
 
     def values_ms(self, column: str) -> Floats:
-        """Return the values of a stage, or of another column less ``_ns``, in ms."""
+        """Return the values in ms of a stage, or of another column without ``_ns``."""
         return numbers_ms(self._ns(column))
 
     def group_ms(self, group: str) -> Floats:
-        """Return the sums, in ms, of the stages of a group; a sample without such stages has none."""
+        """Return the sums in ms of the stages of a group, of the samples that have any."""
         return _numbers(self.sums_ms(group))
 
     def rows(self, metric: RequestMetric | str) -> Rows:
-        """Return a metric's values, a row a request that has any."""
+        """Return a metric's values, an array for each request that has any."""
         column = self.column(metric).dropna()
         if column.index.name != "request_id":
             return list(_numbers(column)[:, None])
@@ -141,12 +140,12 @@ class RequestCell:
         return [found[request] for request in self.good["request_id"] if request in found]
 
     def by_launch(self, metric: str) -> dict[int, dict[int, list[float]]]:
-        """Return the values of a metric by the launch and the block in which they were taken, times in ms."""
+        """Return the values of a metric by launch and block, times in ms."""
         values = self.column(metric).dropna()
         return by_launch(self.good[["launch", "block"]].loc[values.index], values)
 
     def column(self, metric: RequestMetric | str) -> pd.Series[Any]:
-        """Return a metric's column, times in ms; one of the samples' is named with or without ``_ms``."""
+        """Return a metric's column, times in ms; a column of the samples is named with or without ``_ms``."""
         found = OF_ANSWERS.get(metric) if isinstance(metric, str) else metric
         if found and found.of:
             return found.of(self)
@@ -154,22 +153,21 @@ class RequestCell:
         return self.good[name] if name in self.good else self._ns(name.removesuffix("_ms")) / _NS_PER_MS
 
     def sums_ms(self, group: str) -> pd.Series[Any]:
-        """Return the sums of the stages of a group, a row a request."""
+        """Return the sums in ms of the stages of a group, a row a request."""
         names = [f"{stage}_ns" for stage, of in self.stages.items() if of == group]
         return self.good[names].sum(axis=1, min_count=1) / _NS_PER_MS
 
     def fact(self, name: str) -> pd.Series[Any]:
-        """Return a fact, a row a request; NaN where nobody tells it."""
+        """Return a fact, a row a request; NaN where it is absent."""
         return self._facts.get(name, self._facts["events"] * float("nan"))
 
     def _ns(self, column: str) -> pd.Series[Any]:
-        """Return a column of ns; that of a stage which the run's transports do not have is empty."""
         name = f"{column}_ns"
         return self.good[name] if name in self.good else self.good["frame_index"].iloc[:0]
 
     @property
     def has_ingest(self) -> bool:
-        """Return whether the server is a llama-server, seen from outside."""
+        """Whether the server is a llama-server, whose `ingest` is not part of inference."""
         return bool(self.group_ms("ingest").size)
 
     def flagged(self) -> int:
@@ -177,7 +175,7 @@ class RequestCell:
 
     @cached_property
     def _facts(self) -> pd.DataFrame:
-        """Return the facts of each request that counts, its events (tokens as they came), and their span in s."""
+        """The facts of each request that counts, its events (tokens as they arrived), and their span in s."""
         import pandas as pd
 
         times = self.tokens.groupby("request_id")["client_ns"].agg(["min", "max", "size"])
@@ -187,19 +185,19 @@ class RequestCell:
 
     @property
     def n_tokens(self) -> pd.Series[Any]:
-        """Return the tokens of each answer: the server's own count, its invisible last left out, where it tells one."""
+        """The tokens of each answer: the server's count without the end token, else the events."""
         return _some(self.fact(PREDICTED_N)).fillna(self.fact("events")) - self.fact(END_N).fillna(0)
 
     @property
     def has_engine_time(self) -> bool:
-        """Return whether the engine reports T_eval; else the client's rate stands for the paper's."""
+        """Whether the engine reports T_eval."""
         return bool(_some(self.fact(PREDICTED_MS)).notna().any())
 
     @cached_property
     def answers(self) -> pd.DataFrame:
-        """Return the tokens of the samples that count by ``request_id``, each request's in order.
+        """The tokens of the samples that count by ``request_id``, in order.
 
-        ``gap_ns`` is the time since the token before, as the client saw both; the first has none.
+        ``gap_ns`` is the client's time since the previous token; the first token has none.
         """
         tokens = self.tokens[self.tokens["request_id"].isin(self.good["request_id"])]
         tokens = tokens.sort_values(["request_id", "index"]).set_index("request_id")
@@ -207,18 +205,17 @@ class RequestCell:
 
 
 def _some(values: pd.Series[Any]) -> pd.Series[Any]:
-    """Return values without those that are 0."""
     return values.where(values != 0)
 
 
 def decode_rate(cell: RequestCell) -> pd.Series[Any]:
-    """Return (n - 1) / (t_last - t_first), as the client saw the tokens."""
+    """Return (n - 1) / (t_last - t_first) at the client."""
     tokens, span_s = cell.n_tokens, cell.fact("span_s")
     return ((tokens - 1) / span_s).where((tokens > 1) & (span_s > 0))
 
 
 def _engine_rate(cell: RequestCell) -> pd.Series[Any]:
-    """Return N_tokens / T_eval; ``predicted_steps`` is present where the engine's time covers another number (vLLM)."""
+    # vLLM's time covers another number of steps than tokens.
     steps = cell.fact(PREDICTED_STEPS).fillna(cell.n_tokens)
     return (steps / _some(cell.fact(PREDICTED_MS)) * 1e3).fillna(decode_rate(cell))
 
@@ -301,13 +298,13 @@ TOKEN_METRICS: Final = (
         ("median", "p90", "p99"),
     ),
 )
-"""What the tokens of a request show, so that a row has several values."""
+"""Metrics of tokens: a row has several values."""
 
 OF_ANSWERS: Final = by_name((*ANSWER_METRICS, *TOKEN_METRICS))
 
 
 def by_launch(places: pd.DataFrame, values: Iterable[Any]) -> dict[int, dict[int, list[float]]]:
-    """Collect values by their places' columns ``launch`` and ``block``."""
+    """Return values by the columns ``launch`` and ``block`` of their ``places``."""
     found: dict[int, dict[int, list[float]]] = {}
     for launch, block, value in zip(places["launch"], places["block"], values, strict=True):
         found.setdefault(int(launch), {}).setdefault(int(block), []).append(float(value))
@@ -315,12 +312,12 @@ def by_launch(places: pd.DataFrame, values: Iterable[Any]) -> dict[int, dict[int
 
 
 def numbers_ms(column: pd.Series[Any]) -> Floats:
-    """Return a column of ns in ms, the missing values left out."""
+    """Return a column of ns in ms without missing values."""
     return _numbers(column) / _NS_PER_MS
 
 
 def cells_of(run: StoredRun) -> list[RequestCell]:
-    """Split a run into its cells, once, in the order that their transports declare, then by name."""
+    """Split a run into its cells, once, in the order that transports declare, then by name."""
     samples, tokens = run.samples, run.tokens
     if (kept := run.derived.get("cells")) and kept[0] is samples and kept[1] is tokens:
         return [*kept[2]]
@@ -335,7 +332,7 @@ def split(runs: Iterable[StoredRun]) -> Split:
 
 
 def launches_of(run: StoredRun) -> list[tuple[int, list[RequestCell]]]:
-    """Return launch and cells for every launch of a run."""
+    """Return (launch, its cells) for every launch of a run."""
     samples = run.samples
     return [(int(launch), _cells(run, samples[samples["launch"] == launch])) for launch in samples["launch"].unique()]
 
@@ -351,12 +348,12 @@ def _cells(run: StoredRun, samples: pd.DataFrame) -> list[RequestCell]:
 
 
 def payloads_of(cells: Iterable[RequestCell]) -> list[str]:
-    """Return how pictures travel, each way once."""
+    """Return the distinct payloads."""
     return [each for each in dict.fromkeys(cell.payload for cell in cells) if each]
 
 
 def titles(cells: Sequence[RequestCell]) -> list[str]:
-    """Return what cells are called where no column says their payloads: those are named where there are several."""
+    """Return the names of cells, with their payloads if those are several."""
     several = len(payloads_of(cells)) > 1
     return [f"{cell.label} {cell.payload}".rstrip() if several else cell.name for cell in cells]
 
@@ -364,7 +361,7 @@ def titles(cells: Sequence[RequestCell]) -> list[str]:
 def ratios(cells: list[RequestCell], seed: int) -> Iterator[tuple[str, RequestCell, RequestCell, Ratio]]:
     """Yield metric, cell, base and ratio: every cell over those that it is compared with.
 
-    A pair is left out where a cell lacks the metric, as e2e without inference behind a black box.
+    Pairs without the metric on both sides are left out.
     """
     for metric in RATIO_METRICS:
         for base in cells:
@@ -374,15 +371,15 @@ def ratios(cells: list[RequestCell], seed: int) -> Iterator[tuple[str, RequestCe
 
 
 def metric_phrase(metric: str) -> str:
-    """Return the name of what cells are compared by in words: End to end without inference."""
+    """Return a metric's name as text, such as "End to end without inference"."""
     return metric.replace("e2e", "End to end").replace("_", " ")
 
 
 def ratio_between(cell: RequestCell, base: RequestCell, metric: str, seed: int) -> Ratio | None:
-    """Divide the medians of two cells, launch by launch and block by block.
+    """Divide the medians of two cells, launch by launch and block by block; None if they cannot be compared.
 
-    None where they cannot be compared: a llama-server's `ingest` slices and resizes the picture, which our engine
-    counts as inference, so that e2e without inference does not mean the same on both sides.
+    A llama-server's `ingest` slices and resizes the picture, which our engine counts as inference: e2e without
+    inference means something else there.
     """
     if metric == "e2e_without_inference" and cell.has_ingest != base.has_ingest:
         return None
@@ -392,24 +389,24 @@ def ratio_between(cell: RequestCell, base: RequestCell, metric: str, seed: int) 
 
 
 def observation_of(run: StoredRun, cells: list[RequestCell]) -> str:
-    """Return what each request brings, in words: the pictures' sizes, how many, and the robot's state."""
+    """Return what each request carries: the pictures' sizes, their number, and the robot's state."""
     sizes = sorted({cell.about["size"] for cell in cells})
     return str(run.manifest["configuration"].get("observation") or ", ".join(sizes))
 
 
 def answer_kind(run: StoredRun) -> str:
-    """Return what answers are made of: tokens or actions."""
+    """Return tokens or actions."""
     engine: dict[str, Any] = run.manifest["configuration"].get("engine") or {}
     return "actions" if engine.get("answer") == "actions" else "tokens"
 
 
 def action_shape(run: StoredRun) -> str:
-    """Return the shape of each answer, in words, where answers are chunks of actions that an engine of ours makes."""
+    """Return the shape of each chunk of actions as text; empty for tokens, or another's engine."""
     return str((run.manifest.get("model") or {}).get("answer") or "")
 
 
 def engine_note(run: StoredRun, cells: list[RequestCell]) -> Note:
-    """Return what did not really answer: an echo, a replayed profile, dummy weights; empty where a model did."""
+    """Return what stood in for a model: an echo, a replayed profile, dummy weights; empty for a real model."""
     engines = dict.fromkeys(cell.about["engine"] for cell in cells)
     idle = [name for name in engines if not declared_engine(name).computes]
     notes = [Note(f"{name} engine", f"{name} engine") for name in idle]
@@ -428,12 +425,11 @@ def engine_note(run: StoredRun, cells: list[RequestCell]) -> Note:
 
 
 def stand_ins(runs: Split) -> list[str]:
-    """Return what did not really answer runs, a sentence each."""
+    """Return what stood in for a model in some run, a sentence each."""
     return sorted({note.sentence() for run, cells in runs if (note := engine_note(run, cells))})
 
 
 def _replayed(run: StoredRun, cells: list[RequestCell]) -> dict[str, Any]:
-    """Return the facts of the replayed profile: of our own server, or from the answers of another."""
     model: dict[str, Any] = run.manifest.get("model") or {}
     if declared_engine(model.get("engine", "")).plays:
         return model
@@ -451,12 +447,12 @@ def _emulated(model: dict[str, Any]) -> Note:
 
 
 def groups_present(cells: list[RequestCell]) -> list[str]:
-    """List the groups that some sample has, in the order of the path."""
+    """Return the groups that some sample has, in path order."""
     return [group for group in GROUPS if any(cell.group_ms(group).size for cell in cells)]
 
 
 def stages_present(cells: list[RequestCell]) -> list[str]:
-    """List the stages that some sample has, in the order of the path."""
+    """Return the stages that some sample has, in path order."""
     stages = cells[0].stages if cells else ()
     return [stage for stage in stages if any(cell.values_ms(stage).size for cell in cells)]
 
@@ -469,9 +465,8 @@ def _cell(
     origin: Provenance,
     mixed: bool,
 ) -> RequestCell:
-    """Sort the samples of one cell into those that count and those that are only counted."""
     about = {
-        key: str(samples[key].iloc[-1])  # who answers may be known from the first answer on
+        key: str(samples[key].iloc[-1])  # the engine may be unknown before the first answer
         for key in ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")
     }
     failed = samples["error"] != ""
@@ -481,11 +476,10 @@ def _cell(
 
 
 def _place(cell: RequestCell) -> tuple[int, float, str, int, str]:
-    """Sort by the payload, the transport's order, its variants in theirs, then by name."""
-    travels = PAYLOADS.index(cell.payload) if cell.payload in PAYLOADS else len(PAYLOADS)
+    payload = PAYLOADS.index(cell.payload) if cell.payload in PAYLOADS else len(PAYLOADS)
     transport, variant = declared_transport(cell.pipeline), cell.about["variant"]
     known = transport.variants.index(variant) if variant in transport.variants else len(transport.variants)
-    return travels, transport.order, cell.pipeline, known, cell.name
+    return payload, transport.order, cell.pipeline, known, cell.name
 
 
 def _numbers(column: pd.Series[Any]) -> Floats:
@@ -494,7 +488,7 @@ def _numbers(column: pd.Series[Any]) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class RequestsCell:
-    """What the cells of every run of requests say about themselves."""
+    """The fields that cells of all runs of requests have."""
 
     cell: Annotated[str, about("The name that ratios use.")]
     pipeline: str
@@ -520,17 +514,17 @@ class RequestsCell:
     warmups: Count
 
 
-def cell_class(name: str, meaning: str, metrics: Iterable[RequestMetric], **own: Any) -> type:
-    """Return the class of a cell of ``--json``: its ``own`` fields, and a summary of each metric that it has."""
+def cell_class(name: str, meaning: str, metrics: Iterable[RequestMetric], **fields: Any) -> type:
+    """Return the class of a cell of ``--json``: ``fields``, and a summary of each metric."""
     hints = {each.key: Annotated[Summary | None, about(each.about) if each.about else {}] for each in metrics}
-    made: type = with_fields(name, meaning, RequestsCell, {**own, **hints})
+    made: type = with_fields(name, meaning, RequestsCell, {**fields, **hints})
     return made
 
 
 def cell_json(
-    cls: type, cell: RequestCell, run: StoredRun, metrics: Iterable[RequestMetric], **own: Any
+    cls: type, cell: RequestCell, run: StoredRun, metrics: Iterable[RequestMetric], **fields: Any
 ) -> dict[str, Any]:
-    """Return one cell's numbers; a metric that no sample has is an absent key, ``dummy`` where it is not known."""
+    """Return one cell as JSON; a metric that no sample has is absent, and so is an unknown ``dummy``."""
     origin = run.origins.of(cell.name)
     described: dict[str, Any] = {
         "cell": cell.name,
@@ -541,13 +535,13 @@ def cell_json(
         "dummy": {"real": False, "dummy": True, "none": True}.get(origin.weights),
         **{name: getattr(cell, name) for name in ("emulated", "n", "errors", "warmups")},
     }
-    return present(cls(**described, **own, **summaries((each.key, cell.values(each)) for each in metrics)))
+    return present(cls(**described, **fields, **summaries((each.key, cell.values(each)) for each in metrics)))
 
 
 def summarised(
     cells: Iterable[RequestCell], metrics: Iterable[RequestMetric]
 ) -> Iterator[tuple[RequestCell, str, Summary]]:
-    """Yield every cell and metric that has values, with their summary."""
+    """Yield cell, key of a metric and summary, where there are values."""
     every = list(metrics)
     for cell in cells:
         for metric in every:
@@ -556,7 +550,7 @@ def summarised(
 
 
 def ratio_table(cells: Iterable[RequestCell], found: Iterable[tuple[str, str, str, Ratio]]) -> CsvTable:
-    """Lay out metric, cell, base and ratio for programs."""
+    """Return metric, cell, base and ratio as CSV."""
     emulated = {cell.name for cell in cells if cell.emulated}
     header = ("metric", "of", "to", "value", "ci95_low", "ci95_high", "launches", "launch_sd", "emulated")
     return CsvTable.of(
@@ -565,7 +559,7 @@ def ratio_table(cells: Iterable[RequestCell], found: Iterable[tuple[str, str, st
 
 
 def compared_by(metrics: Iterable[RequestMetric], shown: tuple[str, ...], **more: Any) -> Comparable:
-    """Return what runs of requests are compared by, a row a request, every launch by itself."""
+    """Return what runs of requests are compared by: a row a request, each launch on its own."""
     named = by_name(metrics)
 
     def subject(cell: RequestCell, launch: int) -> Subject:
@@ -580,7 +574,7 @@ def compared_by(metrics: Iterable[RequestMetric], shown: tuple[str, ...], **more
 
 
 def launches_note(ratios: Iterable[Ratio]) -> tuple[str, ...]:
-    """Return for what the intervals of ratios hold, one launch or any like those measured; nothing without them."""
+    """Return whether the intervals of ratios hold for one launch or for similar ones; empty without intervals."""
     bounded = [ratio for ratio in ratios if ratio.low is not None]
     if not bounded:
         return ()
@@ -594,19 +588,19 @@ def launches_note(ratios: Iterable[Ratio]) -> tuple[str, ...]:
 
 
 def engine_notes(run: StoredRun, cells: list[RequestCell]) -> tuple[str, ...]:
-    """Return what did not really answer, as a sentence."""
+    """Return what stood in for a model, as a sentence."""
     note = engine_note(run, cells)
     return (note.sentence(),) if note else ()
 
 
 def failure_notes(cells: Iterable[RequestCell], what: str) -> tuple[str, ...]:
-    """Return how many samples or requests failed."""
+    """Return the number of failures of ``what``, as a sentence."""
     failed = sum(cell.errors for cell in cells)
     return (f"{failed} {what} failed and are in no number here; samples.csv says why.",) if failed else ()
 
 
 def span_of(counts: Iterable[int], what: str = "") -> str:
-    """Return how many there are: 50, or 48 to 50 requests."""
+    """Return least and greatest count as text, such as "50", or "48 to 50 requests"."""
     found = sorted(counts)
     span = " to ".join(str(count) for count in dict.fromkeys((*found[:1], *found[-1:])))
     return f"{span} {what}{'s' * (found[-1] != 1)}" if what else span
@@ -615,6 +609,6 @@ def span_of(counts: Iterable[int], what: str = "") -> str:
 def caption_for(
     run: StoredRun, cells: list[RequestCell], what: str, facts: Sequence[str], notes: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """Return what a figure draws, from how many samples of what, and what did not really answer."""
+    """Return a figure's caption: the subject, the samples, notes, and what stood in for a model."""
     counts = ", ".join((f"n = {span_of(cell.n for cell in cells)} a cell", *facts))
     return (what, f"{counts}.", *notes, *engine_notes(run, cells))
