@@ -100,7 +100,7 @@ def test_a_replayed_profile_stays_emulated(fast_board: str, tmp_path: Path) -> N
     assert run.table(ROLLOUTS)["emulated"].all()
     first = origin_notes(run)[0]
     assert first.startswith("EMULATED (replayed) tokens over loopback; car simulated. 1")
-    assert first.endswith(" tokens/s came.")
+    assert first.endswith(" tokens/s arrived.")
     assert ccrb_json(run)["live"]["emulated"] is True
 
 

@@ -1,4 +1,4 @@
-"""What a CCRB run compares: policies, a board or a model, the scenario, a simulator; and what it refuses."""
+"""The options of a CCRB run: policies, a board or a model, the scenario, a simulator."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class PlanRequest(Options):
-    """Which model answers, over which transport."""
+    """The model of a live run and its transport."""
 
     PANEL: ClassVar[str] = "A model that answers"
 
@@ -44,18 +44,17 @@ class PlanRequest(Options):
 
 
 LONG_S: Final = 600.0
-"""Plans that take longer than this are no driving."""
+"""The longest time until a plan is whole."""
 SPANS: Final = {"phase_rates": 10_000.0, "phase_gaps_m": 1000.0}
-"""Fields with a span, from and to, and the most that it may reach."""
+"""Fields with a span (from, to) -> its greatest end."""
 MODELLED: Final = ("rate", "prompt_s", "phase", "random", "all_followers", "sensitivity")
-"""Fields about tokens that are modelled, besides the profile: refused where a model answers."""
-
+"""Fields of modelled tokens, besides the profile: refused with `live`."""
 DRAWN: Final = ("all_followers", "sensitivity", "seeds", "seed_points")
-"""Fields that change nothing of what else is driven; a manifest has them where they are not the default."""
+"""Fields that change no other roll-out; the manifest omits their defaults."""
 
 
 class CcrbConfig(Options):
-    """What is driven; the defaults are the operating point at which the paper's outcome comes about."""
+    """What is driven; the defaults are an operating point with the paper's outcome."""
 
     PANEL: ClassVar[str] = "Drives"
 
@@ -92,7 +91,7 @@ class CcrbConfig(Options):
 
     @property
     def virtual(self) -> bool:
-        """Whether nothing but this process computes."""
+        """Whether the whole run is computed in this process."""
         return not self.plan_request.live and self.simulator != "carla"
 
     @property
@@ -101,7 +100,7 @@ class CcrbConfig(Options):
 
     @cached_property
     def timeline(self) -> TimelineConfig:
-        """Return the timeline run whose plans these are: one setting, even tokens."""
+        """The timeline run with the same plans: one setting, even tokens."""
         from s2a_bench.harness.timelines.config import TimelineConfig
 
         durations, rate = (
@@ -123,7 +122,7 @@ class CcrbConfig(Options):
 
     @cached_property
     def request(self) -> TimelineConfig:
-        """Return the live timeline whose one plan is driven; raises UsageError naming the field."""
+        """The live timeline whose one plan is driven; raises UsageError naming the field."""
         from s2a_bench.harness.timelines.config import TimelineConfig
 
         plan_request = self.plan_request
@@ -162,17 +161,16 @@ class CcrbConfig(Options):
         return self.request.risks() if self.plan_request.live else super().risks()
 
     def to_manifest(self) -> dict[str, Any]:
-        """Return the options as plain data, those of the scenario among them, without those of the other mode."""
+        """Return the options of this mode and of the scenario as plain data."""
         left_out = {"scenario", "plan_request"}
         left_out |= {name for name in DRAWN if getattr(self, name) == type(self).model_fields[name].default}
         left_out |= (
             {"profile", *MODELLED, "phase_rates", "phase_gaps_m", "phase_points"} if self.plan_request.live else set()
         )
-        own = {**self.model_dump(exclude=left_out), **self.scenario.to_manifest()}
-        return {**own, "t_nom_s": self.scenario.durations.nominal_s, "time": "virtual"}
+        given = {**self.model_dump(exclude=left_out), **self.scenario.to_manifest()}
+        return {**given, "t_nom_s": self.scenario.durations.nominal_s, "time": "virtual"}
 
     def _check_live(self) -> None:
-        """Refuse options of modelled tokens, and requests that the model cannot answer."""
         for name in MODELLED if self.plan_request.engine.kind.plays else (*MODELLED, "profile"):
             if getattr(self, name) != type(self).model_fields[name].default:
                 raise UsageError(f"`{name}` is about tokens that are modelled; leave it out with `live`")
@@ -194,6 +192,6 @@ class CcrbView(Options):
     animation: bool = option(False, "write the animation (GIF, MP4): half a minute", flag="animation/--no-animation")
 
     def check(self) -> None:
-        """Raise MissingExtra, before anything is driven, where an animation cannot be drawn."""
+        """Raise MissingExtra before anything is driven if the animation's packages are missing."""
         if self.animation:
             extras.need("ccrb", "highway_env")

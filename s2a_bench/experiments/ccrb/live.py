@@ -1,7 +1,7 @@
 """The CCRB run on a model's tokens: one real request about the rendered scene, then the roll-outs in virtual time.
 
-Open loop: the request is at t = 0, and nothing that happens on the road changes the answer. What the model writes is
-parsed, as arrivals are those of parsed skills; the set-points that the ego drives are the scenario's.
+Open loop: the request is at t = 0, and the road does not change the answer. The model's text is parsed only for the
+arrival times of its skills; the ego drives the scenario's set-points.
 """
 
 from __future__ import annotations
@@ -38,10 +38,7 @@ if TYPE_CHECKING:
 
 
 def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
-    """Ask for one plan and drive it under every policy; raises S2AError.
-
-    Whatever happens, the requests so far are in the folder.
-    """
+    """Request one plan and drive it under every policy; raises S2AError. The folder keeps the requests so far."""
 
     def road(feed: FeedPlan) -> FrameSource:
         return Stamped(RoadSource(config.scenario.cars, *feed.size, fps=feed.fps), feed.nonce)
@@ -65,14 +62,14 @@ def _drive(config: CcrbConfig, ask: PlanPrompt, world: Simulator, launch: Runnin
     link = ModelLink(config.request, launch, f"{world.name} simulator")
     prior = link.warm_up(ask)
     progress.stage(f"one plan over {link.cell.name}")
-    ready = _hear(config, ask, link, prior)
+    ready = _request_plan(config, ask, link, prior)
     progress.advance()
     progress.stage("driving the operating point")
     drive_point(config, ready, world, launch.writer)
 
 
-def _hear(config: CcrbConfig, ask: PlanPrompt, link: ModelLink, prior: GapPrior | None) -> Prepared:
-    """Make the request, and let the policies have its arrivals; raises TransportError where the plan is not whole."""
+def _request_plan(config: CcrbConfig, ask: PlanPrompt, link: ModelLink, prior: GapPrior | None) -> Prepared:
+    """Request the plan and apply the policies to its arrivals; raises TransportError for an incomplete plan."""
     events: list[Event] = []
     feed = PlanFeed(Parser(ask.format), events.append)
     measured = link.request(ask, 0, feed)

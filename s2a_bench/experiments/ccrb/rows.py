@@ -12,14 +12,14 @@ from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
 from s2a_bench.store.schema import Many, NonNegative, Positive, Table, about, with_fields
 
 _DEADLINE: Final = (
-    "S_front: who brakes as planned from then on keeps 2 m to the lead; negative: too late from the beginning."
+    "S_front: the latest start of the planned braking that keeps 2 m to the lead; negative: too late at the request."
 )
 _IMPACT: Final = (LEAST_IMPACT_MPS, None)
 MPS2, MPS3 = "m/s\N{SUPERSCRIPT TWO}", "m/s\N{SUPERSCRIPT THREE}"
 
 
 def _metric(name: str, unit: str, title: str = "", better: Better = "lower", **more: Any) -> Metric:
-    """Return a metric that is 0 or more; of a time or a count every roll-out has a value."""
+    """Return a metric of 0 or more; only times and counts (with a ``kind``) are never absent."""
     return Metric(name, unit, better, title, **{"bounds": (0, None), "optional": "kind" not in more, **more})
 
 
@@ -30,7 +30,6 @@ TIMES: Final = (
     _metric("stall_s", "s", "stalled", kind=TIME),
     _metric("deadline_s", "s", kind=TIME, bounds=(None, None), about=_DEADLINE),
 )
-"""When the ego acted."""
 IMPACTS: Final = (
     _metric("impact_speed_mps", "m/s", "impact", bounds=_IMPACT, about="Of the harder impact; absent without one."),
     _metric("front_impact_mps", "m/s", bounds=_IMPACT),
@@ -38,7 +37,6 @@ IMPACTS: Final = (
     _metric("min_front_gap_m", "m", "front gap", "higher", optional=False),
     _metric("min_rear_gap_m", "m", "rear gap", "higher"),
 )
-"""What became of the cars."""
 MARGINS: Final = (
     _metric("min_front_ttc_s", "s", "TTC front", "higher", about="Absent where the cars never closed in."),
     _metric("min_rear_ttc_s", "s", "TTC rear", "higher"),
@@ -47,26 +45,23 @@ MARGINS: Final = (
         about="Greatest closing speed^2 / (2 gap) towards the lead; absent with a front impact.",
     ),
 )
-"""How near an impact was."""
 MOTION: Final = (
     _metric("rms_jerk", MPS3, "RMS jerk"),
     _metric("peak_jerk", MPS3, "peak jerk"),
     _metric("sparc", "", "SPARC", "higher", bounds=(None, 0)),
 )
-"""How smoothly the ego drove."""
 METRICS: Final = (*TIMES, *IMPACTS, *MARGINS, *MOTION)
 
 
 @dataclass(frozen=True, slots=True)
 class AboutRollout:
-    """What a row of `ROLLOUTS` says of a roll-out besides the metrics: what was tried. SI units.
+    """The columns of a row of `ROLLOUTS` besides the metrics: what was tried. SI units.
 
-    ``study`` is what it belongs to: point, phase or random; ``draw`` counts its scenarios. ``title`` names the board.
-    ``late`` says that s2a-ttc could not keep the deadline ``deadline_ns`` (S_front) without stalls; null for others.
-    Studies end when the outcome is decided, and have no least rear gap but that of an impact.
-    Impact speeds are null without that impact, times to collision where the cars never closed in, the required
-    deceleration (DRAC, to the lead) with a front impact, motion where no trajectory is kept, ``prompt_s`` where a model
-    took what it took.
+    ``study`` is point, phase or random; ``draw`` counts its scenarios. ``title`` names the board. ``late``: s2a-ttc
+    could not keep the deadline ``deadline_ns`` (S_front) without stalls; null for other policies. Studies stop when the
+    outcome is decided: their least rear gap is null without an impact. Null are also impact speeds without that impact,
+    times to collision where the cars never closed in, the required deceleration (DRAC, to the lead) with a front
+    impact, motion without a trajectory, and ``prompt_s`` of a live model.
     """
 
     cell: Annotated[str, {"minLength": 1}]
@@ -82,7 +77,7 @@ class AboutRollout:
     reflex: bool
     lane_change: bool
     tokens_per_s: float
-    prompt_s: Annotated[NonNegative | None, about("c; absent with --live: a model took what it took.")]
+    prompt_s: Annotated[NonNegative | None, about("c; absent with --live.")]
     tokens_per_skill: Many
     n_skills: Annotated[Many, about("A lane change included.")]
     t_nom_s: NonNegative
@@ -94,7 +89,7 @@ class AboutRollout:
     reaction_s: NonNegative
     follower_survives: Annotated[
         bool | None,
-        about("Whether the car behind stops behind an ego whose tokens come at once; if not, rear says nothing."),
+        about("Whether the car behind avoids an ego with immediate tokens; if not, a rear impact proves nothing."),
     ]
 
 
@@ -113,11 +108,11 @@ RolloutRow: Final = with_fields(
 
 @dataclass(frozen=True, slots=True)
 class FollowerRow:
-    """What became of many points of the plane under one policy, with one follower and lead: counts.
+    """Counts of outcomes over points of the plane under one policy, with one follower and lead.
 
-    ``seed`` drew the points over rate and rear gap; null: the operating point alone. ``survived`` counts where the
-    follower stops behind an ego whose tokens come at once, ``rear_survived`` rear impacts among those; ``paper``
-    counts where all three policies have the paper's outcome.
+    ``seed`` drew the points over rate and rear gap; null: the operating point alone. ``survived``: the follower avoids
+    an ego with immediate tokens; ``rear_survived``: rear impacts among those; ``paper``: all three policies have the
+    paper's outcome.
     """
 
     cell: str
@@ -137,9 +132,9 @@ class FollowerRow:
 
 @dataclass(frozen=True, slots=True)
 class SensitivityRow:
-    """At how many of the points of the plane that a seed drew the paper's ordering holds, one number changed.
+    """The number of a seed's points where the paper's ordering holds, with one number changed.
 
-    ``varied`` names the number, SI units; ``rear_gap_m`` leaves the rate as the only axis.
+    ``varied`` names the number, in SI units; ``rear_gap_m`` leaves the rate as the only axis.
     """
 
     cell: str
@@ -154,9 +149,9 @@ class SensitivityRow:
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryRow:
-    """The three cars of a shown roll-out at one time from the request; positions are bumper to bumper.
+    """The three cars of a recorded roll-out at one time from the request; positions are bumper to bumper.
 
-    ``phase`` says what the ego does: waiting, acting, gap or done; ``skill`` counts from 0, -1 before the first.
+    ``phase`` of the ego: waiting, acting, gap or done; ``skill`` counts from 0, -1 before the first.
     """
 
     cell: str
@@ -177,15 +172,9 @@ class TrajectoryRow:
 
 ROLLOUTS: Final[Table[AboutRollout]] = Table("rollouts", RolloutRow)
 """One row a roll-out of the driving scenario."""
-
-
 TRAJECTORIES: Final[Table[TrajectoryRow]] = Table("trajectories", TrajectoryRow)
-"""One row a moment of a shown roll-out."""
-
-
+"""One row a moment of a recorded roll-out."""
 FOLLOWER_STUDY: Final[Table[FollowerRow]] = Table("followers", FollowerRow)
 """One row a policy, follower, lead and seed."""
-
-
 SENSITIVITY: Final[Table[SensitivityRow]] = Table("sensitivity", SensitivityRow)
 """One row a value of a varied number and seed."""

@@ -1,4 +1,4 @@
-"""The CCRB run: one plan at the operating point, driven by every policy; and where their ordering holds."""
+"""The CCRB run: one plan at the operating point, driven by every policy, and the studies of their ordering."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.rows import FOLLOWER_STUDY, ROLLOUTS, SENSITIVITY, TRAJECTORIES
 from s2a_bench.experiments.ccrb.studies import (
     VARIED,
+    count_blocks,
     follower_rows,
     motion_of,
-    pieces,
     rollout_rows,
     sensitivity_rows,
     studies,
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """One plan, ready to be driven by every policy."""
+    """One plan and its schedule under every policy."""
 
     setting: PlanSetting
     request_id: str
@@ -58,7 +58,7 @@ class Prepared:
 
 
 def prepare(config: CcrbConfig) -> Prepared:
-    """Let the board's tokens come, and ask the policies; they are the plans' ``token_s``."""
+    """Draw the board's tokens, which are the plans' ``token_s``, and schedule them under every policy."""
     board, setting = next(settings(config.timeline))
     known = learn(config.timeline, board, setting)
     _, plans = draw(config.timeline, board, setting, 1, "plans")
@@ -69,7 +69,7 @@ def prepare(config: CcrbConfig) -> Prepared:
 def complete(
     config: CcrbConfig, setting: PlanSetting, request_id: str, plans: Plans, policies: Mapping[str, Policy]
 ) -> Prepared:
-    """Ask the policies about a plan, drawn or heard."""
+    """Schedule a plan, drawn or received, under every policy."""
     scenario = config.scenario
     if scenario.lane_change:
         plans = with_lane_change(plans, scenario.lane_durations)
@@ -82,7 +82,7 @@ def complete(
 
 
 def with_lane_change(plans: Plans, lane: Durations) -> Plans:
-    """Let the last skill take as long as a lane change."""
+    """Set the last skill's durations to those of a lane change."""
     changed: dict[str, Any] = {name: np.array(getattr(plans, name)) for name in ("nominal_s", "least_s", "most_s")}
     for name, value in changed.items():
         value[-1] = getattr(lane, name)
@@ -90,7 +90,7 @@ def with_lane_change(plans: Plans, lane: Durations) -> Plans:
 
 
 def drive_point(config: CcrbConfig, ready: Prepared, world: Simulator, writer: RunWriter) -> None:
-    """Drive the policies one after the other, and keep everything."""
+    """Drive the policies one after the other, and record everything."""
     scenario = config.scenario
     for name, schedule in ready.schedules.items():
         driven = drive(world, scenario.cars, scenario.driving, schedule, record=True)
@@ -105,7 +105,6 @@ def drive_point(config: CcrbConfig, ready: Prepared, world: Simulator, writer: R
 
 
 def _about(config: CcrbConfig, ready: Prepared, world: Simulator) -> dict[str, Any]:
-    """Return what the roll-outs of the operating point have in common."""
     setting, scenario = ready.setting, config.scenario
     of_setting = ("board", "title", "emulated", "tokens_per_s", "prompt_s", "n_skills", "t_nom_s")
     of_scenario = ("follower", "reflex", "lane_change", "front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s")
@@ -155,7 +154,6 @@ def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
 
 
 def _drive_studies(config: CcrbConfig, writer: RunWriter, progress: Progress) -> None:
-    """Drive the studies beside the operating point, and record their speed."""
     work = list(_work(config))
     if not work:
         return
@@ -165,20 +163,20 @@ def _drive_studies(config: CcrbConfig, writer: RunWriter, progress: Progress) ->
     for _, _, table, rows_of in work:
         while True:
             before = process_time()
-            piece = next(rows_of, None)
+            block = next(rows_of, None)
             spent_s += process_time() - before
-            if piece is None:
+            if block is None:
                 break
-            driven += piece[0]
-            writer.append(table, piece[1])
+            driven += block[0]
+            writer.append(table, block[1])
             progress.advance()
     writer.update(studies={"rollouts": driven, "rollouts_per_cpu_s": driven / spent_s})
 
 
 def _work(config: CcrbConfig) -> Iterator[tuple[str, int, Table[Any], Iterator[tuple[int, list[Any]]]]]:
-    """Yield what each study is called, of how many pieces it is, its table, and what drives it piece by piece."""
+    """Yield each study's name, number of blocks, table, and iterator of (roll-outs, rows) block by block."""
     for study, scenes in studies(config):
-        yield study, pieces(scenes), ROLLOUTS, study_rows(config, study, scenes)
+        yield study, count_blocks(scenes), ROLLOUTS, study_rows(config, study, scenes)
     if config.all_followers:
         count = len(FOLLOWERS) * len(NCAP_GAPS_M) * len(NCAP_DECELS_MPS2)
         yield "all followers", count, FOLLOWER_STUDY, follower_rows(config)

@@ -1,9 +1,8 @@
-"""Roll-outs as rows, and where the ordering of the policies holds: the studies.
+"""Roll-outs as rows, and the studies: phase diagram, random scenarios, every follower, six numbers varied.
 
-The studies are the phase diagram, random scenarios, every follower, and six numbers varied.
-Tokens come evenly, so that stream-to-act starts at S0 (closed form: the online rule does the same with even tokens),
-and the ego is the bare integrator. For followers and varied numbers every seed draws its own points of the phase
-diagram's plane, by a scrambled Sobol sequence; all of them meet the same points.
+Tokens arrive evenly, so that stream-to-act starts at S0 (closed form: the online rule does the same with even tokens),
+and the ego is the bare integrator. For followers and varied numbers each seed draws points of the phase diagram's
+plane, by a scrambled Sobol sequence; all followers and numbers use the same points.
 """
 
 from __future__ import annotations
@@ -47,23 +46,23 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _TOLERANCE_S = 0.02
-"""Shorter stalls do not count (POLICY section 1)."""
+"""Shorter stalls are not counted (POLICY section 1)."""
 
 
 def rollout_rows(
     about: Mapping[str, Any], schedule: Schedule, outcomes: Outcomes, *, motion: Mapping[str, Any] | None = None
 ) -> Iterator[AboutRollout]:
-    """Describe M roll-outs; what ``about`` says is one value for all, or an array with one each."""
+    """Yield the rows of M roll-outs; a value of ``about`` is common to all, or an array of M."""
     stall_s = stalls(schedule)
     end_s = schedule.start_s[-1] + schedule.duration_s[-1]
     shared = {name: value for name, value in about.items() if not isinstance(value, np.ndarray)}
-    own = {name: value for name, value in about.items() if isinstance(value, np.ndarray)}
+    each = {name: value for name, value in about.items() if isinstance(value, np.ndarray)}
     found = {metric.name: getattr(outcomes, metric.name) for metric in (*IMPACTS, *MARGINS)}
     for place in range(len(outcomes.code)):
         metrics: dict[str, Any] = {name: _finite(values[place]) for name, values in found.items()}
         yield RolloutRow(
             **shared,
-            **{name: value[place].item() for name, value in own.items()},
+            **{name: value[place].item() for name, value in each.items()},
             start_ns=to_ns(schedule.start_s[0, place]),
             end_ns=to_ns(end_s[place]),
             stalls=int((stall_s[:, place] > _TOLERANCE_S).sum()),
@@ -75,7 +74,7 @@ def rollout_rows(
 
 
 def motion_of(path: Trajectory) -> dict[str, float]:
-    """Return jerk and smoothness of the ego of a single roll-out, from the request until it rests or crashes."""
+    """Return jerk and smoothness of the ego in a single roll-out, from the request to rest or impact."""
     speed = path.speed_mps[:, EGO, 0]
     if len(speed) < 3:  # noqa: PLR2004 - over at once
         return {}
@@ -84,7 +83,7 @@ def motion_of(path: Trajectory) -> dict[str, float]:
 
 
 def trajectory_rows(cell: str, path: Trajectory) -> Iterator[TrajectoryRow]:
-    """List every recorded moment of a single roll-out."""
+    """Yield every recorded moment of a single roll-out."""
     cars: dict[str, Any] = {
         f"{role}_{what}": getattr(path, what)[:, place, 0].tolist()
         for what in ("position_m", "speed_mps", "acceleration_mps2")
@@ -106,9 +105,9 @@ def _finite(value: float) -> float | None:
 
 
 FORMS: Final = {name: policy(name).foreseeing for name in COMPARED}
-"""The paper's three policies with all arrivals known."""
+"""The paper's three policies, with all arrivals known."""
 SCENES: Final = 1366
-"""Scenarios in lock step: some 8 thousand roll-outs."""
+"""Scenarios of a block, driven in lock step: about 8,000 roll-outs."""
 VARIED: Final[dict[str, tuple[float, ...]]] = {
     "gap_decel_mps2": (3.0, 4.0, 5.0, 6.0, 7.0, 8.0),
     "build_s": (0.2, 0.4, 0.6, 0.8, 1.0, 1.2),
@@ -117,7 +116,7 @@ VARIED: Final[dict[str, tuple[float, ...]]] = {
     "rear_gap_m": (8.0, 11.0, 14.0, 17.0, 20.0, 24.0),
     "onset_s": (-0.5, -0.25, 0.0, 0.25, 0.5, 1.0),
 }
-"""Numbers of `Cars` that are varied one at a time, and their values."""
+"""Field of `Cars` that is varied -> its values."""
 
 
 def studies(config: CcrbConfig) -> Iterator[tuple[str, Scenes]]:
@@ -139,23 +138,21 @@ def studies(config: CcrbConfig) -> Iterator[tuple[str, Scenes]]:
 
 
 def study_rows(config: CcrbConfig, study: str, scenes: Scenes) -> Iterator[tuple[int, list[AboutRollout]]]:
-    """Drive every scenario with every gap behaviour and policy: how many were driven, and their rows, piece by piece.
+    """Drive every scenario with every gap behaviour and policy; yield roll-outs and rows block by block.
 
-    The check on the car behind is one more drive of each.
-
-    What never stalls has no gap to behave in: it is driven once, and stands in a row for every gap behaviour.
+    The check on the car behind is one more roll-out a scenario. A policy that never stalls is driven once, with a row
+    for every gap behaviour.
     """
     for first in range(0, len(scenes), SCENES):
-        yield _piece(config, study, scenes.cut(slice(first, first + SCENES)))
+        yield _block(config, study, scenes.cut(slice(first, first + SCENES)))
 
 
-def pieces(scenes: Scenes) -> int:
-    """Return how many pieces of work `study_rows` makes of them."""
+def count_blocks(scenes: Scenes) -> int:
+    """Return the number of blocks that `study_rows` yields."""
     return -(-len(scenes) // SCENES)
 
 
-def _piece(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[AboutRollout]]:
-    """Drive some scenarios in lock step: naive with each gap behaviour, the others once."""
+def _block(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[AboutRollout]]:
     scenario = config.scenario
     cases = [(name, gap) for name, form in FORMS.items() for gap in (GAPS if form.stalls else (scenario.gap,))]
     gaps = np.repeat([gap for _, gap in cases], len(scenes))
@@ -192,7 +189,7 @@ def _piece(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[Ab
 
 
 def schedules(config: CcrbConfig, scenes: Scenes, names: Sequence[str]) -> Schedule:
-    """Ask the policies, and put the answers side by side; a shorter plan goes on with skills of no length."""
+    """Concatenate the policies' schedules; shorter plans are padded with skills of no length."""
     at, count = scenes.numbers, len(scenes)
     longest = int(at["n_skills"].max())
     start_s = {name: np.empty((longest, count)) for name in FORMS}
@@ -213,7 +210,7 @@ def schedules(config: CcrbConfig, scenes: Scenes, names: Sequence[str]) -> Sched
 
 
 def follower_rows(config: CcrbConfig) -> Iterator[tuple[int, list[FollowerRow]]]:
-    """Drive every follower in Euro NCAP's combinations: roll-outs and rows, combination by combination."""
+    """Drive every follower in Euro NCAP's combinations; yield roll-outs and rows of each."""
     for follower, front_m, decel in product(FOLLOWERS, NCAP_GAPS_M, NCAP_DECELS_MPS2):
         changed: dict[str, Any] = {"follower": follower, "front_gap_m": front_m, "lead_decel_mps2": decel}
         scenario = config.scenario.but(lane_change=False, **changed)
@@ -246,7 +243,7 @@ def follower_rows(config: CcrbConfig) -> Iterator[tuple[int, list[FollowerRow]]]
 
 
 def sensitivity_rows(config: CcrbConfig) -> Iterator[tuple[int, list[SensitivityRow]]]:
-    """Drive the plane with one number changed at a time: roll-outs and rows, value by value."""
+    """Drive the plane with one number changed at a time; yield roll-outs and rows of each value."""
     scenario = config.scenario.but(lane_change=False)
     seeds, scenes = _points(config, scenario)
     drawn = seeds >= 0
@@ -275,7 +272,7 @@ def sensitivity_rows(config: CcrbConfig) -> Iterator[tuple[int, list[Sensitivity
 
 
 def _points(config: CcrbConfig, scenario: CcrbOptions) -> tuple[NDArray[np.int64], Scenes]:
-    """Return drawn points and whose seed's they are; the last is the operating point, of seed -1."""
+    """Return the seeds of the drawn points, and the points; the last is the operating point, of seed -1."""
     from scipy.stats import qmc
 
     seeds = range(config.seed, config.seed + config.seeds)

@@ -1,4 +1,4 @@
-"""The animation of a CCRB run: the policies below one another, drawn by highway-env; GIF and MP4."""
+"""The animation of a CCRB run, drawn by highway-env: a road for each policy; GIF and MP4."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 FRAMES_A_S: Final = 20
 WIDTH, ROAD_HEIGHT, TEXT_HEIGHT, FOOT_HEIGHT = 880, 96, 46, 40
-"""Pixels; even numbers, as video codecs want."""
+"""Pixels; video codecs need even numbers."""
 LAST_S: Final = 2.0
-"""How long the last picture stands."""
+"""Duration of the last frame."""
 _PHASES: Final = {"waiting": "no skill yet: keeps its speed", "gap": "STALL: no skill is valid", "done": "plan done"}
 _HITS: Final[dict[str, frozenset[int]]] = {
     "front": frozenset({LEAD, EGO}),
@@ -40,9 +40,9 @@ _INK, _PAPER, _RED, _FAINT = (20, 20, 20), (255, 255, 255), (200, 60, 0), (110, 
 
 
 def animation_files(run: StoredRun) -> dict[str, Callable[[Path], None]]:
-    """Return what writes the animation in real time, by file name; raises StoreError where that fails.
+    """Return file name -> function that writes the animation in real time, or raises StoreError.
 
-    A panel stops at its first impact: what comes after one is not modelled.
+    A panel stops at its first impact: the time after it is not modelled.
     """
     drawn = cache(partial(frames_of, run))
 
@@ -57,7 +57,7 @@ def animation_files(run: StoredRun) -> dict[str, Callable[[Path], None]]:
 
 
 def frames_of(run: StoredRun, frames_a_s: int = FRAMES_A_S) -> list[Image]:
-    """Draw every frame of the animation."""
+    """Return every frame of the animation."""
     panels = [RoadPanel(run, row) for row in rollouts_of(run, "point").to_dict("records")]
     until_s = max(panel.until_s for panel in panels)
     foot = f"{tokens_line(run)} Yellow: lead, green: ego, blue: car behind, red: impact.\n{law(configuration(run))}"
@@ -65,7 +65,7 @@ def frames_of(run: StoredRun, frames_a_s: int = FRAMES_A_S) -> list[Image]:
 
 
 class RoadPanel:
-    """One policy's road with a line of text above it."""
+    """One policy's road, and its text."""
 
     def __init__(self, run: StoredRun, row: dict[Any, Any]) -> None:
         self._row = row
@@ -79,7 +79,7 @@ class RoadPanel:
         self.until_s = float(self._path["time_s"][self._last])
 
     def draw(self, at_s: float) -> tuple[NDArray[np.uint8], str, str, bool]:
-        """Return the road's pixels, who drives it, what happens, and whether that is an impact."""
+        """Return the road's pixels, the policy with facts, the event, and whether that is an impact."""
         step_s = float(self._path["time_s"][1]) if len(self._path) > 1 else 1.0
         place = min(round(at_s / step_s), self._last)
         now = self._path.iloc[place]
@@ -122,7 +122,7 @@ def _frame(panels: list[RoadPanel], at_s: float, foot: str) -> Image:
 
 
 def _first_impact(path: pd.DataFrame, outcome: str) -> int | None:
-    """Return the row of the first impact; None without one. The last row before contact counts as well."""
+    """Return the row of the first impact, or the last row before contact; None without an impact."""
     if outcome == "none":
         return None
     side = "front" if outcome == "front" else "rear"
@@ -131,7 +131,7 @@ def _first_impact(path: pd.DataFrame, outcome: str) -> int | None:
 
 
 def _headings(path: pd.DataFrame) -> NDArray[np.float64]:
-    """Return the ego's heading in rad, to the left, from how far it moves sideways on its way."""
+    """Return the ego's heading in rad, positive to the left."""
     along = np.gradient(path["ego_position_m"].to_numpy(dtype="float64")) if len(path) > 1 else np.ones(1)
     aside = np.gradient(path["ego_lateral_m"].to_numpy(dtype="float64")) if len(path) > 1 else np.zeros(1)
     return np.where(np.abs(along) > 1e-6, np.arctan2(aside, np.maximum(along, 1e-6)), 0.0)  # noqa: PLR2004 - at rest
@@ -145,10 +145,10 @@ def _font(size: int) -> FreeTypeFont:
 
 
 def _write_gif(path: Path, frames: list[Image]) -> None:
-    """Write a GIF at half the frames: its times are hundredths, and viewers slow down what is faster."""
+    """Write a GIF of every second frame: its times are hundredths of a second, and viewers slow down faster ones."""
     from PIL import Image
 
-    ends = np.vstack([np.asarray(frames[place]) for place in (0, -1)])  # the colours of an impact come last
+    ends = np.vstack([np.asarray(frames[place]) for place in (0, -1)])  # the last frame has the colours of an impact
     palette = Image.fromarray(ends).quantize(64)
     shown = [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in [*frames[::2], frames[-1]]]
     times = [2000 // FRAMES_A_S] * (len(shown) - 1) + [round(1000 * LAST_S)]
@@ -156,7 +156,6 @@ def _write_gif(path: Path, frames: list[Image]) -> None:
 
 
 def _write_film(path: Path, frames: list[Image]) -> None:
-    """Write an MP4 with OpenCV's MPEG-4 encoder."""
     import cv2
 
     size = frames[0].size

@@ -14,8 +14,8 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     configuration,
     has,
     origin_notes,
-    plane_words,
-    rate_span_here,
+    plane_text,
+    rate_span_at_point,
     rollouts_of,
     scenes_of,
     share_of,
@@ -70,7 +70,7 @@ _POINT: Final[dict[str, Any]] = {
 
 
 def build_scenario(run: StoredRun) -> Figure:
-    """Draw the operating point: a column a policy; positions, speeds and gaps over time."""
+    """Draw positions, speeds and gaps over time at the operating point, a column a policy."""
     found = rollouts_of(run, "point")
     survives, rows = survives_of(found), found.to_dict("records")
     paths = {row["policy"]: _path(run, row) for row in rows}
@@ -101,7 +101,7 @@ def build_scenario(run: StoredRun) -> Figure:
 
 
 def ccrb_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
-    """Return every figure by its file's name; those of studies where the run has them."""
+    """Return every figure by its file's name."""
     builders: dict[str, Callable[[], Figure]] = {"scenario": partial(build_scenario, run)}
     if has(run, "phase"):
         builders["phase"] = partial(build_phase, run)
@@ -111,7 +111,7 @@ def ccrb_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
 
 
 def path_of(run: StoredRun, cell: str) -> pd.DataFrame:
-    """Return the trajectory of a shown roll-out with times in s, speeds in km/h, and gaps."""
+    """Return the trajectory of a recorded roll-out with times in s, speeds in km/h, and gaps."""
     rows = run.table(TRAJECTORIES)
     path: pd.DataFrame = rows[rows["cell"] == cell].reset_index(drop=True)
     path["time_s"] = path["at_ns"] / 1e9
@@ -129,7 +129,7 @@ def rest_of(path: pd.DataFrame) -> int:
 
 
 def _path(run: StoredRun, row: dict[Any, Any]) -> pd.DataFrame:
-    """Return a trajectory up to rest; after an impact from behind the trailing car is out."""
+    """Return a trajectory up to rest, without the car behind after its impact."""
     path = path_of(run, row["cell"])
     shown = path["time_s"] <= float(path["time_s"].iloc[rest_of(path)]) + _AFTER_S
     path = path.loc[shown].copy()
@@ -141,7 +141,6 @@ def _path(run: StoredRun, row: dict[Any, Any]) -> pd.DataFrame:
 
 
 def _shade(axes: Axes, path: pd.DataFrame, skills: pd.DataFrame) -> None:
-    """Shade when the ego waits, acts, and has nothing valid to do."""
     first = float(skills["start_ns"].iloc[0]) / 1e9
     axes.axvspan(0, first, zorder=0, **_PHASES["waiting"])
     last = float(path["time_s"].iloc[-1])
@@ -195,7 +194,7 @@ def _legend() -> list[object]:
 
 
 def region_of(scenes: pd.DataFrame) -> list[str]:
-    """Name the region of each scenario."""
+    """Return the region of each scenario, a key of `REGIONS`."""
     named = []
     for row in scenes.to_dict("records"):
         hit = tuple(row[name] != "none" for name in PAPER)
@@ -209,7 +208,7 @@ def region_of(scenes: pd.DataFrame) -> list[str]:
 
 
 def build_phase(run: StoredRun) -> Figure:
-    """Draw a panel a gap behaviour, the operating point marked, the findings above each."""
+    """Draw the regions of the plane, a panel a gap behaviour."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
@@ -232,7 +231,7 @@ def build_phase(run: StoredRun) -> Figure:
         scenes = scenes_of(run, "phase", gap)
         seen |= _draw_panel(axes, scenes, settings, run)
         share = share_of(scenes, "paper").value
-        axes.set_title(f"{gap}: the paper's ordering {share:.1%}, {_here(run, gap, settings)}", loc="left")
+        axes.set_title(f"{gap}: the paper's ordering {share:.1%}, {_span_at_point(run, gap, settings)}", loc="left")
     for axes in grid[-1]:
         axes.set_xlabel("R (tokens/s)")
     for axes in grid[:, 0]:
@@ -274,20 +273,20 @@ def _draw_panel(axes: Axes, scenes: pd.DataFrame, settings: dict[str, Any], run:
     return set(np.unique(named))
 
 
-def _here(run: StoredRun, gap: str, settings: dict[str, Any]) -> str:
-    span = rate_span_here(run, gap)
+def _span_at_point(run: StoredRun, gap: str, settings: dict[str, Any]) -> str:
+    span = rate_span_at_point(run, gap)
     where = f"R {span[0]:.1f}\N{EN DASH}{span[1]:.1f}" if span else "no R"
     return f"at {settings['rear_gap_m']:g} m: {where}"
 
 
 def build_sensitivity(run: StoredRun) -> Figure:
-    """Draw the ordering's share of the plane over each varied number, the range over the seeds as a band."""
+    """Draw the ordering's share of the plane over each varied number, with the range over the seeds as a band."""
     found, settings = run.table(SENSITIVITY), configuration(run)
     shares = found.assign(share=100 * found["paper"] / found["points"])
     seeds, points = found["seed"].nunique(), int(found["points"].iloc[0])
     scene = f"{ahead(settings)}, gap behaviour {settings['gap']}"
     caption = (
-        f"The paper's ordering as a share of {plane_words(settings)}: {scene}",
+        f"The paper's ordering as a share of {plane_text(settings)}: {scene}",
         f"Mean, least and most of {seeds} seeds of {points} points; dotted: the default.",
         f"Rear: {law(settings)}.",
         f"EMULATED: tokens come evenly. {NO_SCORE}",

@@ -1,4 +1,4 @@
-"""What a CCRB run holds: the operating point, what its numbers are made of, and where the paper's ordering holds."""
+"""What a CCRB run holds: the operating point, the origin of its numbers, and where the paper's ordering holds."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ VARIED_TITLES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """How often something is so: ``k`` of ``n``, and the 95 % Clopper-Pearson interval."""
+    """``k`` of ``n``, with the 95 % Clopper-Pearson interval."""
 
     k: int
     n: int
@@ -41,7 +41,7 @@ class Share:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Return the interval, for scenarios that were drawn independently."""
+        """The interval, for scenarios that were drawn independently."""
         from scipy.stats import binomtest
 
         found = binomtest(self.k, self.n).proportion_ci(0.95, method="exact")
@@ -49,23 +49,23 @@ class Share:
 
 
 def rollouts_of(run: StoredRun, study: str) -> pd.DataFrame:
-    """Return the roll-outs of the operating point (point), the phase diagram (phase) or random scenarios (random)."""
+    """Return the roll-outs of a study: point (the operating point), phase (the diagram) or random."""
     rows = run.table(ROLLOUTS)
     return rows[rows["study"] == study].reset_index(drop=True)
 
 
 def cells_of(run: StoredRun) -> list[dict[str, Any]]:
-    """Return each policy's roll-out at the operating point: names and metrics, times in s; what it lacks is no key."""
+    """Return each policy's roll-out at the operating point as JSON, times in s; absent values have no key."""
     return [_cell(row) for row in rollouts_of(run, "point").to_dict("records")]
 
 
 def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
-    """Return a row a scenario of a study under one gap behaviour, with columns of truth values for each ordering.
+    """Return a row a scenario of a study under one gap behaviour, with a boolean column for each ordering.
 
-    ``paper``: naive is hit from behind only, wait-then-act hits the lead only, stream-to-act nobody. ``wait_worse``,
-    ``wait_better``, ``naive_worse``, ``naive_better``: against stream-to-act, an impact faster by more than .5 m/s
-    (none counts as 0); ``naive_rear_worse`` and ``naive_rear_better``: the same for impacts from behind alone.
-    ``survives``: the car behind stops behind an ego whose tokens come at once.
+    ``paper``: naive is hit from behind only, wait-then-act hits the lead only, stream-to-act has no impact.
+    ``wait_worse``, ``wait_better``, ``naive_worse``, ``naive_better``: the impact is more than 0.5 m/s faster or slower
+    than stream-to-act's (none counts as 0); ``naive_rear_worse``, ``naive_rear_better``: the same for rear impacts.
+    ``survives``: the car behind avoids an ego with immediate tokens.
     """
     import pandas as pd
 
@@ -87,22 +87,22 @@ def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
 
 
 def share_of(scenes: pd.DataFrame, ordering: str) -> Share:
-    """Count the scenarios in which an ordering holds."""
+    """Return the share of the scenarios in which an ordering holds."""
     return Share(int(scenes[ordering].sum()), len(scenes))
 
 
 def survives_of(rows: pd.DataFrame) -> bool:
-    """Return whether the car behind passes its check at the operating point."""
+    """Return whether the car behind avoids an ego with immediate tokens."""
     return bool(rows["follower_survives"].all())
 
 
 def rate_span(run: StoredRun, gap: str) -> tuple[float, float] | None:
-    """Return the least and greatest R of the phase diagram at which the paper's ordering holds; None where nowhere."""
+    """Return the least and greatest R of the phase diagram with the paper's ordering; None without any."""
     return _span_of(scenes_of(run, "phase", gap))
 
 
-def rate_span_here(run: StoredRun, gap: str) -> tuple[float, float] | None:
-    """Return the same at the grid's rear gap that is nearest to the operating point's."""
+def rate_span_at_point(run: StoredRun, gap: str) -> tuple[float, float] | None:
+    """Return the same at the grid's rear gap nearest to the operating point's."""
     scenes = scenes_of(run, "phase", gap)
     wanted = configuration(run)["rear_gap_m"]
     nearest = min(scenes["rear_gap_m"].unique(), key=lambda gap_m: abs(gap_m - wanted))
@@ -126,7 +126,7 @@ def configuration(run: StoredRun) -> dict[str, Any]:
 
 
 def token_times_s(run: StoredRun) -> list[float]:
-    """Return when the tokens of the shown plan arrived, in s from the request."""
+    """Return the arrival times of the driven plan's tokens, in s from the request."""
     request_id = run.table(SKILLS)["request_id"].iloc[0]
     tokens = run.table(TOKENS)
     zero_ns = run.manifest.get("request", {}).get("requested_ns", 0)
@@ -146,13 +146,13 @@ def _cell(row: dict[Any, Any]) -> dict[str, Any]:
 
 
 def _compared(theirs: pd.DataFrame, mine: pd.DataFrame, column: str) -> tuple[pd.Series[Any], pd.Series[Any]]:
-    """Return where a policy's impact is faster than stream-to-act's, and where slower."""
+    """Return where a policy's impact is faster than stream-to-act's, and where it is slower."""
     difference = theirs[column].astype("float64").fillna(0.0) - mine[column].astype("float64").fillna(0.0)
     return difference > LEAST_IMPACT_MPS, difference < -LEAST_IMPACT_MPS
 
 
 def origin_notes(run: StoredRun) -> tuple[str, ...]:
-    """Return what the numbers are made of, and which laws they hang on."""
+    """Return the origin of the numbers, and the laws that they depend on."""
     settings = configuration(run)
     notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
     notes.append(f"Rear: {law(settings)}.")
@@ -163,7 +163,7 @@ def origin_notes(run: StoredRun) -> tuple[str, ...]:
 
 
 def tokens_line(run: StoredRun) -> Note:
-    """Say in one line where the tokens come from."""
+    """Return the origin of the tokens as one line."""
     if (live := run.manifest.get("live")) is None:
         return Note(f"EMULATED tokens, {run.manifest['boards'][0]['tokens_per_s']:g}/s.", EMULATED)
     kind = "EMULATED (replayed)" if live["emulated"] else "LIVE"
@@ -178,7 +178,7 @@ def _live_notes(run: StoredRun) -> list[str]:
     rate = rollouts_of(run, "point")["tokens_per_s"].iloc[0]
     line = tokens_line(run)
     if "paced_tokens_per_s" not in live:
-        line = Note(f"{line} {rate:g} tokens/s came.", *line.labels)
+        line = Note(f"{line} {rate:g} tokens/s arrived.", *line.labels)
     road = "Open loop: one request at t = 0 about the rendered scene; the road does not change the answer."
     driven = "the set-points driven are those of the scenario."
     if live.get("dummy"):
@@ -191,13 +191,13 @@ def _emulated_notes(run: StoredRun) -> list[str]:
     rates = {"paper": "the paper's rate (table II)", "measured": "a measured rate", "given": "a rate as given"}
     rate = f"{rates[board['origin']]}, {board['tokens_per_s']:g}/s"
     papers = [PAPERS] if board["origin"] == "paper" else []
-    notes: list[str] = [Note(f"EMULATED: no model answered; tokens come evenly at {rate}.", EMULATED, *papers)]
+    notes: list[str] = [Note(f"EMULATED: no model answered; tokens arrive evenly at {rate}.", EMULATED, *papers)]
     if board["prompt_origin"] == "assumed":
-        notes.append(Note(f"c = {board['prompt_s']:g} s before decoding is an assumption of ours.", ASSUMED))
+        notes.append(Note(f"c = {board['prompt_s']:g} s before decoding is our assumption.", ASSUMED))
     return notes
 
 
-def plane_words(settings: dict[str, Any]) -> str:
-    """Return the plane's sides in words."""
+def plane_text(settings: dict[str, Any]) -> str:
+    """Return the plane's axes as text."""
     (slow, fast), (near, far) = settings["phase_rates"], settings["phase_gaps_m"]
     return f"the plane of R {slow:g} to {fast:g} tokens/s, rear gap {near:g} to {far:g} m"

@@ -1,4 +1,4 @@
-"""How a CCRB run is shown: its sentences, tables for people, and CSV and JSON for programs."""
+"""The sentences, tables, CSV and JSON of a CCRB run."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     configuration,
     has,
     origin_notes,
-    plane_words,
+    plane_text,
     rate_span,
-    rate_span_here,
+    rate_span_at_point,
     rollouts_of,
     scenes_of,
     share_of,
@@ -78,7 +78,7 @@ def show(run: StoredRun, *, animation: bool = False, **_: Any) -> Shown:
 
 
 def ccrb_sentences(run: StoredRun) -> list[str]:
-    """Return what became of the cars, where that ordering of the policies holds, and the studies' speed."""
+    """Return the outcomes, where the paper's ordering holds, and the studies' speed."""
     rows = rollouts_of(run, "point")
     survives = survives_of(rows)
     sentences = [
@@ -96,23 +96,22 @@ def ccrb_sentences(run: StoredRun) -> list[str]:
 
 
 def findings(run: StoredRun) -> list[str]:
-    """Return what the phase diagram shows, gap behaviour by gap behaviour."""
+    """Return the findings of the phase diagram, a sentence a gap behaviour."""
     return [_finding(run, gap) for gap in GAPS] if has(run, "phase") else []
 
 
 def _finding(run: StoredRun, gap: str) -> str:
     share = share_of(scenes_of(run, "phase", gap), "paper")
     sentence = f"{gap}: the paper's ordering holds at {share.value:.1%} of the diagram"
-    span, here = rate_span(run, gap), rate_span_here(run, gap)
+    span, at_point = rate_span(run, gap), rate_span_at_point(run, gap)
     if span is None:
         return f"{gap}: the paper's ordering holds nowhere in the diagram."
     at = f"at a rear gap of {configuration(run)['rear_gap_m']:g} m"
-    where = f"{at} for {here[0]:.1f} to {here[1]:.1f}" if here else f"{at} nowhere"
+    where = f"{at} for {at_point[0]:.1f} to {at_point[1]:.1f}" if at_point else f"{at} nowhere"
     return f"{sentence}, for R = {span[0]:.1f} to {span[1]:.1f} tokens/s; {where}."
 
 
 def _sensitivity(run: StoredRun) -> str:
-    """Return between which shares the ordering moves, number by number."""
     found = run.table(SENSITIVITY)
     summed = found.groupby(["varied", "value"], sort=False)[["paper", "points"]].sum()
     share = 100 * summed["paper"] / summed["points"]
@@ -135,8 +134,8 @@ ORDERINGS: Final = {
 _SETTING: Final = ["follower", "front_gap_m", "lead_decel_mps2"]
 _ORDERING_NOTES: Final = (
     Note(ORDERING, PAPERS),
-    "Worse, better: than stream-to-act, by an impact more than 0.5 m/s faster or slower; behind: from there alone.",
-    "Where the follower hits even an ego whose tokens come at once, a rear impact says nothing of the policy.",
+    "Worse, better: an impact more than 0.5 m/s faster or slower than stream-to-act's; behind: rear impacts alone.",
+    "Where the follower hits even an ego with immediate tokens, a rear impact says nothing about the policy.",
 )
 
 _TIMES: Final = [metric for metric in METRICS if metric.kind == TIME]
@@ -168,7 +167,7 @@ CcrbSensitivity = cell_of_row(
 
 @dataclass(frozen=True)
 class OrderingShare:
-    """In how many scenarios an ordering holds."""
+    """The number and share of the scenarios in which an ordering holds."""
 
     k: Count
     value: Fraction
@@ -191,16 +190,16 @@ class CcrbStudy:
     ]
     follower_survives: Annotated[
         OrderingShare | None,
-        about("Where the car behind stops behind an ego whose tokens come at once; elsewhere rear says nothing."),
+        about("Where the car behind avoids an ego with immediate tokens; otherwise a rear impact proves nothing."),
     ] = None
     paper_rates_tokens_per_s: Annotated[
         tuple[float, float] | None,
-        about("Least and greatest R at which the paper's ordering holds; absent where it does nowhere."),
+        about("Least and greatest R at which the paper's ordering holds; absent if it never does."),
     ] = None
 
 
 def outcome_table(run: StoredRun) -> TextTable:
-    """Lay out what became of the three cars under each policy."""
+    """Return the table of the outcomes, a row a policy."""
     rows, shown = [], [metric for metric in (*TIMES, *IMPACTS) if metric.title]
     for cell in cells_of(run):
         outcome = outcome_label(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
@@ -212,7 +211,7 @@ def outcome_table(run: StoredRun) -> TextTable:
 
 
 def margin_table(run: StoredRun) -> TextTable:
-    """Lay out how near an impact was, and how smoothly the ego drove."""
+    """Return the table of margins and motion, a row a policy."""
     rows = [(cell["policy"], *(_entry(cell, metric) for metric in (*MARGINS, *MOTION))) for cell in cells_of(run)]
     notes = (
         "TTC: least time to collision. DRAC: greatest deceleration required towards the lead, closing^2 / (2 gap).",
@@ -222,12 +221,12 @@ def margin_table(run: StoredRun) -> TextTable:
 
 
 def phase_table(run: StoredRun) -> TextTable:
-    """Lay out at which share of the diagram each ordering holds, a column a gap behaviour."""
+    """Return the table of each ordering's share of the diagram, a column a gap behaviour."""
     rows = _share_rows(run, "phase", lambda share: f"{share.value:.1%}")
     settings = configuration(run)
     rows.append(("R of the paper's ordering", *(_span(rate_span(run, gap)) for gap in GAPS)))
-    here = (_span(rate_span_here(run, gap)) for gap in GAPS)
-    rows.append((f"  at a rear gap of {settings['rear_gap_m']:g} m", *here))
+    at_point = (_span(rate_span_at_point(run, gap)) for gap in GAPS)
+    rows.append((f"  at a rear gap of {settings['rear_gap_m']:g} m", *at_point))
     (low, high), (near, far) = settings["phase_rates"], settings["phase_gaps_m"]
     spans = f"R {low:g} to {high:g} tokens/s, rear gap {near:g} to {far:g} m"
     title = f"Phase diagram: {spans}, {settings['follower']} follower"
@@ -236,14 +235,13 @@ def phase_table(run: StoredRun) -> TextTable:
 
 
 def random_table(run: StoredRun) -> TextTable:
-    """Lay out in which share of random scenarios each ordering holds, with its interval."""
+    """Return the table of each ordering's share of random scenarios, with its interval."""
     settings = configuration(run)
     title = f"{settings['random']} random scenarios: % [95 % Clopper-Pearson], {settings['follower']} follower"
     return TextTable(title, ("ordering", *GAPS), _share_rows(run, "random", _with_interval), 1, notes=_ORDERING_NOTES)
 
 
 def _share_rows(run: StoredRun, study: str, written: Callable[[Share], str]) -> list[tuple[str, ...]]:
-    """Return a row an ordering, and one of the check on the car behind where the run has it."""
     scenes = {gap: scenes_of(run, study, gap) for gap in GAPS}
     checked = all(found["survives"].notna().all() for found in scenes.values())
     counted = {**ORDERINGS, **({"survives": "follower survives fast tokens"} if checked else {})}
@@ -251,22 +249,22 @@ def _share_rows(run: StoredRun, study: str, written: Callable[[Share], str]) -> 
 
 
 def follower_tables(run: StoredRun) -> dict[str, TextTable]:
-    """Lay out each follower at Euro NCAP's combinations: what came of the operating point, and shares of the plane."""
+    """Return the tables of the followers at Euro NCAP's combinations: operating point, and shares of the plane."""
     found, settings = run.table(FOLLOWER_STUDY), configuration(run)
     rate = run.manifest["boards"][0]["tokens_per_s"]
     where = f"R = {rate:g} tokens/s, rear gap {settings['rear_gap_m']:g} m, gap behaviour {settings['gap']}"
     drawn = found[found["seed"].notna()]
     seeds, points = drawn["seed"].nunique(), int(drawn["points"].iloc[0])
     notes = (
-        "Survives: the follower stops behind an ego whose tokens come at once, at the same gap.",
-        f"{MARK} It does not: a rear outcome says nothing of the policy.",
+        "Survives: the follower avoids an ego with immediate tokens, at the same gap.",
+        f"{MARK} It does not: a rear outcome says nothing about the policy.",
         *(f"{law({**settings, 'follower': follower})}." for follower in dict.fromkeys(found["follower"])),
         NO_SCORE,
     )
     shares = (
         Note(ORDERING, PAPERS),
-        f"Mean [least, most] of {seeds} seeds that draw {points} points of {plane_words(settings)} each.",
-        "naive*: of the points where the follower survives; nobody without stalls is hit there, as it brakes alike.",
+        f"Mean [least, most] of {seeds} seeds that draw {points} points of {plane_text(settings)} each.",
+        "naive*: of the points where the follower survives; a policy without stalls is never hit there.",
         "A front impact ends a roll-out.",
         *notes,
     )
@@ -287,9 +285,9 @@ def follower_tables(run: StoredRun) -> dict[str, TextTable]:
 def _point_rows(point: pd.DataFrame) -> list[tuple[str, ...]]:
     rows = []
     for key, group in point.groupby(_SETTING, sort=False):
-        here = {row["policy"]: row for row in group.to_dict("records")}
-        survives = "yes" if here[NAIVE]["survived"] else "no"
-        rows.append((*_names(key), survives, *(_outcome(here[policy]) for policy in PAPER)))
+        by_policy = {row["policy"]: row for row in group.to_dict("records")}
+        survives = "yes" if by_policy[NAIVE]["survived"] else "no"
+        rows.append((*_names(key), survives, *(_outcome(by_policy[policy]) for policy in PAPER)))
     return rows
 
 
@@ -310,13 +308,12 @@ def _names(setting: Any) -> tuple[str, str]:
 
 
 def _outcome(row: dict[Any, Any]) -> str:
-    """Return an outcome of the operating point as its code, marked where it says nothing."""
     outcome = CODES[int(row["front"]) + 2 * int(row["rear"])]
     return outcome + marked(outcome, bool(row["survived"]))
 
 
 def _range(count: pd.Series[Any], of: pd.Series[Any]) -> str:
-    """Return shares of the seeds in percent: the mean, the least and the most."""
+    """Return the shares over the seeds in percent: mean [least, most]."""
     share = (100 * count[of > 0] / of[of > 0]).astype("float64")
     if share.empty:
         return ABSENT
@@ -326,7 +323,7 @@ def _range(count: pd.Series[Any], of: pd.Series[Any]) -> str:
 
 
 def ccrb_tables(run: StoredRun) -> dict[str, TextTable]:
-    """Return every table of a run by its file's name; what is compared comes last."""
+    """Return every table of a run by its file's name."""
     tables = {}
     if has(run, "random"):
         tables["random"] = random_table(run)
@@ -338,7 +335,7 @@ def ccrb_tables(run: StoredRun) -> dict[str, TextTable]:
 
 
 def ccrb_csv(run: StoredRun) -> dict[str, CsvTable]:
-    """Return file name -> CSV table: the shares of the studies; the roll-outs are in rollouts.csv."""
+    """Return file name -> CSV table: the shares of the studies."""
     rows: list[tuple[Any, ...]] = []
     for study in ("phase", "random"):
         if has(run, study):
@@ -354,10 +351,7 @@ def ccrb_csv(run: StoredRun) -> dict[str, CsvTable]:
 
 
 def ccrb_json(run: StoredRun) -> dict[str, Any]:
-    """Return the object that ``--json`` prints, as docs/schema/s2a-bench-1.json describes it; SI units, float seconds.
-
-    A cell a policy at the operating point; studies are summed up as shares, their roll-outs are in the run folder.
-    """
+    """Return the ``--json`` object (docs/schema/s2a-bench-1.json): SI units, a cell a policy, studies as shares."""
     studies = [_study(run, study, gap) for study in ("phase", "random") if has(run, study) for gap in GAPS]
     live = {"live": run.manifest["live"]} if "live" in run.manifest else {}
     varied = {"followers": _counts(run, FOLLOWER_STUDY), "sensitivity": _counts(run, SENSITIVITY)}
@@ -366,7 +360,6 @@ def ccrb_json(run: StoredRun) -> dict[str, Any]:
 
 
 def _counts(run: StoredRun, table: Table[Any]) -> list[dict[str, Any]]:
-    """Return the rows of a study that counts; what one lacks is no key."""
     rows = run.table(table).drop(columns=["cell", PROVENANCE])
     return [{str(name): value for name, value in row.dropna().items()} for _, row in rows.astype(object).iterrows()]
 
@@ -389,7 +382,7 @@ def _study(run: StoredRun, study: str, gap: str) -> dict[str, Any]:
 
 def _deadline_note(run: StoredRun) -> tuple[str, ...]:
     deadline_s = float(rollouts_of(run, "point")["deadline_ns"].iloc[0]) / 1e9
-    return (f"S_front = {deadline_s:.2f} s: who brakes as planned from then on keeps 2 m to the lead.",)
+    return (f"S_front = {deadline_s:.2f} s: planned braking that starts by then keeps 2 m to the lead.",)
 
 
 def _title(metric: Metric) -> str:
