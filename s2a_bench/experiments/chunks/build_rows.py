@@ -1,4 +1,4 @@
-"""A simulated cell as rows: its metrics, its first ticks, its first requests."""
+"""The rows of a cell: its metrics, its first ticks, its first requests."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import RunWriter
 
 EVENTS: Final = 100_000
-"""Moments of events that reactions are measured at."""
+"""Random events whose reaction times are measured."""
 SHARES: Final = np.linspace(0, 1, 401)
-"""Of the quantiles of reaction times that are kept: closer than the line of a figure is wide."""
+"""Quantiles of reaction times that are stored: denser than a figure can show."""
 NO_NAMES: Final[Mapping[int, str]] = {}
 _SIDE: Final = 0.975
 """Confidence of each end of a two-sided 95 % interval."""
@@ -54,10 +54,10 @@ def write_cell(
     late_ns: Ints | None = None,
     names: Mapping[int, str] = NO_NAMES,
 ) -> None:
-    """Write the rows of what a cell did, its ticks and requests within the first ``most`` ticks.
+    """Write the rows of a cell, its ticks and requests within the first ``most`` ticks.
 
-    ``more`` are metrics that others do not have, or that stand in for what is computed here; ``late_ns`` is how long
-    after it was due each action left, ``names`` are the ids of the requests' samples.
+    ``more`` adds metrics or overrides computed ones; ``late_ns`` is each action's delay after its due time, ``names``
+    are the ids of the requests' samples.
     """
     setting, latency_ns = config.setting.slowed(cell.slower), cell.drawn.judged
     reaction_s = reactions_s(cycles, ticks, setting, generator(config.seed, "chunks events"))
@@ -87,12 +87,12 @@ def write_cell(
 def metrics_of(
     cell: ChunkCell, setting: ControlSetting, cycles: Cycles, ticks: Ticks, reaction_s: Floats
 ) -> dict[str, float | None]:
-    """Return the value of every metric of what was simulated; NaN or None where there is none."""
+    """Return the value of every computed metric; NaN or None if it has none."""
     period_s, latency_ns = setting.period_ns / 1e9, cell.drawn.judged
     found: dict[str, Any] = asdict(measure(cell.mode, cycles, ticks))
     expected = closed(cell.acting, latency_ns, setting)
     mean_reaction = expected.mean_reaction_ticks
-    delay = cycles.delay_ticks[: latency_ns.size]  # live, an answer may not have come by the end
+    delay = cycles.delay_ticks[: latency_ns.size]  # a live run may end before an answer
     later = setting.rounding == "floor"  # an action leaves at the end of its tick
     assumed = np.array(cell.triggers, np.float64) if cell.triggers else cell.mode.assumed_ticks
     length = found["ticks"] or math.nan
@@ -121,7 +121,7 @@ def stalls_of(cycles: Cycles) -> dict[str, Any]:
 
 
 def stall_metrics(stalled: int, boundaries: int) -> dict[str, Any]:
-    """Return counts, share and its two-sided 95 % interval (Clopper and Pearson); without boundaries counts alone."""
+    """Return counts, and with boundaries the share and its two-sided 95 % interval (Clopper and Pearson)."""
     found: dict[str, Any] = {"boundaries": boundaries, "stalled_cycles": stalled}
     if boundaries:
         found["p_stall_cycle"] = stalled / boundaries
@@ -131,7 +131,7 @@ def stall_metrics(stalled: int, boundaries: int) -> dict[str, Any]:
 
 
 def reactions_s(cycles: Cycles, ticks: Ticks, setting: ControlSetting, rng: np.random.Generator) -> Floats:
-    """Return the reaction times to events at uniform moments from the first action to the last request, in s."""
+    """Return the reaction times in s to uniform random events from the first action to the last request."""
     acted = ticks.chunk >= 0
     if not acted.any():
         return np.empty(0)
@@ -143,7 +143,7 @@ def reactions_s(cycles: Cycles, ticks: Ticks, setting: ControlSetting, rng: np.r
 def reaction_rows(
     cell: ChunkCell, latency_ns: Ints, setting: ControlSetting, reaction_s: Floats
 ) -> Iterator[ReactionRow]:
-    """Yield the quantiles of a cell's reaction times, none where there are none."""
+    """Yield the quantiles of a cell's reaction times, if any."""
     if not reaction_s.size:
         return
     period_s = setting.period_ns / 1e9
@@ -192,7 +192,6 @@ def request_rows(
 
 
 def _mean(triggers: tuple[int, ...], given: int | None) -> float | None:
-    """Return the mean of what a rule chose, else what the mode was given."""
     return float(np.mean(triggers)) if triggers else None if given is None else float(given)
 
 

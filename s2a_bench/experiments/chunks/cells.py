@@ -1,4 +1,4 @@
-"""What is tried: each mode as given, and the first whose trigger rules may choose again, with each rule's."""
+"""The cells: each mode as given, and the first mode with a trigger once more under each rule."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
     from s2a_bench.policy.chunks import Ints, Mode
 
 FIXED: Final = ("calibrated", "oracle")
-"""The rules that choose one trigger for all requests, and may slow actions down."""
+"""Rules that choose one trigger for all requests, and may slow actions down."""
 GIVEN: Final = "given"
-"""The rule of a mode with its own parameters."""
+"""The rule of a mode with the trigger of its parameters."""
 _ORACLE_DRAWS: Final = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LatencyDraw:
-    """The latencies of one source, in ns: those that are judged, and others that rules learn from."""
+    """The latencies of one source in ns: those that are judged, and those that rules learn from."""
 
     source: Source
     judged: Ints
@@ -43,22 +43,22 @@ class LatencyDraw:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChunkCell:
-    """One mode under one source; ``triggers`` are those that a rule chose request by request."""
+    """One mode under one source; ``triggers`` are a rule's, one a request."""
 
     mode: Mode
     name: str
-    """The mode with its parameters; of one with a rule without the trigger."""
+    """The mode with its parameters, without the trigger if a rule chooses it."""
     rule: str
     drawn: LatencyDraw
     triggers: tuple[int, ...] = ()
     slower: float = 1.0
-    """So many times slower than the others it executes its actions (time-scaling)."""
+    """By how many times slower its actions are executed (time-scaling)."""
     begin: Callable[[], TriggerRule] | None = None
-    """Makes the rule that chooses triggers while it acts."""
+    """Creates the rule that chooses triggers in a live run."""
 
     @property
     def acting(self) -> Mode:
-        """Return the mode with the triggers that a rule chose, or chooses as it acts."""
+        """The mode with the triggers of its rule."""
         if self.begin is not None:
             return Learning(self.mode, self.begin)
         return self.mode.varied(self.triggers) if self.triggers else self.mode
@@ -70,7 +70,7 @@ class ChunkCell:
 
 
 def draw(config: ChunksConfig, source: Source) -> LatencyDraw:
-    """Draw the latencies of a source; a recording is played in its order, its first half for the rules if any."""
+    """Draw the latencies of a source; a recording keeps its order, its first half for the rules if any."""
     count = config.learnt(source)
     if source.recorded_ns is not None:
         judged = source.recorded_ns[count:]
@@ -82,7 +82,7 @@ def draw(config: ChunksConfig, source: Source) -> LatencyDraw:
 
 
 def cells(config: ChunksConfig, drawn: LatencyDraw) -> Iterator[ChunkCell]:
-    """Yield the cells of one source; live, nothing has been judged yet."""
+    """Yield the cells of one source; a live one has no judged latencies yet."""
     for name, given in config.made.items():
         yield ChunkCell(given, name, GIVEN, drawn)
     mode = config.triggered
@@ -99,32 +99,28 @@ def cells(config: ChunksConfig, drawn: LatencyDraw) -> Iterator[ChunkCell]:
             triggers = (chosen.ticks,)
             yield ChunkCell(mode, name, rule, drawn, triggers, min(chosen.beta, config.slowest))
         elif config.live:
-            yield ChunkCell(mode, name, rule, drawn, begin=partial(_made, config, rule, drawn))
+            yield ChunkCell(mode, name, rule, drawn, begin=partial(_learner, config, rule, drawn))
         else:
-            triggers = tuple(follow(_made(config, rule, drawn), drawn.judged, config.setting, most).tolist())
+            triggers = tuple(follow(_learner(config, rule, drawn), drawn.judged, config.setting, most).tolist())
             yield ChunkCell(mode, name, rule, drawn, triggers)
 
 
 def without_trigger(mode: Mode) -> str:
-    """Name a mode whatever its trigger."""
+    """Return a mode's name without its trigger."""
     return canonical(mode.name, mode.varied((0,)))
 
 
-def _made(config: ChunksConfig, rule: str, drawn: LatencyDraw) -> TriggerRule:
-    """Return a rule that has seen what the calibration has."""
+def _learner(config: ChunksConfig, rule: str, drawn: LatencyDraw) -> TriggerRule:
     if rule == "tracked":
         return TrackedLatency.begin(drawn.learnt.tolist(), config.epsilon)
-    made: TriggerRule = Maximum() if rule == "maximum" else Mean()
+    learner: TriggerRule = Maximum() if rule == "maximum" else Mean()
     for latency_ns in drawn.learnt.tolist():
-        made.learn(latency_ns, stalled=False)
-    return made
+        learner.learn(latency_ns, stalled=False)
+    return learner
 
 
 def _oracle_ns(config: ChunksConfig, drawn: LatencyDraw) -> int:
-    """Return the latency that a share epsilon of the distribution itself exceeds at most.
-
-    The distribution is a million other draws; of a recording all that was recorded.
-    """
+    """Return the latency that at most a share epsilon exceeds of a million other draws, or of the whole recording."""
     import numpy as np
 
     source = drawn.source

@@ -1,4 +1,4 @@
-"""What a run of chunks tries, live whom it asks, and what it refuses."""
+"""The options of a run of chunks: modes, rules and latencies; live, its requests."""
 
 from __future__ import annotations
 
@@ -54,24 +54,24 @@ class LiveRequests(FirstVariants):
     )
 
     def check(self) -> None:
-        """Refuse contradictory options; in virtual time, without requests, nothing."""
+        """Check as other requests do, unless none are configured (virtual time)."""
         if self.model_fields_set:
             super().check()
 
 
 RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
-"""What may choose the trigger of queue."""
+"""Rules for the trigger of queue."""
 PROMISING: Final = ("calibrated", "tracked")
-"""Those that keep to `epsilon`, where there is enough to learn from."""
+"""Rules that keep to `epsilon`, given enough latencies."""
 CYCLES: Final = 10_000
 CALIBRATION: Final = 8_000
 VIRTUAL: Final = ("cycles", "calibration_cycles", "tokens_per_action")
-"""Options that live runs do not have."""
+"""Options of virtual time."""
 FASTEST_LIVE_HZ: Final = 10_000.0
 MOST_LIVE_TICKS: Final = 1_000_000
 
 Sources = Annotated[tuple[str, ...], BeforeValidator(split, json_schema_input_type=tuple[str | float, ...])]
-"""Several sources of latencies; as text with commas between them, which may hold the parameters of a family too."""
+"""Sources of latencies; as text they are separated by commas, and so are the parameters of a family."""
 
 
 class ChunksConfig(Options):
@@ -142,7 +142,7 @@ class ChunksConfig(Options):
 
     @cached_property
     def live_requests(self) -> LiveRequests:
-        """Return what the control loop asks for, live; raises UsageError naming the field."""
+        """The requests of a live control loop; raises UsageError naming the field."""
         engine_settings: dict[str, Any] = {"answer": "actions", "horizon": self.horizon}
         if self.known:
             engine_settings |= {"latency": self.known} | (
@@ -152,7 +152,7 @@ class ChunksConfig(Options):
 
     @property
     def known(self) -> str:
-        """Return the latencies that our own server keeps, live; nothing where it answers at its own speed."""
+        """The latencies that our live server keeps; empty if it answers as fast as it can."""
         return self.latency[0] if "latency" in self.model_fields_set else ""
 
     def named(self, pipeline: str) -> str:
@@ -166,14 +166,14 @@ class ChunksConfig(Options):
 
     @cached_property
     def made(self) -> dict[str, Mode]:
-        """Return the modes by their names with parameters; raises UsageError naming the field."""
+        """The modes by their names with parameters; raises UsageError naming the field."""
         from s2a_bench.policy.parameters import build, canonical
 
         known = {written: written.partition("?")[0] for written in self.modes}
         if unknown := [name for name in known.values() if name not in MODES]:
             raise UsageError(f"`modes`: {none_of(unknown[0], MODES)}")
-        made = [build(MODES[name], written, "modes") for written, name in known.items()]
-        found = {canonical(each.name, each): each for each in made}
+        built = [build(MODES[name], written, "modes") for written, name in known.items()]
+        found = {canonical(each.name, each): each for each in built}
         for name, each in found.items():
             try:
                 each.execution_horizon(self.setting)
@@ -183,7 +183,7 @@ class ChunksConfig(Options):
 
     @cached_property
     def sources(self) -> tuple[Source, ...]:
-        """Return the latencies' sources; raises S2AError naming the field."""
+        """The sources of latencies; raises S2AError naming the field."""
         from s2a_bench.experiments.chunks.latencies import sources
 
         return tuple(
@@ -192,7 +192,7 @@ class ChunksConfig(Options):
 
     @cached_property
     def plant(self) -> ActionKind | None:
-        """Return what takes actions in virtual time; raises UsageError naming the field."""
+        """The robot of virtual time; raises UsageError naming the field."""
         from s2a_bench.act import ActionKind, kind
 
         if not self.robot:
@@ -205,14 +205,14 @@ class ChunksConfig(Options):
 
     @cached_property
     def rules_tried(self) -> Sequence[str]:
-        """Return what chooses triggers: if none is named nothing live, and nothing that has too little to learn."""
+        """The rules; by default none live, and none with too few latencies to learn from."""
         if "rules" in self.model_fields_set:
             return self.rules
         return () if self.live else tuple(rule for rule in self.rules if rule not in PROMISING or not self.too_few)
 
     @cached_property
     def too_few(self) -> str:
-        """Return which source of latencies is too short for a rule that keeps to `epsilon`, or nothing."""
+        """The source with too few latencies for a rule that keeps to `epsilon`, as text; else empty."""
         from s2a_bench.policy.conformal import fewest
 
         needed = fewest(self.epsilon)
@@ -231,12 +231,12 @@ class ChunksConfig(Options):
         return self.calibration_cycles if recorded is None else min(self.calibration_cycles, recorded.size // 2)
 
     def learnt(self, source: Source) -> int:
-        """Return how many latencies of a source rules learn from, before the others are judged."""
+        """Return how many latencies of a source the rules learn from."""
         return self._learnable(source) if self.with_rules else 0
 
     @cached_property
     def triggered(self) -> Mode | None:
-        """Return the first mode whose trigger rules may choose."""
+        """The first mode that has a trigger for rules to choose."""
         return next((each for each in self.made.values() if each.triggered), None)
 
     @property
@@ -267,7 +267,6 @@ class ChunksConfig(Options):
             raise UsageError(f"`rules`: {self.too_few}; raise `epsilon`, or take `rules` {others}")
 
     def _check_live(self) -> None:
-        """Refuse what only virtual time has, and what no server accepts."""
         from s2a_bench.act import ActionKind, kind
 
         if self.robot:
@@ -289,9 +288,7 @@ class ChunksConfig(Options):
                 f"`seconds`: {self.seconds:g} s are less than two ticks at `control_hz` {self.control_hz:g}"
             )
         if self.control_hz > FASTEST_LIVE_HZ:
-            raise UsageError(
-                f"`control_hz`: {self.control_hz:g}: live no loop of ours keeps up above {FASTEST_LIVE_HZ:g}"
-            )
+            raise UsageError(f"`control_hz`: {self.control_hz:g}: a live control loop keeps up to {FASTEST_LIVE_HZ:g}")
         if self.seconds * self.control_hz > MOST_LIVE_TICKS:
             raise UsageError(
                 f"`seconds`: {self.seconds:g} s at `control_hz` {self.control_hz:g} are over {MOST_LIVE_TICKS:.0e} "
@@ -302,7 +299,7 @@ class ChunksConfig(Options):
         from s2a_bench.policy.conformal import fewest
 
         if "oracle" in self.rules_tried:
-            raise UsageError("`rules`: nobody is an oracle live; take calibrated, tracked, maximum or mean")
+            raise UsageError("`rules`: a live run has no oracle; take calibrated, tracked, maximum or mean")
         if {*PROMISING} & {*self.rules_tried} and self.with_rules:
             needed = fewest(self.epsilon)
             if self.requests.warmup < needed:
@@ -332,7 +329,7 @@ class ChunksConfig(Options):
             yield "robot", risk, self.robot
 
     def to_manifest(self) -> dict[str, Any]:
-        """Return the options as plain data, with the numbers that follow from others."""
+        """Return the options as plain data, with the numbers that follow from them."""
         file = None if self.export_delays is None else str(self.export_delays)
         more = {"modes": list(self.made), "period_ns": self.setting.period_ns, "export_delays": file}
         return {**self.model_dump(exclude={"requests"}), **more}

@@ -1,4 +1,4 @@
-"""Where latencies come from: what `boards.latency` reads, a run folder, a profile; and delays, written for others."""
+"""Sources of latencies: what `boards.latency` reads, a run folder, a profile; and the export of delays."""
 
 from __future__ import annotations
 
@@ -29,25 +29,24 @@ _PARAMETER: Final = re.compile(r"\s*\w+\s*=")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Source:
-    """Latencies under a name: drawn from ``gaps`` or by ``tokens``, or ``recorded_ns``, whichever it has."""
+    """Named latencies: drawn from ``gaps`` or from ``tokens`` of a profile, or ``recorded_ns``."""
 
     name: str
     gaps: Gaps | None = None
     recorded_ns: Ints | None = None
     profile: str = ""
-    """The board whose tokens make a chunk."""
     tokens: int = 0
-    """Tokens of a chunk, where a profile answers."""
+    """Tokens of a chunk, for a profile."""
     weights: str = NONE
     requests: tuple[Mapping[str, object], ...] = ()
-    """Of measured ones what is known of each request, by the columns of `COLUMNS`."""
+    """Measured requests, as the columns of `COLUMNS`."""
 
     @property
     def provenance(self) -> Provenance:
         return Provenance.computed(self.name, self.weights)
 
     def draw(self, rng: np.random.Generator, count: int) -> Ints:
-        """Draw latencies of shape (count,), in ns; raises TypeError for recorded ones, which are not drawn."""
+        """Draw latencies of shape (count,), in ns; raises TypeError for a recording."""
         if self.profile:
             from s2a_bench.boards.profile import load_profile
             from s2a_bench.boards.tokens import AS_PROFILE, board_of_profile
@@ -60,9 +59,9 @@ class Source:
 
 
 def sources(written: str, tokens: int) -> Iterator[Source]:
-    """Read one source as people write it; raises S2AError naming the field.
+    """Yield the sources of one written name; raises S2AError naming the field.
 
-    A run folder has a source a cell, FOLDER#CELL one alone. ``tokens`` are those of a chunk, where a profile answers.
+    A run folder has a source a cell, FOLDER#CELL is one of them. ``tokens`` are those of a chunk, for a profile.
     """
     if (read := read_latency(written)) is not None:
         yield Source(written, read.gaps, read.recorded_ns)
@@ -73,13 +72,13 @@ def sources(written: str, tokens: int) -> Iterator[Source]:
 
 
 def split(value: object) -> object:
-    """Split text at the commas between sources, not at those within a family's parameters, and keep each once."""
+    """Split text at the commas between sources, not at those of a family's parameters; drop duplicates."""
     if not isinstance(value, str):
         return tuple(map(str, value)) if isinstance(value, (list, tuple)) else (str(value),)
     found: list[str] = []
-    for part in (part.strip() for part in value.split(",") if part.strip()):
-        goes_on = found and ":" in found[-1] and _PARAMETER.match(part)
-        found[-1:] = [f"{found[-1]},{part}"] if goes_on else [*found[-1:], part]
+    for text in (text.strip() for text in value.split(",") if text.strip()):
+        continues = found and ":" in found[-1] and _PARAMETER.match(text)
+        found[-1:] = [f"{found[-1]},{text}"] if continues else [*found[-1:], text]
     return tuple(dict.fromkeys(found))
 
 
@@ -93,10 +92,9 @@ def _of_profile(written: str, tokens: int) -> Source:
 
 
 def measured(folder: Path, only: str = "") -> Iterator[Source]:
-    """Yield the latencies of each cell of a latency or throughput run, or of one, in the order of asking.
+    """Yield the latencies of each cell of a latency or throughput run, or of one, in time order.
 
-    Failed requests and warm-ups are left out. Raises StoreError where there is no run, UsageError where it has no
-    answers, or no such cell.
+    Failed requests and warm-ups are left out. Raises StoreError without a run, UsageError without answers or cell.
     """
     import numpy as np
 
@@ -123,7 +121,7 @@ def measured(folder: Path, only: str = "") -> Iterator[Source]:
 
 
 def _request(row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[int, int | None]]) -> dict[str, Any]:
-    """Return what is known of a request: its marks by the group of stages that ends there, null where there is none."""
+    """Return the times of a request, from its marks at the ends of groups of stages; null without the mark."""
     marks = json.loads(row["marks"])
     ends = {run.stages.get(stage, ""): at_ns for stage, at_ns in marks}
     streaming_ns, last_engine_ns = pieces.get(row["request_id"], (0, None))
@@ -140,7 +138,7 @@ def _request(row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[
 
 
 def _pieces(run: StoredRun) -> dict[str, tuple[int, int | None]]:
-    """Return by request how long after the first piece the last one came, and when that left the engine."""
+    """Return for each request the time from the first to the last piece, and when that left the engine."""
     found: pd.DataFrame = run.tokens.groupby("request_id").agg(
         first=("client_ns", "min"), last=("client_ns", "max"), left=("engine_ns", "max")
     )
@@ -167,27 +165,24 @@ COLUMNS: Final = (
     "delta_t_ns",
     "provenance",
 )
-"""Columns of delays as CSV, for simulators that assume one so far: a row a request, its times and d.
+"""Columns of the exported delays, a row a request.
 
 | column | meaning |
 |---|---|
 | request | number, from 0 |
 | observation_ns, received_ns | when the observation was made, when the whole chunk was there; L is their difference |
-| sent_ns, server_in_ns, server_out_ns | on the way there, at the server, on the way back; empty where nobody knows |
-| bytes | of the request; empty where nothing travelled |
+| sent_ns, server_in_ns, server_out_ns | when it left the client, reached and left the server; empty if unknown |
+| bytes | of the request; empty in process |
 | latency_ns | L |
 | d | L in control ticks, by the convention of the column ``rounding`` (floor, ceil) |
 | delta_t_ns | the control tick that d counts in |
 
-All times are whole ns of one clock. What a reader needs of it says `boards.latency`, which reads it back.
+All times are whole ns of one clock. `boards.latency` reads the file back.
 """
 
 
 def delay_rows(drawn: LatencyDraw, mode: Mode, setting: ControlSetting) -> Iterator[dict[str, object]]:
-    """Yield a row a request: of measured latencies when each really was made, else as ``mode`` makes them.
-
-    Of a measured run all requests that count are there, also those that rules learn from.
-    """
+    """Yield a row a request: all measured requests at their times, or those of ``mode``."""
     source = drawn.source
     requests = source.requests or _simulated(drawn, mode, setting)
     for number, request in enumerate(requests):
@@ -202,8 +197,8 @@ def delay_rows(drawn: LatencyDraw, mode: Mode, setting: ControlSetting) -> Itera
 
 
 def _simulated(drawn: LatencyDraw, mode: Mode, setting: ControlSetting) -> Iterator[dict[str, object]]:
-    asked_ns = mode.cycles(drawn.judged, setting).request_tick * setting.period_ns
-    for at_ns, latency_ns in zip(asked_ns.tolist(), drawn.judged.tolist(), strict=True):
+    request_ns = mode.cycles(drawn.judged, setting).request_tick * setting.period_ns
+    for at_ns, latency_ns in zip(request_ns.tolist(), drawn.judged.tolist(), strict=True):
         yield {"observation_ns": at_ns, "received_ns": at_ns + latency_ns, "latency_ns": latency_ns}
 
 
@@ -214,7 +209,7 @@ def _delay(latency_ns: object, setting: ControlSetting) -> int:
 
 
 def write_delays(path: Path, rows: Iterable[Mapping[str, object]]) -> None:
-    """Write rows, each with some of `COLUMNS`; raises StoreError where that fails."""
+    """Write rows as CSV; raises StoreError."""
     try:
         with path.open("w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")

@@ -1,6 +1,6 @@
-"""The live run: every mode acts at control rate on what a server answers, judged with the formulas of virtual time.
+"""The live run: every mode acts at control rate on a server's answers; the metrics are those of virtual time.
 
-A latency counts from the start of the tick in which a request left until its chunk was there.
+A latency counts from the start of the tick of a request until its chunk is complete.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import RunWriter
     from s2a_bench.types import Vector
 CLIENTS: Final = 4
-"""Of a cell, where a mode has several requests under way."""
-LOOK_S: Final = 0.05
-"""How often who waits for a loop writes down what was measured."""
+"""Of a cell, for modes with several concurrent requests."""
+KEEP_S: Final = 0.05
+"""Period in which measurements are written while the loop runs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveResult:
-    """What a mode did over a pipeline; ``triggers`` are those that a rule chose as it went."""
+    """The actions of a mode over a pipeline; ``triggers`` are those that its rule chose."""
 
     cell: ChunkCell
     setting: ControlSetting
@@ -57,21 +57,21 @@ class LiveResult:
 
     @property
     def judged(self) -> ChunkCell:
-        """Return the cell with the latencies that it had, of whole answers, and the triggers."""
+        """The cell with the measured latencies of complete answers, and the triggers."""
         latency_ns = self.acted.arrival_ns[: self.acted.whole, 0 if self.cell.mode.streams else -1]
         cell = replace(self.cell, drawn=replace(self.cell.drawn, judged=latency_ns))
         triggers = self.triggers[: latency_ns.size]
         return replace(cell, triggers=triggers, begin=None) if triggers else cell
 
     def counted(self) -> tuple[Cycles, Ticks]:
-        """Return what it did in all of its ticks; an answer that never came is usable behind the last of them."""
+        """Return cycles and ticks of the whole run; a missing answer is usable after the last tick."""
         acted, ticks = self.acted, self.acted.chunk.size
         arrival_ns = acted.arrival_ns[:, -1]
         delay = np.where(arrival_ns < 0, ticks, self.setting.delay_ticks(np.maximum(arrival_ns, 0)))
         return gather(acted.request_tick, acted.request_tick + delay, acted.chunk, acted.index, self.setting.horizon)
 
     def agreement(self) -> float:
-        """Return the share of the ticks in which it did what virtual time says of the same arrivals."""
+        """Return the share of the ticks that equal those of virtual time with the same arrivals."""
         acted = self.acted
         arrival_ns = np.where(acted.arrival_ns < 0, NEVER, acted.arrival_ns)
         _, computed = follow(self.cell.acting, arrival_ns, self.setting, acted.chunk.size)
@@ -80,7 +80,7 @@ class LiveResult:
         return float(agreed.sum()) / acted.chunk.size
 
     def smooth(self) -> dict[str, float]:
-        """Return how smoothly the robot moved, where that is known. Nobody knows what the policy follows."""
+        """Return the robot's smoothness, if it reports its motion; the policy's target is unknown."""
         if self.robot is None or (moved := self.robot.moved(MOST_TICKS)) is None:
             return {}
         motion, actions = moved
@@ -104,14 +104,14 @@ class LiveResult:
 
 
 def write(config: ChunksConfig, writer: RunWriter, live: LiveResult) -> None:
-    """Write the rows of one mode over one pipeline; raises TransportError where too little was answered."""
+    """Write the rows of one mode over one pipeline; raises TransportError for fewer than two chunks."""
     if live.acted.whole < 2:  # noqa: PLR2004 - a boundary lies between two chunks
         raise TransportError(f"{live.cell.cell}: {live.acted.whole} chunks in {config.seconds:g} s; act for longer")
     cell = live.judged
     keep_origin(writer, cell.cell, live.session.origin)
     cycles, ticks = live.counted()
     more: dict[str, Any] = live.timing() | live.smooth()
-    if ticks.stalled.any() and ticks.stalled[-1]:  # the boundary that it waits for at the end
+    if ticks.stalled.any() and ticks.stalled[-1]:  # the run ends while it waits at a boundary
         found = stalls_of(cycles)
         more |= stall_metrics(found["stalled_cycles"] + 1, found["boundaries"] + 1)
     if cell.mode.streams:  # the closed forms are about a given gap between actions
@@ -122,7 +122,7 @@ def write(config: ChunksConfig, writer: RunWriter, live: LiveResult) -> None:
 
 
 def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
-    """Act and return the run folder; raises S2AError for what a user can mend."""
+    """Act and return the run folder; raises S2AError."""
     plan = resolve(config.live_requests.answered(progress.say))
     several = any(each.several for each in config.made.values())
     settings = {**plan.manifest["configuration"], **config.to_manifest()}
@@ -138,7 +138,7 @@ def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
 
 
 def _drive(config: ChunksConfig, launch: RunningLaunch) -> None:
-    """Let every mode act over every pipeline, in random order."""
+    """Run every mode over every pipeline, in random order."""
     blocks = count()
     tried: list[tuple[ChunkCell, list[Session], int]] = []
     launch.progress.stage("warming up")
@@ -159,7 +159,7 @@ def _drive(config: ChunksConfig, launch: RunningLaunch) -> None:
 def _warm_up(
     config: ChunksConfig, launch: RunningLaunch, sessions: Sequence[Session], blocks: Iterator[int]
 ) -> tuple[Ints, int]:
-    """Return the latencies of requests before any loop starts, in ns, and of how many numbers an action is."""
+    """Return the latencies of warm-up requests in ns, and the size of an action."""
     latency_ns: list[int] = []
     dims, error = 0, ""
     for session, _ in product(sessions, range(launch.plan.blocks.warmup)):
@@ -176,7 +176,7 @@ def _warm_up(
 
 @contextmanager
 def robot_of(config: ChunksConfig, cell: ChunkCell, dims: int) -> Iterator[ActionRobot | None]:
-    """Open the robot for a cell, if there is one; raises S2AError."""
+    """Open the robot of a cell, if any; raises S2AError."""
     if not config.robot:
         yield None
         return
@@ -195,24 +195,26 @@ def _act(
     blocks: Iterator[int],
     robot: ActionRobot | None,
 ) -> LiveResult:
-    """Act in one mode, and write down every request as it is measured."""
+    """Act in one mode, and store every request as it is measured."""
     setting = config.setting.slowed(cell.slower)
     sends_state = robot is not None and _accepts_state(config, sessions[0], robot)
 
-    def heard(request: int, actions: Sequence[Any], at_ns: int) -> None:
+    def on_actions(request: int, actions: Sequence[Any], at_ns: int) -> None:
         loop.arrived(request, actions, at_ns)
 
-    requester = ChunkRequester(sessions, config.horizon, config.seed, cell.mode.streams, heard, blocks)
+    requester = ChunkRequester(sessions, config.horizon, config.seed, cell.mode.streams, on_actions, blocks)
 
-    def ask(request: int, tick: int) -> None:
+    def request_chunk(request: int, tick: int) -> None:
         requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else ()))
 
-    send = _nowhere if robot is None else robot.send
-    loop = ControlLoop(cell.acting, setting, send, ask, max(2, round(config.seconds * 1e9 / setting.period_ns)))
+    send = _discard if robot is None else robot.send
+    loop = ControlLoop(
+        cell.acting, setting, send, request_chunk, max(2, round(config.seconds * 1e9 / setting.period_ns))
+    )
     with requester.running():
         try:
             loop.start()
-            while not loop.join(LOOK_S):
+            while not loop.join(KEEP_S):
                 _keep(requester, launch)
             if any(session.busy for session in sessions):
                 launch.progress.stage("waiting for the last answer")
@@ -222,8 +224,8 @@ def _act(
     return LiveResult(cell, setting, sessions[0], loop.acted(), requester, robot, tuple(loop.stepper.triggers))
 
 
-def _nowhere(action: Vector | None, at_ns: int) -> None:
-    """Take actions that nobody executes."""
+def _discard(action: Vector | None, at_ns: int) -> None:
+    """Ignore an action: there is no robot."""
 
 
 def _accepts_state(config: ChunksConfig, session: Session, robot: ActionRobot) -> bool:

@@ -1,4 +1,4 @@
-"""Requests of a control loop: threads that measure them one after another, each with a client of its own."""
+"""Requests of a control loop: threads that measure them one after another, each with its client."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
     from s2a_bench.types import Piece, Vector
 
 OnActions: TypeAlias = "Callable[[int, Sequence[Vector], int], None]"
-"""Called with a request's number, what has come of its chunk so far, and when, in ns."""
+"""Called with a request's number, the actions received so far, and the time in ns."""
 
 SEEDS: Final = 2**31
 GRACE_S: Final = 1.0
-"""For answers under way where a run ends before its time."""
+"""For answers in progress when a run ends early."""
 MOST_WAIT_S: Final = 5.0
-"""For a server that refused and asks to be left alone."""
+"""The longest wait for a server that names a time to retry."""
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A request as the loop asks for it."""
+    """A request of the loop."""
 
     request: int
     tick: int
@@ -39,31 +39,31 @@ class Job:
 
 @dataclass(slots=True)
 class ChunkRequester:
-    """Asks for chunks in the background; what was measured waits in ``done``.
+    """Requests chunks in the background; measurements are put into ``done``.
 
-    A request that fails before its chunk is whole is made again, as the robot goes on waiting for it; of the new answer
-    only actions count that had not come.
+    A request that fails before its chunk is complete is repeated, as the robot still waits for it; only the missing
+    actions are taken from the new answer.
     """
 
     sessions: Sequence[Session]
     horizon: int
     seed: int
     streams: bool
-    heard: OnActions
+    on_actions: OnActions
     blocks: Iterator[int]
-    """Gives each request its place in the run."""
+    """The next place in the run."""
     jobs: SimpleQueue[Job | None] = field(default_factory=SimpleQueue)
     done: SimpleQueue[tuple[Session, Measured]] = field(default_factory=SimpleQueue)
     names: dict[int, str] = field(default_factory=dict)
     """Request -> the id of its sample."""
     sent_bytes: int = 0
-    """What the pictures weighed on the wire."""
+    """Bytes of the pictures on the wire."""
     failure: BaseException | None = None
     over: Event = field(default_factory=Event)
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Ask while the block runs, and until the last answers are there; but for `GRACE_S` where it raises."""
+        """Serve jobs during the block and until the last answer; for at most `GRACE_S` more if the block raises."""
         threads = [
             Thread(target=self._work, args=(session,), name=f"requester-{place}", daemon=True)
             for place, session in enumerate(self.sessions)
@@ -73,7 +73,7 @@ class ChunkRequester:
         patience_s: float | None = GRACE_S
         try:
             yield
-            patience_s = None  # a client that is in use is of no use to anybody else; its own limits end every answer
+            patience_s = None  # clients are not shared while in use; their limits end every answer
         finally:
             self.over.set()
             for _ in threads:
@@ -86,25 +86,25 @@ class ChunkRequester:
         try:
             while (job := self.jobs.get()) is not None and not self.over.is_set():
                 self._ask(session, job)
-        except BaseException as error:  # noqa: BLE001 - raised again where the loop is waited for
+        except BaseException as error:  # noqa: BLE001 - raised again by the thread that waits for the loop
             self.failure = self.failure or error
 
     def _ask(self, session: Session, job: Job) -> None:
-        """Ask until there is an answer, or nobody waits for one."""
+        """Repeat the request until its chunk is complete, or the run is over."""
         chunk: list[Vector] = []
         for attempt in count():
             actions: list[Vector] = []
 
-            def heard(piece: Piece, at_ns: int, actions: list[Vector] = actions) -> None:
+            def on_piece(piece: Piece, at_ns: int, actions: list[Vector] = actions) -> None:
                 if isinstance(piece, Action):
                     actions.append(piece.values)
                 if len(actions) > len(chunk) and (self.streams or len(actions) == self.horizon):
                     chunk.extend(actions[len(chunk) :])
-                    self.heard(job.request, chunk, at_ns)
+                    self.on_actions(job.request, chunk, at_ns)
 
             place = Place(next(self.blocks), attempt, warmup=False)
             request = replace(session.request, seed=(self.seed + job.tick) % SEEDS)
-            measured = session.measure(place, RequestContext(job.state or None, heard, request=request))
+            measured = session.measure(place, RequestContext(job.state or None, on_piece, request=request))
             self.names[job.request] = measured.sample.request_id
             self.sent_bytes += measured.sample.payload_bytes or 0
             self.done.put((session, measured))
@@ -117,14 +117,14 @@ class ChunkRequester:
 
 
 def warm_up(session: Session, place: Place, horizon: int) -> tuple[Measured, int]:
-    """Ask once before the loop starts, and return of how many numbers an action is; raises as `check` does."""
+    """Measure a request before the loop starts; return it and the size of an action; raises as `check` does."""
     actions: list[Vector] = []
 
-    def heard(piece: Piece, _at_ns: int) -> None:
+    def on_piece(piece: Piece, _at_ns: int) -> None:
         if isinstance(piece, Action):
             actions.append(piece.values)
 
-    measured = session.measure(place, RequestContext(on_piece=heard))
+    measured = session.measure(place, RequestContext(on_piece=on_piece))
     if not measured.sample.error:
         check(session, len(actions), horizon)
     return measured, actions[0].size if actions else 0
@@ -136,4 +136,4 @@ def check(session: Session, actions: int, horizon: int) -> None:
     if not actions:
         raise RequestFailed(f"{cell} answers with tokens; acting needs a server that answers with chunks of actions")
     if actions != horizon:
-        raise UsageError(f"`horizon`: {cell} answers with chunks of {actions} actions, not {horizon}; say so")
+        raise UsageError(f"`horizon`: {cell} answers with chunks of {actions} actions, not {horizon}; set that")

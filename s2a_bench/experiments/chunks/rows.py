@@ -1,6 +1,6 @@
-"""The rows of a run of chunks, and the one metric table that columns, JSON and its schema, CSV and tables are made of.
+"""The rows of a run of chunks, and its metric table, from which columns, JSON, schema, CSV and tables follow.
 
-A new metric is a row here, and a value under its name in `build_rows.metrics_of`.
+A new metric is a row of the table, and a value under its name in `build_rows.metrics_of`.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ METRICS: Final[Mapping[str, Metric]] = {
         _ticks("age_ticks_mean", "age", "Of the observation behind an executed action."),
         _ticks("age_ticks_p99", "p99", "Its 99th percentile."),
         _ticks("age_ticks_max", "max", "The greatest."),
-        _ticks("age_ticks_blended", "blended", "Its mean where actions are blended: ages weighted as the actions are."),
+        _ticks("age_ticks_blended", "blended", "Its mean with blended actions: ages weighted as the actions are."),
         _number("reaction_s_mean", "s", "react (ms)", "From an event to the start of the first tick that knows of it."),
         _number("reaction_s_p99", "s", "p99", "Its 99th percentile."),
         _number("reaction_s_closed", "s", "form", "Its mean by the closed form, in ticks, where that holds."),
@@ -62,7 +62,7 @@ METRICS: Final[Mapping[str, Metric]] = {
         _ticks(
             "margin_ticks",
             "margin",
-            "The stability margin: all latencies may be so much longer without a stall; -1 where some stalls as it is.",
+            "The stability margin: all latencies may be longer by this without a stall; -1 where some stall already.",
             better="higher",
             bounds=(-1, None),
             kind=COUNT,
@@ -71,7 +71,7 @@ METRICS: Final[Mapping[str, Metric]] = {
             "slow_down",
             "",
             "beta",
-            "So many times slower actions stall in a share epsilon of the cycles at most, at the greatest trigger.",
+            "The least slow-down of actions at which a share epsilon of the cycles stalls, at the greatest trigger.",
             bounds=(1, None),
         ),
         _number(
@@ -92,33 +92,32 @@ METRICS: Final[Mapping[str, Metric]] = {
         _plant("boundary_jump_p99", "u", "p99", "Its 99th percentile."),
         _plant("action_step_mean", "u", "step", "From one action to the next within a chunk.", "neither"),
         _ticks("blocked_ticks", "blocked", "Ticks in which the control loop waits for an answer.", kind=COUNT),
-        _share("agreement", "alike, %", "Live: share of the ticks as virtual time has them.", "higher"),
-        _number("jitter_s_p50", "s", "jitter (ms)", "Live: how long after it was due an action left, the median."),
+        _share("agreement", "alike, %", "Live: share of the ticks that equal those of virtual time.", "higher"),
+        _number("jitter_s_p50", "s", "jitter (ms)", "Live: delay of an action after its due time, the median."),
         _number("jitter_s_p99", "s", "p99", "Its 99th percentile."),
         _number("jitter_s_max", "s", "max", "The greatest."),
         _ticks("late_ticks", "late", "Live: ticks whose action left a whole tick late or more.", kind=COUNT),
-        _number("blocked_s_p99", "s", "busy (ms)", "Live: what asking and sending took of a tick, 99th percentile."),
+        _number("blocked_s_p99", "s", "busy (ms)", "Live: time of requests and sending in a tick, 99th percentile."),
         _number("blocked_s_max", "s", "max", "The greatest."),
-        _number("bytes_up_per_s", "bytes/s", "MB/s up", "Live: what the pictures weigh that leave in a second."),
+        _number("bytes_up_per_s", "bytes/s", "MB/s up", "Live: bytes of pictures sent in a second."),
     )
 }
-"""The metrics by their names, in the order of their columns."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AboutCell:
-    """What a row of `CHUNKS` says of its cell besides the metrics."""
+    """The columns of a row of `CHUNKS` besides the metrics."""
 
     cell: str
     mode: Annotated[str, about("With the parameters that are not at their defaults.")]
-    rule: Annotated[str, about("What chose the trigger: calibrated, tracked, ...; given where the mode names it.")]
-    latency: Annotated[str, about("Where latencies come from, as --latency names it.")]
+    rule: Annotated[str, about("The rule of the trigger: calibrated, tracked, ...; given where the mode names it.")]
+    latency: Annotated[str, about("The source of the latencies, as in --latency.")]
     latency_s: Annotated[NonNegative, about("The mean.")]
     latency_s_p99: NonNegative
     rounding: Annotated[str, about("The convention for d: floor or ceil of latency over control tick.")]
     delta_t_s: Positive
     horizon: Annotated[Many, about("H, actions of a chunk.")]
-    execution_horizon: Annotated[Count, about("s, ticks that a chunk is to be executed for.")]
+    execution_horizon: Annotated[Count, about("s, planned ticks of a chunk's execution.")]
     requests: Many
     trigger: Annotated[
         NonNegative | None, about("m, actions left at the next request; its mean where a rule moves it.")
@@ -135,9 +134,9 @@ ChunkRow: Final = with_fields(
 
 @dataclass(frozen=True, slots=True)
 class TickRow:
-    """One control tick: which request's chunk the action was from, its place there, and the age of the observation.
+    """One control tick: the request of the action's chunk, its index there, and the age of the observation.
 
-    ``chunk``, ``index`` and ``age_ticks`` are null for a tick without an action; ``stalled`` if the robot had begun.
+    ``chunk``, ``index`` and ``age_ticks`` are null for a tick without an action, ``stalled`` if the robot had begun.
     """
 
     cell: str
@@ -147,15 +146,15 @@ class TickRow:
     age_ticks: int | None
     stalled: bool
     late_ns: int | None = None
-    """How long after it was due the action left; null in virtual time."""
+    """Delay of the action after its due time; null in virtual time."""
 
 
 @dataclass(frozen=True, slots=True)
 class RequestRow:
-    """One request: when it left, how long its chunk took, when and from which action on it was executed.
+    """One request: its time, the latency of its chunk, and from which tick and action that was executed.
 
-    ``start_tick`` and ``first_index`` are null where no action of it was; ``jump`` is by how many actions the robot was
-    thrown ahead, or back where below 0.
+    ``start_tick`` and ``first_index`` are null if no action was executed; ``jump`` counts actions skipped, negative for
+    actions repeated.
     """
 
     cell: str
@@ -170,7 +169,7 @@ class RequestRow:
     stall_ticks: int
     jump: int | None
     request_id: str | None = None
-    """Of its sample; null in virtual time."""
+    """The id of its sample; null in virtual time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +190,7 @@ class TriggerRow:
 
 @dataclass(frozen=True, slots=True)
 class ReactionRow:
-    """A quantile of a cell's reaction times: as simulated, and by the closed form where it holds."""
+    """A quantile of a cell's reaction times: simulated, and by the closed form where it holds."""
 
     cell: str
     share: float
@@ -201,7 +200,7 @@ class ReactionRow:
 
 @dataclass(frozen=True, slots=True)
 class MeanRow:
-    """A mode at one mean latency: the source's latencies, all longer or shorter by one factor."""
+    """A mode at one mean latency: the source's latencies, all scaled by one factor."""
 
     latency: str
     mode: str

@@ -1,4 +1,4 @@
-"""The run of chunks in virtual time: modes and rules under the same latencies; triggers and mean latencies varied."""
+"""The run of chunks in virtual time: modes and rules under the same latencies, varied triggers and mean latencies."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ if TYPE_CHECKING:
     from s2a_bench.progress import Progress
 
 MOST_POINTS: Final = 64
-"""Triggers that are tried of a longer chunk."""
+"""The most triggers that are tried."""
 MEANS_TRIED: Final = 33
 REQUESTS_TRIED: Final = 2000
-"""Of a mean latency."""
+"""For each mean latency."""
 SMOOTH: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal")
-"""What is kept of a follower's motion at each."""
+"""The metrics of motion at each mean latency."""
 
 
 def trigger_rows(config: ChunksConfig, drawn: LatencyDraw) -> Iterator[TriggerRow]:
-    """Try every trigger of the first mode that has one to choose."""
+    """Yield a row for every trigger of the first mode that has one."""
     if config.triggered is None:
         return
     setting = config.setting
@@ -59,7 +59,7 @@ def trigger_rows(config: ChunksConfig, drawn: LatencyDraw) -> Iterator[TriggerRo
 
 
 def mean_rows(config: ChunksConfig, drawn: LatencyDraw, follows: TrackingPlant | None) -> Iterator[MeanRow]:
-    """Try each mode as given with a source's latencies made longer or shorter: means from 0 to H ticks."""
+    """Yield a row for each mode under the source's latencies scaled to means from 0 to H ticks."""
     setting, judged = config.setting, drawn.judged[:REQUESTS_TRIED]
     shape = judged / max(float(judged.mean()), 1.0)
     for mean_ns in np.linspace(0, setting.horizon * setting.period_ns, MEANS_TRIED):
@@ -78,7 +78,7 @@ def mean_rows(config: ChunksConfig, drawn: LatencyDraw, follows: TrackingPlant |
 
 
 def mean_age(cycles: Cycles) -> float:
-    """Return the mean age of the observation behind executed actions, in ticks, of chunks executed in one run each."""
+    """Return the mean age of the observation in ticks over executed actions; each chunk is executed in one run."""
     middle = cycles.start_tick - cycles.request_tick + (cycles.executed - 1) / 2
     return float(np.average(middle, weights=cycles.executed))
 
@@ -88,11 +88,11 @@ def _steps(first: int, last: int) -> list[int]:
 
 
 MOST_TICKS = 100_000_000
-"""Control ticks of a cell: they are held in memory."""
+"""Control ticks of a cell, which are held in memory."""
 
 
 def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
-    """Simulate every cell, or act live, and return the run folder; raises S2AError for what a user can mend."""
+    """Simulate every cell, or act live, and return the run folder; raises S2AError."""
     if config.live:
         from s2a_bench.experiments.chunks.live import run_live
 
@@ -141,7 +141,6 @@ def _simulate(config: ChunksConfig, cell: ChunkCell, follows: TrackingPlant | No
 
 
 def _check(config: ChunksConfig, drawn: LatencyDraw) -> None:
-    """Refuse what would not fit into memory."""
     ticks = int(drawn.judged.size) * config.horizon + int(config.setting.known_ticks(drawn.judged).sum())
     if ticks > MOST_TICKS:
         raise UsageError(

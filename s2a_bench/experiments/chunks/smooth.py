@@ -1,9 +1,7 @@
-"""How smoothly a plant moves under a mode, in virtual time: actions are the best forecasts there can be of a target.
+"""The smoothness of a plant under a mode in virtual time: actions are the best possible forecasts of a target.
 
-Nobody can know far ahead where the robot should be. Virtual time has no pictures and no policy: a stand-in that cannot
-be improved leaves timing alone to be measured.
-The action of index i in a chunk is meant for i ticks after its observation, and forecasts the target then. Where a mode
-executes it later, as queue does, the robot lags.
+Virtual time has no pictures and no policy; with optimal forecasts only timing is measured. Action i of a chunk
+forecasts the target i ticks after its observation. A mode that executes it later, such as queue, makes the robot lag.
 """
 
 from __future__ import annotations
@@ -25,9 +23,9 @@ if TYPE_CHECKING:
     from s2a_bench.policy.chunks import Cycles, Ints, Mode, Ticks
 
 RATE: Final = 3.0
-"""In 1/s: how fast the target changes its mind. What it does in .32 s is known up to .66 standard deviations."""
+"""In 1/s: how fast the target changes. Its position in 0.32 s is known to within 0.66 standard deviations."""
 MOST_TICKS: Final = 50_000
-"""Control ticks of a cell whose motion is computed, the first ones."""
+"""The first control ticks of a cell, whose motion is computed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,7 +33,7 @@ class TargetPath:
     """A target at control ticks, in units of its standard deviation; arrays of shape (K,).
 
     Position x and drift y = x' + r x follow dy = -r y dt + noise, dx = (y - r x) dt: a stationary Gaussian process with
-    covariance (1 + r |t|) e^(-r |t|), Matern's with parameter 3/2. Its path has a velocity, and no acceleration.
+    covariance (1 + r |t|) e^(-r |t|) (Matern 3/2). Its path has a velocity, and no acceleration.
     """
 
     position: Floats
@@ -43,20 +41,20 @@ class TargetPath:
     period_s: float
 
     def forecast(self, tick: Ints, ahead: Ints) -> Floats:
-        """Return E[x(tick + ahead)] given all until ``tick``, arrays of one shape; with ``ahead`` >= 0."""
+        """Return E[x(tick + ahead)] given the path until ``tick``; arrays of one shape, ``ahead`` >= 0."""
         time_s = ahead * self.period_s
         expected: Floats = np.exp(-RATE * time_s) * (self.position[tick] + self.drift[tick] * time_s)
         return expected
 
 
 def draw_target(rng: np.random.Generator, ticks: int, period_s: float) -> TargetPath:
-    """Draw a target, exact at its ticks; the first ones are the same however many there are."""
+    """Draw a target, exact at its ticks; a longer draw begins with the same ticks."""
     from scipy.signal import lfilter
     from scipy.special import gammainc
 
     step = RATE * period_s
     keep = np.exp(-step)
-    of_drift, of_both, of_position = gammainc((1, 2, 3), 2 * step)  # what noise adds in a tick to x and y / r
+    of_drift, of_both, of_position = gammainc((1, 2, 3), 2 * step)  # variances that noise adds to y / r and x in a tick
     added = np.linalg.cholesky([[2 * of_drift, of_both], [of_both, of_position]])
     first = np.linalg.cholesky([[2.0, 1.0], [1.0, 1.0]])
     drawn = rng.standard_normal((ticks, 2))
@@ -69,15 +67,15 @@ def draw_target(rng: np.random.Generator, ticks: int, period_s: float) -> Target
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackingPlant:
-    """A plant that is to follow a target."""
+    """A plant and the target that it follows."""
 
     plant: ActionKind
     target: TargetPath
 
     def measure(self, mode: Mode, cycles: Cycles, ticks: Ticks) -> Mapping[str, float]:
-        """Return the metrics of smoothness by their names; none where nothing was executed.
+        """Return the metrics of smoothness by name; none if nothing was executed.
 
-        ``..._ideal`` is of the plant alone: with a request in every tick and no latency.
+        ``..._ideal`` has a request in every tick and no latency.
         """
         target, period_s = self.target, self.target.period_s
         chunk = ticks.chunk[: target.position.size]
@@ -92,10 +90,7 @@ class TrackingPlant:
 
 
 def follower(config: ChunksConfig) -> TrackingPlant | None:
-    """Return what follows, the same target for all cells of a seed; None without a robot.
-
-    Nor where all actions are slowed down: no target waits for them.
-    """
+    """Return plant and target, which all cells of a seed share; None without a robot, or with actions slowed down."""
     if config.plant is None or config.slow_down > 1:
         return None
     rng = generator(config.seed, "chunks target")
@@ -103,7 +98,7 @@ def follower(config: ChunksConfig) -> TrackingPlant | None:
 
 
 def executed(mode: Mode, cycles: Cycles, ticks: Ticks, target: TargetPath) -> Floats:
-    """Return the action of each tick, as long as the target goes; NaN for no action."""
+    """Return the action of each tick of the target; NaN without an action."""
     length = min(ticks.chunk.size, target.position.size)
     found = np.full(length, np.nan)
     for tick, chunk, index, share in mode.blend(cycles, ticks):
@@ -114,12 +109,12 @@ def executed(mode: Mode, cycles: Cycles, ticks: Ticks, target: TargetPath) -> Fl
 
 
 def smoothness(motion: PlantMotion, actions: Floats, chunk: Ints, reference: Floats | None = None) -> dict[str, float]:
-    """Measure a motion under actions of shape (K, D), of which tick k's is from ``chunk[k]``, -1 in a stall.
+    """Measure a motion under actions of shape (K, D); tick k's action is from ``chunk[k]``, -1 in a stall.
 
-    ``reference``, shape (K, D), is where the joints should have been when each tick began; without it there is no
-    ``tracking_rms``. Returns metrics by their names, in the actions' unit and s, root mean squares over joints and
-    time, NaN where there is nothing to count. Jumps and steps, from one action to the next across a boundary of chunks
-    and within a chunk, are Euclidean over joints.
+    ``reference``, shape (K, D), holds the wanted positions at the start of each tick; without it there is no
+    ``tracking_rms``. Returns metrics by name in the actions' unit and s: root mean squares over joints and time, and
+    Euclidean distances from one action to the next across a boundary of chunks (jump) and within a chunk (step); NaN
+    without values.
     """
     acted = np.flatnonzero(chunk >= 0)
     step = np.linalg.norm(np.diff(actions[acted], axis=0), axis=1)

@@ -236,7 +236,7 @@ def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
-        ({"live": True, "rules": "mean,oracle"}, "`rules`: nobody is an oracle live"),
+        ({"live": True, "rules": "mean,oracle"}, "`rules`: a live run has no oracle"),
         (
             {"live": True, "rules": "tracked"},
             "`warmup`: 5 requests are too few to learn from for `epsilon` 0.01; take 99",
@@ -245,7 +245,7 @@ def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
             {"live": True, "seconds": 80_000, "control_hz": 1000},
             "`seconds`: 80000 s at `control_hz` 1000 are over",
         ),
-        ({"live": True, "control_hz": 1e6}, "`control_hz`: 1e[+]06: live no loop of ours keeps up above 10000"),
+        ({"live": True, "control_hz": 1e6}, "`control_hz`: 1e[+]06: a live control loop keeps up to 10000"),
         ({"live": True, "control_hz": 0.1, "seconds": 1}, "`seconds`: 1 s are less than two ticks at `control_hz` 0.1"),
         ({"live": True, "cycles": 5}, "`cycles` is for virtual time"),
         ({"seconds": 5}, "`seconds` is for a control loop"),

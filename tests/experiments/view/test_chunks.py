@@ -22,10 +22,7 @@ from s2a_bench.experiments.chunks.view.figures import (
     short,
 )
 from s2a_bench.experiments.chunks.view.tables import (
-    action_table,
-    delay_table,
-    smoothness_table,
-    stall_table,
+    chunk_tables,
 )
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
@@ -45,7 +42,8 @@ def drawn(run: StoredRun, build: object) -> Figure:
 
 
 def test_tables_number_the_sources_and_name_the_convention(run: StoredRun) -> None:
-    stalls, actions, delays = stall_table(run), action_table(run), delay_table(run)
+    tables = chunk_tables(run)
+    stalls, actions, delays = tables["chunks"], tables["actions"], tables["delays"]
     assert stalls.header[:3] == ("L", "mode", "rule")
     assert [row[0] for row in stalls.rows] == ["1"] * 9 + ["2"] * 9
     assert stalls.rules == {9}
@@ -124,7 +122,7 @@ def test_reactions_have_the_closed_form_drawn_over_them(run: StoredRun) -> None:
 
 
 def test_smoothness_stands_beside_the_ideal(run: StoredRun) -> None:
-    table = smoothness_table(run)
+    table = chunk_tables(run)["smoothness"]
     assert table.header[3:] == ("tracking", "ideal", "jerk", "ideal", "jump", "p99", "step")
     tracking, ideal = (float(text) for text in table.rows[0][3:5])
     assert tracking > ideal > 0

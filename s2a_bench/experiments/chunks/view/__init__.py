@@ -1,4 +1,4 @@
-"""How a run of chunks is shown: its sentences, tables, figures and JSON."""
+"""The sentences, tables, figures and JSON of a run of chunks."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ def show(run: StoredRun, **_: Any) -> Shown:
 
 
 def chunk_sentences(run: StoredRun) -> list[str]:
-    """Return what calibration costs over the oracle, what the other rules do, and how a control loop kept time."""
+    """Return each rule's stalled cycles, a live loop's agreement and jitter, and the slow-down that queue needs."""
     sentences = []
     epsilon = float(run.manifest["configuration"]["epsilon"])
     for name, rows in sources_of(rows_of(run)):
         by_rule = {row["rule"]: row for row in rows if row["p_stall_cycle"] is not None}
-        parts = [
+        stalls = [
             f"{rule} {row['p_stall_cycle']:.2%} at age {entry(row['age_ticks_mean'])}"
             for rule, row in by_rule.items()
             if rule != "given"
         ]
-        if parts:
-            sentences.append(f"Stalled cycles of queue @ {name}, for at most {epsilon:.2%}: {', '.join(parts)} ticks.")
+        if stalls:
+            sentences.append(f"Stalled cycles of queue @ {name}, for at most {epsilon:.2%}: {', '.join(stalls)} ticks.")
         if live(run):
             least, worst = min(row["agreement"] for row in rows), max(row["jitter_s_p99"] for row in rows)
             sentences.append(
-                f"Control loop @ {name}: {least:.2%} of the ticks and more are as virtual time has them; "
-                f"p99 of the jitter {number(worst * 1e3)} ms at most."
+                f"Control loop @ {name}: at least {least:.2%} of the ticks equal those of virtual time; "
+                f"p99 of the jitter at most {number(worst * 1e3)} ms."
             )
         slower = max((row["slow_down"] or 1 for row in rows if row["mode"].startswith("queue")), default=1)
         if slower > 1:

@@ -23,24 +23,24 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 MOST_LANES: Final = 12
-"""More would not be legible; chunk_ticks.csv has all."""
+"""More are not legible; chunk_ticks.csv has all."""
 COLOURS: Final = ("#0072B2", "#56B4E9", "#009E73")
-"""Of chunks that follow one another."""
+"""Colours of consecutive chunks."""
 _BAR: Final = 0.34
 _AGE: Final = 0.42
 """Height of the greatest age."""
 LOOKS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-"""Of modes, of sources."""
+"""Colours of modes or sources."""
 _RULES: Final = {"calibrated": "o", "tracked": "s", "maximum": "^", "mean": "v", "oracle": "*"}
 _INK: Final = "#222222"
 _MOST_PANELS: Final = 8
 _BULK: Final = 0.9975
-"""The axis of reaction times ends at this quantile; chunk_reactions.csv has the rest."""
+"""Quantile where the axis of reaction times ends; chunk_reactions.csv has the rest."""
 
 
 @dataclass(frozen=True, slots=True)
 class CellTicks:
-    """The first ticks of one cell, and the requests that left in them."""
+    """The first ticks of one cell, and their requests."""
 
     name: str
     rule: str
@@ -103,7 +103,7 @@ def build_lanes(run: StoredRun) -> Figure:
 
 
 def draw_lane(axes: Axes, lane: CellTicks, place: int, oldest: int) -> None:
-    """Draw one lane around y = ``place``; ``oldest`` is the age that the curve below reaches the next lane with."""
+    """Draw one lane around y = ``place``; the curve of ages below it reaches the next lane at age ``oldest``."""
     top = place - _BAR / 2
     chunk = lane.ticks["chunk"].fillna(-1).to_numpy(dtype="int64")
     stalled = lane.ticks["stalled"].to_numpy(dtype="bool")
@@ -133,24 +133,24 @@ def draw_lane(axes: Axes, lane: CellTicks, place: int, oldest: int) -> None:
 
 
 def _age_at(place: float, share: Any) -> Any:
-    """Return where a share of the greatest age is drawn, below the bar of the lane at ``place``."""
+    """Return the y of a share of the greatest age, below the bar of the lane at ``place``."""
     return place + _BAR / 2 + 0.03 + _AGE * share
 
 
 def runs_of(values: np.ndarray) -> list[tuple[int, int]]:
-    """Return from where to before where values are the same."""
+    """Return the half-open ranges of equal values."""
     edges = np.flatnonzero(np.diff(values)) + 1
     bounds = [0, *edges.tolist(), values.size]
     return list(pairwise(bounds))
 
 
 def _label(lane: CellTicks, *, several: bool) -> str:
-    parts = [lane.title, lane.source] if several else [lane.title]
-    return "\n".join(short(part, 30) for part in parts)
+    lines = [lane.title, lane.source] if several else [lane.title]
+    return "\n".join(short(line, 30) for line in lines)
 
 
 def short(text: str, most: int) -> str:
-    """Return a text of ``most`` letters at most, cut off: `textwrap.shorten` leaves nothing of one long word."""
+    """Return a text cut to ``most`` characters; `textwrap.shorten` would drop a single long word."""
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
@@ -168,7 +168,7 @@ def _legend() -> dict[str, Any]:
 
 
 def chunk_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
-    """Return each figure that the run has rows for, by its file's name."""
+    """Return every figure that the run has rows for, by its file's name."""
     found: dict[str, Callable[[], Figure]] = {}
     if lanes_of(run):
         found["lanes"] = partial(build_lanes, run)
@@ -195,14 +195,12 @@ def build_smoothness(run: StoredRun) -> Figure:
 
 
 def _over_means(run: StoredRun, what: str, shown: Mapping[str, str]) -> Figure:
-    """Draw columns, each with its label, a panel each; dashed the ideal of those that have one."""
+    """Draw columns over mean latency, a panel each; dashed: their ideal, if any."""
     rows = run.table(MEANS)
     modes = [str(mode) for mode in rows["mode"].unique()][: len(LOOKS)]
     columns = 2 if max(map(len, modes)) <= LINE_CHARS // 3 else 1
     foot_in = 0.17 * -(-(len(modes) + 1) // columns)
-    caption = _caption(
-        run, what, f"Latencies are those of {rows['latency'].iloc[0]}, all longer or shorter by one factor."
-    )
+    caption = _caption(run, what, f"Latencies are those of {rows['latency'].iloc[0]}, all scaled by one factor.")
     figure = new_figure(0.8 + 1.3 * len(shown) + foot_in, caption)
     panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
     latency_ms = rows["latency_s"].to_numpy(dtype="float64") * 1e3
@@ -224,7 +222,7 @@ def _over_means(run: StoredRun, what: str, shown: Mapping[str, str]) -> Figure:
 
 
 def build_triggers(run: StoredRun) -> Figure:
-    """Draw P(stall) over the trigger with its closed form, a line a source, and where each rule ends up."""
+    """Draw P(stall) over the trigger with its closed form, a line a source, and the trigger of each rule."""
     rows = run.table(TRIGGERS)
     epsilon = float(run.manifest["configuration"]["epsilon"])
     groups = sources_of(rows_of(run))[:_MOST_PANELS]
@@ -261,8 +259,8 @@ def build_triggers(run: StoredRun) -> Figure:
                     axes.plot(cell["trigger"], at, marker, color=colour, markerfacecolor="none", markersize=7)
     for rule, marker in _RULES.items():
         if any(cell["rule"] == rule for _, cells in groups for cell in cells):
-            look: dict[str, Any] = {"markerfacecolor": "none", "markersize": 6, "linestyle": "none"}
-            rules += axes.plot([], [], marker, color=_INK, label=rule, **look)
+            style: dict[str, Any] = {"markerfacecolor": "none", "markersize": 6, "linestyle": "none"}
+            rules += axes.plot([], [], marker, color=_INK, label=rule, **style)
     axes.axhline(epsilon, color=_INK, linestyle=":", linewidth=0.8)
     axes.text(0.01, epsilon, f"epsilon = {epsilon:.3g}", transform=axes.get_yaxis_transform(), va="bottom")
     axes.set_yscale("log")
@@ -275,11 +273,11 @@ def build_triggers(run: StoredRun) -> Figure:
 
 
 def build_reactions(run: StoredRun) -> Figure:
-    """Draw the distribution of reaction times, a panel a source and a line a mode, the closed form dashed over it."""
+    """Draw the distribution of reaction times, a panel a source and a line a mode; dotted: the closed form."""
     rows = run.table(REACTIONS)
     groups = sources_of(rows_of(run))[:_MOST_PANELS]
-    names = list(dict.fromkeys(_who(cell) for _, cells in groups for cell in cells if _drawn(cell)))
-    what = "From an event to the first tick that knows of it; the last 0.25 % of the slowest mode lie beyond the axis."
+    names = list(dict.fromkeys(_line_name(cell) for _, cells in groups for cell in cells if _drawn(cell)))
+    what = "From an event to the first tick that knows of it; the last 0.25 % of the slowest mode are beyond the axis."
     foot_in = 0.17 * -(-(len(names) + 1) // 2)
     figure = new_figure(0.5 + foot_in + 1.6 * len(groups), _caption(run, "Reaction times", what))
     panels = figure.subplots(len(groups), 1, squeeze=False)[:, 0]
@@ -287,7 +285,7 @@ def build_reactions(run: StoredRun) -> Figure:
         for cell in filter(_drawn, cells):
             mine = rows[rows["cell"] == cell["cell"]]
             with_form = mine[mine["closed_s"].notna()]
-            colour = LOOKS[names.index(_who(cell)) % len(LOOKS)]
+            colour = LOOKS[names.index(_line_name(cell)) % len(LOOKS)]
             axes.step(mine["reaction_s"] * 1e3, mine["share"], where="post", color=colour)
             axes.plot(with_form["closed_s"] * 1e3, with_form["share"], ":", color="black", linewidth=0.8)
         axes.set_title(short(source, LINE_CHARS), loc="left", pad=2)
@@ -305,11 +303,10 @@ def build_reactions(run: StoredRun) -> Figure:
 
 
 def _drawn(cell: dict[str, Any]) -> bool:
-    """Whether a cell is drawn among others: the modes as given, and the calibrated trigger."""
     return cell["rule"] in {"given", "calibrated"}
 
 
-def _who(cell: dict[str, Any]) -> str:
+def _line_name(cell: dict[str, Any]) -> str:
     return str(cell["mode"]) if cell["rule"] == "given" else f"{cell['mode']}, {cell['rule']}"
 
 

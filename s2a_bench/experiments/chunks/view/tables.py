@@ -1,4 +1,4 @@
-"""The tables of a run of chunks, and its ``--json`` object."""
+"""The tables of a run of chunks, its CSV and its ``--json`` object."""
 
 from __future__ import annotations
 
@@ -46,18 +46,22 @@ _LOOP: Final = (
     *("agreement", "jitter_s_p50", "jitter_s_p99", "jitter_s_max", "late_ticks", "blocked_s_p99", "blocked_s_max"),
     "bytes_up_per_s",
 )
+_LOOP_NOTE: Final = (
+    "alike: share of the ticks that equal those of virtual time with the measured latencies; jitter: delay of an "
+    "action after its due time; late: by a tick or more; busy: time of a tick spent on requests and sending, p99."
+)
 _MOTION: Final = ("jerk_rms", "boundary_jump_mean", "boundary_jump_p99", "action_step_mean")
 _FOLLOWING: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal", *_MOTION[1:])
 _TITLES: Final = {"execution_horizon": "s", "trigger": "m", **{name: metric.title for name, metric in METRICS.items()}}
 _SCALES: Final = {"s": 1e3, "bytes/s": 1e-6}
-"""Times are shown in ms, bytes in MB."""
+"""Unit -> factor: tables show times in ms, bytes in MB."""
 _EMULATED: Final = Note(
-    "EMULATED: ticks are counted in virtual time, on latencies that are given; nothing was measured here.", EMULATED
+    "EMULATED: ticks are counted in virtual time, with given latencies; nothing was measured.", EMULATED
 )
 
 
 def rows_of(run: StoredRun) -> list[Row]:
-    """Return the rows of a run; what a row lacks is None. Live they are made in random order, which is put right."""
+    """Return the rows of a run in the order of the options; a missing value is None."""
     table = run.table(CHUNKS).drop(columns=PROVENANCE)
     whole = table.astype(object).where(table.notna(), None)
     rows = [{str(name): value for name, value in row.items()} for row in whole.to_dict("records")]
@@ -71,29 +75,9 @@ def rows_of(run: StoredRun) -> list[Row]:
 
 
 def sources_of(rows: list[Row]) -> list[tuple[str, list[Row]]]:
-    """Return the rows of each source of latencies, in the order of the options."""
+    """Return the rows of each source of latencies."""
     names = dict.fromkeys(row["latency"] for row in rows)
     return [(name, [row for row in rows if row["latency"] == name]) for name in names]
-
-
-def stall_table(run: StoredRun) -> TextTable:
-    """Lay out how often each mode stalls, and what would have been safe."""
-    return _table(run, "Stalls", _STALLS)
-
-
-def action_table(run: StoredRun) -> TextTable:
-    """Lay out how old the actions are, how soon the robot reacts, and what is lost at boundaries."""
-    return _table(run, "Actions: ages in ticks", _ACTIONS)
-
-
-def loop_table(run: StoredRun) -> TextTable:
-    """Lay out how well the control loop of a live run kept time."""
-    note = (
-        "alike: share of the ticks that virtual time has the same way, on the latencies that were measured; jitter: "
-        "how long after it was due an action left; late: by a tick or more; busy: for how long asking and sending kept "
-        "the loop in a tick, p99."
-    )
-    return _table(run, "Control loop", _LOOP, (_convention(run), note))
 
 
 def live(run: StoredRun) -> bool:
@@ -102,7 +86,7 @@ def live(run: StoredRun) -> bool:
 
 
 def smoothness_table(run: StoredRun) -> TextTable:
-    """Lay out how smoothly a plant moves under each mode; in virtual time, how well it follows a target besides."""
+    """Return the table of the plant's smoothness under each mode; in virtual time, also of its tracking error."""
     robot = run.manifest["configuration"]["robot"]
     jump = "jump: from one action to the next across a boundary, step: within a chunk."
     if live(run):
@@ -117,25 +101,30 @@ def smoothness_table(run: StoredRun) -> TextTable:
 
 def chunk_tables(run: StoredRun) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
-    found = {"chunks": stall_table(run), "actions": action_table(run), "delays": delay_table(run)}
-    found |= {"loop": loop_table(run)} if live(run) else {}
+    found = {
+        "chunks": _table(run, "Stalls", _STALLS),
+        "actions": _table(run, "Actions: ages in ticks", _ACTIONS),
+        "delays": delay_table(run),
+    }
+    if live(run):
+        found["loop"] = _table(run, "Control loop", _LOOP, (_convention(run), _LOOP_NOTE))
     smooth = any(row.get("jerk_rms") is not None for row in rows_of(run))
     return found | ({"smoothness": smoothness_table(run)} if smooth else {})
 
 
 def delay_table(run: StoredRun) -> TextTable:
-    """Lay out the realised delays of each source, live of each mode beside the d that it is ready for."""
+    """Return the table of the delays of each source; in a live run, of each mode with the d that it assumes."""
     names = ["delay_ticks_mean", "delay_ticks_p99", "delay_ticks_max"]
     names += ["delay_assumed_ticks", "p_delay_above"] if live(run) else []
     rows = []
     for place, (name, group) in enumerate(sources_of(rows_of(run)), 1):
         shared = next((row for row in group if not streams(row["mode"])), group[0])
         for one in group if live(run) else [shared]:
-            latency = (number(one[part] * 1e3) for part in ("latency_s", "latency_s_p99"))
-            who = (one["mode"],) if live(run) else (name, str(one["requests"]))
-            rows.append((str(place), *who, *latency, *(_cell(one, name) for name in names)))
-    left = ("L", "mode") if live(run) else ("L", "latency", "requests")
-    header = (*left, "ms", "p99", *(_TITLES[name] for name in names))
+            latency = (number(one[column] * 1e3) for column in ("latency_s", "latency_s_p99"))
+            left = (one["mode"],) if live(run) else (name, str(one["requests"]))
+            rows.append((str(place), *left, *latency, *(_cell(one, name) for name in names)))
+    names_left = ("L", "mode") if live(run) else ("L", "latency", "requests")
+    header = (*names_left, "ms", "p99", *(_TITLES[name] for name in names))
     title = f"Delays, d = {_rounding(run)} of L over Delta t"
     return TextTable(title, header, rows, 2, notes=(_convention(run),))
 
@@ -154,7 +143,7 @@ def chunk_json(run: StoredRun) -> dict[str, Any]:
 
 
 def _table(run: StoredRun, title: str, names: Sequence[str], notes: Iterable[str] | None = None) -> TextTable:
-    """Lay out a line a row; of several sources the first column has the number that the table of delays names."""
+    """Return a table with a line a row; with several sources the first column is a number of the table of delays."""
     found = sources_of(rows_of(run))
     several = len(found) > 1
     ruled = any(row["rule"] != "given" for row in rows_of(run))
@@ -175,13 +164,12 @@ def _table(run: StoredRun, title: str, names: Sequence[str], notes: Iterable[str
 
 
 def _named(row: Row, column: str) -> str:
-    """Return a row's mode or rule, and by how much the rule slowed actions down."""
     slower = row.get("slower") or 1
     return f"{row[column]}, {slower:.3g}x slower" if column == "rule" and slower > 1 else str(row[column])
 
 
 def _cell(row: Row, name: str) -> str:
-    """Write one value of a row as tables show it: shares in percent without the sign, P(stall) with its interval."""
+    """Return one value as text: shares in percent without the sign, P(stall) with its interval."""
     value, metric = row[name], METRICS.get(name)
     if value is None:
         return ABSENT
@@ -198,7 +186,7 @@ def _cell(row: Row, name: str) -> str:
 
 
 def entry(value: float) -> str:
-    """Write a number, a whole one without decimals."""
+    """Return a number as text, without decimals if it is whole."""
     return str(int(value)) if float(value).is_integer() else number(value)
 
 
@@ -213,7 +201,7 @@ def _convention(run: StoredRun) -> str:
 def _notes(run: StoredRun) -> Iterator[str]:
     yield _convention(run)
     yield (
-        "P(stall): share of the cycles, with its 95 % interval; form: what the closed form says, where it holds; "
+        "P(stall): share of the cycles, with its 95 % interval; form: the closed form, where it holds; "
         "margin: ticks that all latencies may be longer without a stall. Ages and stalls are in control ticks."
     )
     rows = rows_of(run)
@@ -223,10 +211,10 @@ def _notes(run: StoredRun) -> Iterator[str]:
         yield "Where no trigger is enough, actions have to be slower by beta (chunks.csv: slow_down)."
     if any(row["rule"] != "given" for row in rows):
         settings = run.manifest["configuration"]
-        seen = "an oracle that knows the distribution. All others saw the same cycles before."
+        others = "an oracle that knows the distribution. All others learnt from the same cycles."
         yield (
             f"Rules choose m of queue: calibrated for P(stall) <= {settings['epsilon']:.2%}, tracked from there, "
-            f"lerobot's maximum, the mean, {'each after the same warm-up.' if live(run) else seen}"
+            f"lerobot's maximum, the mean, {'each after the same warm-up.' if live(run) else others}"
         )
     if live(run):
         sources = [name for name, _ in sources_of(rows)]
