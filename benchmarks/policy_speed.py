@@ -21,7 +21,7 @@ from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.arrivals import fragments, tokens
 from s2a_bench.policy.evaluate import evaluate
-from s2a_bench.policy.schedule import CHUNK, elastic
+from s2a_bench.policy.schedule import BLOCK, elastic
 
 N_SKILLS = 32
 SECONDS = 2.0
@@ -44,15 +44,15 @@ class Speed:
 def measure(seconds: float = SECONDS) -> list[Speed]:
     """Time every way to evaluate plans of 32 skills, on this thread alone."""
     rng = np.random.default_rng(0)
-    arrival_s = fragments(tokens(GAPS, 0.5, 4 * N_SKILLS, CHUNK, rng), 4).copy()
+    arrival_s = fragments(tokens(GAPS, 0.5, 4 * N_SKILLS, BLOCK, rng), 4).copy()
     nominal_s = rng.uniform(0.65, 1.35, arrival_s.shape)
     plans = Plans(arrival_s, nominal_s, 0.8 * nominal_s, 1.5 * nominal_s)
     few = [(arrival_s[:, i].tolist(), nominal_s[:, i].tolist()) for i in range(1000)]
     naive = policy("naive")
     found = [
-        _time("evaluate", CHUNK, seconds, lambda: evaluate(arrival_s, nominal_s)),
-        _time("schedule of naive: every start and duration", CHUNK, seconds, lambda: naive.schedule(plans)),
-        _time("schedule of the elastic optimum: every start and duration", CHUNK, seconds, lambda: elastic(plans)),
+        _time("evaluate", BLOCK, seconds, lambda: evaluate(arrival_s, nominal_s)),
+        _time("schedule of naive: every start and duration", BLOCK, seconds, lambda: naive.schedule(plans)),
+        _time("schedule of the elastic optimum: every start and duration", BLOCK, seconds, lambda: elastic(plans)),
     ]
     for length in (1, 2, 4, 6):
 
@@ -90,7 +90,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=SECONDS, help="how long to measure each line (default: 2)")
     seconds = parser.parse_args().seconds
     sys.stdout.write(
-        f"million timelines/s, N = {N_SKILLS}, float64, one core, {CHUNK} plans a pass: median turn (best)\n"
+        f"million timelines/s, N = {N_SKILLS}, float64, one core, {BLOCK} plans a pass: median turn (best)\n"
     )
     for speed in measure(seconds):
         sys.stdout.write(f"{speed.median_per_s / 1e6:8.2f} ({speed.best_per_s / 1e6:6.2f})  {speed.what}\n")

@@ -1,9 +1,9 @@
-"""When to act: a policy answers when each skill of a plan starts and how long it runs. Pure: time comes in as numbers.
+"""When to act: a policy decides when each skill of a plan starts and how long it runs. Pure: times are arguments.
 
-A policy is a class with a name and a `Policy.stepper`, an object that is told what has happened so far, for a robot.
-`Policy.schedule` decides for plans whose arrivals are known; it drives the stepper unless a policy has arrays for it,
-for studies of millions of plans: both give the same result. The words are those of docs/policies.md: N skills, M plans,
-times in seconds from the request.
+A policy is a class with a name and a `Policy.stepper`, which follows one plan on a robot, event by event.
+`Policy.schedule` decides for plans whose arrivals are known. It drives the stepper unless a policy computes with
+arrays, for studies of millions of plans; both give the same result. docs/policies.md defines N skills and M plans;
+times are in seconds from the request.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Floats: TypeAlias = "NDArray[np.float64]"
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """How long one skill takes: as planned, at least, at most (by time-scaling it)."""
+    """Duration of one skill: as planned, and the limits within which it can be time-scaled."""
 
     nominal_s: float
     least_s: float
@@ -38,8 +38,8 @@ class Start:
     """Start the next skill now.
 
     It ends after ``duration_s`` if the next skill has arrived by then, or if none follows (all ``n_skills`` have
-    started, or the stream has ended); else it is held on until the next arrives, but no longer than ``latest_s``
-    (>= ``duration_s``) after its start: then the robot stalls.
+    started, or the stream has ended). Otherwise it is held on until the next skill arrives, at most until ``latest_s``
+    (>= ``duration_s``) after its start; then the robot stalls.
     """
 
     duration_s: float
@@ -54,14 +54,14 @@ class PlanShape:
     tokens_per_skill: float
     """Delimiter included."""
     expected: Timing
-    """Of a skill whose fragment has not been parsed yet."""
+    """Durations of a skill whose fragment has not been parsed yet."""
     expected_cv: float = 0.2
     safe_start_s: float | None = None
-    """S0, which nobody knows before the last token: given in studies only, for s2a-clairvoyant."""
+    """S0, unknown before the last token: set in studies only, for s2a-clairvoyant."""
 
     @property
     def key(self) -> Verbatim:
-        """Return what draws for such plans follow from."""
+        """Return the text that seeds the draws for such plans."""
         of = self.expected
         return Verbatim(
             f"PlanShape(n_skills={self.n_skills!r}, tokens_per_skill={self.tokens_per_skill!r}, "
@@ -73,23 +73,23 @@ class PlanShape:
 class Stepper(Protocol):
     """One policy following one plan. Times never decrease from call to call.
 
-    What happens at the same instant is told in the order token, fragment, end, and then `decide` is asked.
+    Events at the same instant are passed in the order token, fragment, end; a call of `decide` follows.
     """
 
     def token(self, at_s: float) -> None:
-        """Learn that a token arrived."""
+        """Record that a token arrived."""
 
     def fragment(self, at_s: float, timing: Timing) -> None:
-        """Learn that the next skill has been parsed."""
+        """Record that the next skill has been parsed."""
 
     def end(self, at_s: float) -> None:
-        """Learn that the stream has ended: no skill will follow."""
+        """Record that the stream has ended: no skill will follow."""
 
     def decide(self, now_s: float) -> Start | float:
-        """Return what to do while no skill runs: start the next one, or when to ask again (inf: on an event).
+        """Return what to do while no skill runs: start the next one, or when to decide again (inf: on an event).
 
-        It is asked again at that time, and before it at every token, fragment and end. After a Start the policy takes
-        the skill as started at ``now_s``; it is asked again when that has ended, held on or not.
+        The next call is at that time, or before it at a token, fragment or end. After a Start the skill counts as
+        started at ``now_s``; the next call is when it has ended, held on or not.
         """
 
 
@@ -98,31 +98,31 @@ class Plans:
     """M plans of N skills each, as arrays of shape (N, M), in seconds from the request."""
 
     arrival_s: Floats
-    """t_i: when fragment i is complete; non-decreasing along the first axis."""
+    """t_i, when fragment i is complete; non-decreasing along the first axis."""
     nominal_s: Floats
     least_s: Floats
     most_s: Floats
     token_s: Floats | None = None
-    """When each token arrived, shape (tokens, M), for the policies that learn from tokens."""
+    """Arrival of each token, shape (tokens, M), for policies that learn from tokens."""
     shape: PlanShape | None = None
-    """What was known before the first token, for the policies that learn; one for all M plans."""
+    """Shape common to all M plans, for policies that learn."""
 
 
 @dataclass(frozen=True, slots=True)
 class Schedule:
-    """What a policy makes of M plans: arrays of shape (N, M), in seconds; durations include holding on."""
+    """Decisions for M plans: arrays of shape (N, M), in seconds; durations include holding on."""
 
     start_s: Floats
     duration_s: Floats
 
 
 class Policy(Protocol):
-    """A rule for acting; a subclass of this one gets `schedule` from its stepper."""
+    """A rule for acting; a subclass gets `schedule` from its stepper."""
 
     stalls: ClassVar[bool] = True
     """Whether a robot that has begun may have to wait for a skill."""
     learns: ClassVar[bool] = False
-    """Whether it goes by a prior and a lambda that are learned from other plans: `informed` returns it with them."""
+    """Whether it uses a prior and a lambda learned from other plans, which `informed` sets."""
 
     @property
     def name(self) -> str:
@@ -130,30 +130,29 @@ class Policy(Protocol):
 
     @property
     def prior(self) -> GapPrior:
-        """Return what it expects of the gaps between tokens before the first."""
         from s2a_bench.policy.estimator import VAGUE
 
         return VAGUE
 
     @property
     def caution(self) -> float | None:
-        """Return its lambda: a plan that does not stall at one does not at a greater one; None: has none yet."""
+        """Return lambda, None before calibration; a plan without stalls at one lambda has none at a greater one."""
         return None
 
     @property
     def foreseeing(self) -> Policy:
-        """Return what does the same as it where all arrivals are known and tokens come evenly."""
+        """Return the policy that decides the same where all arrivals are known and tokens come evenly."""
         return self
 
     def informed(self, prior: GapPrior | None = None, caution: float | None = None) -> Policy:  # noqa: ARG002
-        """Return it with what was learned; None leaves what it has."""
+        """Return a copy with these values; None keeps the present one."""
         return self
 
     def stepper(self, shape: PlanShape) -> Stepper:
-        """Follow one plan as it arrives."""
+        """Return a stepper for one plan."""
 
     def schedule(self, plans: Plans) -> Schedule:
-        """Decide for many plans at once; step by step they need ``shape``, raises ValueError without."""
+        """Decide for many plans at once; raises ValueError if the stepper needs ``plans.shape`` and it is None."""
         from s2a_bench.policy.stepping import schedule
 
         return schedule(self, plans)
@@ -180,12 +179,12 @@ POLICIES: Final[Registry[Callable[..., Policy]]] = Registry(
         "s2a-mean": "s2a_bench.policy.stream_to_act:MeanStart",
     },
 )
-"""What builds each policy from its parameters, which all have defaults; names starting with s2a- are for study."""
+"""Constructor of each policy; all parameters have defaults. Names starting with s2a- are for study."""
 
 ONLINE: Final = "stream-to-act"
-"""The rule that the paper proposes and a robot can run."""
+"""The paper's rule in the form that a robot can run."""
 COMPARED: Final = ("naive", "wait-then-act", ONLINE)
-"""What commands compare unless told."""
+"""Policies that commands compare by default."""
 CAUTION: Final = 2.33
 """lambda until it is calibrated: the normal distribution's 99 % quantile."""
 

@@ -1,4 +1,4 @@
-"""When fragments arrive, at a steady rate or from random gaps between tokens, and the plans that they make."""
+"""Arrivals of tokens and fragments, at a steady rate or with random gaps, and plans made of them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def uniform(prompt_s: ArrayLike, tokens_per_skill: ArrayLike, tokens_per_s: Arra
 
 
 def tokens(gaps: Gaps, prompt_s: ArrayLike, count: int, plans: int, rng: np.random.Generator) -> Floats:
-    """Draw when each token arrives, shape (count, plans): the first one gap after ``prompt_s`` (one, or one a plan)."""
+    """Draw token arrivals, shape (count, plans); the first comes one gap after ``prompt_s`` (one, or (plans,))."""
     at_s = gaps.sample(rng, count, plans)
     at_s[0] += prompt_s
     for previous, row in pairwise(at_s):  # in place along contiguous rows: faster than cumsum
@@ -32,12 +32,12 @@ def tokens(gaps: Gaps, prompt_s: ArrayLike, count: int, plans: int, rng: np.rand
 
 
 def fragments(token_s: Floats, tokens_per_skill: int) -> Floats:
-    """Take the tokens that complete a skill, every ``tokens_per_skill``-th: (N L, M) -> (N, M), a view."""
+    """Return the arrivals of the tokens that complete a skill: (N L, M) -> (N, M), a view."""
     return token_s[tokens_per_skill - 1 :: tokens_per_skill]
 
 
 def with_skills(token_s: Floats, shape: PlanShape, rng: np.random.Generator) -> Plans:
-    """Make plans of tokens, shape (N L, M), by drawing each skill's duration: uniform around the expected one."""
+    """Make plans of tokens, shape (N L, M); each skill's duration is drawn uniformly around the expected one."""
     half = shape.expected_cv * 3**0.5
     factor = rng.uniform(1 - half, 1 + half, (shape.n_skills, token_s.shape[1]))
     return Plans(
@@ -51,10 +51,10 @@ def with_skills(token_s: Floats, shape: PlanShape, rng: np.random.Generator) -> 
 
 
 def recorded_plans(recordings: Sequence[ArrayLike], shape: PlanShape, rng: np.random.Generator) -> Plans:
-    """Make one plan of each recorded answer: when its tokens arrived, in s from the request.
+    """Make one plan of each recorded answer, given as its tokens' arrivals in s from the request.
 
-    Takes the first N L tokens and leaves shorter recordings out. Parts of one answer share its rate and would not be
-    exchangeable with further answers, so that a long one makes one plan too.
+    The first N L tokens are used; shorter recordings are left out. A long answer makes one plan only, because its
+    segments share a rate and would not be exchangeable with further answers.
     """
     count = shape.n_skills * int(shape.tokens_per_skill)
     long_enough = [np.asarray(token_s, dtype=np.float64)[:count] for token_s in recordings if np.size(token_s) >= count]

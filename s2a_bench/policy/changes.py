@@ -1,16 +1,16 @@
-"""Has the machine changed its speed within this plan? The estimate of `estimator`, which begins anew where it has.
+"""Detect changes of the machine's rate within a plan; the estimate of `estimator` starts anew at a change.
 
-After every token the last h = 1..WINDOW gaps are compared with what the gaps before them lead to expect, by the number
-of standard deviations
+After every token the last h = 1..WINDOW gaps are compared with the forecast from the gaps before them, in standard
+deviations
 
     z_h = (their sum - h mu) / (mu sqrt(h sigma^2 + h^2 v)),
 
-with mu and v learned from the tokens before the window. Where the largest z_h is above SURPRISE the machine has slowed
-down: the plan's rate is learned anew from that window on, with next to no prior (plan CV FRESH_CV). Where a slow plan's
-least z_h is below -SURPRISE it is as fast again, and all its tokens count. That a plan is faster than believed is no
-change: to start on a few short gaps would be a risk. This is the generalised likelihood ratio of a change in mean over
-a sliding window (Willsky and Jones, IEEE TAC 1976). sigma is that of *sums* of gaps: where slow tokens usually come in
-bursts, a burst is no change.
+with mu and v learned from the tokens before the window. If the largest z_h exceeds SURPRISE, the machine has slowed
+down: the plan's rate is learned anew from that window on, with a vague prior (plan CV FRESH_CV). If a slow plan's least
+z_h is below -SURPRISE, the rate has recovered and all tokens count again. Gaps shorter than expected are no change: it
+would be risky to start on a few of them. This is the generalised likelihood ratio of a change in mean over a sliding
+window (Willsky and Jones, IEEE TAC 1976). sigma is that of *sums* of gaps: where slow tokens usually come in bursts, a
+burst is no change.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FRESH_CV: Final = 1.0
 
 
 class ChangeWatch:
-    """Follows the tokens of M plans at once, one token of each at a time."""
+    """Change detection on M plans in parallel, one token of each at a time."""
 
     def __init__(self, prior: GapPrior, plans: int = 1) -> None:
         self._prior = prior
@@ -41,10 +41,10 @@ class ChangeWatch:
         self._began_s = self._first_s = np.zeros(plans)
         self._gaps = np.zeros(plans)
         self.slow = np.zeros(plans, dtype=np.bool_)
-        """Whether each plan has slowed down, and not become as fast again."""
+        """Whether each plan has slowed down and not recovered."""
 
     def token(self, at_s: ArrayLike) -> None:
-        """Learn that the next token arrived: one time, or of shape (M,)."""
+        """Record the arrival of the next token: one time, or shape (M,)."""
         at_s = np.atleast_1d(np.asarray(at_s, dtype=np.float64))
         self._recent_s[1:] = self._recent_s[:-1].copy()
         self._recent_s[0] = at_s
@@ -77,13 +77,12 @@ class ChangeWatch:
 
     @property
     def learned(self) -> tuple[Floats, Floats]:
-        """Return each plan's mean gap in s and its variance relative to the mean squared, as `GapPrior.learned`."""
         elapsed_s = self._recent_s[0] - self._first_s if self._tokens else self._first_s
         return posterior(self._prior_s, self._plan, self._token, self._gaps, elapsed_s)
 
 
 def learned_along(prior: GapPrior, token_s: Floats) -> tuple[Floats, Floats]:
-    """Return what is learned after each token, two arrays of the shape of ``token_s``, (tokens, M)."""
+    """Return `GapPrior.learned` after each token: two arrays of the shape of ``token_s``, (tokens, M)."""
     watch = ChangeWatch(prior, token_s.shape[1])
     mean_s, variance = np.empty((2, *token_s.shape))
     for row, at_s in enumerate(token_s):

@@ -1,19 +1,19 @@
-"""How cautious to be: calibrate lambda on recorded plans so that stalls are as rare as asked, and track it.
+"""Calibrate lambda, the caution, on recorded plans so that at most a share epsilon stalls, and track it.
 
 A plan's *score* is the least caution from which on it does not stall: at that lambda and at every greater one of
 GRID. "Stalls at lambda or at a greater one" is a loss of 0 or 1 that cannot grow with lambda, as conformal risk
-control wants it. With n exchangeable plans, choosing the least lambda at which r of them stall makes
+control requires. With n exchangeable plans, choosing the least lambda at which r of them stall makes
 
 - the expected share of stalls among further plans at most (r + 1) / (n + 1): conformal risk control (Angelopoulos,
   Bates, Fisch, Lei and Schuster, ICLR 2024, arXiv 2208.02814, theorem 1), here the split conformal quantile;
 - that share, for the lambda at hand rather than on average over calibrations, at most x with confidence
   1 - P(Bin(n, x) <= r): a risk-controlling prediction set (Bates et al., J. ACM 2021, arXiv 2101.02703).
 
-`calibrate` takes the greatest r that keeps the `Guarantee`. *expected* keeps the first at epsilon or less: epsilon
-means epsilon, on average over calibrations. *high-confidence*, the default, also keeps the second at 2 epsilon with
-99.9 % confidence: whoever calibrates once lives with that one lambda. With epsilon = 1 %, 400 plans give r = 3 and
-r = 0, a rule that stalls in .25 % of the plans on average; 1000 plans give r = 9 and r = 7. The scores come from plans
-that the prior may have been fitted to; with a prior of its own plans the first bound is exact.
+`calibrate` takes the greatest r that keeps the `Guarantee`. *expected* keeps the first at epsilon or less, on average
+over calibrations. *high-confidence*, the default, also keeps the second at 2 epsilon with 99.9 % confidence, because a
+robot calibrated once keeps that one lambda. With epsilon = 1 %, 400 plans give r = 3 and r = 0, a rule that stalls in
+0.25 % of the plans on average; 1000 plans give r = 9 and r = 7. The prior may have been fitted to the scored plans; the
+first bound is exact if it was fitted to other plans.
 """
 
 from __future__ import annotations
@@ -35,56 +35,53 @@ if TYPE_CHECKING:
 EPSILON: Final = 0.01
 """Share of plans that may stall."""
 PLANS: Final = 400
-"""As many should be recorded: with 342 or more one calibration is as good as promised."""
+"""Recommended number of plans; from 342 on the second bound holds for epsilon = 1 %."""
 TOLERANCE_S: Final = 1e-6
 """Any longer gap between skills is a stall."""
 CEILING: Final = 2.0
-"""The share that one calibration may really have, over epsilon ..."""
+"""Bound on the true share of stalls for one calibration, over epsilon ..."""
 CONFIDENCE: Final = 0.999
 """... with this confidence."""
 GRID: Final = (*(i / 4 for i in range(17)), 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0, 16.0, 24.0, 32.0)
-"""The values of lambda that are tried; beyond them a plan is waited for."""
+"""Values of lambda that are tried; beyond them the robot waits for the whole plan."""
 Guarantee: TypeAlias = Literal["high-confidence", "expected"]
-"""What epsilon bounds; see the module's head."""
+"""What epsilon bounds; see the module docstring."""
 GUARANTEES: Final[tuple[Guarantee, ...]] = get_args(Guarantee)
 GUARANTEE: Final = (
     "what epsilon bounds: expected (the mean over calibrations), high-confidence (also 2 epsilon for this one, 99.9 %)"
 )
-"""The same for people who choose one."""
+"""Help text of the choice."""
 ROUNDING: Final = 1e-9
-"""A product this close below a whole number is one."""
+"""A product this close below a whole number counts as whole."""
 
 
 @dataclass(frozen=True, slots=True)
 class Calibration:
-    """What calibration found, and what it promises for further plans of the same kind."""
+    """A calibrated lambda and its bounds for further plans of the same kind."""
 
     caution: float
-    """lambda; infinity where nothing less than waiting for the whole plan is safe enough."""
+    """lambda; infinity if only waiting for the whole plan is safe enough."""
     epsilon: float
     plans: int
     stalled: int
-    """Calibration plans that stall with this caution or a greater one."""
+    """Calibration plans that stall at this or a greater caution."""
     expected_risk: float
     """Bound on P(any stall) of a further plan, on average over calibrations; at most epsilon."""
     risk: float
-    """Bound on P(any stall) with this caution, with ``confidence``."""
+    """Bound on P(any stall) at this caution, with ``confidence``."""
     confidence: float
     guarantee: Guarantee = "high-confidence"
 
 
 def scores(policy: Policy, plans: Plans) -> Floats:
-    """Return each plan's score, shape (M,): the least caution of GRID from which on it does not stall, else infinity.
-
-    Tries the greatest caution first; a plan that has stalled is done.
-    """
+    """Return each plan's score, shape (M,): the least caution of GRID from which on it has no stall, else infinity."""
     import numpy as np
 
     count = plans.arrival_s.shape[1]
     score = np.full(count, GRID[0])
     left = np.arange(count)
     above = math.inf
-    for caution in reversed(GRID):
+    for caution in reversed(GRID):  # a plan that has stalled needs no lower caution
         stalls = stalled(policy.informed(caution=caution), take(plans, left))
         score[left[stalls]] = above
         left, above = left[~stalls], caution
@@ -94,7 +91,7 @@ def scores(policy: Policy, plans: Plans) -> Floats:
 
 
 def check(plans: int, epsilon: float = EPSILON) -> None:
-    """Refuse to calibrate on so few plans that nothing can be promised; raises UsageError."""
+    """Raise UsageError if so few plans allow no bound of ``epsilon``."""
     if not 0 < epsilon < 1:
         raise UsageError(f"`epsilon`: {epsilon:g} should be between 0 and 1")
     if plans < fewest(epsilon):
@@ -105,27 +102,24 @@ def check(plans: int, epsilon: float = EPSILON) -> None:
 
 
 def fewest(epsilon: float) -> int:
-    """Return how many plans, or latencies, a promise of ``epsilon`` takes at least."""
+    """Return the least number of plans, or latencies, for a bound of ``epsilon``."""
     return math.ceil(1 / epsilon - ROUNDING) - 1
 
 
 def coarse(plans: int, epsilon: float = EPSILON) -> bool:
-    """Return whether these are too few plans for the second promise, even if none of them stalls: worth a warning."""
+    """Return True if the plans are too few for the second bound even if none stalls: callers warn."""
     return upper_bound(0, plans, CONFIDENCE) > CEILING * epsilon
 
 
 def calibrate(
     policy: Policy, plans: Plans, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence"
 ) -> Calibration:
-    """Find lambda for P(any stall) <= ``epsilon`` from recorded plans; see the module's head.
-
-    Raises UsageError where so few plans allow no such promise.
-    """
+    """Find lambda for P(any stall) <= ``epsilon`` from recorded plans; raises UsageError for too few plans."""
     return choose(scores(policy, plans), epsilon, guarantee)
 
 
 def may_stall(plans: int, epsilon: float, guarantee: Guarantee) -> int:
-    """Return r, how many of the calibration plans may stall."""
+    """Return r, the number of calibration plans that may stall."""
     from scipy import stats
 
     most = math.floor((plans + 1) * epsilon + ROUNDING) - 1
@@ -136,7 +130,7 @@ def may_stall(plans: int, epsilon: float, guarantee: Guarantee) -> int:
 
 
 def choose(score: Floats, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence") -> Calibration:
-    """Find lambda from scores, shape (plans,)."""
+    """Find lambda from scores, shape (plans,); raises UsageError for too few scores."""
     import numpy as np
 
     count = score.size
@@ -159,10 +153,10 @@ class Tracker:
     """Follow lambda from plan to plan while the machine drifts: adaptive conformal inference.
 
     The level alpha, the share of recent scores that may lie above lambda, moves by ``step`` (epsilon - stalled) after
-    every plan. Where it leaves no room, lambda is infinite and the next plan is waited for, which cannot stall; so
-    among T plans the share that stalls exceeds epsilon by at most (alpha_1 + step) / (step T), whatever the machine
-    does (Gibbs and Candes, NeurIPS 2021, arXiv 2106.00170, proposition 4.1). The scores are those of as many recent
-    plans as there were to begin with, so that lambda also learns how much caution the machine needs now.
+    every plan. If no score may lie above, lambda is infinite and the robot waits for the next plan, which cannot stall.
+    So among T plans the share that stalls exceeds epsilon by at most (alpha_1 + step) / (step T), whatever the machine
+    does (Gibbs and Candes, NeurIPS 2021, arXiv 2106.00170, proposition 4.1). The scores are those of the most recent
+    plans, as many as at the beginning, so lambda also follows the caution that the machine needs now.
     """
 
     def __init__(self, score: Iterable[float], epsilon: float = EPSILON, *, step: float = 0.002) -> None:
@@ -183,9 +177,9 @@ class Tracker:
         return math.inf if above < 0 else self._sorted[count - 1 - above]
 
     def learn(self, score: float, *, stalled: bool) -> None:
-        """Learn how a plan went: whether it stalled, and its score, which its recorded arrivals tell afterwards.
+        """Update the level with whether a plan stalled, and the scores with the score of its recorded arrivals.
 
-        The level stays below 2 epsilon: a long calm must not use up the alertness.
+        The level stays at 2 epsilon or below, so that a long time without stalls does not make the rule careless.
         """
         self.level = min(self.level + self.step * (self.epsilon - stalled), CEILING * self.epsilon)
         self._scores.append(score)
@@ -199,7 +193,7 @@ class Tracker:
 
     @staticmethod
     def resume(state: Mapping[str, Any]) -> Tracker:
-        """Go on from a state; raises KeyError, TypeError or ValueError for what is none."""
+        """Continue from `state`; raises KeyError, TypeError or ValueError for an invalid one."""
         scores = [math.inf if score is None else float(score) for score in state["scores"]]
         tracker = Tracker(scores, float(state["epsilon"]), step=float(state["step"]))
         tracker.level = float(state["level"])
@@ -213,7 +207,7 @@ class Tracker:
 def upper_bound(stalled: int, plans: int, confidence: float) -> float:
     """Return the share x with P(Bin(plans, x) <= stalled) = 1 - confidence (Clopper and Pearson, Biometrika 1934).
 
-    The upper end of their two-sided 95 % interval is the bound with confidence .975.
+    The upper end of their two-sided 95 % interval is the bound with confidence 0.975.
     """
     from scipy import stats
 
@@ -221,7 +215,7 @@ def upper_bound(stalled: int, plans: int, confidence: float) -> float:
 
 
 def stalled(policy: Policy, plans: Plans) -> NDArray[np.bool_]:
-    """Return which plans stall at all, shape (M,)."""
+    """Return a mask of the plans with any stall, shape (M,)."""
     import numpy as np
 
     from s2a_bench.policy.metrics import stalls
@@ -230,7 +224,7 @@ def stalled(policy: Policy, plans: Plans) -> NDArray[np.bool_]:
 
 
 def take(plans: Plans, columns: NDArray[np.intp]) -> Plans:
-    """Take some of the plans."""
+    """Return the plans of these columns."""
 
     def cut(rows: Floats | None) -> Any:
         return rows if rows is None or rows.shape[1] == 1 else rows[:, columns]

@@ -1,13 +1,13 @@
-"""How fast do the tokens come: a prior from the hardware profile, made sharper by every token of the plan.
+"""Estimate of the gap between tokens: a prior from the hardware profile, updated by every token of the plan.
 
-The gaps of one plan have an unknown mean mu ~ N(mu0, tau0^2) and vary around it with variance sigma^2; then after g
-gaps that took ``elapsed`` together mu is N(mu_g, v_g) with (conjugate update, e.g. Gelman et al., Bayesian Data
-Analysis, 3rd edition, section 2.5)
+The gaps of one plan have an unknown mean mu ~ N(mu0, tau0^2) and vary around it with variance sigma^2. After g gaps
+that took ``elapsed`` together, mu is N(mu_g, v_g) with (conjugate update, e.g. Gelman et al., Bayesian Data Analysis,
+3rd edition, section 2.5)
 
     w = tau0^2 / (sigma^2 + g tau0^2),    mu_g = mu0 + w (elapsed - g mu0),    v_g = sigma^2 w.
 
-tau0 and sigma are kept relative to the mean: a board that is slower today is as much more uneven. sigma^2 is the
-variance a token that *sums* of gaps have: larger than that of single gaps where slow tokens come in bursts.
+tau0 and sigma are relative to the mean: a slower board varies more in proportion. sigma^2 is the variance of *sums* of
+gaps, per token: larger than that of single gaps where slow tokens come in bursts.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ Number = TypeVar("Number", float, "Floats")
 """One plan's value, or an array of many plans' values."""
 
 PLAN_CV = 0.10
-"""How much the mean gap differs from plan to plan, where a profile does not say."""
+"""Coefficient of variation of the mean gap from plan to plan, if the profile has none."""
 
 LEAST_CV = 1e-6
-"""Estimates stay above it: a variance of zero would forbid to learn."""
+"""Lower limit of estimates: with a variance of zero nothing could be learned."""
 
 
 @dataclass(frozen=True, slots=True)
 class GapPrior:
-    """What is known of the gaps between tokens before a plan's first token."""
+    """Distribution of the gaps between tokens before a plan's first token."""
 
     mean_s: float
     plan_cv: float
-    """tau0 / mu0: how much the mean gap differs from plan to plan."""
+    """tau0 / mu0, the variation of the mean gap from plan to plan."""
     token_cv: float
-    """sigma / mu: square root of a long sum's variance a token, over the mean."""
+    """sigma / mu: square root of a long sum's variance per token, over the mean."""
 
     def __post_init__(self) -> None:
         for name in ("mean_s", "plan_cv", "token_cv"):
@@ -46,7 +46,7 @@ class GapPrior:
 
     @staticmethod
     def of_profile(profile: Profile, *, seed: int = 0) -> GapPrior:
-        """Take rate and spreads from a hardware profile; how sums of its gaps spread is drawn (2,000 of 64 gaps)."""
+        """Take rate and spreads from a hardware profile; the spread of sums is drawn (2,000 sums of 64 gaps)."""
         import numpy as np
 
         sums = profile.gaps.sample(np.random.default_rng(seed), 64, 2000).sum(axis=0)
@@ -55,10 +55,10 @@ class GapPrior:
 
     @staticmethod
     def fit(token_s: Floats) -> GapPrior:
-        """Estimate the prior from recorded plans: when each token arrived, in s, of shape (tokens, plans).
+        """Estimate the prior from recorded plans: token arrivals in s, shape (tokens, plans).
 
-        sigma^2 comes from sums over blocks of about sqrt(gaps) gaps, freed of each plan's own mean; tau0^2 is what the
-        plans' means vary beyond what sigma explains. Raises UsageError for fewer than 2 gaps a plan or 2 plans.
+        sigma^2 comes from sums over blocks of about sqrt(gaps) gaps, around each plan's mean; tau0^2 is the variance of
+        the plans' means beyond what sigma explains. Raises UsageError for fewer than 2 gaps a plan or 2 plans.
         """
         import numpy as np
 
@@ -73,7 +73,7 @@ class GapPrior:
         size = min(round(count**0.5), count // 2)
         number = count // size
         blocks = gaps[: number * size].reshape(number, size, plans).sum(axis=1)
-        # Unbiased within each plan, then the mean over plans: a variance a gap, relative to the mean squared.
+        # Unbiased within each plan, then the mean over plans: a variance per gap, relative to the mean squared.
         token = float(blocks.var(axis=0, ddof=1).mean()) / size / mean**2
         plan = float(means.var(ddof=1)) / mean**2 - token / count
         return GapPrior(mean, max(plan, LEAST_CV**2) ** 0.5, max(token, LEAST_CV**2) ** 0.5)
@@ -95,4 +95,4 @@ def posterior(
 
 
 VAGUE: Final = GapPrior(mean_s=0.2, plan_cv=3.0, token_cv=0.2)
-"""Without a profile: next to nothing is known of the rate, and the first gaps of each plan tell it."""
+"""Prior without a profile: the rate is learned from the first gaps of each plan."""

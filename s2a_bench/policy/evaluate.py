@@ -1,8 +1,8 @@
-"""Naive, wait-then-act and clairvoyant stream-to-act over millions of plans, in one pass; where naive never stalls.
+"""Naive, wait-then-act and clairvoyant stream-to-act over millions of plans in one pass, and where naive never stalls.
 
-By T1 the three differ only in when they begin, so that a few numbers a plan say it all. Naive is stall-free iff S0 =
-t_1; at steady rate and equal durations T that is L / R <= T, the paper's figure 2 over tokens per skill L and rate R.
-The paper draws that line for T_min, but naive runs skills at T_nom: both are worth drawing.
+By T1 the three differ only in their start, so a few numbers per plan describe them. Naive is stall-free iff S0 = t_1;
+at steady rate and equal durations T that is L / R <= T, the paper's figure 2 over tokens per skill L and rate R. The
+paper draws that line for T_min, but naive runs skills at T_nom: figures show both.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 from s2a_bench.boards.gaps import Gaps
 from s2a_bench.policy import Floats
 from s2a_bench.policy.arrivals import fragments, tokens
-from s2a_bench.policy.schedule import align, chunks
+from s2a_bench.policy.schedule import align, blocks
 
 Counts: TypeAlias = NDArray[np.int32]
 Flags: TypeAlias = NDArray[np.bool_]
 
 TOLERANCE_S = 0.02
-"""A stall that makes the robot stop and go is longer than this (POLICY section 1)."""
+"""Longer stalls make the robot stop and go."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,17 +32,17 @@ class Evaluation:
     naive_start_s: Floats
     """t_1."""
     safe_start_s: Floats
-    """S0: when clairvoyant stream-to-act starts."""
+    """S0, the start of clairvoyant stream-to-act."""
     wait_start_s: Floats
     """t_N."""
     end_s: Floats
-    """S0 + P_N: of naive and of clairvoyant stream-to-act alike."""
+    """S0 + P_N, both of naive and of clairvoyant stream-to-act."""
     wait_end_s: Floats
     """t_N + P_N."""
     naive_stalls: Counts
     """Stalls longer than the tolerance."""
     naive_stall_s: Floats
-    """All of them together, S0 - t_1."""
+    """Sum of all stalls, S0 - t_1."""
     naive_longest_stall_s: Floats
 
 
@@ -55,7 +55,7 @@ def evaluate(arrival_s: Floats, duration_s: Floats, tolerance_s: float = TOLERAN
     work: Floats = np.zeros_like(safe)
     longest: Floats = np.zeros_like(safe)
     stalls: Counts = np.zeros(safe.shape, np.int32)
-    for part in chunks(safe.size):
+    for part in blocks(safe.size):
         t, d = arrival_s[:, part], duration_s[:, part]
         begin, before, most = safe[part], work[part], longest[part]
         later, stall = np.empty_like(begin), np.empty_like(begin)
@@ -81,7 +81,7 @@ def evaluate(arrival_s: Floats, duration_s: Floats, tolerance_s: float = TOLERAN
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """The same axes for the analytic and the simulated region: L down (K,), R across (J,)."""
+    """Axes of the analytic and the simulated region: L (K,) by R (J,)."""
 
     tokens_per_skill: tuple[int, ...]
     tokens_per_s: tuple[float, ...]
@@ -111,8 +111,7 @@ def simulate(
     """Return P(a naive plan stalls), shape (K, J), over random plans: a share, with sd <= 0.5 / sqrt(plans).
 
     ``gaps`` gives the shape of the jitter; its gaps are scaled to each rate. One set of draws serves the whole grid, so
-    neighbouring cells differ by what they are, not by luck. The prompt's time shifts every arrival alike and so has no
-    part in it.
+    neighbouring cells do not differ by chance. The prompt's time shifts all arrivals equally and is left out.
     """
     longest = max(grid.tokens_per_skill)
     at = tokens(gaps, 0.0, longest * n_skills, plans, rng) / gaps.mean_s

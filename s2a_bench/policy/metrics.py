@@ -1,7 +1,7 @@
-"""The numbers of a timeline: waiting, stalls, regret, age of what is acted on, distortion, fluidity, smoothness.
+"""Metrics of a timeline: waiting, stalls, regret, age of actions, distortion, fluidity, smoothness.
 
-Per skill as arrays of shape (N, M), per plan as arrays of shape (M,); times in s from the request. What a plan does not
-have is NaN, never zero: a regret over a span of length zero.
+Arrays have the shape (N, M) per skill and (M,) per plan; times are in s from the request. An undefined value, such as a
+regret over a span of length zero, is NaN, never zero.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from s2a_bench.policy.evaluate import TOLERANCE_S, Counts
 from s2a_bench.policy.schedule import align, least_end, safe_start
 
 RAMP_S = 0.3
-"""How fast a robot's speed follows: the time of one of the two ramps of `speed_profile`."""
+"""Duration of each of the two ramps of `speed_profile`."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanMetrics:
-    """M timelines of one policy, each number an array of shape (M,)."""
+    """M timelines of one policy: arrays of shape (M,)."""
 
     first_action_s: Floats
     """Time to first action, s_1."""
     end_s: Floats
     """Completion, e_N."""
     stalls: Counts
-    """Stalls longer than the tolerance: how often the robot stops and goes."""
+    """Number of stalls longer than the tolerance (stop-and-go)."""
     stall_s: Floats
-    """All stalls together, whatever their length."""
+    """Sum of all stalls of any length."""
     longest_stall_s: Floats
     stall_ratio: Floats
     """Share of the time from first action to completion that is stalled."""
@@ -40,35 +40,35 @@ class PlanMetrics:
     start_regret_elastic: Floats
     """max(0, s_1 - S_lo) / S_lo, over the least start that stretching to T_max allows (T2)."""
     too_early_s: Floats
-    """max(0, S_lo - s_1): so much of the stalls no stretching can avoid once the robot has started."""
+    """max(0, S_lo - s_1): the stall that no stretching can avoid after this start."""
     start_regret_of_wait: Floats
-    """max(0, s_1 - S0) / (t_N - S0): 0 as clairvoyant, 1 as wait-then-act. Long times to first token flatter the
-    regret over S0, not this one."""
+    """max(0, s_1 - S0) / (t_N - S0): 0 for clairvoyant, 1 for wait-then-act. Unlike the regret over S0, it does not
+    shrink with a long time to first token."""
     end_regret: Floats
     """(e_N - E) / E with E = S0 + P_N, the end of clairvoyant stream-to-act and of naive."""
     end_regret_of_wait: Floats
-    """(e_N - E) / (t_N - S0): 1 as wait-then-act."""
+    """(e_N - E) / (t_N - S0): 1 for wait-then-act."""
     end_regret_elastic: Floats
-    """(e_N - E_lo) / E_lo, over the least end that any schedule within T_min has."""
+    """(e_N - E_lo) / E_lo, over the least end that T_min allows."""
     mean_queue_wait_s: Floats
     """Mean of s_i - t_i."""
     longest_queue_wait_s: Floats
     mean_action_age_s: Floats
-    """Mean of s_i - t_observation: how old the picture is that the robot acts on."""
+    """Mean of s_i - t_observation, the age of the picture behind each action."""
     oldest_action_s: Floats
     speed_distortion: Floats
-    """Sum of durations, held on or not, over the sum of the nominal ones: above 1 is slower than planned."""
+    """Sum of durations, holding included, over the sum of nominal durations: above 1 is slower than planned."""
     fluidity: Floats
-    """Share of deadlines met, as `fluidity` defines it."""
+    """Share of deadlines met; see `fluidity`."""
 
 
 def measure(
     plans: Plans, schedule: Schedule, *, observed_s: float = 0.0, tolerance_s: float = TOLERANCE_S
 ) -> PlanMetrics:
-    """Derive all numbers of M timelines.
+    """Compute the metrics of M timelines.
 
-    ``observed_s`` is when the picture was taken that the plan answers, on the same clock: 0 is the request, negative
-    is earlier. ``tolerance_s`` decides which stalls count (20 ms unless told; studies of P(any stall) use 1 us).
+    ``observed_s`` is when the picture behind the plan was taken, in s from the request: negative is earlier. Stalls
+    longer than ``tolerance_s`` count; studies of P(any stall) use 1 us.
     """
     arrival_s, nominal_s, least_s, most_s, start_s, duration_s = align(
         plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s, schedule.start_s, schedule.duration_s
@@ -116,18 +116,18 @@ def stalls(schedule: Schedule) -> Floats:
 
 
 def queue_wait(plans: Plans, schedule: Schedule) -> Floats:
-    """Return s_i - t_i, shape (N, M): how long each skill lies ready before it starts."""
+    """Return s_i - t_i, shape (N, M)."""
     return schedule.start_s - plans.arrival_s
 
 
 def fluidity(stalls_s: Floats, nominal_s: Floats, tolerance_s: float = TOLERANCE_S) -> Floats:
     """Return the fluidity index, shape (M,): 1 - missed deadlines / all deadlines (Etalon, arXiv 2407.07000).
 
-    Etalon gives each token a deadline, carries the slack of early ones over, and after a late one counts every
+    Etalon gives each token a deadline, carries the slack of early tokens over, and after a late one counts every
     deadline missed meanwhile, floor(lateness / D_d) + 1, before it starts anew. Here a token is a skill. Its deadline
-    is the end of the skill before, so D_d is that skill's nominal duration, the slack is the queue, and the lateness is
-    the stall; the first deadline (Etalon's D_p) is the policy's own start and therefore met. Starting late costs
-    nothing here: read it beside the time to first action.
+    is the end of the skill before: D_d is that skill's nominal duration, the slack is the queue, and the lateness is
+    the stall. The first deadline (Etalon's D_p) is the policy's start and always met, so a late start costs nothing:
+    read it beside the time to first action.
     """
     stalls_s, budget_s = align(stalls_s, nominal_s[:-1])
     late = stalls_s > tolerance_s
@@ -139,26 +139,26 @@ def fluidity(stalls_s: Floats, nominal_s: Floats, tolerance_s: float = TOLERANCE
 def speed_profile(
     start_s: Floats, duration_s: Floats, nominal_s: Floats, sample_s: float, ramp_s: float = RAMP_S
 ) -> Floats:
-    """Return the speed of one timeline, as a share of the planned one, every ``sample_s`` from s_1 on until it rests.
+    """Return the speed of one timeline, over the planned speed, every ``sample_s`` from s_1 until the robot rests.
 
-    The arrays have the shape (N,). This is a model, to be named where its numbers are shown: a robot that flows from
-    skill to skill moves at T_nom / d while a skill takes d instead of T_nom, and rests while it stalls. Its speed
-    follows with limited jerk, by two moving averages over ``ramp_s``: from rest to full speed in 2 ramp_s with a peak
-    acceleration of 1 / ramp_s and a jerk of 1 / ramp_s^2.
+    The arrays have the shape (N,). This is a model, and reports name it: the robot moves at T_nom / d while a skill
+    takes d instead of T_nom, without a pause between skills, and rests while it stalls. Two moving averages over
+    ``ramp_s`` limit the jerk: from rest to full speed in 2 ramp_s with a peak acceleration of 1 / ramp_s and a jerk of
+    1 / ramp_s^2.
     """
     edges = np.stack([start_s, start_s + duration_s], axis=1).ravel() - start_s[0]
     way = np.repeat(np.cumsum(nominal_s), 2)
     way[0], way[2::2] = 0.0, way[1:-1:2]
     size = max(round(ramp_s / sample_s), 1)
-    cells = int(np.ceil(edges[-1] / sample_s - 1e-9))  # a last cell of rounding alone is none
+    cells = int(np.ceil(edges[-1] / sample_s - 1e-9))  # no last cell from rounding alone
     at_s = np.arange(cells + 1) * sample_s
-    speed = np.diff(np.interp(at_s, edges, way)) / sample_s  # means over the cells: no edge is rounded to a sample
+    speed = np.diff(np.interp(at_s, edges, way)) / sample_s  # cell means: edges are not rounded to samples
     ramp = np.full(size, 1 / size)
     return np.convolve(np.convolve(np.pad(speed, 1), ramp), ramp)
 
 
 def jerk(speed_mps: Floats, sample_s: float) -> Floats:
-    """Return the jerk in m/s^3 at the inner samples, by the second central difference: shape (n,) -> (n - 2,)."""
+    """Return the jerk in m/s^3 at the inner samples by the second central difference: shape (n,) -> (n - 2,)."""
     speed = np.asarray(speed_mps, dtype=np.float64)
     return np.diff(speed, 2) / sample_s**2
 
@@ -181,9 +181,9 @@ def sparc(
     The length of the curve of the amplitude spectrum, scaled to its maximum, over frequency, scaled to the band from 0
     to the highest frequency up to ``cutoff_hz`` whose amplitude reaches ``threshold``; the transform is padded to
     2^``padding`` times the next power of two. Definition and defaults: Balasubramanian, Melendez-Calderon,
-    Roby-Brami and Burdet, "On the analysis of movement smoothness", J NeuroEng Rehabil 12:112 (2015), which refines
-    theirs of 2012 (IEEE TBME 59(8)), and the authors' program. It was made for single movements: compare profiles of
-    the same task only. Raises ValueError for a profile that never moves.
+    Roby-Brami and Burdet, "On the analysis of movement smoothness", J NeuroEng Rehabil 12:112 (2015), and the authors'
+    program. It is defined for single movements: compare profiles of the same task only. Raises ValueError for a profile
+    that never moves.
     """
     speed = np.asarray(speed_mps, dtype=np.float64)
     if speed.size == 0 or not speed.any():
@@ -201,7 +201,6 @@ def sparc(
 
 
 def _enough(values: Floats) -> Floats:
-    """Raise ValueError for a profile too short to have a jerk."""
     if not values.size:
         raise ValueError("a speed profile needs 3 samples or more to have a jerk")
     return values

@@ -20,24 +20,22 @@ class Naive(Policy):
     def schedule(self, plans: Plans) -> Schedule:
         return Schedule(work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[0]), plans.nominal_s)
 
-    def stepper(self, shape: PlanShape) -> Stepper:  # noqa: ARG002 - naive looks at nothing but what has arrived
+    def stepper(self, shape: PlanShape) -> Stepper:  # noqa: ARG002 - only what has arrived matters
         return NominalQueue()
 
 
 @dataclass(slots=True)
 class NominalQueue:
-    """Start whatever has arrived, in its order, at its nominal duration: what is left to do once a robot has begun."""
+    """Start skills in the order of their arrival at nominal durations: the rule of any policy once the robot moves."""
 
     waiting: deque[Timing] = field(default_factory=deque)
 
-    def token(self, at_s: float) -> None:
-        """Ignore it."""
+    def token(self, at_s: float) -> None: ...
 
     def fragment(self, at_s: float, timing: Timing) -> None:  # noqa: ARG002 - it may start at once
         self.waiting.append(timing)
 
-    def end(self, at_s: float) -> None:
-        """Ignore it."""
+    def end(self, at_s: float) -> None: ...
 
     def decide(self, now_s: float) -> Start | float:  # noqa: ARG002 - now, if there is something to start
         if not self.waiting:

@@ -1,4 +1,4 @@
-"""The online rule of `stream_to_act` for M plans at once: loops over events and skills, arrays over plans."""
+"""The online rule of `stream_to_act` for M plans: loops over events and skills, arrays over plans."""
 
 from __future__ import annotations
 
@@ -49,41 +49,41 @@ def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, rule: StartRule)
 
 
 def _sums_before(duration_s: Floats) -> Floats:
-    """Return the sums over the skills before each skill, and over all: shape (N + 1, M)."""
+    """Return the sums over the skills before each skill and over all: shape (N + 1, M)."""
     return np.vstack([np.zeros(duration_s.shape[1]), np.cumsum(duration_s, axis=0)])
 
 
 class _Arrivals:
-    """What has come when: tokens and fragments of M plans in the order of time, one event a row."""
+    """Tokens and fragments of M plans in order of time, one event a row."""
 
     def __init__(self, token_s: Floats, arrival_s: Floats) -> None:
-        """Merge tokens and fragments; at the same instant tokens come first, since fragments are made of them."""
         both = np.concatenate([token_s, arrival_s])
+        # Stable: at one instant tokens come before the fragment that they complete.
         order = np.argsort(both, axis=0, kind="stable")
         is_token = order < len(token_s)
         self.token_s = token_s
         self.event_s = np.take_along_axis(both, order, axis=0)
-        # With each event: how many tokens and fragments have come.
+        # Tokens and fragments up to each event.
         self.tokens = np.cumsum(is_token, axis=0)
         self.parsed = np.arange(1, len(both) + 1)[:, np.newaxis] - self.tokens
-        # With fragment m: how many tokens have come; row 0 stands for no fragment.
+        # Tokens up to fragment m; row 0 stands for no fragment.
         self.at_fragment = np.zeros((len(arrival_s) + 1, arrival_s.shape[1]), dtype=np.intp)
         self.at_fragment[1:] = self.tokens.T[~is_token.T].reshape(arrival_s.shape[::-1]).T
 
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """What is known before the first token."""
+    """Values known before the first token."""
 
     prior: GapPrior
     caution: Floats
     shape: PlanShape
     rule: StartRule
     learned: tuple[Floats, Floats] | None
-    """With changes of the rate: what is learned after each token."""
+    """`GapPrior.learned` after each token, where changes of the rate are detected."""
 
     def view(self, stream: _Arrivals, plans: Ints, event: Ints) -> _View:
-        """See some of the plans as they are after one of their events each."""
+        """Return the state of some plans after one event each."""
         tokens, parsed = stream.tokens[event, plans], stream.parsed[event, plans]
         last_s = stream.token_s[np.maximum(tokens, 1) - 1, plans]
         if self.learned is None:
@@ -98,7 +98,7 @@ class _Known:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """What some of the plans look like after an event: one value a plan, and a row for each skill that is missing."""
+    """State of some plans after an event: one value per plan, and a row for each missing skill."""
 
     known: _Known
     plans: Ints
@@ -111,12 +111,12 @@ class _View:
     next_in: Floats
     """Tokens until the next fragment."""
     unknown: Floats
-    """How many skills of unknown duration come before each missing one: a column 0, 1, ..."""
+    """Number of skills of unknown duration before each missing one: a column 0, 1, ..."""
 
     def mean_start_s(self, known_s: Floats, unknown_s: float) -> Floats:
-        """Return when the mean forecasts meet the durations before each skill; infinity where only a token can tell.
+        """Return when the mean forecasts meet the durations before each skill; infinity: not before another token.
 
-        Both grow evenly from skill to skill, so that the next skill or the last one decides.
+        Both grow linearly from skill to skill, so the next skill or the last one decides.
         """
         at_s = np.full(self.plans.shape, -np.inf)
         for unknown in (np.zeros_like(self.next_in), np.maximum(self.missing - 1.0, 0.0)):
@@ -128,7 +128,7 @@ class _View:
         return np.where(self.missing > 0, at_s, -np.inf)
 
     def cautious_start_s(self, known_s: Floats, unknown_s: float, caution: Floats) -> Floats:
-        """Return the same for the cautious forecasts, each plan with a lambda of its own."""
+        """Return the same for the cautious forecasts, with one lambda per plan."""
         forecast_s, overdue_s = self._forecasts(unknown_s, caution)
         budget_s = known_s + self.unknown * unknown_s
         each_s = self.last_s + forecast_s - budget_s
@@ -136,7 +136,7 @@ class _View:
         return self._worst(each_s)
 
     def demand(self, now_s: Floats, known_s: Floats, unknown_s: float) -> Floats:
-        """Return the largest (cautious forecast - now) / (durations until then); -inf where nothing is missing."""
+        """Return the largest (cautious forecast - now) / (durations until then); -inf if nothing is missing."""
         forecast_s, overdue_s = self._forecasts(unknown_s, self.caution)
         until_s = np.maximum(self.last_s + forecast_s, now_s + overdue_s) - now_s
         return self._worst(until_s / (known_s + self.unknown * unknown_s))
@@ -146,7 +146,7 @@ class _View:
         return self.known.caution[self.plans]
 
     def _forecasts(self, unknown_s: float, caution: Floats) -> tuple[Floats, Floats]:
-        """Return the cautious forecasts in s from the last token, and those from a token that comes now."""
+        """Return the cautious forecasts in s from the last token, and from a token that arrives now."""
         tokens = self.next_in + self.unknown * self.known.shape.tokens_per_skill
         skills = self.unknown * (self.known.shape.expected_cv * unknown_s) ** 2
         return self._forecast(tokens, skills, caution), self._forecast(tokens - 1, skills, caution)
@@ -154,7 +154,7 @@ class _View:
     def _forecast(self, tokens: Floats, skills: Floats, caution: Floats) -> Floats:
         gaps = tokens * self.known.prior.token_cv**2 + tokens**2 * self.variance
         noise = np.sqrt(self.mean_s**2 * gaps + skills)
-        # No noise stays none, with infinite caution too.
+        # Zero noise stays zero, also with infinite caution.
         np.multiply(noise, caution, out=noise, where=noise > 0)
         return tokens * self.mean_s + noise
 
@@ -175,7 +175,7 @@ def _first_start(known: _Known, stream: _Arrivals, nominal_sum: Floats, most_sum
         if rule.spend and rule.within < np.inf:
             whole_s = nominal_s + view.missing * expected.nominal_s
             found = np.where(found > rule.within * whole_s, view.mean_start_s(nominal_s, expected.nominal_s), found)
-        # This demand is cheap and lets few plans through before their time.
+        # The cheap mean forecast rules out most plans; the cautious one is computed for the rest.
         near = np.flatnonzero(found < until_s)
         view = known.view(stream, live[near], np.full(near.shape, event))
         cautious_s = view.cautious_start_s(most_s[near], expected.most_s, rule.start_caution * view.caution)
@@ -187,14 +187,14 @@ def _first_start(known: _Known, stream: _Arrivals, nominal_sum: Floats, most_sum
 
 
 def _resume(known: _Known, stream: _Arrivals, now_s: Floats, most_sum: Floats, skill: int) -> Floats:
-    """Return when the skill of that number starts: later than now where no forecast can be met."""
+    """Return when the skill of that number starts: later than now where no forecast is met."""
     unknown_s = known.shape.expected.most_s
-    plans, view = _seen(known, stream, now_s)
+    plans, view = _unfinished(known, stream, now_s)
     most_s = most_sum[view.parsed, plans] - most_sum[skill, plans]
     favourable = np.full(plans.shape, -FAVOURABLE)
     holding = plans[view.cautious_start_s(most_s, unknown_s, favourable) > now_s[plans]]
 
-    def at_s(event: int, live: Ints, until_s: Floats) -> Floats:  # noqa: ARG001 - nothing is cheaper here
+    def at_s(event: int, live: Ints, until_s: Floats) -> Floats:  # noqa: ARG001 - no cheaper test
         view = known.view(stream, live, np.full(live.shape, event))
         return view.cautious_start_s(most_sum[view.parsed, live] - most_sum[skill, live], unknown_s, view.caution)
 
@@ -204,16 +204,16 @@ def _resume(known: _Known, stream: _Arrivals, now_s: Floats, most_sum: Floats, s
 
 
 def _first(stream: _Arrivals, plans: Ints, from_s: Floats, at_s: Callable[[int, Ints, Floats], Floats]) -> Floats:
-    """Return the first time from ``from_s`` on that ``at_s`` allows after the events so far; when all has come, then.
+    """Return the first time from ``from_s`` on that ``at_s`` allows, at the latest the last event.
 
-    ``at_s`` is told event, plans and when their next event is.
+    ``at_s`` takes an event, plans, and the times of their next events.
     """
     start_s: Floats = np.maximum(stream.event_s[-1, plans], from_s)
     waiting = np.arange(plans.size)
     for event in range(len(stream.event_s) - 1):
         begins_s = np.maximum(stream.event_s[event, plans[waiting]], from_s[waiting])
         until_s = stream.event_s[event + 1, plans[waiting]]
-        # Nothing to start before the first fragment; nothing is decided between events at one instant.
+        # No start before the first fragment, and no decision between events at one instant.
         ready = (stream.parsed[event, plans[waiting]] > 0) & (begins_s < until_s)
         live, begins_s, until_s = waiting[ready], begins_s[ready], until_s[ready]
         if not live.size:
@@ -225,17 +225,17 @@ def _first(stream: _Arrivals, plans: Ints, from_s: Floats, at_s: Callable[[int, 
     return start_s
 
 
-def _seen(known: _Known, stream: _Arrivals, now_s: Floats) -> tuple[Ints, _View]:
-    """Return the plans of which something is still to come, as they are now."""
+def _unfinished(known: _Known, stream: _Arrivals, now_s: Floats) -> tuple[Ints, _View]:
+    """Return the plans with further events, and their present state."""
     plans = np.flatnonzero(now_s < stream.event_s[-1])
     event = (stream.event_s[:, plans] <= now_s[plans]).sum(axis=0) - 1
     return plans, known.view(stream, plans, event)
 
 
 def _demand(known: _Known, stream: _Arrivals, now_s: Floats, nominal_sum: Floats, skill: int) -> Floats:
-    """Return each plan's demand when the skill of that number (from 0) starts; -inf once all has come."""
+    """Return each plan's demand when the skill of that number (from 0) starts; -inf after the last event."""
     demand = np.full(now_s.shape, -np.inf)
-    plans, view = _seen(known, stream, now_s)
+    plans, view = _unfinished(known, stream, now_s)
     known_s = nominal_sum[view.parsed, plans] - nominal_sum[skill, plans]
     demand[plans] = view.demand(now_s[plans], known_s, known.shape.expected.nominal_s)
     return demand

@@ -1,7 +1,7 @@
-"""A policy's parameters as its users write them: ``name?parameter=value&other=value``.
+"""Policies with parameters as users write them: ``name?parameter=value&other=value``.
 
-They are the fields of the policy's dataclass with a plain default, a number or a text; their annotations, pydantic's
-``Field`` included, say what they may be.
+Parameters are the fields of the policy's dataclass whose default is a number or a text; their annotations, pydantic's
+``Field`` included, define the valid values.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ T = TypeVar("T")
 
 
 def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
-    """Build ``name?parameter=value&...``; raises UsageError naming ``field``, the parameter, and those there are."""
+    """Build ``name?parameter=value&...``; raises UsageError naming ``field``, the parameter, and the known ones."""
     name, _, given = written.partition("?")
     if not given:
         try:
@@ -41,7 +41,7 @@ def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
 
 
 def canonical(name: str, policy: object) -> str:
-    """Write a policy or mode with its parameters in the order of their names, those at their default left out."""
+    """Return the text of a policy or mode: parameters sorted by name, those at their default left out."""
     given = {}
     for field in _parameters(type(policy)):
         value = getattr(policy, field.name)

@@ -1,6 +1,6 @@
-"""A stepper on plans whose arrivals are known, in virtual time: what `Policy.schedule` does where no arrays do it.
+"""Run a stepper in virtual time on plans whose arrivals are known: `Policy.schedule` for policies without arrays.
 
-The robot here has no delays of its own: a skill starts when the policy says so, and runs as `Start` defines.
+The simulated robot adds no delay: a skill starts when the policy decides, and runs as `Start` defines.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ ROUNDING_S = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """A stream as it arrives; it ends with the last thing that comes."""
+    """Arrivals of one plan; the stream ends with the last of them."""
 
     token_s: Sequence[float]
     arrival_s: Sequence[float]
     timings: Sequence[Timing]
 
     def instants(self) -> list[tuple[float, list[tuple[int, int]]]]:
-        """List when something comes, and what: tokens (0), fragments (1), the end (2); each with its place."""
+        """List each instant with its events (kind, index): tokens are of kind 0, fragments 1, the end 2."""
         events = [(at, 0, i) for i, at in enumerate(self.token_s)] + [(at, 1, i) for i, at in enumerate(self.arrival_s)]
         events.append((max(events)[0], 2, 0))
         grouped = groupby(sorted(events), key=lambda event: event[0])
-        return [(at_s, [(kind, place) for _, kind, place in group]) for at_s, group in grouped]
+        return [(at_s, [(kind, index) for _, kind, index in group]) for at_s, group in grouped]
 
 
 @dataclass(slots=True)
 class _Robot:
-    """Carries a stepper's decisions out."""
+    """Execution of a stepper's decisions."""
 
     stepper: Stepper
     stream: Stream
@@ -46,33 +46,33 @@ class _Robot:
     arrived: int = 0
     ended: bool = False
 
-    def hear(self, now_s: float, events: list[tuple[int, int]]) -> None:
-        for kind, place in events:
+    def receive(self, now_s: float, events: list[tuple[int, int]]) -> None:
+        for kind, index in events:
             if kind == 0:
                 self.stepper.token(now_s)
             elif kind == 1:
-                self.stepper.fragment(now_s, self.stream.timings[place])
+                self.stepper.fragment(now_s, self.stream.timings[index])
                 self.arrived += 1
             else:
                 self.stepper.end(now_s)
                 self.ended = True
 
     def act(self, now_s: float) -> float:
-        """End and start what is due, and return when to act next if nothing happens before."""
+        """End and start what is due, and return when to act next if no event comes before."""
         while True:
-            wake_s = self._ask(now_s) if self.running is None else self.starts_s[-1] + self._length_s(self.running)
+            wake_s = self._decide(now_s) if self.running is None else self.starts_s[-1] + self._length_s(self.running)
             if wake_s > now_s:
                 return wake_s
             if self.running is not None:
                 self.durations_s.append(now_s - self.starts_s[-1])
                 self.running = None
 
-    def _ask(self, now_s: float) -> float:
-        """Ask the stepper, and start a skill where it says so; raises ValueError for what no robot can do."""
+    def _decide(self, now_s: float) -> float:
+        """Execute the stepper's decision; raises ValueError for an impossible one."""
         answer = self.stepper.decide(now_s)
         if not isinstance(answer, Start):
             if not answer > now_s:
-                raise ValueError(f"a stepper asked at {now_s} s wants to be asked again at {answer} s")
+                raise ValueError(f"a stepper that decides at {now_s} s wants to decide again at {answer} s")
             return answer
         if self.arrived == len(self.starts_s):
             raise ValueError(f"a stepper starts skill {self.arrived + 1} at {now_s} s, before it has arrived")
@@ -83,10 +83,9 @@ class _Robot:
         return now_s + self._length_s(answer)
 
     def _length_s(self, running: Start) -> float:
-        """Return how long the skill runs, as things stand now."""
-        next_is_here = self.arrived > len(self.starts_s)
+        next_arrived = self.arrived > len(self.starts_s)
         none_follows = self.ended or len(self.starts_s) == self.n_skills
-        return running.duration_s if next_is_here or none_follows else max(running.latest_s, running.duration_s)
+        return running.duration_s if next_arrived or none_follows else max(running.latest_s, running.duration_s)
 
 
 def follow(stepper: Stepper, stream: Stream, n_skills: int) -> tuple[list[float], list[float]]:
@@ -96,7 +95,7 @@ def follow(stepper: Stepper, stream: Stream, n_skills: int) -> tuple[list[float]
     for at_s, events in stream.instants():
         while wake_s < at_s:
             wake_s = robot.act(wake_s)
-        robot.hear(at_s, events)
+        robot.receive(at_s, events)
         wake_s = robot.act(at_s)
     while wake_s < math.inf:
         wake_s = robot.act(wake_s)
@@ -104,14 +103,14 @@ def follow(stepper: Stepper, stream: Stream, n_skills: int) -> tuple[list[float]
 
 
 def step(policy: Policy, plans: Plans, column: int = 0, *, missing: int = 0) -> tuple[list[float], list[float]]:
-    """Follow one of M plans and return starts and durations in s; ``missing`` skills more are expected than come.
+    """Follow one of M plans and return starts and durations in s; ``missing`` more skills are expected than arrive.
 
-    The policy is told S0, which a robot would not know. Raises ValueError for plans without ``shape``.
+    The policy gets S0, which a robot could not know. Raises ValueError for plans without ``shape``.
     """
     from s2a_bench.policy.schedule import align, safe_start
 
     if plans.shape is None:
-        raise ValueError(f"{policy.name} is asked step by step: plans need shape")
+        raise ValueError(f"{policy.name} decides step by step: plans need shape")
     arrays = align(plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s)
     arrival_s, *durations_s = (array[:, column] for array in arrays)
     first_s = float(safe_start(arrays[0][:, [column]], arrays[1][:, [column]])[0])
@@ -122,7 +121,7 @@ def step(policy: Policy, plans: Plans, column: int = 0, *, missing: int = 0) -> 
 
 
 def schedule(policy: Policy, plans: Plans) -> Schedule:
-    """Decide for many plans, one after another; raises ValueError where the stepper does not start every skill."""
+    """Decide for many plans, one after another; raises ValueError if the stepper does not start every skill."""
     start_s, duration_s = np.empty((2, *np.broadcast_shapes(plans.arrival_s.shape, plans.nominal_s.shape)))
     for column in range(start_s.shape[1]):
         starts, durations = step(policy, plans, column)

@@ -1,26 +1,26 @@
-"""stream-to-act online: start as soon as the forecast of the missing skills allows, stretch skills while it is bad.
+"""stream-to-act online: start as soon as the forecast of the missing skills allows, stretch skills while it is late.
 
-**Forecast.** k tokens have come, the last at a_k; skill m + u is u L - (tokens since fragment m) = n tokens away, and
-u - 1 skills before it are of unknown duration. With the plan's mean gap mu and its uncertainty v (`estimator`), and
+**Forecast.** k tokens have arrived, the last at a_k; skill m + u is u L - (tokens since fragment m) = n tokens away,
+and u - 1 skills before it are of unknown duration. With the plan's mean gap mu and its uncertainty v (`estimator`), and
 lambda the *caution*, it is expected at
 
     a_k + n mu + lambda sqrt(n sigma^2 + n^2 v + (u - 1) sigma_T^2).
 
-A token that is overdue pushes the forecast: no skill comes before now + the forecast of n - 1 tokens.
+An overdue token delays the forecast: no skill arrives before now + the forecast of n - 1 tokens.
 
 **Start.** The first instant at which every *mean* forecast (lambda = 0) meets the nominal durations before that skill
 and every *cautious* forecast meets the stretched durations before it.
 
 **While running.** At each skill boundary the stretch is the largest (cautious forecast - now) / (nominal durations
 until then), at least 1 and at most T_max / T_nom; a skill whose successor is still missing is held on up to T_max.
-Where that ratio allows it, a skill is compressed, down to T_min, to recover what stretching and stalls have cost.
+Where that ratio allows it, a skill is compressed, down to T_min, to recover the time lost by stretching and stalls.
 
-**Variants.** `StartRule` says how the stretch is split between start and reserve, and whether a change of the rate
-within the plan is looked for (`changes`). Then the forecast is made anew; and at a boundary from which stretching
-cannot even meet a favourable forecast (lambda = -FAVOURABLE) the robot holds once, until it can meet the cautious one,
-instead of stalling again and again.
+**Variants.** `StartRule` divides the stretch between start and reserve, and switches the detection of rate changes
+within the plan (`changes`). After a change the forecast is made anew. At a boundary from which stretching cannot meet
+even a favourable forecast (lambda = -FAVOURABLE) the robot holds once, until it can meet the cautious one, instead of
+stalling repeatedly.
 
-The stepper here is plain arithmetic on one plan; `online.schedule` does the same for arrays of plans.
+The stepper computes one plan in plain arithmetic; `online.schedule` does the same for arrays of plans.
 """
 
 from __future__ import annotations
@@ -47,21 +47,21 @@ Caution: TypeAlias = Annotated[float, Field(ge=0)]
 
 @dataclass(frozen=True, slots=True)
 class StartRule:
-    """What variants of the online rule differ in."""
+    """Parameters in which the variants of the online rule differ."""
 
     elastic: bool = True
     """Whether skills may be stretched, held on and compressed."""
     spend: float = 0.0
-    """Share of the stretch, from nominal to longest durations, that the mean forecast may use up at the start."""
+    """Share of the stretch, from nominal to longest durations, that the mean forecast may use at the start."""
     within: float = math.inf
-    """Spend only where the start comes within so many times the plan's nominal duration."""
+    """Spend only if the start is within this multiple of the plan's nominal duration."""
     start_caution: float = 1.0
-    """lambda at the start, over that which stretches."""
+    """lambda at the start, over the lambda of stretching."""
     detect: bool = False
-    """Whether a change of the rate within the plan is looked for."""
+    """Whether changes of the rate within the plan are detected."""
 
     def budget(self, nominal_s: Number, most_s: Number) -> Number:
-        """Return what the mean forecast has to meet at the start."""
+        """Return the duration that the mean forecast has to meet at the start."""
         return nominal_s if not self.spend else (1 - self.spend) * nominal_s + self.spend * most_s
 
 
@@ -74,9 +74,9 @@ class StreamToAct(Policy):
 
     prior: GapPrior = VAGUE
     caution: Caution | None = None
-    """None: calibrated where a run has plans to do that on, else `CAUTION`."""
+    """None: calibrated if a run has plans for that, else `CAUTION`."""
     detect: bool = False
-    """Whether a change of the rate within the plan is looked for."""
+    """Whether changes of the rate within the plan are detected."""
 
     def schedule(self, plans: Plans) -> Schedule:
         from s2a_bench.policy.online import schedule
@@ -121,7 +121,7 @@ class StreamToAct(Policy):
 
 @dataclass(frozen=True, slots=True)
 class EarlyStart(StreamToAct):
-    """Start as soon as the cautious forecast meets the stretched durations: stretching is spent on an early start."""
+    """Start as soon as the cautious forecast meets the stretched durations: stretching allows an early start."""
 
     name: ClassVar[str] = "stream-to-act-early"
 
@@ -140,7 +140,7 @@ class EarlyStart(StreamToAct):
 
 @dataclass(frozen=True, slots=True)
 class MeanStart(StreamToAct):
-    """For study, the obvious online rule: start when the mean forecast meets the nominal durations, never stretch."""
+    """The simple online rule, for study: start when the mean forecast meets the nominal durations, never stretch."""
 
     name: ClassVar[str] = "s2a-mean"
 
@@ -160,7 +160,6 @@ class OnlineStepper:
     shape: PlanShape
     rule: StartRule
     watch: ChangeWatch | None = None
-    """Looks for changes of the rate."""
     parsed: list[Timing] = field(default_factory=list)
     started: int = 0
     tokens: int = 0
@@ -171,7 +170,7 @@ class OnlineStepper:
     holding: bool = False
     """Whether the robot holds at a boundary, until stretching can meet the cautious forecast."""
     due_s: float = math.nan
-    """When the next skill would start had all skills run at their nominal durations; NaN before the first start."""
+    """Start of the next skill if all skills ran at their nominal durations; NaN before the first start."""
 
     def token(self, at_s: float) -> None:
         if not self.tokens:
@@ -188,11 +187,10 @@ class OnlineStepper:
         self.since_fragment = 0
         self.parsed.append(timing)
 
-    def end(self, at_s: float) -> None:  # noqa: ARG002 - whenever it comes, nothing is missing any more
+    def end(self, at_s: float) -> None:  # noqa: ARG002 - the time does not matter
         self.ended = True
 
     def decide(self, now_s: float) -> Start | float:
-        """Wait for the start time, then start each skill at once, stretched as the forecast demands."""
         if self.started == len(self.parsed):
             return math.inf
         if math.isnan(self.due_s):
@@ -209,7 +207,7 @@ class OnlineStepper:
         return Start(ratio * timing.nominal_s, timing.most_s if self.rule.elastic else timing.nominal_s)
 
     def _missing(self) -> list[tuple[float, int]]:
-        """List the skills to come: how many tokens away, and after how many other skills of unknown duration."""
+        """List for each missing skill the tokens until it, and the skills of unknown duration before it."""
         length = self.shape.tokens_per_skill
         next_in = max(length - self.since_fragment, 1.0)
         count = 0 if self.ended else max(self.shape.n_skills - len(self.parsed), 0)
@@ -221,17 +219,17 @@ class OnlineStepper:
         gap_noise = mean**2 * (tokens * self.prior.token_cv**2 + tokens**2 * variance)
         skill_noise = unknown * (self.shape.expected_cv * duration_s) ** 2
         noise = math.sqrt(gap_noise + skill_noise)
-        return tokens * mean + (caution * noise if noise else 0.0)  # no noise stays none, with infinite caution too
+        return tokens * mean + (caution * noise if noise else 0.0)  # zero noise stays zero, also with infinite caution
 
     def _learned(self) -> tuple[float, float]:
-        """Return the plan's mean gap, and its variance relative to the mean squared."""
+        """Return `GapPrior.learned` of the tokens so far."""
         if self.watch is None:
             return self.prior.learned(float(max(self.tokens - 1, 0)), self.last_token_s - self.first_token_s)
         mean_s, variance = self.watch.learned
         return mean_s.item(), variance.item()
 
     def _start_s(self) -> float:
-        """Return the start time as things stand now; infinity where only another token can tell."""
+        """Return the present start time; infinity: not before another token."""
         rule, expected = self.rule, self.shape.expected
         nominal_s = sum(timing.nominal_s for timing in self.parsed)
         if not rule.elastic:
@@ -244,7 +242,7 @@ class OnlineStepper:
         return max(at_s, self._met_s(self.caution * rule.start_caution, most_s, expected.most_s))
 
     def _resume_s(self, now_s: float) -> float:
-        """Return until when to hold at this boundary; a time that is past where stretching may still be enough."""
+        """Return until when to hold at this boundary; a past time if stretching may still be enough."""
         most_s = sum(timing.most_s for timing in self.parsed[self.started :])
         unknown_s = self.shape.expected.most_s
         self.holding = self.holding or self._met_s(-FAVOURABLE, most_s, unknown_s) > now_s
@@ -253,21 +251,21 @@ class OnlineStepper:
         return at_s
 
     def _met_s(self, caution: float, known_s: float, unknown_s: float) -> float:
-        """Return from when on every forecast is met by the durations before it; infinity where only a token can tell.
+        """Return from when on the durations before each skill meet its forecast; infinity: not before another token.
 
-        ``known_s`` is what the skills take that are parsed, ``unknown_s`` each of those after them.
+        ``known_s`` is the duration of all parsed skills, ``unknown_s`` of each skill after them.
         """
         at_s = -math.inf
         for tokens, unknown in self._missing():
             budget_s = known_s + unknown * unknown_s
-            # Overdue at that time: the forecast moves on with the clock, so the budget must cover its rest.
+            # If the token is overdue then, the forecast moves with the clock: the budget must cover the rest.
             if self._forecast(tokens - 1, unknown, caution, unknown_s) > budget_s:
                 return math.inf
             at_s = max(at_s, self.last_token_s + self._forecast(tokens, unknown, caution, unknown_s) - budget_s)
         return at_s
 
     def _ratio(self, now_s: float, timing: Timing) -> float:
-        """Return by how much to scale the next skill's nominal duration."""
+        """Return the factor of the next skill's nominal duration."""
         unknown_s = self.shape.expected.nominal_s
         known_s = sum(timing.nominal_s for timing in self.parsed[self.started :])
         demand = -math.inf

@@ -1,9 +1,8 @@
-"""Lambda from plan to plan: a policy that learns from every plan that it has decided.
+"""Lambda tracked from plan to plan: a policy that learns from every plan it has decided.
 
-A robot keeps one `TrackedPolicy` for as long as its machine stays the same. Before each plan it takes
-`TrackedPolicy.policy`, after it tells what came and whether the plan stalled: the plan's score is what its recorded
-arrivals say afterwards.
-`follow` does the same for arrays of plans. See `conformal.Tracker` for the rule and its bound.
+A robot keeps one `TrackedPolicy` as long as its machine stays the same. Before each plan it takes
+`TrackedPolicy.policy`; afterwards it passes the recorded arrivals, from which the plan's score follows, and whether the
+plan stalled. `TrackedPolicy.follow` does the same for arrays of plans. `conformal.Tracker` has the rule and its bound.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from s2a_bench.policy.metrics import stalls as stalls_of
 
 CAUTIONS: Final = (*GRID, float("inf"))
 AT_ONCE: Final = 512
-"""Plans that are decided at every lambda at once; they fit the memory."""
+"""Plans decided at every lambda in one pass, limited by memory."""
 
 
 @dataclass(slots=True)
@@ -43,15 +42,15 @@ class TrackedPolicy:
         return self.made.informed(caution=self.tracker.caution)
 
     def learn(self, plan: Plans, *, stalled: bool) -> None:
-        """Learn from a plan, one column with ``token_s`` and ``shape``, and from whether it stalled."""
+        """Update lambda from a plan, one column with ``token_s`` and ``shape``, and from whether it stalled."""
         self.tracker.learn(float(scores(self.made, plan)[0]), stalled=stalled)
 
     def follow(self, plans: Plans) -> tuple[Floats, Schedule]:
-        """Decide plans one after another, learning from each; returns each plan's lambda and the schedule.
+        """Decide plans one after another, learning from each; return each plan's lambda and the schedule.
 
-        What some plans would do at every lambda is computed at once, and lambda is picked from it plan by plan.
+        Blocks of plans are decided at every lambda in one pass; then lambda is chosen plan by plan.
         """
-        chosen, parts = [], []
+        chosen, starts, durations = [], [], []
         count = plans.arrival_s.shape[1]
         for places in np.array_split(np.arange(count), -(-count // AT_ONCE)):
             every = self.made.schedules(take(plans, places), CAUTIONS)
@@ -62,16 +61,16 @@ class TrackedPolicy:
                 self.tracker.learn(score, stalled=bool(stalls[ranks[place], place]))
             chosen += [CAUTIONS[rank] for rank in ranks]
             columns = np.arange(places.size)
-            parts.append((every.start_s[:, ranks, columns], every.duration_s[:, ranks, columns]))
-        start_s, duration_s = (np.concatenate(each, axis=1) for each in zip(*parts, strict=True))
-        return np.array(chosen), Schedule(start_s, duration_s)
+            starts.append(every.start_s[:, ranks, columns])
+            durations.append(every.duration_s[:, ranks, columns])
+        return np.array(chosen), Schedule(np.concatenate(starts, axis=1), np.concatenate(durations, axis=1))
 
     def state(self) -> dict[str, Any]:
         return {"prior": asdict(self.made.prior), **self.tracker.state()}
 
     @staticmethod
     def resume(policy: Policy, state: Mapping[str, Any]) -> TrackedPolicy:
-        """Go on from a state; raises UsageError for what is none."""
+        """Continue from `state`; raises UsageError for an invalid one."""
         try:
             prior = GapPrior(**{name: float(value) for name, value in state["prior"].items()})
             return TrackedPolicy(policy.informed(prior), Tracker.resume(state))
@@ -80,7 +79,7 @@ class TrackedPolicy:
 
 
 def _least(stalls: NDArray[np.bool_]) -> list[float]:
-    """Return the least lambda from which on each plan does not stall."""
+    """Return each plan's score: the least lambda from which on it does not stall."""
     above = len(CAUTIONS) - np.argmax(stalls[::-1], axis=0)
     ranks = np.where(stalls.any(axis=0), above, 0)
     return [CAUTIONS[min(rank, len(CAUTIONS) - 1)] for rank in ranks]

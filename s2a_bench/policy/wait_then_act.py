@@ -1,4 +1,4 @@
-"""wait-then-act and s2a-clairvoyant: wait until the whole plan has arrived, or until S0; then what naive does."""
+"""wait-then-act and s2a-clairvoyant: wait until the whole plan has arrived, or until S0; then act as naive."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from s2a_bench.policy.schedule import safe_start, work_conserving
 
 @dataclass(frozen=True, slots=True)
 class WaitThenAct(Policy):
-    """s_1 = t_N, then back to back at nominal durations: it never stalls, and starts last."""
+    """s_1 = t_N, then back to back at nominal durations: no stalls, and the latest start."""
 
     name: ClassVar[str] = "wait-then-act"
     stalls: ClassVar[bool] = False
@@ -27,7 +27,7 @@ class WaitThenAct(Policy):
 
 
 class WaitingStepper(NominalQueue):
-    """Count the skills; the plan is whole when all have arrived, or when the stream ends before."""
+    """Wait for ``missing`` skills, or for the end of the stream."""
 
     def __init__(self, missing: int) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class WaitingStepper(NominalQueue):
         self.missing -= 1
         super().fragment(at_s, timing)
 
-    def end(self, at_s: float) -> None:  # noqa: ARG002 - whenever it comes, the plan is whole
+    def end(self, at_s: float) -> None:  # noqa: ARG002 - the time does not matter
         self.missing = 0
 
     def decide(self, now_s: float) -> Start | float:
@@ -46,7 +46,7 @@ class WaitingStepper(NominalQueue):
 
 @dataclass(frozen=True, slots=True)
 class Clairvoyant(Policy):
-    """Stream-to-act as the paper defines it, which needs to know every arrival: no stalls, and naive's end.
+    """Stream-to-act as the paper defines it, with every arrival known: no stalls, and the end of naive.
 
     s_1 = S0 = max_i (t_i - P_{i-1}), then back to back at nominal durations.
     """
@@ -59,7 +59,7 @@ class Clairvoyant(Policy):
         return Schedule(work_conserving(plans.arrival_s, plans.nominal_s, first_s), plans.nominal_s)
 
     def stepper(self, shape: PlanShape) -> Stepper:
-        """Follow one plan as it arrives; raises UsageError where ``shape`` does not tell S0."""
+        """Return a stepper for one plan; raises UsageError if ``shape.safe_start_s`` is None."""
         if shape.safe_start_s is None:
             raise UsageError(
                 "`policy`: s2a-clairvoyant needs to know when every skill will arrive, so it runs on recorded or "
@@ -69,7 +69,7 @@ class Clairvoyant(Policy):
 
 
 class ClairvoyantStepper(NominalQueue):
-    """Wait for S0, then start whatever has arrived."""
+    """Wait for S0, then act as naive."""
 
     def __init__(self, start_s: float) -> None:
         super().__init__()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.evaluate import evaluate
 from s2a_bench.policy.metrics import measure
-from s2a_bench.policy.schedule import CHUNK
+from s2a_bench.policy.schedule import BLOCK
 from s2a_bench.testing.policy import draw
 from tests.policy import plain
 
@@ -41,12 +41,12 @@ def test_it_agrees_with_the_policies_and_their_metrics(seed: int, n_skills: int,
         np.testing.assert_allclose(stalls[2], measured.longest_stall_s, rtol=0, atol=1e-11)
 
 
-def test_it_agrees_with_the_plain_loop_on_more_plans_than_fit_a_chunk() -> None:
+def test_it_agrees_with_the_plain_loop_on_more_plans_than_fit_a_block() -> None:
     rng = np.random.default_rng(11)
-    arrival_s = np.cumsum(rng.uniform(0, 2, (4, CHUNK + 2)), axis=0)
+    arrival_s = np.cumsum(rng.uniform(0, 2, (4, BLOCK + 2)), axis=0)
     duration_s = rng.uniform(0.2, 1.5, arrival_s.shape)
     found = evaluate(arrival_s, duration_s)
-    for column in (0, CHUNK - 1, CHUNK, CHUNK + 1):
+    for column in (0, BLOCK - 1, BLOCK, BLOCK + 1):
         t, d = arrival_s[:, column].tolist(), duration_s[:, column].tolist()
         stall = plain.stalls(plain.execute(t, d, t[0]), d)
         assert found.safe_start_s[column] == pytest.approx(plain.safe_start(t, d))

@@ -94,7 +94,7 @@ def test_a_policy_with_a_stepper_alone_decides_for_many_plans() -> None:
 
 
 def test_plans_without_a_shape_cannot_be_stepped_through() -> None:
-    with pytest.raises(ValueError, match="after-two is asked step by step: plans need shape"):
+    with pytest.raises(ValueError, match="after-two decides step by step: plans need shape"):
         AfterTwo().schedule(replace(draw(5, 6, 2, 1.3, 1), shape=None))
 
 
@@ -119,8 +119,8 @@ class AsTold(Wrong):
 @pytest.mark.parametrize(
     ("answer", "message"),
     [
-        (0.0, "asked at 0.0 s wants to be asked again at 0.0 s"),
-        (math.nan, "wants to be asked again at nan s"),
+        (0.0, "decides at 0.0 s wants to decide again at 0.0 s"),
+        (math.nan, "wants to decide again at nan s"),
         (Start(1.0, 1.0), "starts skill 1 at 0.0 s, before it has arrived"),
     ],
 )

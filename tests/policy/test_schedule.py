@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.metrics import stalls
-from s2a_bench.policy.schedule import CHUNK, elastic, hold, least_end, safe_start, work_conserving
+from s2a_bench.policy.schedule import BLOCK, elastic, hold, least_end, safe_start, work_conserving
 from tests.policy import plain
 
 EXACT = 1e-9
@@ -57,11 +57,11 @@ def test_the_arrays_agree_with_the_plain_loop(plans: Plans) -> None:
 
 def test_more_plans_than_fit_a_chunk_are_the_same_plans() -> None:
     rng = np.random.default_rng(5)
-    t = np.cumsum(rng.uniform(0, 2, (5, CHUNK + 3)), axis=0)
+    t = np.cumsum(rng.uniform(0, 2, (5, BLOCK + 3)), axis=0)
     least = rng.uniform(0, 1, t.shape)
     plans = Plans(t, least, least, least + rng.uniform(0, 1, t.shape))
     schedule, first = elastic(plans), safe_start(t, least)
-    for column in (0, CHUNK - 1, CHUNK, CHUNK + 2):
+    for column in (0, BLOCK - 1, BLOCK, BLOCK + 2):
         cut = slice(column, column + 1)
         alone = elastic(Plans(t[:, cut], least[:, cut], least[:, cut], plans.most_s[:, cut]))
         assert alone.start_s[:, 0].tolist() == schedule.start_s[:, column].tolist()

@@ -1,8 +1,8 @@
-"""Overlapping actions are blended: the timing and the weights of lerobot's asynchronous inference.
+"""Blend overlapping actions, with the timing and the weights of lerobot's asynchronous inference.
 
-An action of index i is due when i more actions have been executed since its chunk's observation: a stall shifts what is
-due, and loses nothing. lerobot sends an observation in every tick with few actions left, of which the server takes the
-newest when it is free; here one request is under way at a time, which is the same for observations that travel at once.
+Action i of a chunk is due when i actions have been executed since the chunk's observation: a stall delays actions, and
+loses none. lerobot sends an observation in every tick with few actions left, and a free server takes the newest. Here
+one request is pending at a time, which is equivalent for observations that arrive at once.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ WEIGHTS: Final[Mapping[Kind, float]] = {
     "average": 0.5,
     "conservative": 0.3,
 }
-"""The new action's weight by kind; the one in the queue has the rest (lerobot, AGGREGATE_FUNCTIONS)."""
+"""Weight of the new action by kind; the queued one has the rest (lerobot, AGGREGATE_FUNCTIONS)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Aggregate(Laid):
-    """Ask when ``trigger`` actions are left; what arrives is blended into them where both have an action."""
+    """Request a chunk when ``trigger`` actions are left, and blend it into them where both have an action."""
 
     name: ClassVar[str] = "aggregate"
 
@@ -56,23 +56,20 @@ class Aggregate(Laid):
         return Closed(stall_share(delay, self.trigger), delay, cycle)
 
     def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
-        """Say what becomes of requests with latencies of shape (R,), in ns.
-
-        With q actions left at the request, min(d, q) of the new chunk are past when it arrives.
-        """
+        # With q actions left at the request, min(d, q) of the new chunk are past when it arrives.
         delay, horizon, most = setting.delay_ticks(latency_ns), setting.horizon, self.trigger
         known = setting.known_ticks(latency_ns)
-        if 2 * most < horizon:  # what is left on arrival is above the trigger whatever the delay
+        if 2 * most < horizon:  # on arrival more actions are left than the trigger
             first = np.minimum(delay, most)
             first[:1] = 0
             leaves = np.concatenate(([0], np.cumsum(delay + horizon - first - most)))
         else:
             leaves_at, skipped, left = [0], [], 0
-            for ticks, here_at in zip(delay.tolist(), known.tolist(), strict=True):
+            for ticks, known_ticks in zip(delay.tolist(), known.tolist(), strict=True):
                 skipped.append(min(ticks, left))
-                here, here_left = leaves_at[-1] + ticks, horizon - skipped[-1]
-                leaves_at.append(max(here + here_left - most, leaves_at[-1] + max(here_at, 1)))
-                left = max(here_left - (leaves_at[-1] - here), 0)
+                end = leaves_at[-1] + ticks + horizon - skipped[-1]
+                leaves_at.append(max(end - most, leaves_at[-1] + max(known_ticks, 1)))
+                left = max(end - leaves_at[-1], 0)
             leaves, first = np.array(leaves_at), np.array(skipped, np.int64)
         request = leaves[:-1]
         usable = request + delay
@@ -83,7 +80,7 @@ class Aggregate(Laid):
         weight = self.weight
         acted = np.flatnonzero(ticks.chunk >= 0)
         newest, index = ticks.chunk[acted], ticks.index[acted]
-        due = np.searchsorted(acted, cycles.request_tick)  # what is due first, in actions since the start
+        due = np.searchsorted(acted, cycles.request_tick)  # due time of action 0, in actions since the start
         action = due[newest] + index
         rest = np.ones(acted.size)
         open_, chunk = np.arange(acted.size), newest
@@ -104,33 +101,30 @@ class Aggregate(Laid):
 
 @dataclass(slots=True)
 class AggregateStepper(ChunkStepper):
-    """The newest chunk, and how many of its actions are past."""
+    """State of the newest chunk."""
 
     horizon: int
     trigger: int = 0
     newest: int = -1
     past: int = 0
     """Actions executed since the newest chunk's observation."""
-    asked: int = 0
-    since_asked: int = 0
-    """Actions executed since the observation under way."""
-    under_way: bool = False
+    since_request: int = 0
+    """Actions executed since the pending request's observation."""
+    pending: bool = False
 
-    def arrived(self, request: int, actions: int, tick: int) -> None:  # noqa: ARG002 - chunks arrive whole, whenever
-        """Take over behind what has been executed since the observation."""
-        self.newest, self.past, self.under_way = request, self.since_asked, False
+    def arrived(self, request: int, actions: int, tick: int) -> None:  # noqa: ARG002 - chunks arrive whole
+        self.newest, self.past, self.pending = request, self.since_request, False
 
-    def ask(self, tick: int) -> bool:  # noqa: ARG002 - whenever few are left
+    def ask(self, tick: int) -> bool:  # noqa: ARG002 - the time does not matter
         left = self.horizon - self.past if self.newest >= 0 else 0
-        if self.under_way or left > self.trigger:
+        if self.pending or left > self.trigger:
             return False
-        self.asked += 1
-        self.under_way, self.since_asked = True, 0
+        self.pending, self.since_request = True, 0
         return True
 
-    def act(self, tick: int) -> ChunkAction | None:  # noqa: ARG002 - whatever is next
+    def act(self, tick: int) -> ChunkAction | None:  # noqa: ARG002 - the time does not matter
         if self.newest < 0 or self.past == self.horizon:
             return None
         self.past += 1
-        self.since_asked += 1
+        self.since_request += 1
         return ChunkAction(self.newest, self.past - 1)

@@ -1,7 +1,7 @@
-"""Chunks one after another: each is executed from its first action on, behind what is left of the one before.
+"""Chunks one after another: each is executed from its first action on, after the rest of the one before.
 
-No action is skipped, so at every boundary the robot is thrown back by the m actions that were executed since the
-observation. One request is under way at a time.
+No action is skipped, so at every boundary the robot jumps back by the m actions executed since the observation. One
+request is pending at a time.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Appending(Laid):
 
 @dataclass(frozen=True, slots=True)
 class Queue(Appending):
-    """Ask when ``trigger`` actions are left, and append; ``execute`` is s, 0 for the whole chunk."""
+    """Request a chunk when ``trigger`` actions are left, and append it; ``execute`` is s, 0 for the whole chunk."""
 
     name: ClassVar[str] = "queue"
     triggered: ClassVar[bool] = True
@@ -56,22 +56,21 @@ class Queue(Appending):
 
 
 class VariedQueue(Varied):
-    """The same with a trigger for each request."""
+    """`Queue` with one trigger per request."""
 
     def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
-        """Say what becomes of requests with latencies of shape (R,), in ns, one request at a time."""
         delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
         length, last = self.mode.execution_horizon(setting), len(self.triggers) - 1
         leaves, starts, left = [0], [], 0
-        for request, (ticks, here) in enumerate(zip(delay.tolist(), known.tolist(), strict=True)):
+        for request, (ticks, known_ticks) in enumerate(zip(delay.tolist(), known.tolist(), strict=True)):
             now = leaves[-1]
             starts.append(now + max(left, ticks))
             end = starts[-1] + length
-            leaves.append(max(end - self.triggers[min(request + 1, last)], now + max(here, 1)))
+            leaves.append(max(end - self.triggers[min(request + 1, last)], now + max(known_ticks, 1)))
             left = max(0, end - leaves[-1])
-        asked, start = np.array(leaves[:-1], np.int64), np.array(starts, np.int64)
+        tick, start = np.array(leaves[:-1], np.int64), np.array(starts, np.int64)
         first, until = np.zeros_like(start), start + length
-        return assemble(asked, asked + delay, start, first, until, ticks=leaves[-1], horizon=setting.horizon)
+        return assemble(tick, tick + delay, start, first, until, ticks=leaves[-1], horizon=setting.horizon)
 
     def ticks(self, latency_ns: Ints, setting: ControlSetting) -> Ticks:
         return lay(self.cycles(latency_ns, setting))
@@ -79,7 +78,7 @@ class VariedQueue(Varied):
 
 @dataclass(frozen=True, slots=True)
 class Sync(Appending):
-    """Ask when the chunk is used up, and stand still meanwhile: the loop is blocked while it stalls."""
+    """Request a chunk when the last one is used up, and stall meanwhile with a blocked loop."""
 
     name: ClassVar[str] = "sync"
     blocks: ClassVar[bool] = True
@@ -101,10 +100,10 @@ class Sync(Appending):
 class Streamed(Appending):
     """As queue, with actions that arrive one after another: the first after L, then one every ``gap_s``.
 
-    ``start=safe`` begins a chunk at S0, as soon as no stall within it can follow: L and then s - 1 times gap - Delta t,
-    rounded up to ticks, since a robot sees ticks only; that is at most one tick after the exact S0. ``start=naive``
-    executes what there is. By T1 both stall equally long in all, naive within chunks too. ``trigger`` counts actions
-    that are here or under way; the next request leaves when all actions of this one have arrived at the earliest.
+    ``start=safe`` begins a chunk at S0, from which on no stall within it can follow: L plus s - 1 times gap - Delta t,
+    rounded up to ticks, so at most one tick after the exact S0. ``start=naive`` executes actions as they arrive. By T1
+    the stalls of both add up to the same; with naive they are within chunks too. ``trigger`` counts actions that have
+    arrived or are pending; the next request leaves after all actions of this one have arrived.
     """
 
     name: ClassVar[str] = "streamed"
@@ -121,12 +120,12 @@ class Streamed(Appending):
         return round(self.gap_s * 1e9)
 
     def hold_ticks(self, setting: ControlSetting) -> int:
-        """Return for how many ticks the first action is held back, S0 - L rounded up."""
+        """Return the ticks by which the first action is delayed, S0 - L rounded up."""
         slower_ns = max(0, self.gap_ns - setting.period_ns) if self.start == "safe" else 0
         return -(-(self.execution_horizon(setting) - 1) * slower_ns // setting.period_ns)
 
     def waits_within(self, setting: ControlSetting) -> bool:
-        """Whether it may stall within a chunk: then neither arrays nor a closed form tell."""
+        """Whether it may stall within a chunk: then arrays and closed forms do not hold."""
         return self.start == "naive" and self.gap_ns > setting.period_ns
 
     def stepper(self, setting: ControlSetting) -> ChunkStepper:
@@ -156,31 +155,29 @@ class Streamed(Appending):
 
 @dataclass(slots=True)
 class QueueStepper(ChunkStepper):
-    """A queue of actions; the first of a chunk is held back for ``hold`` ticks after it arrived."""
+    """A queue of actions; the first of a chunk is delayed by ``hold`` ticks after its arrival."""
 
     length: int
     trigger: int = 0
     hold: int = 0
     waiting: deque[tuple[ChunkAction, int]] = field(default_factory=deque)
-    """Actions, and from which tick on they may be executed."""
-    asked: int = 0
+    """Actions, each with the first tick in which it may be executed."""
+    requests: int = 0
     missing: int = 0
-    """Actions under way."""
+    """Pending actions."""
 
     def arrived(self, request: int, actions: int, tick: int) -> None:
-        """Queue what is new, as far as it is to be executed; the rest of an older chunk may still trickle in."""
-        if request < self.asked - 1:
+        if request < self.requests - 1:  # actions beyond s of an older chunk
             return
         have = self.length - self.missing
         for index in range(have, min(actions, self.length)):
             self.waiting.append((ChunkAction(request, index), tick + (0 if index else self.hold)))
         self.missing = self.length - max(have, min(actions, self.length))
 
-    def ask(self, tick: int) -> bool:  # noqa: ARG002 - whenever few are left
-        """Ask when few actions are left, and none is under way."""
+    def ask(self, tick: int) -> bool:  # noqa: ARG002 - the time does not matter
         if self.missing or len(self.waiting) > self.trigger:
             return False
-        self.asked += 1
+        self.requests += 1
         self.missing = self.length
         return True
 
@@ -193,9 +190,9 @@ class QueueStepper(ChunkStepper):
 def _append(ready: Ints, known: Ints, whole: Ints, trigger: int, length: int, horizon: int) -> Cycles:
     """Append chunks that may begin ``ready`` ticks after the request, shapes (R,).
 
-    With q actions left at the request at k, the chunk begins at e = k + max(q, ready), and the next request leaves when
-    ``trigger`` are left and all are known to be here, at max(e + length - trigger, k + known). Where that is always the
-    former, q is always the trigger, and nothing depends on what was before.
+    With q actions left at the request at k, the chunk begins at e = k + max(q, ready). The next request leaves when
+    ``trigger`` actions are left and all have arrived, at max(e + length - trigger, k + known). If that is always the
+    former, q is always the trigger, and cycles do not depend on each other.
     """
     left = np.full(ready.size, trigger)
     left[:1] = 0
@@ -204,10 +201,10 @@ def _append(ready: Ints, known: Ints, whole: Ints, trigger: int, length: int, ho
         leaves = np.concatenate(([0], np.cumsum(step)))
     else:
         leaves_at, left_then = [0], [0]
-        for begins, here in zip(ready.tolist(), known.tolist(), strict=True):
+        for ready_ticks, known_ticks in zip(ready.tolist(), known.tolist(), strict=True):
             now = leaves_at[-1]
-            begin = now + max(left_then[-1], begins)
-            leaves_at.append(max(begin + length - trigger, now + here, now + 1))
+            begin = now + max(left_then[-1], ready_ticks)
+            leaves_at.append(max(begin + length - trigger, now + known_ticks, now + 1))
             left_then.append(begin + length - leaves_at[-1])
         leaves, left = np.array(leaves_at), np.array(left_then[:-1], np.int64)
     request = leaves[:-1]

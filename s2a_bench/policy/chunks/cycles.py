@@ -1,6 +1,6 @@
-"""What becomes of requests and ticks: from arrays of when chunks take over, or of a stepper in virtual ticks.
+"""Cycles and ticks of a mode, from arrays of takeover ticks or from a stepper in virtual time.
 
-In modes with arrays a chunk that is executed at all is executed in one run of ticks; between runs lie stalls.
+With arrays, an executed chunk is one run of ticks; stalls lie between runs.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import numpy as np
 from s2a_bench.policy.chunks import ChunkStepper, ControlSetting, Cycles, Ints, Mode, Ticks
 
 _Arrival: TypeAlias = tuple[int, int, int, int]
-"""When actions are usable, from when on asking knows of them, the request, and how many of its actions that are."""
+"""The tick in which actions are usable, the tick in which `ask` knows them, the request, the number of its actions."""
 
 NEVER: Final = 2**61
-"""An arrival that does not come, in ns."""
+"""Arrival time of an action that never arrives, in ns."""
 
 
 class Laid(Mode):
-    """A mode with arrays for `cycles`, in which every chunk is one run: its ticks follow from that."""
+    """A mode whose `cycles` are arrays with one run per chunk; its ticks follow from them."""
 
     def ticks(self, latency_ns: Ints, setting: ControlSetting) -> Ticks:
         return lay(self.cycles(latency_ns, setting))
@@ -29,7 +29,7 @@ class Laid(Mode):
 def assemble(
     request_tick: Ints, usable_tick: Ints, start_tick: Ints, first_index: Ints, until: Ints, *, ticks: int, horizon: int
 ) -> Cycles:
-    """Make cycles of runs: chunk r is executed from ``start_tick`` until before ``until``, both of shape (R,)."""
+    """Return the cycles of runs: chunk r is executed from ``start_tick`` to before ``until``, both of shape (R,)."""
     executed: Ints = np.clip(np.minimum(until, ticks) - start_tick, 0, None)
     used = np.flatnonzero(executed)
     start, length = start_tick[used], executed[used]
@@ -51,7 +51,7 @@ def assemble(
 
 
 def gather(request_tick: Ints, usable_tick: Ints, chunk: Ints, index: Ints, horizon: int) -> tuple[Cycles, Ticks]:
-    """Make cycles and ticks of what each tick executed, both of shape (K,), -1 for nothing; runs may be broken."""
+    """Return cycles and ticks from the chunk and index of each tick, shapes (K,), -1 for no action; runs may break."""
     count, ticks = request_tick.size, chunk.size
     acted = np.flatnonzero(chunk >= 0)
     by = chunk[acted]
@@ -71,7 +71,7 @@ def gather(request_tick: Ints, usable_tick: Ints, chunk: Ints, index: Ints, hori
 
 
 def lay(cycles: Cycles) -> Ticks:
-    """Lay runs out tick by tick."""
+    """Return the ticks of cycles with one run per chunk."""
     used = np.flatnonzero(cycles.executed)
     start, length = cycles.start_tick[used], cycles.executed[used]
     end = start + length
@@ -87,16 +87,15 @@ def lay(cycles: Cycles) -> Ticks:
         return np.repeat(each, spans)
 
     chunk, tick = spread(used), np.arange(cycles.ticks)
-    nothing = chunk < 0
+    stalled = chunk < 0
     index, age = tick - spread(start - cycles.first_index[used]), tick - spread(cycles.request_tick[used])
-    index[nothing], age[nothing] = -1, -1
-    stalled = nothing
+    index[stalled], age[stalled] = -1, -1
     stalled[: start[0] if used.size else cycles.ticks] = False
     return Ticks(chunk, index, age, stalled)
 
 
 def _executed_before(tick: Ints, start: Ints, length: Ints, done_before: Ints) -> Ints:
-    """Return how many actions had been executed before each tick."""
+    """Return the number of actions executed before each tick."""
     run = np.searchsorted(start, tick, "right") - 1
     inside = np.minimum(tick - start[run], length[run])
     return np.where(run < 0, 0, done_before[run] + inside)
@@ -108,15 +107,15 @@ def _stalled(chunk: Ints) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
 
 
 def step(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> tuple[Cycles, Ticks]:
-    """Run a mode's stepper until it asks once more than there are latencies, shape (R,) in ns."""
+    """Run a mode's stepper until its first request without a latency; ``latency_ns`` has the shape (R,)."""
     shifts = np.arange(setting.horizon) * mode.gap_ns
     return follow(mode, latency_ns[:, np.newaxis] + shifts, setting)
 
 
 def follow(mode: Mode, arrival_ns: Ints, setting: ControlSetting, most: int = NEVER) -> tuple[Cycles, Ticks]:
-    """Do the same with the arrival of every action after the request's tick began: shape (R, H), in ns.
+    """Run a mode's stepper with the arrival of every action after its request's tick began: shape (R, H), in ns.
 
-    It ends after ``most`` ticks, if there have been as many.
+    It ends after ``most`` ticks, or before the first request without arrivals.
     """
     count, horizon = len(arrival_ns), setting.horizon
     usable, known = setting.delay_ticks(arrival_ns), setting.known_ticks(arrival_ns)
@@ -135,7 +134,7 @@ def follow(mode: Mode, arrival_ns: Ints, setting: ControlSetting, most: int = NE
                 break
             leaves.append(tick)
             times = list(zip((tick + usable[request]).tolist(), (tick + known[request]).tolist(), strict=True))
-            for at, actions in {at: place for place, at in enumerate(times, 1)}.items():
+            for at, actions in {at: actions for actions, at in enumerate(times, 1)}.items():
                 heapq.heappush(coming, (*at, request, actions))
         while coming and coming[0][0] <= tick:
             _deliver(stepper, heapq.heappop(coming))

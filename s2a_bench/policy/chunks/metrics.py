@@ -1,4 +1,4 @@
-"""What a simulation of chunks comes to, in numbers; ticks are control ticks, and all count from the first action on.
+"""Metrics of a simulation of chunks, in control ticks from the first action on.
 
 The first request has no boundary: waiting for it is the time to first action, not a stall.
 """
@@ -17,10 +17,10 @@ from s2a_bench.policy.chunks import ControlSetting, Cycles, Ints, Mode, Ticks
 
 @dataclass(frozen=True, slots=True)
 class ChunkMetrics:
-    """One robot's run; NaN where there is nothing to count."""
+    """Metrics of one robot's run; undefined values are NaN."""
 
     first_action_tick: int
-    """Time to first action; the run's length where there was none."""
+    """Time to first action; the run's length without one."""
     ticks: int
     """From the first action on."""
     stall_ticks: int
@@ -44,7 +44,7 @@ class ChunkMetrics:
 
 
 def measure(mode: Mode, cycles: Cycles, ticks: Ticks) -> ChunkMetrics:
-    """Count a mode's run."""
+    """Compute the metrics of a mode's run."""
     settled, age = cycles.settled, ticks.age[ticks.age >= 0]
     first = int(np.argmax(ticks.chunk >= 0)) if age.size else cycles.ticks
     stall_ticks, length = int(ticks.stalled.sum()), cycles.ticks - first
@@ -69,10 +69,10 @@ def measure(mode: Mode, cycles: Cycles, ticks: Ticks) -> ChunkMetrics:
 
 
 def reaction_ticks(cycles: Cycles, moment_ticks: Floats) -> Floats:
-    """Return how long after events, at any moments (M,) in ticks, the first action that knows of them is executed.
+    """Return the reaction times to events at moments (M,), in ticks.
 
-    That is the first action of a chunk observed at the event or later; an action counts at its tick's start, so where
-    it leaves at the end one tick more passes. NaN for events that no executed chunk of the run knows of.
+    A reaction is the first action of a chunk observed at the event or later. An action counts at its tick's start; if
+    it leaves at the end, one more tick passes. NaN for events after the last observation of an executed chunk.
     """
     used = np.flatnonzero(cycles.executed)
     place = np.searchsorted(cycles.request_tick[used], moment_ticks)
@@ -81,9 +81,9 @@ def reaction_ticks(cycles: Cycles, moment_ticks: Floats) -> Floats:
 
 
 def margin_ticks(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> int:
-    """Return the stability margin, in ticks: by how much all latencies, shape (R,), may grow without a stall.
+    """Return the stability margin: the ticks by which all latencies, shape (R,), may grow without any stall.
 
-    -1 for a run that stalls as it is. All of it counts, so that a longer run has a smaller margin.
+    -1 for a run that stalls without growth. A longer run has a smaller margin.
     """
     for added in range(2 * setting.horizon + 1):
         if mode.ticks(latency_ns + added * setting.period_ns, setting).stalled.any():

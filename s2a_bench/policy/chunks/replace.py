@@ -1,12 +1,11 @@
-"""Ask every s ticks; a new chunk takes over where it is due: real-time chunking and its family, as far as timing goes.
+"""Request a chunk every s ticks; it takes over where it is due: the timing of real-time chunking and its family.
 
-An action of index i is due i ticks after its chunk's observation, on the clock: a stall loses the actions that were due
-meanwhile. The first chunk of all is due from the tick on which it arrives.
+Action i is due i ticks after its chunk's observation, on the clock: a stall loses the actions due meanwhile. The first
+chunk is due from the tick of its arrival.
 """
 
 from __future__ import annotations
 
-from collections import deque
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar, Literal
 
@@ -20,11 +19,11 @@ from s2a_bench.policy.chunks.cycles import Laid, assemble
 
 @dataclass(frozen=True, slots=True)
 class Replace(Laid):
-    """Ask ``execute`` ticks after the last request; what arrives takes over at its index now - observation.
+    """Request a chunk ``execute`` ticks after the last request; it takes over at index now - observation.
 
-    ``under_way=one`` waits for the answer before it asks again, so that a cycle lasts max(s, ceil(L / Delta t)) ticks;
+    ``under_way=one`` waits for the answer before the next request, so a cycle lasts max(s, ceil(L / Delta t)) ticks;
     ``many`` does not, and drops an answer that a newer one has overtaken. With ``assumed`` >= 0 a chunk takes over at
-    that index whatever the delay was: a fixed estimate of d, which makes the robot jump by estimate - d actions.
+    that index for any delay: a fixed estimate of d, which makes the robot jump by estimate - d actions.
     """
 
     name: ClassVar[str] = "replace"
@@ -82,23 +81,21 @@ class Replace(Laid):
 
 @dataclass(slots=True)
 class ReplaceStepper(ChunkStepper):
-    """The newest chunk, and from when on its actions are due."""
+    """State of the newest chunk."""
 
     rule: Replace
     horizon: int
-    next_ask: int = 0
-    asked_at: deque[tuple[int, int]] = field(default_factory=deque)
-    """Requests under way, and when they left."""
-    asked: int = 0
+    next_request: int = 0
+    pending: dict[int, int] = field(default_factory=dict)
+    """Request -> the tick in which it left."""
+    requests: int = 0
     newest: int = -1
     due_from: int = 0
 
     def arrived(self, request: int, actions: int, tick: int) -> None:  # noqa: ARG002 - chunks arrive whole
-        """Take over, unless a newer chunk has."""
-        left_at = dict(self.asked_at)[request]
-        self.asked_at.remove((request, left_at))
+        left_at = self.pending.pop(request)
         if request == 0:
-            self.next_ask = tick + self.rule.execute
+            self.next_request = tick + self.rule.execute
         if request > self.newest:
             self.newest = request
             self.due_from = left_at if self.rule.assumed < 0 else tick - self.rule.assumed
@@ -106,13 +103,12 @@ class ReplaceStepper(ChunkStepper):
                 self.due_from = tick
 
     def ask(self, tick: int) -> bool:
-        """Ask every so many ticks, and first of all at once."""
-        waits = self.asked_at and (not self.rule.several or self.newest < 0)
-        if tick < self.next_ask or waits:
+        waits = self.pending and (not self.rule.several or self.newest < 0)
+        if tick < self.next_request or waits:
             return False
-        self.asked_at.append((self.asked, tick))
-        self.asked += 1
-        self.next_ask = tick + self.rule.execute
+        self.pending[self.requests] = tick
+        self.requests += 1
+        self.next_request = tick + self.rule.execute
         return True
 
     def act(self, tick: int) -> ChunkAction | None:

@@ -1,12 +1,11 @@
-"""When to ask: how many actions should be left, so that at most a share epsilon of the cycles stalls; modes that do.
+"""Triggers: the number of actions left at a request for which at most a share epsilon of the cycles stalls.
 
-A cycle's score is its latency: queue stalls where d > m, so the latency is the least trigger, in ns, from which on this
-cycle does not stall. Choosing the r-th greatest of n recorded latencies is the conformal rule that stream-to-act is
-calibrated with, and promises the same (`conformal`): with exchangeable latencies P(stall) <= (r + 1) / (n + 1).
+A cycle's score is its latency: queue stalls if d > m, so the latency is the least trigger, in ns, without a stall in
+this cycle. Choosing the r-th greatest of n recorded latencies is the conformal rule that calibrates stream-to-act, with
+the same bound (`conformal`): for exchangeable latencies P(stall) <= (r + 1) / (n + 1).
 
-Beside it stand rules to compare with: lerobot's all-time maximum, whose trigger only ever grows; the mean, that most
-cycles near the mean exceed. ``most`` is the greatest trigger
-there is, s for queue and H - s for the others: where the latency is above it no trigger helps, but slowing down does.
+Rules for comparison are lerobot's all-time maximum, whose trigger only grows, and the mean. ``most`` is the greatest
+possible trigger, s for queue and H - s for the others: above it no trigger helps, only slower actions.
 """
 
 from __future__ import annotations
@@ -25,28 +24,28 @@ from s2a_bench.policy.conformal import EPSILON, Calibration, Guarantee, Tracker,
 
 @dataclass(frozen=True, slots=True)
 class Trigger:
-    """What a rule says: ask when ``ticks`` actions are left, with all actions ``beta`` times slower."""
+    """Request a chunk when ``ticks`` actions are left, with all actions ``beta`` times slower."""
 
     ticks: int
     beta: float = 1.0
 
 
 class TriggerRule(Protocol):
-    """A rule that learns each latency and says from which one on cycles may stall."""
+    """A rule that learns from each latency and limits the next one."""
 
     @property
     def latency_ns(self) -> float:
-        """Return the latency to be ready for in the next cycle; infinity for as great a one as there can be."""
+        """Return the greatest latency without a stall in the next cycle; infinity: the greatest trigger."""
 
     def learn(self, latency_ns: int, *, stalled: bool) -> None:
-        """Learn how long the answer took, and whether the robot stalled."""
+        """Learn from the latency of an answer, and from whether the robot stalled."""
 
 
 def trigger(latency_ns: float, setting: ControlSetting, most: int) -> Trigger:
-    """Return the least trigger that a latency does not stall with, and the slow-down where that is above ``most``.
+    """Return the least trigger without a stall at a latency, and the slow-down if that exceeds ``most``.
 
-    An infinite latency has the greatest trigger, and no slow-down. Raises ValueError for a ``most`` below 1 that a
-    slow-down would be needed for.
+    An infinite latency gives the greatest trigger and no slow-down. Raises ValueError if a slow-down is needed and
+    ``most`` is below 1.
     """
     if math.isinf(latency_ns):
         return Trigger(most)
@@ -57,24 +56,21 @@ def trigger(latency_ns: float, setting: ControlSetting, most: int) -> Trigger:
 
 
 def calibrate(latency_ns: Ints, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence") -> Calibration:
-    """Find the latency to be ready for, ``caution`` in ns, from n recorded ones of shape (n,); see the module's head.
-
-    Raises UsageError where so few latencies allow no such promise.
-    """
+    """Find the latency limit, ``caution`` in ns, from latencies of shape (n,); raises UsageError for too few."""
     return choose(latency_ns.astype(float), epsilon, guarantee)
 
 
 @dataclass(slots=True)
 class Maximum:
-    """The greatest latency there has been, for ever: `max` of lerobot's latency tracker (policies/rtc).
+    """The greatest latency so far: `max` of lerobot's latency tracker (policies/rtc).
 
-    lerobot takes ceil(max / Delta t) for the delay that the model assumes; its trigger is a fixed number of actions.
-    Here the same number is the trigger, the least that would have been safe so far.
+    In lerobot ceil(max / Delta t) is the delay that the model assumes, and the trigger is fixed. Here the same number
+    is the trigger, the least that would have been safe so far.
     """
 
     latency_ns: float = 0.0
 
-    def learn(self, latency_ns: int, *, stalled: bool) -> None:  # noqa: ARG002 - what counts is the latency
+    def learn(self, latency_ns: int, *, stalled: bool) -> None:  # noqa: ARG002 - only the latency matters
         self.latency_ns = max(self.latency_ns, float(latency_ns))
 
 
@@ -89,7 +85,7 @@ class Mean:
     def latency_ns(self) -> float:
         return self.sum_ns / max(self.count, 1)
 
-    def learn(self, latency_ns: int, *, stalled: bool) -> None:  # noqa: ARG002 - what counts is the latency
+    def learn(self, latency_ns: int, *, stalled: bool) -> None:  # noqa: ARG002 - only the latency matters
         self.sum_ns += latency_ns
         self.count += 1
 
@@ -98,8 +94,8 @@ class Mean:
 class TrackedLatency:
     """The calibrated latency, tracked from cycle to cycle while the latencies drift: `conformal.Tracker`.
 
-    Its bound on stalls, whatever the machine does, is about cycles that an infinite caution saves; here that is the
-    greatest trigger, so latencies above it are not covered: they need a slow-down.
+    An infinite caution is the greatest trigger here, so the tracker's bound on stalls does not cover latencies above
+    it: they need a slow-down.
     """
 
     tracker: Tracker = field(repr=False)
@@ -117,26 +113,26 @@ class TrackedLatency:
 
 
 def follow(rule: TriggerRule, latency_ns: Ints, setting: ControlSetting, most: int) -> Ints:
-    """Return the trigger of each request where a rule learns every latency, shape (R,), after the cycle it decided.
+    """Return the trigger of each request, shape (R,), if a rule learns every latency after its cycle.
 
     A trigger is at most ``most``, below s; the robot stalls for max(0, d - m) ticks.
     """
     triggers = np.empty(latency_ns.size, np.int64)
-    for place, latency in enumerate(latency_ns.tolist()):
-        triggers[place] = trigger(rule.latency_ns, setting, most).ticks
-        rule.learn(latency, stalled=_ticks(latency, setting) > int(triggers[place]))
+    for request, latency in enumerate(latency_ns.tolist()):
+        triggers[request] = trigger(rule.latency_ns, setting, most).ticks
+        rule.learn(latency, stalled=_ticks(latency, setting) > int(triggers[request]))
     return triggers
 
 
 def _ticks(latency_ns: float, setting: ControlSetting) -> int:
-    """Return d of a latency that need not be whole."""
+    """Return d of a latency with a fraction of ns."""
     whole = math.ceil(latency_ns)
     return whole // setting.period_ns if setting.rounding == "floor" else -(-whole // setting.period_ns)
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen(Mode):
-    """How another mode acts whose trigger is chosen request by request."""
+    """Another mode with a trigger chosen request by request."""
 
     mode: Mode
 
@@ -155,11 +151,11 @@ class Chosen(Mode):
 
 @dataclass(slots=True)
 class ChosenStepper(ChunkStepper):
-    """Tells a stepper the trigger before it is asked."""
+    """Sets a stepper's trigger before each `ask`."""
 
     stepper: ChunkStepper
     choose: Callable[[], int]
-    asked_at: int = 0
+    request_tick: int = 0
     triggers: list[int] = field(default_factory=list)
 
     def arrived(self, request: int, actions: int, tick: int) -> None:
@@ -170,7 +166,7 @@ class ChosenStepper(ChunkStepper):
         self.stepper.trigger = self.choose()
         asks = self.stepper.ask(tick)
         if asks:
-            self.asked_at = tick
+            self.request_tick = tick
             self.triggers.append(self.stepper.trigger)
         return asks
 
@@ -180,7 +176,7 @@ class ChosenStepper(ChunkStepper):
 
 @dataclass(frozen=True, slots=True)
 class Varied(Chosen):
-    """Ask for chunk r when ``triggers[r]`` actions are left, the last one ever after."""
+    """Request chunk r when ``triggers[r]`` actions are left; the last trigger applies to all later requests."""
 
     triggers: tuple[int, ...]
 
@@ -194,10 +190,10 @@ class Varied(Chosen):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Learning(Chosen):
-    """Ask when as few actions are left as a rule says, which ``begin`` makes.
+    """Choose each trigger by a rule, which ``begin`` makes: `follow` on a live robot.
 
-    What `follow` says of recorded latencies, a robot does here as it goes. It sees whole ticks, and learns the middle
-    of what a delay of d ticks can have been: no matter to a quantile or a maximum, and right for a mean.
+    The robot measures whole ticks. The rule learns the middle of the latencies that give a delay of d ticks, which is
+    unbiased for a mean, and makes no difference to a quantile or a maximum.
     """
 
     begin: Callable[[], TriggerRule]
@@ -213,20 +209,20 @@ class Learning(Chosen):
 
 @dataclass(slots=True, kw_only=True)
 class LearningStepper(ChosenStepper):
-    """A stepper whose rule learns the delay of every answer."""
+    """A stepper whose rule learns from the delay of every answer."""
 
     rule: TriggerRule
     setting: ControlSetting
     length: int
-    """Actions of a chunk that are to be executed: when the last one is there the delay is known."""
+    """Executed actions of a chunk: the delay is known when the last of them has arrived."""
     learnt: int = 0
-    """Requests of which it is."""
+    """Requests with a known delay."""
 
     def arrived(self, request: int, actions: int, tick: int) -> None:
         ChosenStepper.arrived(self, request, actions, tick)
         if self.learnt <= request == len(self.triggers) - 1 and actions >= self.length:
             self.learnt = request + 1
-            delay = tick - self.asked_at
+            delay = tick - self.request_tick
             stalled = request > 0 and delay > self.triggers[-1]
             half_ticks = 2 * delay + (1 if self.setting.rounding == "floor" else -1)
             self.rule.learn(max(half_ticks, 0) * self.setting.period_ns // 2, stalled=stalled)
