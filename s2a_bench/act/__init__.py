@@ -1,6 +1,6 @@
-"""Acting: an `Executor` carries out one policy's decisions, a `ControlLoop` a chunk's actions, and robots take both.
+"""Acting: an `Executor` carries out a policy's decisions, a `ControlLoop` the actions of chunks; robots execute both.
 
-docs/executor.md and docs/chunks-live.md say what happens when, and how a robot is plugged in.
+docs/executor.md and docs/chunks-live.md define the timing, and show how a robot is plugged in.
 """
 
 from __future__ import annotations
@@ -15,24 +15,22 @@ from s2a_bench.registry import Registry
 from s2a_bench.types import Vector
 
 if TYPE_CHECKING:
-    from typing import TypeGuard
-
     from s2a_bench.act.plant import PlantMotion
     from s2a_bench.policy import Floats
 
 Report: TypeAlias = Callable[[str], None]
-"""Called once, from any thread, when a skill has ended by itself: with nothing, or with what went wrong."""
+"""Called once, from any thread, when a skill has ended by itself: with an error, empty on success."""
 
 
 class Running(Protocol):
-    """A skill that a robot is carrying out."""
+    """A skill in progress."""
 
     def retime(self, end_ns: int) -> None:
         """End at ``end_ns`` instead: later (extend) or sooner, perhaps now (compress)."""
         ...
 
     def ended(self) -> bool:
-        """Tell, at the commanded end, whether it is over; if not, it will report that it is."""
+        """Return, at the commanded end, whether it is over; if not, it reports its end later."""
         ...
 
     def abort(self) -> None:
@@ -41,9 +39,9 @@ class Running(Protocol):
 
 
 class SkillRobot(Protocol):
-    """What carries skills out, one at a time. Called on the executor's thread: every call returns at once.
+    """A robot that executes skills, one at a time. Called on the executor's thread: every call returns at once.
 
-    What a call raises ends the plan with the outcome ``skill-failed``.
+    An exception ends the plan with the outcome ``skill-failed``.
     """
 
     def start(self, call: Call, end_ns: int, report: Report) -> Running:
@@ -51,7 +49,7 @@ class SkillRobot(Protocol):
         ...
 
     def hold(self, gap: Gap) -> None:
-        """Fill the time until the next skill, or until the next plan: no skill is valid now."""
+        """Fill the time until the next skill or plan."""
         ...
 
     def close(self) -> None:
@@ -60,25 +58,25 @@ class SkillRobot(Protocol):
 
 
 class ActionRobot(Protocol):
-    """What carries actions out. One thread, the control loop's, calls it, and every call returns at once."""
+    """A robot that executes actions. Called on the control loop's thread: every call returns at once."""
 
     def send(self, action: Vector | None, at_ns: int) -> None:
         """Execute an action, float32 (D,), from ``at_ns`` (CLOCK_MONOTONIC) until the next tick; called in every tick.
 
-        None is a stall: hold. The array is only lent. Raises S2AError, which ends the run.
+        None is a stall: hold. The array is not to be kept. Raises S2AError, which ends the run.
         """
         ...
 
     def state(self) -> tuple[float, ...]:
-        """Return what a request tells the policy of the robot, in the robot's own units; empty: nothing."""
+        """Return the state that a request sends to the policy, in the robot's units; empty: none."""
         ...
 
     def moved(self, most: int) -> tuple[PlantMotion, Floats] | None:  # noqa: ARG002 - for subclasses
-        """Return how it moved from the first action on, and under which actions, ``most`` ticks; None: unknown."""
+        """Return the motion from the first action on, and the actions, of ``most`` ticks; None: unknown."""
         return None
 
     def describe(self) -> dict[str, str]:
-        """Return what it is, for the manifest."""
+        """Return its parameters for the manifest."""
         ...
 
     def close(self) -> None:
@@ -87,21 +85,21 @@ class ActionRobot(Protocol):
 
 
 class RobotKind:
-    """A kind of robot with its parameters: the fields of a frozen dataclass, which all have defaults.
+    """A kind of robot; its parameters are the fields of a frozen dataclass, all with defaults.
 
-    What it can do it declares by what it is derived from: `SkillKind`, `ActionKind`, or both.
+    It derives from `SkillKind`, `ActionKind`, or both.
     """
 
     risk: ClassVar[str] = ""
-    """``program`` where a parameter names code that it runs: a file of somebody else's should not choose it."""
+    """``program`` if a parameter names code to run: a file from another person should not choose it."""
 
 
 class SkillKind(RobotKind):
-    """A kind of robot that carries out skills."""
+    """A kind of robot that executes skills."""
 
     lacks: ClassVar[str] = "carries out no skills"
     several: ClassVar[bool] = False
-    """Whether any number may be open side by side, each with a policy of its own: nothing moves."""
+    """Whether several may be open at once, one per policy: nothing moves."""
 
     def open_skills(self, skills: SkillSet) -> SkillRobot:
         """Open a robot for the skills of a set; raises S2AError."""
@@ -109,11 +107,11 @@ class SkillKind(RobotKind):
 
 
 class ActionKind(RobotKind):
-    """A kind of robot that takes an action a control tick."""
+    """A kind of robot that takes one action per control tick."""
 
     lacks: ClassVar[str] = "takes no actions"
     simulated: ClassVar[bool] = False
-    """Whether it follows from its actions how it moves, as `respond` says."""
+    """Whether `respond` computes its motion from its actions."""
 
     def open_actions(self, dims: int, period_ns: int) -> ActionRobot:
         """Open a robot for actions of ``dims`` numbers, one every ``period_ns``; raises S2AError."""
@@ -137,15 +135,15 @@ ROBOTS: Final[Registry[type[RobotKind]]] = Registry(
         "call": "s2a_bench.act.call:PythonCall",
     },
 )
-"""Every kind of robot, whichever of the two it can do."""
+"""Kinds of robots, for skills, for actions or for both."""
 
 _Able = TypeVar("_Able", SkillKind, ActionKind)
 
 
 def kind(written: str, able: type[_Able]) -> _Able:
-    """Build the kind ``name[?parameter=value&...]`` of those that can do what is asked, `SkillKind` or `ActionKind`.
+    """Build the kind ``name[?parameter=value&...]`` derived from ``able``, `SkillKind` or `ActionKind`.
 
-    Raises UsageError for an unknown name, parameter or value; for one that cannot, with the names of those that can.
+    Raises UsageError for an unknown name, parameter or value, and for another kind, with the names of suitable ones.
     """
     name = written.partition("?")[0]
     made_by = ROBOTS[name]
@@ -156,10 +154,10 @@ def kind(written: str, able: type[_Able]) -> _Able:
 
 
 def open_robot(written: str, dims: int, period_ns: int) -> ActionRobot:
-    """Open the robot ``name[?parameter=value&...]`` for actions; raises S2AError for what the caller can mend."""
+    """Open the robot ``name[?parameter=value&...]`` for actions; raises S2AError."""
     return kind(written, ActionKind).open_actions(dims, period_ns)
 
 
 def _is(entry: object, able: type[_Able]) -> TypeGuard[type[_Able]]:
-    """Return whether an entry is such a kind; another package may have offered anything."""
+    """Check the type of an entry, which another package may provide."""
     return isinstance(entry, type) and issubclass(entry, able)

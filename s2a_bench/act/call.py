@@ -1,4 +1,4 @@
-"""A robot of Python functions of its user's: called with each action, or for each skill on a thread of its own."""
+"""A robot made of Python functions: one called with each action, or one per skill on a thread of its own."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _FUNCTION: Final = re.compile(r"[\w.]+:[\w.]+")
 class PythonCall(SkillKind, ActionKind):
     """Call ``function``, written ``module:name``, with each action, float32 (D,), or each skill's `SkillMotion`.
 
-    What it returns is not looked at. Actions are sent on the control loop's thread: meanwhile nothing else is executed.
-    A skill has a thread of its own; `CallableRobot` has a function for each skill, and one for the gaps.
+    Its result is ignored. Actions are sent on the control loop's thread, which the function blocks. Each skill has its
+    own thread; `CallableRobot` has one function per skill, and one for the gaps.
     """
 
     risk: ClassVar[str] = "program"
@@ -35,12 +35,12 @@ class PythonCall(SkillKind, ActionKind):
             raise UsageError(f"function = '{self.function}' should look like module:name")
 
     def open_skills(self, skills: SkillSet) -> CallableRobot:
-        """Import the function, which is called for every skill of the set; raises UsageError where that fails."""
+        """Import the function, which is called for every skill of the set; raises UsageError if that fails."""
         return CallableRobot(skills, dict.fromkeys((skill.name for skill in skills.skills), self._imported()))
 
     def open_actions(self, dims: int, period_ns: int) -> CallableActions:
-        """Import the function; raises UsageError where that fails."""
-        del dims, period_ns  # the function's own business
+        """Import the function; raises UsageError if that fails."""
+        del dims, period_ns
         return CallableActions(self.function, self._imported())
 
     def _imported(self) -> Callable[..., object]:
@@ -65,7 +65,7 @@ class CallableActions(ActionRobot):
         self._name, self._function = name, function
 
     def send(self, action: Vector | None, at_ns: int) -> None:
-        """Call the function; raises RobotError for what it raises."""
+        """Call the function; translates its exceptions into RobotError."""
         del at_ns
         if action is None:
             return
@@ -75,21 +75,18 @@ class CallableActions(ActionRobot):
             raise RobotError(f"`robot`: call: {self._name}: {type(error).__name__}: {error}") from error
 
     def state(self) -> tuple[float, ...]:
-        """Return nothing: the function does not say."""
         return ()
 
     def describe(self) -> dict[str, str]:
         return {"robot": "call", "function": self._name}
 
-    def close(self) -> None:
-        """Do nothing."""
+    def close(self) -> None: ...
 
 
 class SkillMotion:
-    """What a skill's function is given: the call, and how long it may take, which can change on the way."""
+    """Argument of a skill's function: the call and its commanded end, in ns of CLOCK_MONOTONIC, which may change."""
 
     def __init__(self, call: Call, end_ns: int) -> None:
-        """End at ``end_ns`` of CLOCK_MONOTONIC unless told otherwise."""
         self.call = call
         self._changed = Condition()
         self._end_ns = end_ns
@@ -105,11 +102,11 @@ class SkillMotion:
 
     @property
     def remaining_s(self) -> float:
-        """Return how long is left until the commanded end, in s; 0 when it is past."""
+        """Return the time until the commanded end in s; 0 if it is past."""
         return max(self._end_ns - now_ns(), 0) / 1e9
 
     def wait(self, longest_s: float | None = None) -> bool:
-        """Sleep until the end as it stands by then, at most ``longest_s``; return at once, False, on an abort."""
+        """Sleep until the present end, at most ``longest_s``, and return True; return False at once on an abort."""
         until_ns = None if longest_s is None else now_ns() + round(longest_s * 1e9)
         with self._changed:
             while not self._aborted:
@@ -137,25 +134,25 @@ class SkillMotion:
         error = ""
         try:
             function(self)
-        except Exception as failure:  # noqa: BLE001 - the user's code; what it raises is the skill's outcome
+        except Exception as failure:  # noqa: BLE001 - an exception of the user's code is the skill's outcome
             error = f"{type(failure).__name__}: {failure}"
-        self._over = not error  # what failed has to be heard of
+        self._over = not error  # the executor waits for the report of a failure
         report(error)
 
 
 SkillFunction: TypeAlias = Callable[[SkillMotion], object]
-"""A skill as a function: returns when the skill is done, raises where it fails, looks after ``motion.aborted``."""
+"""A skill as a function: returns when the skill is done, raises if it fails, checks ``motion.aborted``."""
 
 
 class CallableRobot:
-    """Calls one function a skill."""
+    """Calls one function per skill."""
 
     def __init__(
         self, skills: SkillSet, functions: Mapping[str, SkillFunction], hold: Callable[[Gap], None] | None = None
     ) -> None:
-        """Take the functions by the skills' names; raises UsageError where a skill has none.
+        """Set the functions by the skills' names; raises UsageError for a skill without one.
 
-        ``hold`` fills the time without a skill: stop, coast, hold or cruise. It runs on the executor's thread.
+        ``hold`` is called on the executor's thread to fill the time without a skill: stop, coast, hold or cruise.
         """
         if missing := [skill.name for skill in skills.skills if skill.name not in functions]:
             raise UsageError(f"`robot`: no function for the skills {', '.join(missing)} of '{skills.name}'")
@@ -163,7 +160,7 @@ class CallableRobot:
         self._fill = hold
 
     def start(self, call: Call, end_ns: int, report: Report) -> Running:
-        """Call the skill's function on a new thread, which does not keep the process alive."""
+        """Call the skill's function on a new daemon thread."""
         motion = SkillMotion(call, end_ns)
         Thread(target=motion.run, args=(self._functions[call.skill.name], report), daemon=True).start()
         return motion
@@ -172,5 +169,4 @@ class CallableRobot:
         if self._fill is not None:
             self._fill(gap)
 
-    def close(self) -> None:
-        """Do nothing: functions end by themselves."""
+    def close(self) -> None: ...

@@ -1,9 +1,9 @@
-"""Acting on chunks of actions: a loop at control rate, on a thread of its own, that nothing blocks.
+"""Act on chunks of actions: a loop at control rate, on its own thread, that nothing blocks.
 
-Ticks begin at fixed times. What a tick does follows from what had arrived by its time, not by when the thread woke up:
-asking sees what had arrived when the tick began; an action leaves at the end of its tick where d is the floor of
-latency over control tick, at its start where d is the ceiling (`policy.chunks.Rounding`). So virtual time says what
-happens here (`policy.chunks.cycles.follow`), and lateness is a number beside it. A tick that is late is made up for.
+Ticks begin at fixed times. A tick depends on what had arrived by its time, not by the time the thread woke up: requests
+see what had arrived when the tick began; an action leaves at the end of its tick if d is the floor of latency over
+control tick, at its start if d is the ceiling (`policy.chunks.Rounding`). So the loop does the same as virtual time
+(`policy.chunks.cycles.follow`), and lateness is recorded beside it. The loop catches up after a late tick.
 """
 
 from __future__ import annotations
@@ -21,47 +21,47 @@ from s2a_bench.policy.chunks import ControlSetting, Ints, Mode
 from s2a_bench.types import Vector
 
 Send: TypeAlias = "Callable[[Vector | None, int], None]"
-"""Called in every tick with its action, None where there is none, and the time in ns when it is due."""
-Ask: TypeAlias = "Callable[[int, int], None]"
-"""Called on the loop's thread with a request's number, from 0, and the tick in which it leaves; should not block."""
+"""Called in every tick with its action, None for no action, and its due time in ns."""
+RequestChunk: TypeAlias = "Callable[[int, int], None]"
+"""Called on the loop's thread with a request's number, from 0, and the tick in which it leaves; must not block."""
 
 HEAD_START_NS: Final = 20_000_000
 """From `ControlLoop.start` to the first tick."""
 SWITCH_S: Final = 0.0005
-"""How long another thread of this process may go on before a tick gets its turn (Python's default: 5 ms)."""
+"""Longest time that another thread of this process delays a tick (Python's default: 5 ms)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Acted:
-    """What a loop did: arrays of shape (K,), int64, one value a tick."""
+    """Record of a loop: arrays of shape (K,), int64, one value per tick."""
 
     start_ns: int
     """When the first tick began."""
     chunk: Ints
-    """Which request's chunk the action was from; -1 for no action."""
+    """Request whose chunk the action was from; -1 for no action."""
     index: Ints
-    """Its place there; -1 for no action."""
+    """Index of the action in the chunk; -1 for no action."""
     late_ns: Ints
-    """How long after it was due the action left."""
+    """Delay of the action after its due time."""
     busy_ns: Ints
-    """For how long the loop did something: asking and sending, and not waiting."""
+    """Time spent on requesting and sending, without waiting."""
     request_tick: Ints
     """When each request left: shape (R,)."""
     arrival_ns: Ints
-    """How long after that tick began each action was there: shape (R, H), -1 where it never was."""
+    """Arrival of each action after that tick began: shape (R, H), -1 for no arrival."""
 
     @property
     def whole(self) -> int:
-        """Return how many requests have been answered whole, counted up to the first that was not."""
+        """Return the number of complete answers before the first incomplete one."""
         missing = [request for request, arrivals in enumerate(self.arrival_ns) if arrivals[-1] < 0]
         return missing[0] if missing else len(self.arrival_ns)
 
 
 class ControlLoop:
-    """One robot that acts on chunks for so many control ticks."""
+    """One robot that acts on chunks for ``ticks`` control ticks."""
 
     def __init__(
-        self, mode: Mode, setting: ControlSetting, send: Send, ask: Ask, ticks: int, clock: Clock | None = None
+        self, mode: Mode, setting: ControlSetting, send: Send, ask: RequestChunk, ticks: int, clock: Clock | None = None
     ) -> None:
         self.stepper, self._setting = mode.stepper(setting), setting
         self._weight = mode.weight
@@ -72,11 +72,11 @@ class ControlLoop:
         self._inbox: deque[tuple[int, int, int]] = deque()
         self._actions: dict[int, Sequence[Vector]] = {}
         self._executing = 0
-        """The request whose chunk is executed; older ones are not needed any more."""
+        """The request whose chunk is executed; older chunks are dropped."""
         self._arrivals: dict[int, list[int]] = {}
-        self._asked: list[int] = []
+        self._request_ticks: list[int] = []
         self._acts: list[tuple[int, int, int]] = []
-        """The action of each tick and how late it left: request and index, -1 for none, and ns."""
+        """Each tick's request and index, -1 for no action, and its lateness in ns."""
         self._busy: list[int] = []
         self._start_ns = 0
         self._stopped = False
@@ -91,7 +91,7 @@ class ControlLoop:
         self._stopped = True
 
     def join(self, timeout_s: float | None = None) -> bool:
-        """Wait for its end, and return whether it has come by then; raises what the loop raised."""
+        """Wait for the end and return whether it is reached; raises what the loop raised."""
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             return False
@@ -100,9 +100,9 @@ class ControlLoop:
         return True
 
     def arrived(self, request: int, actions: Sequence[Vector], at_ns: int) -> None:
-        """Tell, from any thread, that a chunk has come as far as ``actions``, of shape (D,) each, at a time.
+        """Deliver, from any thread, the ``actions`` of a chunk that have arrived so far, of shape (D,) each.
 
-        What has been told before is passed over.
+        Actions that were delivered before are ignored.
         """
         arrivals = self._arrivals.setdefault(request, [])
         if len(actions) <= len(arrivals):
@@ -113,7 +113,7 @@ class ControlLoop:
         self._inbox.append((at_ns, request, len(actions)))
 
     def run(self) -> None:
-        """Run all ticks on this thread."""
+        """Run all ticks on the calling thread."""
         period_ns, floor = self._setting.period_ns, self._setting.rounding == "floor"
         for tick in range(self._ticks + floor):
             begins_ns = self._start_ns + tick * period_ns
@@ -127,40 +127,40 @@ class ControlLoop:
             if tick < self._ticks:
                 self._deliver(begins_ns + 1, tick)
                 if self.stepper.ask(tick):
-                    self._asked.append(tick)
-                    self._ask(len(self._asked) - 1, tick)
+                    self._request_ticks.append(tick)
+                    self._ask(len(self._request_ticks) - 1, tick)
                 if not floor:
                     self._deliver(begins_ns + 1, tick)
                     self._act(tick, begins_ns)
             self._busy.append(self._clock.now_ns() - woke_ns)
 
     def acted(self) -> Acted:
-        """Return what it has done, once nobody calls `arrived` any more."""
+        """Return the record, after the last call of `arrived`."""
         import numpy as np
 
-        asked, horizon = np.array(self._asked, np.int64), self._setting.horizon
-        arrival_ns = np.full((asked.size, horizon), -1)
+        request_tick, horizon = np.array(self._request_ticks, np.int64), self._setting.horizon
+        arrival_ns = np.full((request_tick.size, horizon), -1)
         for request, times in self._arrivals.items():
-            began_ns = self._start_ns + self._asked[request] * self._setting.period_ns
+            began_ns = self._start_ns + self._request_ticks[request] * self._setting.period_ns
             arrival_ns[request, : len(times)] = np.array(times[:horizon]) - began_ns
         chunk, index, late_ns = np.array(self._acts, np.int64).reshape(-1, 3).T
         busy_ns = np.array(self._busy[: len(self._acts)], np.int64)
-        return Acted(self._start_ns, chunk, index, late_ns, busy_ns, asked, arrival_ns)
+        return Acted(self._start_ns, chunk, index, late_ns, busy_ns, request_tick, arrival_ns)
 
     def _guarded(self) -> None:
-        gc.freeze()  # what lives already is not looked through again between two ticks
+        gc.freeze()  # no garbage collection of existing objects between two ticks
         switch_s = sys.getswitchinterval()
         sys.setswitchinterval(SWITCH_S)
         try:
             self.run()
-        except BaseException as error:  # noqa: BLE001 - raised again where it is waited for
+        except BaseException as error:  # noqa: BLE001 - `join` raises it again
             self._failure = error
         finally:
             sys.setswitchinterval(switch_s)
             gc.unfreeze()
 
     def _deliver(self, before_ns: int, tick: int) -> None:
-        """Tell the stepper what had arrived before a time; what its thread was late to put down comes with the next."""
+        """Pass the stepper what had arrived before a time; the next call passes what was delivered late."""
         for _ in range(len(self._inbox)):
             arrival = self._inbox.popleft()
             if arrival[0] < before_ns:
@@ -171,11 +171,11 @@ class ControlLoop:
                 self._inbox.append(arrival)
 
     def _blend(self, actions: Sequence[Vector]) -> None:
-        """Blend a chunk, from the action on that is due next, into what is left."""
+        """Blend a chunk, from the next due action on, into the actions that are left."""
         due = actions[self.stepper.past :]
         weight, left = self._weight, self._blended
         self._blended = deque(
-            weight * new + (1 - weight) * left[place] if place < len(left) else new for place, new in enumerate(due)
+            weight * new + (1 - weight) * left[index] if index < len(left) else new for index, new in enumerate(due)
         )
 
     def _act(self, tick: int, due_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""What an executor is told: events, the feed that makes them of a stream's tokens, and inboxes on either clock."""
+"""Events of an executor, the feed that makes them from a stream's tokens, and inboxes on a live or a virtual clock."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from s2a_bench.plan import Call, Parser, SkillParsed
 from s2a_bench.plan import Event as PlanEvent
 
 Fault: TypeAlias = Literal["stream-error", "silence", "invalid-line"]
-"""Why a stream can be trusted no longer."""
+"""Reasons to stop trusting a stream."""
 
 
 @dataclass(frozen=True, slots=True)
 class Requested:
-    """The plan has been asked for: the policy's time starts here."""
+    """The plan has been requested: the policy's time starts here."""
 
     at_ns: int
 
@@ -42,14 +42,14 @@ class SkillArrived:
 
 @dataclass(frozen=True, slots=True)
 class StreamEnded:
-    """The model has said all it had to say."""
+    """The answer is complete."""
 
     at_ns: int
 
 
 @dataclass(frozen=True, slots=True)
 class StreamBroke:
-    """Nothing that follows can be trusted."""
+    """The rest of the stream cannot be trusted."""
 
     at_ns: int
     fault: Fault
@@ -58,7 +58,7 @@ class StreamBroke:
 
 @dataclass(frozen=True, slots=True)
 class SkillOver:
-    """The skill of that number (from 0) has ended by itself; ``error`` is empty if it went well."""
+    """The skill of that number (from 0) has ended by itself; ``error`` is empty on success."""
 
     at_ns: int
     index: int
@@ -67,64 +67,66 @@ class SkillOver:
 
 @dataclass(frozen=True, slots=True)
 class AbortRequested:
-    """Somebody wants the robot to stop."""
+    """The robot should stop."""
 
     at_ns: int
-    why: str = "asked to stop"
+    why: str = "abort requested"
 
 
 Event: TypeAlias = Requested | TokenArrived | SkillArrived | StreamEnded | StreamBroke | SkillOver | AbortRequested
 
 
 class PlanFeed:
-    """Told what a stream brings, by the thread that reads it: every executor that follows it is told the same."""
+    """Turns a stream into events, on the thread that reads it.
 
-    def __init__(self, parser: Parser, tell: Callable[[Event], None]) -> None:
-        """Read with ``parser``, a new one for every answer; ``tell`` delivers each event, as `EventQueue.put`."""
+    ``parser`` is a new one for every answer; ``put`` delivers an event to every executor, as `EventQueue.put`.
+    """
+
+    def __init__(self, parser: Parser, put: Callable[[Event], None]) -> None:
         self._parser = parser
-        self._tell = tell
+        self._put = put
         self.token_ns: list[int] = []
         self.requested_ns: int | None = None
 
     def requested(self, at_ns: int) -> None:
         self.requested_ns = at_ns
-        self._tell(Requested(at_ns))
+        self._put(Requested(at_ns))
 
     def token(self, text: str | bytes, at_ns: int) -> None:
-        """Take a token that arrived at ``at_ns``: the skills that it completes arrived then too."""
+        """Deliver a token that arrived at ``at_ns``, and the skills that it completes."""
         self.token_ns.append(at_ns)
-        self._tell(TokenArrived(at_ns))
+        self._put(TokenArrived(at_ns))
         self._parsed(self._parser.feed(text), at_ns)
 
     def ended(self, at_ns: int) -> None:
         self._parsed(self._parser.close(), at_ns)
-        self._tell(StreamEnded(at_ns))
+        self._put(StreamEnded(at_ns))
 
     def broke(self, why: str, at_ns: int, fault: Fault = "stream-error") -> None:
-        self._tell(StreamBroke(at_ns, fault, why))
+        self._put(StreamBroke(at_ns, fault, why))
 
     def _parsed(self, events: Sequence[PlanEvent], at_ns: int) -> None:
         for event in events:
             if isinstance(event, SkillParsed):
-                self._tell(SkillArrived(at_ns, event.call))
+                self._put(SkillArrived(at_ns, event.call))
             else:
                 self.broke(f"line {event.line + 1} ({event.problem}): {event.why}", at_ns, "invalid-line")
 
 
 class EventQueue(Protocol):
-    """Events on their way to one executor."""
+    """Events for one executor."""
 
     def put(self, event: Event) -> None:
         """Deliver an event, from any thread."""
         ...
 
     def wait(self, until_ns: int | None) -> list[Event]:
-        """Wait for events until then (None: for ever) and return those there are, in order; none at that time."""
+        """Wait for events until ``until_ns`` (None: for ever) and return them in order; an empty list at that time."""
         ...
 
 
 class LiveInbox:
-    """Waits on CLOCK_MONOTONIC, asleep."""
+    """An inbox on CLOCK_MONOTONIC, which sleeps while it waits."""
 
     def __init__(self) -> None:
         self._events: SimpleQueue[Event] = SimpleQueue()
@@ -135,18 +137,17 @@ class LiveInbox:
     def wait(self, until_ns: int | None) -> list[Event]:
         found: list[Event] = []
         while not found and (until_ns is None or now_ns() < until_ns):
-            with suppress(Empty):  # a timeout is a little early where the system's unit is coarser
+            with suppress(Empty):  # a timeout may be early by the system's time unit
                 found.append(self._events.get(timeout=None if until_ns is None else max(until_ns - now_ns(), 0) / 1e9))
-        while not self._events.empty():  # nobody else takes from it
+        while not self._events.empty():  # this is the only reader
             found.append(self._events.get())
         return found
 
 
 class ScriptedInbox:
-    """Knows beforehand what comes when; waiting moves a virtual clock. What is put is delivered at its own time."""
+    """An inbox with a script of events, ordered by time and then by position; waiting moves a virtual clock."""
 
     def __init__(self, clock: VirtualClock, script: Iterable[Event] = ()) -> None:
-        """Take the events in order of time; at the same instant in the order given."""
         self._clock = clock
         self._order = count()
         self._events: list[tuple[int, int, Event]] = []
@@ -158,7 +159,7 @@ class ScriptedInbox:
         heapq.heappush(self._events, (event.at_ns, next(self._order), event))
 
     def wait(self, until_ns: int | None) -> list[Event]:
-        """Jump to the next event, or to ``until_ns``; raises RuntimeError where nothing will ever happen."""
+        """Jump to the next event, or to ``until_ns``; raises RuntimeError without either."""
         if not self._events and until_ns is None:
             raise RuntimeError("nothing will ever happen: the executor would wait for ever")
         if not self._events or (until_ns is not None and until_ns < self._events[0][0]):

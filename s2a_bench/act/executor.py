@@ -1,14 +1,14 @@
-"""The executor: one policy's stepper on one live stream, its decisions carried out by a robot, everything recorded.
+"""The executor: one policy's stepper on one live stream, with a robot that executes its decisions, all recorded.
 
-Rules, held in this file:
-- Between two events it sleeps until the next time at which there is something to do; it never polls.
+Rules of this file:
+- Between two events it sleeps until the next decision or deadline; it never polls.
 - Only skills that the parser has emitted are started, in their order, one at a time, at most as many as announced.
-- A skill ends when it reports so, or at its commanded end if it obeys time. At its nominal end with the next skill
+- A skill ends when it reports its end, or at its commanded end if it obeys time. At its nominal end with the next skill
   missing it is *extended* up to the policy's ``latest_s``; when the next arrives meanwhile it is *compressed* to now.
-- A skill that is done before its commanded end makes room for the next: waiting would only move idle time (T1).
-- Whenever no skill runs the robot is told to *hold* in the manner of the last skill's gap, the set's before the first.
-- When the stream breaks (error, silence, a line that is no skill) before the announced skills are all there, the skill
-  under way runs to its end, none is started after it, and the robot holds. Once all are there the stream is done with.
+- After a skill that ends before its commanded end the next starts at once: waiting would only move idle time (T1).
+- While no skill runs the robot *holds* with the gap behaviour of the last skill, that of the set before the first.
+- If the stream breaks (error, silence, a line that is no skill) before all announced skills have arrived, the running
+  skill ends, no other is started, and the robot holds. After the last announced skill the stream is ignored.
 - A skill that fails or overruns its end by more than the patience ends the plan the same way; abort ends it at once.
 """
 
@@ -38,17 +38,17 @@ from s2a_bench.plan import Gap
 from s2a_bench.policy import PlanShape, Policy, Start, Timing
 
 SILENCE_S: Final = 60.0
-"""A stream without a token for so long is dead."""
+"""Longest time without a token before the stream counts as broken."""
 PATIENCE_S: Final = 10.0
-"""How long a skill may go on after its commanded end."""
+"""Longest time that a skill may run on after its commanded end."""
 NEVER: Final = sys.maxsize
-"""No time to wake at: something has to happen first."""
+"""A wake time after all others: the executor waits for an event."""
 
 _T = TypeVar("_T")
 
 
 class Executor:
-    """Carries out one plan. `run` blocks; ``record`` can be looked at from other threads meanwhile."""
+    """Executes one plan. `run` blocks; other threads may read ``record`` meanwhile."""
 
     def __init__(
         self,
@@ -63,9 +63,9 @@ class Executor:
         patience_s: float = PATIENCE_S,
         name: str = "",
     ) -> None:
-        """Follow the stream that ``inbox`` tells of, whose clock is ``clock``; ``gap`` is how to wait at first.
+        """Follow the stream in ``inbox``, on ``clock``; ``gap`` is the gap behaviour before the first skill.
 
-        ``name`` is what the record calls the policy, its own name otherwise.
+        ``name`` replaces the policy's name in the record.
         """
         self.record = Record(name or policy.name)
         self._stepper = policy.stepper(shape)
@@ -77,8 +77,8 @@ class Executor:
         self._open = True
         self._holding = False
         self._failure: tuple[Outcome, str] | None = None
-        self._heard_ns = 0
-        self._told_s = 0.0
+        self._last_token_ns = 0
+        self._policy_s = 0.0
 
     def run(self) -> Record:
         """Follow the plan to its end and return the record; errors of stream and robot are outcomes, not exceptions."""
@@ -86,25 +86,25 @@ class Executor:
         while (wake_ns := self._act(due_ns)) is not None:
             events = self._inbox.wait(None if wake_ns == NEVER else wake_ns)
             for event in events:
-                self._hear(event)
-            # Of several events the first: they piled up because this thread was late, which is jitter too.
+                self._receive(event)
+            # Of several events the first: they queued because this thread was late, which is jitter too.
             due_ns = min([wake_ns, *(event.at_ns for event in events)])
         return self.record
 
-    def _hear(self, event: Event) -> None:
-        """Note what happened, and tell the policy what concerns it."""
+    def _receive(self, event: Event) -> None:
         record = self.record
         match event:
             case Requested(at_ns):
-                record.requested_ns = self._heard_ns = at_ns
+                record.requested_ns = self._last_token_ns = at_ns
             case TokenArrived(at_ns) if self._open:
                 record.token_ns.append(at_ns)
-                self._heard_ns = at_ns
-                self._stepper.token(self._tell(at_ns))
+                self._last_token_ns = at_ns
+                self._stepper.token(self._policy_time_s(at_ns))
             case SkillArrived(at_ns, call) if self._open and not self._whole:
                 record.arrivals.append((at_ns, call))
                 times = call.skill.durations
-                self._stepper.fragment(self._tell(at_ns), Timing(times.nominal_s, times.least_s, times.most_s))
+                timing = Timing(times.nominal_s, times.least_s, times.most_s)
+                self._stepper.fragment(self._policy_time_s(at_ns), timing)
             case SkillArrived() if self._open:
                 record.extra += 1
             case StreamEnded(at_ns):
@@ -121,19 +121,18 @@ class Executor:
     def _whole(self) -> bool:
         return len(self.record.arrivals) >= self._announced
 
-    def _tell(self, at_ns: int) -> float:
-        """Return a time as the policy is told it: s from the request, never before what it was told last."""
-        self._told_s = max((at_ns - (self.record.requested_ns or 0)) / 1e9, self._told_s)
-        return self._told_s
+    def _policy_time_s(self, at_ns: int) -> float:
+        """Return a time in s from the request, not before the last returned one."""
+        self._policy_s = max((at_ns - (self.record.requested_ns or 0)) / 1e9, self._policy_s)
+        return self._policy_s
 
     def _close(self, at_ns: int) -> None:
         if self._open:
             self._open = False
             self.record.ended_ns = at_ns
-            self._stepper.end(self._tell(at_ns))
+            self._stepper.end(self._policy_time_s(at_ns))
 
     def _break(self, at_ns: int, fault: Fault, why: str) -> None:
-        """Start nothing more, unless the plan is whole."""
         if self._open and not self._whole:
             self._fail(fault, why)
         self._close(at_ns)
@@ -142,7 +141,7 @@ class Executor:
         self._failure = self._failure or (outcome, why)
 
     def _over(self, at_ns: int, index: int, error: str) -> None:
-        """End the skill that reports its end; a late word of one that was given up means nothing."""
+        """End the skill that reports its end; a late report of an aborted one is ignored."""
         if self._running is None or index != len(self.record.skills) - 1:
             return
         self._end(at_ns)
@@ -150,7 +149,7 @@ class Executor:
             self._fail("skill-failed", f"{self.record.skills[index].call}: {error}")
 
     def _act(self, due_ns: int) -> int | None:
-        """Do all that is due, for a reason that was there at ``due_ns``; return when to act again, None at the end."""
+        """Do all that is due since ``due_ns``; return when to act again, None at the end."""
         record = self.record
         while record.outcome is None:
             now_ns = self._clock.now_ns()
@@ -165,16 +164,16 @@ class Executor:
 
     def _silent_ns(self) -> int:
         waiting = self._open and not self._whole and self.record.requested_ns is not None
-        return self._heard_ns + self._silence_ns if waiting else NEVER
+        return self._last_token_ns + self._silence_ns if waiting else NEVER
 
     def _decide(self, now_ns: int, due_ns: int) -> int:
-        """Ask the policy while no skill runs; return when to act again, 0 for at once."""
+        """Follow the policy's decision while no skill runs; return when to act again, 0 for at once."""
         started, requested_ns = len(self.record.skills), self.record.requested_ns
         if self._failure is not None:
             return self._settle(now_ns, *self._failure)
         if started == self._announced:
             return self._settle(now_ns, "completed")
-        answer = math.inf if requested_ns is None else self._stepper.decide(self._tell(now_ns))
+        answer = math.inf if requested_ns is None else self._stepper.decide(self._policy_time_s(now_ns))
         if isinstance(answer, Start):
             self._start(answer, due_ns)
             return 0
@@ -184,7 +183,7 @@ class Executor:
         return NEVER if self._open else self._settle(now_ns, "short", f"{started} of {self._announced} skills came")
 
     def _steer(self, now_ns: int) -> int:
-        """See the running skill to its end; return when to act again, 0 for at once."""
+        """Extend, compress or end the running skill; return when to act again, 0 for at once."""
         run = self.record.skills[-1]
         if self._failure is not None and self._failure[0] in {"aborted", "skill-failed"}:
             return self._abort(now_ns)
@@ -249,7 +248,6 @@ class Executor:
         return 0
 
     def _hold(self, now_ns: int) -> None:
-        """Fill the time without a skill, once a gap."""
         if not self._holding:
             self._holding = True
             skills = self.record.skills
@@ -266,9 +264,9 @@ class Executor:
         self.record.commands.append(RobotCommand(at_ns, what, index))
 
     def _order(self, otherwise: _T, call: Callable[[], _T]) -> _T:
-        """Call the robot; what it raises fails the plan."""
+        """Call the robot; an exception fails the plan."""
         try:
             return call()
-        except Exception as error:  # noqa: BLE001 - a robot is the user's code, and must not take the executor along
+        except Exception as error:  # noqa: BLE001 - the robot is the user's code and must not end the executor
             self._fail("skill-failed", f"the robot: {type(error).__name__}: {error}")
             return otherwise

@@ -1,11 +1,11 @@
-"""A simulated robot: second-order joints, all alike, that follow actions held from one control tick to the next.
+"""A simulated robot: equal second-order joints that follow actions held from one control tick to the next.
 
-x'' = w^2 (u - x) - 2 zeta w x': what a position-controlled joint looks like to a policy. Within a tick u is constant,
-so that the solution is exact at any step (zero-order hold). The plant begins at rest where its first action puts it,
-and counts in ticks: an action lasts one control period whatever the clock says.
+x'' = w^2 (u - x) - 2 zeta w x' models a position-controlled joint. Within a tick u is constant, and the solution exact
+at any step (zero-order hold). The plant begins at rest at its first action, and counts in ticks: an action lasts one
+control period, whatever the clock.
 
-An action that jumps makes the acceleration jump, and its derivative infinite. Jerk is therefore what a controller at
-the control rate sees: by how much the acceleration changes over one control period, divided by that period.
+A jump of the action makes the acceleration jump, and its derivative infinite. Jerk is therefore the change of the
+acceleration over one control period, divided by that period, as a controller at the control rate measures it.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from s2a_bench.policy import Floats
 from s2a_bench.types import Vector
 
 SUBSTEPS: Final = 8
-"""Of a control tick, at which motion is looked at."""
+"""Samples of the motion per control tick."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlantMotion:
-    """How a plant moved in K ticks with n steps each: arrays of shape (K, n, D), the first step when a tick begins.
+    """Motion of a plant in K ticks with n steps each: arrays of shape (K, n, D), the first step when a tick begins.
 
-    The units are the actions' own, and s. Right at a tick's beginning its action is in effect.
+    The units are those of the actions, and s. A tick's action is in effect from its first step on.
     """
 
     position: Floats
@@ -44,7 +44,7 @@ class PlantMotion:
 
 @dataclass(frozen=True, slots=True)
 class Plant(ActionKind):
-    """Joints with a natural frequency, undamped, and a damping ratio, 1 for the fastest without overshoot."""
+    """Joints with an undamped natural frequency and a damping ratio, 1 for the fastest motion without overshoot."""
 
     simulated: ClassVar[bool] = True
 
@@ -89,10 +89,9 @@ def transition(plant: Plant, step_s: float) -> tuple[Floats, Floats]:
 
 
 class PlantRobot(ActionRobot):
-    """A plant that is sent one action a tick."""
+    """A plant that takes one action per tick; at rest at 0 before the first."""
 
     def __init__(self, plant: Plant, dims: int, period_ns: int) -> None:
-        """Begin at rest, at 0 until the first action."""
         self._plant, self._dims, self._period_s = plant, dims, period_ns / 1e9
         self._step, self._drive = transition(plant, self._period_s)
         self._state: NDArray[np.float64] = np.zeros((2, dims))
@@ -100,7 +99,7 @@ class PlantRobot(ActionRobot):
         self._sent: list[NDArray[np.float64]] = []
 
     def send(self, action: Vector | None, at_ns: int) -> None:
-        """Move on by one tick; nothing moves before the first action. Raises UsageError for another shape."""
+        """Simulate one tick, from the first action on; raises UsageError for another shape."""
         del at_ns
         if action is not None:
             if action.shape != (self._dims,):
@@ -114,11 +113,11 @@ class PlantRobot(ActionRobot):
 
     @property
     def actions(self) -> Floats:
-        """Return what was executed, shape (K, D): a row a tick from the first action on, held ones included."""
+        """Return the executed actions, shape (K, D): a row per tick from the first action on, held ones included."""
         return np.array(self._sent).reshape(-1, self._dims)
 
     def motion(self, most: int | None = None) -> PlantMotion | None:
-        """Return how it moved, from the first action on for ``most`` ticks if told; None before that."""
+        """Return the motion from the first action on, of ``most`` ticks (None: all); None before the first action."""
         return self._plant.respond(self.actions[:most], self._period_s) if self._sent else None
 
     def moved(self, most: int) -> tuple[PlantMotion, Floats] | None:
@@ -132,12 +131,11 @@ class PlantRobot(ActionRobot):
         plant = self._plant
         return {"robot": "plant", "frequency_hz": f"{plant.frequency_hz:g}", "damping": f"{plant.damping:g}"}
 
-    def close(self) -> None:
-        """Do nothing: what was sent can still be looked at."""
+    def close(self) -> None: ...
 
 
 def _hold(actions: Floats) -> Floats:
-    """Replace NaN by what the joint was told last."""
-    told = np.where(np.isnan(actions), 0, np.arange(len(actions))[:, np.newaxis])
-    held: Floats = np.take_along_axis(actions, np.maximum.accumulate(told, axis=0), axis=0)
+    """Replace NaN by each joint's last action."""
+    rows = np.where(np.isnan(actions), 0, np.arange(len(actions))[:, np.newaxis])
+    held: Floats = np.take_along_axis(actions, np.maximum.accumulate(rows, axis=0), axis=0)
     return held

@@ -1,4 +1,4 @@
-"""What an executor did: skills as they really ran, the orders it gave, and how the plan ended."""
+"""Record of an executor: the skills as they ran, the commands to the robot, and the outcome."""
 
 from __future__ import annotations
 
@@ -10,42 +10,41 @@ from s2a_bench.plan import Call
 from s2a_bench.policy import Plans, PlanShape
 
 Outcome: TypeAlias = Literal["completed", "short", "skill-failed", "skill-overran", "aborted"] | Fault
-"""How a plan ended. ``short``: the stream ended properly, with fewer skills than announced; they were carried out."""
+"""How a plan ended. ``short``: the stream ended normally with fewer skills than announced, all executed."""
 
 What: TypeAlias = Literal["start", "extend", "compress", "end", "hold", "abort"]
 
 
 @dataclass(slots=True)
 class SkillRun:
-    """One skill that was started; times on the executor's clock, in ns."""
+    """One started skill; times are on the executor's clock, in ns."""
 
     index: int
     call: Call
     arrival_ns: int
     due_ns: int
-    """When the reason to start it was there: a time the policy named, an arrival, or the end of the skill before."""
+    """When the start was due: the time set by the policy, an arrival, or the end of the skill before."""
     ordered_ns: int
-    """When the order was given: what the durations count from."""
+    """When the command was sent; durations count from it."""
     start_ns: int
-    """When the robot had the order."""
+    """When the robot had accepted the command."""
     duration_ns: int
-    """As first ordered by the policy."""
+    """The policy's first duration."""
     latest_ns: int
-    """How long it may be held on for while the next skill is missing."""
+    """The longest duration while the next skill is missing."""
     until_ns: int
-    """The end as ordered last."""
+    """The last commanded end."""
     end_ns: int | None = None
-    """When it was over; None while it runs."""
+    """None while it runs."""
 
     @property
     def jitter_ns(self) -> int:
-        """Return the start jitter: from the reason to start until the robot had the order."""
         return self.start_ns - self.due_ns
 
 
 @dataclass(frozen=True, slots=True)
 class RobotCommand:
-    """An order to the robot; ``index`` is the skill's, -1 for a hold before the first."""
+    """A command to the robot; ``index`` is the skill's, -1 for a hold before the first."""
 
     at_ns: int
     what: What
@@ -54,7 +53,7 @@ class RobotCommand:
 
 @dataclass(slots=True)
 class Record:
-    """All of one plan under one policy; filled while it runs, so that it can be watched."""
+    """One plan under one policy, filled while it runs."""
 
     policy: str
     requested_ns: int | None = None
@@ -65,11 +64,11 @@ class Record:
     skills: list[SkillRun] = field(default_factory=list)
     commands: list[RobotCommand] = field(default_factory=list)
     extra: int = 0
-    """Skills beyond those announced, which were not carried out."""
+    """Skills beyond those announced, which are not executed."""
     outcome: Outcome | None = None
     """None while it runs."""
     why: str = ""
-    """What went wrong, where something did."""
+    """The error; empty without one."""
 
     @property
     def ran(self) -> list[SkillRun]:
@@ -77,12 +76,12 @@ class Record:
 
     @property
     def stalls_ns(self) -> list[int]:
-        """Return how long the robot had nothing to do between skills, as it happened."""
+        """Return the times between the end of one skill and the start of the next."""
         return [after.start_ns - (before.end_ns or 0) for before, after in zip(self.ran, self.skills[1:], strict=False)]
 
 
 def observed(record: Record, shape: PlanShape) -> Plans | None:
-    """Return the plan as it came, one column with tokens and ``shape``; None where it did not come whole."""
+    """Return the received plan, one column with tokens and ``shape``; None if it is incomplete."""
     import numpy as np
 
     zero_ns, arrivals = record.requested_ns, record.arrivals[: shape.n_skills]

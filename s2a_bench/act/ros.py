@@ -1,12 +1,11 @@
 """A robot behind ROS 2: every action is a message on a topic, every skill a goal of an action.
 
-A message of trajectory_msgs/JointTrajectory has one point, to be reached one control period after it came: its header
-has no stamp, which by convention means "now". In a stall nothing is published: a controller holds what it has.
+A message of trajectory_msgs/JointTrajectory has one point, to be reached one control period after its arrival: the zero
+stamp in its header means "now" by convention. In a stall nothing is published, and a controller holds its last point.
 
-A skill is a goal of ``<namespace>/execute_skill``, s2a_msgs/action/ExecuteSkill. Its duration cannot be changed once it
-is sent (ROS 2 has no message for it), so extending and compressing reach such a robot as waiting for its result and as
-nothing; abort cancels the goal. What fills the gaps is published on ``<namespace>/gap`` as std_msgs/msg/String: stop,
-coast, hold, cruise.
+A skill is a goal of ``<namespace>/execute_skill``, s2a_msgs/action/ExecuteSkill. ROS 2 has no message to change the
+duration of a sent goal, so an extended skill is waited for, and compressing has no effect; abort cancels the goal. The
+gap behaviour is published on ``<namespace>/gap`` as std_msgs/msg/String: stop, coast, hold, cruise.
 """
 
 from __future__ import annotations
@@ -58,10 +57,9 @@ _NAME: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 class RosRobot(SkillKind, ActionKind):
     """Publish each action on ``topic`` as a message of ``type``; send skills to the node in ``namespace``.
 
-    ``joints`` are the joints' names with colons between them; joint_1, joint_2, ... unless told. ``middleware``,
-    ``domain_id`` and ``router`` are those of the ROS transport: default_middleware, ROS_DOMAIN_ID, rmw_zenoh's. For
-    ``wait_s`` the peer is waited for, a subscription or an action server, without which there is no robot; 0: whoever
-    listens, listens.
+    ``joints`` are the joints' names separated by colons; joint_1, joint_2, ... by default. ``middleware``,
+    ``domain_id`` and ``router`` are those of the ROS transport: default_middleware, ROS_DOMAIN_ID, rmw_zenoh's. Without
+    a peer, a subscription or an action server, within ``wait_s`` opening fails; 0 does not wait for a peer.
     """
 
     topic: str = "/joint_trajectory"
@@ -90,13 +88,13 @@ class RosRobot(SkillKind, ActionKind):
         return self.joints.split(":") if self.joints else []
 
     def open_skills(self, skills: SkillSet) -> RosSkills:
-        """Join the domain and find the robot's action; raises TransportError without one."""
-        del skills  # which skills there are is the server's business
+        """Join the domain and find the robot's action server; raises TransportError without one."""
+        del skills
         self._refuse(FOR_ACTIONS, "actions, not skills")
         return self._join("/s2a_bench/executor", lambda node: RosSkills(node, self.namespace, self.wait_s))
 
     def open_actions(self, dims: int, period_ns: int) -> RosActions:
-        """Join the domain; raises UsageError for other joints than ``dims``, RobotError where nobody subscribes."""
+        """Join the domain; raises UsageError for other joints than ``dims``, RobotError without a subscription."""
         self._refuse(FOR_SKILLS, "skills, not actions")
         names = self.names or [f"joint_{joint}" for joint in range(1, dims + 1)]
         if len(names) != dims:
@@ -104,7 +102,7 @@ class RosRobot(SkillKind, ActionKind):
         return self._join("/s2a_bench/robot", lambda node: RosActions(self, node, names, period_ns))
 
     def _refuse(self, names: Sequence[str], about: str) -> None:
-        """Refuse parameters that this robot would not look at."""
+        """Refuse parameters without effect on this robot."""
         for field in fields(self):
             if field.name in names and getattr(self, field.name) != field.default:
                 raise UsageError(f"`robot`: ros: {field.name} is about {about}")
@@ -126,18 +124,18 @@ class RosRobot(SkillKind, ActionKind):
 class RosActions(ActionRobot):
     """Publishes actions."""
 
-    def __init__(self, asked: RosRobot, middleware: Middleware, joints: list[str], period_ns: int) -> None:
-        """Announce the topic and take over ``middleware``; raises RobotError where nobody subscribes in time."""
-        self._asked, self._middleware = asked, middleware
-        type_name = TRAJECTORY if asked.type == "JointTrajectory" else ARRAY
-        self._publisher = middleware.publisher(asked.topic, type_name, QoS(depth=1))
+    def __init__(self, kind: RosRobot, middleware: Middleware, joints: list[str], period_ns: int) -> None:
+        """Announce the topic and take over ``middleware``; raises RobotError without a subscription in time."""
+        self._kind, self._middleware = kind, middleware
+        type_name = TRAJECTORY if kind.type == "JointTrajectory" else ARRAY
+        self._publisher = middleware.publisher(kind.topic, type_name, QoS(depth=1))
         self._joints = joints
         seconds, nanoseconds = divmod(period_ns, 1_000_000_000)
         self._period = ros.default("builtin_interfaces/msg/Duration", sec=seconds, nanosec=nanoseconds)
-        if asked.wait_s and not appeared(lambda: self._publisher.matched() > 0, asked.wait_s):
+        if kind.wait_s and not appeared(lambda: self._publisher.matched() > 0, kind.wait_s):
             raise RobotError(
-                f"`robot`: ros: nobody subscribed to {asked.topic} ({type_name}) in {asked.wait_s:g} s; start the "
-                "controller first, with the same ROS_DOMAIN_ID, or publish to nobody with wait_s=0"
+                f"`robot`: ros: no subscription to {kind.topic} ({type_name}) appeared in {kind.wait_s:g} s; start the "
+                "controller first, with the same ROS_DOMAIN_ID, or publish without a subscription with wait_s=0"
             )
 
     def send(self, action: Vector | None, at_ns: int) -> None:
@@ -147,7 +145,7 @@ class RosActions(ActionRobot):
 
     def _message(self, action: Vector) -> Any:
         values = action.astype("float64")
-        if self._asked.type == "Float64MultiArray":
+        if self._kind.type == "Float64MultiArray":
             return ros.default(ARRAY, data=values)
         point = ros.default(POINT, positions=values, time_from_start=self._period)
         return ros.default(TRAJECTORY, joint_names=self._joints, points=[point])
@@ -156,19 +154,19 @@ class RosActions(ActionRobot):
         return ()
 
     def describe(self) -> dict[str, str]:
-        told = {name: value for name, value in asdict(self._asked).items() if name not in FOR_SKILLS}
-        told |= {"robot": "ros", "joints": ":".join(self._joints), **self._middleware.describe()}
-        return {name: str(value) for name, value in told.items()}
+        facts = {name: value for name, value in asdict(self._kind).items() if name not in FOR_SKILLS}
+        facts |= {"robot": "ros", "joints": ":".join(self._joints), **self._middleware.describe()}
+        return {name: str(value) for name, value in facts.items()}
 
     def close(self) -> None:
         self._middleware.close()
 
 
 class RosSkills:
-    """Sends skills as goals; a thread of its own takes what comes back."""
+    """Sends skills as goals; its own thread receives the results."""
 
     def __init__(self, middleware: Middleware, namespace: str, wait_s: float) -> None:
-        """Find the action server and take over ``middleware``; raises TransportError where none appears in time."""
+        """Find the action server and take over ``middleware``; raises TransportError if none appears in time."""
         name = f"{namespace}/execute_skill"
         self._middleware = middleware
         self._client: ActionClient = middleware.action_client(name, EXECUTE_SKILL)
@@ -185,7 +183,7 @@ class RosSkills:
         self._thread.start()
 
     def start(self, call: Call, end_ns: int, report: Report) -> Running:
-        """Send a goal with the time that is left until ``end_ns``."""
+        """Send a goal with the time until ``end_ns``."""
         times = call.skill.durations
         goal = ros.default(
             EXECUTE_SKILL + "_Goal",
@@ -221,7 +219,7 @@ class RosSkills:
                     report(self._error(event))
 
     def _error(self, event: ActionEvent) -> str:
-        """Return what went wrong with a goal; nothing if it went well."""
+        """Return the error of a goal, empty on success."""
         if not isinstance(event, Result):
             return "the robot rejected the goal"
         succeeded = event.status == Status.SUCCEEDED
@@ -235,16 +233,16 @@ class RosSkills:
 
 
 class _Goal:
-    """A goal under way."""
+    """A pending goal."""
 
     def __init__(self, client: ActionClient, goal_id: bytes) -> None:
         self._client, self._id = client, goal_id
 
     def retime(self, end_ns: int) -> None:
-        """Let it be: a goal keeps the duration that it was sent with."""
+        """Do nothing: a sent goal keeps its duration."""
 
     def ended(self) -> bool:
-        """Leave it to the result to say so."""
+        """Return False: the result reports the end."""
         return False
 
     def abort(self) -> None:

@@ -1,4 +1,4 @@
-"""A robot that does nothing but take its time: every skill lasts exactly as long as it is told."""
+"""A robot that only waits: every skill lasts exactly as long as commanded."""
 
 from __future__ import annotations
 
@@ -9,33 +9,28 @@ from s2a_bench.plan import Call, Gap, SkillSet
 
 
 class Timed(SkillKind):
-    """Stands in for a robot wherever only the times matter: timelines, tests, demonstrations."""
+    """A robot for timelines, tests and demonstrations, where only times matter."""
 
     several: ClassVar[bool] = True
 
     def open_skills(self, skills: SkillSet) -> TimedRobot:
-        """Take any skills."""
         del skills
         return TimedRobot()
 
 
 class TimedRobot:
-    """Waits, and is the skill that it waits for too: over whenever the executor says so."""
+    """Robot and running skill in one object: a skill is over at its commanded end."""
 
-    def start(self, call: Call, end_ns: int, report: Report) -> Running:  # noqa: ARG002 - whatever it is
+    def start(self, call: Call, end_ns: int, report: Report) -> Running:  # noqa: ARG002 - all skills are the same
         return self
 
-    def hold(self, gap: Gap) -> None:
-        """Wait on."""
+    def hold(self, gap: Gap) -> None: ...
 
-    def close(self) -> None:
-        """Do nothing."""
+    def close(self) -> None: ...
 
-    def retime(self, end_ns: int) -> None:
-        """Be as patient as asked."""
+    def retime(self, end_ns: int) -> None: ...
 
     def ended(self) -> bool:
         return True
 
-    def abort(self) -> None:
-        """Be done at once."""
+    def abort(self) -> None: ...

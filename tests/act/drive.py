@@ -1,4 +1,4 @@
-"""Executors in virtual time: plans as scripts of events, and robots that do as they are told, or not."""
+"""Executors in virtual time: plans as scripts of events, and robots that obey commands, or not."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ZERO_NS = 7_000_000_000
 
 EVERY_POLICY = tuple(POLICIES)
 SAFE_START = {"s2a-clairvoyant"}
-"""Policies that are told S0, as nobody can know it."""
+"""Policies that get S0, which a robot could not know."""
 
 
 def ns(seconds: float) -> int:
@@ -30,7 +30,7 @@ def call(name: str = "go", nominal_s: float = 1.0, least: float = 0.8, most: flo
 
 
 def script(token_s: Sequence[float], arrivals: Sequence[tuple[float, Call]], end_s: float | None = None) -> list[Event]:
-    """A stream that ends with the last thing that comes unless told otherwise (never: a negative time)."""
+    """A stream that ends with its last event, or at ``end_s`` (never: a negative time)."""
     events: list[Event] = [Requested(ns(0))]
     events += sorted(
         [*(TokenArrived(ns(at)) for at in token_s), *(SkillArrived(ns(at), skill) for at, skill in arrivals)],
@@ -48,14 +48,14 @@ def plan(arrival_s: Sequence[float], names: Sequence[str] = ()) -> list[Event]:
 
 @dataclass
 class Obedient:
-    """Obeys time, and keeps what it was told."""
+    """Obeys time, and records its commands."""
 
     clock: VirtualClock
-    told: list[tuple[float, str]] = field(default_factory=list)
+    commands: list[tuple[float, str]] = field(default_factory=list)
     closed: bool = False
 
     def say(self, what: str) -> None:
-        self.told.append((round((self.clock.now_ns() - ZERO_NS) / 1e9, 6), what))
+        self.commands.append((round((self.clock.now_ns() - ZERO_NS) / 1e9, 6), what))
 
     def start(self, call: Call, end_ns: int, report: Report) -> Running:
         self.say(f"start {call.skill.name} until {(end_ns - ZERO_NS) / 1e9:g}")
@@ -88,7 +88,7 @@ class Task:
 
 @dataclass
 class SelfPaced(Obedient):
-    """Takes each skill ``off_s`` longer (or shorter) than told, and reports its end itself; inf: never."""
+    """Takes each skill ``off_s`` longer (or shorter) than commanded, and reports its end itself; inf: never."""
 
     off_s: float = 0.0
     error: str = ""

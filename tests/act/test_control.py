@@ -44,7 +44,7 @@ class Late(VirtualClock):
 
 
 def act(written: str, setting: ControlSetting, latency_ns: list[int], clock: VirtualClock, ticks: int = 400) -> Acted:
-    """Run a loop whose answers are told at once, for the time at which they come."""
+    """Run a loop whose answers are delivered at once, stamped with the time at which they arrive."""
     chosen = mode(written)
     actions = [np.full(1, place, np.float32) for place in range(setting.horizon)]
     start_ns: list[int] = []
@@ -78,10 +78,10 @@ def test_loop_does_what_virtual_time_says(
     setting = ControlSetting(PERIOD_NS, HORIZON, rounding)  # type: ignore[arg-type]
     acted = act(written, setting, latency_ns, Late(late_ns))
     arrival_ns = np.where(acted.arrival_ns < 0, NEVER, acted.arrival_ns)
-    _, said = follow(mode(written), arrival_ns, setting, acted.chunk.size)
+    _, expected = follow(mode(written), arrival_ns, setting, acted.chunk.size)
     assert acted.whole == len(latency_ns)
-    np.testing.assert_array_equal(acted.chunk, said.chunk)
-    np.testing.assert_array_equal(acted.index, said.index)
+    np.testing.assert_array_equal(acted.chunk, expected.chunk)
+    np.testing.assert_array_equal(acted.index, expected.index)
 
 
 def test_lateness_is_told_and_made_up_for() -> None:
@@ -132,11 +132,11 @@ def test_overlapping_actions_are_blended_as_virtual_time_says() -> None:
     loop = ControlLoop(chosen, setting, lambda action, _: sent.append(action), ask, 80, VirtualClock())
     loop.run()
     cycles, ticks = follow(chosen, np.repeat(latency_ns[:, np.newaxis], HORIZON, axis=1), setting)
-    said = np.full((cycles.ticks, 2), np.nan)
+    expected = np.full((cycles.ticks, 2), np.nan)
     for tick, chunk, index, share in chosen.blend(cycles, ticks):
-        said[tick] = np.nan_to_num(said[tick]) + share[:, np.newaxis] * chunks[chunk, index]
+        expected[tick] = np.nan_to_num(expected[tick]) + share[:, np.newaxis] * chunks[chunk, index]
     done = np.array([[np.nan] * 2 if action is None else action for action in sent[: cycles.ticks]])
-    np.testing.assert_allclose(done, said, rtol=1e-5)
+    np.testing.assert_allclose(done, expected, rtol=1e-5)
 
 
 def test_failure_of_a_robot_reaches_who_waits_and_the_interpreter_is_as_before() -> None:
@@ -157,11 +157,11 @@ def test_failure_of_a_robot_reaches_who_waits_and_the_interpreter_is_as_before()
 
 
 def test_stop_ends_it_before_its_time() -> None:
-    asked = Event()
+    request_left = Event()
     setting = ControlSetting(1_000_000, 3)
-    loop = ControlLoop(mode("sync"), setting, lambda *_: None, lambda *_: asked.set(), 10**9, SystemClock())
+    loop = ControlLoop(mode("sync"), setting, lambda *_: None, lambda *_: request_left.set(), 10**9, SystemClock())
     loop.start()
-    assert asked.wait(10)
+    assert request_left.wait(10)
     assert not loop.join(0.001)
     loop.stop()
     assert loop.join(10)

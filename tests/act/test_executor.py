@@ -122,7 +122,7 @@ def test_a_stream_that_dies_anywhere_leaves_the_robot_holding(
     came = [skill for event in kept if isinstance(event, SkillArrived) for skill in [event.call.skill.name]]
     assert [skill.call.skill.name for skill in record.skills] == came[: len(record.skills)]
     assert all(skill.end_ns is not None for skill in record.skills)
-    assert robot.told[-1][1] == ("hold" if record.skills else "cruise")
+    assert robot.commands[-1][1] == ("hold" if record.skills else "cruise")
 
 
 def test_a_dead_stream_lets_the_skill_under_way_end_and_starts_no_other() -> None:
@@ -130,7 +130,7 @@ def test_a_dead_stream_lets_the_skill_under_way_end_and_starts_no_other() -> Non
     record, robot = run(events, 5)
     assert (record.outcome, record.why) == ("stream-error", "cable pulled")
     assert (starts(record), ends(record)) == ([1.0], [2.0])
-    assert robot.told == [(-1.0, "cruise"), (1.0, "start skill0 until 2"), (2.0, "hold")]
+    assert robot.commands == [(-1.0, "cruise"), (1.0, "start skill0 until 2"), (2.0, "hold")]
 
 
 def test_unless_told_otherwise_silence_is_a_minute_and_a_skill_may_overrun_by_ten_seconds() -> None:
@@ -148,7 +148,7 @@ def test_silence_counts_from_the_last_token() -> None:
     record, robot = run([Requested(ns(0)), TokenArrived(ns(4))], 3, silence_s=10.0)
     assert (record.outcome, record.why, record.skills) == ("silence", "no token for 10 s", [])
     assert record.ended_ns == ns(14)
-    assert robot.told == [(-1.0, "cruise")]
+    assert robot.commands == [(-1.0, "cruise")]
 
 
 def test_silence_after_the_last_announced_skill_means_nothing() -> None:
@@ -193,13 +193,13 @@ def test_a_missing_skill_is_a_stall_that_is_counted_as_it_happened() -> None:
     assert [(command.what, command.index) for command in record.commands] == [
         *(("hold", -1), ("start", 0), ("end", 0), ("hold", 0), ("start", 1), ("end", 1), ("hold", 1)),
     ]
-    assert robot.told[1:4] == [(1.0, "start skill0 until 2"), (2.0, "hold"), (4.0, "start skill1 until 5")]
+    assert robot.commands[1:4] == [(1.0, "start skill0 until 2"), (2.0, "hold"), (4.0, "start skill1 until 5")]
 
 
 def test_a_skill_is_extended_while_the_next_is_missing_and_compressed_when_it_comes() -> None:
     record, robot = run(script([0.9, 1.0, 2.2], [(1.0, call("a")), (2.2, call("b"))]), 2, by=Elastic())
     words = ["start a until 2", "until 2.5", "until 2.2", "start b until 3.2"]
-    assert robot.told[1:5] == list(zip([1.0, 2.0, 2.2, 2.2], words, strict=True))
+    assert robot.commands[1:5] == list(zip([1.0, 2.0, 2.2, 2.2], words, strict=True))
     assert [command.what for command in record.commands][1:5] == ["start", "extend", "compress", "end"]
     assert (record.stalls_ns, ends(record)) == ([0], [2.2, 3.2])
     assert [(skill.duration_ns, skill.latest_ns) for skill in record.skills] == [(10**9, 3 * 10**9 // 2)] * 2
@@ -225,13 +225,13 @@ def test_a_skill_that_never_ends_is_aborted_when_the_patience_is_over() -> None:
     record, robot = run(plan([1.0, 1.1]), 2, robot=partial(SelfPaced, off_s=float("inf")))
     assert (record.outcome, record.why) == ("skill-overran", "skill0() went on for 5 s after its end")
     assert ends(record) == [7.0]
-    assert [word for _, word in robot.told[-2:]] == ["abort", "hold"]
+    assert [word for _, word in robot.commands[-2:]] == ["abort", "hold"]
 
 
 def test_a_skill_that_fails_ends_the_plan() -> None:
     record, robot = run(plan([1.0, 1.1]), 2, robot=partial(SelfPaced, off_s=-0.5, error="dropped the cup"))
     assert (record.outcome, record.why) == ("skill-failed", "skill0(): dropped the cup")
-    assert (len(record.skills), robot.told[-1]) == (1, (1.5, "hold"))
+    assert (len(record.skills), robot.commands[-1]) == (1, (1.5, "hold"))
 
 
 def test_a_robot_whose_call_raises_ends_the_plan_and_not_the_executor() -> None:
@@ -241,17 +241,17 @@ def test_a_robot_whose_call_raises_ends_the_plan_and_not_the_executor() -> None:
 
     record, robot = run(plan([1.0, 1.1]), 2, robot=Broken)
     assert (record.outcome, record.why, record.skills) == ("skill-failed", "the robot: OSError: no arm", [])
-    assert [word for _, word in robot.told] == ["cruise"]
+    assert [word for _, word in robot.commands] == ["cruise"]
 
 
 @pytest.mark.parametrize("at_s", [0.5, 1.0, 1.5, 2.5])
 def test_an_abort_ends_everything_at_once(at_s: float) -> None:
     record, robot = run([*plan([1.0, 4.0])[:-1], AbortRequested(ns(at_s)), StreamEnded(ns(4))], 2)
-    assert (record.outcome, record.why) == ("aborted", "asked to stop")
+    assert (record.outcome, record.why) == ("aborted", "abort requested")
     assert len(record.skills) == (at_s > 1)
     assert ends(record) == [min(at_s, 2.0)] * (at_s > 1)
-    assert ((at_s, "abort") in robot.told) == (at_s == 1.5)
-    assert robot.told[-1][1] in {"hold", "cruise"}
+    assert ((at_s, "abort") in robot.commands) == (at_s == 1.5)
+    assert robot.commands[-1][1] in {"hold", "cruise"}
 
 
 def test_an_abort_before_the_request_ends_it_too() -> None:
@@ -267,7 +267,7 @@ def test_skills_that_arrive_together_keep_their_order() -> None:
 def test_the_gap_of_the_skill_that_ran_last_fills_the_stall() -> None:
     events = script([1, 4], [(1.0, call("a", gap="coast")), (4.0, call("b", gap="stop"))])
     _, robot = run(events, 2)
-    assert [word for _, word in robot.told if " " not in word] == ["cruise", "coast", "stop"]
+    assert [word for _, word in robot.commands if " " not in word] == ["cruise", "coast", "stop"]
 
 
 def test_minutes_are_computed_and_not_waited_for() -> None:

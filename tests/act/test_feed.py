@@ -32,7 +32,7 @@ def execute(chunks: list[str], n_skills: int, gap_s: float = 0.5, name: str = "n
     clock = VirtualClock(ns(0))
     robot = Obedient(clock)
     record = Executor(policy(name), shape(n_skills), robot, ScriptedInbox(clock, events), clock).run()
-    assert {word.split()[1] for _, word in robot.told if word.startswith("start")} <= {"go_to", "pick", "place"}
+    assert {word.split()[1] for _, word in robot.commands if word.startswith("start")} <= {"go_to", "pick", "place"}
     return record
 
 

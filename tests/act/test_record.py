@@ -1,4 +1,4 @@
-"""What a record tells of a plan that came as it was asked for."""
+"""The plan that a record holds."""
 
 from __future__ import annotations
 

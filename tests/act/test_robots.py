@@ -91,16 +91,16 @@ class TestFunctions:
         assert second.start_ns >= first.end_ns
 
     def test_a_function_that_does_not_end_is_told_to_and_given_up(self) -> None:
-        told = Flag()
+        delivered = Flag()
 
         def wave(motion: SkillMotion) -> None:
             while motion.wait():
                 pass
-            told.set()
+            delivered.set()
 
         record = execute(CallableRobot(QUICK, {"wave": wave}), [CUP], patience_s=0.05)
         assert record.outcome == "skill-overran"
-        assert told.wait(10)
+        assert delivered.wait(10)
 
     def test_an_abort_reaches_the_function(self) -> None:
         begun, stopped = Flag(), Flag()
@@ -170,7 +170,7 @@ class TestRosActions:
         self, server: ActionServer, goals: int, answer: str = "succeed", begun: Flag | None = None
     ) -> list[tuple[str, list[str], float]]:
         """Answer goals on a thread, and return what they ask for as it comes."""
-        asked: list[tuple[str, list[str], float]] = []
+        goals_received: list[tuple[str, list[str], float]] = []
         self.cancelled = Flag()
 
         def end(goal: ServerGoal) -> None:
@@ -195,22 +195,22 @@ class TestRosActions:
                 goal.succeed(result)
 
         def run() -> None:
-            while len(asked) < goals:
+            while len(goals_received) < goals:
                 goal = server.next_goal(0.1)
                 if goal is not None:
                     wanted = goal.unpack()
-                    asked.append((wanted.skill, list(wanted.arguments), wanted.duration))
+                    goals_received.append((wanted.skill, list(wanted.arguments), wanted.duration))
                     end(goal)
 
         Thread(target=run, daemon=True).start()
-        return asked
+        return goals_received
 
     def test_every_skill_is_a_goal_and_ends_with_its_result(self, server: ActionServer, robot: RosSkills) -> None:
-        asked = self.serve(server, 2)
+        goals_received = self.serve(server, 2)
         record = execute(robot, [CUP, BOX])
         assert (record.outcome, len(record.ran)) == ("completed", 2)
-        assert [(skill, arguments) for skill, arguments, _ in asked] == [("wave", ["cup"]), ("wave", ["box"])]
-        assert all(0 <= duration_s <= 0.04 for _, _, duration_s in asked)
+        assert [(skill, arguments) for skill, arguments, _ in goals_received] == [("wave", ["cup"]), ("wave", ["box"])]
+        assert all(0 <= duration_s <= 0.04 for _, _, duration_s in goals_received)
 
     @pytest.mark.parametrize(("left_s", "least_s", "most_s"), [(3600.0, 3000.0, 3600.0), (-1.0, 0.0, 0.0)])
     def test_a_goal_is_told_the_time_that_is_left_and_the_skill_s_bounds(
@@ -256,9 +256,9 @@ class TestRosActions:
 
     def test_an_abort_cancels_the_goal(self, server: ActionServer, robot: RosSkills) -> None:
         begun = Flag()
-        asked = self.serve(server, 1, "cancel", begun)
+        goals_received = self.serve(server, 1, "cancel", begun)
         record = execute(robot, [CUP], abort_at=begun)
-        assert (record.outcome, [skill for skill, _, _ in asked]) == ("aborted", ["wave"])
+        assert (record.outcome, [skill for skill, _, _ in goals_received]) == ("aborted", ["wave"])
         assert self.cancelled.wait(10)
 
     def test_gaps_are_published(self, serving: Middleware, server: ActionServer, robot: RosSkills) -> None:

@@ -96,8 +96,8 @@ def test_joints_have_the_names_that_are_given(dds_domain: int) -> None:
     (message,) = taken(listener, 1)
     assert message.joint_names == ["lift", "grip"]
     assert message.points[0].time_from_start == Time(1, 500_000_000)
-    told = robot.describe()
-    assert (told["middleware"], told["domain_id"], told["joints"]) == ("cyclonedds", str(dds_domain), "lift:grip")
+    facts = robot.describe()
+    assert (facts["middleware"], facts["domain_id"], facts["joints"]) == ("cyclonedds", str(dds_domain), "lift:grip")
     robot.close()
 
 
@@ -115,7 +115,7 @@ def test_over_zenoh_nodes_meet_at_a_router(dds_domain: int) -> None:
 
 
 def test_a_robot_that_nobody_listens_to_is_no_robot(dds_domain: int) -> None:
-    with pytest.raises(RobotError, match=r"`robot`: ros: nobody subscribed to /nowhere \(trajectory_msgs/msg/Joint"):
+    with pytest.raises(RobotError, match=r"`robot`: ros: no subscription to /nowhere \(trajectory_msgs/msg/Joint"):
         open_robot(f"ros?topic=/nowhere&wait_s=0.2&domain_id={dds_domain}", 2, 20_000_000)
 
 

@@ -40,8 +40,9 @@ if TYPE_CHECKING:
 Ints: TypeAlias = "NDArray[np.int64]"
 Flags: TypeAlias = "NDArray[np.bool_]"
 Rounding: TypeAlias = Literal["floor", "ceil"]
-"""floor: an action leaves at the end of its tick, so a chunk that arrives within it is in time (Real-time chunking, arXiv
-2506.07339). ceil: it leaves at the tick's start (lerobot). They differ by one tick unless L is a multiple of Delta t."""
+"""floor: an action leaves at the end of its tick, so a chunk that arrives within it is in time (Real-time chunking,
+arXiv 2506.07339). ceil: it leaves at the tick's start (lerobot). They differ by one tick unless L is a multiple of
+Delta t."""
 
 
 @dataclass(frozen=True, slots=True)
