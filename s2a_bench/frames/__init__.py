@@ -1,12 +1,13 @@
-"""Where pictures come from: a FrameSource delivers frames, one at a time, in its native format."""
+"""Sources of pictures: a FrameSource delivers frames, one at a time, in its native format."""
 
 from __future__ import annotations
 
 from typing import Final, Protocol
 
-from s2a_bench.errors import UsageError
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import SourceError, UsageError
 from s2a_bench.registry import Registry
-from s2a_bench.types import Encoding, Frame
+from s2a_bench.types import Encoding, Frame, Pixels
 
 
 class FrameSource(Protocol):
@@ -27,13 +28,13 @@ class FrameSource(Protocol):
 
 
 class SourceKind(Protocol):
-    """What opens sources of one kind: usually the class itself."""
+    """Opens sources of one kind: usually the class itself."""
 
     where: str
-    """What to write after the name and a colon, as ``FILE``; empty where nothing is."""
+    """The text after the name and a colon in usage messages, as ``FILE``; empty if there is none."""
 
     def __call__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> FrameSource:
-        """Open ``where``; raises UsageError for a size it cannot have, SourceError where it cannot deliver."""
+        """Open ``where``; raises UsageError for an impossible size, SourceError if it cannot deliver."""
         ...
 
 
@@ -48,13 +49,12 @@ SOURCES: Final[Registry[SourceKind]] = Registry(
         "bag": "s2a_bench.frames.bag:Recording",
     },
 )
-"""What opens each kind of source."""
 
 
 def open_source(spec: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> FrameSource:
     """Open ``name[:where]``, delivering frames of ``width`` x ``height`` pixels.
 
-    Raises UsageError for an unknown name or a ``where`` missing or too many, SourceError when it cannot deliver.
+    Raises UsageError for an unknown name, a missing or superfluous ``where``, SourceError if it cannot deliver.
     """
     name, _, where = spec.partition(":")
     kind = SOURCES[name]
@@ -64,8 +64,38 @@ def open_source(spec: str, width: int, height: int, *, fps: float = 30.0, seed: 
     return kind(where, width, height, fps=fps, seed=seed)
 
 
+class NumberedSource:
+    """Base of the built-in sources: numbers the pictures of a subclass and stamps them."""
+
+    encoding: Encoding
+
+    def __init__(self, name: str, width: int, height: int, *, smallest: int = 1, even: bool = False) -> None:
+        check_size(width, height, smallest=smallest, even=even)
+        self.name, self.width, self.height = name, width, height
+        self._index = 0
+        self._closed = False
+
+    def read(self) -> Frame:
+        if self._closed:
+            raise SourceError(f"`source`: {self.name} was closed, it has no more frames")
+        stamp_ns = self._grab()
+        frame = Frame(self._index, stamp_ns, self.width, self.height, self.encoding, self._picture())
+        self._index += 1
+        return frame
+
+    def close(self) -> None:
+        self._closed = True
+
+    def _grab(self) -> int:
+        """Return the stamp of the next picture: the time of reading, unless a driver knows better."""
+        return now_ns()
+
+    def _picture(self) -> Pixels:
+        raise NotImplementedError
+
+
 def check_size(width: int, height: int, *, smallest: int = 1, even: bool = False) -> None:
-    """Raise UsageError unless a source can have this size; ``even`` is for YUYV, which holds pixels in pairs."""
+    """Raise UsageError unless a source can have this size; ``even`` is for YUYV, which stores pixels in pairs."""
     if width < smallest or height < smallest:
         raise UsageError(f"`size`: {width}x{height} should be {smallest}x{smallest} or more")
     if even and width % 2:

@@ -1,4 +1,4 @@
-"""Frames of a ROS 2 recording (rosbag2 folder, ``.mcap`` or ``.db3`` file), over and over."""
+"""Frames of a ROS 2 recording (rosbag2 folder, ``.mcap`` or ``.db3`` file), in a loop."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError
 from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 
-from s2a_bench.clock import now_ns
 from s2a_bench.errors import SourceError, UsageError
-from s2a_bench.frames import check_size
+from s2a_bench.frames import NumberedSource, check_size
 from s2a_bench.frames.convert import bgr_to_rgb, decode_image, resize, yuyv_to_bgr
-from s2a_bench.types import Encoding, Frame, Pixels
+from s2a_bench.types import Encoding, Pixels
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -26,30 +25,28 @@ TOPIC_KEY = "?topic="
 METADATA = "metadata.yaml"
 MAX_METADATA_BYTES = 8 * 2**20
 MAX_DEPTH = 32
-"""Of nested lists and maps in a recording's YAML, which has 8."""
-MOST_SAID = 300
-"""Characters of what a library says of a damaged file."""
+"""The most nested lists and maps in a recording's YAML, which has 8."""
+MOST_QUOTED = 300
+"""Characters that are quoted of a library's error about a damaged file."""
 
 
-class Recording:
-    """A recorded image topic as a camera, in its own encoding; CompressedImage is decoded to ``bgr8``.
+class Recording(NumberedSource):
+    """A recorded image topic as a camera, in the recorded encoding; CompressedImage is decoded to ``bgr8``.
 
-    ``where`` is the recording's path, then ``?topic=/name`` unless its first image topic is meant. Pictures of
-    another size are scaled; YUYV, which cannot be, is converted to ``bgr8`` then. After the last picture comes the
-    first again. read() reads the file as it goes and never waits for the recorded rate; ``fps`` and ``seed`` change
-    nothing. Stamps are those of reading, as from any camera. Raises SourceError for a recording that is missing,
+    ``where`` is the recording's path, then ``?topic=/name`` for another topic than its first with images. Pictures of
+    another size are scaled; YUYV, which cannot be scaled, is then converted to ``bgr8``. After the last picture it
+    starts over. read() reads the file step by step and never waits for the recorded rate; ``fps`` and ``seed`` have no
+    effect. Stamps are those of reading, as from any camera. Raises SourceError for a recording that is missing,
     damaged, or without such a topic.
     """
 
     where: ClassVar[str] = "FILE[?topic=/NAME]"
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
-        check_size(width, height)
+        super().__init__(f"bag:{where}", width, height)
         self._path, key, topic = where.partition(TOPIC_KEY)
         if key and not topic.startswith("/"):
             raise UsageError(f"`source`: 'bag:{where}' should end with the absolute name of a topic, {TOPIC_KEY}/name")
-        self.name = f"bag:{where}"
-        self.width, self.height = width, height
         self._types = get_typestore(Stores.ROS2_JAZZY)  # Humble's images are the same
         self._reader: Any = _open(self._path)
         try:
@@ -62,12 +59,8 @@ class Recording:
         except BaseException:
             self.close()
             raise
-        self._index = 0
 
-    def read(self) -> Frame:
-        stamp_ns = now_ns()
-        if self._reader is None:
-            raise SourceError(f"`source`: {self.name} was closed, it has no more frames")
+    def _picture(self) -> Pixels:
         message, self._ahead = self._ahead or self._next(), None
         if self._delivered(message) != self.encoding:
             raise SourceError(
@@ -75,34 +68,30 @@ class Recording:
                 f"{message.encoding} at {message.width}x{message.height}; a source has one format, cut the recording"
             )
         try:
-            data = self._pixels(message)
+            return self._pixels(message)
         except ValueError as error:
             raise SourceError(f"`source`: {self._path}: picture {self._index} cannot be read: {error}") from error
-        frame = Frame(self._index, stamp_ns, self.width, self.height, self.encoding, data)
-        self._index += 1
-        return frame
 
     def close(self) -> None:
-        if self._reader is not None:
+        if not self._closed:
             with suppress(Exception):  # a damaged file may not even close
                 self._reader.close()
-        self._reader = None
+        super().close()
 
     def _next(self) -> Any:
-        """Deserialise the next message, starting over once."""
         try:
-            found = next(self._messages, None)
-            if found is None:
+            entry = next(self._messages, None)
+            if entry is None:
                 self._messages = self._reader.messages([self._connection])
-                found = next(self._messages, None)
-            if found is not None:
-                return self._types.deserialize_cdr(found[2], self._connection.msgtype)
-        except Exception as error:  # rosbags raises whatever its parsing of a damaged file runs into
+                entry = next(self._messages, None)
+            if entry is not None:
+                return self._types.deserialize_cdr(entry[2], self._connection.msgtype)
+        except Exception as error:  # rosbags raises any exception on a damaged file
             raise SourceError(f"`source`: {_unreadable(self._path, error)}") from error
         raise SourceError(f"`source`: {self._path} holds no picture on {self._connection.topic}; record some")
 
     def _delivered(self, message: Any) -> Encoding:
-        """Say in which encoding this source delivers such a message."""
+        """Return the encoding in which this source delivers such a message."""
         if not hasattr(message, "encoding"):
             return "bgr8"
         if message.encoding not in CHANNELS:
@@ -115,7 +104,7 @@ class Recording:
         return cast("Encoding", message.encoding)
 
     def _pixels(self, message: Any) -> Pixels:
-        """Make the picture of a message an array of its own, of the size asked for; ValueError if it is none."""
+        """Return a message's picture as a new array of the source's size; ValueError if it is invalid."""
         if not hasattr(message, "encoding"):
             return resize(bgr_to_rgb(decode_image(message.data)), self.width, self.height)
         channels = CHANNELS[message.encoding]
@@ -133,7 +122,6 @@ class Recording:
 
 
 def _open(path: str) -> Any:
-    """Open a recording with rosbags, every way of failing made one line."""
     if not Path(path).exists():
         raise SourceError(f"`source`: no recording at {path}")
     try:
@@ -142,13 +130,13 @@ def _open(path: str) -> Any:
         reader.open()
         if not all(isinstance(name, str) for each in reader.connections for name in (each.topic, each.msgtype)):
             raise ValueError("a topic's name or type is no text")
-    except Exception as error:  # rosbags raises whatever its parsing of a damaged file runs into
+    except Exception as error:  # rosbags raises any exception on a damaged file
         raise SourceError(f"`source`: {_unreadable(path, error)}") from error
     return reader
 
 
 def _check_metadata(path: Path) -> None:
-    """Refuse a folder's YAML that is no YAML, or that could grow without bound when it is read; rosbag2 writes none."""
+    """Raise ValueError for a folder's YAML that is invalid, or that could grow without bound when it is read."""
     if not path.is_file():
         return
     if path.stat().st_size > MAX_METADATA_BYTES:
@@ -182,10 +170,10 @@ def _connection(connections: list[Any], path: str, topic: str) -> Any:
 
 
 def _unreadable(path: str, error: Exception) -> str:
-    """Say in one line that a recording cannot be read, and what may help."""
-    said = " ".join(str(error).split()) or type(error).__name__
-    said = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in said[:MOST_SAID])
+    """Return one line that a recording cannot be read, and what may help."""
+    reason = " ".join(str(error).split()) or type(error).__name__
+    reason = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in reason[:MOST_QUOTED])
     return (
-        f"{path} is no recording that can be read ({said}); it should be a rosbag2 folder, "
+        f"{path} is no recording that can be read ({reason}); it should be a rosbag2 folder, "
         "a .mcap or a .db3 file. `mcap recover` repairs an .mcap that was cut short, `ros2 bag reindex` a folder"
     )

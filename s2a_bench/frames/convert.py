@@ -2,7 +2,7 @@
 
 YUYV is ITU-R BT.601 with limited range (Y 16..235), as V4L2 cameras deliver it. OpenCV computes it in 20-bit
 fixed point, within 1 of the real-valued formula. Pixel arrays may be read-only or windows of larger ones as long as
-the pixels of a row lie together; ``out`` must not overlap ``data``.
+the pixels of a row are contiguous; ``out`` must not overlap ``data``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ BytesLike: TypeAlias = "bytes | bytearray | memoryview | Pixels"
 _DECODE_RGB: int | None = getattr(cv2, "IMREAD_COLOR_RGB", None)
 
 AS_IT_IS: Final = -1
-"""No code of OpenCV's: nothing is to be converted."""
+"""Instead of a code of OpenCV: no conversion."""
 
 
 def yuyv_to_bgr(data: Pixels, out: Pixels | None = None) -> Pixels:
@@ -54,7 +54,7 @@ _CODES: Final[dict[str, tuple[int, int, int]]] = {
     "bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2BGR, cv2.COLOR_BayerGBRG2RGB),
     "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2BGR, cv2.COLOR_BayerGRBG2RGB),
 }
-"""Raw encoding -> channels of what OpenCV converts, its code to BGR, its code to RGB."""
+"""Raw encoding -> channels of OpenCV's input, its code to BGR, its code to RGB."""
 
 
 def to_bgr(frame: Frame, out: Pixels | None = None) -> Pixels:
@@ -102,9 +102,9 @@ def encode_png(bgr: Pixels) -> Pixels:
 
 
 def decode_image(data: BytesLike) -> Pixels:
-    """Decode a JPEG, PNG or other picture file to (h, w, 3) ``rgb8``; ValueError when it is none.
+    """Decode a JPEG, PNG or other picture file to (h, w, 3) ``rgb8``; ValueError if it is none.
 
-    A JPEG that is cut short is an error to OpenCV 5; OpenCV 4 fills in what is missing.
+    A truncated JPEG is an error in OpenCV 5; OpenCV 4 fills in the missing part.
     """
     if _DECODE_RGB is not None:
         return _decode(data, _DECODE_RGB)
@@ -112,14 +112,14 @@ def decode_image(data: BytesLike) -> Pixels:
 
 
 def resize(bgr: Pixels, width: int, height: int) -> Pixels:
-    """Scale (h, w, 3) to (height, width, 3), as it is where it fits already; the aspect ratio is not kept."""
+    """Scale (h, w, 3) to (height, width, 3), unless it has that size; the aspect ratio is not kept."""
     if bgr.shape[:2] == (height, width):
         return bgr
     return cast("Pixels", cv2.resize(bgr, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def _convert(data: Pixels, channels: int, code: int, out: Pixels | None = None) -> Pixels:
-    """Run one cvtColor; checked first, because OpenCV would quietly leave an unfit ``out`` untouched."""
+    """Run one cvtColor with checks: OpenCV would silently leave an unfit ``out`` unchanged."""
     last = data.shape[2:]
     if data.ndim < 2 or last != ((channels,) if channels > 1 else ()) or data.dtype != np.uint8:  # noqa: PLR2004
         wanted = f"(h, w, {channels})" if channels > 1 else "(h, w)"
@@ -144,7 +144,6 @@ def _encode(suffix: str, bgr: Pixels, parameters: list[int]) -> Pixels:
 
 
 def _decode(data: BytesLike, flags: int) -> Pixels:
-    """Decode with OpenCV, every way of failing made one."""
     buffer = np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
     try:
         picture = cv2.imdecode(buffer, flags) if buffer.size else None

@@ -1,7 +1,7 @@
-"""A stamp in the corner of every frame, so that no picture is ever sent twice: a server may keep what it made of one.
+"""A stamp in the corner of every frame, so that no picture is sent twice: a server may cache its work on a picture.
 
-The stamp is a hash of a nonce and the frame's index. A run draws a nonce of its own, and adds the name of the cell
-where a server is not ours; the same nonce gives the same pictures.
+The stamp is a hash of a nonce and the frame's index. Each run draws a new nonce, and adds the name of the cell for an
+external server; the same nonce gives the same pictures.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from s2a_bench.frames import FrameSource
 from s2a_bench.types import Frame
 
 SIDE = 8
-"""Cells of the stamp each way, a bit each; of 2x2 pixels, large enough to survive JPEG."""
+"""Cells of the stamp in each direction, one bit each; 2x2 pixels are large enough to survive JPEG."""
 BLACK, WHITE, GREY = 16, 235, 128
 """Luma of 0 and 1, and the chroma."""
 
 
 def new_nonce() -> str:
-    """Return a nonce that no other run has."""
+    """Return a new nonce, which no other run has."""
     return token_hex(8)
 
 
 class Stamped:
-    """A source whose frames are stamped in their upper left 16x16 pixels; compressed ones pass as they are."""
+    """A source whose frames are stamped in their upper left 16x16 pixels; compressed frames stay unchanged."""
 
     def __init__(self, source: FrameSource, nonce: str) -> None:
         self.name, self.encoding = source.name, source.encoding
@@ -47,7 +47,7 @@ class Stamped:
         self._source.close()
 
     def _stamp(self, frame: Frame) -> None:
-        """Write the hash into the corner, as much of it as a smaller picture has room for."""
+        """Write the hash into the corner, cut off in a smaller picture."""
         digest = blake2b(f"{self._nonce}/{frame.index}".encode(), digest_size=SIDE * SIDE // 8).digest()
         bits = np.unpackbits(np.frombuffer(digest, np.uint8)).reshape(SIDE, SIDE)
         corner = frame.data[: 2 * SIDE, : 2 * SIDE]

@@ -3,9 +3,9 @@
 The scene is rendered when the camera is made, larger than a frame; a frame is a window of it that moves along
 a Lissajous curve. So capture costs one copy, as from a driver's buffer, and what is measured is the transport.
 
-The scene is made of "dead leaves": opaque shapes with power-law sizes hide one another; that alone gives the edges and
-the spectrum of natural pictures (Lee, Mumford and Huang, 2001, doi:10.1023/A:1011109015675). Noise of every scale
-textures the surfaces, a slight blur stands for the lens, and white noise for the sensor.
+The scene consists of "dead leaves": opaque shapes with power-law sizes hide one another, which gives the edges and the
+spectrum of natural pictures (Lee, Mumford and Huang, 2001, doi:10.1023/A:1011109015675). Noise of every scale textures
+the surfaces, a slight blur models the lens, and white noise the sensor.
 """
 
 from __future__ import annotations
@@ -17,22 +17,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from s2a_bench.clock import now_ns
-from s2a_bench.errors import SourceError, UsageError
-from s2a_bench.frames import check_size
-from s2a_bench.types import Encoding, Frame, Pixels
+from s2a_bench.errors import UsageError
+from s2a_bench.frames import NumberedSource
+from s2a_bench.types import Encoding, Pixels
 
 Plane: TypeAlias = NDArray[np.float32]
 
 PERIODS_S = (11.0, 7.0)
-"""How long the window takes there and back, across and down; coprime, so the path closes after 77 s only."""
+"""Periods of the window's motion, across and down; coprime, so the path closes after 77 s only."""
 
 
-class SyntheticCamera:
+class SyntheticCamera(NumberedSource):
     """A window moving over a rendered scene: (h, w, 2) ``yuv422_yuy2``.
 
     The same size, ``fps`` and ``seed`` give the same frames. ``fps`` sets how far the window moves between two
-    frames; read() never waits. The noise moves with the scene, where a sensor's would be new in every frame.
+    frames; read() never waits. The noise moves with the scene, unlike a sensor's, which is new in every frame.
     Raises UsageError for an odd or tiny size.
     """
 
@@ -40,39 +39,27 @@ class SyntheticCamera:
     encoding: Encoding = "yuv422_yuy2"
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:
-        """Render the scene; ``where`` is empty, since there is nothing to open."""
-        check_size(width, height, smallest=16, even=True)
+        super().__init__(f"synthetic:{where}" if where else "synthetic", width, height, smallest=16, even=True)
         if not fps > 0:
             raise UsageError(f"`fps`: {fps} should be above 0")
-        self.name = f"synthetic:{where}" if where else "synthetic"
-        self.width, self.height, self.fps = width, height, fps
-        # a quarter of the frame each way is room enough to move, and soon rendered
-        self._room = (width // 8 * 2, height // 4)
-        self._scene: Pixels | None = render_scene(width + self._room[0], height + self._room[1], seed)
-        self._index = 0
+        self.fps = fps
+        # a quarter of the frame each way is enough for the motion, and soon rendered
+        self._margin = (width // 8 * 2, height // 4)
+        self._scene = render_scene(width + self._margin[0], height + self._margin[1], seed)
 
-    def read(self) -> Frame:
-        stamp_ns = now_ns()
-        if self._scene is None:
-            raise SourceError("`source`: the synthetic camera was closed, it has no more frames")
-        index = self._index
-        x, y = self._corner(index / self.fps)
-        data = self._scene[y : y + self.height, x : x + self.width].copy()
-        self._index += 1
-        return Frame(index, stamp_ns, self.width, self.height, self.encoding, data)
-
-    def close(self) -> None:
-        self._scene = None
+    def _picture(self) -> Pixels:
+        x, y = self._corner(self._index / self.fps)
+        return self._scene[y : y + self.height, x : x + self.width].copy()
 
     def _corner(self, t_s: float) -> tuple[int, int]:
-        """Return where the window's upper left corner is; x is even, so that pixel pairs stay whole."""
+        """Return the window's upper left corner; x is even, so that pixel pairs stay whole."""
         across, down = (0.5 + 0.5 * math.sin(math.tau * t_s / period_s) for period_s in PERIODS_S)
-        return round(across * self._room[0] / 2) * 2, round(down * self._room[1])
+        return round(across * self._margin[0] / 2) * 2, round(down * self._margin[1])
 
 
 OBJECTS = 700
 LIGHT, TEXTURE, LENS_BLUR_PX, SENSOR_NOISE = 0.12, 7.0, 0.55, 1.5
-"""Share that lighting varies by; sd of the finest texture and of noise, in luma steps: for a natural JPEG weight."""
+"""Variation of the lighting; sd of the finest texture and of noise in luma steps, for JPEGs of a natural size."""
 LUMA_RANGE, CHROMA_RANGE = (16, 235), (16, 240)
 
 
@@ -102,12 +89,12 @@ def _wall_and_floor(width: int, height: int) -> Pixels:
 
 
 def _paint_objects(yuv: Pixels, rng: np.random.Generator) -> None:
-    """Paint ellipses and boxes, the density of their sizes falling with the cube, later ones hiding earlier ones."""
+    """Paint ellipses and boxes, whose density falls with the cube of their size; later ones hide earlier ones."""
     height, width = yuv.shape[:2]
     largest, smallest = height / 5, max(1.5, height / 240)
     # inverse transform of p(r) ~ r^-3 between the two
     radii = (smallest**-2 - rng.random(OBJECTS) * (smallest**-2 - largest**-2)) ** -0.5
-    # every picture has some objects near by, whatever the law's tail yields
+    # every picture has some objects near by, however the tail is drawn
     radii[:: OBJECTS // 12] = rng.uniform(0.4, 1.0, radii[:: OBJECTS // 12].size) * largest
     for radius in radii:
         centre = (int(rng.integers(width)), int(rng.integers(height)))
@@ -122,9 +109,9 @@ def _paint_objects(yuv: Pixels, rng: np.random.Generator) -> None:
 
 
 def _texture(width: int, height: int, rng: np.random.Generator) -> Plane:
-    """Return noise of every scale, rough here and smooth there.
+    """Return noise of every scale, with rough and smooth regions.
 
-    Octaves of equal strength would be 1/f noise; coarse ones are weaker, as the objects bring coarse power already.
+    Octaves of equal strength would be 1/f noise; coarse ones are weaker, because the objects have coarse power already.
     """
     texture = np.zeros((height, width), np.float32)
     cell = 2
@@ -136,7 +123,7 @@ def _texture(width: int, height: int, rng: np.random.Generator) -> Plane:
 
 
 def _luma(yuv: Pixels, texture: Plane, rng: np.random.Generator) -> Plane:
-    """Light, texture and blur the painted luma, and add what a sensor adds."""
+    """Light, texture and blur the painted luma, and add the sensor's noise."""
     height, width = texture.shape
     light = 1 + LIGHT * _noise(width, height, max(2, height // 2), rng)
     luma = _blur(yuv[..., 0] * light + TEXTURE * texture, LENS_BLUR_PX)

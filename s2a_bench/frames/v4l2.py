@@ -1,4 +1,4 @@
-"""Real cameras, through Linux' V4L2: one as a source of the YUYV that its driver delivers, and which there are."""
+"""Real cameras through Linux' V4L2: a camera as a source of its driver's YUYV, and the list of cameras."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import cv2
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import SourceError
-from s2a_bench.frames import check_size
-from s2a_bench.types import Encoding, Frame, Pixels
+from s2a_bench.frames import NumberedSource
+from s2a_bench.types import Encoding, Pixels
 
 VIDIOC_QUERYCAP = 0x80685600
 VIDIOC_ENUM_FMT = 0xC0405602
@@ -33,34 +33,32 @@ CAN_CAPTURE, CAN_CAPTURE_PLANES, HAS_DEVICE_CAPS = 0x00000001, 0x00001000, 0x800
 CAPTURE, CAPTURE_PLANES = 1, 9
 DISCRETE = 1
 MOST = 64
-"""Entries of a list that are asked for; a driver that never says "no more" is cut off."""
+"""The most entries of a list that are read: a driver might never end it."""
 
 QUEUE = 10
-"""The most buffers that OpenCV has a driver fill; 4 unless told otherwise."""
+"""The most buffers that OpenCV has a driver fill; its default is 4."""
 AT_ONCE_NS = 1_000_000
 """A frame delivered faster than this was waiting in the queue."""
 
 Ioctl = Callable[[int, int, bytes], bytes]
 
 
-class V4L2Camera:
+class V4L2Camera(NumberedSource):
     """A V4L2 capture device: (h, w, 2) ``yuv422_yuy2``, not converted.
 
-    ``stamp_ns`` is the driver's time of capture where it stamps with CLOCK_MONOTONIC, as USB cameras' does, else that
-    of arrival. read() passes over frames that grew old in the driver's queue while nobody read.
-    Raises UsageError for an odd width, SourceError when the device cannot be used or offers no such frames.
+    ``stamp_ns`` is the driver's time of capture if it stamps with CLOCK_MONOTONIC, as USB cameras do, else the time of
+    arrival. read() skips frames that grew old in the driver's queue. ``where`` is ``/dev/video0`` or ``0``; ``fps`` is
+    the requested rate, ``self.fps`` the one that the camera reports.
+    Raises UsageError for an odd width, SourceError if the device cannot be used or offers no such frames.
     """
 
     where: ClassVar[str] = "DEVICE"
     encoding: Encoding = "yuv422_yuy2"
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
-        """Open ``where``, as ``/dev/video0`` or ``0``; ``fps`` is asked for, ``self.fps`` what the camera promises."""
-        check_size(width, height, even=True)
         self._path = f"/dev/video{where}" if where.isdecimal() else where
+        super().__init__(f"v4l2:{self._path}", width, height, even=True)
         _check_device(self._path)
-        self.name = f"v4l2:{self._path}"
-        self.width, self.height = width, height
         capture = self._capture = cv2.VideoCapture(self._path, cv2.CAP_V4L2)
         try:
             self._configure(capture, fps)
@@ -68,31 +66,26 @@ class V4L2Camera:
             self.close()
             raise
         self.fps = capture.get(cv2.CAP_PROP_FPS) or fps
-        self._index = 0
 
-    def read(self) -> Frame:
-        """Wait for the next frame; SourceError when the camera stops delivering, or once closed."""
-        if not self._capture.isOpened():
-            raise SourceError(f"`source`: {self.name} was closed, it has no more frames")
-        stamp_ns = self._grab()
+    def _picture(self) -> Pixels:
         done, picture = self._capture.retrieve()
         if not done or picture.nbytes != self.width * self.height * 2:
             raise SourceError(
                 f"`source`: {self._path} delivered {picture.nbytes if done else 'no'} bytes where "
                 f"{self.width}x{self.height} YUYV has {self.width * self.height * 2}; try another cable, port or `size`"
             )
-        data = cast("Pixels", picture).reshape(self.height, self.width, 2)
-        frame = Frame(self._index, stamp_ns, self.width, self.height, self.encoding, data)
-        self._index += 1
-        return frame
+        return cast("Pixels", picture).reshape(self.height, self.width, 2)
 
     def close(self) -> None:
+        super().close()
         self._capture.release()
 
     def _configure(self, capture: cv2.VideoCapture, fps: float) -> None:
-        """Ask for YUYV of our size and see whether that is what the camera gives."""
+        """Set YUYV of our size; raises SourceError unless the camera agrees."""
         if not capture.isOpened():
-            raise SourceError(f"`source`: cannot start {self._path}; `fuser -v {self._path}` shows who else uses it")
+            raise SourceError(
+                f"`source`: cannot start {self._path}; `fuser -v {self._path}` shows whether another program uses it"
+            )
         yuyv = cv2.VideoWriter.fourcc(*"YUYV")
         capture.set(cv2.CAP_PROP_FOURCC, yuyv)
         capture.set(cv2.CAP_PROP_FRAME_WIDTH, self.width)
@@ -109,16 +102,16 @@ class V4L2Camera:
             )
 
     def _grab(self) -> int:
-        """Have the driver hand over a frame and say when it was captured."""
+        """Have the driver hand over a frame; return its time of capture."""
         for _ in range(QUEUE):
-            asked_ns = now_ns()
+            began_ns = now_ns()
             if not self._capture.grab():
                 raise SourceError(f"`source`: {self._path} delivers no frames; is it still plugged in?")
             arrived_ns = now_ns()
             driver_ns = round(self._capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
-            # a driver that stamps with another clock is decades off, one that does not stamp says 0
+            # a driver that stamps with another clock is decades off, one that does not stamp gives 0
             stamp_ns = driver_ns if 0 < driver_ns <= arrived_ns else arrived_ns
-            waited = arrived_ns - asked_ns > AT_ONCE_NS
+            waited = arrived_ns - began_ns > AT_ONCE_NS
             # a USB camera stamps a frame's start, so one that just arrived is about one period old
             if waited or arrived_ns - stamp_ns < 2e9 / self.fps:
                 break
@@ -126,7 +119,7 @@ class V4L2Camera:
 
 
 def _check_device(path: str) -> None:
-    """Raise SourceError unless ``path`` is a capture device we may open: OpenCV tells no reason, and prints."""
+    """Raise SourceError unless ``path`` is a capture device that can be opened: OpenCV gives no reason."""
     try:
         device = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     except FileNotFoundError:
@@ -152,12 +145,12 @@ def _check_device(path: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class CameraInfo:
-    """One capture device; ``problem`` says why nothing is known of it."""
+    """One capture device; ``problem`` is the reason if it cannot be examined."""
 
     path: str
     card: str = ""
     formats: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
-    """Four-letter code -> sizes; of a range of sizes the smallest and the largest."""
+    """Four-letter code -> sizes; the smallest and the largest if they are a range."""
     problem: str = ""
 
     def summary(self) -> str:
@@ -167,12 +160,12 @@ class CameraInfo:
 
 
 def list_cameras(folder: Path = Path("/dev"), ioctl: Ioctl = fcntl.ioctl) -> list[CameraInfo]:
-    """Look at every ``video`` device; those that capture nothing (metadata, encoders) are left out."""
+    """Examine every ``video`` device; those that capture nothing (metadata, encoders) are left out."""
     paths = sorted(folder.glob("video[0-9]*"), key=lambda path: int(re.sub(r"\D", "", path.name)))
-    return [camera for path in paths if (camera := _look(path, ioctl)) is not None]
+    return [camera for path in paths if (camera := _examine(path, ioctl)) is not None]
 
 
-def _look(path: Path, ioctl: Ioctl) -> CameraInfo | None:
+def _examine(path: Path, ioctl: Ioctl) -> CameraInfo | None:
     try:
         device = os.open(path, os.O_RDWR | os.O_NONBLOCK)
     except PermissionError:
@@ -202,7 +195,7 @@ def _formats(device: int, kind: int, ioctl: Ioctl) -> dict[str, list[tuple[int, 
         try:
             answer = ioctl(device, VIDIOC_ENUM_FMT, FORMAT.pack(index, kind, 0, b"", 0))
         except OSError as error:
-            if error.errno != errno.EINVAL:  # EINVAL: no more of them
+            if error.errno != errno.EINVAL:  # EINVAL: the end of the list
                 raise
             break
         code: int = FORMAT.unpack(answer)[4]
@@ -211,7 +204,7 @@ def _formats(device: int, kind: int, ioctl: Ioctl) -> dict[str, list[tuple[int, 
 
 
 def _sizes(device: int, code: int, ioctl: Ioctl) -> list[tuple[int, int]]:
-    """List the sizes of a format; a driver need not know them."""
+    """List the sizes of a format, as far as the driver knows them."""
     sizes: list[tuple[int, int]] = []
     for index in range(MOST):
         try:
