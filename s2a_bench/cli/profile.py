@@ -122,10 +122,10 @@ def _capture(
     json_: Json = False,
 ) -> None:
     from s2a_bench.cli.progress import RunProgress
-    from s2a_bench.experiments.profile_capture.run import capture, make_room, write_profile
+    from s2a_bench.experiments.profile_capture.run import capture, prepare_file, write_profile
 
     path = output / f"{config.name}.toml"
-    make_room(path, force=force)
+    prepare_file(path, force=force)
     with RunProgress() as progress:
         tables = capture(config, progress)
         for warning in tables["capture"]["warnings"]:

@@ -140,7 +140,7 @@ def test_throughput_of_a_server_that_does_not_tell_says_only_that(tmp_path: Path
     with serving(reply) as url:
         done = program("throughput", *SMALL, "--url", url, "--output", tmp_path)
     output = " ".join(done.stdout.split())
-    assert "http/as-deployed: the server does not tell T_eval, so decode stands in for N / T_eval." in output
+    assert "http/as-deployed: the server does not report T_eval; decode stands in for N / T_eval." in output
     assert "the engine's own figure" not in output
 
 

@@ -187,7 +187,7 @@ def test_without_threads_the_reference_has_those_of_this_process() -> None:
         ("illegal", "AMX does not work; compile it on this machine: nothing"),
         ("garbage", "not llama-bench's JSON"),
         ("empty", "not llama-bench's JSON"),
-        ("old", "too old to know --flash-attn auto"),
+        ("old", "too old for --flash-attn auto"),
     ],
 )
 def test_a_reference_that_fails_says_so_in_one_line(

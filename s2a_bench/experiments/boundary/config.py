@@ -1,4 +1,4 @@
-"""Which plane a boundary run draws, and what it refuses."""
+"""The options of a boundary run."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from s2a_bench.policy.evaluate import Grid
 
 PLANS: Final = 2000
-"""Plans a point with jitter; without, one tells all."""
+"""Plans a point with jitter; without jitter all plans are equal."""
 MARKS, SHADES = 25, 73
-"""Rates of a grid whose points are drawn one by one, or as shades."""
+"""Rates of a grid that is drawn as marks, or as shades."""
 
 
 class BoundaryConfig(Options):
-    """Which plane is drawn."""
+    """The plane of tokens per skill and rate."""
 
     profiles: Names = option(
         ("rtx-4080", "jetson-agx-orin", "jetson-orin-nano"),
@@ -47,7 +47,7 @@ class BoundaryConfig(Options):
 
     @cached_property
     def boards(self) -> list[Profile]:
-        """Read the profiles; raises UsageError for one that there is not."""
+        """The profiles; raises UsageError for an unknown one."""
         from s2a_bench.boards.profile import load_profile
 
         return [load_profile(name) for name in self.profiles]
@@ -58,7 +58,7 @@ class BoundaryConfig(Options):
 
     @property
     def durations(self) -> dict[str, float]:
-        """Return what a skill may take, in s: as naive runs it, and at the least."""
+        """The durations of a skill in s: as naive runs it, and the least."""
         return {"t_nom": self.t_nom_s, "t_min": self.t_min * self.t_nom_s}
 
     @property
@@ -90,5 +90,5 @@ class BoundaryConfig(Options):
         gaps_of(self.jitter, 1.0)
 
     def to_manifest(self) -> dict[str, object]:
-        """Return the options as plain data, with the numbers that follow from others."""
+        """Return the options as plain data, with the numbers that follow from them."""
         return {**self.model_dump(), "plans": self.plans_a_point, "points": self.rates_tried}

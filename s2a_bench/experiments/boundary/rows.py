@@ -12,8 +12,7 @@ from s2a_bench.store.schema import Fraction, Many, Positive, Table, about
 class BoundaryRow:
     """One point of the plane of tokens per skill and rate: whether naive is stall-free there, by formula and by trial.
 
-    ``duration`` names what every skill takes: t_nom or t_min. ``board`` is the profile that has this rate, empty for
-    points of the grid. ``stall_free`` is the formula's answer, ``p_stall`` the share of ``plans`` that stalled.
+    ``duration`` of every skill: t_nom or t_min. ``board`` is the profile with this rate, empty for points of the grid.
     """
 
     duration: str
@@ -29,4 +28,3 @@ class BoundaryRow:
 
 
 BOUNDARY: Final[Table[BoundaryRow]] = Table("boundary", BoundaryRow)
-"""One row a point of the plane."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def run_boundary(config: BoundaryConfig, output: Path, progress: Progress) -> Path:
-    """Compute the plane and return the run folder; raises S2AError for what a user can mend."""
+    """Compute the plane and return the run folder; raises S2AError."""
     manifest = {
         "configuration": config.to_manifest(),
         "environment": environment.collect(),
@@ -47,7 +47,7 @@ def run_boundary(config: BoundaryConfig, output: Path, progress: Progress) -> Pa
 
 
 def rows(config: BoundaryConfig, duration: str, grid: Grid, board: str = "") -> Iterator[BoundaryRow]:
-    """Ask formula and trial at every point; all points of a grid share their draws."""
+    """Yield formula and trial at every point; all points of a grid share their draws."""
     duration_s = config.durations[duration]
     free = analytic(grid, duration_s)
     share = simulate(

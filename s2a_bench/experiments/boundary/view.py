@@ -1,4 +1,4 @@
-"""How a boundary run is shown: tables, JSON, and figure 2 of the paper, where naive is stall-free."""
+"""The tables and JSON of a boundary run, and its figure: where naive is stall-free (the paper's figure 2)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 DURATIONS = ("t_nom", "t_min")
-"""As skills are executed, and as the paper draws the line."""
+"""The durations of naive execution, and of the paper's line."""
 _FREE, _BETWEEN, _STALLS = "#009E73", "#F0E442", "#D55E00"
 _SHADE: Final = 0.3
 _INK: Final = "#222222"
@@ -76,12 +76,12 @@ def marks_of(run: StoredRun) -> list[tuple[str, float, pd.DataFrame]]:
 
 
 def is_random(run: StoredRun) -> bool:
-    """Return whether plans differ at a point."""
+    """Return whether the plans of a point differ."""
     return bool((run.table(BOUNDARY)["plans"] > 1).any())
 
 
 def board_table(run: StoredRun) -> TextTable:
-    """Lay out the boards: gap between skills, and whether naive is stall-free there."""
+    """Return the table of the boards: gap between skills, and whether naive is stall-free."""
     groups = []
     for title, rate, points in marks_of(run):
         nominal, least = (points[points["duration"] == name].to_dict("records") for name in DURATIONS)
@@ -97,7 +97,7 @@ def board_table(run: StoredRun) -> TextTable:
 
 
 def line_table(run: StoredRun) -> TextTable:
-    """Lay out the slowest stall-free rate: L / T, and the slowest of the grid's rates that passed the trial."""
+    """Return the table of the slowest stall-free rates: L / T, and the slowest rate that passed the trial."""
     rows = []
     for tokens in sorted(grid_of(run, "t_nom")["tokens_per_skill"].unique()):
         row = [str(tokens)]
@@ -112,13 +112,13 @@ def line_table(run: StoredRun) -> TextTable:
 
 
 def boundary_csv(run: StoredRun) -> dict[str, CsvTable]:
-    """Return file name -> CSV table: every point of the plane and of the boards."""
+    """Return file name -> CSV table."""
     names = ("duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall")
     return {"boundary.csv": CsvTable.of(names, run.table(BOUNDARY)[list(names)].itertuples(index=False, name=None))}
 
 
 def boundary_sentences(run: StoredRun) -> list[str]:
-    """Return whether the formula holds, and what the paper's line leaves out."""
+    """Return where naive stalls, and whether the formula agrees."""
     points = len(run.table(BOUNDARY))
     sentences = [f"Naive execution was tried at {points} points of rate and tokens per skill."]
     if is_random(run):
@@ -133,7 +133,7 @@ def boundary_sentences(run: StoredRun) -> list[str]:
 
 
 def disagreements(run: StoredRun) -> int:
-    """Count the points where formula and trial differ; with jitter they must, so that only even tokens tell."""
+    """Count the points where formula and trial differ; meaningful for even tokens only."""
     rows = run.table(BOUNDARY)
     return int(((rows["p_stall"] == 0) != rows["stall_free"]).sum())
 
@@ -163,15 +163,15 @@ def _notes(run: StoredRun) -> tuple[str, ...]:
     else:
         notes.append(f"Formula and trial agree at {points - disagreements(run)} of {points} points.")
     if any(board["origin"] == "paper" for board in run.manifest["boards"]):
-        rates = "EMULATED: the boards' rates are the paper's (table II); nothing was measured here."
+        rates = "EMULATED: the boards' rates are the paper's (table II); nothing was measured."
         notes.append(Note(rates, EMULATED, PAPERS))
     return tuple(notes)
 
 
 def build_boundary(run: StoredRun) -> Figure:
-    """Draw the lines R = L / T_nom and R = L / T_min, what trials found, and the boards.
+    """Draw the lines R = L / T_nom and R = L / T_min, the trials, and the boards.
 
-    Without jitter regions are shaded by the formula and every trial is a mark; with jitter P(a plan stalls) is shaded.
+    Without jitter the formula's regions are shaded and every trial is a mark; with jitter P(a plan stalls) is shaded.
     """
     figure = new_figure(3.4, _caption(run))
     axes = figure.subplots()
@@ -205,7 +205,6 @@ def build_boundary(run: StoredRun) -> Figure:
 
 
 def _shade_regions(axes: Axes, tokens: np.ndarray, lines: dict[str, float], low: float, high: float) -> None:
-    """Shade what the formula says."""
     nominal, least = tokens / lines["t_nom"], tokens / lines["t_min"]
     for below, above, colour, label in (
         (least, high, _FREE, "stall-free"),
@@ -223,7 +222,6 @@ def _mark_trials(axes: Axes, run: StoredRun) -> None:
 
 
 def _shade_shares(figure: Figure, axes: Axes, run: StoredRun) -> None:
-    """Shade the share of plans that stall, as executed at T_nom."""
     table = grid_of(run, "t_nom").pivot_table(index="tokens_per_s", columns="tokens_per_skill", values="p_stall")
     mesh = axes.pcolormesh(
         table.columns.to_numpy(dtype="float64"),
@@ -239,7 +237,7 @@ def _shade_shares(figure: Figure, axes: Axes, run: StoredRun) -> None:
 
 
 def _mark_boards(axes: Axes, run: StoredRun) -> None:
-    """Draw a line a board, named beside it, with its granularities: filled where naive is stall-free at T_nom."""
+    """Draw a named line a board with its granularities: filled where naive is stall-free at T_nom."""
     for title, rate, points in marks_of(run):
         nominal = points[points["duration"] == "t_nom"]
         axes.axhline(rate, color=_INK, linewidth=0.5, linestyle=":")
@@ -264,6 +262,6 @@ def _caption(run: StoredRun) -> tuple[str, ...]:
     jitter = f"{settings['plans']} plans a point, jitter {settings['jitter']}"
     facts.append(jitter if is_random(run) else "tokens come evenly")
     paper = any(board["origin"] == "paper" for board in run.manifest["boards"])
-    whose = " at the paper's rates (not measured here)" if paper else ""
-    squares = f"Squares: boards{whose}, filled where the formula says stall-free."
+    rates = " at the paper's rates (not measured)" if paper else ""
+    squares = f"Squares: boards{rates}, filled where the formula says stall-free."
     return ("Stall-free region of naive execution", f"{', '.join(facts)}.", *([squares] if marks_of(run) else []))

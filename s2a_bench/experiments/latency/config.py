@@ -11,7 +11,7 @@ from s2a_bench.transport import PAYLOADS, Payloads
 
 
 class LatencyConfig(RequestsConfig):
-    """The settings of a latency run: all of a run of requests, and of the engine what matters to transports."""
+    """The options of a latency run: those of requests, and of the engine those that matter to transports."""
 
     COUNTS_TOKENS: ClassVar[str] = ""
 
@@ -31,6 +31,6 @@ class LatencyConfig(RequestsConfig):
 
     @property
     def usual_payloads(self) -> tuple[str, ...]:
-        """Return raw, and JPEG as a second block where there is time and no name has a payload of its own."""
+        """Raw; and JPEG, unless the run is quick or streams, or a pipeline names its payload."""
         named = any("payload=" in name for name in self.names)
         return ("raw",) if self.quick or self.mode == "stream" or named else ("raw", "jpeg")

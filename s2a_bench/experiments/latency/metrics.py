@@ -1,4 +1,4 @@
-"""What a latency run is measured by: the metric table, and from it JSON, CSV and comparison; times in ms."""
+"""The metric table of a latency run, and its JSON, CSV and comparison; times in ms."""
 
 from __future__ import annotations
 
@@ -36,27 +36,27 @@ METRICS: Final = (
         "e2e_without_inference",
         "ms",
         title="e2e w/o infer.",
-        about="Absent behind a black box that does not tell its inference time.",
+        about="Absent if the server does not report its inference time.",
     ),
     RequestMetric(
         "e2e_without_model",
         "ms",
         title="e2e w/o model",
-        about="e2e less what the model computes up to the first token; preprocessing is left in. Of a llama-server: "
+        about="e2e less the model's time up to the first token; preprocessing is included. Of a llama-server: "
         "e2e less the prompt_ms it reports.",
     ),
     RequestMetric("e2e", "ms", title="e2e"),
     RequestMetric("ttft", "ms", about="From the prompt: e2e without capture."),
     RequestMetric("frame_age", "ms", about="Age of the frame when inference starts."),
     *TOKEN_METRICS,
-    RequestMetric("residual", "ms", title="residual", about="What lies between the stages."),
+    RequestMetric("residual", "ms", title="residual", about="The time between the stages."),
     RequestMetric("residual_share", about="The residual as a share of e2e without inference."),
 )
-"""A metric is a row here: JSON and its schema, CSV, comparison and the tables have it from its row."""
+"""A metric is a row: JSON and its schema, CSV, comparison and tables follow from it."""
 
 
 def compared(metrics: Sequence[RequestMetric] = METRICS) -> Comparable:
-    """Return what latency runs are compared by: metrics, groups of stages, and the stages of a run."""
+    """Return what latency runs are compared by: metrics, groups of stages, and each run's stages."""
     groups = [RequestMetric(f"group.{name}", "ms", of=partial(RequestCell.sums_ms, group=name)) for name in GROUPS]
     shown = ("e2e_without_inference", "e2e", "itl")
     return compared_by(
@@ -68,7 +68,7 @@ def latency_cell(metrics: Sequence[RequestMetric] = METRICS) -> type:
     """Return the class of a cell of ``--json``."""
     return cell_class(
         "LatencyCell",
-        "One pipeline, stage by stage; what no sample has is an absent key.",
+        "One pipeline, stage by stage; a value that no sample has is an absent key.",
         metrics,
         residual_flagged=Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")],
         stages_ms=Annotated[dict[str, Summary], {"propertyNames": {"pattern": "^[a-z][a-z0-9_]*$"}}],
@@ -81,7 +81,7 @@ LatencyCell: Final = latency_cell()
 
 
 def latency_json(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, Any]:
-    """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
+    """Return the ``--json`` object (docs/schema/s2a-bench-1.json)."""
     cells = cells_of(run)
     found = [
         cell_json(
@@ -99,7 +99,7 @@ def latency_json(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> 
 
 
 def latency_csv(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, CsvTable]:
-    """Return file name -> CSV table in long form, one row a value, every digit kept; what is absent has no row."""
+    """Return file name -> CSV table in long form, unrounded; absent values have no row."""
     cells = cells_of(run)
     return {
         "stages.csv": CsvTable.of(("cell", "group", "stage", *SUMMARY, "emulated"), _stage_rows(cells)),
@@ -116,7 +116,6 @@ def _ratios(cells: list[RequestCell], run: StoredRun) -> Iterator[tuple[str, str
 
 
 def _stage_rows(cells: list[RequestCell]) -> Iterator[tuple[object, ...]]:
-    """Yield a row a cell and stage, the residual last."""
     for cell in cells:
         for stage in (*stages_present([cell]), "residual"):
             if summary := summary_of(cell.values_ms(stage)):
@@ -124,7 +123,7 @@ def _stage_rows(cells: list[RequestCell]) -> Iterator[tuple[object, ...]]:
 
 
 def _rows(cells: list[RequestCell], metrics: Sequence[RequestMetric]) -> Iterator[tuple[object, ...]]:
-    """Yield a row a cell and metric; a cell in which everything failed has one row, without numbers."""
+    """Yield a row a cell and metric; a cell without successful samples has one row, without numbers."""
     for cell in cells:
         found = [(key, summary_values(summary)) for _, key, summary in summarised([cell], metrics)]
         for key, values in found or [("", (0, *[None] * (len(SUMMARY) - 1)))]:

@@ -11,8 +11,5 @@ from s2a_bench.progress import Progress
 
 
 def run_latency(config: RequestsConfig, output: Path, progress: Progress) -> Path:
-    """Measure and return the run folder; whatever happens, the samples so far are in it.
-
-    Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
-    """
+    """Measure and return the run folder, which keeps the samples so far if S2AError or KeyboardInterrupt is raised."""
     return run_requests(Task("latency"), resolve(config.answered(progress.say)), output, progress)

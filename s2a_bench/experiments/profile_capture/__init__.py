@@ -20,7 +20,7 @@ LEAST_GAPS: Final = 40
 
 
 class CaptureConfig(Options):
-    """How this machine is measured."""
+    """The options of a capture."""
 
     name: str = option(..., "name of the profile; its file is NAME.toml", argument=True)
     title: str = option("", "what figures call it [default: the board's or CPU's name]")
@@ -45,7 +45,7 @@ class CaptureConfig(Options):
 
 @dataclass(frozen=True, kw_only=True)
 class BoardFacts:
-    """This board; what cannot be read is absent."""
+    """This board; unreadable facts are absent."""
 
     model: Annotated[str | None, about("From the device tree.")] = None
     gpu: str | None = None
@@ -58,7 +58,7 @@ class BoardFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class ProfileJson:
-    """One board running one model."""
+    """One board with one model."""
 
     name: str
     title: str
@@ -71,12 +71,12 @@ class ProfileJson:
     ttft_s: Annotated[NonNegative, about("prompt_s + 1 / tokens_per_s.")]
     gaps: Annotated[dict[str, Any], Facts(required=["family"], properties={"family": {"enum": list(FAMILIES)}})]
     recorded: Annotated[Count, about("How many gaps the recording holds; 0: there is none.")]
-    assumed: Annotated[list[str], about("Keys whose values nobody measured.")]
+    assumed: Annotated[list[str], about("Keys of assumed values.")]
     dummy: Annotated[bool, about("Whether the model's weights were dummies.")]
     facts: Annotated[dict[str, dict[str, Any]], about("The file's free tables.")]
-    differences: Annotated[
-        list[str] | None, about("match: in which state the profile's board was and this one is not.")
-    ] = None
+    differences: Annotated[list[str] | None, about("match: states of the profile's board that this one is not in.")] = (
+        None
+    )
 
 
 def profile_json(profile: Profile, path: Path, differences: list[str] | None = None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Measure this machine as a hardware profile: requests with ever new pictures, every gap between tokens kept."""
+"""Measure this machine as a hardware profile: requests with new pictures, and every gap between tokens."""
 
 from __future__ import annotations
 
@@ -52,14 +52,14 @@ _MODEL_FACTS = (
 
 @dataclass(frozen=True, slots=True)
 class TimedAnswer:
-    """One request as timed: to its first token, and from each token to the next."""
+    """The times of one request: to its first token, and from each token to the next."""
 
     ttft_ns: int
     gaps_ns: list[int]
 
 
 def answers(engine: Engine, config: CaptureConfig) -> Iterator[TimedAnswer]:
-    """Ask again and again, each time about a new picture and with a new seed, and yield the times."""
+    """Yield the times of requests without end, each with a new picture and seed."""
     with ExitStack() as stack:
         source = Stamped(open_source(config.source, *config.size, seed=config.seed), "capture")
         stack.callback(source.close)
@@ -77,7 +77,6 @@ def _rgb(frame: Frame) -> Frame:
 
 
 def _timed(engine: Engine, request: Request) -> TimedAnswer:
-    """Answer one request; raises EngineError for an empty answer."""
     started = now_ns()
     times = [now_ns() for _ in engine.generate(request)]
     if not times:
@@ -86,17 +85,14 @@ def _timed(engine: Engine, request: Request) -> TimedAnswer:
 
 
 def open_model(config: EngineConfig) -> Engine:
-    """Open llama.cpp on this very thread: tokens handed over by another are seen late, and then several at once."""
+    """Open llama.cpp on this thread: another thread would hand tokens over late, and several at once."""
     from s2a_bench.inference.llama_cpp import LlamaCppEngine
 
     return LlamaCppEngine(config)
 
 
 def capture(config: CaptureConfig, progress: Progress) -> dict[str, Any]:
-    """Measure, and return the profile as the tables of its file.
-
-    Raises EngineError where the model's answers are too short to time.
-    """
+    """Measure, and return the profile as the tables of its file; raises EngineError for short answers."""
     need_engine(config.engine)
     limit_threads()
     progress.expect(config.warmup + config.requests)
@@ -183,7 +179,7 @@ def document(
 
 
 def rate_cv(rows: list[list[float]]) -> float:
-    """Return the spread of requests' mean gaps beyond what independent gaps would make, as a share of the mean."""
+    """Return the spread of requests' mean gaps beyond that of independent gaps, as a share of the mean."""
     import numpy as np
 
     long = [row for row in rows if len(row) > 1]
@@ -195,10 +191,10 @@ def rate_cv(rows: list[list[float]]) -> float:
 
 
 def write_profile(tables: dict[str, Any], path: Path, *, force: bool) -> Profile:
-    """Write the file and return what it reads as; raises UsageError where it is there already, else StoreError."""
+    """Write the file and return its profile; raises UsageError if the file exists, else StoreError."""
     text = to_toml(tables)
     profile = parse_profile(path.stem, text, f"profile {path}")
-    make_room(path, force=force)
+    prepare_file(path, force=force)
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:
@@ -206,8 +202,8 @@ def write_profile(tables: dict[str, Any], path: Path, *, force: bool) -> Profile
     return profile
 
 
-def make_room(path: Path, *, force: bool) -> None:
-    """Make the file's folder, before anything is measured in vain; raises as `write_profile`."""
+def prepare_file(path: Path, *, force: bool) -> None:
+    """Create the file's folder before measuring; raises as `write_profile`."""
     if path.exists() and not force:
         raise UsageError(f"{path} exists already; give another NAME or `output`, or `force` to replace it")
     try:

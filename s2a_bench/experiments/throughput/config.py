@@ -16,18 +16,16 @@ from s2a_bench.text import none_of
 from s2a_bench.transport.defaults import LLAMA_SERVER, LOOPBACK
 
 IN_PROCESS: Final = "in-process"
-"""What this command calls the transport `loopback`: here it is the engine that is looked at, not the way to it."""
-
-
+"""The name of the transport `loopback` in this command, which measures the engine."""
 TWIN: Final = "llama-server"
-"""What `engine` may be here besides: llama.cpp's own server, beside the engine in this process on the same files."""
+"""An additional `engine`: llama.cpp's server beside the engine in this process, on the same files."""
 TWINS: Final = (IN_PROCESS, LLAMA_SERVER)
 
 
-def _ways(written: str) -> str:
-    for way in listed(written) or ("",):
-        if way not in FLASH_ATTENTION:
-            raise ValueError(none_of(way, FLASH_ATTENTION))
+def _check_settings(written: str) -> str:
+    for setting in listed(written) or ("",):
+        if setting not in FLASH_ATTENTION:
+            raise ValueError(none_of(setting, FLASH_ATTENTION))
     return ",".join(listed(written))
 
 
@@ -40,13 +38,13 @@ class ThroughputEngine(EngineConfig):
         f"(EMULATED), {TWIN} is llama.cpp's own, in turn with llama in this process",
         flag="engine",
     )
-    flash_attention: Annotated[str, AfterValidator(_ways)] = option(
+    flash_attention: Annotated[str, AfterValidator(_check_settings)] = option(
         "auto", "auto (llama.cpp's own choice), on, off; several with commas, each in cells of its own"
     )
 
 
 class ThroughputConfig(FirstVariants):
-    """The settings of a throughput run."""
+    """The options of a throughput run."""
 
     QUICK: ClassVar[dict[str, int]] = {"requests": 3, "warmup": 1, "max_tokens": 32}
     OF_ENGINE: ClassVar[tuple[str, ...]] = ("flash_attention",)
@@ -67,7 +65,7 @@ class ThroughputConfig(FirstVariants):
     )
 
     def __init__(self, **given: Any) -> None:
-        """Keep what is given, `TWINS` for the engine of that name; raises UsageError naming the field."""
+        """Replace the engine `TWIN` by the transports `TWINS`; raises UsageError naming the field."""
         engine = given.get("engine")
         if isinstance(engine, Mapping) and engine.get("name") == TWIN:
             if "transports" in given:
@@ -82,13 +80,13 @@ class ThroughputConfig(FirstVariants):
 
     @property
     def names(self) -> Sequence[str]:
-        """Return pipeline names, ``in-process`` by that of its transport, each with every way of flash attention."""
+        """Pipeline names, with the transport of ``in-process``, each with every setting of flash attention."""
         written = (name.partition("?") for name in self.transports)
         names = [f"{LOOPBACK if path == IN_PROCESS else path}{mark}{query}" for path, mark, query in written]
-        ways = listed(self.engine.flash_attention)
-        if len(ways) == 1:
+        settings = listed(self.engine.flash_attention)
+        if len(settings) == 1:
             return names
-        return [f"{name}{'&' if '?' in name else '?'}flash_attention={way}" for name in names for way in ways]
+        return [f"{name}{'&' if '?' in name else '?'}flash_attention={each}" for name in names for each in settings]
 
     @property
     def greedy(self) -> bool:

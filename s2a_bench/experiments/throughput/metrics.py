@@ -1,4 +1,4 @@
-"""What a throughput run is measured by: the reference's rows, the metric table, and JSON, CSV and compare from it."""
+"""The metric table of a throughput run, the reference's rows, and JSON, CSV and comparison."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ReferenceRow:
-    """One run of llama-bench beside ours: ``n_gen`` tokens decoded in ``decode_ns``, behind ``depth`` others."""
+    """One run of llama-bench: ``n_gen`` tokens decoded in ``decode_ns``, after ``depth`` others."""
 
     block: int
     position: int
@@ -49,18 +49,12 @@ class ReferenceRow:
 
 
 REFERENCE: Final[Table[ReferenceRow]] = Table("reference", ReferenceRow)
-"""One row a run of the reference program."""
-
-
+"""One row a run of llama-bench."""
 RATIO_METRIC: Final = "decode_tokens_per_s"
-"""What cells and the reference are compared by."""
-
+"""The metric of ratios of cells and llama-bench."""
 ENGINE_METRIC: Final = "tokens_per_s"
-"""What engines are compared by besides: sending is not in it."""
-
+"""The metric of ratios of engines: without sending."""
 LLAMA_BENCH: Final = "llama-bench"
-"""How the reference is called where cells are listed."""
-
 BIN: Final = 32
 """Tokens of one bin of the rates by position."""
 
@@ -79,7 +73,7 @@ class Position:
 
 ThroughputCell: Final = cell_class(
     "ThroughputCell",
-    "One pipeline in tokens a second; what no request has is an absent key.",
+    "One pipeline in tokens a second; a value that no request has is an absent key.",
     METRICS,
     t_eval=Annotated[
         Literal["engine", "client"],
@@ -100,19 +94,19 @@ class Reference:
 
 
 def throughput_cells(run: StoredRun) -> list[RequestCell]:
-    """Split a run into its cells: in-process first, then HTTP and ROS."""
+    """Return the cells of a run, in-process first."""
     return sorted(cells_of(run), key=lambda cell: not declared_transport(cell.pipeline).in_process)
 
 
 def joined(cell: RequestCell) -> int:
-    """Count tokens that came together with another, as where a server holds back half a character."""
+    """Count tokens that arrived together with another, as when a server holds back half a character."""
     return int((cell.n_tokens - cell.fact("events")).clip(lower=0).sum())
 
 
 def rates_by_position(cell: RequestCell) -> dict[tuple[int, int], Floats]:
-    """Return (first, last token of a bin, from 0) -> decode rates there, one a request that got so far.
+    """Return (first, last token of a bin, from 0) -> decode rates, one for each request that reached the bin.
 
-    The gap before token i belongs to the bin of i; token 0 has none.
+    The gap before token i belongs to the bin of i.
     """
     answers = cell.answers
     gaps = answers.assign(bin=answers["index"] // BIN).dropna(subset="gap_ns")
@@ -124,7 +118,7 @@ def rates_by_position(cell: RequestCell) -> dict[tuple[int, int], Floats]:
 
 
 def reference_by_launch(run: StoredRun) -> dict[int, dict[int, list[float]]]:
-    """Return llama-bench's tokens/s by launch and block, its warm-ups left out."""
+    """Return llama-bench's tokens/s by launch and block, without warm-ups."""
     rows = run.table(REFERENCE)
     counted = rows[~rows["warmup"]]
     return by_launch(counted, counted["n_gen"] / counted["decode_ns"] * 1e9)
@@ -137,15 +131,15 @@ def reference_values(run: StoredRun) -> list[float]:
 
 
 def reference_depths(run: StoredRun) -> list[int]:
-    """Return how many tokens lay before those that llama-bench timed: one number where all prompts are alike."""
+    """Return the distinct numbers of tokens before those that llama-bench timed."""
     rows = run.table(REFERENCE)
     return sorted({int(depth) for depth in rows[~rows["warmup"]]["depth"]})
 
 
 def ratios_of(run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[str, str, str, Ratio]]:
-    """Yield metric, cell, base and ratio: every cell to llama-bench where it ran, and every other cell to in-process.
+    """Yield metric, cell, base and ratio: every cell to llama-bench, if it ran, and to in-process.
 
-    Cells that another engine answered are compared by the engines' own figures too.
+    Cells of different engines are compared by the engines' figures too.
     """
     reference, seed = reference_by_launch(run), run.bootstrap_seed
     for cell in cells:
@@ -165,7 +159,7 @@ def ratios_of(run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[st
 
 
 def throughput_json(run: StoredRun) -> dict[str, Any]:
-    """Return the object that ``--json`` prints; strict JSON, as docs/schema/s2a-bench-1.json describes it."""
+    """Return the ``--json`` object (docs/schema/s2a-bench-1.json)."""
     cells = throughput_cells(run)
     found = [
         cell_json(
@@ -186,7 +180,7 @@ def throughput_json(run: StoredRun) -> dict[str, Any]:
 
 
 def throughput_csv(run: StoredRun) -> dict[str, CsvTable]:
-    """Return file name -> CSV table, every digit kept; what is absent has no row."""
+    """Return file name -> CSV table, unrounded; absent values have no row."""
     cells = throughput_cells(run)
     rows = [
         (cell.name, key, *summary_values(summary), cell.emulated) for cell, key, summary in summarised(cells, METRICS)
@@ -206,8 +200,8 @@ def throughput_csv(run: StoredRun) -> dict[str, CsvTable]:
 
 
 def _base(cell: RequestCell, cells: Sequence[RequestCell]) -> RequestCell | None:
-    """Return the cell in this process whose engine is set alike, as its name ends, or the first; None for itself."""
-    here = [each for each in cells if declared_transport(each.pipeline).in_process]
-    alike = [each for each in here if each is not cell and cell.name.endswith(each.name.partition("?")[2])]
-    found = max(alike, key=lambda each: len(each.name), default=here[0] if here else None)
+    """Return the in-process cell with the same engine settings (the end of its name), or the first; None for itself."""
+    local = [each for each in cells if declared_transport(each.pipeline).in_process]
+    matching = [each for each in local if each is not cell and cell.name.endswith(each.name.partition("?")[2])]
+    found = max(matching, key=lambda each: len(each.name), default=local[0] if local else None)
     return None if found is cell else found

@@ -1,8 +1,8 @@
-"""The throughput run: how many tokens a second a model writes, in this process, over transports, beside llama-bench.
+"""The throughput run: tokens a second in this process, over transports, and of llama-bench.
 
-llama.cpp's own ``llama-bench`` is a reference on the same file and settings, one run of it a block. Its ``tg`` test
-decodes random tokens, samples nothing and turns nothing into text. It starts behind ``--n-depth`` tokens, here as many
-as our prompts have, as attention costs more the longer the context is.
+llama.cpp's ``llama-bench`` is a reference on the same file and settings, one run a block. Its ``tg`` test decodes
+random tokens, without sampling or text. It starts after ``--n-depth`` tokens, as many as our prompts have: attention
+costs more with a longer context.
 """
 
 from __future__ import annotations
@@ -26,14 +26,11 @@ from s2a_bench.progress import Progress
 from s2a_bench.store.run import RunWriter
 
 LONGEST_S = 7200
-"""A board that writes half a token a second still ends in time."""
+"""Long enough for a board with half a token a second."""
 
 
 def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -> Path:
-    """Measure and return the run folder; whatever happens, the samples so far are in it.
-
-    Raises S2AError for what a user can mend; KeyboardInterrupt passes through.
-    """
+    """Measure and return the run folder, which keeps the samples so far if S2AError or KeyboardInterrupt is raised."""
 
     def drive(launch: RunningLaunch) -> None:
         def longest_prompt() -> int:
@@ -52,10 +49,10 @@ def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -
 
 
 class LlamaBench:
-    """One turn of llama-bench a block; called with its place."""
+    """Runs llama-bench once a block; called with its place."""
 
     def __init__(self, program: Path, plan: RunPlan, writer: RunWriter, depth: Callable[[], int]) -> None:
-        """Prepare the command; ``depth`` tells how many tokens lie in the context before those that are timed."""
+        """Prepare the command; ``depth()`` is the number of tokens in the context before the timed ones."""
         self._program = program
         self._writer = writer
         self._depth = depth
@@ -65,7 +62,7 @@ class LlamaBench:
         self._command += ["--n-prompt", "0", "--n-gen", str(plan.request.max_pieces)]
 
     def __call__(self, place: Place) -> None:
-        """Run it once and keep what it says; raises EngineError where it fails."""
+        """Run it once and store its result; raises EngineError."""
         command = [*self._command, "--n-depth", str(self._depth())]
         self._writer.update(reference={"command": command})
         started_ns = now_ns()
@@ -106,7 +103,7 @@ class LlamaBench:
             ) from error
         if isinstance(test.get("flash_attn"), bool) and self._flash_attention != "off":
             raise EngineError(
-                f"--reference {self._program}: it is too old to know --flash-attn {self._flash_attention}, reads that "
-                "as off and would be compared with something else; take a newer one, or --flash-attention off"
+                f"--reference {self._program}: it is too old for --flash-attn {self._flash_attention}, which it reads "
+                "as off, and would measure other settings; take a newer one, or --flash-attention off"
             )
         return dict(test)

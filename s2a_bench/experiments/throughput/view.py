@@ -1,4 +1,4 @@
-"""How a throughput run is shown: rates with the paper's table II beside them, the prompt, gaps, rates by position."""
+"""The tables and figures of a throughput run: rates, the prompt, gaps, rates by position; the paper's table II."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
 
 
 def throughput_sentences(run: StoredRun) -> list[str]:
-    """Return how many tokens a second each cell generates."""
+    """Return each cell's tokens a second."""
     sentences, cells = [], throughput_cells(run)
     for cell in cells:
         if found := summary_of(cell.values(ENGINE_METRIC)):
@@ -83,7 +83,7 @@ def throughput_tables(run: StoredRun) -> dict[str, TextTable]:
 
 
 def speed_table(run: StoredRun) -> TextTable:
-    """Lay out the rates: the paper's, what the client saw, and the ratios."""
+    """Return the table of the rates: the paper's, the client's, and the ratios."""
     cells = throughput_cells(run)
     reference = reference_values(run)
     ratios = {(of, to): ratio for metric, of, to, ratio in ratios_of(run, cells) if metric == RATIO_METRIC}
@@ -118,7 +118,7 @@ def _median_mean(values: Floats) -> str:
 
 
 def prompt_table(run: StoredRun) -> TextTable:
-    """Lay out what happens before the first token, part by part, and the step after it: medians."""
+    """Return the table of the time before the first token, and of the step after it: medians."""
     columns = (
         *("prompt_tokens", "preprocess_ms", "vision_encode_ms", "prompt_eval_ms", "prompt_ms"),
         *("prefill_tokens_per_s", "first_decode_ms", "ttft_ms"),
@@ -136,7 +136,7 @@ def prompt_table(run: StoredRun) -> TextTable:
 
 
 def gap_table(run: StoredRun) -> TextTable:
-    """Lay out the gaps between tokens, each gap of each request."""
+    """Return the table of all gaps between tokens."""
     rows = []
     for cell in throughput_cells(run):
         gaps = cell.values("itl")
@@ -147,10 +147,10 @@ def gap_table(run: StoredRun) -> TextTable:
 
 
 def position_table(run: StoredRun) -> TextTable | None:
-    """Lay out the decode rate by the place in the answer; None where all answers end in the first bin."""
+    """Return the table of decode rates by position in the answer; None if all answers end in the first bin."""
     found = {cell.name: rates_by_position(cell) for cell in throughput_cells(run)}
     bins = sorted({place for rates in found.values() for place in rates})
-    if len(bins) < 2:  # noqa: PLR2004 - one bin is the whole answer, which stands elsewhere
+    if len(bins) < 2:  # noqa: PLR2004 - one bin is the whole answer, which has a table
         return None
     rows: list[tuple[str, ...]] = [
         (
@@ -167,23 +167,23 @@ def _notes(run: StoredRun, cells: list[RequestCell], launches: tuple[str, ...]) 
     notes = ["N / T_eval is the engine's own figure, as in the paper."] if len(without_time) < len(cells) else []
     notes.append("decode is (n - 1) / (t_last - t_first) at the client.")
     if without_time:
-        notes.append(f"{', '.join(without_time)}: the server does not tell T_eval, so decode stands in for N / T_eval.")
+        notes.append(f"{', '.join(without_time)}: the server does not report T_eval; decode stands in for N / T_eval.")
     facts = sorted({cell.about["size"] for cell in cells})
     if sampling := (run.manifest.get("model") or {}).get("sampling"):
         facts.append(f"sampling of our engine: {sampling}")
     notes += [f"{', '.join(facts)}.", *launches, *engine_notes(run, cells)]
     if depths := reference_depths(run):
         notes.append(
-            f"{LLAMA_BENCH} decodes behind {', '.join(map(str, depths))} tokens, as our requests do; "
-            "it samples nothing and writes no text."
+            f"{LLAMA_BENCH} decodes after {', '.join(map(str, depths))} tokens, as our requests do, "
+            "without sampling or text."
         )
     if together := sum(map(joined, cells)):
-        notes.append(f"{together} tokens came together with another one: gaps are between arrivals.")
+        notes.append(f"{together} tokens arrived together with another one: gaps are between arrivals.")
     return notes
 
 
 def throughput_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
-    """Return every figure by its file's name; the paper's values where `against_paper`. No rates, no figures."""
+    """Return every figure by its file's name; none without rates."""
     if not any(cell.values(RATIO_METRIC).size for cell in throughput_cells(run)):
         return {}
     return {
@@ -194,9 +194,9 @@ def throughput_figures(run: StoredRun, *, against_paper: bool = False) -> dict[s
 
 
 def build_throughput_bars(run: StoredRun, *, against_paper: bool = False) -> Figure:
-    """Draw medians of N / T_eval, a row a cell (the paper's table II), and llama-bench's decode rate where it ran.
+    """Draw medians of N / T_eval, a row a cell (the paper's table II), and llama-bench's decode rate.
 
-    Bars from zero; points on a logarithmic axis where the rates are too far apart for one scale.
+    Bars from zero; points on a logarithmic axis if the rates differ too much.
     """
     cells = [cell for cell in throughput_cells(run) if cell.values(ENGINE_METRIC).size]
     styles = cell_styles({cell.name: cell.path for cell in cells})
@@ -226,9 +226,9 @@ def build_gap_distribution(run: StoredRun) -> Figure:
 
 
 def build_rate_by_position(run: StoredRun) -> Figure:
-    """Draw the decode rate over the place in the answer, median and a band from the lower to the upper quartile.
+    """Draw the decode rate over the position in the answer: median, and a band of the quartiles.
 
-    Not means: tokens that arrive together after a pause have any rate at all.
+    Not means: the rate of tokens that arrive together after a pause is arbitrary.
     """
     cells = [cell for cell in throughput_cells(run) if rates_by_position(cell)]
     styles = cell_styles({cell.name: cell.path for cell in cells})

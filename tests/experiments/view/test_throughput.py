@@ -149,7 +149,7 @@ def test_a_server_that_tells_nothing_has_the_clients_rate_and_no_zeros(make: Mak
     assert list(cell.values("tokens_per_s")) == list(cell.values("decode_tokens_per_s")) == [100.0] * 3
     for absent in ("prompt_ms", "image_ms", "prompt_eval_ms", "prefill_tokens_per_s", "tokens_per_joule"):
         assert cell.values(absent).size == 0
-    assert "the server does not tell T_eval" in " ".join(speed_table(run).notes)
+    assert "the server does not report T_eval" in " ".join(speed_table(run).notes)
     (cell,) = throughput_json(run)["cells"]
     assert cell["t_eval"] == "client"
     assert not {"prompt_ms", "image_ms", "tokens_per_joule"} & set(cell)
@@ -160,7 +160,7 @@ def test_tokens_that_come_together_are_counted_by_the_server(make: Make) -> None
     cell = only(run)
     assert list(cell.values("decode_tokens_per_s")) == [pytest.approx(100.0)] * 3  # 6 of 7 tokens in 60 ms
     assert joined(cell) == 12
-    assert "12 tokens came together with another one" in " ".join(speed_table(run).notes)
+    assert "12 tokens arrived together with another one" in " ".join(speed_table(run).notes)
 
 
 def test_warm_ups_are_in_no_number(make: Make) -> None:

@@ -1,4 +1,4 @@
-"""How a latency run is shown: sentences and tables."""
+"""The sentences and tables of a latency run."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 _STAGE_CELLS = 5
-"""With more cells than these the cells become rows, where there is no room for the whole table."""
+"""With more cells than this a narrow table has the cells as rows."""
 _MOST = 6
-"""Sentences of one kind; the tables have the rest."""
+"""Sentences of one kind."""
 
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
@@ -59,7 +59,7 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
 
 
 def latency_sentences(run: StoredRun) -> list[str]:
-    """Return how long each cell takes, and how many times as long as ROS or loopback."""
+    """Return each cell's median, and its ratio to those that it is compared with."""
     if not (cells := cells_of(run)):
         return []
     about = cells[0].about
@@ -90,7 +90,6 @@ def latency_sentences(run: StoredRun) -> list[str]:
 
 
 def _of(payload: str) -> str:
-    """Return whose pictures are meant, behind a name."""
     return f" with {payload} pictures" if payload else ""
 
 
@@ -106,7 +105,7 @@ def _times(cell: RequestCell, base: RequestCell, ratio: Ratio) -> str:
 
 
 _FOOT = ("residual", "e2e_without_inference", "preprocess", "e2e_without_model", "inference", "e2e")
-"""What stands below the stages, each sum below its parts; what the engines of a run do not tell is left out."""
+"""Rows below the stages, each sum below its terms."""
 _HEADINGS = {"preprocess": "preproc.", "inference": "infer.", **{metric.name: metric.title for metric in METRICS}}
 
 _FRAME_FOOT = {
@@ -114,14 +113,13 @@ _FRAME_FOOT = {
     "path": "frame path",
     "latency": "frame path from the intended time",
 }
-"""What stands below the stages of frames."""
+"""Column -> row below the stages of frames."""
 
 
 def stage_table(run: StoredRun, *, full: bool = True) -> TextTable:
-    """Lay out the stages in the order of the path, a column a cell: the median, and mean ± sd where ``full``.
+    """Return the table of the stages in path order, a column a cell: the median, and mean ± sd if ``full``.
 
-    Inference stands below the residual, so that what is compared, e2e without inference, reads as one sum, and so do
-    e2e without model and e2e below it.
+    Inference is below the residual, so that e2e without inference reads as one sum, and so do the rows below it.
     """
     cells = cells_of(run)
     rows: list[tuple[str, ...]] = []
@@ -146,7 +144,7 @@ def stage_table(run: StoredRun, *, full: bool = True) -> TextTable:
 
 
 def group_table(run: StoredRun) -> TextTable:
-    """Lay out the groups as columns and the cells as rows: for runs of many cells."""
+    """Return a table with groups as columns and cells as rows, for runs of many cells."""
     cells = cells_of(run)
     groups = [group for group in groups_present(cells) if group != "inference"]
     foot = _foot(cells)[1:]
@@ -166,8 +164,8 @@ def _by_cell(
     rows: Sequence[tuple[str, ...]],
     notes: Iterable[str],
 ) -> TextTable:
-    """Lay out a row a cell, and where there are several payloads a block each."""
-    if len(payloads_of(cells)) < 2:  # noqa: PLR2004 - one payload, which the notes say
+    """Return a table with a row a cell, in a block a payload if there are several."""
+    if len(payloads_of(cells)) < 2:  # noqa: PLR2004 - one payload, named by the notes
         named = [(cell.name, *row) for cell, row in zip(cells, rows, strict=True)]
         return TextTable(title, ("cell", *header), named, 1, notes=tuple(notes))
     blocks: dict[str, list[tuple[str, ...]]] = {}
@@ -177,7 +175,7 @@ def _by_cell(
 
 
 def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> TextTable:
-    """Lay out what a publication quotes: n, spread, percentiles, and the ratios to what is compared with."""
+    """Return the table of n, spread, percentiles and ratios."""
     cells = cells_of(run)
     bases: dict[str, list[RequestCell]] = {}
     for base in cells:
@@ -198,7 +196,7 @@ def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> Text
 
 
 def token_table(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> TextTable | None:
-    """Lay out what happens to every token after it left the engine; None where no server tells when that was."""
+    """Return the table of gaps and delays of tokens; None if no server reports when they left the engine."""
     cells = [cell for cell in cells_of(run) if cell.values("token_delay").size]
     if not cells:
         return None
@@ -210,7 +208,7 @@ def token_table(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> T
 
 
 def fact_table(run: StoredRun) -> TextTable | None:
-    """Lay out the facts of the requests; None without facts."""
+    """Return the table of the facts of requests; None without facts."""
     cells = cells_of(run) if run.facts else []
     facts_of = [[json.loads(str(facts)) for facts in cell.good["facts"]] for cell in cells]
     rows = []
@@ -224,7 +222,7 @@ def fact_table(run: StoredRun) -> TextTable | None:
 
 
 def _foot(cells: list[RequestCell]) -> list[str]:
-    """List what stands below the stages: preprocessing and e2e without model only where somebody tells them."""
+    """Return the rows below the stages; preprocessing and e2e without model only if reported."""
     optional = {"preprocess", "e2e_without_model"}
     return [name for name in _FOOT if name not in optional or any(cell.values_ms(name).size for cell in cells)]
 
@@ -245,8 +243,8 @@ def _notes(run: StoredRun, cells: list[RequestCell]) -> tuple[str, ...]:
     if any(cell.has_ingest for cell in cells):
         notes.append(
             "A llama-server's ingest slices and resizes the picture, which our engine counts as inference: compare e2e "
-            "or e2e without model. Of a llama-server that is e2e less the prompt_ms it reports, assumed to be all that "
-            "its model computes before the first token that it sends."
+            "or e2e without model. Of a llama-server that is e2e less the prompt_ms it reports, which is assumed to be "
+            "all of its model's time before the first token."
         )
     if flagged := sum(cell.flagged() for cell in cells):
         notes.append(
@@ -257,10 +255,7 @@ def _notes(run: StoredRun, cells: list[RequestCell]) -> tuple[str, ...]:
 
 
 def frame_table(run: StoredRun) -> TextTable | None:
-    """Lay out the budget of the frames that a prompt was about: medians in ms, a column a cell; None without frames.
-
-    The last row is the age of the frame when inference starts, from the samples.
-    """
+    """Return the table of the budget of frames with a prompt: medians in ms, a column a cell; None without frames."""
     if run.frames.empty:
         return None
     cells = cells_of(run)

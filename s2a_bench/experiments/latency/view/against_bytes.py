@@ -1,7 +1,7 @@
-"""Time against bytes, over the latency runs of a sweep: a fixed cost and a cost a megabyte for every pipeline.
+"""Time against bytes over the latency runs of a sweep: a fixed cost and a cost a megabyte for every pipeline.
 
 The bytes are those of the pictures as pixels (width x height x 3 x cameras), the same for every pipeline and payload,
-so that lines can cross; what of them travels is a column beside them. Loopback's line is the work on the pixels.
+so that lines can cross; the share on the wire is another column. Loopback's line is the work on the pixels.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ FITTED = (
     "the medians by relative distance; 95 % intervals of a bootstrap over launches and within each."
 )
 FIT = (
-    "Travels: bytes on the wire for each of the pixels. Off: root mean square of the medians' distances from the line; "
-    "launches differ, and what costs a call rather than a byte lies off it."
+    "Travels: bytes on the wire for each byte of the pixels. Off: root mean square of the medians' distances from the "
+    "line; launches differ, and a cost of calls rather than of bytes is off the line."
 )
 
 
@@ -47,14 +47,14 @@ class FittedPipeline:
     payload: str
     path: tuple[str, str]
     groups: tuple[tuple[float, Floats], ...]
-    """MB of pixels a request, ms of each request; an entry a run."""
+    """For each run: MB of pixels a request, ms of each request."""
     line: Line | None
-    travels: float | None
-    """Bytes on the wire for each of the pixels; None where nothing travels, or nobody tells."""
+    wire_share: float | None
+    """Bytes on the wire for each byte of the pixels; None in process, or if unknown."""
 
 
 def against_bytes(runs: Split) -> list[FittedPipeline]:
-    """Return the pipelines of latency runs that differ in how many bytes their pictures have; nothing of others."""
+    """Return the pipelines of latency runs with pictures of different sizes; empty for other runs."""
     found: dict[tuple[str, str], list[tuple[float, RequestCell]]] = {}
     for run, cells in runs:
         if run.manifest["command"] != "latency" or run.samples.empty or not (pixels := _pixels(run)):
@@ -62,7 +62,7 @@ def against_bytes(runs: Split) -> list[FittedPipeline]:
         payloads = payloads_of(cells)
         for cell in cells:
             if cell.values_ms(METRIC).size:
-                for payload in [cell.payload] if cell.payload else payloads or [""]:  # in process it is beside each
+                for payload in [cell.payload] if cell.payload else payloads or [""]:  # in process: beside each payload
                     found.setdefault((cell.label, payload), []).append((pixels, cell))
     lines = [_pipeline(name, payload, sized) for (name, payload), sized in found.items()]
     order = sorted(
@@ -76,19 +76,19 @@ def _pipeline(name: str, payload: str, cells: Sequence[tuple[float, RequestCell]
     shares = [
         float(sent.median()) / pixels for pixels, cell in cells if (sent := cell.good["payload_bytes"].dropna()).size
     ]
-    travels = float(np.median(shares)) if shares else None
-    return FittedPipeline(name, payload, cells[0][1].path, groups, fit_line(groups), travels)
+    wire_share = float(np.median(shares)) if shares else None
+    return FittedPipeline(name, payload, cells[0][1].path, groups, fit_line(groups), wire_share)
 
 
 def _pixels(run: StoredRun) -> int:
-    """Return the bytes of a request's pictures as pixels, scaled if they are before they travel."""
+    """Return the bytes of a request's pictures as pixels, after `resize`."""
     settings: Mapping[str, Any] = run.manifest["configuration"]
     width, height = settings.get("resize") or (settings.get("width", 0), settings.get("height", 0))
     return int(width) * int(height) * 3 * int(settings.get("cameras") or 1)
 
 
 def crossings(pipelines: Sequence[FittedPipeline]) -> list[tuple[FittedPipeline, FittedPipeline, Estimate]]:
-    """Return the pairs whose lines cross between the smallest and the largest picture: the cheaper below first."""
+    """Return (faster below, faster above, where) for lines that cross between the smallest and largest picture."""
     found = []
     for one, other in combinations([each for each in pipelines if each.line], 2):
         if not (one.line and other.line) or (one.name != other.name and one.payload != other.payload):
@@ -102,14 +102,14 @@ def crossings(pipelines: Sequence[FittedPipeline]) -> list[tuple[FittedPipeline,
 
 
 def line_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable:
-    """Lay out each line: the fixed cost, the cost a megabyte, what of the pixels travels, how well a line fits."""
+    """Return the table of the lines: fixed cost, cost a megabyte, share on the wire, fit."""
     rows: list[tuple[str, ...]] = [
         (
             each.name,
             each.payload,
             _estimate(each.line.fixed),
             _estimate(each.line.slope),
-            ABSENT if each.travels is None else f"{each.travels:.2f}",
+            ABSENT if each.wire_share is None else f"{each.wire_share:.2f}",
             f"{each.line.off:.0%}",
         )
         for each in pipelines
@@ -121,7 +121,7 @@ def line_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> 
 
 
 def crossing_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable | None:
-    """Lay out where lines cross, with loopback, which no picture travels over, left out; None where none do."""
+    """Return the table of the crossings of pipelines with a wire; None without any."""
     wired = [each for each in pipelines if not declared_transport(each.path[0]).in_process]
     rows: list[tuple[str, ...]] = [
         (_label(below), _label(above), _estimate(met))
@@ -146,7 +146,7 @@ def _estimate(found: Estimate) -> str:
 
 
 def build_lines(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> Figure:
-    """Draw medians and lines, a panel a payload, both axes logarithmic."""
+    """Draw medians and lines, a panel a payload, on logarithmic axes."""
     drawn = [each for each in pipelines if each.line]
     payloads = list(dict.fromkeys(each.payload for each in drawn))
     names = {each.name: each.path for each in drawn}
@@ -184,7 +184,7 @@ def _draw(axes: Axes, pipelines: Sequence[FittedPipeline], styles: Mapping[str, 
 
 
 def shown(runs: Split) -> tuple[dict[str, TextTable], dict[str, Callable[[], Figure]]]:
-    """Return the tables and the figure of runs that differ in bytes, by their files' names."""
+    """Return the tables and the figure of runs with pictures of different sizes, by their files' names."""
     pipelines = against_bytes(runs)
     if not pipelines:
         return {}, {}

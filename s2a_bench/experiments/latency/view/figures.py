@@ -1,4 +1,4 @@
-"""The figures of a latency run, drawn from its samples: bars, stage breakdown, distribution; PNG and PDF."""
+"""The figures of a latency run: bars, stage breakdown, distribution."""
 
 from __future__ import annotations
 
@@ -60,10 +60,10 @@ def build_latency_bars(run: StoredRun, *, against_paper: bool = False) -> Figure
 
 
 def build_stage_breakdown(run: StoredRun) -> Figure:
-    """Draw the median of every group of stages, stacked, the residual hatched (the paper's figure 6).
+    """Draw the medians of the groups of stages, stacked, the residual hatched (the paper's figure 6).
 
-    A line marks the median of the whole, which medians of parts do not add up to. Where the cells differ by more than
-    `WIDE_SPREAD` a second panel shows each group's share, so that the short bars can be read too.
+    A line marks the median of the whole; medians of stages do not add up to it. If the cells differ by more than
+    `WIDE_SPREAD`, a second panel shows shares, where short bars are legible.
     """
     from matplotlib.patches import Patch
 
@@ -71,7 +71,7 @@ def build_stage_breakdown(run: StoredRun) -> Figure:
     groups = [group for group in groups_present(cells) if group != "inference" or metric == "e2e"]
     fills = {group: GROUP_FILLS[group] for group in groups} | {"residual": RESIDUAL_FILL}
     wholes = [median(cell.values_ms(metric).tolist()) for cell in cells]
-    parts = [{name: _median(cell, name, cell.values_ms(metric).size) for name in fills} for cell in cells]
+    medians = [{name: _median(cell, name, cell.values_ms(metric).size) for name in fills} for cell in cells]
     shares = max(wholes) > WIDE_SPREAD * min(wholes)
     panels = 2 if shares else 1
     legend_rows = -(-(len(fills) + 1) // 4)
@@ -81,7 +81,7 @@ def build_stage_breakdown(run: StoredRun) -> Figure:
     figure = new_figure(height, _caption(run, cells, "Stages, medians", metric, *notes))
     all_axes = figure.subplots(panels, 1, squeeze=False)[:, 0]
     for axes, share in zip(all_axes, (False, True), strict=False):
-        for place, (part, whole) in enumerate(zip(parts, wholes, strict=True)):
+        for place, (part, whole) in enumerate(zip(medians, wholes, strict=True)):
             left, all_of_it = 0.0, sum(part.values())
             for name, (colour, hatch) in fills.items():
                 width = part[name] * (100 / all_of_it if share else 1)
@@ -91,7 +91,7 @@ def build_stage_breakdown(run: StoredRun) -> Figure:
                 draw_over(axes, (whole, whole), (place - 0.42, place + 0.42), "-", "" if place else "whole")
                 write_beside(axes, place, number(whole))
         name_rows(axes, [_label(cell) for cell in cells])
-        axes.set_xlim(0, 100 if share else 1.02 * max(*wholes, *(sum(part.values()) for part in parts)))
+        axes.set_xlim(0, 100 if share else 1.02 * max(*wholes, *(sum(part.values()) for part in medians)))
         axes.set_xlabel("share (%)" if share else _axis_label(metric))
     handles: list[object] = [
         Patch(facecolor=colour, hatch=hatch, edgecolor=_edge(name), linewidth=0.3, label=name)
@@ -104,7 +104,7 @@ def build_stage_breakdown(run: StoredRun) -> Figure:
 
 
 def build_latency_distribution(run: StoredRun) -> Figure:
-    """Draw the empirical distribution of e2e without inference, a line a cell; logarithmic where it spreads widely."""
+    """Draw the empirical distribution of e2e without inference, a line a cell; logarithmic if wide."""
     cells, metric = _shown(run)
     styles = cell_styles({cell.name: cell.path for cell in cells})
     named = zip(titles(cells), cells, strict=True)
@@ -113,7 +113,7 @@ def build_latency_distribution(run: StoredRun) -> Figure:
 
 
 def latency_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
-    """Return every figure by its file's name; the paper's values where `against_paper`. No samples, no figures."""
+    """Return every figure by its file's name; none without samples."""
     if not _shown(run)[0]:
         return {}
     return {
@@ -124,7 +124,7 @@ def latency_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str,
 
 
 def _shown(run: StoredRun) -> tuple[list[RequestCell], str]:
-    """Return the cells that can be drawn and by what: e2e only where no cell tells its inference apart."""
+    """Return the cells that can be drawn, and the metric: e2e only if no cell has e2e without inference."""
     cells = cells_of(run)
     for metric in ("e2e_without_inference", "e2e"):
         if shown := [cell for cell in cells if cell.values_ms(metric).size]:
@@ -145,13 +145,12 @@ def _axis_label(metric: str) -> str:
 
 
 def _label(cell: RequestCell) -> str:
-    """Return the label of a row: the cell, and its payload on a second line."""
     name = cell.label.replace("?", "\n?")
     return f"{name}\n({cell.payload})" if cell.payload else name
 
 
 def _median(cell: RequestCell, name: str, n: int) -> float:
-    """Return the median of a group over all samples; one without the group spent no time there."""
+    """Return the median of a group over all samples; a sample without the group counts as 0."""
     values: Floats = cell.values_ms("residual") if name == "residual" else cell.group_ms(name)
     return float(median((*values.tolist(), *[0.0] * (n - values.size))))
 
