@@ -1,4 +1,4 @@
-"""Car-to-car rear braking under each policy: who hits whom, and when."""
+"""Car-to-car rear braking under each policy: impacts and their speeds."""
 
 from s2a_bench.experiments import Experiment
 

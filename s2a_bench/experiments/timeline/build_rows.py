@@ -1,8 +1,4 @@
-"""Timelines as rows: what a policy made of plans, computed or really executed, in the integers of a run folder.
-
-Whoever has run plans (in virtual time, in real time or with a live model) hands over `Plans` and `Schedule` in
-seconds from the request, and gets the rows that every table and figure of timelines is made of.
-"""
+"""The rows of timelines: `Plans` and `Schedule` in seconds from the request, computed or executed, as table rows."""
 
 from __future__ import annotations
 
@@ -25,12 +21,11 @@ if TYPE_CHECKING:
     from s2a_bench.policy import Floats
 
 SAMPLE_S: Final = 0.01
-"""How finely the speed is sampled that jerk and SPARC are taken from."""
-
+"""Sampling period of the speed, for jerk and SPARC."""
 SHORTEST_MOTION_S: Final = 1e-9
-"""Shorter motions have no jerk and no SPARC: no sample of theirs moves."""
+"""Shorter motions have no jerk and no SPARC: none of their samples moves."""
 LONGEST_MOTION_S: Final = 1000.0
-"""Longer motions have none of these: their samples would fill the memory."""
+"""Longer motions have none either: their samples would fill the memory."""
 
 
 def timeline_rows(
@@ -46,10 +41,10 @@ def timeline_rows(
     observed_s: float = 0.0,
     tolerance_s: float = TOLERANCE_S,
 ) -> list[PlanRow]:
-    """Describe M timelines; ``tolerance_s`` is the longest gap that is no stall for ``any_stall`` (default 1 us).
+    """Return the rows of M timelines; gaps up to ``tolerance_s`` are no stall for ``any_stall``.
 
-    ``caution`` is one lambda, or one a plan. Motion is computed for plans below `KEPT_PLANS`. ``observed_s`` is when
-    the picture was taken, from the request.
+    ``caution`` is one lambda, or one a plan. Motion is computed for plans below `KEPT_PLANS`. ``observed_s`` is the
+    time of the picture from the request.
     """
     found = metrics_of(plans, schedule, observed_s=observed_s, tolerance_s=tolerance_s)
     rows = []
@@ -81,7 +76,7 @@ def timeline_rows(
 
 
 def metrics_of(plans: Plans, schedule: Schedule, *, observed_s: float, tolerance_s: float) -> dict[str, NDArray[Any]]:
-    """Return the metrics of M timelines by their names, but for motion: arrays of shape (M,), times in s."""
+    """Return the metrics of M timelines without motion: arrays of shape (M,), times in s."""
     arrival_s, nominal_s, least_s = align(plans.arrival_s, plans.nominal_s, plans.least_s)
     found = measure(plans, schedule, observed_s=observed_s)
     safe_s = safe_start(arrival_s, nominal_s)
@@ -97,7 +92,7 @@ def metrics_of(plans: Plans, schedule: Schedule, *, observed_s: float, tolerance
 
 
 def _motion(schedule: Schedule, nominal_s: Floats, place: int) -> dict[str, float]:
-    """Return jerk and smoothness of one timeline, under the model of `speed_profile`; none if too long or too short."""
+    """Return jerk and smoothness of one timeline in the model of `speed_profile`; empty if too long or too short."""
     start_s, duration_s, nominal_s = (
         np.ascontiguousarray(values[:, place]) for values in align(schedule.start_s, schedule.duration_s, nominal_s)
     )

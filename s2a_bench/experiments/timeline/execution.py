@@ -1,4 +1,4 @@
-"""Really executing: several policies side by side on one stream of tokens, each with its executor, in real time."""
+"""Execution in real time: several policies side by side on one stream of tokens, each with its executor."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import RunWriter
 
 SWITCH_S: Final = 0.0005
-"""How soon Python's threads give way to one another: at the usual 5 ms a busy thread would make starts that late."""
+"""Python's switch interval between threads: with the default 5 ms a busy thread would delay starts by as much."""
 
 
 class SideBySide:
@@ -38,7 +38,7 @@ class SideBySide:
     def __init__(
         self, policies: Mapping[str, Policy], shape: PlanShape, gap: Gap, robots: Sequence[SkillRobot], silence_s: float
     ) -> None:
-        """Prepare; policies by the names they are recorded under, one robot each."""
+        """Create the executors: one robot a policy; ``policies`` by their recorded names."""
         self._inboxes = [LiveInbox() for _ in policies]
         clock = SystemClock()
         self._executors = [
@@ -52,7 +52,7 @@ class SideBySide:
     def records(self) -> list[Record]:
         return [executor.record for executor in self._executors]
 
-    def tell(self, event: Event) -> None:
+    def send(self, event: Event) -> None:
         for inbox in self._inboxes:
             inbox.put(event)
 
@@ -65,13 +65,13 @@ class SideBySide:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:
-            self.tell(AbortRequested(now_ns(), "the run was ended"))
+            self.send(AbortRequested(now_ns(), "the run was ended"))
         self._pool.shutdown()
 
 
 @contextmanager
 def quick_switching() -> Iterator[None]:
-    """Let threads give way to one another soon."""
+    """Shorten the switch interval between threads to `SWITCH_S`."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(SWITCH_S)
     try:
@@ -88,9 +88,9 @@ def keep(
     policies: Mapping[str, Policy],
     records: Sequence[Record],
 ) -> list[RunWarning]:
-    """Write what happened as rows, as far as skills ran, and return the warnings.
+    """Write the rows of the skills that ran, and return the warnings.
 
-    A rate of 0 says that too few tokens came to know it; then there are no rows.
+    A rate of 0 means too few tokens to measure it: then no rows are written.
     """
     for record in records:
         cell = f"{setting.name}/{record.policy}"
@@ -117,7 +117,7 @@ def keep(
 
 
 def jitter_facts(records: Sequence[Record]) -> dict[str, float | int]:
-    """Summarise the start jitter of all skills that were started; empty where none was."""
+    """Summarise the start jitter of all skills; empty without skills."""
     values = [skill.jitter_ns / 1e6 for record in records for skill in record.skills]
     if not values:
         return {}
@@ -126,7 +126,7 @@ def jitter_facts(records: Sequence[Record]) -> dict[str, float | int]:
 
 
 def _arrays(record: Record, requested_ns: int) -> tuple[Plans, Schedule, Any]:
-    """Return what ran as arrays of shape (N, 1), in s from the request, and when each skill was due."""
+    """Return the skills that ran as arrays of shape (N, 1) in s from the request, and their due times."""
 
     def column(value: Callable[[SkillRun], float]) -> Any:
         return np.array([[value(skill)] for skill in record.ran])
@@ -146,7 +146,7 @@ def _arrays(record: Record, requested_ns: int) -> tuple[Plans, Schedule, Any]:
 
 
 def _facts(record: Record) -> dict[str, Any]:
-    """Return what the tables do not hold: how the plan ended, and every order with its time from the request, in ms."""
+    """Return the facts that the tables lack: the plan's outcome, and every order with its time in ms."""
     zero_ns = record.requested_ns or 0
     return {
         "outcome": record.outcome,
@@ -162,15 +162,15 @@ def _facts(record: Record) -> dict[str, Any]:
 
 
 def _warnings(setting: PlanSetting, plan: int, records: Sequence[Record]) -> Iterator[RunWarning]:
-    """Tell of a plan that was not completed; once where all policies met the same."""
+    """Yield a warning for each way in which the plan was not completed."""
     ends: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         if record.outcome != "completed":
             ends.setdefault((record.outcome or "unfinished", record.why), []).append(record)
-    for (outcome, why), same in ends.items():
-        ran = ", ".join(f"{record.policy} {len(record.ran)}" for record in same)
+    for (outcome, why), ended in ends.items():
+        ran = ", ".join(f"{record.policy} {len(record.ran)}" for record in ended)
         yield RunWarning(
             f"plan-{outcome}",
             f"{setting.name}, plan {plan + 1}: {why}; the robots held after {ran} of {setting.n_skills} skills",
-            "their numbers are about the skills that ran; see 'executions' in manifest.json",
+            "their numbers describe the skills that ran; see 'executions' in manifest.json",
         )

@@ -1,7 +1,7 @@
 """Live timelines: a model writes plans, over a real transport, and every policy executes them as they arrive.
 
-Tokens, parsing and execution are real. With ``--pace`` the server holds the tokens back to a rate: then the rate is
-set, and labelled as set; nothing is emulated unless the engine is the replay of a profile.
+Tokens, parsing and execution are real. With ``--pace`` the server delays the tokens to a rate, which is labelled as
+set; only the replay of a profile is emulated.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from s2a_bench.store.requests import SKILLS
 
 
 def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
-    """Ask for plans, execute them, and return the run folder; raises S2AError for what a user can mend.
+    """Request plans, execute them, and return the run folder; raises S2AError.
 
-    Whatever happens, the timelines so far are in the folder. KeyboardInterrupt passes through, after the robots hold.
+    The folder keeps the timelines so far; the robots hold before KeyboardInterrupt passes through.
     """
     plan, asks = prepare_requests(config, progress)
     seed = plan.request.seed
@@ -75,24 +75,24 @@ def _execute(
     robots: Sequence[SkillRobot],
     records: list[Record],
 ) -> None:
-    """Ask for one plan, let every policy execute it as it arrives, and add what they did to ``records``."""
+    """Request one plan, execute it under every policy as it arrives, and extend ``records``."""
     policies, progress = following.policies(), link.launch.progress
     span_s = ask.n_skills * (ask.tokens_per_skill / link.rate if link.rate else 0.0) + ask.n_skills * ask.t_nom_s
     progress.stage(f"{link.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
     side_by_side = SideBySide(policies, ask.shape, ask.skills.gap, robots, link.config.timeout_s)
-    feed = PlanFeed(Parser(ask.format), side_by_side.tell)
+    feed = PlanFeed(Parser(ask.format), side_by_side.send)
     title = f"live {link.cell.name}, L = {ask.tokens_per_skill}{_remarks(link)}"
     request_id = ""
     try:
         with side_by_side, watching(progress, Scene(title, side_by_side.records, ask.n_skills, span_s)):
             try:
                 request_id = link.request(ask, plan, feed).sample.request_id
-            except S2AError as error:  # the run ends, but not in the middle of a skill
-                side_by_side.tell(StreamBroke(now_ns(), "stream-error", f"{type(error).__name__}: {error}"))
+            except S2AError as error:  # the run ends after the current skills
+                side_by_side.send(StreamBroke(now_ns(), "stream-error", f"{type(error).__name__}: {error}"))
                 side_by_side.finish()
                 raise
             side_by_side.finish()
-    finally:  # what an interruption leaves is kept too
+    finally:  # also after an interruption
         executed = side_by_side.records
         records += executed
         link.learn_rate(max((record.token_ns for record in executed), key=len))

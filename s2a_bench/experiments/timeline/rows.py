@@ -1,6 +1,6 @@
-"""The rows of a timeline run, and the one metric table that columns, JSON, CSV, tables and comparison are made of.
+"""The rows of a timeline run, and its metric table, from which columns, JSON, CSV, tables and comparison follow.
 
-A new metric is a row here, and under its name an array of one number a plan in `build_rows.metrics_of`.
+A new metric is a row of the table, and an array of one number a plan under its name in `build_rows.metrics_of`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class TimelineMetric(Metric):
     def stored(self, value: float) -> int | float | bool:
         if self.kind == TIME:
             return round(float(value) * 1e9)
-        # Times are exact to a nanosecond, so that what is less of a share is rounding; 0.0 makes -0.0 a zero.
+        # Times are exact to a nanosecond: smaller shares are rounding errors; adding 0.0 turns -0.0 into 0.0.
         plain: int | float | bool = self.column_type(value)
         return round(plain, 9) + 0.0 if isinstance(plain, float) else plain
 
@@ -108,16 +108,14 @@ METRICS: Final[Mapping[str, TimelineMetric]] = {
         ),
     )
 }
-"""The metrics by their names, in the order of their columns."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanRow:
-    """What a row of `TIMELINES` says of its plan besides the metrics.
+    """The columns of a row of `TIMELINES` besides the metrics.
 
-    ``board`` is a profile's name, empty where only a rate was given. ``mode`` says what passed the time: ``virtual``
-    (computed), else a clock; ``emulated`` is true where no model answered. ``requested_ns`` is when the clock showed
-    the request, from which all times count: 0 in virtual time.
+    ``board`` is a profile's name, empty for a given rate. ``mode`` is ``virtual`` (computed), or the clock;
+    ``emulated`` is true if no model answered. All times count from ``requested_ns``, 0 in virtual time.
     """
 
     cell: str

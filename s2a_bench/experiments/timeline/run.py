@@ -38,7 +38,7 @@ MODE = "real-time"
 
 
 def run_timeline(config: TimelineConfig, output: Path, progress: Progress) -> Path:
-    """Run all timelines and return the run folder; raises S2AError for what a user can mend."""
+    """Run all timelines and return the run folder; raises S2AError."""
     if config.live:
         from s2a_bench.experiments.timeline.live import run_live
 
@@ -48,7 +48,7 @@ def run_timeline(config: TimelineConfig, output: Path, progress: Progress) -> Pa
     work = list(settings(config))
     answers = recordings(config.calibrate) if config.calibrate else []
     for _, setting in work if answers else ():
-        plans_of(config, setting, answers)  # what is wrong shows before there is a folder
+        plans_of(config, setting, answers)  # refuse before the folder is created
     with RunWriter.create(output, "timeline", manifest_of(config, work), (TIMELINES, SKILLS, TOKENS)) as writer:
         progress.opened(writer.path)
         progress.stage("computing timelines")
@@ -67,7 +67,7 @@ def run_timeline(config: TimelineConfig, output: Path, progress: Progress) -> Pa
 def _compute(
     config: TimelineConfig, board: Board, setting: PlanSetting, answers: Sequence[Floats], writer: RunWriter
 ) -> dict[str, Any]:
-    """Draw one setting's plans, let every policy decide them, keep the rows and return the calibrations."""
+    """Draw one setting's plans, schedule them under every policy, write the rows and return the calibrations."""
     known = learn(config, board, setting, answers)
     token_s, plans = draw(config, board, setting, config.plans_a_cell, "plans")
     request_ids = [setting.request_id(plan) for plan in range(config.plans_a_cell)]
@@ -83,7 +83,7 @@ def _compute(
 def _decide(
     known: Knowledge, chosen: Policy, plans: Plans, *, track: bool
 ) -> tuple[float | Sequence[float | None] | None, Schedule]:
-    """Return a policy's lambda, of each plan where it follows them, and what it makes of the plans."""
+    """Return a policy's lambda, one a plan if it tracks them, and its schedule."""
     tracked = known.tracked(chosen) if track else None
     if tracked is not None:
         cautions, schedule = tracked.follow(plans)
@@ -93,7 +93,7 @@ def _decide(
 
 
 def manifest_of(config: TimelineConfig, work: Sequence[tuple[Board, PlanSetting]]) -> dict[str, Any]:
-    """Return what is known before a run that no model answers."""
+    """Return the manifest of a run without a model."""
     return {
         "configuration": config.to_manifest(),
         "environment": environment.collect(),
@@ -104,7 +104,6 @@ def manifest_of(config: TimelineConfig, work: Sequence[tuple[Board, PlanSetting]
 
 
 def _origins(config: TimelineConfig, work: Sequence[tuple[Board, PlanSetting]]) -> Origins:
-    """Return where the numbers of each timeline come from: its board's tokens."""
     clock = {setting.mode: "virtual" if setting.mode == "virtual" else "monotonic" for _, setting in work}
     cells = {
         name: replace(board.provenance, clock=clock[setting.mode])
@@ -115,7 +114,7 @@ def _origins(config: TimelineConfig, work: Sequence[tuple[Board, PlanSetting]]) 
 
 
 def _facts(board: Board) -> dict[str, Any]:
-    """Return a board as plain data; a recording as its family alone."""
+    """Return a board as plain data, without a recording's gaps."""
     plain = asdict(board) | {"gaps": to_table(board.gaps)}
     plain["gaps"].pop("trace", None)
     return plain
@@ -136,9 +135,9 @@ def calibration_warnings(calibrations: dict[str, Any]) -> list[RunWarning]:
 
 
 def recordings(folder: Path) -> list[Floats]:
-    """Return the token times of every request that counts, in s from the request, of a latency or throughput run.
+    """Return the token times, in s from the request, of the requests that count of a latency or throughput run.
 
-    Raises StoreError where there is no run, UsageError where it has no tokens.
+    Raises StoreError without a run, UsageError without tokens.
     """
     run = read_run(folder)
     samples = run.samples
@@ -157,15 +156,14 @@ def recordings(folder: Path) -> list[Floats]:
 
 @dataclass(frozen=True, slots=True)
 class _Play:
-    """One plan to be played: when its tokens come, and what they say."""
+    """One plan to play: the times of its tokens, and the plan of shape (N, 1)."""
 
     token_s: Floats
     plans: Plans
-    """Of shape (N, 1)."""
 
     @property
     def calls(self) -> list[Call]:
-        """Return the skills; nobody wrote them, so they are numbers with durations."""
+        """The skills, numbered, with their durations."""
         times = zip(self.plans.least_s[:, 0], self.plans.nominal_s[:, 0], self.plans.most_s[:, 0], strict=True)
         return [
             Call(Skill(f"skill{number}", (), Durations(*map(float, durations)), "hold"), ())
@@ -174,14 +172,14 @@ class _Play:
 
     @property
     def span_s(self) -> float:
-        """Return when the last policy ends: the one that waits."""
+        """The end of the last policy, which waits for the whole plan."""
         return float(self.plans.arrival_s[-1, 0] + self.plans.nominal_s.sum())
 
 
 def run_real_time(config: TimelineConfig, output: Path, progress: Progress) -> Path:
     """Play all timelines, one setting after the other, and return the run folder; raises S2AError.
 
-    Nothing is measured of a model: arrivals are emulated, executions are real.
+    Arrivals are emulated, executions are real.
     """
     answers = recordings(config.calibrate) if config.calibrate else []
     work = [(board, replace(setting, mode=MODE)) for board, setting in settings(config)]
@@ -211,7 +209,6 @@ class _RealTime:
     calibrations: dict[str, Any] = field(default_factory=dict)
 
     def play(self, board: Board, setting: PlanSetting) -> None:
-        """Play the plans of one setting."""
         config = self.config
         self.progress.stage(f"learning {setting.title}")
         known = learn(config, board, setting, self.answers)
@@ -228,7 +225,6 @@ class _RealTime:
             self.progress.advance()
 
     def _execute(self, setting: PlanSetting, plan: int, play: _Play, following: Following) -> None:
-        """Let every policy execute one plan."""
         self.progress.stage(f"{setting.title}, L = {setting.tokens_per_skill}: about {play.span_s:.0f} s")
         safe_s = float(safe_start(play.plans.arrival_s, play.plans.nominal_s)[0])
         shape = replace(self.config.shape(setting), safe_start_s=safe_s)
@@ -239,7 +235,7 @@ class _RealTime:
         try:
             with executors, watching(self.progress, Scene(title, executors.records, setting.n_skills, play.span_s)):
                 _play(play, setting.tokens_per_skill, executors)
-        finally:  # what an interruption leaves is kept too
+        finally:  # also after an interruption
             self.records += executors.records
             request_id = setting.request_id(plan)
             if plan < KEPT_PLANS:
@@ -248,7 +244,6 @@ class _RealTime:
         following.learn(executors.records)
 
     def conclude(self) -> None:
-        """Write the facts of the whole run."""
         warnings = [*self.warnings, *calibration_warnings(self.calibrations)]
         self.writer.update(
             calibrations=self.calibrations,
@@ -258,18 +253,18 @@ class _RealTime:
 
 
 def _play(play: _Play, tokens_per_skill: int, executors: SideBySide) -> None:
-    """Tell the executors of every token at its time, and wait until they are done."""
+    """Send every token to the executors at its time, and wait until they finish."""
     clock = SystemClock()
     requested_ns = clock.now_ns()
-    executors.tell(Requested(requested_ns))
+    executors.send(Requested(requested_ns))
     calls = iter(play.calls)
     for place, due_s in enumerate(play.token_s, start=1):
         clock.sleep_until_ns(requested_ns + round(float(due_s) * 1e9))
         at_ns = clock.now_ns()
-        executors.tell(TokenArrived(at_ns))
+        executors.send(TokenArrived(at_ns))
         if place % tokens_per_skill == 0:
-            executors.tell(SkillArrived(at_ns, next(calls)))
-    executors.tell(StreamEnded(clock.now_ns()))
+            executors.send(SkillArrived(at_ns, next(calls)))
+    executors.send(StreamEnded(clock.now_ns()))
     executors.finish()
 
 

@@ -1,4 +1,4 @@
-"""Timelines while they happen: lanes that grow on the terminal, or a line a policy where there is none."""
+"""Timelines as they are executed: growing lanes on a terminal, else a line a policy."""
 
 from __future__ import annotations
 
@@ -18,23 +18,22 @@ STATUS = 21
 """Columns to the right of the lanes."""
 LEAST_LANE = 20
 NARROW = 90
-"""Terminals of fewer columns get no words beside the lanes, but short ones."""
+"""Terminals with fewer columns get short texts beside the lanes."""
 COLOURS = ("blue", "yellow", "green", "cyan", "magenta")
 STALL_S = 0.02
-"""Shorter ones are the machine's, not the policy's: POLICY section 1."""
-
+"""Shorter stalls are the machine's, not the policy's: POLICY section 1."""
 WAITING, SKILL, STALL, TOKEN, COMPLETE, NOW, SAFE = "─█╱·┃│┊"  # noqa: RUF001 - a hatch, not a slash
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """What can be watched while it happens: the records grow."""
+    """A view of records that grow."""
 
     title: str
     records: Sequence[Record]
     n_skills: int
     span_s: float
-    """About how long it takes."""
+    """Expected duration."""
 
     def draw(self, width: int) -> Group:
         return draw(self, now_ns(), width)
@@ -44,7 +43,7 @@ class Scene:
 
 
 def draw(scene: Scene, at_ns: int, width: int) -> Group:
-    """Draw a scene at a moment, ``width`` columns wide: tokens, a lane a policy, and the time axis below."""
+    """Draw a scene at a time, ``width`` columns wide: tokens, a lane a policy, and the time axis."""
     names = max(len(record.policy) for record in scene.records)
     status = STATUS if width >= NARROW else STATUS - 9
     first = scene.records[0]
@@ -65,7 +64,7 @@ def draw(scene: Scene, at_ns: int, width: int) -> Group:
 
 
 def summary(record: Record) -> str:
-    """Say in words how a plan went."""
+    """Return how a plan ended, as text."""
     stalls = _stalls_s(record)
     if not record.skills or record.requested_ns is None:
         return f"{record.outcome}, nothing was started" + (f": {record.why}" if record.why else "")
@@ -85,7 +84,6 @@ class _Axis:
         return min(max(int(at_s / self.span_s * self.columns), 0), self.columns - 1)
 
     def cells(self, from_s: float, to_s: float) -> range:
-        """Return the columns of a stretch, one at least."""
         first = self.column(from_s)
         return range(first, max(self.column(to_s), first + 1))
 
@@ -95,7 +93,6 @@ def _row(name: str, names: int, lane: Text, status: str) -> Text:
 
 
 def _tokens(record: Record, axis: _Axis, now_s: float | None) -> Text:
-    """Draw tokens, those that complete a skill, and the present."""
     cells = [" "] * axis.columns
     zero_ns = record.requested_ns or 0
     for at_ns in list(record.token_ns):
@@ -108,7 +105,6 @@ def _tokens(record: Record, axis: _Axis, now_s: float | None) -> Text:
 
 
 def _lane(record: Record, axis: _Axis, now_s: float, safe_s: float | None, colour: str) -> Text:
-    """Draw one policy: waiting, skills with their numbers, stalls, S0 and the present."""
     cells: list[tuple[str, str]] = [(" ", "")] * axis.columns
     zero_ns = record.requested_ns or 0
     skills = list(record.skills)
@@ -144,14 +140,14 @@ def _stalls_s(record: Record) -> list[float]:
 
 
 def _scale(axis: _Axis, safe_s: float | None, known: bool) -> Text:
-    """Write the times below the lanes, and where S0 is: so far in brackets, until the whole plan has come."""
+    """Return the time axis with S0, in brackets until the whole plan has arrived."""
     cells = [" "] * axis.columns
     step = next(
         (each for each in (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50, 100, 200, 500) if each / axis.span_s * axis.columns > 7),  # noqa: PLR2004 - columns that a number needs
         axis.span_s,
     )
     marks = [(step * place, f"{step * place:g}") for place in range(int(axis.span_s / step) + 1)]
-    if safe_s is not None:  # first, so that a number too near makes room
+    if safe_s is not None:  # first, so that it replaces a number too near
         marks.insert(0, (safe_s, "S0" if known else "(S0)"))
     for at_s, text in marks:
         column = min(axis.column(at_s), axis.columns - len(text))
@@ -161,7 +157,7 @@ def _scale(axis: _Axis, safe_s: float | None, known: bool) -> Text:
 
 
 def _safe_s(record: Record) -> float | None:
-    """Return S0 of the skills that have arrived; None before the first."""
+    """Return S0 of the skills so far; None before the first."""
     found, before_s = None, 0.0
     for at_ns, call in list(record.arrivals):
         at_s = (at_ns - (record.requested_ns or 0)) / 1e9
@@ -171,7 +167,7 @@ def _safe_s(record: Record) -> float | None:
 
 
 def _end_s(record: Record) -> float:
-    """Return when the last skill ended, or the stream where none ran."""
+    """Return the end of the last skill, or of the stream if none ran."""
     ends = [skill.end_ns for skill in record.ran if skill.end_ns is not None]
     at_ns = ends[-1] if ends else record.ended_ns
     return (at_ns - record.requested_ns) / 1e9 if at_ns is not None and record.requested_ns is not None else 0.0

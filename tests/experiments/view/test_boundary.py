@@ -83,7 +83,7 @@ def test_with_jitter_the_line_is_a_slope(jittery: StoredRun) -> None:
 
 def test_the_figure_draws_both_lines_every_trial_and_every_board(even: StoredRun) -> None:
     figure = drawn(even)
-    assert "the paper's rates (not measured here)" in " ".join(caption_of(figure))
+    assert "the paper's rates (not measured)" in " ".join(caption_of(figure))
     axes = figure.axes[0]
     lines = {line.get_label(): line for line in axes.lines}
     nominal = next(line for label, line in lines.items() if "T_\\mathrm{nom}" in label)

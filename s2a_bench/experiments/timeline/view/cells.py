@@ -1,4 +1,4 @@
-"""The cells of a timeline run, computed, emulated or live: metrics, what they are made of, JSON and comparison."""
+"""The cells of a timeline run: metrics, origins, JSON and comparison."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Timelines:
-    """One cell: all plans of one policy in one setting. ``skills`` and ``tokens`` are those of its shown plan."""
+    """One cell: all plans of one policy in one setting; ``skills`` and ``tokens`` of its shown plan."""
 
     rows: pd.DataFrame
     skills: pd.DataFrame
     tokens: pd.DataFrame
 
     def about(self, column: str) -> Any:
-        """Return what all rows of the cell have in common; None where it is missing."""
+        """Return a value that all rows of the cell share; None if missing."""
         import pandas as pd
 
         value = self.rows[column].iloc[0]
@@ -42,7 +42,7 @@ class Timelines:
 
     @property
     def setting(self) -> tuple[str, int, int, float]:
-        """Return the title, L, N and T_nom in s."""
+        """The title, L, N and T_nom in s."""
         names = ("title", "tokens_per_skill", "n_skills", "t_nom_s")
         return tuple(self.about(name) for name in names)
 
@@ -51,13 +51,13 @@ class Timelines:
         return len(self.rows)
 
     def values(self, metric: str) -> Floats:
-        """Return a metric's values, times in s, one a plan that has it."""
+        """Return a metric's values, times in s, one for each plan that has it."""
         found = METRICS[metric]
         values: Floats = self.rows[found.column].dropna().to_numpy(dtype="float64")
         return values / 1e9 if found.kind == TIME else values
 
     def mean(self, metric: str) -> float | None:
-        """Return a metric's mean over the plans; None where no plan has it."""
+        """Return a metric's mean over the plans; None if no plan has it."""
         values = self.values(metric)
         return float(values.mean()) if values.size else None
 
@@ -67,7 +67,7 @@ class Timelines:
 
     @property
     def token_s(self) -> Floats:
-        """Return when the tokens of the shown plan arrived, in s from the request."""
+        """The arrival times of the shown plan's tokens, in s from the request."""
         return (self.tokens["client_ns"].to_numpy(dtype="float64") - float(self.about("requested_ns"))) / 1e9
 
     def moment_s(self, metric: str) -> float:
@@ -75,7 +75,7 @@ class Timelines:
 
 
 def timelines_of(run: StoredRun) -> list[Timelines]:
-    """Split a run into its cells, in the order in which they were run; the shown plan is the first."""
+    """Return the cells of a run in their order; the shown plan is the first."""
     rows, skills, tokens = run.table(TIMELINES), run.table(SKILLS), run.table(TOKENS)
     skills_of = dict(list(skills.groupby(["cell", "request_id"], sort=False)))
     tokens_of = dict(list(tokens.groupby("request_id", sort=False)))
@@ -95,25 +95,23 @@ def panels(cells: Sequence[Timelines]) -> Iterator[tuple[tuple[str, int, int, fl
 
 
 def origin_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
-    """Return what the timelines are made of: emulated or not, whose rates, what is assumed."""
+    """Return the origins of the timelines: emulated or not, the rates, the assumptions."""
     boards = run.manifest.get("boards", [])
     notes = []
     if any(cell.about("emulated") and cell.about("mode") != "live" for cell in cells):
         rates = {"paper": "the paper's rates (table II)", "measured": "measured rates", "given": "rates as given"}
-        whose = [rates[origin] for origin in dict.fromkeys(board["origin"] for board in boards)]
+        origins = [rates[origin] for origin in dict.fromkeys(board["origin"] for board in boards)]
         virtual = all(cell.about("mode") == "virtual" for cell in cells)
         emulated = (
-            f"EMULATED{' in virtual time' if virtual else ', executed in real time'}: no model answered; tokens come "
-            f"at {' and '.join(whose) or 'given rates'}, {_jitter(run)}."
+            f"EMULATED{' in virtual time' if virtual else ', executed in real time'}: no model answered; tokens arrive "
+            f"at {' and '.join(origins) or 'given rates'}, {_jitter(run)}."
         )
         papers = [PAPERS] if any(board["origin"] == "paper" for board in boards) else []
         notes.append(Note(emulated, EMULATED, *papers))
     notes += _live_notes(run)
     if assumed := [board for board in boards if board["prompt_origin"] == "assumed"]:
         listed = ", ".join(f"{board['prompt_s']:g}" for board in assumed)
-        shift = (
-            f"c = {listed} s before decoding is an assumption of ours: it shifts all policies of a board by as much."
-        )
+        shift = f"c = {listed} s before decoding is our assumption: it shifts all policies of a board by as much."
         notes.append(Note(shift, ASSUMED))
     return tuple(notes)
 
@@ -133,15 +131,15 @@ def _live_notes(run: StoredRun) -> list[Note]:
     dummy = " Dummy weights: what the plan says means nothing." if live.get("dummy") else ""
     grammar = "held to its form by a grammar" if live["grammar"] else "without a grammar"
     robot = "skills only take their time" if live["robot"] == "timed" else f"skills are carried out by {live['robot']}"
-    whose = "tokens of a server that runs already" if live["engine"] == "unknown" else "real tokens"
-    tokens = "EMULATED tokens" if live["emulated"] else f"LIVE: {whose}"
+    source = "tokens of a running server" if live["engine"] == "unknown" else "real tokens"
+    tokens = "EMULATED tokens" if live["emulated"] else f"LIVE: {source}"
     how = f"parsed and executed as they arrive, {grammar}; {robot}"
     labels = [*([EMULATED] if live["emulated"] else []), *([DUMMY] if dummy else [])]
     return [Note(f"{tokens} over {live['transport']}{paced}, {how}.{dummy}", *labels)]
 
 
 def jitter_notes(run: StoredRun) -> tuple[str, ...]:
-    """Return how late the executors' robots had their orders."""
+    """Return the start jitter of the executors, if any."""
     found = run.manifest.get("start_jitter")
     if not found:
         return ()
@@ -153,20 +151,20 @@ def jitter_notes(run: StoredRun) -> tuple[str, ...]:
 class _About:
     cell: str
     policy: str
-    profile: Annotated[str | None, about("Null where only a rate was given, or a model answered.")]
-    mode: Annotated[str, about("virtual: computed; else what passed the time.")]
+    profile: Annotated[str | None, about("Null for a given rate, or a model.")]
+    mode: Annotated[str, about("virtual: computed; else the clock.")]
     emulated: Annotated[bool, about("True where no model answered.")]
     rate_tokens_per_s: Positive
     prompt_s: Annotated[
         NonNegative | None,
-        about("c: from the request to the start of decoding; absent where a model took what it took."),
+        about("c: from the request to the start of decoding; absent for a model."),
     ] = None
     tokens_per_skill: Annotated[Many, about("L, the delimiter included.")]
     n_skills: Many
     t_nom_s: Positive
-    plans: Annotated[Many, about("Plans that the means are over.")]
+    plans: Annotated[Many, about("Plans of the means.")]
     caution: Annotated[
-        NonNegative | None, about("lambda; absent where the policy has none, or waits for the whole plan.")
+        NonNegative | None, about("lambda; absent if the policy has none, or waits for the whole plan.")
     ] = None
 
 
@@ -185,13 +183,12 @@ _SETTING: Final = ("tokens_per_s", "prompt_s", "tokens_per_skill", "n_skills", "
 
 
 def timelines_json(run: StoredRun) -> dict[str, Any]:
-    """Return the object that ``--json`` prints, as docs/schema/s2a-bench-1.json describes it."""
+    """Return the ``--json`` object (docs/schema/s2a-bench-1.json)."""
     executed = {name: run.manifest[name] for name in ("live", "start_jitter") if run.manifest.get(name)}
     return frame(run, [_cell(cell) for cell in timelines_of(run)], [], **executed)
 
 
 def _cell(cell: Timelines) -> dict[str, Any]:
-    """Return one cell: means over its plans; a metric that no plan has is an absent key."""
     facts = {name: cell.about(name) for name in ("cell", "policy", "caution", *_SETTING)}
     facts |= {"rate_tokens_per_s": facts.pop("tokens_per_s"), "profile": cell.about("board") or None, "plans": cell.n}
     return present(TimelineCell(**facts, **{name: cell.mean(name) for name in METRICS}))

@@ -1,9 +1,8 @@
 """Timelines as a trace for ui.perfetto.dev or chrome://tracing: JSON in the Trace Event Format.
 
-A process is one setting (board, granularity, plan length, duration), a thread one policy, and one more thread holds the
-tokens that policies share. What the viewers are particular about: ids are whole numbers from 1, no thread id
-is used twice in a trace, metadata has no time, and slices of a thread must not overlap, so every boundary is rounded to
-a whole microsecond, the format's unit, before durations are taken.
+A process is one setting (board, granularity, plan length, duration), a thread one policy, and another thread holds
+shared tokens. The viewers require ids from 1, distinct thread ids, metadata without a time, and slices that do not
+overlap in a thread: boundaries are rounded to a microsecond, the format's unit, before durations are computed.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ Event: TypeAlias = dict[str, Any]
 
 
 def to_trace(run: StoredRun) -> dict[str, Any]:
-    """Return the trace of the shown plan of every cell that has one."""
+    """Return the trace of every cell's shown plan."""
     cells = [cell for cell in timelines_of(run) if len(cell.skills)]
     return {
         "traceEvents": list(_events(cells)),
@@ -67,7 +66,6 @@ def _thread(pid: int, tid: int, name: str) -> Iterator[Event]:
 
 
 def _tokens(pid: int, tid: int, cell: Timelines) -> Iterator[Event]:
-    """Mark the tokens, and the moments when skills are complete."""
     for index, at_s in enumerate(cell.token_s):
         yield _instant(pid, tid, f"token {index + 1}", round(at_s * 1e6))
     for skill in cell.skills.to_dict("records"):
@@ -75,7 +73,6 @@ def _tokens(pid: int, tid: int, cell: Timelines) -> Iterator[Event]:
 
 
 def _skills(pid: int, tid: int, cell: Timelines) -> Iterator[Event]:
-    """List waiting, skills and stalls as slices, and S0 as a mark."""
     yield _instant(pid, tid, "S0", round(cell.moment_s("safe_start_s") * 1e6))
     yield from _slice(pid, tid, "waiting", 0, round(cell.moment_s("start_s") * 1e6), {})
     for skill in cell.skills.to_dict("records"):
@@ -93,7 +90,7 @@ def _skills(pid: int, tid: int, cell: Timelines) -> Iterator[Event]:
 
 
 def _slice(pid: int, tid: int, name: str, start_us: int, end_us: int, args: dict[str, Any]) -> Iterator[Event]:
-    """Make a complete event; none for what takes less than the unit."""
+    """Yield a complete event, unless it is shorter than the unit."""
     if end_us > start_us:
         event = {"ph": "X", "pid": pid, "tid": tid, "name": name, "cat": "timeline"}
         yield {**event, "ts": start_us, "dur": end_us - start_us, "args": args}

@@ -1,4 +1,4 @@
-"""Figure 5 of the paper: what each policy does while tokens arrive, a panel a board and granularity; PNG and PDF."""
+"""Figure 5 of the paper: each policy's timeline as tokens arrive, a panel a board and granularity."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 _LEGEND_COLUMNS: Final = {WIDTH_IN: 3, WIDE_IN: 6}
 
 _SHADES: Final = {"blue": "#0072B2", "orange": "#E69F00", "green": "#009E73"}
-"""The paper's colours as Okabe and Ito have them: the eye tells them apart, and so does a grey copy."""
+"""The paper's colours in Okabe and Ito's palette, distinct to all eyes and in grey."""
 _OTHERS: Final = ("#56B4E9", "#CC79A7", "#D55E00", "#999999")
 _VISIBLE_NS: Final = 20_000_000
-"""A stall or stretch below is rounding, or a real executor's jitter, and too narrow to be seen."""
+"""Shorter stalls and stretches are rounding or jitter, and too narrow to see."""
 _LANE: Final = 0.7
 """Height of a lane's bars."""
 
 
 def policy_colours(policies: Sequence[str]) -> dict[str, str]:
-    """Return a colour for every policy: the paper's where it has one."""
+    """Return a colour for every policy, the paper's if it has one."""
     known = {name: _SHADES[colour] for name, colour in paper_colours().items()}
     others = [name for name in policies if name not in known]
     return known | {name: _OTHERS[place % len(_OTHERS)] for place, name in enumerate(others)}
@@ -38,7 +38,7 @@ def policy_colours(policies: Sequence[str]) -> dict[str, str]:
 def build_timelines(run: StoredRun, cells: Sequence[Timelines]) -> Figure:
     """Draw the shown plan of every cell: boards side by side, granularities below one another, policies as lanes.
 
-    ``cells`` share plan length and T_nom. Every panel has its own time axis: boards differ by orders of magnitude.
+    ``cells`` share plan length and T_nom. Every panel has a time axis: boards differ by orders of magnitude.
     """
     groups = dict(panels(cells))
     titles = list(dict.fromkeys(setting[0] for setting in groups))
@@ -70,7 +70,7 @@ def build_timelines(run: StoredRun, cells: Sequence[Timelines]) -> Figure:
 
 
 def draw_panel(axes: Axes, cells: Sequence[Timelines], colours: dict[str, str], *, names: bool) -> None:
-    """Draw one setting: tokens on top where all policies share them, else above each policy's own skills."""
+    """Draw one setting: tokens at the top if all policies share them, else above each policy's skills."""
     shared = len({cell.about("request_id") for cell in cells}) == 1
     end_s = max(cell.moment_s("end_s") for cell in cells)
     if shared:
@@ -92,7 +92,7 @@ def draw_panel(axes: Axes, cells: Sequence[Timelines], colours: dict[str, str], 
 
 
 def timeline_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
-    """Return every figure by its file's name: one for every plan length and T_nom."""
+    """Return every figure by its file's name, one for each plan length and T_nom."""
     cells = [cell for cell in timelines_of(run) if len(cell.skills)]
     shapes = list(dict.fromkeys(cell.setting[2:] for cell in cells))
     builders: dict[str, Callable[[], Figure]] = {}
@@ -104,7 +104,7 @@ def timeline_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
 
 
 def _draw_skills(axes: Axes, cell: Timelines, lane: int, colour: str, end_s: float) -> None:
-    """Draw one lane: a line while the robot waits, then skills (what is longer than planned is paler) and stalls."""
+    """Draw one lane: a line until the start, then stalls and skills, paler beyond their planned duration."""
     skills = cell.skills.to_dict("records")
     axes.hlines(lane, 0, cell.moment_s("start_s"), "#BBBBBB", linewidth=0.8)
     for skill in skills:
@@ -114,7 +114,7 @@ def _draw_skills(axes: Axes, cell: Timelines, lane: int, colour: str, end_s: flo
         axes.barh(lane, end - start, _LANE, start, color=colour, edgecolor="white", linewidth=0.4, label="skill")
         if (end - start - nominal) * 1e9 > _VISIBLE_NS:
             axes.barh(lane, end - start - nominal, _LANE, start + nominal, color="white", alpha=0.5, linewidth=0)
-        if end - start > 0.03 * end_s:  # else its number does not fit
+        if end - start > 0.03 * end_s:  # wide enough for its number
             axes.text(
                 start + min(end - start, nominal) / 2,
                 lane,
@@ -127,7 +127,6 @@ def _draw_skills(axes: Axes, cell: Timelines, lane: int, colour: str, end_s: flo
 
 
 def _draw_tokens(axes: Axes, cell: Timelines, low: float, high: float) -> None:
-    """Draw a tick a token, and a longer one where a skill is complete."""
     middle = (low + high) / 2
     axes.vlines(cell.token_s, low, middle, "#888888", linewidth=0.4)
     arrivals_s = cell.skills["arrival_ns"].to_numpy(dtype="float64") / 1e9
@@ -135,7 +134,6 @@ def _draw_tokens(axes: Axes, cell: Timelines, low: float, high: float) -> None:
 
 
 def _legend(cells: Sequence[Timelines]) -> list[object]:
-    """Explain everything but the policies, which are named at their lanes."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

@@ -1,4 +1,4 @@
-"""How timelines are shown, the same however they were run: sentences, tables for people, and CSV for programs."""
+"""The sentences, tables and CSV of a run of timelines."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
 
 
 def timeline_sentences(run: StoredRun) -> list[str]:
-    """Say of each policy where it stalls, when it starts, and when it ends."""
+    """Return for each policy where it stalls, when it starts, and when it ends."""
     cells = timelines_of(run)
     by_policy: dict[str, list[Timelines]] = {}
     for cell in cells:
@@ -92,17 +92,17 @@ _WAITING = (
 )
 _MOTION = ("speed_distortion", "fluidity", "rms_jerk", "peak_jerk", "sparc")
 _WAITING_NOTES = (
-    "queued: from a skill's arrival to its start. age: from the request, as if pictured then, to a skill's start.",
+    "queued: from a skill's arrival to its start. age: from the request, the time of the picture, to a skill's start.",
     "of wait: start regret over t_N - S0. over S_lo, E_lo: over the least start and end within T_min, T_max.",
 )
 _MOTION_NOTES = (
     "distortion: durations over nominal ones. fluidity: share of deadlines met (Etalon).",
-    "Jerk and SPARC are a model's: a robot at unit speed flows from skill to skill and rests in stalls.",
+    "Jerk and SPARC are a model's: a robot at unit speed moves from skill to skill and rests in stalls.",
 )
 
 
 def execution_table(run: StoredRun) -> TextTable:
-    """Lay out starts, ends, stalls and regrets: means over the plans, in s."""
+    """Return the table of starts, ends, stalls and regrets: means over the plans, in s."""
     cells = timelines_of(run)
     random = any(cell.n > 1 for cell in cells)
     title = f"Timelines{_common(cells)}: times in s{', means' if random else ''}"
@@ -112,7 +112,7 @@ def execution_table(run: StoredRun) -> TextTable:
 
 
 def skill_table(cells: Sequence[Timelines]) -> TextTable:
-    """Lay out every skill of the shown plan of some cells."""
+    """Return the table of the skills of the shown plans."""
     groups = []
     for cell in cells:
         name = (cell.setting[0], str(cell.setting[1]), cell.policy)
@@ -140,24 +140,24 @@ def timeline_tables(run: StoredRun) -> dict[str, TextTable]:
 
 
 def timeline_csv(run: StoredRun) -> dict[str, CsvTable]:
-    """Return file name -> CSV table in long form, every digit kept, times in s; what is absent has no row."""
+    """Return file name -> CSV table in long form, unrounded, times in s; absent values have no row."""
     summaries = []
     for cell in timelines_of(run):
         for name, metric in METRICS.items():
             if found := summary_of(cell.values(name)):
-                parts = ("n", "mean") if metric.kind == FLAG else SUMMARY
-                values = (getattr(found, part) if part in parts else None for part in SUMMARY)
+                statistics = ("n", "mean") if metric.kind == FLAG else SUMMARY
+                values = (getattr(found, each) if each in statistics else None for each in SUMMARY)
                 summaries.append((cell.about("cell"), name, *values))
     return {"timelines.csv": CsvTable.of(("cell", "metric", *SUMMARY), summaries)}
 
 
 def seconds(value: float) -> str:
-    """Write a time in s: two decimals below 100, one above."""
+    """Return a time in s as text: two decimals below 100, one above."""
     return f"{value:.2f}" if abs(value) < 99.995 else f"{value:.1f}"  # noqa: PLR2004 - five characters at most
 
 
 def _table(cells: Sequence[Timelines], title: str, metrics: Sequence[str], notes: Iterable[str]) -> TextTable:
-    """Lay out the means of metrics: a group of rows a board, L where it begins."""
+    """Return a table of means, a group of rows a board."""
     several = len({cell.setting[2:] for cell in cells}) > 1
     boards: dict[str, list[tuple[str, ...]]] = {}
     for (name, tokens, n_skills, t_nom_s), group in panels(cells):
@@ -190,7 +190,7 @@ def _common(cells: Sequence[Timelines]) -> str:
 
 
 def _promise(calibrations: Iterable[Mapping[str, Any]]) -> str:
-    """Return what share of further plans calibration lets stall: that of epsilon, or less where plans are few."""
+    """Return the share of further plans that calibration lets stall: epsilon, or less with few plans."""
     worst = max(calibrations, key=lambda each: float(each["expected_risk"]))
     return (
         f"--guarantee {worst.get('guarantee', 'high-confidence')}: lambda lets at most {worst['expected_risk']:.2%} of "
@@ -203,7 +203,7 @@ ONLINE_LIVE = (ONLINE, "live")
 
 
 def _plan_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
-    """Return how many plans there are, and what stream-to-act knew before them."""
+    """Return the number of plans, and the calibration or prior of stream-to-act."""
     notes = []
     plans = {cell.n for cell in cells}
     if max(plans, default=1) > 1:
@@ -218,7 +218,7 @@ def _plan_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
         notes.append(_promise(calibrations.values()))
     elif live_cautions := {cell.about("caution") for cell in cells if (cell.policy, cell.about("mode")) == ONLINE_LIVE}:
         span = ", ".join(f"{caution:g}" for caution in sorted(live_cautions))
-        notes.append(f"stream-to-act: lambda {span}, not calibrated; its prior comes from the warm-ups, or the pace.")
+        notes.append(f"stream-to-act: lambda {span}, not calibrated; its prior is from the warm-ups, or the pace.")
     elif any((cell.policy, cell.about("mode")) == (ONLINE, "virtual") for cell in cells):
-        notes.append("Nothing varies, and stream-to-act's prior knows it: online it starts at S0.")
+        notes.append("Nothing varies, and stream-to-act's prior knows it: it starts at S0.")
     return tuple(notes)
