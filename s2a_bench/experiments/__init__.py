@@ -76,7 +76,6 @@ class Metric:
 
     @property
     def schema(self) -> dict[str, Any]:
-        """Its JSON Schema: description and bounds."""
         facts = {"description": self.about or None, "minimum": self.bounds[0], "maximum": self.bounds[1]}
         return {key: value for key, value in facts.items() if value is not None}
 
@@ -170,7 +169,6 @@ class Experiment:
     """What progress counts, and what is kept of an interrupted run."""
 
     def run_with(self, config: Options, output: Path, progress: Progress) -> Path:
-        """Run it and return the run folder; raises S2AError."""
         folder: Path = resolve_name(self.run)(config, output, progress)
         return folder
 
@@ -185,12 +183,10 @@ class Experiment:
         return replace(shown, tables=tables, figures=figures)
 
     def cell_class(self) -> type | None:
-        """Return the class of a cell of its ``--json``; None if not declared."""
         cell: type | None = resolve_name(self.cell) if self.cell else None
         return cell
 
     def compared_by(self) -> Comparable | None:
-        """Return what its runs are compared by; None if they are not."""
         compared: Comparable | None = resolve_name(self.compared) if self.compared else None
         return compared
 

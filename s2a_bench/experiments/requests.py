@@ -111,7 +111,6 @@ class RequestCell:
 
     @property
     def label(self) -> str:
-        """Its name without the payload."""
         return without(self.name, "payload")
 
     def is_compared_with(self, base: RequestCell) -> bool:
@@ -124,7 +123,6 @@ class RequestCell:
         return _numbers(self.column(metric))
 
     def values_ms(self, column: str) -> Floats:
-        """Return the values in ms of a stage, or of another column without ``_ns``."""
         return numbers_ms(self._ns(column))
 
     def group_ms(self, group: str) -> Floats:
@@ -153,12 +151,10 @@ class RequestCell:
         return self.good[name] if name in self.good else self._ns(name.removesuffix("_ms")) / _NS_PER_MS
 
     def sums_ms(self, group: str) -> pd.Series[Any]:
-        """Return the sums in ms of the stages of a group, a row a request."""
         names = [f"{stage}_ns" for stage, of in self.stages.items() if of == group]
         return self.good[names].sum(axis=1, min_count=1) / _NS_PER_MS
 
     def fact(self, name: str) -> pd.Series[Any]:
-        """Return a fact, a row a request; NaN where it is absent."""
         return self._facts.get(name, self._facts["events"] * float("nan"))
 
     def _ns(self, column: str) -> pd.Series[Any]:
@@ -190,7 +186,6 @@ class RequestCell:
 
     @property
     def has_engine_time(self) -> bool:
-        """Whether the engine reports T_eval."""
         return bool(_some(self.fact(PREDICTED_MS)).notna().any())
 
     @cached_property
@@ -331,8 +326,7 @@ def split(runs: Iterable[StoredRun]) -> Split:
     return [(run, cells_of(run)) for run in runs]
 
 
-def launches_of(run: StoredRun) -> list[tuple[int, list[RequestCell]]]:
-    """Return (launch, its cells) for every launch of a run."""
+def _launches_of(run: StoredRun) -> list[tuple[int, list[RequestCell]]]:
     samples = run.samples
     return [(int(launch), _cells(run, samples[samples["launch"] == launch])) for launch in samples["launch"].unique()]
 
@@ -568,7 +562,7 @@ def compared_by(metrics: Iterable[RequestMetric], shown: tuple[str, ...], **more
         )
 
     def subjects(run: StoredRun) -> list[Subject]:
-        return [subject(cell, launch) for launch, cells in launches_of(run) for cell in cells]
+        return [subject(cell, launch) for launch, cells in _launches_of(run) for cell in cells]
 
     return Comparable(named, subjects, lambda run: stand_ins(split([run])), shown, **more)
 

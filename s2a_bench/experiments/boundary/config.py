@@ -47,7 +47,6 @@ class BoundaryConfig(Options):
 
     @cached_property
     def boards(self) -> list[Profile]:
-        """The profiles; raises UsageError for an unknown one."""
         from s2a_bench.boards.profile import load_profile
 
         return [load_profile(name) for name in self.profiles]
@@ -90,5 +89,4 @@ class BoundaryConfig(Options):
         gaps_of(self.jitter, 1.0)
 
     def to_manifest(self) -> dict[str, object]:
-        """Return the options as plain data, with the numbers that follow from them."""
         return {**self.model_dump(), "plans": self.plans_a_point, "points": self.rates_tried}

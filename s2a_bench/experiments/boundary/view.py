@@ -38,7 +38,7 @@ _TRIALS: Final[dict[str, dict[str, Any]]] = {
 def show(run: StoredRun, **_: Any) -> Shown:
     """Return what a boundary run shows."""
     return Shown(
-        sentences=boundary_sentences(run),
+        sentences=_boundary_sentences(run),
         tables={"boundary": line_table(run), "boards": board_table(run)},
         main=["boards"],
         csvs=boundary_csv(run),
@@ -117,8 +117,7 @@ def boundary_csv(run: StoredRun) -> dict[str, CsvTable]:
     return {"boundary.csv": CsvTable.of(names, run.table(BOUNDARY)[list(names)].itertuples(index=False, name=None))}
 
 
-def boundary_sentences(run: StoredRun) -> list[str]:
-    """Return where naive stalls, and whether the formula agrees."""
+def _boundary_sentences(run: StoredRun) -> list[str]:
     points = len(run.table(BOUNDARY))
     sentences = [f"Naive execution was tried at {points} points of rate and tokens per skill."]
     if is_random(run):
@@ -237,7 +236,6 @@ def _shade_shares(figure: Figure, axes: Axes, run: StoredRun) -> None:
 
 
 def _mark_boards(axes: Axes, run: StoredRun) -> None:
-    """Draw a named line a board with its granularities: filled where naive is stall-free at T_nom."""
     for title, rate, points in marks_of(run):
         nominal = points[points["duration"] == "t_nom"]
         axes.axhline(rate, color=_INK, linewidth=0.5, linestyle=":")

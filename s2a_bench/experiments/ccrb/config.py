@@ -37,7 +37,6 @@ class PlanRequest(Options):
     )
 
     def check(self) -> None:
-        """Refuse what needs ``live``; raises UsageError naming the field."""
         for name in () if self.live else self.given():
             if name != "live":
                 raise UsageError(f"`{name}` is about a model that answers; it needs `live`")
@@ -91,7 +90,6 @@ class CcrbConfig(Options):
 
     @property
     def virtual(self) -> bool:
-        """Whether the whole run is computed in this process."""
         return not self.plan_request.live and self.simulator != "carla"
 
     @property
@@ -161,7 +159,6 @@ class CcrbConfig(Options):
         return self.request.risks() if self.plan_request.live else super().risks()
 
     def to_manifest(self) -> dict[str, Any]:
-        """Return the options of this mode and of the scenario as plain data."""
         left_out = {"scenario", "plan_request"}
         left_out |= {name for name in DRAWN if getattr(self, name) == type(self).model_fields[name].default}
         left_out |= (

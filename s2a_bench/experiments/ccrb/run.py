@@ -72,7 +72,7 @@ def complete(
     """Schedule a plan, drawn or received, under every policy."""
     scenario = config.scenario
     if scenario.lane_change:
-        plans = with_lane_change(plans, scenario.lane_durations)
+        plans = _with_lane_change(plans, scenario.lane_durations)
     schedules = {name: policy.schedule(plans) for name, policy in policies.items()}
     late = None
     if config.ttc:
@@ -81,8 +81,7 @@ def complete(
     return Prepared(setting, request_id, plans, schedules, late)
 
 
-def with_lane_change(plans: Plans, lane: Durations) -> Plans:
-    """Set the last skill's durations to those of a lane change."""
+def _with_lane_change(plans: Plans, lane: Durations) -> Plans:
     changed: dict[str, Any] = {name: np.array(getattr(plans, name)) for name in ("nominal_s", "least_s", "most_s")}
     for name, value in changed.items():
         value[-1] = getattr(lane, name)

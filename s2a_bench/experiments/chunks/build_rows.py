@@ -79,9 +79,9 @@ def write_cell(
         **{name: _plain(values.get(name), whole=metric.kind == COUNT) for name, metric in METRICS.items()},
     )
     writer.append(CHUNKS, [row])
-    writer.append(REACTIONS, reaction_rows(cell, latency_ns, setting, reaction_s))
-    writer.append(TICKS, tick_rows(cell.cell, ticks, most, late_ns))
-    writer.append(REQUESTS, request_rows(cell.cell, latency_ns, cycles, most, names))
+    writer.append(REACTIONS, _reaction_rows(cell, latency_ns, setting, reaction_s))
+    writer.append(TICKS, _tick_rows(cell.cell, ticks, most, late_ns))
+    writer.append(REQUESTS, _request_rows(cell.cell, latency_ns, cycles, most, names))
 
 
 def metrics_of(
@@ -140,10 +140,9 @@ def reactions_s(cycles: Cycles, ticks: Ticks, setting: ControlSetting, rng: np.r
     return found[~np.isnan(found)]
 
 
-def reaction_rows(
+def _reaction_rows(
     cell: ChunkCell, latency_ns: Ints, setting: ControlSetting, reaction_s: Floats
 ) -> Iterator[ReactionRow]:
-    """Yield the quantiles of a cell's reaction times, if any."""
     if not reaction_s.size:
         return
     period_s = setting.period_ns / 1e9
@@ -154,8 +153,7 @@ def reaction_rows(
         yield ReactionRow(cell.cell, share, simulated_s, expected_s)
 
 
-def tick_rows(cell: str, ticks: Ticks, most: int, late_ns: Ints | None) -> Iterator[TickRow]:
-    """Yield the first ticks of a cell."""
+def _tick_rows(cell: str, ticks: Ticks, most: int, late_ns: Ints | None) -> Iterator[TickRow]:
     late = [None] * most if late_ns is None else late_ns.tolist()
     columns = (ticks.chunk, ticks.index, ticks.age, ticks.stalled)
     for tick, (chunk, index, age, stalled) in enumerate(zip(*(each[:most].tolist() for each in columns), strict=True)):
@@ -171,10 +169,9 @@ def tick_rows(cell: str, ticks: Ticks, most: int, late_ns: Ints | None) -> Itera
         )
 
 
-def request_rows(
+def _request_rows(
     cell: str, latency_ns: Ints, cycles: Cycles, most: int, names: Mapping[int, str]
 ) -> Iterator[RequestRow]:
-    """Yield the requests that left within the first ticks of a cell."""
     count = min(latency_ns.size, int(np.searchsorted(cycles.request_tick, most)))
     kept = [each.name for each in fields(RequestRow)]
     columns = {name: getattr(cycles, name)[:count].tolist() for name in kept if hasattr(cycles, name)}

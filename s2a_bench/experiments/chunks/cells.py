@@ -58,7 +58,6 @@ class ChunkCell:
 
     @property
     def acting(self) -> Mode:
-        """The mode with the triggers of its rule."""
         if self.begin is not None:
             return Learning(self.mode, self.begin)
         return self.mode.varied(self.triggers) if self.triggers else self.mode

@@ -166,7 +166,6 @@ class ChunksConfig(Options):
 
     @cached_property
     def made(self) -> dict[str, Mode]:
-        """The modes by their names with parameters; raises UsageError naming the field."""
         from s2a_bench.policy.parameters import build, canonical
 
         known = {written: written.partition("?")[0] for written in self.modes}
@@ -183,7 +182,6 @@ class ChunksConfig(Options):
 
     @cached_property
     def sources(self) -> tuple[Source, ...]:
-        """The sources of latencies; raises S2AError naming the field."""
         from s2a_bench.experiments.chunks.latencies import sources
 
         return tuple(
@@ -192,7 +190,6 @@ class ChunksConfig(Options):
 
     @cached_property
     def plant(self) -> ActionKind | None:
-        """The robot of virtual time; raises UsageError naming the field."""
         from s2a_bench.act import ActionKind, kind
 
         if not self.robot:
@@ -231,12 +228,10 @@ class ChunksConfig(Options):
         return self.calibration_cycles if recorded is None else min(self.calibration_cycles, recorded.size // 2)
 
     def learnt(self, source: Source) -> int:
-        """Return how many latencies of a source the rules learn from."""
         return self._learnable(source) if self.with_rules else 0
 
     @cached_property
     def triggered(self) -> Mode | None:
-        """The first mode that has a trigger for rules to choose."""
         return next((each for each in self.made.values() if each.triggered), None)
 
     @property
@@ -329,7 +324,6 @@ class ChunksConfig(Options):
             yield "robot", risk, self.robot
 
     def to_manifest(self) -> dict[str, Any]:
-        """Return the options as plain data, with the numbers that follow from them."""
         file = None if self.export_delays is None else str(self.export_delays)
         more = {"modes": list(self.made), "period_ns": self.setting.period_ns, "export_delays": file}
         return {**self.model_dump(exclude={"requests"}), **more}

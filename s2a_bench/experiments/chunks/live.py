@@ -138,7 +138,6 @@ def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
 
 
 def _drive(config: ChunksConfig, launch: RunningLaunch) -> None:
-    """Run every mode over every pipeline, in random order."""
     blocks = count()
     tried: list[tuple[ChunkCell, list[Session], int]] = []
     launch.progress.stage("warming up")
@@ -150,7 +149,7 @@ def _drive(config: ChunksConfig, launch: RunningLaunch) -> None:
     launch.progress.expect(len(tried))
     for cell, sessions, dims in Random(config.seed).sample(tried, len(tried)):  # noqa: S311 - an order, not a secret
         launch.progress.stage(f"acting for {config.seconds:g} s: {cell.cell}")
-        with robot_of(config, cell, dims) as robot:
+        with _robot_of(config, cell, dims) as robot:
             launch.writer.update(robot={} if robot is None else robot.describe())
             write(config, launch.writer, _act(config, cell, sessions, launch, blocks, robot))
         launch.progress.advance()
@@ -175,8 +174,7 @@ def _warm_up(
 
 
 @contextmanager
-def robot_of(config: ChunksConfig, cell: ChunkCell, dims: int) -> Iterator[ActionRobot | None]:
-    """Open the robot of a cell, if any; raises S2AError."""
+def _robot_of(config: ChunksConfig, cell: ChunkCell, dims: int) -> Iterator[ActionRobot | None]:
     if not config.robot:
         yield None
         return
@@ -195,7 +193,6 @@ def _act(
     blocks: Iterator[int],
     robot: ActionRobot | None,
 ) -> LiveResult:
-    """Act in one mode, and store every request as it is measured."""
     setting = config.setting.slowed(cell.slower)
     sends_state = robot is not None and _accepts_state(config, sessions[0], robot)
 

@@ -62,7 +62,6 @@ class LlamaBench:
         self._command += ["--n-prompt", "0", "--n-gen", str(plan.request.max_pieces)]
 
     def __call__(self, place: Place) -> None:
-        """Run it once and store its result; raises EngineError."""
         command = [*self._command, "--n-depth", str(self._depth())]
         self._writer.update(reference={"command": command})
         started_ns = now_ns()

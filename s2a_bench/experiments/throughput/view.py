@@ -76,7 +76,7 @@ def throughput_sentences(run: StoredRun) -> list[str]:
 
 def throughput_tables(run: StoredRun) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
-    tables = {"throughput": speed_table(run), "prompt": prompt_table(run), "gaps": gap_table(run)}
+    tables = {"throughput": speed_table(run), "prompt": _prompt_table(run), "gaps": _gap_table(run)}
     if positions := position_table(run):
         tables["positions"] = positions
     return tables
@@ -117,8 +117,7 @@ def _median_mean(values: Floats) -> str:
     return f"{median} ({mean})" if values.size else median
 
 
-def prompt_table(run: StoredRun) -> TextTable:
-    """Return the table of the time before the first token, and of the step after it: medians."""
+def _prompt_table(run: StoredRun) -> TextTable:
     columns = (
         *("prompt_tokens", "preprocess_ms", "vision_encode_ms", "prompt_eval_ms", "prompt_ms"),
         *("prefill_tokens_per_s", "first_decode_ms", "ttft_ms"),
@@ -135,8 +134,7 @@ def prompt_table(run: StoredRun) -> TextTable:
     return TextTable("The prompt and the first step after it: medians, in ms", header, rows, 1)
 
 
-def gap_table(run: StoredRun) -> TextTable:
-    """Return the table of all gaps between tokens."""
+def _gap_table(run: StoredRun) -> TextTable:
     rows = []
     for cell in throughput_cells(run):
         gaps = cell.values("itl")

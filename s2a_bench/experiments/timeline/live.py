@@ -52,7 +52,6 @@ def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
 def _drive(
     config: TimelineConfig, asks: Sequence[PlanPrompt], robots: Sequence[SkillRobot], launch: RunningLaunch
 ) -> None:
-    """Let every policy execute every plan."""
     link, records, progress = ModelLink(config, launch, config.robot), list[Record](), launch.progress
     progress.expect(config.warmup + len(asks) * config.plans_a_cell)
     try:

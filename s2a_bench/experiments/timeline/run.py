@@ -67,7 +67,6 @@ def run_timeline(config: TimelineConfig, output: Path, progress: Progress) -> Pa
 def _compute(
     config: TimelineConfig, board: Board, setting: PlanSetting, answers: Sequence[Floats], writer: RunWriter
 ) -> dict[str, Any]:
-    """Draw one setting's plans, schedule them under every policy, write the rows and return the calibrations."""
     known = learn(config, board, setting, answers)
     token_s, plans = draw(config, board, setting, config.plans_a_cell, "plans")
     request_ids = [setting.request_id(plan) for plan in range(config.plans_a_cell)]
@@ -163,7 +162,6 @@ class _Play:
 
     @property
     def calls(self) -> list[Call]:
-        """The skills, numbered, with their durations."""
         times = zip(self.plans.least_s[:, 0], self.plans.nominal_s[:, 0], self.plans.most_s[:, 0], strict=True)
         return [
             Call(Skill(f"skill{number}", (), Durations(*map(float, durations)), "hold"), ())
@@ -172,7 +170,6 @@ class _Play:
 
     @property
     def span_s(self) -> float:
-        """The end of the last policy, which waits for the whole plan."""
         return float(self.plans.arrival_s[-1, 0] + self.plans.nominal_s.sum())
 
 

@@ -44,7 +44,7 @@ def animation_files(run: StoredRun) -> dict[str, Callable[[Path], None]]:
 
     A panel stops at its first impact: the time after it is not modelled.
     """
-    drawn = cache(partial(frames_of, run))
+    drawn = cache(partial(_frames_of, run))
 
     def write(as_file: Callable[[Path, list[Image]], None], path: Path) -> None:
         try:
@@ -56,8 +56,7 @@ def animation_files(run: StoredRun) -> dict[str, Callable[[Path], None]]:
     return {"figures/scenario.gif": partial(write, _write_gif), "figures/scenario.mp4": partial(write, _write_film)}
 
 
-def frames_of(run: StoredRun, frames_a_s: int = FRAMES_A_S) -> list[Image]:
-    """Return every frame of the animation."""
+def _frames_of(run: StoredRun, frames_a_s: int = FRAMES_A_S) -> list[Image]:
     panels = [RoadPanel(run, row) for row in rollouts_of(run, "point").to_dict("records")]
     until_s = max(panel.until_s for panel in panels)
     foot = f"{tokens_line(run)} Yellow: lead, green: ego, blue: car behind, red: impact.\n{law(configuration(run))}"

@@ -129,7 +129,6 @@ def rest_of(path: pd.DataFrame) -> int:
 
 
 def _path(run: StoredRun, row: dict[Any, Any]) -> pd.DataFrame:
-    """Return a trajectory up to rest, without the car behind after its impact."""
     path = path_of(run, row["cell"])
     shown = path["time_s"] <= float(path["time_s"].iloc[rest_of(path)]) + _AFTER_S
     path = path.loc[shown].copy()

@@ -41,7 +41,6 @@ class Share:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The interval, for scenarios that were drawn independently."""
         from scipy.stats import binomtest
 
         found = binomtest(self.k, self.n).proportion_ci(0.95, method="exact")

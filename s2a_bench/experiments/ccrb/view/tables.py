@@ -67,18 +67,17 @@ def show(run: StoredRun, *, animation: bool = False, **_: Any) -> Shown:
     """Return what a CCRB run shows."""
     tables = ccrb_tables(run)
     return Shown(
-        sentences=ccrb_sentences(run),
+        sentences=_ccrb_sentences(run),
         tables=tables,
         main=[name for name in ("outcomes", "phase", "random", "followers", "follower-shares") if name in tables],
-        csvs=ccrb_csv(run),
+        csvs=_ccrb_csv(run),
         figures=ccrb_figures(run),
         files=animation_files(run) if animation else {},
         json=lambda: ccrb_json(run),
     )
 
 
-def ccrb_sentences(run: StoredRun) -> list[str]:
-    """Return the outcomes, where the paper's ordering holds, and the studies' speed."""
+def _ccrb_sentences(run: StoredRun) -> list[str]:
     rows = rollouts_of(run, "point")
     survives = survives_of(rows)
     sentences = [
@@ -198,8 +197,7 @@ class CcrbStudy:
     ] = None
 
 
-def outcome_table(run: StoredRun) -> TextTable:
-    """Return the table of the outcomes, a row a policy."""
+def _outcome_table(run: StoredRun) -> TextTable:
     rows, shown = [], [metric for metric in (*TIMES, *IMPACTS) if metric.title]
     for cell in cells_of(run):
         outcome = outcome_label(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
@@ -210,8 +208,7 @@ def outcome_table(run: StoredRun) -> TextTable:
     return TextTable(title, header, rows, 2, notes=(*origin_notes(run), *_deadline_note(run), NO_SCORE))
 
 
-def margin_table(run: StoredRun) -> TextTable:
-    """Return the table of margins and motion, a row a policy."""
+def _margin_table(run: StoredRun) -> TextTable:
     rows = [(cell["policy"], *(_entry(cell, metric) for metric in (*MARGINS, *MOTION))) for cell in cells_of(run)]
     notes = (
         "TTC: least time to collision. DRAC: greatest deceleration required towards the lead, closing^2 / (2 gap).",
@@ -220,8 +217,7 @@ def margin_table(run: StoredRun) -> TextTable:
     return TextTable("Margins and motion", ("policy", *map(_title, (*MARGINS, *MOTION))), rows, 1, notes=notes)
 
 
-def phase_table(run: StoredRun) -> TextTable:
-    """Return the table of each ordering's share of the diagram, a column a gap behaviour."""
+def _phase_table(run: StoredRun) -> TextTable:
     rows = _share_rows(run, "phase", lambda share: f"{share.value:.1%}")
     settings = configuration(run)
     rows.append(("R of the paper's ordering", *(_span(rate_span(run, gap)) for gap in GAPS)))
@@ -234,8 +230,7 @@ def phase_table(run: StoredRun) -> TextTable:
     return TextTable(title, ("share of the diagram", *GAPS), rows, 1, rules, _ORDERING_NOTES)
 
 
-def random_table(run: StoredRun) -> TextTable:
-    """Return the table of each ordering's share of random scenarios, with its interval."""
+def _random_table(run: StoredRun) -> TextTable:
     settings = configuration(run)
     title = f"{settings['random']} random scenarios: % [95 % Clopper-Pearson], {settings['follower']} follower"
     return TextTable(title, ("ordering", *GAPS), _share_rows(run, "random", _with_interval), 1, notes=_ORDERING_NOTES)
@@ -248,8 +243,7 @@ def _share_rows(run: StoredRun, study: str, written: Callable[[Share], str]) -> 
     return [(text, *(written(share_of(scenes[gap], name)) for gap in GAPS)) for name, text in counted.items()]
 
 
-def follower_tables(run: StoredRun) -> dict[str, TextTable]:
-    """Return the tables of the followers at Euro NCAP's combinations: operating point, and shares of the plane."""
+def _follower_tables(run: StoredRun) -> dict[str, TextTable]:
     found, settings = run.table(FOLLOWER_STUDY), configuration(run)
     rate = run.manifest["boards"][0]["tokens_per_s"]
     where = f"R = {rate:g} tokens/s, rear gap {settings['rear_gap_m']:g} m, gap behaviour {settings['gap']}"
@@ -326,16 +320,15 @@ def ccrb_tables(run: StoredRun) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
     tables = {}
     if has(run, "random"):
-        tables["random"] = random_table(run)
+        tables["random"] = _random_table(run)
     if has(run, "phase"):
-        tables["phase"] = phase_table(run)
+        tables["phase"] = _phase_table(run)
     if len(run.table(FOLLOWER_STUDY)):
-        tables |= follower_tables(run)
-    return {**tables, "margins": margin_table(run), "outcomes": outcome_table(run)}
+        tables |= _follower_tables(run)
+    return {**tables, "margins": _margin_table(run), "outcomes": _outcome_table(run)}
 
 
-def ccrb_csv(run: StoredRun) -> dict[str, CsvTable]:
-    """Return file name -> CSV table: the shares of the studies."""
+def _ccrb_csv(run: StoredRun) -> dict[str, CsvTable]:
     rows: list[tuple[Any, ...]] = []
     for study in ("phase", "random"):
         if has(run, study):

@@ -80,7 +80,7 @@ def build_lanes(run: StoredRun) -> Figure:
     axes = figure.subplots()
     oldest = max(int(lane.ticks["age_ticks"].fillna(0).max()) for lane in lanes) or 1
     for place, lane in enumerate(lanes):
-        draw_lane(axes, lane, place, oldest)
+        _draw_lane(axes, lane, place, oldest)
     axes.set_yticks(range(len(lanes)), [_label(lane, several=several) for lane in lanes])
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(len(lanes) - 0.33, -0.6)
@@ -102,7 +102,7 @@ def build_lanes(run: StoredRun) -> Figure:
     return figure
 
 
-def draw_lane(axes: Axes, lane: CellTicks, place: int, oldest: int) -> None:
+def _draw_lane(axes: Axes, lane: CellTicks, place: int, oldest: int) -> None:
     """Draw one lane around y = ``place``; the curve of ages below it reaches the next lane at age ``oldest``."""
     top = place - _BAR / 2
     chunk = lane.ticks["chunk"].fillna(-1).to_numpy(dtype="int64")
@@ -133,7 +133,6 @@ def draw_lane(axes: Axes, lane: CellTicks, place: int, oldest: int) -> None:
 
 
 def _age_at(place: float, share: Any) -> Any:
-    """Return the y of a share of the greatest age, below the bar of the lane at ``place``."""
     return place + _BAR / 2 + 0.03 + _AGE * share
 
 

@@ -49,7 +49,7 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
     """Return what a latency run shows."""
     tables = latency_tables(run)
     return Shown(
-        sentences=latency_sentences(run),
+        sentences=_latency_sentences(run),
         tables=tables,
         main=[name for name in ("stages", "summary", "summary-model") if name in tables],
         csvs=latency_csv(run),
@@ -58,8 +58,7 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
     )
 
 
-def latency_sentences(run: StoredRun) -> list[str]:
-    """Return each cell's median, and its ratio to those that it is compared with."""
+def _latency_sentences(run: StoredRun) -> list[str]:
     if not (cells := cells_of(run)):
         return []
     about = cells[0].about
@@ -164,7 +163,6 @@ def _by_cell(
     rows: Sequence[tuple[str, ...]],
     notes: Iterable[str],
 ) -> TextTable:
-    """Return a table with a row a cell, in a block a payload if there are several."""
     if len(payloads_of(cells)) < 2:  # noqa: PLR2004 - one payload, named by the notes
         named = [(cell.name, *row) for cell, row in zip(cells, rows, strict=True)]
         return TextTable(title, ("cell", *header), named, 1, notes=tuple(notes))
@@ -195,7 +193,7 @@ def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> Text
     return _by_cell(title, header, cells, rows, (*_notes(run, cells), *launches_note(found)))
 
 
-def token_table(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> TextTable | None:
+def _token_table(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> TextTable | None:
     """Return the table of gaps and delays of tokens; None if no server reports when they left the engine."""
     cells = [cell for cell in cells_of(run) if cell.values("token_delay").size]
     if not cells:
@@ -254,7 +252,7 @@ def _notes(run: StoredRun, cells: list[RequestCell]) -> tuple[str, ...]:
     return (*notes, *failure_notes(cells, "samples"))
 
 
-def frame_table(run: StoredRun) -> TextTable | None:
+def _frame_table(run: StoredRun) -> TextTable | None:
     """Return the table of the budget of frames with a prompt: medians in ms, a column a cell; None without frames."""
     if run.frames.empty:
         return None
@@ -287,9 +285,9 @@ def latency_tables(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -
     tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
     if any(cell.values_ms("e2e_without_model").size for cell in cells_of(run)):
         tables["summary-model"] = summary_table(run, "e2e_without_model")
-    if tokens := token_table(run, metrics):
+    if tokens := _token_table(run, metrics):
         tables["tokens"] = tokens
-    if frames := frame_table(run):
+    if frames := _frame_table(run):
         tables["frames"] = frames
     if facts := fact_table(run):
         tables["facts"] = facts

@@ -120,7 +120,7 @@ def line_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> 
     return TextTable("Time against bytes: a line for each pipeline", header, rows, 2, notes=notes)
 
 
-def crossing_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable | None:
+def _crossing_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable | None:
     """Return the table of the crossings of pipelines with a wire; None without any."""
     wired = [each for each in pipelines if not declared_transport(each.path[0]).in_process]
     rows: list[tuple[str, ...]] = [
@@ -145,8 +145,7 @@ def _estimate(found: Estimate) -> str:
     return f"{number(found.value)} [{number(found.low)}, {number(found.high)}]"
 
 
-def build_lines(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> Figure:
-    """Draw medians and lines, a panel a payload, on logarithmic axes."""
+def _build_lines(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> Figure:
     drawn = [each for each in pipelines if each.line]
     payloads = list(dict.fromkeys(each.payload for each in drawn))
     names = {each.name: each.path for each in drawn}
@@ -190,6 +189,6 @@ def shown(runs: Split) -> tuple[dict[str, TextTable], dict[str, Callable[[], Fig
         return {}, {}
     answered = stand_ins(runs)
     tables = {"bytes": line_table(pipelines, answered)}
-    if crossed := crossing_table(pipelines, answered):
+    if crossed := _crossing_table(pipelines, answered):
         tables["crossings"] = crossed
-    return tables, {"time_against_bytes": lambda: build_lines(pipelines, answered)}
+    return tables, {"time_against_bytes": lambda: _build_lines(pipelines, answered)}

@@ -42,7 +42,6 @@ class Timelines:
 
     @property
     def setting(self) -> tuple[str, int, int, float]:
-        """The title, L, N and T_nom in s."""
         names = ("title", "tokens_per_skill", "n_skills", "t_nom_s")
         return tuple(self.about(name) for name in names)
 
@@ -51,13 +50,11 @@ class Timelines:
         return len(self.rows)
 
     def values(self, metric: str) -> Floats:
-        """Return a metric's values, times in s, one for each plan that has it."""
         found = METRICS[metric]
         values: Floats = self.rows[found.column].dropna().to_numpy(dtype="float64")
         return values / 1e9 if found.kind == TIME else values
 
     def mean(self, metric: str) -> float | None:
-        """Return a metric's mean over the plans; None if no plan has it."""
         values = self.values(metric)
         return float(values.mean()) if values.size else None
 

@@ -59,7 +59,7 @@ def build_timelines(run: StoredRun, cells: Sequence[Timelines]) -> Figure:
             if group is None:
                 axes.set_axis_off()
                 continue
-            draw_panel(axes, group, colours, names=column == 0)
+            _draw_panel(axes, group, colours, names=column == 0)
             rate = f"{group[0].about('tokens_per_s'):g} tokens/s"
             head = "" if row else f"{board if rate in board else f'{board}, {rate}'}\n"
             axes.set_title(f"{head}L = {tokens} tokens/skill", loc="left", pad=2)
@@ -69,7 +69,7 @@ def build_timelines(run: StoredRun, cells: Sequence[Timelines]) -> Figure:
     return figure
 
 
-def draw_panel(axes: Axes, cells: Sequence[Timelines], colours: dict[str, str], *, names: bool) -> None:
+def _draw_panel(axes: Axes, cells: Sequence[Timelines], colours: dict[str, str], *, names: bool) -> None:
     """Draw one setting: tokens at the top if all policies share them, else above each policy's skills."""
     shared = len({cell.about("request_id") for cell in cells}) == 1
     end_s = max(cell.moment_s("end_s") for cell in cells)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 def show(run: StoredRun, **_: Any) -> Shown:
     """Return what a run of timelines shows."""
     return Shown(
-        sentences=timeline_sentences(run),
+        sentences=_timeline_sentences(run),
         tables=timeline_tables(run),
         main=["timelines"],
         csvs=timeline_csv(run),
@@ -41,8 +41,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
     )
 
 
-def timeline_sentences(run: StoredRun) -> list[str]:
-    """Return for each policy where it stalls, when it starts, and when it ends."""
+def _timeline_sentences(run: StoredRun) -> list[str]:
     cells = timelines_of(run)
     by_policy: dict[str, list[Timelines]] = {}
     for cell in cells:
