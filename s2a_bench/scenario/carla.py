@@ -1,9 +1,9 @@
-"""CARLA behind the same seam: three cars on a straight stretch of its map, in synchronous mode.
+"""CARLA as a simulator: three cars on a straight stretch of its map, in synchronous mode.
 
-**This adapter has never been run against a CARLA server**: none can be had where the project is built. It is kept thin,
+**This adapter has never been run against a CARLA server**: none is available where the project is built. It is thin,
 written to the client API of 0.9.16 (extra ``carla``), and tested against a stand-in of that API. Each step sets the
-cars' target velocities, which CARLA's physics then follow; positions are read back from the server. Lane changes are
-left to the embedded simulator. The server's settings are put back at the end.
+cars' target velocities, which CARLA's physics follow; positions are read back from the server. Only the embedded
+simulator changes lanes. The server's settings are restored at the end.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ from s2a_bench.policy import Floats
 from s2a_bench.scenario import EGO, LEAD, REAR, ROLES, DriveCommand, State
 
 STEP_S: Final = 0.02
-"""CARLA wants a tenth of a second at most; the finer the step, the longer a roll-out takes."""
+"""CARLA requires at most 0.1 s; a finer step makes roll-outs longer."""
 TIMEOUT_S: Final = 10.0
 STRAIGHT_M: Final = 250.0
 LOOK_M: Final = 10.0
 MOST_TURN_DEG: Final = 1.0
 SETTLE_TICKS: Final = 50
-"""Cars are dropped from a little above the road."""
+"""Cars are spawned `DROP_M` above the road."""
 LONGEST_M: Final = 10.0
-"""No car is longer."""
+"""Upper limit of a car's length."""
 DROP_M: Final = 0.5
 BLUEPRINT: Final = "vehicle.tesla.model3"
 
 
 class Carla:
-    """A CARLA server's world, which is ours while we use it."""
+    """A CARLA server's world, used exclusively."""
 
     name: ClassVar[str] = "carla"
     steers: ClassVar[bool] = False
@@ -60,11 +60,11 @@ class Carla:
             ) from error
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
-        """Spawn the three cars on a straight lane, let them settle, and set them going."""
+        """Spawn the three cars on a straight lane, let them settle, and start them."""
         self._remove_cars()
         start = self._straight()
         self._along, self._right = start.transform.get_forward_vector(), start.transform.get_right_vector()
-        # The ego first: where the others go hangs on how long a car is.
+        # The ego first: the other places depend on a car's length.
         behind_m = float(position_m[EGO, 0] - position_m[REAR, 0]) + LONGEST_M
         self._cars = {EGO: self._spawn(EGO, start, behind_m)}
         self._length_m = 2 * float(self._cars[EGO].bounding_box.extent.x)
@@ -75,19 +75,18 @@ class Carla:
         for _ in range(SETTLE_TICKS):
             self._tick()
         self._speed = speed_mps[:, 0].astype(float)
-        self._tick()  # the cars move from here on, together: gaps stay
+        self._tick()  # the cars start together: gaps stay
         self._origin: Any = self._cars[EGO].get_location()
         self._offset_m = float(position_m[EGO, 0])
         return self._state()
 
     def step(self, command: DriveCommand) -> State:
-        """Set the speeds that the accelerations lead to, and let the server pass one step."""
         self._speed = np.maximum(self._speed + command.acceleration_mps2[:, 0] * self.step_s, 0.0)
         self._tick()
         return self._state()
 
     def close(self) -> None:
-        """Remove the cars and put the server's settings back."""
+        """Remove the cars and restore the server's settings."""
         self._remove_cars()
         if self._before is not None:
             self._world.apply_settings(self._before)
@@ -101,10 +100,9 @@ class Carla:
         try:
             self._world.tick()
         except RuntimeError as error:
-            raise SimulatorError(f"CARLA: the server has gone away ({error}); start it again") from error
+            raise SimulatorError(f"CARLA: the server has disconnected ({error}); start it again") from error
 
     def _state(self) -> State:
-        """Read where the cars are, along and across the straight."""
         position, lateral, speed = np.zeros((3, 1)), np.zeros((3, 1)), np.zeros((3, 1))
         for car, actor in self._cars.items():
             at, velocity = actor.get_location(), actor.get_velocity()
@@ -122,20 +120,20 @@ class Carla:
         place.location.z += DROP_M
         actor = self._world.try_spawn_actor(blueprint, place)
         if actor is None:
-            raise SimulatorError(f"CARLA: there is no room to spawn the {ROLES[car]} car; reload the map")
+            raise SimulatorError(f"CARLA: there is no space to spawn the {ROLES[car]} car; reload the map")
         return actor
 
     def _straight(self) -> Any:
         world_map = self._world.get_map()
         for spawn in world_map.get_spawn_points():
             first = world_map.get_waypoint(spawn.location)
-            here = first
+            last = first
             for _ in range(int(STRAIGHT_M / LOOK_M)):
-                ahead = here.next(LOOK_M)
+                ahead = last.next(LOOK_M)
                 turn = ahead and ahead[0].transform.rotation.yaw - first.transform.rotation.yaw
                 if not ahead or abs((turn + 180) % 360 - 180) > MOST_TURN_DEG:
                     break
-                here = ahead[0]
+                last = ahead[0]
             else:
                 return first
         raise SimulatorError(

@@ -1,6 +1,6 @@
-"""The embedded simulator: highway-env's kinematic bicycles on a straight road, driven by our accelerations.
+"""The embedded simulator: highway-env's kinematic bicycles on a straight road, driven by accelerations.
 
-highway-env integrates with explicit Euler steps and steers by its own lane controller. Pictures: `ccrb.render`.
+highway-env integrates with explicit Euler steps and steers by its lane controller. Pictures: `ccrb.render`.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ ROAD_M: Final = 5000.0
 BEHIND_M: Final = 500.0
 LANE_WIDTH_M: Final = 4.0
 LANES: Final = {0: 1, 1: 0}
-"""Our lane, 0 where all start and 1 to its left -> highway-env's, which counts from the left."""
+"""Lane of `DriveCommand` -> lane of highway-env, which counts from the left."""
 MIDDLE_M: Final = LANE_WIDTH_M * LANES[0]
-"""Where our lane's middle lies on highway-env's y axis, which points to the right."""
+"""Middle of the starting lane on highway-env's y axis, which points to the right."""
 LENGTHS: Final = {LEAD: 1.0, EGO: 0.0, REAR: -1.0}
-"""By how many car lengths a centre lies ahead of our positions, which are bumper to bumper."""
+"""Car lengths from a position, which is bumper to bumper, to the car's centre."""
 
 
 class Embedded:
@@ -49,13 +49,12 @@ class Embedded:
         return self._state()
 
     def step(self, command: DriveCommand) -> State:
-        """Let each vehicle act and step; the ego steers for its lane."""
         for car, vehicle in self._cars.items():
-            # A car that would come to rest within the step just does, and none goes backwards.
+            # A car may come to rest within the step, but not go backwards.
             least = -vehicle.speed / self.step_s
             acceleration = max(float(command.acceleration_mps2[car, 0]), least)
             steering = vehicle.steering_control(lane_index(int(command.lane[0]))) if car == EGO else 0.0
-            # Vehicle's own act: ControlledVehicle's would overwrite what we want.
+            # As Vehicle.act does: ControlledVehicle.act would overwrite the command.
             vehicle.action = {"steering": steering, "acceleration": acceleration}
             vehicle.step(self.step_s)
             vehicle.speed = max(vehicle.speed, 0.0)
@@ -72,11 +71,11 @@ class Embedded:
 
 
 def build_road() -> Any:
-    """Make the road; raises MissingExtra without highway-env."""
+    """Build the road; raises MissingExtra without highway-env."""
     made_of = extras.require("highway_env.road.road", "ccrb")
     straight = made_of.RoadNetwork.straight_road_network
     network = straight(len(LANES), start=-BEHIND_M, length=ROAD_M + BEHIND_M, speed_limit=50.0)
-    # A fixed source of randomness: nothing on this road draws from it, but without one it would be seeded anew.
+    # Fixed and unused; without it highway-env creates a randomly seeded one.
     return made_of.Road(network, np_random=np.random.RandomState(0), record_history=False)
 
 
@@ -86,5 +85,5 @@ def centre(car: int, position_m: float, lateral_m: float, length_m: float) -> Fl
 
 
 def lane_index(lane: int) -> tuple[str, str, int]:
-    """Return highway-env's name of a lane."""
+    """Return highway-env's index of a lane."""
     return ("0", "1", LANES[lane])

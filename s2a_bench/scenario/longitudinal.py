@@ -1,4 +1,4 @@
-"""M roll-outs in lock step: their memory, and a bare integrator along the lane, for phase diagrams and studies."""
+"""M roll-outs in lock step: their state, and a bare integrator along the lane, for phase diagrams and studies."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from s2a_bench.scenario import STEP_S, DriveCommand, State
 
 
 class LockStep:
-    """Something that remembers: each of its arrays has the roll-outs along its last axis; those decided drop out."""
+    """An object with state: every array has the roll-outs along its last axis, from which decided ones are dropped."""
 
     def keep(self, columns: NDArray[np.int64]) -> None:
-        """Go on with these roll-outs only."""
+        """Continue with these roll-outs only."""
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
                 setattr(self, name, value[..., columns])
@@ -24,7 +24,7 @@ class LockStep:
 
 
 def each(number: ArrayLike, rollouts: int) -> Floats:
-    """Return a number for each of M roll-outs, shape (M,), of one or of as many."""
+    """Broadcast one number, or M of them, to M roll-outs, shape (M,)."""
     return np.broadcast_to(np.asarray(number, dtype=np.float64), (rollouts,))
 
 
@@ -54,5 +54,4 @@ class Longitudinal(LockStep):
     def keep(self, columns: NDArray[np.int64]) -> None:
         self._state = self._state.keep(columns)
 
-    def close(self) -> None:
-        """Hold nothing."""
+    def close(self) -> None: ...

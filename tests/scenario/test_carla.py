@@ -58,7 +58,7 @@ def test_a_map_without_a_straight_is_refused(monkeypatch: pytest.MonkeyPatch) ->
 def test_no_room_to_spawn_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World()
     world.full = True
-    with pytest.raises(SimulatorError, match="no room to spawn the ego car"):
+    with pytest.raises(SimulatorError, match="no space to spawn the ego car"):
         connect(monkeypatch, world).place(START, np.zeros((3, 1)))
 
 
@@ -66,7 +66,7 @@ def test_a_server_that_goes_away_is_told(monkeypatch: pytest.MonkeyPatch) -> Non
     world = World()
     adapter = connect(monkeypatch, world)
     world.gone = True
-    with pytest.raises(SimulatorError, match="the server has gone away"):
+    with pytest.raises(SimulatorError, match="the server has disconnected"):
         adapter.place(START, np.zeros((3, 1)))
 
 

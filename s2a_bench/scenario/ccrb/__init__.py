@@ -1,7 +1,7 @@
-"""Car-to-car rear braking (Euro NCAP CCRb) with a car behind: its options, laws, studies and words.
+"""Car-to-car rear braking (Euro NCAP CCRb) with a car behind: options, laws, studies and labels.
 
-A scenario is `options.CcrbOptions`; `drive.drive` carries a schedule out in a simulator and says what came of it.
-Whole planes of scenarios, and random ones, are in studies.py; how results are worded in words.py.
+A scenario is `options.CcrbOptions`; `drive.drive` executes a schedule in a simulator and returns its outcomes.
+studies.py has planes of scenarios, and random ones; labels.py has the texts of results.
 """
 
 from __future__ import annotations

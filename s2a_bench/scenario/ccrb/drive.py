@@ -1,4 +1,4 @@
-"""One roll-out, or M in lock step: the laws of the three cars carried out in a simulator until all is decided."""
+"""Drive one roll-out, or M in lock step: the laws of the three cars in a simulator, until all are decided."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ from s2a_bench.scenario.ccrb.follower import CarMotion, DriverView, follower
 from s2a_bench.scenario.ccrb.outcome import CollisionWatch, Outcomes
 from s2a_bench.scenario.longitudinal import LockStep, Longitudinal, each
 
-NOBODY_M: Final = 1e6
-"""With the lead so far away nothing but the plan slows the ego down."""
+NO_LEAD_M: Final = 1e6
+"""At this distance the lead has no effect on the ego."""
 AFTER_S: Final = 25.0
-"""How long after the plan a roll-out goes on at most; nearly all are decided earlier."""
+"""Limit of a roll-out after the end of its plan; nearly all are decided earlier."""
 RECORD_S: Final = 0.01
 LOOK_STEPS: Final = 40
-"""Every so many steps it is asked whether all is decided."""
+"""Number of steps between two checks for decided roll-outs."""
 RESTING_MPS: Final = 0.01
 DROP_SHARE: Final = 0.2
-"""Roll-outs that are decided stay until so many are."""
+"""Decided roll-outs are dropped when their share reaches this."""
 PASSED_M: Final = 10.0
 """An ego this far ahead of the lead, beside it, has passed it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """What was seen every `RECORD_S`: arrays of shape (steps, 3, M), for the ego alone of shape (steps, M)."""
+    """Samples every `RECORD_S`: arrays of shape (steps, 3, M), phase and skill of the ego (steps, M)."""
 
     time_s: Floats
     position_m: Floats
@@ -42,12 +42,12 @@ class Trajectory:
     acceleration_mps2: Floats
     phase: NDArray[np.int64]
     skill: NDArray[np.int64]
-    """Which skill runs or ran last, from 0 on; -1 before the first."""
+    """The current or last skill, from 0 on; -1 before the first."""
 
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """What came of a drive."""
+    """Result of a drive."""
 
     outcomes: Outcomes
     trajectory: Trajectory | None
@@ -62,17 +62,16 @@ def drive(
     record: bool = False,
     resting_mps: float = RESTING_MPS,
 ) -> Driven:
-    """Drive M roll-outs, as many as the schedule has columns, and say what became of them.
+    """Drive M roll-outs and return their outcomes.
 
-    They end when the trailing car, last of all, is slower than ``resting_mps``: the careful driver creeps up for ever.
-
-    ``schedule`` has the shape (N, M); the numbers of ``cars`` are single or of shape (M,). Raises UsageError where the
-    simulator cannot do it: lane changes along a lane, many roll-outs in a world for one.
+    ``schedule`` has the shape (N, M); the numbers of ``cars`` are single or of shape (M,). A roll-out ends when the
+    trailing car, the last to stop, is slower than ``resting_mps``, because the careful driver never quite stops. Raises
+    UsageError if the simulator has no lane changes, or too few roll-outs.
     """
     rollouts = np.broadcast_shapes(schedule.start_s.shape, (1, 1))[1]
     if any(plan.lane) and not simulator.steers:
         raise UsageError(
-            f"`lane_change`: the simulator '{simulator.name}' knows one lane only; take `simulator` embedded"
+            f"`lane_change`: the simulator '{simulator.name}' has one lane only; take `simulator` embedded"
         )
     if simulator.most is not None and rollouts > simulator.most:
         raise UsageError(f"`simulator`: '{simulator.name}' runs {simulator.most} roll-out at a time, not {rollouts}")
@@ -80,21 +79,21 @@ def drive(
 
 
 def follower_survives(cars: Cars, plan: DrivingPlan, n_skills: ArrayLike, t_nom_s: ArrayLike) -> NDArray[np.bool_]:
-    """Return whether the trailing car never hits an ego whose tokens come at once, at the same gap; shape (M,).
+    """Return whether the trailing car never hits an ego whose tokens arrive at once, at the same gap; shape (M,).
 
-    Skill follows skill, each as long as planned, with nobody ahead; a plan shorter than the longest ends earlier.
+    The ego has no lead, and its skills run back to back at nominal durations; shorter plans end earlier.
     """
     count, nominal_s = np.broadcast_arrays(np.atleast_1d(n_skills), np.atleast_1d(np.asarray(t_nom_s, float)))
-    place = np.arange(count.max())[:, np.newaxis]
-    schedule = Schedule(np.minimum(place, count) * nominal_s, np.where(place < count, nominal_s, 0.0))
-    alone = replace(cars, front_gap_m=NOBODY_M, onset_s=0.0, reflex=False)
+    skill = np.arange(count.max())[:, np.newaxis]
+    schedule = Schedule(np.minimum(skill, count) * nominal_s, np.where(skill < count, nominal_s, 0.0))
+    alone = replace(cars, front_gap_m=NO_LEAD_M, onset_s=0.0, reflex=False)
     along = DrivingPlan(plan.set_point_mps, (0,) * len(plan.lane))
     found = drive(Longitudinal(), alone, along, schedule, resting_mps=LEAST_IMPACT_MPS).outcomes
     return np.asarray(found.code & 2 == 0)
 
 
 class _Drive(LockStep):
-    """The loop and its memory; `LockStep.keep` reaches the laws, the delay, the watch and the simulator too."""
+    """The loop and its state; `LockStep.keep` includes the laws, the delay, the watch and the simulator."""
 
     def __init__(self, simulator: Simulator, cars: Cars, plan: DrivingPlan, schedule: Schedule, rollouts: int) -> None:
         self._simulator = simulator
@@ -133,7 +132,7 @@ class _Drive(LockStep):
         return Driven(self._outcomes, self._trajectory(every * step_s) if record else None)
 
     def _go_on(self, decided: NDArray[np.bool_], *, record: bool) -> bool:
-        """Let roll-outs drop out, many at a time, that are decided; tell whether any is left."""
+        """Drop decided roll-outs, many at a time; return whether any is left."""
         share = decided.mean()
         if share == 1:
             return False
@@ -160,10 +159,10 @@ class _Drive(LockStep):
         acceleration[REAR] = self._rear.acceleration(seen, step_s)
 
     def _decided(self, resting_mps: float) -> NDArray[np.bool_]:
-        """Tell in which roll-outs nothing can happen any more."""
+        """Return a mask of the roll-outs in which nothing more can happen."""
         speed = self._state.speed_mps
         over = self._ego.phase == DONE
-        # Until the driver behind has seen the ego at rest, he may stop and go again.
+        # Until the driver behind has seen the ego at rest, the rear car may stop and start again.
         calm = (speed[REAR] < resting_mps) & (self._acceleration[REAR] <= 0) & self._seen_at_rest
         behind = self._watch.rear.crashed | calm
         resting = over & (speed[EGO] <= 0) & behind
@@ -184,7 +183,7 @@ class _Drive(LockStep):
 
 
 class Delay(LockStep):
-    """Remembers ego and trailing car, each roll-out with its own delay; before the beginning they kept their speed."""
+    """History of ego and trailing car, with one delay per roll-out; before the start they kept their speed."""
 
     def __init__(self, position_m: Floats, speed_mps: Floats, delay_s: Floats, step_s: float) -> None:
         rollouts = position_m.shape[1]
@@ -193,7 +192,7 @@ class Delay(LockStep):
         self._size = int(self._steps.max()) + 1
         self._columns = np.arange(rollouts)
         before = np.arange(-self._size, 0)[:, np.newaxis] * step_s
-        # What is seen together lies together: with delays of their own, roll-outs read from all over the memory.
+        # Contiguous per roll-out: with different delays, roll-outs read different rows.
         self._past = np.zeros((self._size, rollouts, 6))
         for first, car in ((0, EGO), (3, REAR)):
             self._past[..., first] = position_m[car] + before * speed_mps[car]
@@ -206,18 +205,18 @@ class Delay(LockStep):
         self._columns = np.arange(len(columns))
 
     def see(self, state: State, ego_acceleration: Floats, rear_acceleration: Floats) -> DriverView:
-        """Remember the present, and return it beside what was a reaction time ago."""
-        # A brake that holds a car at rest does not slow it down.
-        own_acceleration = np.where(state.speed_mps[REAR] > 0, rear_acceleration, np.maximum(rear_acceleration, 0.0))
+        """Store the present state, and return it with the state a reaction time ago."""
+        # A brake that holds a car at rest does not decelerate it.
+        rear_acceleration = np.where(state.speed_mps[REAR] > 0, rear_acceleration, np.maximum(rear_acceleration, 0.0))
         ego = CarMotion(state.position_m[EGO], state.speed_mps[EGO], ego_acceleration)
-        own = CarMotion(state.position_m[REAR], state.speed_mps[REAR], own_acceleration)
+        rear = CarMotion(state.position_m[REAR], state.speed_mps[REAR], rear_acceleration)
         self._head = (self._head + 1) % self._size
         now = self._past[self._head]
-        for first, car in ((0, ego), (3, own)):
+        for first, car in ((0, ego), (3, rear)):
             now[:, first], now[:, first + 1], now[:, first + 2] = car.position_m, car.speed_mps, car.acceleration_mps2
         if self._same:
             then = self._past[(self._head - self._steps[0]) % self._size]
         else:
             then = self._past[(self._head - self._steps) % self._size, self._columns]
         then = np.ascontiguousarray(then.T)
-        return DriverView(ego, own, CarMotion(*then[:3]), CarMotion(*then[3:]))
+        return DriverView(ego, rear, CarMotion(*then[:3]), CarMotion(*then[3:]))

@@ -1,6 +1,6 @@
-"""The ego's control: it follows the set-points of whichever skill runs, and does something in between.
+"""The ego's control: it follows the set-points of the running skill, and the gap behaviour between skills.
 
-A speed loop of .3 s around the set-point, which falls evenly within a skill, with that slope as feed-forward; then
+A speed loop of 0.3 s around the set-point, which falls linearly within a skill, with that slope as feed-forward; then
 limits of jerk and acceleration. Before the first skill, and after a plan that did not stop it, the ego keeps its speed.
 """
 
@@ -23,7 +23,7 @@ from s2a_bench.text import none_of
 WAITING, ACTING, GAP, DONE = 0, 1, 2, 3
 PHASES: Final = ("waiting", "acting", "gap", "done")
 REFLEX_MPS2, REFLEX_TTC_S = 4.0, 1.5
-"""The reflex brakes fully where more than this is required, or contact is nearer."""
+"""The reflex brakes fully above this required deceleration, or below this time to collision."""
 
 BETWEEN: dict[Gap, Callable[[Floats, Floats, Floats, Floats], Floats]] = {
     "stop": lambda _speed, _slope, _first, hard: -hard,
@@ -31,11 +31,11 @@ BETWEEN: dict[Gap, Callable[[Floats, Floats, Floats, Floats], Floats]] = {
     "hold": lambda _speed, slope, _first, _hard: slope,
     "cruise": lambda speed, _slope, first, _hard: (first - speed) / EGO_LOOP_S,
 }
-"""Gap behaviour -> wanted acceleration, of the speed, the last skill's slope, v0, and how hard *stop* brakes."""
+"""Gap behaviour -> acceleration, a function of speed, the last skill's slope, v0, and the deceleration of *stop*."""
 
 
 class Ego(LockStep):
-    """Controls the ego of M roll-outs through one schedule each."""
+    """The ego of M roll-outs, with one schedule each."""
 
     def __init__(self, cars: Cars, plan: DrivingPlan, schedule: Schedule, rollouts: int) -> None:
         gaps = np.broadcast_to(np.asarray(cars.gap), (rollouts,))
@@ -52,7 +52,7 @@ class Ego(LockStep):
         self._between = {gap: rule for gap, rule in BETWEEN.items() if (gaps == gap).any()}
         self._reflex = Reflex(rollouts) if cars.reflex else None
         self.index = np.full(rollouts, -1)
-        """The skill that runs or ran last, from 0 on; -1 before the first."""
+        """The current or last skill, from 0 on; -1 before the first."""
         self._next_s = self._start_s[0].copy()
         self._from_s, self._until_s = np.zeros(rollouts), np.full(rollouts, -np.inf)
         self._level, self._slope = self._points[0].copy(), np.zeros(rollouts)
@@ -84,11 +84,11 @@ class Ego(LockStep):
         return self.acceleration_mps2
 
     def stopped(self, speed: Floats) -> None:
-        """Let go of the brake where the car has come to rest."""
+        """Release the brake of cars at rest."""
         self.acceleration_mps2 = np.where((speed <= 0) & (self.acceleration_mps2 < 0), 0.0, self.acceleration_mps2)
 
     def _advance(self, now_s: float) -> None:
-        """Take up the next skill where its time has come, and tell the phases."""
+        """Start the skills that are due, and update the phases."""
         now_s += 1e-12
         while (due := now_s >= self._next_s).any():
             columns = np.flatnonzero(due)
@@ -110,7 +110,7 @@ class Ego(LockStep):
 
 
 class Reflex(LockStep):
-    """A layer below the plan: full braking once contact is near, until the ego is no faster than the lead."""
+    """A layer below the plan: full braking near contact, until the ego is no faster than the lead."""
 
     def __init__(self, rollouts: int) -> None:
         self._braking = np.zeros(rollouts, bool)

@@ -1,19 +1,19 @@
-"""The car behind: laws by their published names, all with one brake; the rear outcome hangs on them.
+"""The car behind: laws by their published names, all with one brake; the rear outcome depends on them.
 
-``careful`` (ours, in the manner of UN Regulation 157): from the ego's state tau ago, extrapolated over tau with the
-deceleration it had then, it computes the braking it needs to stay 1 m behind (`needed`), and brakes with that,
-at most 7 m/s^2, once the ego brakes by more than .5 or more than .7 is needed, until it is no faster than the ego.
+``careful`` (of this project, in the manner of UN Regulation 157): from the ego's state tau ago, extrapolated over tau
+with its deceleration then, it computes the braking needed to stay 1 m behind (`needed`), and brakes with that, at most
+7 m/s^2, once the ego brakes by more than 0.5 or more than 0.7 is needed, until it is no faster than the ego.
 
 ``idm``: the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62 (2000) 1805): no delay.
 
 ``hdm``: the delay and the temporal anticipation of the Human Driver Model for one leader, without its estimation errors
 (Treiber, Kesting and Helbing, Physica A 360 (2006) 71): the IDM on s - tau dv, v + tau a, and dv, all of tau ago.
 
-``hybrid`` (ours, called ``idm`` at first): the IDM on its own state now, and the ego of tau ago extrapolated at steady
-speed. It knows its own speed at once, but its closing speed in part late.
+``hybrid`` (of this project): the IDM on the rear car's present state, and the ego of tau ago extrapolated at steady
+speed. The speed is undelayed, the closing speed partly delayed.
 
-The IDM's time headway is what keeps the rear gap of the scenario at v0, so that it is at ease in the beginning; at rest
-behind a car at rest it stays. Every brake gives at most 7 m/s^2, builds up at 7 / .6 and goes at 7 / .2 m/s^3.
+The IDM's time headway keeps the rear gap of the scenario at v0, so the car starts in equilibrium; at rest behind a car
+at rest it stays. Every brake gives at most 7 m/s^2, builds up at 7 / 0.6 and releases at 7 / 0.2 m/s^3.
 """
 
 from __future__ import annotations
@@ -38,17 +38,17 @@ LEAST_ROOM_M: Final = 0.05
 MOST_MPS2: Final = 7.0
 RELEASE_S: Final = 0.2
 SPARE_M: Final = 1.0
-"""How far behind the ego the careful driver means to stay."""
+"""Distance that the careful driver keeps to the ego."""
 LEAST_MPS2: Final = 1e-6
-"""Less is no deceleration."""
+"""Smaller decelerations count as zero."""
 ACTS_MPS2: Final = 0.7
-"""The careful driver brakes once this much is needed."""
+"""The careful driver brakes once more than this is needed."""
 CATCH_UP_MPS2: Final = 1.0
-"""How the careful driver closes up again when slower and farther away than in the beginning."""
+"""The careful driver's acceleration when slower and farther away than at the start."""
 
 IDM_ACCEL_MPS2, IDM_COMFORT_MPS2, IDM_STANDSTILL_M, IDM_EXPONENT = 1.5, 2.0, 2.0, 4
 IDM_HASTE: Final = 1.2
-"""Desired speed over v0: nobody keeps a steady gap at the speed that they would have alone."""
+"""Desired speed over v0: at the desired speed the IDM keeps no finite gap."""
 IDM_LEAST_HEADWAY_S: Final = 0.1
 
 AT_EASE: Final = "headway such that it keeps its gap at first"
@@ -66,19 +66,19 @@ class CarMotion:
 
 @dataclass(frozen=True, slots=True)
 class DriverView:
-    """What a driver can act on: ego and own car as they are, and as they were a reaction time ago."""
+    """Inputs of a law: ego and rear car now, and a reaction time ago."""
 
     ego: CarMotion
-    own: CarMotion
+    rear: CarMotion
     ego_then: CarMotion
-    own_then: CarMotion
+    rear_then: CarMotion
 
 
 class Follower(LockStep):
-    """A law for the trailing car of M roll-outs; it remembers from step to step."""
+    """A law for the trailing car of M roll-outs, with state from step to step."""
 
     law: ClassVar[str]
-    """The law in words; ``{reaction:g}`` stands for the reaction time in s."""
+    """Description of the law; ``{reaction:g}`` is the reaction time in s."""
 
     def acceleration(self, seen: DriverView, step_s: float) -> Floats:
         """Return the acceleration in m/s^2 for the next step, shape (M,)."""
@@ -86,14 +86,14 @@ class Follower(LockStep):
 
 
 class Brake(LockStep):
-    """The trailing car's brake: its force builds up slowly and goes fast."""
+    """The trailing car's brake: its force builds up slowly and releases fast."""
 
     def __init__(self, cars: Cars, rollouts: int) -> None:
         self._build_mps3 = MOST_MPS2 / each(cars.build_s, rollouts)
         self.force_mps2 = np.zeros(rollouts)
 
     def press(self, want_mps2: Floats, step_s: float) -> Floats:
-        """Return the force after a step towards the wanted one."""
+        """Return the force after one step towards ``want_mps2``."""
         change = np.minimum(want_mps2, MOST_MPS2) - self.force_mps2
         self.force_mps2 += np.clip(change, -MOST_MPS2 / RELEASE_S * step_s, self._build_mps3 * step_s)
         return self.force_mps2.copy()
@@ -114,20 +114,20 @@ class Careful(Follower):
         self._brake = Brake(cars, rollouts)
 
     def acceleration(self, seen: DriverView, step_s: float) -> Floats:
-        ego, own = seen.ego_then, seen.own
+        ego, rear = seen.ego_then, seen.rear
         decel = np.maximum(-ego.acceleration_mps2, 0.0)
         until_rest = np.divide(ego.speed_mps, decel, out=np.full(decel.shape, np.inf), where=decel > LEAST_MPS2)
         ahead_s = np.minimum(self._reaction_s, until_rest)
         ahead_m = ego.position_m + ego.speed_mps * ahead_s - decel * ahead_s * ahead_s / 2
         ahead_mps = np.maximum(ego.speed_mps - decel * ahead_s, 0.0)
-        gap_m = ahead_m - own.position_m
-        need = needed(own.speed_mps, gap_m - SPARE_M, ahead_mps, decel)
+        gap_m = ahead_m - rear.position_m
+        need = needed(rear.speed_mps, gap_m - SPARE_M, ahead_mps, decel)
         alarmed = decel > BRAKES_MPS2
-        faster = own.speed_mps > ahead_mps + 1e-9
+        faster = rear.speed_mps > ahead_mps + 1e-9
         self._braking |= alarmed | (need > ACTS_MPS2)
         self._braking &= faster | alarmed
         force = self._brake.press(np.where(self._braking, need, 0.0), step_s)
-        idle = ~self._braking & (force <= 0) & (own.speed_mps < ego.speed_mps) & (gap_m > self._far_m)
+        idle = ~self._braking & (force <= 0) & (rear.speed_mps < ego.speed_mps) & (gap_m > self._far_m)
         return np.where(idle, CATCH_UP_MPS2, -force)
 
 
@@ -148,14 +148,14 @@ class Idm(Follower):
         gap_m, speed, closing, ahead = self._perceived(seen)
         wish = idm_acceleration(gap_m, speed, closing, self._desired_mps, self._headway_s)
         force = self._brake.press(np.maximum(-wish, 0.0), step_s)
-        standing = (seen.own.speed_mps <= 0) & (ahead.speed_mps <= 0)
+        standing = (seen.rear.speed_mps <= 0) & (ahead.speed_mps <= 0)
         going = np.where(standing, 0.0, np.maximum(wish, 0.0))
         return np.where(force > 0, -force, going)
 
     def _perceived(self, seen: DriverView) -> tuple[Floats, Floats, Floats, CarMotion]:
-        """Return gap, own speed, closing speed, and the ego, as the law is given them."""
-        ego, own = seen.ego, seen.own
-        return ego.position_m - own.position_m, own.speed_mps, own.speed_mps - ego.speed_mps, ego
+        """Return the law's inputs: gap, rear speed, closing speed, and the ego."""
+        ego, rear = seen.ego, seen.rear
+        return ego.position_m - rear.position_m, rear.speed_mps, rear.speed_mps - ego.speed_mps, ego
 
 
 class Hdm(Idm):
@@ -167,14 +167,14 @@ class Hdm(Idm):
     )
 
     def _perceived(self, seen: DriverView) -> tuple[Floats, Floats, Floats, CarMotion]:
-        ego, own, ago_s = seen.ego_then, seen.own_then, self._reaction_s
-        closing = own.speed_mps - ego.speed_mps
-        gap_m = ego.position_m - own.position_m - ago_s * closing
-        return gap_m, np.maximum(own.speed_mps + ago_s * own.acceleration_mps2, 0.0), closing, ego
+        ego, rear, ago_s = seen.ego_then, seen.rear_then, self._reaction_s
+        closing = rear.speed_mps - ego.speed_mps
+        gap_m = ego.position_m - rear.position_m - ago_s * closing
+        return gap_m, np.maximum(rear.speed_mps + ago_s * rear.acceleration_mps2, 0.0), closing, ego
 
 
 class Hybrid(Idm):
-    """The IDM on its own state now, and the ego of a reaction time ago extrapolated at steady speed."""
+    """The IDM on the rear car's present state, and the ego of a reaction time ago extrapolated at steady speed."""
 
     law: ClassVar[str] = (
         "hybrid follower (ours): IDM on its own state now and the ego seen {reaction:g} s ago, extrapolated at steady "
@@ -182,16 +182,17 @@ class Hybrid(Idm):
     )
 
     def _perceived(self, seen: DriverView) -> tuple[Floats, Floats, Floats, CarMotion]:
-        ego, own = seen.ego_then, seen.own
-        gap_m = ego.position_m + ego.speed_mps * self._reaction_s - own.position_m
-        return gap_m, own.speed_mps, own.speed_mps - ego.speed_mps, ego
+        ego, rear = seen.ego_then, seen.rear
+        gap_m = ego.position_m + ego.speed_mps * self._reaction_s - rear.position_m
+        return gap_m, rear.speed_mps, rear.speed_mps - ego.speed_mps, ego
 
 
 def needed(speed_mps: Floats, room_m: Floats, ahead_mps: Floats, ahead_decel_mps2: Floats) -> Floats:
-    """Return the deceleration in m/s^2 that just avoids the car ahead, which goes on braking as it does.
+    """Return the least deceleration in m/s^2 that avoids the car ahead if that keeps its deceleration.
 
-    With room r, own speed v, the other's w and A: where it brakes (A > .5) and stops first, v^2 / (2 (r + w^2/(2A)));
-    where it would still move when the speeds meet, A + c^2 / (2 r), c = v - w; where it does not brake, c^2 / (2 r).
+    With room r, speed v, and the speed w and deceleration A ahead: v^2 / (2 (r + w^2/(2A))) if the car ahead brakes
+    (A > 0.5) and stops first; A + c^2 / (2 r), c = v - w, if it moves when the speeds meet; c^2 / (2 r) if it does not
+    brake.
     """
     room = np.maximum(room_m, LEAST_ROOM_M)
     closing = np.maximum(speed_mps - ahead_mps, 0.0)

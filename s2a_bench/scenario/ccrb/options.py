@@ -1,4 +1,4 @@
-"""What can be asked of the scenario: the cars' numbers, the plan's set-points; and what it refuses."""
+"""Options of the scenario: the cars' numbers and the plan's set-points."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SKILL_SET: Final = "driving"
 
 
 class CcrbOptions(Options):
-    """One scenario; the defaults are the operating point at which the paper's outcome comes about."""
+    """One scenario; the defaults are the operating point with the paper's outcome."""
 
     PANEL: ClassVar[str] = "Scenario"
 
@@ -54,7 +54,7 @@ class CcrbOptions(Options):
 
     @cached_property
     def durations(self) -> Durations:
-        """Return how long a set-point takes: the skill set's, scaled to T_nom where that is given."""
+        """Return the durations of a set-point: the skill set's, scaled to T_nom if given."""
         durations = _skill("set_speed").durations
         factor = 1.0 if self.t_nom_s is None else self.t_nom_s / durations.nominal_s
         return Durations(durations.least_s * factor, durations.nominal_s * factor, durations.most_s * factor)
@@ -65,7 +65,7 @@ class CcrbOptions(Options):
 
     @property
     def skills(self) -> int:
-        """Return how many skills the plan has, the lane change included."""
+        """Return the number of skills, the lane change included."""
         return self.n_skills + self.lane_change
 
     @property
@@ -83,19 +83,18 @@ class CcrbOptions(Options):
 
     @property
     def follower_law(self) -> str:
-        """Return how the car behind drives, in words."""
         return law(self.model_dump())
 
     @cached_property
     def follower_survives(self) -> bool:
-        """Return whether the car behind stops behind an ego whose tokens come at once."""
+        """Return whether the car behind stops behind an ego whose tokens arrive at once."""
         from s2a_bench.scenario.ccrb.drive import follower_survives
 
         return bool(follower_survives(self.cars, self.driving, self.skills, self.durations.nominal_s)[0])
 
     @property
     def decel_mps2(self) -> float:
-        """Return a_p, what the plan brakes with."""
+        """Return a_p, the plan's deceleration."""
         if self.plan_decel_mps2 is not None:
             return self.plan_decel_mps2
         return float(plan_decel(self.cars, self.n_skills, self.durations.nominal_s, lane_change=self.lane_change))
@@ -109,12 +108,12 @@ class CcrbOptions(Options):
 
     @property
     def deadline_s(self) -> float:
-        """Return S_front, by when the plan must start to keep its distance to the lead."""
+        """Return S_front, the latest start that keeps the distance to the lead."""
         return float(start_deadline(self.cars, self.decel_mps2))
 
     @property
     def texts(self) -> list[str]:
-        """Return the plan's calls as the driving skill set writes them."""
+        """Return the plan's calls in the driving skill set."""
         plan = self.driving
         points = plan.set_point_mps[1:, 0] / KMH
         return [

@@ -1,4 +1,4 @@
-"""What became of the three cars: impacts, gaps, times to collision, watched step by step."""
+"""Outcomes of the three cars: impacts, gaps, times to collision, watched step by step."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from s2a_bench.scenario.longitudinal import LockStep
 
 @dataclass(frozen=True, slots=True)
 class Outcomes:
-    """M roll-outs, arrays of shape (M,). NaN is what a roll-out does not have; a gap with an impact is 0."""
+    """M roll-outs, arrays of shape (M,). Undefined values are NaN; a gap with an impact is 0."""
 
     code: NDArray[np.int64]
     """Bit 0: the ego hit the lead; bit 1: it was hit from behind."""
@@ -26,16 +26,15 @@ class Outcomes:
     min_rear_gap_m: Floats
     min_front_ttc_s: Floats
     min_rear_ttc_s: Floats
-    """Least gap over closing speed; 0 with an impact, NaN where the cars never closed in."""
+    """Least gap over closing speed; 0 with an impact, NaN if the gap never shrank."""
     required_decel_mps2: Floats
-    """The greatest closing speed^2 / (2 gap) towards the lead (DRAC); NaN with a front impact."""
+    """Greatest closing speed^2 / (2 gap) to the lead (DRAC); NaN with a front impact."""
 
     def put(self, rollouts: NDArray[np.int64], found: Outcomes) -> None:
         for item in fields(self):
             getattr(self, item.name)[rollouts] = getattr(found, item.name)
 
     def name(self, rollout: int) -> str:
-        """Return none, front, rear or both."""
         return OUTCOMES[int(self.code[rollout])]
 
     @property
@@ -45,7 +44,7 @@ class Outcomes:
 
 
 class CarPair(LockStep):
-    """Watches one car behind another until they crash."""
+    """Watches two cars, one behind the other, until they crash."""
 
     def __init__(self, ahead: int, behind: int, state: State) -> None:
         self._ahead, self._behind = ahead, behind
@@ -82,8 +81,8 @@ class CarPair(LockStep):
 class CollisionWatch(LockStep):
     """Watches both pairs.
 
-    A front impact ends a roll-out: what follows a crash is not modelled. After a rear impact the trailing car is out,
-    and the ego goes on as if it had not been pushed; *both* means that it then hits the lead as well.
+    A front impact ends a roll-out: the motion after a crash is not modelled. After a rear impact the trailing car is
+    ignored, and the ego drives on without a push; *both* means that it hits the lead later.
     """
 
     def __init__(self, state: State) -> None:

@@ -1,4 +1,4 @@
-"""Pictures of the three cars from above, by highway-env without a screen; and as frames, what a model is shown."""
+"""Pictures of the three cars from above, by highway-env without a screen, and a source of such frames for a model."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ COLOURS: Final = {LEAD: (230, 159, 0), EGO: (0, 158, 115), REAR: (0, 114, 178)}
 CRASHED: Final = (213, 94, 0)
 PIXELS_A_M: Final = 8.0
 AHEAD_M: Final = 15.0
-"""How far ahead of the ego the middle of the picture lies."""
+"""From the ego to the middle of the picture."""
 LOOP_FRAMES: Final = 1000
-"""After so many frames the cars are back where they began: a road has an end."""
+"""The cars return to their start after this many frames, because the road is finite."""
 
 
 class TopView:
-    """Looks down on the road, and follows the ego."""
+    """A view of the road from above that follows the ego."""
 
     def __init__(self, width: int, height: int) -> None:
-        # pygame asks for its drivers when it is imported: none is there without a screen or loudspeaker.
+        # pygame selects its drivers at import; without a screen or loudspeaker only dummies work.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
         os.environ.setdefault("SDL_AUDIODRIVER", "dummy")
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -65,17 +65,16 @@ class TopView:
 
 
 class RoadSource:
-    """A FrameSource of a single scenario, seen from above as in the animation, the ego and what is round it.
+    """A FrameSource of one scenario: the ego and its surroundings from above, as in the animation.
 
-    All three drive on at v0 with the gaps that they have at t = 0; every frame is one period further down the road.
-    read() renders and never waits. Raises UsageError for a tiny size.
+    All cars drive at v0 with their gaps at t = 0; every frame is one period later. `read` renders and never waits.
+    Raises UsageError for a tiny size.
     """
 
     encoding: Encoding = "rgb8"
     name = "scenario"
 
     def __init__(self, cars: Cars, width: int, height: int, *, fps: float = 30.0) -> None:
-        """Draw once, as the first picture takes longer."""
         check_size(width, height, smallest=16)
         self.width, self.height = width, height
         self._view = TopView(width, height)
@@ -83,7 +82,7 @@ class RoadSource:
         self._gaps_m[LEAD], self._gaps_m[REAR] = float(cars.front_gap_m), -float(cars.rear_gap_m)  # type: ignore[arg-type]
         self._ahead_m = float(cars.speed_mps) / fps  # type: ignore[arg-type]
         self._index = 0
-        self._picture(0)
+        self._picture(0)  # the first picture takes longer
 
     def read(self) -> Frame:
         stamp_ns = now_ns()
@@ -91,8 +90,7 @@ class RoadSource:
         self._index += 1
         return Frame(index, stamp_ns, self.width, self.height, self.encoding, self._picture(index))
 
-    def close(self) -> None:
-        """Hold nothing: the surface is memory."""
+    def close(self) -> None: ...
 
     def _picture(self, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
         flat = np.zeros(3)

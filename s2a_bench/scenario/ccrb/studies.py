@@ -1,4 +1,4 @@
-"""Many scenarios at once: a plane over rate and rear gap, and random ones; driven along the lane, in lock step."""
+"""Many scenarios in lock step along the lane: a plane over rate and rear gap, and random ones."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from s2a_bench.scenario.ccrb.outcome import Outcomes
 from s2a_bench.scenario.longitudinal import Longitudinal
 
 RESTING_MPS: Final = LEAST_IMPACT_MPS
-"""The trailing car counts as stopped: at rest the ego cannot be hit any more, but the gap still shrinks."""
+"""Below it the trailing car counts as stopped: there is no impact any more, but the gap still shrinks."""
 
 RANGES: Final[dict[str, tuple[float, float]]] = {
     "tokens_per_s": (1.0, 20.0),
@@ -29,14 +29,14 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
     "rear_gap_m": (6.0, 30.0),
     "reaction_s": (0.7, 1.8),
 }
-"""What random scenarios are drawn from, uniformly; the rate on a logarithmic scale."""
+"""Ranges of random scenarios, drawn uniformly; the rate on a logarithmic scale."""
 LENGTHS: Final = (1, 2, 3, 4, 5, 6)
 SKILLS: Final = (3, 4, 5, 6, 8)
 
 
 @dataclass(frozen=True, slots=True)
 class Scenes:
-    """M scenarios: arrays of shape (M,), the cars' numbers by the names of `Cars`, the plans' by those of rows."""
+    """M scenarios: arrays of shape (M,), named as in `Cars` and as in the columns of plans."""
 
     numbers: dict[str, Any]
 
@@ -47,18 +47,18 @@ class Scenes:
         return Scenes({name: values[part] for name, values in self.numbers.items()})
 
     def times(self, count: int) -> Scenes:
-        """Return them ``count`` times, one block after the other."""
+        """Repeat all scenarios ``count`` times."""
         return Scenes({name: np.tile(values, count) for name, values in self.numbers.items()})
 
-    def cars(self, gap: NDArray[np.str_], asked: CcrbOptions) -> Cars:
-        """Return their cars; the gap behaviour is one for each, the laws are those of ``asked``."""
+    def cars(self, gap: NDArray[np.str_], options: CcrbOptions) -> Cars:
+        """Return their cars, with one gap behaviour each, and the laws of ``options``."""
         names = ("front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s", "speed_mps")
         numbers = {name: self.numbers[name] for name in names}
-        return Cars(**numbers, gap=gap, follower=asked.follower, reflex=asked.reflex)
+        return Cars(**numbers, gap=gap, follower=options.follower, reflex=options.reflex)
 
 
 def plane(
-    asked: CcrbOptions,
+    options: CcrbOptions,
     rates: Sequence[float],
     gaps_m: Sequence[float],
     points: tuple[int, int],
@@ -66,14 +66,14 @@ def plane(
     prompt_s: float,
     tokens_per_skill: int,
 ) -> Scenes:
-    """Lay rate and rear gap, each from and to, out as a grid, the rate on a logarithmic scale; the rest as asked."""
+    """Return a grid over rate and rear gap, each (from, to), the rate on a logarithmic scale."""
     axes = (np.linspace(0.0, 1.0, number) for number in points)
     share = np.stack([values.ravel() for values in np.meshgrid(*axes, indexing="ij")], axis=1)
-    return spread(asked, rates, gaps_m, share, prompt_s=prompt_s, tokens_per_skill=tokens_per_skill)
+    return spread(options, rates, gaps_m, share, prompt_s=prompt_s, tokens_per_skill=tokens_per_skill)
 
 
 def spread(
-    asked: CcrbOptions,
+    options: CcrbOptions,
     rates: Sequence[float],
     gaps_m: Sequence[float],
     share: Floats,
@@ -84,28 +84,25 @@ def spread(
     """Return scenarios at points of that plane, given as shares of its sides, shape (M, 2)."""
     (slow, fast), (near, far) = rates, gaps_m
     rate, gap = slow * (fast / slow) ** share[:, 0], near + (far - near) * share[:, 1]
-    cars = asked.cars
+    cars = options.cars
     fixed = {
         "prompt_s": prompt_s,
         "tokens_per_skill": tokens_per_skill,
-        "n_skills": asked.n_skills,
-        "t_nom_s": asked.durations.nominal_s,
+        "n_skills": options.n_skills,
+        "t_nom_s": options.durations.nominal_s,
         "speed_mps": cars.speed_mps,
         "front_gap_m": cars.front_gap_m,
         "lead_decel_mps2": cars.lead_decel_mps2,
         "reaction_s": cars.reaction_s,
     }
     numbers = {name: np.full(rate.shape, value) for name, value in fixed.items()}
-    decel = asked.plan_decel_mps2 or plan_decel(cars, asked.n_skills, asked.durations.nominal_s)
+    decel = options.plan_decel_mps2 or plan_decel(cars, options.n_skills, options.durations.nominal_s)
     numbers["plan_decel_mps2"] = np.full(rate.shape, decel)
     return Scenes({**numbers, "tokens_per_s": rate, "rear_gap_m": gap, "draw": np.arange(len(rate))})
 
 
 def draw(rng: np.random.Generator, count: int) -> Scenes:
-    """Draw random scenarios.
-
-    A plan that the ego cannot follow (more than its full braking) is not drawn: its skills get longer.
-    """
+    """Draw random scenarios; skills are lengthened where a plan exceeds the ego's braking."""
     numbers: dict[str, Any] = {
         name: rng.uniform(low, high, count) for name, (low, high) in RANGES.items() if name != "tokens_per_s"
     }
@@ -121,12 +118,12 @@ def draw(rng: np.random.Generator, count: int) -> Scenes:
 
 
 def survived(scenes: Scenes, cars: Cars) -> NDArray[np.bool_]:
-    """Return in which scenarios the trailing car passes its check."""
+    """Return a mask of the scenarios in which the trailing car passes its check."""
     return follower_survives(cars, _plan(scenes, cars), scenes.numbers["n_skills"], scenes.numbers["t_nom_s"])
 
 
 def drive_along(scenes: Scenes, cars: Cars, schedule: Schedule) -> Outcomes:
-    """Drive the scenarios with the bare integrator; there is no least rear gap but that of an impact."""
+    """Drive the scenarios with the bare integrator; the least rear gap is NaN without an impact."""
     outcomes = drive(Longitudinal(), cars, _plan(scenes, cars), schedule, resting_mps=RESTING_MPS).outcomes
     outcomes.min_rear_gap_m[np.isnan(outcomes.rear_impact_mps)] = np.nan
     return outcomes

@@ -1,4 +1,4 @@
-"""When to start where the car ahead sets a deadline: the paper's future work, from closed forms."""
+"""The start before a deadline set by the car ahead (the paper's future work), from closed forms."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from s2a_bench.policy import Floats, Plans, Schedule
 from s2a_bench.policy.schedule import align, safe_start, work_conserving
 
 NAME: Final = "s2a-ttc"
-"""How the rule is called beside the policies."""
+"""Name of the rule in reports."""
 
 
 @dataclass(frozen=True, slots=True)
 class TimedStart:
-    """Schedules of M plans, and where the deadline could not be kept without stalls."""
+    """Schedules of M plans, and a mask of those that cannot keep the deadline without stalls."""
 
     schedule: Schedule
     late: NDArray[np.bool_]
 
 
 def ttc_aware(plans: Plans, deadline_s: ArrayLike) -> TimedStart:
-    """Start at S0 where that keeps the deadline; else at the deadline, if stretching makes that stall-free.
+    """Start at S0 if that keeps the deadline; else at the deadline, if stretching makes that stall-free.
 
-    The stall-free starts are S_lo and later, so that [S_lo, deadline] is what is feasible: the deadline itself is the
-    part of it that stretches skills least. Where S_lo is past the deadline too, the plan starts with its first skill,
-    each skill is held on up to T_max, and the roll-out is flagged ``late``: safety goes before smoothness.
-    Every arrival is known here; ``deadline_s`` is one, or of shape (M,).
+    Starts from S_lo on are stall-free, so [S_lo, deadline] is feasible, and the deadline stretches skills least. If
+    S_lo is past the deadline too, the plan starts with its first skill, each skill is held on up to T_max, and the
+    roll-out is flagged ``late``: safety goes before smoothness. All arrivals are known; ``deadline_s`` is one number,
+    or of shape (M,).
     """
     arrival_s, nominal_s, most_s = align(plans.arrival_s, plans.nominal_s, plans.most_s)
     deadline = np.broadcast_to(np.asarray(deadline_s, float), arrival_s.shape[1:])
@@ -37,14 +37,14 @@ def ttc_aware(plans: Plans, deadline_s: ArrayLike) -> TimedStart:
     late = least > deadline
     first = np.where(safe <= deadline, safe, np.where(late, arrival_s[0], deadline))
     start = work_conserving(arrival_s, nominal_s, first)
-    # Slow early skills down rather than let a later one be missing: backwards, but never the start of a late plan.
+    # Stretch early skills instead of stalling later: backwards, but not in late plans.
     for i in reversed(range(1, len(start) - 1)):
         np.maximum(start[i], start[i + 1] - most_s[i], out=start[i], where=~late)
     return TimedStart(Schedule(start, _durations(start, nominal_s, most_s)), late)
 
 
 def _durations(start_s: Floats, nominal_s: Floats, most_s: Floats) -> Floats:
-    """Let each skill run until the next one starts, at most for its longest; the last as planned."""
+    """Return durations until the next start, at most the longest; the last one as planned."""
     duration: Floats = nominal_s.copy()
     np.minimum(np.diff(start_s, axis=0), most_s[:-1], out=duration[:-1])
     return duration

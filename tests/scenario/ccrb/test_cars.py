@@ -34,10 +34,10 @@ def test_before_a_lane_change_half_the_speed_is_left() -> None:
 
 @pytest.mark.parametrize("lane_change", [False, True])
 def test_the_plan_is_made_of_calls_of_the_driving_skill_set(lane_change: bool) -> None:
-    asked = CcrbOptions(lane_change=lane_change, n_skills=5)
+    options = CcrbOptions(lane_change=lane_change, n_skills=5)
     known = {str(call) for call in load_skills("driving").calls}
-    assert set(asked.texts) <= known
-    assert len(asked.driving.lane) == 5 + lane_change
+    assert set(options.texts) <= known
+    assert len(options.driving.lane) == 5 + lane_change
 
 
 def least_gap(cars: Cars, decel: float, start_s: float) -> float:

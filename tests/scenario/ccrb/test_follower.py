@@ -19,9 +19,9 @@ def motion(position: float, speed: float, acceleration: float) -> CarMotion:
 
 SEEN = DriverView(
     ego=motion(60.0, 11.0, -3.0),
-    own=motion(40.0, 13.0, -0.5),
+    rear=motion(40.0, 13.0, -0.5),
     ego_then=motion(50.0, 12.0, -1.0),
-    own_then=motion(30.0, 13.5, -0.25),
+    rear_then=motion(30.0, 13.5, -0.25),
 )
 
 
@@ -50,7 +50,7 @@ def test_each_law_is_the_idm_on_what_its_name_promises(
 
 @pytest.mark.parametrize("law", [Hdm, Hybrid])
 def test_without_delay_all_are_the_idm(law: type[Idm]) -> None:
-    now = replace(SEEN, ego_then=SEEN.ego, own_then=SEEN.own)
+    now = replace(SEEN, ego_then=SEEN.ego, rear_then=SEEN.rear)
     cars = replace(CARS, reaction_s=0.0)
     assert law(cars, 1).acceleration(now, 10.0) == pytest.approx(Idm(cars, 1).acceleration(now, 10.0))
 
