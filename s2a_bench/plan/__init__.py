@@ -1,4 +1,4 @@
-"""What an answer means: skills, the text that stands for each call, and the parser that reads it as it comes. Pure.
+"""Plans in a model's answer: skills, the text of each call, and the parser that reads the answer as it arrives. Pure.
 
 docs/plans.md has an example; `s2a_bench.inference.tokenizer.Tokenizer` is the tokenizer of a GGUF file.
 """

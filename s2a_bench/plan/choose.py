@@ -1,4 +1,4 @@
-"""Choose the output format that costs a wanted number of tokens a skill with the tokenizer at hand."""
+"""Choose the output format with a given number of tokens per skill for a tokenizer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GRANULARITIES = (6, 4, 2, 1)
 """Tokens a skill in the paper (section IV-E)."""
 
 _FILLERS = ("-", "~", "_", ".")
-"""Words without meaning that make a call longer; which of them cost a token is the tokenizer's business."""
+"""Texts without meaning that make a call longer; the tokenizer decides which of them cost a token."""
 
 _ONE = string.ascii_uppercase + string.ascii_lowercase + string.digits + string.punctuation
 
@@ -25,11 +25,11 @@ _ONE = string.ascii_uppercase + string.ascii_lowercase + string.digits + string.
 def choose_format(skills: SkillSet, tokens_per_skill: int, tokenize: Tokenize, n_skills: int = 8) -> Format:
     """Return a format in which *every* call costs exactly that many tokens, number and delimiter included.
 
-    One token: a code without delimiter stands for a call with its arguments. More: plain words where they are short
-    enough, else letters, else codes; and of these what needs the fewest fillers to make all calls cost the same.
-    Counted with ``tokenize``, line by line for plans of up to ``n_skills``, and once for all calls in a row.
+    One token: a code without delimiter for each call. More: plain words if they are short enough, else letters, else
+    codes, and among these the format with the fewest fillers. ``tokenize`` counts line by line for plans of up to
+    ``n_skills``, and once for all calls in a row.
 
-    Raises UsageError where this tokenizer has no such format for these skills; the message has the least possible.
+    Raises UsageError if this tokenizer has no such format for these skills; the message has the least possible number.
     """
     if tokens_per_skill < 1:
         raise UsageError(f"`tokens_per_skill`: {tokens_per_skill} should be 1 or more")
@@ -39,7 +39,7 @@ def choose_format(skills: SkillSet, tokens_per_skill: int, tokenize: Tokenize, n
         return _stream(skills, tokenize)
     fitting: list[tuple[int, Format]] = []
     shortest = 0
-    for plain in _wordings(skills, tokenize):
+    for plain in _plain_formats(skills, tokenize):
         most = max(plain.counts(tokenize, (1, n_skills)))
         shortest = min(shortest or most, most)
         found = _pad(plain, tokens_per_skill, tokenize, n_skills) if most <= tokens_per_skill else None
@@ -51,7 +51,7 @@ def choose_format(skills: SkillSet, tokens_per_skill: int, tokenize: Tokenize, n
             f"'{skills.name}' in exactly that many tokens of this model; the shortest lines cost up to {shortest}. "
             "Choose another number, or a smaller skill set"
         )
-    return min(fitting, key=lambda found: (found[1].wording.terse, found[0]))[1]
+    return min(fitting, key=lambda found: (found[1].labels.terse, found[0]))[1]
 
 
 def _stream(skills: SkillSet, tokenize: Tokenize) -> Format:
@@ -62,40 +62,40 @@ def _stream(skills: SkillSet, tokenize: Tokenize) -> Format:
             f"`tokens_per_skill` 1: '{skills.name}' has {len(calls)} calls, but only {len(codes)} codes of one token "
             "that do not merge were found in this model's vocabulary; use a smaller skill set, or 2 tokens"
         )
-    wording = Codes({call: code.strip() for call, code in zip(calls, codes, strict=True)})
-    return Format("code stream", skills, wording, tuple(codes), delimiter="")
+    labels = Codes({call: code.strip() for call, code in zip(calls, codes, strict=True)})
+    return Format("code stream", skills, labels, tuple(codes), delimiter="")
 
 
-def _wordings(skills: SkillSet, tokenize: Tokenize) -> Iterator[Format]:
+def _plain_formats(skills: SkillSet, tokenize: Tokenize) -> Iterator[Format]:
     """Yield the formats without fillers, the most readable first."""
-    wordings: list[Calls] = [Calls(), Words()]
-    with suppress(ValueError):  # too many words for one letter each
-        wordings.append(Letters(skills))
-    for wording in wordings:
+    labels: list[Calls] = [Calls(), Words()]
+    with suppress(ValueError):  # too many names for one letter each
+        labels.append(Letters(skills))
+    for each in labels:
         for numbered in (True, False):
-            yield spelled(skills, wording, numbered=numbered)
+            yield spelled(skills, each, numbered=numbered)
     codes = line_codes(len(skills.calls), tokenize)
     if codes:
         yield spelled(skills, Codes(dict(zip(skills.calls, codes, strict=True))), numbered=False)
 
 
 def _pad(plain: Format, target: int, tokenize: Tokenize, n_skills: int) -> tuple[int, Format] | None:
-    """Add fillers until every call costs the target; return how many characters they are, and the format.
+    """Add fillers until every call costs the target; return their number of characters, and the format.
 
-    One filler for all calls if that does, else for each call the first that does.
+    One filler for all calls if possible, else for each call the first that fits.
     """
     if all(count == target for count in plain.counts(tokenize, (1,))):
         return (0, plain) if _holds(plain, target, tokenize, n_skills) else None
-    glued = [plain.wording.glue + filler for filler in _FILLERS]
-    alike = [_filled(plain, [filler], target, tokenize, n_skills) for filler in glued]
+    glued = [plain.labels.glue + filler for filler in _FILLERS]
+    same = [_filled(plain, [filler], target, tokenize, n_skills) for filler in glued]
     mixed = [*glued, *(f" {filler}" for filler in _FILLERS)]
-    found = alike if any(alike) else [_filled(plain, mixed, target, tokenize, n_skills)]
+    found = same if any(same) else [_filled(plain, mixed, target, tokenize, n_skills)]
     sized = [(sum(map(len, format_.texts)) - sum(map(len, plain.texts)), format_) for format_ in found if format_]
     return min(sized, key=lambda entry: entry[0], default=None)
 
 
 def _filled(plain: Format, fillers: Sequence[str], target: int, tokenize: Tokenize, n_skills: int) -> Format | None:
-    """Return the format with every call filled up to the target; None if some cannot be, or two then read alike."""
+    """Return the format with every call filled up to the target; None if that fails, or makes two texts equal."""
     texts = [_padded(plain, text, fillers, target, tokenize) for text in plain.texts]
     whole = tuple(text for text in texts if text is not None)
     if len(whole) < len(texts):
@@ -108,9 +108,9 @@ def _filled(plain: Format, fillers: Sequence[str], target: int, tokenize: Tokeni
 
 
 def _padded(plain: Format, text: str, fillers: Sequence[str], target: int, tokenize: Tokenize) -> str | None:
-    """Return the text with as few fillers of one kind as make its line cost the target, if any do."""
+    """Return the text with the fewest fillers of one kind for which its line costs the target, if any."""
     for filler in fillers:
-        for count in range(2 * target):  # a filler may cost nothing beside another
+        for count in range(2 * target):  # a repeated filler may cost nothing
             padded = text + filler * count
             cost = len(tokenize(plain.line(1, padded)))
             if cost == target:
@@ -121,7 +121,7 @@ def _padded(plain: Format, text: str, fillers: Sequence[str], target: int, token
 
 
 def _holds(chosen: Format, target: int, tokenize: Tokenize, n_skills: int) -> bool:
-    """Check every call at every place, and all calls in a row."""
+    """Check the cost of every call at every number, and of all calls in a row."""
     numbers = range(1, n_skills + 1) if chosen.numbered else (1,)
     if any(count != target for count in chosen.counts(tokenize, numbers)):
         return False
@@ -130,7 +130,7 @@ def _holds(chosen: Format, target: int, tokenize: Tokenize, n_skills: int) -> bo
 
 
 def line_codes(count: int, tokenize: Tokenize) -> list[str] | None:
-    """Return ``count`` texts that cost two tokens with the end of a line; None where there are not that many."""
+    """Return ``count`` texts that cost two tokens with the end of a line; None if there are fewer."""
     for length in (1, 2):
         found = [text for text in _candidates(length) if len(tokenize(f"{text}\n")) == 2]  # noqa: PLR2004
         if len(found) >= count:
@@ -139,11 +139,11 @@ def line_codes(count: int, tokenize: Tokenize) -> list[str] | None:
 
 
 def stream_codes(count: int, tokenize: Tokenize) -> list[str]:
-    """Return up to ``count`` texts of one token each; fewer where the vocabulary has no more.
+    """Return up to ``count`` texts of one token each; fewer if the vocabulary has no more.
 
-    They need no delimiter: all have the same length, so that no code begins another, and any two of them in a row are
-    still the two tokens. A blank before each keeps letters from merging where the tokenizer has words for them;
-    tokenizers of bytes have no such tokens, but do not merge either.
+    They need no delimiter: all have the same length, so no code begins another, and any two of them in a row are the
+    same two tokens. A blank before each prevents merges in tokenizers with tokens for words; tokenizers of bytes have
+    no such tokens, and do not merge either.
     """
     best: list[str] = []
     for blank, length in product((" ", ""), (1, 2)):
@@ -155,18 +155,18 @@ def stream_codes(count: int, tokenize: Tokenize) -> list[str]:
 
 
 def _apart(count: int, tokenize: Tokenize, candidates: Iterator[str]) -> list[str]:
-    """Take candidates one by one if they are single tokens that do not merge with one already taken."""
+    """Return candidates that are single tokens and do not merge with each other."""
     found: dict[str, int] = {}
     for text in candidates:
-        own = tokenize(text)
-        if len(own) != 1 or own[0] in found.values():
+        tokens = tokenize(text)
+        if len(tokens) != 1 or tokens[0] in found.values():
             continue
-        row, ids = [text, text], [*own, *own]
+        row, ids = [text, text], [*tokens, *tokens]
         for other, token in found.items():
             row += [other, text]
-            ids += [token, *own]
+            ids += [token, *tokens]
         if tokenize("".join(row)) == ids:
-            found[text] = own[0]
+            found[text] = tokens[0]
         if len(found) == count:
             break
     return list(found)

@@ -1,4 +1,4 @@
-"""Ways to spell a call, from the paper's ``place(cup, table)`` to one letter a word, and how each is taken apart."""
+"""Labels of calls, from the paper's ``place(cup, table)`` to one letter per name, and their parsing."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ _CALL = re.compile(r"(\w+)\(([^()]*)\)[^()]*")
 
 
 def normalise(line: str) -> str:
-    """Return a line without the blanks that carry no meaning: at its ends, doubled, around brackets and commas."""
+    """Return a line without meaningless blanks: at its ends, doubled, around brackets and commas."""
     return _BLANKS_AT_MARKS.sub(r"\1", " ".join(line.split()))
 
 
 class Calls:
-    """How a call is spelled; here as the paper does, ``place(cup, table)``, and otherwise in subclasses."""
+    """Labels as in the paper, ``place(cup, table)``; subclasses have others."""
 
     name = "calls"
     glue = " "
-    """What stands between words, and before a filler."""
+    """Separator of words, also before a filler."""
     terse = 0
-    """0: plain words; more: further from them, so that a reader needs a list of all calls to know what is meant."""
+    """0: plain words; above 0 the prompt lists all calls."""
 
     def spell(self, call: Call) -> str:
         """Return a call's text, without number, filler and delimiter."""
         return str(call)
 
     def head(self, skill: Skill) -> str | None:
-        """Return what stands for the skill itself; None where one text stands for the whole call."""
+        """Return the label of a skill; None if a label is a whole call."""
         return skill.name
 
     def value(self, vocabulary: str, value: Value) -> str:  # noqa: ARG002 the same in every vocabulary
-        """Return what stands for a value."""
+        """Return the label of a value."""
         return str(value)
 
     def fields(self, line: str) -> list[str] | None:
-        """Take a normalised line apart: head, values, fillers; None where it does not have this form."""
+        """Split a normalised line into head, values, fillers; None if it does not have this form."""
         match = _CALL.fullmatch(line)
         if match is None:
             return None
@@ -68,9 +68,9 @@ class Letters(Calls):
     terse = 1
 
     def __init__(self, skills: SkillSet) -> None:
-        """Give every word a letter, the first of its own that is free; raises ValueError where letters run out.
+        """Assign a letter to every name and value; raises ValueError if there are too many.
 
-        Numbers get letters in order: a digit of their own would be taken for the number.
+        Numbers get letters in order, because one of their digits would look like the number.
         """
         self._heads = _initials(skill.name for skill in skills.skills)
         self._values = {name: _initials(values) for name, values in skills.vocabularies.items()}
@@ -90,7 +90,7 @@ class Letters(Calls):
 
 
 class Codes(Calls):
-    """One text for a call with all its arguments: ``A``."""
+    """One code per call with all its arguments: ``A``."""
 
     name = "codes"
     glue = ""
@@ -102,20 +102,19 @@ class Codes(Calls):
     def spell(self, call: Call) -> str:
         return self._codes[call]
 
-    def head(self, skill: Skill) -> None:
-        """Return None: no part of a code stands for the skill."""
+    def head(self, skill: Skill) -> None: ...
 
     def fields(self, line: str) -> list[str]:
         return [line]
 
 
-def _initials(words: Iterable[Value]) -> dict[Value, str]:
-    """Give each word a letter that no other has: one of its own where possible, else the first that is free."""
+def _initials(names: Iterable[Value]) -> dict[Value, str]:
+    """Assign each name a unique letter, one of its letters if possible, else the first unused one."""
     found: dict[Value, str] = {}
-    for word in words:
-        wanted = [char for char in word if char in LETTERS] if isinstance(word, str) else []
+    for name in names:
+        wanted = [char for char in name if char in LETTERS] if isinstance(name, str) else []
         letter = next((char for char in (*wanted, *LETTERS) if char not in found.values()), None)
         if letter is None:
-            raise ValueError(f"more than {len(LETTERS)} words")
-        found[word] = letter
+            raise ValueError(f"more than {len(LETTERS)} names")
+        found[name] = letter
     return found

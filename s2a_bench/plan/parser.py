@@ -1,15 +1,15 @@
-"""Turn a model's answer into skills while it arrives: no I/O, any chunking, in the manner of h11.
+"""Turn a model's answer into skills while it arrives: no I/O, pieces of any length, in the manner of h11.
 
-Rules, held in this file:
+Rules of this file:
 - A skill is certain, and emitted, at its delimiter; in a format without delimiter, at the last byte of its code. It is
-  not emitted earlier, even where a grammar would allow one continuation only: without it ``go_to(kitchen)`` may go on.
-- At the end of the stream the last line counts as ended if no other line begins with it (``speed 5`` may be the start
-  of ``speed 50``).
-- Blanks at the ends of a line, doubled, or around brackets and commas mean nothing; empty lines are no lines.
-- Numbers in front of calls must be there in a numbered format, and are not compared: the order is that of arrival.
-- Anything else is a `BadLine`, and reading goes on at the next line; without a delimiter, after the next blank. Codes
-  that are written with blanks between must have them, so that prose is not read as codes letter by letter.
-- Bytes that are not UTF-8, and lone surrogates, become U+FFFD, which no skill contains. No more than one line is kept.
+  not emitted earlier, even if a grammar allows one continuation only: without one ``go_to(kitchen)`` may continue.
+- At the end of the stream the last line counts as complete if no other line begins with it (``speed 5`` may be the
+  start of ``speed 50``).
+- Blanks at the ends of a line, doubled, or around brackets and commas are ignored, and so are empty lines.
+- A numbered format requires a number before each call; its value is ignored: the order is that of arrival.
+- Anything else is a `BadLine`, and reading continues at the next line; without a delimiter, after the next blank. Codes
+  written with blanks between must have them, so that prose is not read as codes letter by letter.
+- Bytes that are not UTF-8, and lone surrogates, become U+FFFD, which no skill contains. At most one line is kept.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ class SkillParsed:
     line: int
     """Lines before it that are not empty, bad ones included; in a format without delimiter, codes and bad runs."""
     chunk: int
-    """Which `Parser.feed` completed it, from 0; `Parser.close` counts as the one after the last.
+    """The call of `Parser.feed` that completed it, from 0; `Parser.close` counts as the call after the last.
 
-    Fed one token at a time, this is the token whose arrival is t_i of POLICY section 1.
+    Fed one token at a time, this is the token whose arrival is t_i.
     """
 
 
 @dataclass(frozen=True, slots=True)
 class BadLine:
-    """A line that is no skill. ``text`` is cut where the line became too long."""
+    """A line that is no skill. ``text`` is cut if the line is too long."""
 
     problem: Problem
     text: str
@@ -63,26 +63,26 @@ class Parser:
         self._decoder = codecs.getincrementaldecoder("utf-8")("replace")
         self._reader = _Lines(format_) if format_.delimiter else _Codes(format_)
         self._skills = self._lines = 0
-        self._chunk = -1
+        self._feeds = -1
         self._closed = False
 
-    def feed(self, chunk: str | bytes) -> list[Event]:
-        """Take the next piece of the answer, of any length, and return what has become certain with it.
+    def feed(self, piece: str | bytes) -> list[Event]:
+        """Read the next piece of the answer, of any length, and return the events that it makes certain.
 
-        Pass bytes where a chunk may end within a character. Raises ValueError after `close`.
+        Pass bytes if a piece may end within a character. Raises ValueError after `close`.
         """
         if self._closed:
             raise ValueError("the parser is closed; make a new one for another answer")
-        data = chunk.encode(errors="surrogatepass") if isinstance(chunk, str) else chunk
-        self._chunk += 1
+        data = piece.encode(errors="surrogatepass") if isinstance(piece, str) else piece
+        self._feeds += 1
         return self._events(self._reader.read(self._decoder.decode(data)))
 
     def close(self) -> list[Event]:
-        """End the answer and return what that makes certain; nothing the second time."""
+        """End the answer and return the last events; nothing the second time."""
         if self._closed:
             return []
         self._closed = True
-        self._chunk += 1
+        self._feeds += 1
         return self._events(self._reader.read(self._decoder.decode(b"", final=True)) + self._reader.end())
 
     def _events(self, found: list[_Found]) -> list[Event]:
@@ -90,10 +90,10 @@ class Parser:
         for result in found:
             if isinstance(result, int):
                 call = self._format.skills.calls[result]
-                events.append(SkillParsed(self._skills, call, self._lines, self._chunk))
+                events.append(SkillParsed(self._skills, call, self._lines, self._feeds))
                 self._skills += 1
             else:
-                events.append(BadLine(*result, self._lines, self._chunk))
+                events.append(BadLine(*result, self._lines, self._feeds))
             self._lines += 1
         return events
 
@@ -105,16 +105,16 @@ class _Bad(NamedTuple):
 
 
 _Found: TypeAlias = int | _Bad
-"""A place in ``skills.calls``, or why there is none."""
+"""An index in ``skills.calls``, or an error."""
 
 
 class _Lines:
-    """Reads a format with a delimiter: collects a line, then looks it up."""
+    """Reads a format with a delimiter, line by line."""
 
     def __init__(self, format_: Format) -> None:
         self._format = format_
         self._limit = 64 + 2 * max(map(len, format_.texts))
-        """Characters; the rest is for blanks and for a number."""
+        """Characters; the margin is for blanks and a number."""
         self._line = ""
         self._skipping = False
 
@@ -139,7 +139,6 @@ class _Lines:
         return self._finish()
 
     def _collect(self, text: str, start: int, end: int) -> list[_Found]:
-        """Keep a part of the line, up to the limit."""
         if self._skipping:
             return []
         self._line += text[start : min(end, start + self._limit + 1)]
@@ -175,7 +174,7 @@ class _Codes:
         return found
 
     def _take(self, char: str) -> list[_Found]:
-        """Add a character to the code, and look that up when it can grow no further."""
+        """Add a character to the code, and look the code up if it cannot continue."""
         if self._after_code and self._apart:
             self._skipping = True
             return [_Bad("malformed", char, "codes should be apart")]
@@ -194,7 +193,7 @@ class _Codes:
 
 
 def _text(line: str, format_: Format) -> str | None:
-    """Return what a line says, without its number and meaningless blanks; None where the number is missing."""
+    """Return a line without its number and meaningless blanks; None if the number is missing."""
     if not format_.numbered:
         return normalise(line)
     number, dot, text = line.partition(".")
@@ -202,7 +201,6 @@ def _text(line: str, format_: Format) -> str | None:
 
 
 def _look_up(line: str, format_: Format) -> _Found:
-    """Find the call of a line, or say what is wrong with it."""
     text = _text(line, format_)
     if text is None:
         return _Bad("malformed", line, "a number and a dot should come first")
@@ -211,16 +209,16 @@ def _look_up(line: str, format_: Format) -> _Found:
 
 
 def _explain(text: str, line: str, format_: Format) -> _Bad:
-    wording = format_.wording
-    fields = wording.fields(text)
+    labels = format_.labels
+    fields = labels.fields(text)
     if not fields:
         return _Bad("malformed", line, f"should look like '{format_.texts[0].strip()}'")
     head, *rest = fields
-    skill = next((skill for skill in format_.skills.skills if wording.head(skill) == head), None)
+    skill = next((skill for skill in format_.skills.skills if labels.head(skill) == head), None)
     if skill is None:
         return _Bad("unknown-skill", line, f"'{head}' is none of the skills")
     for argument, given in zip(skill.arguments, rest, strict=False):
-        if given not in {wording.value(argument.vocabulary, value) for value in argument.values}:
+        if given not in {labels.value(argument.vocabulary, value) for value in argument.values}:
             return _Bad("bad-argument", line, f"'{given}' is no {argument.name} of {skill.name}")
     if len(rest) < len(skill.arguments):
         return _Bad("bad-argument", line, f"{skill.name} has {len(skill.arguments)} arguments, {len(rest)} are given")

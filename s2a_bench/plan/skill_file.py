@@ -19,23 +19,22 @@ SKILL_SETS = ("household", "driving")
 """Names of the sets that come with the package, to use or to copy: ``s2a_bench/plan/skills/NAME.toml``."""
 
 MOST_CALLS = 1024
-"""A set with more calls than this is refused: every call is spelled and counted."""
+"""Larger sets are refused, because every call is spelled and counted."""
 
 LONGEST_WORD = 64
 """Characters of a name or value."""
 
 LEAST_RATIO, MOST_RATIO = Decimal("0.8"), Decimal("1.5")
-"""T_min/T_nom and T_max/T_nom where a file leaves them out (POLICY section 3)."""
+"""Defaults of T_min/T_nom and T_max/T_nom."""
 
 _RESERVED = frozenset("(),\ufffd")
-"""What calls are written with, and what the parser puts where bytes are no text."""
+"""Characters of the syntax, and the replacement of invalid bytes."""
 
 _LARGEST: Final = 10**9
 _RANGE: Final = ("from", "to", "step")
 
 
 def _is_number(value: Any) -> bool:
-    """Whether it is a finite number of ordinary size."""
     if isinstance(value, bool) or not isinstance(value, (int, Decimal)):
         return False
     number = Decimal(value)
@@ -48,7 +47,7 @@ def _number(value: Any) -> Decimal:
     return Decimal(value)
 
 
-def _word(name: str) -> str:
+def _identifier(name: str) -> str:
     if not name.isidentifier() or len(name) > LONGEST_WORD:
         raise ValueError(f"'{name}' should be letters, digits and underscores, at most {LONGEST_WORD}")
     return name
@@ -60,11 +59,11 @@ def _values(content: Any) -> tuple[Value, ...]:
     if isinstance(content, dict):
         values = _range(content)
     elif isinstance(content, list) and content and all(isinstance(value, str) for value in content):
-        for word in content:
-            if not 0 < len(word) <= LONGEST_WORD:
-                raise ValueError(f"'{word}' should have 1 to {LONGEST_WORD} characters")
-            if not word.isprintable() or any(char.isspace() or char in _RESERVED for char in word):
-                raise ValueError(f"'{word}' should be printable, without blanks, brackets and commas")
+        for text in content:
+            if not 0 < len(text) <= LONGEST_WORD:
+                raise ValueError(f"'{text}' should have 1 to {LONGEST_WORD} characters")
+            if not text.isprintable() or any(char.isspace() or char in _RESERVED for char in text):
+                raise ValueError(f"'{text}' should be printable, without blanks, brackets and commas")
         values = tuple(content)
     elif isinstance(content, list) and content and all(_is_number(value) for value in content):
         values = tuple(_plain(Decimal(value)) for value in content)
@@ -100,7 +99,7 @@ def _refuse_twins(names: Iterable[str], key: str = "") -> None:
         seen.add(name)
 
 
-Word = Annotated[str, AfterValidator(_word)]
+Identifier = Annotated[str, AfterValidator(_identifier)]
 Number = Annotated[Decimal, BeforeValidator(_number)]
 Vocabulary = Annotated[Any, BeforeValidator(_values)]
 
@@ -108,7 +107,7 @@ Vocabulary = Annotated[Any, BeforeValidator(_values)]
 class _Skill(TomlTable):
     """One ``[[skill]]``."""
 
-    name: Word
+    name: Identifier
     arguments: list[str] = Field([])
     t_nom_s: Number
     t_min_s: Number | None = None
@@ -131,7 +130,7 @@ class _Skill(TomlTable):
 
 
 class _SkillFile(TomlTable):
-    """What the file may hold."""
+    """The whole file."""
 
     name: Line
     role: Line
@@ -141,10 +140,7 @@ class _SkillFile(TomlTable):
 
 
 def load_skills(choice: str) -> SkillSet:
-    """Read the shipped set of that name, else the TOML file at that path; raises UsageError.
-
-    The one place of this package that opens a file.
-    """
+    """Read the shipped set of that name, else the TOML file at that path; raises UsageError."""
     if choice in SKILL_SETS:
         return parse_skills(files("s2a_bench.plan").joinpath("skills", f"{choice}.toml").read_text("utf-8"), choice)
     if not choice.endswith(".toml"):
@@ -172,7 +168,7 @@ def parse_skills(text: str, origin: str) -> SkillSet:
 
 
 def _skill_set(file: _SkillFile) -> SkillSet:
-    """Give arguments their vocabularies; raises ValueError naming the key."""
+    """Build the skills with their vocabularies; raises ValueError naming the key."""
     skills = tuple(_skill(table, file) for table in file.skill)
     _refuse_twins((skill.name for skill in skills), "skill: ")
     used = {argument.vocabulary for skill in skills for argument in skill.arguments}
@@ -198,7 +194,7 @@ def _argument(text: str, vocabularies: Mapping[str, tuple[Value, ...]]) -> Argum
     """Read ``vocabulary``, or ``name:vocabulary``."""
     name, _, vocabulary = text.partition(":")
     vocabulary = vocabulary or name
-    _word(name)
+    _identifier(name)
     if vocabulary not in vocabularies:
         known = ", ".join(vocabularies) or "none is"
         raise ValueError(f"the vocabulary '{vocabulary}' is not defined ({known})")

@@ -1,4 +1,4 @@
-"""What a robot can do: skills with arguments out of closed vocabularies, how long each takes, what fills a gap."""
+"""A robot's skills: arguments from closed vocabularies, durations, gap behaviour."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from itertools import product
 from typing import Literal, TypeAlias, get_args
 
 Gap: TypeAlias = Literal["stop", "coast", "hold", "cruise"]
-"""What the robot does while no skill is valid (POLICY section 3): come to rest, no effort, keep the last command, keep
-the speed it set out with."""
+"""Behaviour between skills: come to rest, no effort, keep the last command, keep the initial speed."""
 
 GAPS: tuple[Gap, ...] = get_args(Gap)
 
@@ -18,7 +17,7 @@ Value: TypeAlias = str | int | float
 
 @dataclass(frozen=True, slots=True)
 class Durations:
-    """How long a skill may take, in seconds: 0 < least <= nominal <= most (T_min, T_nom, T_max of the paper)."""
+    """Durations of a skill in seconds: 0 < least <= nominal <= most (T_min, T_nom, T_max of the paper)."""
 
     least_s: float
     nominal_s: float
@@ -27,7 +26,7 @@ class Durations:
 
 @dataclass(frozen=True, slots=True)
 class Argument:
-    """One argument of a skill: its name, and the vocabulary that its value is from."""
+    """An argument of a skill: its name and the vocabulary of its values."""
 
     name: str
     vocabulary: str
@@ -39,7 +38,7 @@ class Argument:
 
 @dataclass(frozen=True, slots=True)
 class Skill:
-    """One thing the robot can do."""
+    """One ability of the robot."""
 
     name: str
     arguments: tuple[Argument, ...]
@@ -48,13 +47,13 @@ class Skill:
 
     @property
     def signature(self) -> str:
-        """Return it as the paper's prompt lists it: ``place(object, location)``."""
+        """Return the skill as in the paper's prompt: ``place(object, location)``."""
         return f"{self.name}({', '.join(map(str, self.arguments))})"
 
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A skill with a value for every argument; ``str()`` writes it as the paper does: ``place(cup, table)``."""
+    """A skill with a value for every argument; ``str()`` formats it as the paper: ``place(cup, table)``."""
 
     skill: Skill
     values: tuple[Value, ...]
@@ -69,17 +68,17 @@ class Call:
 
 @dataclass(frozen=True)
 class SkillSet:
-    """All that a plan may say; ``role`` completes the prompt's "You are a ..."."""
+    """The skills of a plan; ``role`` completes the prompt's "You are a ..."."""
 
     name: str
     role: str
     gap: Gap
-    """What fills a gap before the first skill, and of every skill that says nothing else."""
+    """Behaviour before the first skill, and the default of every skill."""
     skills: tuple[Skill, ...]
 
     @cached_property
     def calls(self) -> tuple[Call, ...]:
-        """Return every call there is: finite, as every vocabulary is closed."""
+        """Return all calls; vocabularies are closed, so their number is finite."""
         return tuple(
             Call(skill, values)
             for skill in self.skills
