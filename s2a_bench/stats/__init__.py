@@ -1,4 +1,4 @@
-"""Summaries of repeated measurements; `change` holds intervals and the test of whether something is slower."""
+"""Summaries of repeated measurements; `change` has intervals and tests for differences."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What n values look like; ``sd`` is the sample standard deviation (n - 1), None for a single value."""
+    """Summary of n values; ``sd`` is the sample standard deviation (n - 1), None for a single value."""
 
     n: Annotated[int, {"minimum": 1}]
     median: float
@@ -25,10 +25,10 @@ class Summary:
 
 @dataclass(frozen=True, slots=True)
 class Ratio:
-    """A ratio and its confidence interval; None where the values do not allow one, never NaN.
+    """A ratio and its confidence interval; None if the values do not allow one, never NaN.
 
-    The interval of one launch says nothing of the next. Of several it is theirs, and ``launch_sd`` is the standard
-    deviation of the logarithms of their ratios: about the share by which a launch differs from the next.
+    The interval of one launch does not cover differences between launches; that of several does. ``launch_sd`` is the
+    standard deviation of the logarithms of their ratios: about the relative difference between launches.
     """
 
     value: float | None
@@ -55,5 +55,5 @@ def summarise(values: Iterable[float]) -> Summary:
 
 
 def summary_of(values: NDArray[np.float64]) -> Summary | None:
-    """Summarise values; None where there are none."""
+    """Summarise values; None for no values."""
     return summarise(values) if values.size else None

@@ -1,4 +1,4 @@
-"""One launch cut into batches of time, which are drawn with replacement: how far its statistics are to be trusted."""
+"""Uncertainty of one launch's statistics: the launch is cut into batches of time, which are resampled."""
 
 from __future__ import annotations
 
@@ -12,36 +12,35 @@ from numpy.typing import NDArray
 
 Floats: TypeAlias = NDArray[np.float64]
 Rows: TypeAlias = Sequence[Floats]
-"""The values of one launch in order of time: one array a request (its one value, or the gaps of its tokens)."""
+"""The values of one launch in order of time: one array per request (its value, or the gaps of its tokens)."""
 
 STATISTICS: Final[Mapping[str, float | None]] = {"median": 0.5, "mean": None, "p90": 0.9, "p99": 0.99}
-"""Statistic -> its quantile; the mean has none."""
+"""Statistic -> quantile; None for the mean."""
 
 BATCHES: Final = 10
-"""A launch is cut into as many stretches of time; 10 to 30 are enough for an interval (Schmeiser 1982)."""
+"""Batches per launch; 10 to 30 are enough for an interval (Schmeiser 1982)."""
 
 FEWEST_ROWS: Final = 5
 """Fewer requests have no interval."""
 
 FEWEST_BEYOND: Final = 5
-"""A percentile has an interval where at least so many values lie beyond it: p90 needs 50 values, p99 500."""
+"""A percentile has an interval if at least this many values lie beyond it: p90 needs 50 values, p99 500."""
 
 CHANCE: Final = 2.0
-"""Independent neighbours correlate with a standard deviation of about 1 / sqrt(n): beyond so many it is no chance."""
+"""Greatest correlation by chance, in standard deviations of about 1 / sqrt(n) of independent neighbours."""
 
 _RESAMPLES: Final = 1000
 
 
 @final
 class LaunchValues:
-    """The values of one launch; percentiles of resamples are found in the sorted values, without copying them."""
+    """The values of one launch in up to `BATCHES` batches of rows, none empty; percentiles are found by sorted rank."""
 
     def __init__(self, rows: Rows) -> None:
-        """Cut the rows into `BATCHES` batches, fewer where there are fewer rows; no row is empty."""
         self.n_rows = len(rows)
         self.batches = [
-            np.concatenate([rows[place] for place in places])
-            for places in np.array_split(np.arange(len(rows)), min(BATCHES, len(rows)))
+            np.concatenate([rows[row] for row in batch])
+            for batch in np.array_split(np.arange(len(rows)), min(BATCHES, len(rows)))
         ]
         values = np.concatenate(self.batches)
         order = np.argsort(values, kind="stable")
@@ -62,7 +61,7 @@ class LaunchValues:
         return float(self.values.mean() if quantile is None else np.quantile(self.values, quantile))
 
     def draw(self, rng: np.random.Generator) -> NDArray[np.int64]:
-        """Draw batches with replacement: one line a resample, how often each batch is in it."""
+        """Draw batches with replacement: one row per resample with the count of each batch."""
         n = len(self.batches)
         return rng.multinomial(n, [1 / n] * n, size=_RESAMPLES)
 
@@ -89,9 +88,9 @@ class LaunchValues:
 
 @dataclass(frozen=True, slots=True)
 class RowCorrelation:
-    """How alike neighbours of a series of ``n`` rows are, which was cut into ``k`` batches.
+    """Correlation of neighbours in a series of ``n`` rows, which is cut into ``k`` batches.
 
-    ``r``, from 0 to 0.95, is the lag-1 correlation of ranks (outliers matter little).
+    ``r``, from 0 to 0.95, is the lag-1 correlation of ranks, which is robust to outliers.
     """
 
     r: float
@@ -100,7 +99,7 @@ class RowCorrelation:
 
     @classmethod
     def of(cls, levels: Floats) -> RowCorrelation:
-        """Measure it on one number a row, in order of time."""
+        """Compute it from one number per row, in order of time."""
         from scipy import stats
 
         ranks = stats.rankdata(levels) - (len(levels) + 1) / 2
@@ -110,19 +109,19 @@ class RowCorrelation:
 
     @property
     def effective(self) -> float:
-        """Return how many independent rows tell as much: n (1 - r) / (1 + r)."""
+        """Return the equivalent number of independent rows: n (1 - r) / (1 + r)."""
         return self.n * (1 - self.r) / (1 + self.r)
 
     @property
     def dependent(self) -> bool:
-        """Whether rows remember longer than a batch lasts, about (1 + r) / (1 - r) rows, which is no mere chance."""
+        """Whether the correlation length, about (1 + r) / (1 - r) rows, exceeds a batch, beyond chance."""
         return self.effective < self.k and self.r > CHANCE / math.sqrt(self.n)
 
     @property
     def hidden(self) -> float:
-        """Return by how much the variance between batches falls short of that of their mean, batches being alike.
+        """Return the factor by which the variance between correlated batches underestimates that of their mean.
 
-        As if the rows were an autoregressive series of order 1, whose mean over m rows has the variance below.
+        The rows are modelled as an autoregressive series of order 1, whose mean over m rows has the variance below.
         """
         r, n, k = self.r, self.n, self.k
 

@@ -1,4 +1,4 @@
-"""Whether a statistic changed between two sides: effect sizes with intervals, one test, and what it could have seen."""
+"""Change of a statistic between two sides: effect sizes with intervals, one test, and its power."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Blocks: TypeAlias = Mapping[int, Sequence[float]]
 """The values of a cell in one launch, by block."""
 
 POWER: Final = 0.8
-"""The share of repeats in which the smallest change that counts as seen is found (Cohen 1988)."""
+"""Probability of finding the smallest detectable change (Cohen 1988)."""
 
 _MOST: Final = 50.0
-"""Logarithm beyond which a ratio is not worth telling from infinity."""
+"""Limit of the logarithm of a ratio."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class Noise:
     logarithmic: bool = True
 
     def detectable(self, level: float, *, falls: bool = False, power: float = POWER) -> float:
-        """Return the smallest rise (or fall), as a share of the baseline, that a two-sided t test finds so often."""
+        """Return the smallest rise (or fall), over the baseline, that a two-sided t test finds with ``power``."""
         from scipy import special, stats
 
         if not self.error:
@@ -46,7 +46,7 @@ class Noise:
         return -math.expm1(-shift) if falls else math.expm1(min(shift, _MOST))
 
     def power(self, change: float, level: float) -> float:
-        """Return how often the test finds a change of this share."""
+        """Return the probability that the test finds a change of this share."""
         from scipy import stats
 
         shift = math.log1p(change) if self.logarithmic else change
@@ -62,8 +62,8 @@ class Change:
 
     ``superiority`` is the probability that a value of ``other`` is the larger of two, ties counted half (Vargha and
     Delaney 2000); 0.5 means no difference. ``p`` is None where there are too few values for an interval.
-    ``dependent`` is true where neighbours are so alike that batches are not independent: the interval is too narrow.
-    ``noise`` is what the test went by, None where nothing tells how uncertain the change is as a share.
+    ``dependent`` is true if neighbours correlate so much that batches are not independent: the interval is too narrow.
+    ``noise`` is the standard error of the test, None if the uncertainty as a share is unknown.
     """
 
     baseline: float
@@ -77,7 +77,7 @@ class Change:
 
     @property
     def relative(self) -> float | None:
-        """Return the change as a share of the baseline's size; None where something came of nothing."""
+        """Return the change as a share of the baseline's size; None for a change from zero."""
         if self.other == self.baseline:
             return 0.0
         if self.ratio.value is not None:
@@ -86,7 +86,7 @@ class Change:
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Return the interval of `relative`; None where there is none."""
+        """Return the interval of `relative`, or None."""
         if self.ratio.low is not None and self.ratio.high is not None:
             return self.ratio.low - 1, self.ratio.high - 1
         low, high = self.difference.low, self.difference.high
@@ -107,16 +107,16 @@ def change_between(
 ) -> Change:
     """Compare a statistic of two sides, each of one launch or more; every launch has at least one value.
 
-    ``exact`` values are computed, not sampled: any difference is one. ``paired`` sides are cells of one launch: row i
-    of both was measured in block i, so the same batches are drawn of both, and what slowed both down cancels.
+    ``exact`` values are computed, not sampled: any difference counts. ``paired`` sides are cells of one launch: row i
+    of both was measured in block i, so the same batches are drawn of both, and common slow-downs cancel.
 
-    The test is Welch's t on the logarithm of the statistic (on the statistic itself where it may be zero or less);
-    the interval is that of the same t, so both agree. What the t is told about the spread of a side:
+    The test is Welch's t on the logarithm of the statistic (on the statistic itself if it may be zero or less); the
+    interval uses the same t, so both agree. The spread of a side is
 
-    - several launches: that of the launches' own values (Kalibera and Jones 2013);
-    - one launch: its requests, in order of time, are cut into `BATCHES` batches, which are drawn with replacement
-      (a bootstrap of batches, n - 1 degrees of freedom). So neighbours that are alike, or a slow trend, widen the
-      interval. What differs only from launch to launch is not in it.
+    - of several launches, that of the launches' values (Kalibera and Jones 2013);
+    - of one launch, that of its requests, in order of time, cut into `BATCHES` batches, which are drawn with
+      replacement (a bootstrap of batches, n - 1 degrees of freedom). So correlated neighbours, or a slow trend, widen
+      the interval. Differences between launches are not in it.
     """
     rng = np.random.default_rng(seed)
     launches = [[LaunchValues(rows) for rows in side] for side in (baseline, other)]
@@ -149,10 +149,10 @@ def change_between(
 def ratio_of_launches(
     above: Mapping[int, Blocks], below: Mapping[int, Blocks], seed: int, statistic: Middle = "median"
 ) -> Ratio | None:
-    """Divide the medians (or means) of two cells, given by launch and block; None where no launch has values of both.
+    """Divide the medians (or means) of two cells, given by launch and block; None if no launch has values of both.
 
     One launch: `ratio_of_blocks`. Several: the geometric mean of their ratios, with the interval of Student's t on the
-    logarithms, so that whatever differs from launch to launch is in it.
+    logarithms, which includes differences between launches.
     """
     from scipy import stats
 
@@ -174,9 +174,9 @@ def ratio_of_launches(
 
 
 def ratio_of_blocks(above: Blocks, below: Blocks, seed: int, statistic: Middle = "median") -> Ratio | None:
-    """Divide the medians (or means) of two cells of one launch, given by block; paired where both have the same blocks.
+    """Divide the medians (or means) of two cells of one launch, given by block; paired if both have the same blocks.
 
-    None where a cell has no values.
+    None if a cell has no values.
     """
     if not above or not below:
         return None
@@ -185,19 +185,19 @@ def ratio_of_blocks(above: Blocks, below: Blocks, seed: int, statistic: Middle =
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Correct p-values for their number (Holm 1979); None, where there was no test, stays None and does not count."""
-    there = sorted((p, place) for place, p in enumerate(p_values) if p is not None)
+    """Correct p-values for their number (Holm 1979); None, for no test, stays None and does not count."""
+    tests = sorted((p, index) for index, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     highest = 0.0
-    for rank, (p, place) in enumerate(there):
-        highest = max(highest, min(1.0, p * (len(there) - rank)))
-        corrected[place] = highest
+    for rank, (p, index) in enumerate(tests):
+        highest = max(highest, min(1.0, p * (len(tests) - rank)))
+        corrected[index] = highest
     return corrected
 
 
 @dataclass(frozen=True, slots=True)
 class _Side:
-    """A statistic of one side: of each launch; of every resample, and of every row, where there is only one launch."""
+    """A statistic of one side: of each launch; of every resample, and of every row, if there is only one launch."""
 
     points: Floats
     copies: Floats | None
@@ -215,16 +215,16 @@ class _Side:
 
     @property
     def positive(self) -> bool:
-        """Whether it has a logarithm throughout."""
+        """Whether all values have a logarithm."""
         return all((values > 0).all() for values in (self.points, self.copies) if values is not None)
 
     def log(self) -> _Side:
         copies = None if self.copies is None else np.log(self.copies)
-        levels = np.log(np.maximum(self.levels, np.finfo(np.float64).tiny))  # single rows may be zero; ranks count
+        levels = np.log(np.maximum(self.levels, np.finfo(np.float64).tiny))  # a row may be zero; only ranks count
         return _Side(np.log(self.points), copies, levels, self.exact)
 
     def less(self, other: _Side) -> _Side:
-        """Return the differences, block by block, to a side that was measured in the same blocks."""
+        """Return the differences, block by block, to a side measured in the same blocks."""
         copies = None if self.copies is None or other.copies is None else self.copies - other.copies
         return _Side(self.points - other.points, copies, self.levels - other.levels, self.exact)
 
@@ -234,19 +234,19 @@ class _Side:
 
     @property
     def level(self) -> float:
-        """Return what is shown: the only value, else the geometric mean of the launches where there is one."""
+        """Return the only value, else the geometric mean of the launches if it exists."""
         if len(self.points) == 1 or not self.positive:
             return self.mean
         return math.exp(self.log().mean)
 
     @property
     def dependent(self) -> bool:
-        """Whether it is one launch whose neighbours are too much alike."""
+        """Whether it is one launch with correlated neighbours."""
         return len(self.points) == 1 and RowCorrelation.of(self.levels).dependent
 
     @property
     def variance(self) -> tuple[float, int] | None:
-        """Return the variance of that mean with its degrees of freedom; None where nothing tells them."""
+        """Return the variance of the mean with its degrees of freedom; None if unknown."""
         if self.exact:
             return 0.0, 1
         if (n := len(self.points)) > 1:
@@ -256,14 +256,14 @@ class _Side:
         # Drawing k batches with replacement shows (k - 1) / k of the variance.
         memory = RowCorrelation.of(self.levels)
         k = memory.k
-        # Equal values have no variance, whatever rounding says.
+        # Equal values have no variance, despite rounding.
         varies = self.copies.max() > self.copies.min()
         return (float(self.copies.var()) * k / (k - 1) * memory.hidden if varies else 0.0), k - 1
 
 
 @dataclass(frozen=True, slots=True)
 class _Test:
-    """Welch's t of two means, Student's of paired ones; no interval and no p where a side has no variance to go by."""
+    """Welch's t of two means, Student's of paired ones; no interval and no p if a side's variance is unknown."""
 
     shift: float
     low: float | None
@@ -274,7 +274,7 @@ class _Test:
     freedom: float = math.inf
 
     def noise(self, unit: float, *, logarithmic: bool) -> Noise | None:
-        """Return how uncertain the shift is in ``unit``; None where nobody knows, or the unit is 0."""
+        """Return the standard error of the shift in ``unit``; None if it is unknown, or the unit is 0."""
         if self.p is None or (self.error and not unit):
             return None
         return Noise(self.error / unit if self.error else 0.0, self.freedom, logarithmic)
@@ -290,7 +290,7 @@ class _Test:
         if len(known) < len(sides):
             return cls(shift, None, None, None, dependent)
         total = sum(variance for variance, _ in known)
-        if total == 0:  # nothing varies: every difference is certain
+        if total == 0:  # no variance: every difference is certain
             return cls(shift, shift, shift, 0.0 if shift else 1.0, dependent)
         freedom = total**2 / sum(variance**2 / df for variance, df in known)
         error = math.sqrt(total)

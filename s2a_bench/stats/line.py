@@ -1,8 +1,8 @@
-"""Straight lines through groups of measurements, a fixed cost and a cost a unit, with intervals, and where two cross.
+"""Straight lines through groups of measurements, a fixed cost and a cost per unit, with intervals and crossings.
 
-A line minimises the *relative* distances of the groups' medians from it: times of small and of large pictures count
-alike. Intervals are percentiles of a bootstrap of two stages (Davison and Hinkley, Bootstrap Methods, 3.8): groups of
-the same x, which are launches, are drawn with replacement, and so are the values within each.
+A line minimises the *relative* distances of the groups' medians from it, so small and large pictures count equally.
+Intervals are percentiles of a bootstrap of two stages (Davison and Hinkley, Bootstrap Methods, 3.8): groups of the same
+x, which are launches, are drawn with replacement, and so are the values within each.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Line:
 
 
 def fit_line(groups: Sequence[tuple[float, Floats]], seed: int = 0) -> Line | None:
-    """Fit a line through groups of (x, values of y above 0); None where they have fewer than two different x."""
+    """Fit a line through groups of (x, values of y above 0); None for fewer than two different x."""
     groups = [(x, values) for x, values in groups if values.size]
     x = np.array([x for x, _ in groups])
     if len(set(x.tolist())) < 2:  # noqa: PLR2004 - a line needs two
@@ -74,7 +74,7 @@ def fit_line(groups: Sequence[tuple[float, Floats]], seed: int = 0) -> Line | No
 
 
 def crossing(one: Line, other: Line) -> Estimate | None:
-    """Return the x above 0 at which two lines cross; None where they do not, or fewer than 95 % of the draws do."""
+    """Return the x above 0 at which two lines cross; None if they do not, or fewer than 95 % of the draws do."""
 
     def meet(fixed: Floats, slope: Floats) -> Floats:
         with np.errstate(divide="ignore", invalid="ignore"):

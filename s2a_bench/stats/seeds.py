@@ -1,4 +1,4 @@
-"""Random numbers from a seed and the text of a key: the same whatever else is run, in whatever order."""
+"""Random numbers from a seed and the text of a key, independent of what else runs, and in which order."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class Verbatim(str):
-    """A part of a key that stands in it unquoted: the text of a record, fixed whatever its class is called later."""
+    """A part of a key that is not quoted: the text of a record, fixed even if its class is renamed."""
 
     __slots__ = ()
     __repr__ = str.__str__
