@@ -1,6 +1,6 @@
-"""How pictures and answers travel: a Client sends a request and yields tokens or actions, a Server feeds a Handler.
+"""Transports: a Client sends a request and yields tokens or actions, a Server feeds requests to a Handler.
 
-To add a transport, write a package with a module like this, and offer its instance as an entry point of the group
+To add a transport, write a package with a module like this and register its instance as an entry point of the group
 ``s2a_bench.transports``; nothing in this repository changes::
 
     from s2a_bench.options import option
@@ -11,16 +11,16 @@ To add a transport, write a package with a module like this, and offer its insta
 
     class Toy(Transport[ToyOptions]):
         name, options = "toy", ToyOptions           # --transport 'toy?port=7000', serve toy
-        payloads = ("raw",)                         # the first where raw cannot travel
-        stages = {"frame_length": "pack"}           # marked by its client or server, beside those of trace.STAGES
-        facts = (PAYLOAD_BYTES,)                    # the numbers beside the marks, those of its own as facts.Fact(...)
+        payloads = ("raw",)                         # the first is the default where raw is not possible
+        stages = {"frame_length": "pack"}           # marked by its client or server, in addition to trace.STAGES
+        facts = (PAYLOAD_BYTES,)                    # numbers beside the marks; new ones as facts.Fact(...)
 
         def client(self, wiring, alive):
-            from toy.client import ToyClient        # what is heavy is imported here
+            from toy.client import ToyClient        # heavy imports belong here
             return ToyClient(wiring, alive)
 
         def server(self, wiring, handler):
-            from toy.server import ToyServer        # keeps what wiring.limits says
+            from toy.server import ToyServer        # enforces wiring.limits
             return ToyServer(wiring, handler)
 
     TOY = Toy()
@@ -28,13 +28,13 @@ To add a transport, write a package with a module like this, and offer its insta
     [project.entry-points."s2a_bench.transports"]
     toy = "toy:TOY"
 
-`s2a_bench.testing.transport` is the suite that it should pass.
+`s2a_bench.testing.transport` has the conformance suite.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cache
 from math import inf
 from pathlib import Path
@@ -51,22 +51,22 @@ if TYPE_CHECKING:
     from s2a_bench.types import Frame, Piece, Request
 
 PAYLOADS: Final = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
-"""How a picture travels: ``bgr8`` pixels, the camera's own YUYV, JPEG, a JPEG that was at hand before, PNG."""
+"""Forms of a picture: ``bgr8`` pixels, the camera's YUYV, JPEG, a JPEG encoded before the run, PNG."""
 
 LOSSLESS: Final = frozenset({"", "raw", "yuyv", "png"})
-"""Payloads after which the engine sees the camera's very pixels; "" where nothing travels."""
+"""Payloads that give the engine the camera's exact pixels; "" where no picture is sent."""
 
 TRANSPORT: Final = "Transport"
-"""The heading in ``--help`` over options that say how requests travel."""
+"""The heading of transport options in ``--help``."""
 
 SERVER: Final = "server"
-"""``side`` of an option that the server's process is told too: cells that differ in it get servers of their own."""
+"""``side`` of an option that the server process needs too: cells that differ in it get separate servers."""
 
 SERVING: Final = "serving"
 """``side`` of such an option that is a flag of `serve` only; a run has it in the name of a pipeline."""
 
 EXTERNAL: Final = "external"
-"""``side`` of an option that, when set, is the address of a server that runs already and is not ours."""
+"""``side`` of an option that holds the address of a running external server."""
 
 PROGRAM: Final = "program"
 """``side`` of an option that names an external server for the run to start: see `TransportOptions.program`."""
@@ -79,7 +79,7 @@ Payloads = Annotated[tuple[Payload, ...], base.SEVERAL]
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """Somebody else's server that a run starts on its own model files: its kind, the program, its port (0: any)."""
+    """An external server that a run starts on its model files: its kind, the program, its port (0: any)."""
 
     kind: str
     path: Path
@@ -87,52 +87,46 @@ class Program:
 
 
 class TransportOptions(base.Options):
-    """What every transport can be told; a transport without options of its own uses this class.
-
-    An option is the client's business unless its ``side`` says something else.
-    """
+    """Options of every transport. An option belongs to the client unless its ``side`` says otherwise."""
 
     PANEL: ClassVar[str] = TRANSPORT
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {}
-    """Values that options have in `serve` unless told."""
+    """Defaults that differ in `serve`."""
     NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = ()
-    """Options that `serve` takes in the pipeline's name, its file or ``--ros-args``, and has no flag for."""
+    """Options without a flag of `serve`, which takes them in the pipeline's name, its file or ``--ros-args``."""
 
     payload: Payload = base.option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: raw where it can]")
 
     @classmethod
     def of_sides(cls, *sides: str) -> list[str]:
-        """Return the options of one of these sides, "" the client's."""
+        """Return the options with one of these sides; "" is the client's."""
         fields = cls.model_fields.items()
         return [name for name, field in fields if str(base.extra_of(field).get("side", "")) in sides]
 
     @property
     def external(self) -> str:
-        """Return the option that says that the server is not ours, or nothing."""
         return next((name for name in self.of_sides(EXTERNAL, PROGRAM) if getattr(self, name)), "")
 
     @property
     def external_address(self) -> str:
-        """Return the address of a server that runs already, or nothing."""
+        """The address of a running external server, or nothing."""
         return next((getattr(self, name) for name in self.of_sides(EXTERNAL)), "")
 
     @property
     def program(self) -> Program | None:
-        """Return somebody else's server that the run should start, if that is wanted."""
         return None
 
     @property
     def tuned(self) -> bool:
-        """Whether processes keep large blocks of memory for the next picture, and what else makes it faster."""
+        """Whether processes are tuned: they keep large blocks of memory for the next picture, for example."""
         return True
 
     @property
     def against_loss(self) -> str:
-        """Return what to do where pictures or messages are lost on the way."""
         return "look at the network"
 
     def addresses(self) -> Iterable[str]:
-        """Return what a new server of ours may bind: the first that no other has, else the last."""
+        """Return the addresses that a new server tries to bind, in order."""
         return ("",)
 
 
@@ -142,10 +136,10 @@ TOKENS: Final = "tokens"
 ACTIONS: Final = "actions"
 
 TOKEN_S: Final = 5.0
-"""Of a deadline that nobody set, for each token; far slower than any model that a robot could wait for."""
+"""Seconds of the default deadline for each token; far slower than any model that a robot could wait for."""
 
 Handler: TypeAlias = "Callable[[Request, Trace], Generator[Piece, None, None]]"
-"""What a server does with a request whose pictures are ``rgb8``: it yields tokens, or actions, and marks the trace.
+"""Serves a request whose pictures are ``rgb8``: yields tokens or actions, and marks the trace.
 
 A handler marks `queue` if it waited for a free engine, `inference` at the first piece, and appends the time of
 every piece to ``trace.token_ns``. Transports know handlers, never engines.
@@ -153,7 +147,7 @@ every piece to ``trace.token_ns``. Transports know handlers, never engines.
 
 
 class CameraSink(Protocol):
-    """Where a running camera's frames go when the server is to keep the newest itself (stream mode)."""
+    """Takes a running camera's frames where the server keeps the newest one itself (stream mode)."""
 
     def stamp_ns(self, frame: Frame) -> int:
         """Return the ROS-time stamp that will name this frame in the server's marks."""
@@ -176,12 +170,12 @@ class Client(Protocol):
         """Send a request with its frames as captured, yield pieces as they arrive, mark every stage.
 
         After the last piece ``trace.remote`` holds the server's marks. Raises RequestFailed when the server
-        refuses or breaks off, or goes beyond what `transport.limits` allows, ServerDied when it is gone.
+        refuses, breaks off or exceeds the bounds of `transport.limits`, ServerDied when it has ended.
         """
         ...
 
     def describe(self) -> dict[str, str]:
-        """Return how the server is asked, as far as the wiring does not tell, for the manifest."""
+        """Return what the manifest records of the client beside its wiring."""
         ...
 
     def close(self) -> None:
@@ -193,10 +187,10 @@ class Server(Protocol):
     """Receives requests, hands each to a handler and sends back what that yields."""
 
     address: str
-    """Where a client of the same transport finds it, known once the server exists."""
+    """The address for clients of the same transport, known once the server exists."""
 
     def describe(self) -> dict[str, str | int]:
-        """Return what carries the requests, for the manifest."""
+        """Return what the manifest records of the server."""
         ...
 
     def serve(self) -> None:
@@ -210,52 +204,47 @@ class Server(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Wiring(Generic[O]):
-    """What a client, or the process of a server, is told: one pipeline and where its other end is."""
+    """The settings of a client or a server process: one pipeline and the address of its other end."""
 
     transport: str
     variant: str
     options: O
-    """``options.payload`` is what travels, the transport's default filled in."""
+    """``options.payload`` is filled in, with the transport's default if need be."""
     address: str = ""
-    """A client: where the server is. A server: what it should bind, or the address that it had; empty: any."""
+    """For a client the server's address; for a server the address to bind, or the one that it had; empty: any."""
     black_box: bool = False
-    """Whether the server is not ours, so that it sends no marks."""
+    """Whether the server is external and sends no marks."""
     timeout_s: float = 300.0
     """The longest silence before a request counts as failed."""
     deadline_s: float = 0.0
-    """The longest that a whole answer may take; 0: see `deadline_of`."""
+    """The longest time for a whole answer; 0: see `deadline_of`."""
     max_tokens: int = 512
-    """The most tokens of a request that cannot say itself how many it wants."""
+    """The most tokens of a request that has no such field."""
     limits: Limits = LIMITS
-    """What a server takes."""
     restarted: bool = False
-    """Whether a server takes the place of one that died, and of which the network may not know yet."""
+    """Whether a server replaces one that died, whose end the network may not have noticed yet."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return it as plain data."""
-        told = {name: getattr(self, name) for name in ("transport", "variant", "address", "black_box", "restarted")}
-        told |= {"timeout_s": self.timeout_s, "deadline_s": self.deadline_s, "max_tokens": self.max_tokens}
-        return {**told, "options": self.options.model_dump(mode="json"), "limits": self.limits.to_manifest()}
+        settings = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {**settings, "options": self.options.model_dump(mode="json"), "limits": self.limits.to_manifest()}
 
     @property
     def capabilities(self) -> Capabilities[O]:
-        """Return what the pipeline can carry."""
         return TRANSPORTS[self.transport].capabilities(Choice(self.options, self.variant))
 
     def deadline_of(self, max_tokens: int) -> float:
-        """Return the seconds that an answer of so many tokens may take: as told, else generous for that many."""
+        """Return the seconds that an answer of so many tokens may take."""
         return self.deadline_s or self.timeout_s + TOKEN_S * max_tokens
 
     @staticmethod
-    def from_json(told: Mapping[str, Any]) -> Wiring[Any]:
-        """Read what `to_json` returned."""
-        options = TRANSPORTS[told["transport"]].options.model_validate(told["options"])
-        return Wiring(**{**told, "options": options, "limits": Limits(**told["limits"])})
+    def from_json(settings: Mapping[str, Any]) -> Wiring[Any]:
+        options = TRANSPORTS[settings["transport"]].options.model_validate(settings["options"])
+        return Wiring(**{**settings, "options": options, "limits": Limits(**settings["limits"])})
 
 
 @dataclass(frozen=True, slots=True)
 class Choice(Generic[O]):
-    """What is chosen of a transport, by the name of a pipeline and the settings of a run."""
+    """The choice of a pipeline's name and a run's settings."""
 
     options: O
     variant: str = ""
@@ -267,88 +256,81 @@ class Choice(Generic[O]):
 
 @dataclass(frozen=True, slots=True)
 class Capabilities(Generic[O]):
-    """What a choice can carry."""
+    """What a choice can carry; see the attributes of `Transport`."""
 
     options: O
-    """As they hold for the variant."""
+    """The options as they hold for the variant."""
     payloads: tuple[str, ...]
-    """How pictures can travel; the first is taken where raw cannot."""
     answer_kinds: tuple[str, ...]
-    """What answers can be made of: tokens, actions."""
     accepts_state: bool
-    """Whether a request can carry the robot's state."""
     facts: Sequence[Fact]
-    """Those that may be told, by somebody else's server too."""
+    """Facts that may come, from an external server too."""
     server: str = ""
-    """Which of the transport's servers answers the variant."""
+    """Which of the transport's servers serves the variant."""
 
 
 @dataclass(frozen=True, slots=True)
 class Urls:
-    """The URLs that name a server of a transport's kind which is not ours; its option `url` takes them."""
+    """The URLs of external servers that a transport's option `url` takes."""
 
     schemes: tuple[str, ...] = ()
     examine: str = ""
-    """``module:function`` of what `doctor --url` looks at, see `transport.risks`."""
+    """``module:function`` for `doctor --url`, see `transport.risks`."""
     cache_hits: str = ""
-    """``module:function`` that returns counter -> hits of its caches that the server of a wiring has counted so far."""
+    """``module:function`` that returns counter -> cache hits that the server of a wiring has counted so far."""
 
 
 class Transport(Generic[O]):
-    """One way to travel, and all that is said about it; subclass it, and make one instance."""
+    """The declaration of a transport; subclass it, and make one instance."""
 
     name: ClassVar[str] = ""
     options: type[O]
     """The model of its options."""
     variants: ClassVar[tuple[str, ...]] = ()
-    """What follows its name, as ``http/binary``; the first is measured unless told."""
+    """What follows its name, as ``http/binary``; the first is the default."""
     payloads: ClassVar[tuple[str, ...]] = ()
-    """How pictures can travel; the first is taken where raw cannot. Nothing where they do not travel at all."""
+    """Forms of a picture; the first is the default where raw is not possible. Empty where no picture is sent."""
     answer_kinds: ClassVar[tuple[str, ...]] = (TOKENS,)
-    """What answers can be made of: tokens, actions."""
+    """What answers can consist of: tokens, actions."""
     accepts_state: ClassVar[bool] = False
     """Whether a request can carry the robot's state."""
     stages: ClassVar[Mapping[str, str]] = {}
-    """Stage -> group (one of `trace.GROUPS`), those of `trace.STAGES` left out."""
+    """Stage -> group (one of `trace.GROUPS`), in addition to `trace.STAGES`."""
     facts: ClassVar[Sequence[Fact]] = ()
-    """Those that its client and server tell, without those of the handler."""
+    """Facts of its client and server, without those of the handler."""
     order: ClassVar[float] = 50
-    """How its cells sort among others."""
+    """Sort key of its cells among others."""
     style: ClassVar[Mapping[str, tuple[str, str]]] = {}
     """Variant ("" for none) -> colour and line style, in every figure."""
     compared_with: ClassVar[tuple[str, ...]] = ("loopback",)
-    """The transports by whose cells its own are divided."""
+    """Transports whose cells are the denominators of its ratios."""
     packages: ClassVar[tuple[str, ...]] = ()
-    """Python packages whose versions belong beside its results."""
+    """Python packages whose versions are recorded with its results."""
     checks: ClassVar[Mapping[str, str]] = {}
-    """Code -> ``module:function`` of the doctor's checks that are about it."""
+    """Code -> ``module:function`` of the doctor's checks for it."""
     udp_checks: ClassVar[tuple[str, ...]] = ()
-    """Codes of those that matter before a run with large pictures, where it sends UDP packets, which can be lost."""
+    """Codes of the checks that matter before a run that sends large pictures by UDP, whose packets can be lost."""
     in_process: ClassVar[bool] = False
     """Whether its server is a thread of the client's process."""
     urls: ClassVar[Urls] = Urls()
 
     def client(self, wiring: Wiring[O], alive: Callable[[], bool]) -> Client:
-        """Connect to the server at ``wiring.address``; ``alive`` tells whether its process still runs."""
         raise NotImplementedError
 
     def server(self, wiring: Wiring[O], handler: Handler) -> Server:
-        """Bind a server, ready to `serve`; raises PortInUse or TransportError."""
         raise NotImplementedError
 
     def measured(self, choice: Choice[O]) -> Sequence[str]:  # noqa: ARG002 - for those whose variants depend on it
-        """Return the variants to measure where the pipeline names none."""
         return self.variants[:1] or ("",)
 
     def capabilities(self, choice: Choice[O]) -> Capabilities[O]:
-        """Return what a variant can carry with its options."""
         return Capabilities(choice.options, self.payloads, self.answer_kinds, self.accepts_state, self.facts)
 
     def require(self, choice: Choice[O]) -> None:
-        """Raise UsageError for options that do not go together with the rest of a choice, or with this machine."""
+        """Raise UsageError for options that conflict with the rest of a choice, or with this machine."""
 
     def ready(self, wiring: Wiring[O]) -> str:
-        """Return what `serve` says once the server is bound, at ``wiring.address``."""
+        """Return the line that `serve` prints once the server is bound at ``wiring.address``."""
         return f"serving {wiring.transport} at {wiring.address}"
 
 
@@ -364,11 +346,10 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "zmq": "s2a_bench.transport.zmq:ZMQ",
     },
 )
-"""Name -> what is said about it."""
 
 
 class _UndeclaredTransport(Transport[TransportOptions]):
-    """What is assumed of a transport of an old run whose package is not here."""
+    """Stands for a transport of an old run whose package is not installed."""
 
     options = TransportOptions
     order = inf
@@ -376,7 +357,7 @@ class _UndeclaredTransport(Transport[TransportOptions]):
 
 @cache
 def declared_transport(name: str) -> Transport[Any]:
-    """Return what is said about a transport, for showing a run; one that is not installed is like any other."""
+    """Return the declaration of a transport, or a neutral one if it is not installed: results outlive packages."""
     try:
         return TRANSPORTS[name]
     except UsageError:
@@ -384,27 +365,24 @@ def declared_transport(name: str) -> Transport[Any]:
 
 
 def paths() -> Iterator[str]:
-    """Yield what the name of a pipeline may begin with: every transport, and its variants as TRANSPORT/VARIANT."""
+    """Yield the first parts of pipeline names: every transport, and its variants as TRANSPORT/VARIANT."""
     for name, transport in TRANSPORTS.loaded():
         yield from (name, *(f"{name}/{variant}" for variant in transport.variants))
 
 
 def named_by(url: str) -> str:
-    """Return the transport that a URL's scheme names; raises UsageError where none does.
-
-    It is ``http`` for a text without a scheme, of which its options say what is wrong.
-    """
+    """Return the transport of a URL's scheme, ``http`` without one; raises UsageError for an unknown scheme."""
     scheme, mark, _ = url.partition("://")
     known = {scheme: name for name, each in TRANSPORTS.loaded() for scheme in each.urls.schemes}
     if mark and scheme.lower() not in known:
         raise UsageError(
-            f"`url`: no transport here speaks {scheme}://, only {', '.join(f'{each}://' for each in known)}"
+            f"`url`: no installed transport speaks {scheme}://, only {', '.join(f'{each}://' for each in known)}"
         )
     return known.get(scheme.lower(), "http")
 
 
 def open_client(wiring: Wiring[Any], alive: Callable[[], bool] = lambda: True) -> Client:
-    """Connect to the server of a wiring; ``alive`` tells whether its process still runs."""
+    """Connect to the server of a wiring; ``alive`` returns whether its process still runs."""
     return TRANSPORTS[wiring.transport].client(wiring, alive)
 
 

@@ -1,7 +1,7 @@
-"""Access to the servers that a browser can reach, HTTP and WebSocket: decided by the headers, before a body is read.
+"""Access control of servers that a browser can reach, HTTP and WebSocket: by the headers, before a body is read.
 
-A page in a browser on this machine reaches servers on loopback, too. Its requests carry `Origin`, or, where its own
-name has been made to mean this machine (DNS rebinding), that name as `Host`.
+A page in a browser on this machine can reach servers on loopback. Its requests carry `Origin` or, after DNS rebinding,
+the page's own name as `Host`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]*\]|[^:\[\]]*)(?::[0-9]*)?")
 
 
 class WebOptions(ListeningOptions):
-    """How a server that browsers can reach is reached, or somebody else's is asked."""
+    """Options of a server that browsers can reach."""
 
     allow_host: str = option(
         "", "on loopback, more names that clients may send as Host, comma separated: a proxy's", side=SERVING
@@ -29,19 +29,15 @@ class WebOptions(ListeningOptions):
 
 
 class Access:
-    """The rules of one server."""
+    """The rules of one server at the IP address ``bound_host``; clients send the ``key``, if any, with ``scheme``."""
 
     def __init__(self, options: WebOptions, bound_host: str, key: str, scheme: str) -> None:
-        """Listen at the IP address ``bound_host``; clients send the ``key``, if there is one, with ``scheme``."""
         self._key, self._scheme = key.encode(), scheme
         self._names = {LOCAL, *(name.strip().lower() for name in options.allow_host.split(","))}  # "" among them
         self._on_loopback = ip_address(bound_host).is_loopback
 
     def refusal(self, path_is_open: bool, headers: Iterable[tuple[str, str]]) -> tuple[int, str] | None:
-        """Return status and one line for a request that is refused; names of ``headers`` are in lower case.
-
-        A path that ``path_is_open`` needs no key.
-        """
+        """Return the status and one line for a refused request; the names of ``headers`` are in lower case."""
         keys = []
         for name, value in headers:
             if name == "origin":
@@ -55,7 +51,6 @@ class Access:
         return None
 
     def _is_known(self, host: str) -> bool:
-        """Whether a Host header, with or without a port, names this machine or is allowed."""
         found = HOST.fullmatch(host)
         if found is None:
             return False

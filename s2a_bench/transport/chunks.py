@@ -1,4 +1,4 @@
-"""Numbers of a robot as they come from outside, actions and state: checked where they enter, whatever carried them."""
+"""Actions and robot state from outside, checked where they enter, for every transport."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ NUMBERS: Final = 1 << 20
 
 
 def actions_of(values: Any, first: int = 0) -> list[Action]:
-    """Return the actions in an array (H, D), or in (D,) one, from tick ``first`` on.
+    """Return the actions of an array (H, D), or the one of (D,), counted from tick ``first``.
 
-    Raises RequestFailed for what is no such array of finite numbers, or too large: nobody moves a robot by it.
+    Raises RequestFailed unless the values are finite numbers of that shape: they may move a robot.
     """
     rows = _numbers("actions", values, (1, 2))
     return [Action(first + tick, row) for tick, row in enumerate(np.atleast_2d(rows))]
 
 
 def state_of(values: Any) -> tuple[float, ...]:
-    """Return a robot's state from a list or an array (D,), each number a float32; raises RequestFailed."""
+    """Return a robot's state from a list or an array (D,), rounded to float32; raises RequestFailed."""
     try:
         if not len(values):
             return ()
@@ -33,7 +33,7 @@ def state_of(values: Any) -> tuple[float, ...]:
 
 
 def _numbers(what: str, values: Any, dimensions: tuple[int, ...]) -> Vector:
-    """Return finite float32 in an array of so many dimensions; raises RequestFailed."""
+    """Return finite float32 of one of these numbers of dimensions; raises RequestFailed."""
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError) as error:
@@ -44,7 +44,7 @@ def _numbers(what: str, values: Any, dimensions: tuple[int, ...]) -> Vector:
     if array.size > NUMBERS:
         raise RequestFailed(f"{what}: {array.size} numbers; at most {NUMBERS} are taken")
     with np.errstate(over="ignore"):
-        found = array.astype(np.float32)
-    if not np.isfinite(found).all():
+        vector = array.astype(np.float32)
+    if not np.isfinite(vector).all():
         raise RequestFailed(f"{what}: not finite numbers")
-    return found
+    return vector

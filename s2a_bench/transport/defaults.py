@@ -1,18 +1,18 @@
-"""The transports that commands take unless told: what names one outside its folder stands here."""
+"""Default transports of commands: the only names of transports outside their folders."""
 
 from __future__ import annotations
 
 from typing import Final
 
 COMPARED: Final = ("http", "ros")
-"""What requests are compared over."""
+"""Transports of requests."""
 FOLLOWED: Final = "ros"
-"""Over which a streamed plan is followed."""
+"""The transport of a streamed plan."""
 BLACK_BOX: Final = "http"
-"""What a server of somebody else's speaks."""
+"""The transport of an external server."""
 ACTING: Final = ("websocket", "http/binary")
-"""Over which a control loop asks for actions, and where the packages of that are not installed."""
+"""The transport of a control loop, and the one if its packages are not installed."""
 LOOPBACK: Final = "loopback"
 """An engine in this process."""
 LLAMA_SERVER: Final = "http/llama-server"
-"""llama.cpp's own server, which a run starts."""
+"""llama.cpp's server, which a run starts."""

@@ -1,7 +1,7 @@
-"""What a server of ours takes, and a client of one answer, in one place for all transports.
+"""Limits of our servers and bounds of an answer that a client reads, for all transports.
 
-More is refused before it costs memory or time. `Limits` are handed to every server in its `Wiring` and recorded in the
-manifest of a run; three are flags of `serve`. `Bounds` are those of one answer.
+What exceeds them is refused before it costs memory or time. Every server gets `Limits` in its `Wiring`, and a run's
+manifest records them; three are flags of `serve`. `Bounds` are those of one answer.
 """
 
 from __future__ import annotations
@@ -17,18 +17,14 @@ KIB: Final = 1 << 10
 MIB: Final = 1 << 20
 SEEDS: Final = (1 << 32) - 1
 VALUES: Final = 20_000
-"""The most values of a document, JSON or MessagePack, that comes from outside."""
-
+"""The most values of a JSON or MessagePack document from outside."""
 
 STEP: Final = 1 << 16
-"""Bytes of a document that are looked at together."""
+"""Bytes of a document that are examined together."""
 
 
 class Limits(Options):
-    """The most that is taken of one request, and of all at once, over every transport as far as it has such a thing.
-
-    Users set those that `SET` names; the others are the same for every server.
-    """
+    """Limits of one request and of all together. Users set those in `SET`; the others are the same for every server."""
 
     PANEL: ClassVar[str] = "Limits"
 
@@ -47,27 +43,24 @@ class Limits(Options):
 
     @property
     def body_bytes(self) -> int:
-        """Return the largest body in bytes."""
         return round(self.body_mib * MIB)
 
     @property
     def header_bytes(self) -> int:
-        """Return the longest headers in bytes."""
         return round(self.header_kib * KIB)
 
     @property
     def in_flight_bytes(self) -> int:
-        """Return in bytes what the bodies of all requests may be together."""
         return round(self.in_flight_mib * MIB)
 
 
 LIMITS: Final = Limits()
 SET: Final = ("body_mib", "waiting", "answer_s")
-"""What `serve` has flags, keys and parameters for."""
+"""The limits that `serve` has flags, keys and parameters for."""
 
 
 def whole_number(name: str, value: Any, least: int, most: int, default: int) -> int:
-    """Return a number that came from outside, or the default for None; raises RequestFailed for anything else."""
+    """Return a number from outside, or the default for None; raises RequestFailed for anything else."""
     if value is None:
         return default
     if type(value) is not int or not least <= value <= most:
@@ -76,7 +69,7 @@ def whole_number(name: str, value: Any, least: int, most: int, default: int) -> 
 
 
 def text(name: str, value: Any, default: str = "") -> str:
-    """Return a text that came from outside, or the default for None; raises RequestFailed for what cannot be sent."""
+    """Return a text from outside, or the default for None; raises RequestFailed for what UTF-8 cannot carry."""
     if value is None:
         return default
     if not isinstance(value, str):
@@ -91,24 +84,25 @@ def text(name: str, value: Any, default: str = "") -> str:
 def check_values(document: bytes | bytearray) -> None:
     """Raise RequestFailed for a JSON document of too many values, before it is parsed; other bytes may pass.
 
-    Values are at most as many as commas and openings; those within strings are left out only where it matters.
+    There are at most as many values as commas and brackets; those in strings are excluded only if the first count is
+    too large.
     """
-    if _openings(document) <= VALUES:
+    if _separators(document) <= VALUES:
         return
-    values, quotes, within, rest = 0, 0, 0, b""
+    values, quotes, in_string, rest = 0, 0, 0, b""
     for at in range(0, len(document), STEP):
         plain = (rest + document[at : at + STEP]).replace(rb"\\", b"")
-        rest = b"\\" if plain.endswith(b"\\") else b""  # what it escapes comes with the next step
-        parts = plain.replace(rb"\"", b"").split(b'"')
-        values += _openings(b"".join(parts[within::2]))
-        quotes += len(parts) - 1
-        within = quotes % 2
+        rest = b"\\" if plain.endswith(b"\\") else b""  # the escaped letter comes with the next step
+        pieces = plain.replace(rb"\"", b"").split(b'"')
+        values += _separators(b"".join(pieces[in_string::2]))
+        quotes += len(pieces) - 1
+        in_string = quotes % 2
         if values > VALUES or quotes > 4 * VALUES:
             raise RequestFailed(f"the document has more than {VALUES} values")
 
 
-def _openings(document: bytes | bytearray) -> int:
-    """Count what opens a value or follows one, up to one too many; `find` is 20 times as fast as `count`."""
+def _separators(document: bytes | bytearray) -> int:
+    """Count commas and opening brackets, up to one too many; `find` is 20 times as fast as `count`."""
     count = 0
     for sign in (b",", b"[", b"{"):
         at = document.find(sign)
@@ -119,7 +113,7 @@ def _openings(document: bytes | bytearray) -> int:
 
 
 def check_pixels(width: int, height: int, limits: Limits) -> None:
-    """Raise RequestFailed for a picture of more pixels than are taken, or of none."""
+    """Raise RequestFailed for a picture without pixels, or of too many."""
     if width <= 0 or height <= 0:
         raise RequestFailed(f"a picture of {width}x{height} is empty")
     if width * height > limits.pixels:
@@ -127,7 +121,7 @@ def check_pixels(width: int, height: int, limits: Limits) -> None:
 
 
 def check_encoded(data: memoryview, limits: Limits) -> None:
-    """Raise RequestFailed for a file that is no JPEG or PNG, or of too many pixels, as its header says."""
+    """Raise RequestFailed for a file that is neither JPEG nor PNG, or whose header gives too many pixels."""
     size = _png_size(data) or _jpeg_size(data)
     if size is None:
         raise RequestFailed(f"{len(data)} bytes that are neither a JPEG nor a PNG")
@@ -148,7 +142,7 @@ _SEGMENTS = 10_000
 _FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers of a JPEG's frame header (ITU T.81, table B.1)."""
 _ALONE = frozenset({0x00, 0x01, *range(0xD0, 0xD8)})
-"""Those that no length follows."""
+"""Markers without a length."""
 
 
 def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
@@ -169,17 +163,16 @@ def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
 
 
 PIECES_A_TOKEN, PIECES = 8, 64
-"""A server may count otherwise, or send letters: an answer may have so many pieces a token, and some more."""
+"""The most pieces of an answer, for each token and beside: a server may count otherwise, or send single letters."""
 BYTES_A_TOKEN, BYTES = 16 << 10, 5 << 20
-"""All that comes, headers included, in the same way; a token in OpenAI's dialect takes 300 bytes."""
+"""The most bytes of an answer, headers included, likewise; a token in OpenAI's dialect takes 300 bytes."""
 
 
 class Bounds:
-    """The bounds of one answer, told of what comes."""
+    """Counts one answer of ``server``, whose name errors have, against its bounds."""
 
-    def __init__(self, who: str, deadline_s: float, max_tokens: int) -> None:
-        """Start the time; errors name ``who`` answers."""
-        self._who = who
+    def __init__(self, server: str, deadline_s: float, max_tokens: int) -> None:
+        self._server = server
         self._deadline_s = deadline_s
         self._ends_ns = now_ns() + int(deadline_s * 1e9)
         self._max_tokens = max_tokens
@@ -187,11 +180,11 @@ class Bounds:
         self._most_bytes = self._bytes = BYTES + BYTES_A_TOKEN * max_tokens
 
     def left_s(self) -> float:
-        """Return the time that is left; raises RequestFailed after the deadline."""
+        """Return the time left; raises RequestFailed after the deadline."""
         left_ns = self._ends_ns - now_ns()
         if left_ns <= 0:
             raise RequestFailed(
-                f"{self._who} did not end its answer within {self._deadline_s:g} s; see `deadline` and `max_tokens`"
+                f"{self._server} did not end its answer within {self._deadline_s:g} s; see `deadline` and `max_tokens`"
             )
         return left_ns / 1e9
 
@@ -200,14 +193,14 @@ class Bounds:
         self._bytes -= size
         if self._bytes < 0:
             raise RequestFailed(
-                f"{self._who} sent more than {self._most_bytes} bytes for {self._max_tokens} tokens (`max_tokens`)"
+                f"{self._server} sent more than {self._most_bytes} bytes for {self._max_tokens} tokens (`max_tokens`)"
             )
 
     def count_piece(self) -> None:
-        """Count a piece of the answer; raises RequestFailed where the server does not stop."""
+        """Count a piece of the answer; raises RequestFailed if the server does not stop."""
         self._pieces -= 1
         if self._pieces < 0:
             raise RequestFailed(
-                f"{self._who} does not stop: {self._most_pieces} pieces came for {self._max_tokens} tokens "
+                f"{self._server} does not stop: {self._most_pieces} pieces came for {self._max_tokens} tokens "
                 "(`max_tokens`)"
             )

@@ -1,7 +1,7 @@
-"""What transports with an address have in common: where our server listens, whom it lets in, whose else is asked.
+"""Transports with an address: where our server listens, its key, and the URL of an external server.
 
-Options of one name are one flag for all of them. API keys are read from the environment by the variable's name, never
-from a flag, and never shown; URLs hold no secret that would be kept with results.
+Options of one name are one flag for all transports. An API key is read from an environment variable, never from a
+flag, and never shown; a URL must hold no secret, because results keep it.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from s2a_bench.secrets import is_secret, keep
 from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
 
 ANY: Final = "127.0.0.1:0"
-"""What is bound unless told."""
+"""The default address of a server."""
 VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class ListeningOptions(TransportOptions):
-    """How our server is reached, or somebody else's is asked."""
+    """Options of a server with an address, ours or an external one."""
 
     SCHEMES: ClassVar[tuple[str, ...]] = ()
-    """Of the URLs."""
+    """Schemes of `url`."""
 
     host: str = option(
         "127.0.0.1", "address that our server binds; others than this machine need a key", side=SERVING, first=True
@@ -54,33 +54,31 @@ class ListeningOptions(TransportOptions):
         return checked_url(url, cls.SCHEMES)
 
     def check(self) -> None:
-        """Refuse a key that nobody needs."""
         if self.no_auth and self.api_key_env:
             raise UsageError("`no_auth` lets everybody in without the key of `api_key_env`; give one of them")
 
     def addresses(self) -> Iterable[str]:
-        """Return ``host:port``, and any free port."""
         return f"{self.host}:{self.port}", f"{self.host}:0"
 
     def callers(self, with_key: str) -> str:
-        """Return whom our server answers, as `serve` says it; ``with_key`` is who has the key of the variable {}."""
+        """Return which clients our server serves, for `serve`; ``with_key`` describes those with the key {}."""
         if self.api_key_env:
-            return f" for who {with_key.format(f'${self.api_key_env}')}"
-        return " for all who reach it" if self.no_auth else ""
+            return f" for clients that {with_key.format(f'${self.api_key_env}')}"
+        return " for every client" if self.no_auth else ""
 
 
-def split(address: str, scheme: str) -> tuple[str, str]:
-    """Return host and port of ``host:port``, or of what a server's `address` was; without one 127.0.0.1 and 0."""
+def split_address(address: str, scheme: str) -> tuple[str, str]:
+    """Return host and port of ``host:port`` or of a server's `address`; 127.0.0.1 and 0 for an empty one."""
     host, _, port = (address.removeprefix(f"{scheme}://") or ANY).rpartition(":")
     return host or "127.0.0.1", port
 
 
 def bound_socket(address: str, scheme: str, options: ListeningOptions) -> tuple[socket.socket, str]:
-    """Return a TCP socket that listens at an address (see `split`), and the key that clients must send.
+    """Return a TCP socket that listens at an address (see `split_address`), and the key that clients must send.
 
-    Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
+    Raises PortInUse, and UsageError if other hosts could connect without a key and `no_auth` is not set.
     """
-    host, port = split(address, scheme)
+    host, port = split_address(address, scheme)
     bound = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -97,38 +95,37 @@ def bound_socket(address: str, scheme: str, options: ListeningOptions) -> tuple[
 
 
 def cannot_bind(host: str, port: str, number: int | None, why: str | None) -> PortInUse:
-    """Return what to raise where an address cannot be had, for a system's error of this number."""
+    """Return the exception for a system error of this number on binding."""
     if number == errno.EADDRINUSE:
         return PortInUse(f"`port`: {port} is in use on {host}; choose another, or 0 for any free one")
     return PortInUse(f"`port`: cannot bind {host}:{port}: {why}")
 
 
 def checked_url(url: str, schemes: Collection[str]) -> str:
-    """Return a URL with one of the schemes, or ""; raises ValueError for any other text, without its password."""
+    """Return a URL with one of the schemes, or ""; raises ValueError, without a password, for any other text."""
     if not url:
         return url
     try:
-        parts = urlsplit(url)
-        sound = parts.scheme in schemes and bool(parts.hostname) and parts.port != 0
+        address = urlsplit(url)
+        valid = address.scheme in schemes and bool(address.hostname) and address.port != 0
     except ValueError:
-        sound = False
-    if not sound:
+        valid = False
+    if not valid:
         shown = re.sub(r"[^/]*@", "***@", url.partition("?")[0])
         raise ValueError(f"'{shown}' should start with {' or '.join(f'{each}://' for each in schemes)} and name a host")
-    if "@" in parts.netloc:
+    if "@" in address.netloc:
         raise ValueError("leave the password out, which would be kept with the results; see `api_key_env`")
-    for name, _ in parse_qsl(parts.query, keep_blank_values=True):
+    for name, _ in parse_qsl(address.query, keep_blank_values=True):
         if is_secret(name):
             raise ValueError(f"leave '{name}' out, which would be kept with the results; see `api_key_env`")
     return url
 
 
 def read_key(variable: str) -> str:
-    """Return the key that an environment variable holds, without space around it; "" for no variable.
+    """Return the key that an environment variable holds, stripped; "" for no variable.
 
-    From now on it is struck out of what is shown and kept.
-
-    Raises UsageError, which does not repeat the name: somebody may have given the key itself.
+    From now on the key is struck out of everything shown or kept. Raises UsageError without repeating the name: it may
+    be the key itself.
     """
     if not variable:
         return ""
@@ -144,9 +141,9 @@ def read_key(variable: str) -> str:
 
 
 def key_for(host: str, variable: str, *, everybody: bool) -> str:
-    """Return the key that the clients of a server must send, "" for none; ``variable`` names where it is.
+    """Return the key that a server's clients must send, from the environment ``variable``; "" for none.
 
-    Raises UsageError where strangers reach ``host`` without a key and nobody said that ``everybody`` may.
+    Raises UsageError if other hosts can connect to ``host`` without a key and ``everybody`` is not set.
     """
     key = read_key(variable)
     if not (key or everybody or ip_address(host).is_loopback):
@@ -157,7 +154,7 @@ def key_for(host: str, variable: str, *, everybody: bool) -> str:
     return key
 
 
-def has_key(said: bytes, scheme: str, key: bytes) -> bool:
-    """Whether an Authorization header has the key, compared in constant time (RFC 6750, 2.1)."""
-    name, _, token = said.partition(b" ")
+def has_key(header: bytes, scheme: str, key: bytes) -> bool:
+    """Return True if an Authorization header has the key, compared in constant time (RFC 6750, 2.1)."""
+    name, _, token = header.partition(b" ")
     return name.lower() == scheme.lower().encode() and hmac.compare_digest(token.strip(), key)

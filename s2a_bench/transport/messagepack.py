@@ -1,7 +1,6 @@
-"""MessagePack from outside: a bounded number of plain values, and what a protocol makes of its maps, arrays first.
+"""MessagePack from outside: a bounded number of plain values, whose maps a protocol may convert, to arrays for example.
 
-Bytes become nothing but numbers, texts, bytes, lists and dictionaries; no extension type is read, msgpack's own time
-stamps included.
+Values are numbers, texts, bytes, lists and dictionaries; no extension type is read, not even MessagePack's time stamps.
 """
 
 from __future__ import annotations
@@ -18,16 +17,14 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.transport.limits import VALUES
 
 LIST, MAP = 4096, 1024
-"""The most elements of a list, and keys of a map; arrays of numbers are one value each."""
-
+"""The most elements of a list, and keys of a map; an array of numbers is one value."""
 DIMENSIONS: Final = 8
-"""The most of an array."""
 
 
 def unpacked(data: Any, of_map: Callable[[dict[Any, Any]], Any]) -> Any:
-    """Read the message in a buffer, each map as ``of_map`` has it; raises RequestFailed for any other bytes.
+    """Read the message in a buffer, each map converted by ``of_map``; raises RequestFailed for invalid bytes.
 
-    What ``of_map`` refuses it says with a ValueError or a RequestFailed.
+    ``of_map`` raises ValueError or RequestFailed for a map that it refuses.
     """
     left = VALUES
 
@@ -46,7 +43,7 @@ def unpacked(data: Any, of_map: Callable[[dict[Any, Any]], Any]) -> Any:
             ext_hook=_no_extension,
             max_array_len=LIST,
             max_map_len=MAP,
-            max_ext_len=0,  # time stamps never come to the hook, and empty ones pass this
+            max_ext_len=0,  # the hook never gets time stamps; empty extensions pass this
         )
     except (RequestFailed, ValueError, TypeError, OverflowError, RecursionError) as error:  # msgpack's: ValueErrors
         raise RequestFailed(f"{len(data)} bytes that are no message: {str(error) or type(error).__name__}") from error
@@ -57,7 +54,7 @@ def _no_extension(code: int, _: bytes) -> Any:
 
 
 def array_in(data: Any, shape: Any, dtype: np.dtype[Any], start: int = 0, *, fortran: bool = False) -> NDArray[Any]:
-    """Return the read-only array whose elements begin at ``start`` of some bytes; raises RequestFailed for no such."""
+    """Return the read-only array whose elements begin at ``start``; raises RequestFailed if the bytes do not fit."""
     if not isinstance(data, bytes):
         raise RequestFailed(f"an array whose data is {type(data).__name__}, not bytes")
     axes: list[Any] = list(shape) if isinstance(shape, (list, tuple)) else [None]

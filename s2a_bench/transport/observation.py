@@ -1,18 +1,18 @@
-"""Observation templates: a TOML or JSON file that says what a foreign policy is told, with places for what varies.
+"""Observation templates: a TOML or JSON file that describes the observation of a policy server, with placeholders.
 
-It describes the nested dictionary that the policy wants. These texts in it are places:
+It holds the nested dictionary that the policy expects. These texts in it are placeholders:
 
 - ``"{image}"``, ``"{image:1}"``: the first, the second picture, uint8 (H, W, 3) RGB. ``"{image:0|CHW}"`` is
-  (3, H, W) of it, ``"{image:0|bytes}"`` its file as bytes, where pictures travel as JPEG or PNG.
-- ``"{state}"``, ``"{state:0:7}"``, ``"{state:7:}"``: the robot's state, float32 (D,), or some of it.
-- ``{prompt}``, also within a text: ``"Task: {prompt}"``. A brace that is none of these is written twice.
+  (3, H, W), ``"{image:0|bytes}"`` the bytes of its file, if pictures are sent as JPEG or PNG.
+- ``"{state}"``, ``"{state:0:7}"``, ``"{state:7:}"``: the robot's state, float32 (D,), or a slice of it.
+- ``{prompt}``, also within a text: ``"Task: {prompt}"``. Any other brace is written twice.
 
 A list of arrays becomes one array with one more axis in front: ``[["{image}"]]`` is (1, 1, H, W, 3) and
 ``["{image:0}", "{image:1}"]`` is (2, H, W, 3), while ``[["{prompt}"]]`` stays a list of lists of text. A key that ends
-with ``?`` is left out, without the mark, where the request lacks a picture or the numbers that its value wants. All
-else stands for itself. The files beside this module, in ``templates``, are known by name.
+with ``?`` is optional: it is left out if the request lacks the picture or the numbers of its value. All other values
+are constants. The files in ``templates`` beside this module are known by name.
 
-`PolicyTransport` is what transports to servers that are told by such a template have in common.
+`PolicyTransport` is the base of transports whose observations are made from a template.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from s2a_bench.transport import ACTIONS, Capabilities, Choice, Transport
 from s2a_bench.transport.listening import ListeningOptions, read_key
 from s2a_bench.types import Pixels, Vector
 
-HERE: Final = Path(__file__).with_name("templates")
+TEMPLATES: Final = Path(__file__).with_name("templates")
 DEFAULT: Final = "openpi"
 FILE_LETTERS, VALUES, DEPTH, CAMERAS = 1 << 16, 1024, 16, 64
-"""The most that a template has: bytes, values, dictionaries and lists within each other, pictures."""
+"""The most of a template: bytes, values, nested dictionaries and lists, pictures."""
 STATE: Final = 10**6
-"""More numbers than a place for the state can want."""
+"""More numbers than a placeholder of the state can need."""
 WHOLE: Final = range(-(1 << 63), 1 << 64)
-"""What MessagePack has room for."""
+"""The integers of MessagePack."""
 
 _PLACE = re.compile(
     r"\{(?:(?P<picture>image)(?::(?P<image>\d{1,3}))?(?:\|(?P<form>\w+))?"
@@ -53,27 +53,27 @@ _FORMS = (None, "CHW", "bytes")
 
 
 class _Missing(Exception):
-    """What a place wants is not in the request."""
+    """The request lacks the value of a placeholder."""
 
 
 @dataclass(frozen=True, slots=True)
-class _Given:
+class _Values:
     pictures: Sequence[Pixels]
     state: Vector
     prompt: str
 
 
-_Make: TypeAlias = Callable[[_Given], Any]
+_Make: TypeAlias = Callable[[_Values], Any]
 
 
 class Template:
-    """What one policy is told."""
+    """The template of one policy's observations."""
 
     def __init__(self, content: Any, name: str) -> None:
-        """Read a template that TOML or JSON was; raises UsageError naming the key that makes no sense."""
+        """Compile parsed TOML or JSON; raises UsageError naming an invalid key."""
         self.name = name
         self.pictures = 0
-        """How many pictures it has places for."""
+        """Number of pictures that it has placeholders for."""
         self.accepts_state = False
         self.encoded = False
         """Whether pictures are the bytes of a file, as JPEG."""
@@ -83,25 +83,25 @@ class Template:
         self._make = self._table(content, "", 0)
 
     def fill(self, pictures: Sequence[Pixels], state: Sequence[float], prompt: str) -> dict[str, Any]:
-        """Return the observation: its arrays are those of ``pictures``, uint8 (H, W, 3) or (n,), as far as can be.
+        """Return the observation, if possible without copies of ``pictures``, uint8 (H, W, 3) or (n,).
 
-        Raises RequestFailed naming the key whose picture or state is missing, or what has no place.
+        Raises RequestFailed for a key without its picture or state, and for a value without a placeholder.
         """
         if len(pictures) > self.pictures:
             raise RequestFailed(f"`template` {self.name} has places for {self.pictures} pictures, not {len(pictures)}")
         if len(state) and not self.accepts_state:
             raise RequestFailed(f"`template` {self.name} has no place for the robot's state")
         try:
-            filled: dict[str, Any] = self._make(_Given(pictures, np.asarray(state, np.float32), prompt))
+            filled: dict[str, Any] = self._make(_Values(pictures, np.asarray(state, np.float32), prompt))
         except _Missing as missing:
             raise RequestFailed(f"`template` {self.name}: {missing}") from None
         return filled
 
     def check_pictures(self, cameras: int) -> None:
-        """Raise UsageError where it has places for fewer pictures, or wants more."""
+        """Raise UsageError unless requests with so many pictures fit."""
         why = f"has places for {self.pictures}" if cameras > self.pictures else ""
         try:
-            self._make(_Given([np.zeros((1, 1, 3), np.uint8)] * cameras, np.zeros(STATE, np.float32), ""))
+            self._make(_Values([np.zeros((1, 1, 3), np.uint8)] * cameras, np.zeros(STATE, np.float32), ""))
         except _Missing:
             why = f"wants {self.pictures}"
         if why:
@@ -112,10 +112,9 @@ class Template:
         raise UsageError(f"`template` {self.name}: {path or 'it'} {why}")
 
     def _value(self, value: Any, path: str, depth: int) -> _Make:
-        """Prepare a value of any kind."""
         self._values += 1
         if depth > DEPTH or self._values > VALUES:
-            self._refuse(path, f"is beyond what is read: {VALUES} values, {DEPTH} within each other")
+            self._refuse(path, f"exceeds the limits of a template: {VALUES} values, {DEPTH} nested")
         if isinstance(value, Mapping):
             return self._table(value, path, depth)
         if isinstance(value, list):
@@ -123,23 +122,23 @@ class Template:
         if isinstance(value, str):
             return self._text(value, path)
         if not (value is None or isinstance(value, (bool, float)) or (isinstance(value, int) and value in WHOLE)):
-            self._refuse(path, f"is {value!r}, which no policy can be told")
+            self._refuse(path, f"is {value!r}, which no observation can hold")
         return lambda _: value
 
     def _table(self, table: Mapping[str, Any], path: str, depth: int) -> _Make:
         made: dict[str, tuple[_Make, bool]] = {}
         for key, value in table.items():
             name = key.removesuffix("?")
-            here = f"{path}.{name}" if path else name
+            inner = f"{path}.{name}" if path else name
             if not name or name in made or not _is_text(name):
-                self._refuse(here, "is twice there, empty, or no Unicode text")
-            made[name] = self._value(value, here, depth + 1), name != key
+                self._refuse(inner, "is twice there, empty, or no Unicode text")
+            made[name] = self._value(value, inner, depth + 1), name != key
 
-        def make(given: _Given) -> dict[str, Any]:
+        def make(values: _Values) -> dict[str, Any]:
             filled = {}
             for name, (value, optional) in made.items():
                 try:
-                    filled[name] = value(given)
+                    filled[name] = value(values)
                 except _Missing:
                     if not optional:
                         raise
@@ -150,8 +149,8 @@ class Template:
     def _list(self, values: Sequence[Any], path: str, depth: int) -> _Make:
         makes = [self._value(value, f"{path}[{index}]", depth + 1) for index, value in enumerate(values)]
 
-        def make(given: _Given) -> Any:
-            filled = [make(given) for make in makes]
+        def make(values: _Values) -> Any:
+            filled = [make(values) for make in makes]
             if not filled or not all(isinstance(each, np.ndarray) for each in filled):
                 return filled
             if len(filled) == 1:
@@ -174,7 +173,7 @@ class Template:
             if brace[0] in {"{", "}"}:
                 places = "{image}, {image:1}, {image:0|CHW}, {state}, {state:0:7}, {prompt}"
                 self._refuse(path, f"has a brace that is no place: {text!r}; there are {places}, and {{{{ for a brace")
-        return lambda given: _IN_TEXT.sub(lambda found: _BRACES.get(found[0], given.prompt), text)
+        return lambda values: _IN_TEXT.sub(lambda brace: _BRACES.get(brace[0], values.prompt), text)
 
     def _picture(self, path: str, index: int, form: str | None) -> _Make:
         if index >= CAMERAS or form not in _FORMS:
@@ -182,10 +181,10 @@ class Template:
         self.pictures = max(self.pictures, index + 1)
         self.encoded |= form == "bytes"
 
-        def make(given: _Given) -> Any:
-            if index >= len(given.pictures):
-                raise _Missing(f"{path} wants picture {index}, and the request has {len(given.pictures)}")
-            picture = given.pictures[index]
+        def make(values: _Values) -> Any:
+            if index >= len(values.pictures):
+                raise _Missing(f"{path} wants picture {index}, and the request has {len(values.pictures)}")
+            picture = values.pictures[index]
             if form is None:
                 return picture
             return picture.tobytes() if form == "bytes" else np.ascontiguousarray(np.moveaxis(picture, -1, 0))
@@ -198,42 +197,40 @@ class Template:
             self._refuse(path, f"wants the numbers {first}:{last} of the state, which are none")
         self.accepts_state = True
 
-        def make(given: _Given) -> Vector:
-            if len(given.state) < (last or first + 1):
+        def make(values: _Values) -> Vector:
+            if len(values.state) < (last or first + 1):
                 wanted = f"{first}:{last or ''}" if first or last else "all"
-                raise _Missing(f"{path} wants the state's numbers ({wanted}), and the request has {len(given.state)}")
-            return given.state[first:last]
+                raise _Missing(f"{path} wants the state's numbers ({wanted}), and the request has {len(values.state)}")
+            return values.state[first:last]
 
         return make
 
 
 def names() -> list[str]:
     """Return the templates that are known by name."""
-    return sorted(path.stem for path in HERE.glob("*.toml"))
+    return sorted(path.stem for path in TEMPLATES.glob("*.toml"))
 
 
-def template_of(told: str) -> Template:
+def template_of(name: str) -> Template:
     """Return the template of a name, or of a TOML or JSON file; raises UsageError."""
     known = names()
-    if told in known:
-        return Template(toml_file.loads((HERE / f"{told}.toml").read_text("utf-8"), told), told)
-    path = Path(told)
+    path = TEMPLATES / f"{name}.toml" if name in known else Path(name)
     if not path.suffix:
-        raise UsageError(f"`template`: {none_of(told, known, ', nor a TOML or JSON file')}")
+        raise UsageError(f"`template`: {none_of(name, known, ', nor a TOML or JSON file')}")
     try:
         text = read_text(path, FILE_LETTERS)
     except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise UsageError(f"`template`: cannot read {told}: {error}") from error
-    return Template(_loads(text, told) if path.suffix == ".json" else toml_file.loads(text, told), told)
+        raise UsageError(f"`template`: cannot read {name}: {error}") from error
+    return Template(_loads(text, name) if path.suffix == ".json" else toml_file.loads(text, name), name)
 
 
-def _loads(text: str, where: str) -> Any:
+def _loads(text: str, name: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_table)
     except RecursionError:
-        raise UsageError(f"`template` {where}: its lists or objects are too deep") from None
+        raise UsageError(f"`template` {name}: its lists or objects are too deep") from None
     except ValueError as error:
-        raise UsageError(f"`template` {where}: no JSON: {error}") from error
+        raise UsageError(f"`template` {name}: no JSON: {error}") from error
 
 
 def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -247,24 +244,24 @@ def _is_text(text: str) -> bool:
     return not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
-def _readable(told: str) -> str:
+def _readable(name: str) -> str:
     try:
-        template_of(told)
+        template_of(name)
     except UsageError as error:
         raise ValueError(str(error).removeprefix("`template`").lstrip(": ")) from None
-    return told
+    return name
 
 
 TemplateName = Annotated[str, AfterValidator(_readable)]
-"""Name or path of a template that can be read."""
+"""Name or path of a readable template."""
 
 
 class PolicyOptions(ListeningOptions):
-    """How a policy server is reached, and what it is told."""
+    """Options of a policy server, with the template of its observations."""
 
     @property
     def template_name(self) -> str:
-        """Return the name or the path of the template."""
+        """The name or the path of the template."""
         raise NotImplementedError
 
 
@@ -272,23 +269,23 @@ P = TypeVar("P", bound=PolicyOptions)
 
 
 class PolicyTransport(Transport[P]):
-    """Observations go up as MessagePack, a chunk of actions comes back."""
+    """Sends observations as MessagePack and receives chunks of actions."""
 
     payloads: ClassVar[tuple[str, ...]] = ("raw", "jpeg", "jpeg-preencoded", "png")
     answer_kinds = (ACTIONS,)
     stages: ClassVar[Mapping[str, str]] = {"msgpack_pack": "pack", "msgpack_parse": "parse"}
     modules: ClassVar[tuple[str, ...]]
-    """What the extra of its name brings, by the names under which they are imported."""
+    """Modules that the extra of its name installs."""
 
     def capabilities(self, choice: Choice[P]) -> Capabilities[P]:
-        """Return what a policy takes: pixels, unless its template says that it decodes files."""
+        """Return a policy's capabilities: it takes pixels, unless its template has files."""
         options, template = choice.options, template_of(choice.options.template_name)
         pixels = self.payloads[:1] if options.url else self.payloads
         payloads = self.payloads[1:] if template.encoded else pixels
         return Capabilities(options, payloads, self.answer_kinds, template.accepts_state, self.facts)
 
     def require(self, choice: Choice[P]) -> None:
-        """Refuse a key that is not there, and a template for other pictures; raises MissingExtra too."""
+        """Refuse a missing key, and a template for other pictures; raises MissingExtra too."""
         extras.need(self.name, *self.modules)
         template_of(choice.options.template_name).check_pictures(choice.cameras)
         read_key(choice.options.api_key_env)

@@ -1,9 +1,9 @@
-"""What a server makes of an observation whose keys it does not know: pictures, the robot's state, the prompt.
+"""Observations with unknown keys: which values are pictures, the robot's state, the prompt.
 
-Policies name their keys as they like. So every array of uint8 is a picture, (H, W, 3) or (3, H, W) pixels in RGB with
-any axes of batch and time in front, or (n,) the bytes of a JPEG or PNG, as bytes are, with axes of 1 in front; every
-number with a fraction, or array of such, is part of the state; the prompt is the text under ``prompt``, else the first
-text there is. All in the order of the keys. Whole numbers and truths are ignored.
+Policies name their keys as they like, so types decide. Every uint8 array is a picture: (H, W, 3) or (3, H, W) pixels in
+RGB with any axes of batch and time in front, or (n,) bytes of a JPEG or PNG with axes of length 1 in front, as is every
+bytes value. Every float, or array of floats, belongs to the state. The prompt is the text under ``prompt``, else the
+first text. The order is that of the keys. Integers and booleans are ignored.
 
 Our client and server add fields to a policy server's protocol, between each other alone. A request has them under the
 key `EXTENSION`, which no observation has; the message with the server's marks has the same key. Each protocol decides
@@ -24,9 +24,8 @@ from s2a_bench.transport.limits import SEEDS, Limits, check_pixels, text, whole_
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.types import Frame, Request
 
-PICTURES: Final = 64
-NUMBERS: Final = 4096
-"""The most of one request: pictures, and numbers of the state."""
+PICTURES, NUMBERS = 64, 4096
+"""The most pictures, and numbers of the state, in one request."""
 EXTENSION: Final = "s2a"
 PROMPT: Final = "prompt"
 DEPTH: Final = 32
@@ -34,7 +33,7 @@ COLOURS: Final = 3
 
 
 def observed(observation: Any, trace: Trace, limits: Limits) -> tuple[tuple[Frame, ...], tuple[float, ...], str]:
-    """Return pictures as ``rgb8``, state and prompt; marks `image_decode`. Raises RequestFailed naming the key."""
+    """Return pictures as ``rgb8``, state and prompt; marks `image_decode`. Raises RequestFailed with the key."""
     if not isinstance(observation, Mapping):
         raise RequestFailed(f"an observation is a dictionary, not {type(observation).__name__}")
     frames: list[Frame] = []
@@ -59,7 +58,7 @@ def observed(observation: Any, trace: Trace, limits: Limits) -> tuple[tuple[Fram
 
 
 def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
-    """Yield every value that is no dictionary and no list, with the path to it."""
+    """Yield every value that is neither a dictionary nor a list, with its path."""
     if depth > DEPTH:
         raise RequestFailed(f"{path[:80]}: more than {DEPTH} dictionaries and lists in each other")
     if isinstance(value, Mapping):
@@ -97,40 +96,40 @@ def _pictures(key: str, value: Any, trace: Trace, limits: Limits) -> Sequence[Fr
 
 def extension_of(request: Request) -> dict[str, Any]:
     """Return the fields of a request that no observation has."""
-    told = {"id": request.id, "max_tokens": request.max_tokens, "seed": request.seed, "grammar": request.grammar}
-    return {name: value for name, value in told.items() if value}
+    fields = {"id": request.id, "max_tokens": request.max_tokens, "seed": request.seed, "grammar": request.grammar}
+    return {name: value for name, value in fields.items() if value}
 
 
 def take_extension(message: Any) -> dict[Any, Any] | None:
-    """Take what our client added out of a message, None from anybody else's."""
-    told = message.pop(EXTENSION, None) if isinstance(message, dict) else None
-    if told is not None and not isinstance(told, dict):
+    """Take our client's fields out of a message; None if another client sent it."""
+    fields = message.pop(EXTENSION, None) if isinstance(message, dict) else None
+    if fields is not None and not isinstance(fields, dict):
         raise RequestFailed(f"{EXTENSION} should be a map")
-    return told
+    return fields
 
 
-def request_of(observation: Any, told: dict[Any, Any] | None, trace: Trace, limits: Limits) -> Request:
-    """Read an observation and what our client added, decode its pictures; raises RequestFailed."""
-    told = told or {}
+def request_of(observation: Any, extension: dict[Any, Any] | None, trace: Trace, limits: Limits) -> Request:
+    """Read an observation and our client's fields, decode its pictures; raises RequestFailed."""
+    fields = extension or {}
     images, state, prompt = observed(observation, trace, limits)
     return Request(
-        id=text("id", told.get("id")) or "observation-0",
+        id=text("id", fields.get("id")) or "observation-0",
         prompt=prompt,
         images=images,
-        max_tokens=whole_number("max_tokens", told.get("max_tokens"), 1, limits.answer_tokens, limits.answer_tokens),
-        grammar=text("grammar", told.get("grammar")),
-        seed=whole_number("seed", told.get("seed"), 0, SEEDS, 0),
+        max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, limits.answer_tokens, limits.answer_tokens),
+        grammar=text("grammar", fields.get("grammar")),
+        seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
         state=state,
     )
 
 
 def remote_message(remote: Remote) -> dict[str, Any]:
-    """Return what carries a server's marks."""
+    """Return the message with a server's marks."""
     return {EXTENSION: remote.to_json()}
 
 
 def remote_of(message: Any) -> Remote:
-    """Read a server's marks; raises RequestFailed for what can be none."""
+    """Read a server's marks; raises RequestFailed if they are invalid."""
     try:
         return Remote.of_json(message[EXTENSION])
     except (LookupError, TypeError, ValueError) as error:

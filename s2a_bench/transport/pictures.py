@@ -1,4 +1,4 @@
-"""What happens to a picture on its way, whatever carries it: client-side encoding, server-side decoding to RGB."""
+"""Pictures, for every transport: encoding in the client, decoding to RGB in the server."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PREENCODED = {"jpeg": "image/jpeg", "png": "image/png"}
 
 
 def bgr_of(frame: Frame, trace: Trace, out: Pixels | None = None) -> Frame:
-    """Convert what a camera delivers to ``bgr8``, into ``out`` if given; marks `convert` unless it is that."""
+    """Convert a camera's frame to ``bgr8``, into ``out`` if given; marks `convert` unless nothing is to be done."""
     if frame.encoding == "bgr8" and out is None:
         return frame
     converted = replace(frame, encoding="bgr8", data=to_bgr(frame, out))
@@ -32,7 +32,7 @@ def bgr_of(frame: Frame, trace: Trace, out: Pixels | None = None) -> Frame:
 
 
 def rgb_of(frame: Frame, trace: Trace) -> Frame:
-    """Turn any frame into the ``rgb8`` an engine wants; marks `channel_swap`, `yuv_decode` or `image_decode`.
+    """Convert any frame to ``rgb8`` for the engine; marks `channel_swap`, `yuv_decode` or `image_decode`.
 
     Raises RequestFailed for pixels that do not fit their encoding.
     """
@@ -47,7 +47,7 @@ def rgb_of(frame: Frame, trace: Trace) -> Frame:
 
 
 def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
-    """Return the media type and the bytes that travel for ``payload``; marks `convert` and `image_encode`."""
+    """Return the media type and the bytes of a picture as ``payload``; marks `convert` and `image_encode`."""
     if frame.encoding in PREENCODED:
         return PREENCODED[frame.encoding], frame.data
     bgr = bgr_of(frame, trace)
@@ -64,7 +64,7 @@ def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
 
 
 def policy_picture(frame: Frame, payload: str, trace: Trace) -> Pixels:
-    """Return a picture as policies are told it: (H, W, 3) RGB, or a file's (n,) bytes; marks as `encoded` does."""
+    """Return a picture for a policy: (H, W, 3) RGB, or a file's (n,) bytes; marks as `encoded` does."""
     if payload != "raw":
         return encoded(frame, payload, trace)[1].reshape(-1)
     if frame.encoding == "rgb8":
@@ -75,15 +75,15 @@ def policy_picture(frame: Frame, payload: str, trace: Trace) -> Pixels:
 
 
 def decoded(media_type: str, data: bytes | memoryview, trace: Trace, limits: Limits = LIMITS) -> Frame:
-    """Turn received bytes into an ``rgb8`` frame; marks `image_decode` or `channel_swap`. Raises RequestFailed."""
+    """Convert received bytes to an ``rgb8`` frame; marks `image_decode` or `channel_swap`. Raises RequestFailed."""
     try:
         if media_type.startswith(RAW_MIME):
-            facts = dict(part.split("=", 1) for part in media_type.split(";")[1:])
-            width, height = int(facts["width"]), int(facts["height"])
+            parameters = dict(each.split("=", 1) for each in media_type.split(";")[1:])
+            width, height = int(parameters["width"]), int(parameters["height"])
             check_pixels(width, height, limits)
             pixels = np.frombuffer(data, np.uint8).reshape(height, width, 3)
-            if facts["encoding"] != "bgr8":
-                raise ValueError(f"raw encoding '{facts['encoding']}' is not bgr8")
+            if parameters["encoding"] != "bgr8":
+                raise ValueError(f"raw encoding '{parameters['encoding']}' is not bgr8")
             return rgb_of(Frame(-1, 0, width, height, "bgr8", pixels), trace)
         check_encoded(memoryview(data), limits)
         rgb = decode_image(data)

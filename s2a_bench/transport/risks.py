@@ -1,7 +1,7 @@
-"""`doctor --url`: what a server that somebody else runs does that is dangerous, without asking it to do anything.
+"""`doctor --url`: security risks of an external server, found without a request to its model.
 
-Each transport that has URLs examines what answers there (`Urls.examine`); what all of them share is here, and
-gRPC, of which there is no transport: lerobot's policy server speaks it.
+Each transport with URLs has its own examination (`Urls.examine`). This module has the findings that all share, and
+those about gRPC, which lerobot's policy server speaks and no transport does.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from s2a_bench.machine.doctor import Finding
 from s2a_bench.transport import TRANSPORTS
 
 Examine: TypeAlias = Callable[[SplitResult], Iterator[Finding]]
-"""Yields findings about the server at a URL that names a host; raises OSError or TransportError where none answers."""
+"""Yields findings about the server at a URL with a host; raises OSError or TransportError if none answers."""
 
 PATIENCE_S: Final = 5.0
 GRPC: Final = "grpc"
 GRPC_PORT: Final = 8080
-"""Where lerobot's policy server listens unless told."""
+"""The default port of lerobot's policy server."""
 PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
-"""With which a client of HTTP/2 begins, and an empty SETTINGS frame (RFC 9113, 3.4 and 6.5)."""
+"""The connection preface of HTTP/2 and an empty SETTINGS frame (RFC 9113, 3.4 and 6.5)."""
 FRAME_HEADER: Final = 9
 SETTINGS: Final = 4
 ENCRYPTED: Final = frozenset({"https", "wss"})
 
 
 def examine(url: str) -> list[Finding]:
-    """Return what is found at a URL; raises UsageError for one of no known kind."""
+    """Return the findings about a URL; raises UsageError for an unknown scheme."""
     known = {
         scheme: each.urls.examine
         for _, each in TRANSPORTS.loaded()
@@ -41,20 +41,20 @@ def examine(url: str) -> list[Finding]:
         if each.urls.examine
     }
     try:
-        parts = urlsplit(url)
-        host, _ = parts.hostname, parts.port
+        address = urlsplit(url)
+        host, _ = address.hostname, address.port
     except ValueError as error:
         raise UsageError(f"`url`: that is no URL: {error}") from error
-    if not host or parts.scheme not in {*known, GRPC}:
+    if not host or address.scheme not in {*known, GRPC}:
         schemes = ", ".join(f"{scheme}://" for scheme in (*known, GRPC))
-        said = f"{parts.scheme}://{host or ''}" if parts.scheme else url.rpartition("@")[2]
+        without_key = f"{address.scheme}://{host or ''}" if address.scheme else url.rpartition("@")[2]
         raise UsageError(
-            f"`url`: '{said}' should look like http://192.168.0.5:8000: one of {schemes}, a host, and its port"
+            f"`url`: '{without_key}' should look like http://192.168.0.5:8000: one of {schemes}, a host, and its port"
         )
-    own: Examine = grpc if parts.scheme == GRPC else resolve_name(known[parts.scheme])
-    findings = [plain_text(parts)]
+    examine_it: Examine = grpc if address.scheme == GRPC else resolve_name(known[address.scheme])
+    findings = [plain_text(address)]
     try:
-        findings += own(parts)
+        findings += examine_it(address)
     except (OSError, TransportError) as error:
         findings.append(
             Finding("server", "error", f"{host} does not answer: {printable(str(error))}", "start it, or name another")
@@ -63,52 +63,52 @@ def examine(url: str) -> list[Finding]:
 
 
 def printable(text: str, most: int = 120) -> str:
-    """Return what a server said as one short line."""
+    """Return a server's text as one short line."""
     return "".join(letter if letter.isprintable() else "?" for letter in text[:most])
 
 
 def is_local(host: str) -> bool:
-    """Whether a name means this machine alone."""
+    """Return True if a name means this machine alone."""
     with suppress(OSError, ValueError):
-        return all(ip_address(found[4][0]).is_loopback for found in socket.getaddrinfo(host, None))
+        return all(ip_address(each[4][0]).is_loopback for each in socket.getaddrinfo(host, None))
     return False
 
 
-def plain_text(parts: SplitResult) -> Finding:
-    """Say whether pictures, keys and actions can be read and changed on their way."""
-    host, port = parts.hostname or "", parts.port or "PORT"
-    if parts.scheme in ENCRYPTED:
-        return Finding("plain-text", "state", f"what travels to {host} is encrypted")
+def plain_text(address: SplitResult) -> Finding:
+    """Return whether others can read and change pictures, keys and actions on the network."""
+    host, port = address.hostname or "", address.port or "PORT"
+    if address.scheme in ENCRYPTED:
+        return Finding("plain-text", "state", f"the connection to {host} is encrypted")
     if is_local(host):
         return Finding("plain-text", "state", f"{host} is this machine: nothing leaves it")
     return Finding(
         "plain-text",
         "warning",
-        f"all travels to {host} in plain text: who is on the way reads pictures and keys, and changes actions",
+        f"the connection to {host} is plain text: others on the network can read pictures and keys, and change actions",
         f"ssh -L {port}:127.0.0.1:{port} {host}, and then 127.0.0.1 in the URL",
     )
 
 
-def no_key(parts: SplitResult, what: str, cure: str) -> Finding:
-    """Say that a server asks for no key: on this machine that is a choice, off it whoever reaches it uses it."""
-    here = is_local(parts.hostname or "")
-    return Finding("no-key", "advice" if here else "warning", f"it wants no key: {what}", cure)
+def no_key(address: SplitResult, what: str, cure: str) -> Finding:
+    """Return the finding that a server asks for no key: a choice on this machine, a risk on any other."""
+    local = is_local(address.hostname or "")
+    return Finding("no-key", "advice" if local else "warning", f"it wants no key: {what}", cure)
 
 
-def grpc(parts: SplitResult) -> Iterator[Finding]:
-    """Tell whether HTTP/2 answers, and what that means if it is lerobot's; no method is called, as `Ready` resets."""
-    with socket.create_connection((parts.hostname or "", parts.port or GRPC_PORT), PATIENCE_S) as connection:
+def grpc(address: SplitResult) -> Iterator[Finding]:
+    """Find out whether the server speaks HTTP/2, as lerobot's does; no method is called, because `Ready` resets it."""
+    with socket.create_connection((address.hostname or "", address.port or GRPC_PORT), PATIENCE_S) as connection:
         connection.sendall(PREFACE)
         head = b""
-        while len(head) < FRAME_HEADER and (piece := connection.recv(FRAME_HEADER - len(head))):
-            head += piece
+        while len(head) < FRAME_HEADER and (received := connection.recv(FRAME_HEADER - len(head))):
+            head += received
     if len(head) < FRAME_HEADER or head[3] != SETTINGS:
-        yield Finding("server", "error", "what answers does not speak gRPC", "name another scheme, or another port")
+        yield Finding("server", "error", "the server does not speak gRPC", "name another scheme, or another port")
         return
     yield Finding(
         "pickle",
         "warning",
-        "it speaks gRPC; if it is lerobot's policy server, it unpickles what anybody sends, and who reaches the port "
-        "runs code there (CVE-2026-25874); a malicious one does the same to its clients",
+        "it speaks gRPC; if it is lerobot's policy server, it unpickles what any client sends: a client that reaches "
+        "the port can run code there (CVE-2026-25874), and a malicious server can do the same to its clients",
         "let it listen on 127.0.0.1 alone, and reach it by ssh -L; s2a-bench does not speak to it",
     )

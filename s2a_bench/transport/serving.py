@@ -1,11 +1,11 @@
-"""The server core, once for all transports: queue, deadlines, bytes under way, clients that have gone, errors.
+"""The server core of all transports: queue, deadlines, bytes in flight, disconnected clients, errors.
 
-A transport's framing reads requests, makes an `Exchange` of each and has it answered by `Core.answer`, on a thread that
-may wait: one a connection where there are connections, one of a pool where many clients share a socket or a topic.
+A transport's framing reads requests, makes an `Exchange` of each and passes it to `Core.answer`, on a thread that may
+wait: one for each connection, or one of `SharedSourceWorkers` where many clients share a socket or a topic.
 
-The queue is bounded, first come first served, one answer at a time. Who joined must leave, whatever happens; leaving
-twice does no harm, and leaving while waiting gives the place up. From its arrival a request has `Limits.answer_s`:
-then its wait, or its answer at the next piece, ends with Overdue.
+The queue is bounded and first come, first served, with one answer at a time. Every `Turn` must be left; leaving twice
+does no harm, and leaving while waiting gives the place up. `Limits.answer_s` after a request's arrival its wait, or its
+answer at the next piece, ends with Overdue.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 
 RETRY_AFTER_S = 1.0
 STUCK_S = 120
-"""Silence of an answer under way after which it counts as stuck: a long prompt on a small board takes its time."""
+"""Silence after which a running answer counts as stuck: a long prompt on a small board takes its time."""
 POLL_S = 0.1
-"""How often one who waits is asked whether it still wants an answer."""
+"""Interval at which waiting requests check that their clients are still connected."""
 READERS: Final = 8
 """Requests that are parsed and decoded at once, each of which may hold a large picture."""
 IDLE_WORKERS: Final = 2
-"""Threads that wait for requests of a shared source, one in its library."""
+"""Idle threads of a shared source, one of which waits in its library."""
 LARGE_BYTES: Final = 32 << 20
-"""From here on what a request left behind is given back to the system at once."""
+"""Requests from this size on give their memory back to the system at once."""
 _log = logging.getLogger(__name__)
 
 
@@ -50,21 +50,19 @@ class Turn:
     def __init__(self, turns: Turns, answer_s: float) -> None:
         """Take a place; only `Turns.join` does."""
         self.ready: Event | None = None
-        """Set when it is this request's turn; None where it was at once."""
+        """Set when the turn starts; None if it started at once."""
         self.alive_ns = now_ns()
-        """When the answer last showed a sign of life, on CLOCK_MONOTONIC."""
+        """Time of the last piece of the answer, on CLOCK_MONOTONIC."""
         self.deadline_ns = self.alive_ns + round(answer_s * 1e9)
-        """When the whole answer has to be over."""
         self._answer_s = answer_s
         self._turns = turns
 
     @property
     def has_started(self) -> bool:
-        """Whether it is this request's turn, or was."""
         return self.ready is None or self.ready.is_set()
 
     def wait(self, disconnected: Callable[[], bool] = lambda: False) -> bool:
-        """Wait on this thread; return False if the client was ``gone`` before its turn came. Raises Overdue."""
+        """Wait on this thread; return False if the client is ``disconnected`` before the turn. Raises Overdue."""
         while self.ready is not None and not self.ready.wait(POLL_S):
             if disconnected():
                 return False
@@ -72,23 +70,22 @@ class Turn:
         return not disconnected()
 
     def alive(self, at_ns: int) -> None:
-        """Note a sign of life; raises Overdue."""
         self.alive_ns = at_ns
         self.check(at_ns)
 
     def check(self, at_ns: int) -> None:
-        """Raise Overdue after the deadline."""
         if at_ns > self.deadline_ns:
-            doing = "waiting for the engine" if not self.has_started else "being answered"
-            raise Overdue(f"{self._answer_s:g} s after it came the request is still {doing}: the server gives it up")
+            state = "being answered" if self.has_started else "waiting for the engine"
+            raise Overdue(
+                f"{self._answer_s:g} s after its arrival the request is still {state}: the server gives it up"
+            )
 
     def leave(self) -> None:
-        """End the turn, or give up the place; may be called twice, from any thread."""
         self._turns.leave(self)
 
 
 class Turns:
-    """The queue: one turn runs, at most ``limits.waiting`` wait for theirs in the order of their arrival."""
+    """The queue: one turn runs, at most ``limits.waiting`` wait, in the order of their arrival."""
 
     def __init__(self, limits: Limits = LIMITS) -> None:
         self._limits = limits
@@ -97,7 +94,6 @@ class Turns:
         self._waiting: deque[Turn] = deque()
 
     def join(self) -> Turn:
-        """Take the last place; raises Busy where as many as may are waiting."""
         turn = Turn(self, self._limits.answer_s)
         with self._lock:
             if self._running is None:
@@ -111,7 +107,7 @@ class Turns:
         return turn
 
     def leave(self, turn: Turn) -> None:
-        """Take ``turn`` out and let the next one run if it ran."""
+        """Remove ``turn``; if it ran, start the next one."""
         with self._lock:
             if turn is not self._running:
                 if turn in self._waiting:
@@ -127,27 +123,27 @@ class Turns:
         return len(self._waiting)
 
     def silent_s(self) -> float:
-        """Return for how long the running answer has shown no sign of life; 0 where none runs."""
+        """Return the time since the running answer's last piece; 0 if none runs."""
         running = self._running
         return (now_ns() - running.alive_ns) / 1e9 if running is not None else 0.0
 
 
 Answering: TypeAlias = "Callable[[Request, Trace, Turn], Generator[Piece, None, None]]"
-"""What answers in its turn, and leaves as soon as the engine is free: what it does then, nobody waits for."""
+"""Answers in its turn, and leaves it as soon as the engine is free."""
 
 
 class Queued:
-    """A handler that answers one request at a time; `answer` is for who has its turn already."""
+    """A handler that answers one request at a time; `answer` is for a caller that has its turn already."""
 
     def __init__(
         self, answering: Answering, limits: Limits = LIMITS, provenance: Mapping[str, str] | None = None
     ) -> None:
-        """Put a queue in front of ``answering``; ``provenance`` says who that is, and goes with every answer."""
+        """Put a queue in front of ``answering``; every answer carries its ``provenance``."""
         self.turns = Turns(limits)
         self.settings: Options | None = None
-        """What the engine was told, where whoever made this says so: a node's parameters have it."""
+        """The engine's options, if known: a node has them as parameters."""
         self.honours: Collection[str] = ()
-        """The names in `Request.sampling` that the engine honours."""
+        """Names in `Request.sampling` that the engine honours."""
         self.provenance = dict(provenance or {})
         self._answering = answering
 
@@ -178,7 +174,7 @@ class Queued:
             turn.leave()
 
     def answer(self, request: Request, trace: Trace, turn: Turn) -> Generator[Piece, None, None]:
-        """Answer in a turn that has come, and leave it."""
+        """Answer in a turn that has started, and leave it."""
         trace.provenance = self.provenance
         trace.mark(RESIDUAL)
         try:
@@ -189,27 +185,27 @@ class Queued:
 
 
 class Disconnected(Exception):
-    """The client has gone: nothing can be sent to it."""
+    """The client has disconnected: nothing can be sent to it."""
 
 
 class Exchange:
     """One request and its answer, as a transport frames them; all is called on the thread of `Core.answer`."""
 
     def __init__(self, trace: Trace | None = None) -> None:
-        """Keep its trace, or start one: the framing marks it from the last received byte on."""
+        """Keep the trace, or start one: the framing marks it from the last received byte on."""
         self.trace = trace or Trace()
         self.ends_ns = 0
-        """When the answer has to be over, on CLOCK_MONOTONIC; known once the request has its place in the queue."""
+        """Deadline of the answer on CLOCK_MONOTONIC; set when the request joins the queue."""
         self.held = ExitStack()
-        """What the request holds, its bytes under way: given back before the answer's end, which may wait."""
+        """What the request holds, its bytes in flight; released before `end`, which may wait."""
 
     def sent_whole(self) -> None:
-        """Mark an answer that is sent as one: what its later pieces took is `inference` too."""
+        """Mark an answer that is sent as a whole: the time of its later pieces is `inference` too."""
         if len(self.trace.token_ns) > 1:
             self.trace.marks.append(("inference", self.trace.token_ns[-1]))
 
     def left_s(self) -> float:
-        """Return the time until then."""
+        """Return the time until the deadline."""
         return max(0.0, (self.ends_ns - now_ns()) / 1e9)
 
     def request(self) -> Request:
@@ -217,10 +213,10 @@ class Exchange:
         raise NotImplementedError
 
     def accept(self) -> None:
-        """Note that the request has its place in the queue."""
+        """Note that the request has joined the queue."""
 
     def begin(self, request: Request) -> Request | None:
-        """Note that its turn has come; return what the engine is asked, None where no answer is wanted any more."""
+        """Note that its turn has started; return the request for the engine, None if it was cancelled."""
         return request
 
     def send(self, piece: Piece) -> bool:
@@ -232,7 +228,7 @@ class Exchange:
         raise NotImplementedError
 
     def fail(self, error: S2AError) -> None:
-        """Send in one line why there is no answer, or no more of it. Raises Disconnected."""
+        """Send the error in one line. Raises Disconnected."""
         raise NotImplementedError
 
     def disconnected(self) -> bool:
@@ -240,26 +236,25 @@ class Exchange:
         return False
 
     def abandon(self) -> None:
-        """Note that it was `gone` when its turn came; where an end has to be sent all the same, this only returns."""
+        """Handle a client that was `disconnected` before its turn; return only if an end must be sent nevertheless."""
         raise Disconnected
 
 
 class InFlight:
-    """The bytes of all requests of a server that are not answered yet, headers included."""
+    """The bytes of all unanswered requests of a server, headers included."""
 
     def __init__(self, limits: Limits) -> None:
-        """Allow ``limits.body_bytes`` a request and ``limits.in_flight_bytes`` together."""
         self._limits, self._lock, self.bytes = limits, Lock(), 0
 
     @contextmanager
     def counted(self) -> Iterator[Callable[[int], None]]:
-        """Count one request while it lasts: what is given is called with the size of all that comes of it.
+        """Count one request for as long as the context lasts; yield the function that adds to its size.
 
-        That raises TooLarge for too many bytes of one request, Busy for too many together.
+        That function raises TooLarge for too many bytes of one request, Busy for too many together.
         """
         held = 0
 
-        def came(size: int) -> None:
+        def count(size: int) -> None:
             nonlocal held
             with self._lock:
                 held += size
@@ -271,7 +266,7 @@ class InFlight:
                 raise Busy(most, retry_after_s=RETRY_AFTER_S)
 
         try:
-            yield came
+            yield count
         finally:
             with self._lock:
                 self.bytes -= held
@@ -283,14 +278,13 @@ class Core:
     """Answers the exchanges of a server, in the order of their arrival, one at a time."""
 
     def __init__(self, handler: Handler, limits: Limits) -> None:
-        """Answer with ``handler``, within ``limits``."""
         self.queued = Queued.around(handler, limits)
         self.limits = limits
         self.in_flight = InFlight(limits)
         self._reading = Semaphore(READERS)
 
     def join(self, exchange: Exchange) -> Turn:
-        """Give a request its place in the queue; raises Busy."""
+        """Add a request to the queue; raises Busy."""
         turn = self.queued.turns.join()
         exchange.ends_ns = turn.deadline_ns
         try:
@@ -301,11 +295,10 @@ class Core:
         return turn
 
     def answer(self, exchange: Exchange, turn: Turn | None = None) -> bool:
-        """Read a request, wait for its turn and send the answer, or what failed in one line.
+        """Read a request, wait for its turn and send the answer, or an error in one line.
 
-        Return whether its end was sent; else the connection, if there is one, has to be closed.
-
-        ``turn`` is what `join` returned where that was called when it came; else it joins once it is read.
+        Return whether its end was sent; if not, the connection must be closed. ``turn`` comes from `join` if the
+        request joined the queue on arrival; otherwise it joins once it is read.
         """
         try:
             try:
@@ -320,7 +313,7 @@ class Core:
             exchange.end()
         except Disconnected:
             return False
-        except Exception as error:  # noqa: BLE001 - the client must hear of it, whatever broke
+        except Exception as error:  # noqa: BLE001 - every failure is reported to the client
             return _fail(exchange, client_error(error))
         finally:
             exchange.held.close()
@@ -345,33 +338,32 @@ class Core:
                     break
 
     def stuck(self) -> str:
-        """Return what is wrong with the answer under way, nothing where all is well."""
+        """Return the problem of a stuck answer, or nothing."""
         silent_s = self.queued.turns.silent_s()
         return f"the answer under way has shown no sign of life for {silent_s:.0f} s" if silent_s > STUCK_S else ""
 
 
 class SharedSourceWorkers:
-    """The threads of a source that many clients share: they take turns in waiting for a request.
+    """The threads of a source that many clients share: one at a time waits for a request.
 
-    The one that got a request answers it while another waits, so that no request changes threads. One is always left
-    to wait; those that were started while all others answered end when they are idle.
+    The thread that received a request answers it while another waits, so that no request changes threads. One thread
+    always waits; surplus threads end when they are idle.
     """
 
     def __init__(self, take: Callable[[], Callable[[], None] | None], stopped: Event) -> None:
-        """Have one thread at a time ``take``: wait a moment for a request, and return what answers it if one came."""
+        """Receive with ``take``, which waits a moment and returns the function that answers a request, or None."""
         self._take, self._stopped = take, stopped
         self._waits, self._count = Lock(), Lock()
         self._idle = 0
         self._threads: list[Thread] = []
 
     def start(self) -> None:
-        """Start the first threads."""
         with self._count:
             for _ in range(IDLE_WORKERS):
                 self._start_one()
 
     def join(self) -> None:
-        """Wait for all threads; none is started any more once the first has ended."""
+        """Wait for all threads; no thread is started after the first has ended."""
         while self._threads:
             self._threads.pop().join()
 
@@ -408,7 +400,7 @@ class SharedSourceWorkers:
                     _log.warning("no thread for the next request: %s", error)
 
     def _retired(self) -> bool:
-        """Return whether enough others are idle, so that this thread ends."""
+        """Return True if enough other threads are idle, so that this one ends."""
         with self._count:
             if self._idle <= IDLE_WORKERS or self._stopped.is_set():
                 return False
@@ -418,7 +410,7 @@ class SharedSourceWorkers:
 
 
 def client_error(error: Exception) -> S2AError:
-    """Return what a client is told of what a request raised; a bug is for the log."""
+    """Return the error that the client gets; an internal error goes to the log."""
     if isinstance(error, S2AError):
         return error
     _log.error("a request failed", exc_info=error)

@@ -171,7 +171,7 @@ def test_off_loopback_it_wants_a_key_or_to_be_told_that_there_is_none(start: Sta
     assert "--host: others reach 0.0.0.0" in error
     assert "--api-key-env, or let everybody in with --no-auth" in error
     _, line = start(*strangers, "--no-auth")
-    assert "for all who reach it" in line
+    assert "for every client" in line
 
 
 def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -> None:

@@ -147,7 +147,7 @@ def test_throughput_of_a_server_that_does_not_tell_says_only_that(tmp_path: Path
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--url", "http://x", "--dialect", "openvla", "--payload", "jpeg"], "a picture travels as raw, not jpeg"),
+        (["--url", "http://x", "--dialect", "openvla", "--payload", "jpeg"], "can send a picture as raw, not as jpeg"),
         (["--url", "http://x", "--api-key-env", KEY], "takes the name of an environment variable, not the key itself"),
         (["--url", "http://x", "--extra-body", "@/no/such"], "--extra-body: cannot read /no/such"),
     ],

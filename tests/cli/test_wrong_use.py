@@ -58,7 +58,7 @@ WRONG = {
         ("--transport http?conection=x", "; did you mean connection?"),
         ("--engine lama", "'lama' is none of llama, echo, replay; did you mean llama?"),
         ("--transport http/fast", "--transport: 'fast'"),
-        ("--url grpc+http://x", "--url: no transport here speaks grpc+http://, only http://"),
+        ("--url grpc+http://x", "--url: no installed transport speaks grpc+http://, only http://"),
         ("--transport http/llama-server --llama-server /no/such", "--llama-server: /no/such is no program that can"),
         ("--http binary", "--http has another name: write --transport http/binary"),
         ("--bogus", "No such option: --bogus"),

@@ -138,5 +138,5 @@ def test_a_server_that_counts_otherwise_is_not_cut() -> None:
 def test_counters_of_caches_are_not_waited_for(name: str) -> None:
     with serving(lambda _: CASES[name].pieces()) as url:
         started = time.monotonic()
-        assert detect.cache_hits(url) == {}
+        assert detect.cache_hits(wiring_of("http/as-deployed", url=url)) == {}
         assert time.monotonic() - started < detect.PATIENCE_S + 10

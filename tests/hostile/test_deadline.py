@@ -20,7 +20,7 @@ from s2a_bench.types import Request, Token
 from tests.hostile.test_queue import body, serving
 
 SOON = Limits(answer_s=1.0)
-REASON = "1 s after it came the request is still being answered"
+REASON = "1 s after its arrival the request is still being answered"
 
 
 class Endless:

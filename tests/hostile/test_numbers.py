@@ -70,7 +70,7 @@ def test_a_rate_that_can_be_none_fails_no_sample(value: str) -> None:
 def test_a_count_of_hits_that_can_be_none_is_absent(value: str) -> None:
     pieces = [head(kind="text/plain"), f"vllm:prefix_cache_hits_total {value}\n".encode()]
     with serving(lambda _: pieces) as url:
-        assert cache_hits(url) == {}
+        assert cache_hits(wiring_of("http/as-deployed", url=url)) == {}
 
 
 def test_more_cached_than_there_was_is_odd() -> None:

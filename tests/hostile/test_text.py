@@ -23,8 +23,7 @@ from s2a_bench.provenance import Origins
 from s2a_bench.secrets import is_secret, keep, struck, struck_pieces
 from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.text import one_line, visible
-from s2a_bench.transport.http.merge import read_patch
-from s2a_bench.transport.http.options import HttpOptions
+from s2a_bench.transport.http.options import HttpOptions, read_patch
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.latex import to_latex
 from s2a_bench.writers.tables import TextTable, lay_out, to_markdown

@@ -519,7 +519,7 @@ class TestWhatAServerHas:
         with serving(reply) as url:
             client = open_client(wiring_of("http/as-deployed", url=url, **options))
             client.close()
-            return {name: wiring.removeprefix(url) for name, wiring in client.describe().items()}
+            return {name: value.removeprefix(url) for name, value in client.describe().items()}
 
     @pytest.mark.parametrize("dialect", ["openai", "vllm", "ollama", ""])
     def test_the_first_model_of_the_list_is_asked(self, dialect: str) -> None:

@@ -155,7 +155,7 @@ def test_an_answer_ends_at_its_deadline_and_the_next_one_begins(name: str) -> No
     with serving(name, Queued.around(gate, Limits(answer_s=0.5)), answer_s=0.5) as connect:
         client = connect()
         for turn in (1, 2):
-            with pytest.raises(RequestFailed, match=r"0\.5 s after it came the request is still being answered"):
+            with pytest.raises(RequestFailed, match=r"0\.5 s after its arrival the request is still being answered"):
                 ask(client, Request("a", "for ever", max_tokens=60_000))
             until(lambda turn=turn: len(gate.ended) == turn)  # type: ignore[misc]  # bound at once
 

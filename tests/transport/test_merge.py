@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.transport.http.merge import merged, read_patch
+from s2a_bench.transport.http.options import merged, read_patch
 
 
 @pytest.mark.parametrize(

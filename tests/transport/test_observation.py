@@ -106,13 +106,13 @@ def deep() -> Any:
         ({"a": "{image:0|BGR}"}, "a wants picture 0 as BGR"),
         ({"a": "{image:99}"}, "a wants picture 99"),
         ({"a": "{state:7:7}"}, "a wants the numbers 7:7 of the state, which are none"),
-        ({"a": 1 << 70}, "which no policy can be told"),
-        ({"a": object()}, "which no policy can be told"),
+        ({"a": 1 << 70}, "which no observation can hold"),
+        ({"a": object()}, "which no observation can hold"),
         ({"a": 1, "a?": 2}, "a is twice there"),
         ({"?": 1}, "empty"),
         ({"a": "\ud800"}, "a is no Unicode text"),
-        ({"a": [0] * 2000}, "beyond what is read"),
-        (deep(), "beyond what is read"),
+        ({"a": [0] * 2000}, "exceeds the limits of a template"),
+        (deep(), "exceeds the limits of a template"),
     ],
 )
 def test_a_template_that_makes_no_sense_is_refused_with_the_key(content: Any, says: str) -> None:
@@ -161,7 +161,7 @@ def test_toml_and_json_say_the_same(tmp_path: Path) -> None:
         ("a.json", "[" * 100_000, "too deep|no JSON|longer than"),
         ("a.json", "[" * 50_000, "too deep"),
         ("a.toml", "a = ", "no TOML"),
-        ("a.toml", "a = 2020-01-01", "which no policy can be told"),
+        ("a.toml", "a = 2020-01-01", "which no observation can hold"),
         ("a.toml", "#" * 70_000, "longer than 65536 letters"),
     ],
 )

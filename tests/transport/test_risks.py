@@ -42,16 +42,16 @@ def found(url: str) -> dict[str, Finding]:
 
 def test_grpc_is_told_of_without_calling_a_method() -> None:
     with answering(SETTINGS) as (place, heard):
-        wiring = found(f"grpc://{place}")
-    assert wiring["pickle"].level == "warning"
-    assert "unpickles what anybody sends" in wiring["pickle"].message
+        findings = found(f"grpc://{place}")
+    assert findings["pickle"].level == "warning"
+    assert "unpickles what any client sends" in findings["pickle"].message
     assert heard == [PREFACE]
 
 
 @pytest.mark.parametrize("reply", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\0" * 9])
 def test_what_speaks_no_grpc_is_an_error(reply: bytes) -> None:
     with answering(reply) as (place, _):
-        assert found(f"grpc://{place}")["server"].message == "what answers does not speak gRPC"
+        assert found(f"grpc://{place}")["server"].message == "the server does not speak gRPC"
 
 
 def test_a_server_of_models_without_a_key_is_told_of() -> None:

@@ -216,10 +216,10 @@ def test_rosout_and_parameter_events_have_the_qos_that_was_recorded(server: RosS
     assert server.address == "/behaves"
     for end in wanted:
         ours, recorded = found[end].qos, ends[end]
-        wiring = {"reliability": Policy.Reliability, "durability": Policy.Durability, "history": Policy.History}
-        wiring |= {"userdata": Policy.Userdata, "repr": Policy.DataRepresentation}
-        assert {name: repr(ours[policy]) for name, policy in wiring.items()} == {
-            name: recorded[name] for name in wiring
+        policies = {"reliability": Policy.Reliability, "durability": Policy.Durability, "history": Policy.History}
+        policies |= {"userdata": Policy.Userdata, "repr": Policy.DataRepresentation}
+        assert {name: repr(ours[policy]) for name, policy in policies.items()} == {
+            name: recorded[name] for name in policies
         }
         assert found[end].type_name == recorded["type"]
     assert found["writer", "rt/rosout"].qos[Policy.Lifespan] == Policy.Lifespan(10_000_000_000)

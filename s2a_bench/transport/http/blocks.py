@@ -1,4 +1,4 @@
-"""How *binary* answers with actions: each as its bytes, and the end, or an error, as a block of JSON.
+"""Answers of *binary* with actions: each action as bytes, the end or an error as a block of JSON.
 
 A block is the length of what follows (uint32), then b"A", the tick (uint32) and the float32 of one action, or b"J" and
 JSON; all little endian.
@@ -24,18 +24,18 @@ ACTION, JSON = b"A", b"J"
 
 def of_action(action: Action) -> bytes:
     """Return the block of an action."""
-    said = ACTION + LENGTH.pack(action.index) + action.values.astype("<f4").tobytes()
-    return LENGTH.pack(len(said)) + said
+    block = ACTION + LENGTH.pack(action.index) + action.values.astype("<f4").tobytes()
+    return LENGTH.pack(len(block)) + block
 
 
-def of_json(message: Any) -> bytes:
-    """Return the block of anything else."""
-    said = JSON + orjson.dumps(message)
-    return LENGTH.pack(len(said)) + said
+def json_block(message: Any) -> bytes:
+    """Return the block of any other message."""
+    block = JSON + orjson.dumps(message)
+    return LENGTH.pack(len(block)) + block
 
 
 def read(block: bytes) -> Any:
-    """Return what a block says, as a message of our own dialect; raises ValueError or RequestFailed."""
+    """Return a block's content as a message of the native dialect; raises ValueError or RequestFailed."""
     if block[:1] == JSON:
         return orjson.loads(block[1:])
     if block[:1] != ACTION or len(block) <= 1 + LENGTH.size or (len(block) - 1 - LENGTH.size) % 4:
@@ -46,14 +46,12 @@ def read(block: bytes) -> Any:
 
 
 class Blocks:
-    """Cuts a body into blocks; a framing, see `dialects.framing`."""
+    """A framing that cuts a body into blocks, see `dialects.framing`."""
 
     def __init__(self) -> None:
-        """Start at the beginning of a body."""
         self._held = bytearray()
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """Yield the blocks that these bytes complete."""
         self._held += data
         while len(self._held) >= LENGTH.size:
             (size,) = LENGTH.unpack_from(self._held)
@@ -66,7 +64,7 @@ class Blocks:
             yield block
 
     def end(self) -> Iterator[bytes]:
-        """Yield nothing; raises ValueError where a block has begun."""
+        """Yield nothing; raises ValueError for a truncated block."""
         if self._held:
             raise ValueError("a block that is cut off")
         yield from ()

@@ -1,4 +1,4 @@
-"""One chat completion, as both of our HTTP servers have it: a body becomes a request, pieces become an answer."""
+"""A chat completion in both of our HTTP servers: from a body to a request, from pieces to an answer."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ Reads = Callable[[Headers, Buffer, Trace, Limits], tuple[Request, bool]]
 
 
 def of_json(_headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> tuple[Request, bool]:
-    """Read a JSON body that nobody has validated; return the request, and whether its answer is streamed."""
+    """Read an unvalidated JSON body; return the request, and whether its answer is streamed."""
     return of_fields(_parsed(bytes(body), "the body", trace), trace, limits, native.FAST)
 
 
 def of_picture(headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> tuple[Request, bool]:
-    """Read a body that is the picture itself."""
-    said = dict(headers)
-    fields = _parsed(said.get(native.PARAMETERS_HEADER, "").encode(), f"header {native.PARAMETERS_HEADER}", trace)
+    """Read a body that consists of the pictures."""
+    values = dict(headers)
+    fields = _parsed(values.get(native.PARAMETERS_HEADER, "").encode(), f"header {native.PARAMETERS_HEADER}", trace)
     if not (isinstance(fields, dict) and isinstance(prompt := fields.get("prompt", ""), str)):
         raise RequestFailed(f"header {native.PARAMETERS_HEADER} should be an object whose prompt is text")
-    pictures = _cut(fields.get("pictures"), said.get("content-type", ""), body)
+    pictures = _cut(fields.get("pictures"), values.get("content-type", ""), body)
     images = tuple(decoded(kind, data, trace, limits) for kind, data in pictures)
     return _request(fields, prompt, images, limits)
 
@@ -49,22 +49,22 @@ def _parsed(document: bytes, what: str, trace: Trace) -> Any:
 
 
 def _cut(pictures: Any, media_type: str, body: Buffer) -> list[tuple[str, Buffer]]:
-    """Return the pictures of a body with their media types; raises RequestFailed where they are not the whole."""
+    """Return the pictures of a body with their media types; raises RequestFailed unless they fill it."""
     if pictures is None:
         return [(media_type, body)] if body else []
     view, at = memoryview(body), 0
-    found: list[tuple[str, Buffer]] = []
+    blocks_of: list[tuple[str, Buffer]] = []
     try:
         for kind, size in pictures:
             if not (isinstance(kind, str) and type(size) is int and 0 < size <= len(view) - at):
                 raise ValueError(f"{size!r} bytes of {kind!r} where {len(view) - at} are left")
-            found.append((kind, view[at : at + size]))
+            blocks_of.append((kind, view[at : at + size]))
             at += size
         if at != len(view):
-            raise ValueError(f"{len(view) - at} bytes are nobody's")
+            raise ValueError(f"{len(view) - at} bytes belong to no picture")
     except (TypeError, ValueError) as error:
         raise RequestFailed(f"pictures should be pairs of media type and bytes: {error}") from error
-    return found
+    return blocks_of
 
 
 def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) -> tuple[Request, bool]:
@@ -74,8 +74,8 @@ def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) ->
     try:
         for message in fields["messages"]:
             content = message["content"]
-            parts: list[dict[str, Any]] = [{"type": "text", "text": content}] if isinstance(content, str) else content
-            for part in parts:
+            items: list[dict[str, Any]] = [{"type": "text", "text": content}] if isinstance(content, str) else content
+            for part in items:
                 if part["type"] != "image_url":
                     texts.append(part["text"])
                     continue
@@ -90,7 +90,6 @@ def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) ->
 
 
 def _request(fields: dict[str, Any], prompt: str, images: tuple[Frame, ...], limits: Limits) -> tuple[Request, bool]:
-    """Read the parameters."""
     request = Request(
         id=text("request_id", fields.get("request_id")) or "chatcmpl-0",
         prompt=text("the prompt", prompt),
@@ -107,24 +106,23 @@ class ChatExchange(Exchange):
     """One chat completion; a server's framing adds `read`, `write` and `whole`."""
 
     takes_blocks = False
-    """Whether the client reads `blocks` where the answer is one of actions."""
+    """Whether the client reads actions as `blocks`."""
 
     def __init__(self, codec: native.Codec, trace: Trace | None = None) -> None:
-        """Write JSON with ``codec``."""
         super().__init__(trace)
         self._codec = codec
-        self._asked = Request("", "")
+        self._request = Request("", "")
         self._streamed = False
         self._pieces: list[Piece] = []  # of an answer that is not streamed
         self._count = 0
-        self._kind = ""  # of the answer that has begun
+        self._kind = ""  # media type of the answer that has begun
 
     def read(self) -> tuple[Request, bool]:
         """Parse and decode the request; return it, and whether its answer is streamed."""
         raise NotImplementedError
 
     def write(self, data: bytes, kind: str, *, last: bool) -> None:
-        """Send a part of a streamed answer; the first one names the media type, which is ``kind``."""
+        """Send a block of a streamed answer; ``kind`` is the media type with the first block, else empty."""
         raise NotImplementedError
 
     def whole(self, status: int, value: Any, headers: dict[str, str]) -> None:
@@ -132,21 +130,21 @@ class ChatExchange(Exchange):
         raise NotImplementedError
 
     def request(self) -> Request:
-        self._asked, self._streamed = self.read()
-        return self._asked
+        self._request, self._streamed = self.read()
+        return self._request
 
     def send(self, piece: Piece) -> bool:
         self._count += 1
         if not self._streamed:
             self._pieces.append(piece)
         elif not isinstance(piece, Action):
-            event = native.stream_event(self._asked.id, {"content": piece.text})
+            event = native.stream_event(self._request.id, {"content": piece.text})
             event["choices"][0]["token"] = piece.id
             self._write(self._framed(event))
         elif self.takes_blocks:
             self._write(blocks.of_action(piece), blocks.MEDIA_TYPE)
         else:
-            event = native.stream_event(self._asked.id, {})
+            event = native.stream_event(self._request.id, {})
             event["choices"][0] |= {"tick": piece.index, "action": piece.values.tolist()}
             self._write(self._framed(event))
         if self.disconnected():
@@ -156,8 +154,8 @@ class ChatExchange(Exchange):
     def end(self) -> None:
         if not self._streamed:
             self.sent_whole()
-        request_id, marks = self._asked.id, self.trace.to_remote().to_json()
-        finish = "length" if self._count >= self._asked.max_tokens else "stop"
+        request_id, marks = self._request.id, self.trace.to_remote().to_json()
+        finish = "length" if self._count >= self._request.max_tokens else "stop"
         prompt = int(self.trace.facts.get(PROMPT_N, 0))
         usage = {"prompt_tokens": prompt, "completion_tokens": self._count, "total_tokens": prompt + self._count}
         if not self._streamed:
@@ -176,8 +174,8 @@ class ChatExchange(Exchange):
 
     def fail(self, error: S2AError) -> None:
         if self._kind:
-            said = {"error": {"message": str(error), "type": type(error).__name__}}
-            self._write(self._framed(said), last=True)
+            message = {"error": {"message": str(error), "type": type(error).__name__}}
+            self._write(self._framed(message), last=True)
         else:
             status = native.status_of(error)
             self.whole(status, native.error_json(status, str(error)), native.headers_of(error))
@@ -187,13 +185,13 @@ class ChatExchange(Exchange):
         self.write(data, self._kind if first else "", last=last)
 
     def _framed(self, value: Any) -> bytes:
-        """Return a message as the answer under way has them."""
-        return (
-            blocks.of_json(value) if self._kind == blocks.MEDIA_TYPE else b"data: " + self._codec.dumps(value) + b"\n\n"
-        )
+        """Return a message in the framing of the running answer."""
+        if self._kind == blocks.MEDIA_TYPE:
+            return blocks.json_block(value)
+        return b"data: " + self._codec.dumps(value) + b"\n\n"
 
 
 def content(pieces: Sequence[Piece]) -> str:
-    """Return an answer as one text; actions as a JSON list of theirs."""
+    """Return an answer as one text, actions as a JSON list."""
     acts = any(isinstance(piece, Action) for piece in pieces)
     return f"[{', '.join(piece.text for piece in pieces)}]" if acts else "".join(piece.text for piece in pieces)

@@ -1,9 +1,9 @@
 """The HTTP client: encode, pack, send, read the answer, and mark each step, in every dialect.
 
-Our own server sends its marks with the last event. A black box sends none: where its response headers are known to
-leave when inference starts (llama-server), they end the stage `ingest` and the first token ends `inference`; anywhere
-else all from the last byte packed to the first token is the stage `server`. The first token is the first text of the
-answer: empty pieces and what a model thinks before are none. What a server tells of its own times becomes facts.
+Our server sends its marks with the last event. A black box sends none. If it is known to send its response headers when
+inference starts (llama-server), they end the stage `ingest` and the first token ends `inference`; otherwise the time
+from the last byte packed to the first token is the stage `server`. The first token is the first text of the answer:
+empty pieces and thinking do not count. Times that a server reports become facts.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from s2a_bench.transport.http.detect import body_of, met
 from s2a_bench.transport.http.dialects import NATIVE, EncodedPicture, Event, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_MODEL
 from s2a_bench.transport.http.dialects.decoder import Decoder
-from s2a_bench.transport.http.merge import merged, read_patch
-from s2a_bench.transport.http.options import HttpOptions
+from s2a_bench.transport.http.options import HttpOptions, merged, read_patch
 from s2a_bench.transport.http.refusals import advice_for, refusal
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
@@ -35,14 +34,14 @@ from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Piece, Request, Token
 
 ERROR_LIMIT = 1 << 16
-"""Bytes that are read of a refusal."""
+"""The most bytes of a refusal that are read."""
 
 
 class HttpClient:
     """One variant of the HTTP pipeline."""
 
     def __init__(self, wiring: Wiring[HttpOptions], alive: Callable[[], bool]) -> None:
-        """Prepare to ask the server at ``wiring.address``; a black box of no known dialect is asked what it is."""
+        """Prepare requests to ``wiring.address``; a black box of unknown dialect is asked for its list of models."""
         self.camera = None
         self._wiring, self._alive = wiring, alive
         options, key = wiring.options, read_key(wiring.options.api_key_env)
@@ -60,30 +59,26 @@ class HttpClient:
         self._client = self._new_client() if options.connection != "client-per-request" else None
 
     def describe(self) -> dict[str, str]:
-        """Return who is asked, and how, for the manifest; the model where the server named it."""
-        found = {"model": self._model} if self._model not in {self._wiring.options.served_model, NO_MODEL} else {}
-        return {"url": self._url, "dialect": self._dialect.name, **found}
+        """Return the URL, the dialect and, if the server named it, the model."""
+        named = {"model": self._model} if self._model not in {self._wiring.options.served_model, NO_MODEL} else {}
+        return {"url": self._url, "dialect": self._dialect.name, **named}
 
     def _new_client(self) -> BoundedClient | LeanClient:
-        """Build the client of the variant; over TLS, and maybe a proxy, httpx is that of all.
-
-        The TLS context of httpx's alone takes about 20 ms, which is why it is normally built once.
-        """
+        """Build the client of the variant; over TLS every variant has httpx, whose TLS context alone takes 20 ms."""
         bounds, timeout_s, tls = self._bounds(0), self._wiring.timeout_s, self._wiring.address.startswith("https:")
         if self._wiring.variant in {native.BEST_EFFORT, native.BINARY} and not tls:
             return LeanClient(bounds, timeout_s)
-        # a kept connection stays kept, however long a turn of the other cells takes; a cloud may be behind a proxy and
-        # with certificates that the environment names, what is measured here is not
+        # a connection is kept, however long a turn of the other cells takes; only a cloud's server may need the proxy
+        # and the certificates of the environment
         return BoundedClient(bounds, timeout=timeout_s, trust_env=tls, limits=httpx.Limits(keepalive_expiry=None))
 
     def _bounds(self, max_tokens: int) -> Bounds:
-        """Start the bounds of an answer."""
         return Bounds(self._wiring.address, self._wiring.deadline_of(max_tokens), max_tokens)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        """Encode and send the request and yield the streamed tokens.
+        """Encode and send the request and yield the streamed pieces.
 
-        It is sent once more if the server had just closed the kept connection, as HTTP clients do: llama-server
+        Like other HTTP clients it repeats a request if the server has just closed the kept connection: llama-server
         announces keep-alive and yet closes after every streamed answer.
         """
         body, headers = self._pack(request, trace)
@@ -96,19 +91,19 @@ class HttpClient:
         try:
             with self._translated(), ExitStack() as stack:
 
-                def asked() -> HttpResponse:
+                def post() -> HttpResponse:
                     answer: AbstractContextManager[HttpResponse] = client.stream(
                         "POST", self._url, content=body, headers=headers
                     )
                     return stack.enter_context(answer)
 
                 try:
-                    response = asked()
+                    response = post()
                 except (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
                     if self._options.connection != "keep-alive":
                         raise
                     trace.facts[RECONNECTS] = 1.0
-                    response = asked()
+                    response = post()
                 headers_ns = now_ns()
                 self._check(response)
                 for token in self._tokens(response, trace, headers_ns, packed_ns):
@@ -119,17 +114,16 @@ class HttpClient:
                 client.close()
 
     def _check(self, response: HttpResponse) -> None:
-        """Raise RequestFailed for an answer whose headers say that there is none, or not as it was asked for."""
+        """Raise RequestFailed unless the headers announce a good answer."""
         kind = response.headers.get("content-type", "")
         expected = self._dialect.media_type, *((blocks.MEDIA_TYPE,) if self._dialect.name == NATIVE else ())
         if response.status_code != httpx.codes.OK or not kind.startswith(expected):
             text = body_of(response, ERROR_LIMIT, self._wiring.timeout_s)
             raise refusal(self._url, response, text, self._options, self._dialect.media_type)
         if (coding := response.headers.get("content-encoding", "identity")) != "identity":
-            raise RequestFailed(f"{self._url} compressed its answer ({coding}), which nobody asked for")
+            raise RequestFailed(f"{self._url} compressed its answer ({coding}) without being asked to")
 
     def _pack(self, request: Request, trace: Trace) -> tuple[Any, dict[str, str]]:
-        """Build the body, marking each stage."""
         if request.grammar and not self._dialect.takes_grammar:
             raise UsageError(
                 f"`grammar`: the dialect '{self._dialect.name}' has no field for a GBNF grammar; leave it out, or ask "
@@ -151,7 +145,7 @@ class HttpClient:
         return body, headers
 
     def _pack_binary(self, request: Request, trace: Trace) -> tuple[Any, dict[str, str]]:
-        """Build our own binary variant: the pictures are the body, one after the other, all else a header."""
+        """Build the native binary form: the pictures are the body, one after the other, the rest is a header."""
         types, bodies = [], []
         for frame in request.images:
             media_type, data = encoded(frame, self._options.payload, trace)
@@ -169,7 +163,7 @@ class HttpClient:
         return (bodies[0] if bodies else b""), headers
 
     def _tokens(self, response: HttpResponse, trace: Trace, headers_ns: int, packed_ns: int) -> Iterator[Piece]:
-        """Yield the tokens of an answer; after the last, complete the trace."""
+        """Yield the pieces of an answer; after the last, complete the trace."""
         first_ns, thinking_ns, thoughts, index, finished = 0, 0, 0, 0, False
         for event in self._events(response):
             if event.error:
@@ -199,7 +193,7 @@ class HttpClient:
             self._mark(trace, headers_ns, packed_ns, first_ns)
 
     def _mark(self, trace: Trace, headers_ns: int, packed_ns: int, first_ns: int) -> None:
-        """Name the stretch from the last byte packed to the first token, as far as it is known what it was."""
+        """Mark the stages from the last byte packed to the first token, as far as they are known."""
         if trace.remote is not None and trace.remote.clock == clock_id():
             trace.marks.append(("return", first_ns))
             return
@@ -211,23 +205,23 @@ class HttpClient:
             trace.marks.append(("server", first_ns))
 
     def _events(self, response: HttpResponse) -> Iterator[Event]:
-        """Yield the events of an answer; comments and drops of an event do not count as a sign of life for ever."""
+        """Yield the events of an answer; comments and incomplete events count as silence."""
         if response.headers.get("content-type") == blocks.MEDIA_TYPE:
             decoder = Decoder(self._dialect, blocks.read, blocks.Blocks)
         else:
             decoder = Decoder(self._dialect, self._codec.loads)
-        heard_ns, patience_ns = now_ns(), int(self._wiring.timeout_s * 1e9)
+        event_ns, patience_ns = now_ns(), int(self._wiring.timeout_s * 1e9)
         for data in response.iter_raw():
             for event in decoder.feed(data):
                 yield event
-                heard_ns = now_ns()
-            if now_ns() - heard_ns > patience_ns:
+                event_ns = now_ns()
+            if now_ns() - event_ns > patience_ns:
                 raise RequestFailed(f"{self._url} sent nothing that means anything for {self._wiring.timeout_s:g} s")
         yield from decoder.end()
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Turn what httpx raises into this project's errors."""
+        """Translate httpx's exceptions into this project's."""
         url = self._url
         try:
             yield
@@ -237,7 +231,7 @@ class HttpClient:
             raise RequestFailed(f"{url} was silent for too long: {type(error).__name__}") from error
         except httpx.RequestError as error:
             if not self._alive():
-                raise ServerDied(f"the server at {url} is gone: {error}") from error
+                raise ServerDied(f"the server at {url} has ended: {error}") from error
             raise RequestFailed(f"{url} broke the connection: {error}") from error
         except httpx.InvalidURL as error:
             raise TransportError(f"`url`: '{url}' is no URL: {error}") from error

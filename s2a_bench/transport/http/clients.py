@@ -1,9 +1,9 @@
-"""The two HTTP clients, bounded: whatever a server sends, headers and interim answers too, counts and takes time.
+"""The two HTTP clients, with bounds on everything that a server sends, headers and interim answers included.
 
-httpx is how servers are usually asked; its own time-outs are for one read each, so that a byte a second, or ``103``
-after ``103``, never ends. *Best effort* and *binary* have the standard library's client, by measurement the fastest
-there is (docs/measuring.md): a picture goes out of the array that holds it, nothing is parsed that nobody needs, and no
-TLS context is built. It stands in for the part of an httpx client that is used here, exceptions included.
+httpx is the usual client; its time-outs hold for one read each, so that a byte a second, or ``103`` after ``103``,
+never ends. *Best effort* and *binary* have the standard library's client, the fastest in our measurements
+(docs/measuring.md): it sends a picture without a copy, parses only what is needed, and builds no TLS context. It has
+the interface of httpx as far as `client` uses it, exceptions included.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ import httpx
 from s2a_bench.transport.limits import Bounds
 
 PIECE = 1 << 16
-"""Bytes of an answer that are read at once; a chunk may say that it is larger than any memory."""
+"""Bytes of an answer that are read at once; HTTP's announced lengths may exceed any memory."""
 
 
 @contextmanager
 def _in_time(bounds: Bounds, timeout_s: float | None) -> Iterator[float]:
-    """Yield how long a read or write may take; raises RequestFailed where it was the deadline that ended it."""
+    """Yield how long a read or write may take; raises RequestFailed if the deadline ended it."""
     try:
         yield min(inf if timeout_s is None else timeout_s, bounds.left_s())
     except (TimeoutError, httpcore.TimeoutException):
@@ -36,14 +36,13 @@ def _in_time(bounds: Bounds, timeout_s: float | None) -> Iterator[float]:
 
 
 class BoundedClient(httpx.Client):
-    """An httpx client that reads no more, and waits no longer, than the bounds of the request under way allow."""
+    """An httpx client within the bounds of the running request."""
 
     def __init__(self, bounds: Bounds, **options: Any) -> None:
-        """Build the client; the options are httpx's."""
         # compression would delay tokens, and a few bytes could become gigabytes
         super().__init__(headers={"accept-encoding": "identity"}, **options)
         self.bounds = bounds
-        # httpx has no option for httpcore's network backend, and a transport of our own would know no proxies
+        # httpx has no option for httpcore's network backend, and a custom transport would not support proxies
         for transport in (self._transport, *self._mounts.values()):
             if isinstance(transport, httpx.HTTPTransport):
                 pool = transport._pool  # noqa: SLF001
@@ -99,31 +98,28 @@ class _BoundedStream(httpcore.NetworkStream):
 
 
 class LeanResponse:
-    """An answer whose headers are there."""
+    """An answer whose headers have arrived."""
 
     def __init__(self, response: HTTPResponse) -> None:
-        """Wrap what the standard library read."""
         self._response = response
         self.status_code, self.headers = response.status, response.headers
 
     def iter_raw(self) -> Iterator[bytes]:
-        """Yield the body as it comes."""
         with _as_httpx():
             while piece := self._response.read1(PIECE):
                 yield piece
 
 
 class LeanClient:
-    """One kept connection to one server, without TLS."""
+    """One kept connection to one server, without TLS, opened by the first request."""
 
     def __init__(self, bounds: Bounds, timeout_s: float) -> None:
-        """Connect with the first request."""
         self.bounds, self.timeout_s = bounds, timeout_s
         self._connection: HTTPConnection | None = None
 
     @contextmanager
     def stream(self, method: str, url: str, *, content: Any, headers: Mapping[str, str]) -> Iterator[LeanResponse]:
-        """Send a request; yield its answer, whose rest is thrown away, and the connection with it."""
+        """Send a request and yield its answer; the connection of an unfinished answer is closed."""
         parts = urlsplit(url)
         response = None
         try:
@@ -132,7 +128,7 @@ class LeanClient:
                 if connection.sock is None:
                     connection.sock = self._connected(connection.host, connection.port)
                 path = urlunsplit(("", "", parts.path or "/", parts.query, ""))
-                with suppress(BrokenPipeError, ConnectionResetError):  # a refusal may be there already
+                with suppress(BrokenPipeError, ConnectionResetError):  # a refusal may have arrived already
                     connection.request(method, path, content, headers)
                 response = connection.getresponse()
             yield LeanResponse(response)
@@ -165,7 +161,6 @@ class _Socket(socket.socket):
         self._client = client
 
     def recv_into(self, *to: Any) -> int:
-        """Read what is there, as `socket.makefile` does."""
         with _in_time(self._client.bounds, self._client.timeout_s) as left_s:
             self.settimeout(left_s)
             size = super().recv_into(*to)
@@ -173,7 +168,6 @@ class _Socket(socket.socket):
         return size
 
     def sendall(self, *data: Any) -> None:
-        """Send the whole."""
         with _in_time(self._client.bounds, self._client.timeout_s) as left_s:
             self.settimeout(left_s)
             super().sendall(*data)
@@ -181,7 +175,7 @@ class _Socket(socket.socket):
 
 @contextmanager
 def _as_httpx() -> Iterator[None]:
-    """Raise what httpx would raise."""
+    """Translate exceptions into httpx's."""
     try:
         yield
     except InvalidURL as error:

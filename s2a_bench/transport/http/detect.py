@@ -1,4 +1,4 @@
-"""What a server says of itself when nothing is measured: its dialect, its models, the hits of its caches."""
+"""Questions to a server outside the measurement: its dialect, its models, the hits of its caches."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
 
 OWNERS = {"llamacpp": "llama-server", "vllm": "vllm", "s2a-bench": NATIVE}
-"""``owned_by`` of the first model -> dialect. Ollama says ``library``, clouds their names: plain OpenAI."""
+"""``owned_by`` of the first model -> dialect. Ollama gives ``library``, clouds their names: plain OpenAI."""
 
 HITS = re.compile(r"^(\w+:\w*(?:hits|cached_tokens|tokens_cached)(?:_total)?)(?:\{.*\})? (\S+)", re.MULTILINE)
 """A counter of cache hits: vLLM's of prefixes and pictures, SGLang's of prompt tokens."""
@@ -32,9 +32,9 @@ LIMIT = 1 << 20
 
 
 def met(base: str, key: str, spoken: str, model: str) -> tuple[Dialect, str, str]:
-    """Return the dialect, where to post, and the model of a black box: as told, else as the server says.
+    """Return the dialect, the URL to post to and the model of a black box: as given, else as its list of models says.
 
-    What makes no sense as a list of models means a plain server. Raises ServerDied where nothing answers.
+    A server with an invalid list counts as plain OpenAI. Raises ServerDied if nothing answers.
     """
     with probe(base) as client:
         if not spoken:
@@ -46,34 +46,30 @@ def met(base: str, key: str, spoken: str, model: str) -> tuple[Dialect, str, str
 
 
 def probe(url: str) -> BoundedClient:
-    """Return a client for questions that are not measured."""
+    """Return a client for requests that are not measured."""
     return BoundedClient(Bounds(url, PATIENCE_S, 0), timeout=PATIENCE_S, trust_env=url.startswith("https:"))
 
 
-def cache_hits(base: str, key: str = "") -> Mapping[str, float]:
-    """Return the counters of cache hits among a server's Prometheus metrics; nothing where it tells none."""
-    found: dict[str, float] = {}
+def cache_hits(wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
+    """Return the counters of cache hits among a server's Prometheus metrics, empty without such metrics."""
+    hits: dict[str, float] = {}
     try:
-        parts = urlsplit(base)
-        path = re.sub(r"/(v1|v1beta|api)(/.*)?$", "", parts.path.rstrip("/")) + "/metrics"
-        with probe(base) as client:
+        url = urlsplit(wiring.address)
+        path = re.sub(r"/(v1|v1beta|api)(/.*)?$", "", url.path.rstrip("/")) + "/metrics"
+        with probe(wiring.address) as client:
+            key = read_key(wiring.options.api_key_env)
             headers = {"authorization": f"Bearer {key}"} if key else {}
-            text = _text(urlunsplit((parts.scheme, parts.netloc, path, "", "")), client, headers)
+            text = _text(urlunsplit((url.scheme, url.netloc, path, "", "")), client, headers)
         for name, value in HITS.findall(text):
             if 0 <= float(value) <= FACT_LIMIT:
-                found[name] = found.get(name, 0.0) + float(value)
+                hits[name] = hits.get(name, 0.0) + float(value)
     except (*NO_LIST, ServerDied, RequestFailed, httpx.HTTPError, httpx.InvalidURL):
         return {}
-    return found
-
-
-def counted_hits(wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
-    """Return the counters of cache hits that the server of a wiring tells by its metrics."""
-    return cache_hits(wiring.address, read_key(wiring.options.api_key_env))
+    return hits
 
 
 def getter(client: BoundedClient, headers: dict[str, str]) -> Get:
-    """Return what asks for JSON at a URL, bounded in size and time."""
+    """Return a function that gets JSON from a URL, bounded in size and time."""
 
     def get(url: str) -> Any:
         try:
@@ -85,7 +81,7 @@ def getter(client: BoundedClient, headers: dict[str, str]) -> Get:
 
 
 def _text(url: str, client: BoundedClient, headers: dict[str, str]) -> str:
-    """Return what a GET answers; raises ServerDied where nothing does, RequestFailed where it does not end."""
+    """Return the body of a GET; raises ServerDied if nothing answers, RequestFailed if the answer does not end."""
     client.bounds = Bounds(url, PATIENCE_S, 0)
     try:
         with client.stream("GET", url, headers=headers) as response:
@@ -96,11 +92,10 @@ def _text(url: str, client: BoundedClient, headers: dict[str, str]) -> str:
 
 
 def body_of(response: HttpResponse, limit: int, patience_s: float) -> str:
-    """Return a body's first ``limit`` bytes, or what came of it in time, as text."""
-    pieces, size, deadline = [], 0, now_ns() + int(patience_s * 1e9)
-    for piece in response.iter_raw():
-        pieces.append(piece)
-        size += len(piece)
-        if size >= limit or now_ns() > deadline:
+    """Return a body's first ``limit`` bytes, as far as they arrive in time, as text."""
+    body, deadline = bytearray(), now_ns() + int(patience_s * 1e9)
+    for data in response.iter_raw():
+        body += data
+        if len(body) >= limit or now_ns() > deadline:
             break
-    return b"".join(pieces)[:limit].decode("utf-8", "replace")
+    return body[:limit].decode("utf-8", "replace")

@@ -1,6 +1,6 @@
-"""The server of *best effort* and *binary*: a thread a connection on blocking sockets, and no framework.
+"""The server of *best effort* and *binary*: one thread for each connection, blocking sockets, no framework.
 
-httptools reads the head of a request; its body, whose length the head has to say, is read straight into its place.
+httptools parses the head of a request, which must give the body's length; the body is read straight into its array.
 """
 
 from __future__ import annotations
@@ -30,21 +30,20 @@ from s2a_bench.types import Request
 
 PIECE: Final = 1 << 16
 EARLY: Final = 1 << 20
-"""The most that may come behind a request before its answer."""
+"""The most bytes that may follow a request before its answer."""
 END: Final = b"\r\n\r\n"
 CONTINUE: Final = b"HTTP/1.1 100 Continue\r\n\r\n"
 READS: Final[Mapping[str, Reads]] = {
-    native.PATHS[native.AS_DEPLOYED]: of_json,  # where clients of OpenAI's dialect look
+    native.PATHS[native.AS_DEPLOYED]: of_json,  # the usual path of OpenAI's clients
     native.PATHS[native.BEST_EFFORT]: of_json,
     native.PATHS[native.BINARY]: of_picture,
 }
 
 
 class Head:
-    """The head of a request, parsed."""
+    """A request's head, parsed from its bytes with the empty line; raises Refused."""
 
     def __init__(self, data: bytes) -> None:
-        """Parse what comes before a body, the empty line included; raises Refused."""
         if data.count(b"\n") > native.LINES:
             raise Refused(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, f"more than {native.LINES} lines of headers")
         self.headers: list[tuple[str, str]] = []
@@ -53,14 +52,14 @@ class Head:
         try:
             parser.feed_data(data)
         except httptools.HttpParserUpgrade:
-            pass  # which a server may ignore (RFC 9110, 7.8)
+            pass  # a server may ignore it (RFC 9110, 7.8)
         except httptools.HttpParserError as error:
             raise Refused(HTTPStatus.BAD_REQUEST, f"no HTTP request: {error}") from error
         if not self._complete:
             raise Refused(HTTPStatus.BAD_REQUEST, "no HTTP request")
         self.method, self.path = parser.get_method(), self._url.partition(b"?")[0].decode("latin-1")
-        self.chunks = parser.get_http_version() == "1.1"
-        self.keep = self.chunks and "close" not in self.said("connection").lower()
+        self.chunked = parser.get_http_version() == "1.1"
+        self.keep = self.chunked and "close" not in self.value("connection").lower()
 
     def on_url(self, url: bytes) -> None:
         self._url += url
@@ -71,28 +70,24 @@ class Head:
     def on_headers_complete(self) -> None:
         self._complete = True
 
-    def said(self, name: str) -> str:
-        """Return the value of a header; of several they are a list (RFC 9110, 5.3)."""
+    def value(self, name: str) -> str:
+        """Return the value of a header; several are joined to a list (RFC 9110, 5.3)."""
         return ", ".join(value for known, value in self.headers if known == name)
 
     def body_bytes(self, most: int) -> int:
-        """Return how long the body is; raises Refused where that is not said, or more than is taken."""
-        if self.said("transfer-encoding"):
-            raise Refused(HTTPStatus.LENGTH_REQUIRED, "a body has to say how long it is: Content-Length")
-        length = int(self.said("content-length") or 0)  # one number below 2^64, or the parser would have refused it
+        """Return the length of the body; raises Refused if it is not given, or too large."""
+        if self.value("transfer-encoding"):
+            raise Refused(HTTPStatus.LENGTH_REQUIRED, "the length of a body is needed: Content-Length")
+        length = int(self.value("content-length") or 0)  # one number below 2^64, as the parser has checked
         if length > most:
             raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"the body is larger than {most} bytes")
         return length
 
 
 class FastServer:
-    """Answers one request of a connection after the other."""
+    """Answers the requests of each connection in turn; `bound_socket` says what it raises."""
 
     def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
-        """Bind ``host:port`` of ``wiring.address`` or what `address` was, without it 127.0.0.1 and any port.
-
-        Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
-        """
         listener, key = bound_socket(wiring.address, "http", wiring.options)
         host, port = listener.getsockname()
         self.address = f"http://{host}:{port}"
@@ -109,11 +104,10 @@ class FastServer:
         self._connections.serve()
 
     def stop(self) -> None:
-        """Finish the requests under way, for a second at most."""
         self._connections.stop()
 
     def _answer_all(self, wire: Wire) -> None:
-        """Answer the requests of a connection until one is refused, or the client wants no more."""
+        """Answer the requests of a connection until one is refused, or the client closes it."""
         wire.socket.setsockopt(IPPROTO_TCP, TCP_NODELAY, 1)
         early: bytes | None = b""
         try:
@@ -130,8 +124,8 @@ class FastServer:
         wire.linger()
 
     def _answer(self, wire: Wire, early: bytes, held: ExitStack) -> bytes | None:
-        """Answer one request, of which ``early`` came already; return what came of the next, None for no more."""
-        came = held.enter_context(self._core.in_flight.counted())
+        """Answer one request that begins with ``early``; return the first bytes of the next, None to close."""
+        count = held.enter_context(self._core.in_flight.counted())
         data, rest = self._head(wire, early)
         if not data:
             return None
@@ -145,43 +139,43 @@ class FastServer:
         reads = READS.get(head.path) if head.method == b"POST" else None
         if reads is None:
             raise Refused(HTTPStatus.NOT_FOUND, f"POST to one of {', '.join(READS)}")
-        came(len(data))
+        count(len(data))
         wire.read_until(now_ns() + round(limits.body_s * 1e9))
-        if len(rest) < size and head.said("expect").lower() == "100-continue":
+        if len(rest) < size and head.value("expect").lower() == "100-continue":
             wire.sendall(CONTINUE)
         try:
-            body = _body(wire, rest, size, came)
+            body = _body(wire, rest, size, count)
         except TimeoutError:
             message = f"the body took more than {limits.body_s:g} s"
             raise Refused(HTTPStatus.REQUEST_TIMEOUT, message) from None
         exchange = FastExchange(wire, head, reads, body, rest[size:], limits)
         exchange.trace.mark("network")
-        del body  # which the exchange gives back once it is read
+        del body  # the exchange frees it once it is read
         exchange.held = held
         wire.read_until(0)
         self._core.answer(exchange)
         return bytes(exchange.early) if exchange.keep else None
 
     def _head(self, wire: Wire, early: bytes) -> tuple[bytes, bytes]:
-        """Return a head and what came behind it; nothing where the client has closed, or sends none for an hour."""
-        data, limits, seen, ends_ns = bytearray(early), self._core.limits, 0, 0
-        while (end := data.find(END, seen)) < 0:
-            seen = max(0, len(data) - len(END))
+        """Return a head and the bytes after it; nothing if the client has closed, or sends none for an hour."""
+        data, limits, searched, ends_ns = bytearray(early), self._core.limits, 0, 0
+        while (end := data.find(END, searched)) < 0:
+            searched = max(0, len(data) - len(END))
             if len(data) > limits.header_bytes:
                 break
             if data and not ends_ns:
                 ends_ns = now_ns() + round(limits.head_s * 1e9)
             wire.read_until(ends_ns or now_ns() + native.KEEP_ALIVE_S * 10**9)
             try:
-                piece = wire.recv(PIECE)
+                block = wire.recv(PIECE)
             except TimeoutError:
                 if not data:
                     return b"", b""
                 message = f"the headers took more than {limits.head_s:g} s"
                 raise Refused(HTTPStatus.REQUEST_TIMEOUT, message) from None
-            if not piece:
+            if not block:
                 return b"", b""
-            data += piece
+            data += block
         size = end + len(END)
         if end < 0 or size > limits.header_bytes:
             message = f"more than {limits.header_bytes} bytes of headers"
@@ -189,7 +183,7 @@ class FastServer:
         return bytes(data[:size]), bytes(data[size:])
 
     def _page(self, head: Head) -> bytes | None:
-        """Return what is answered without a request, None for another path."""
+        """Return the answer of a page beside the chat, None for any other path."""
         if head.method != b"GET":
             return None
         if head.path == native.HEALTH:
@@ -199,35 +193,33 @@ class FastServer:
         )
 
 
-def _body(wire: Wire, begun: bytes, size: int, came: Callable[[int], None]) -> memoryview:
-    """Read a body into its place: no more of its memory is touched than has come. Raises EOFError, TimeoutError."""
+def _body(wire: Wire, begun: bytes, size: int, count: Callable[[int], None]) -> memoryview:
+    """Read a body into an array whose memory is touched only as bytes arrive. Raises EOFError, TimeoutError."""
     body, have = np.empty(size, np.uint8).data, min(len(begun), size)
     body[:have] = begun[:have]
-    came(have)
+    count(have)
     while have < size:
         more = wire.recv_into(body[have:])
         if not more:
             raise EOFError
-        came(more)
+        count(more)
         have += more
     return body
 
 
 class FastExchange(ChatExchange):
-    """One request whose body is there."""
+    """A request with its body; a stream has chunked encoding, or for HTTP/1.0 ends with the connection."""
 
     def __init__(self, wire: Wire, head: Head, reads: Reads, body: memoryview, early: bytes, limits: Limits) -> None:
-        """Answer on ``wire``; a stream is chunked, or ends with the connection where that is too old for it."""
         super().__init__(native.FAST)
         self.takes_blocks = reads is of_picture
         self.keep = False
-        """Whether the connection may be kept: once the answer is on its way."""
+        """Whether the connection may be kept: set once the answer is sent."""
         self.early = bytearray(early)
-        """What came of the next request."""
+        """The first bytes of the next request."""
         self._wire, self._head, self._reads, self._body, self._limits = wire, head, reads, body, limits
 
     def disconnected(self) -> bool:
-        """Whether the client has hung up, or floods us; what it left is read, for its end comes behind."""
         try:
             self.early += self._wire.socket.recv(PIECE, MSG_DONTWAIT)
         except BlockingIOError:
@@ -241,10 +233,10 @@ class FastExchange(ChatExchange):
         return self._reads(self._head.headers, body, self.trace, self._limits)
 
     def write(self, data: bytes, kind: str, *, last: bool) -> None:
-        if self._head.chunks:
+        if self._head.chunked:
             data = b"%x\r\n%b\r\n%b" % (len(data), data, b"0\r\n\r\n" * last)
         if kind:
-            headers = {"content-type": kind, **({"transfer-encoding": "chunked"} if self._head.chunks else {})}
+            headers = {"content-type": kind, **({"transfer-encoding": "chunked"} if self._head.chunked else {})}
             data = native.head_of(200, headers, keep=self._head.keep) + data
         self._wire.sendall(data)
         if last:

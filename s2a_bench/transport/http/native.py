@@ -1,8 +1,8 @@
-"""The words on the wire of our own HTTP server: request bodies and streamed events, without any I/O.
+"""The wire format of our HTTP server: request bodies and streamed events, without any I/O.
 
-The dialect is OpenAI's ``chat/completions`` with Server-Sent Events. Three things are added, all optional: the
-media type ``application/x-raw`` for uncompressed pixels, the fields ``grammar`` (as llama-server has it) and
-``request_id``, and in the last event the key ``s2a`` with the server's marks.
+The dialect is OpenAI's ``chat/completions`` with Server-Sent Events and three optional additions: the media type
+``application/x-raw`` for uncompressed pixels, the fields ``grammar`` (as in llama-server) and ``request_id``, and in
+the last event the key ``s2a`` with the server's marks.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ PATHS = {
     BEST_EFFORT: "/best-effort/v1/chat/completions",
     BINARY: "/binary/v1/chat/completions",
 }
-"""Variant -> path on our own server; a black box is always asked at the first."""
+"""Variant -> path on our server."""
 
 SCHEME = "Bearer"
 HEALTH, MODELS = "/health", "/v1/models"
 KEEP_ALIVE_S: Final = 3600
 """A client that waits for its turn in an interleaved run keeps its connection."""
 LINES: Final = 128
-"""The most lines of a head: each header costs a few hundred bytes of objects, however short it is."""
+"""The most lines of a head: even a short header costs a few hundred bytes of objects."""
 
 PARAMETERS_HEADER = "s2a-request"
-"""Binary variant: the parameters as ASCII JSON in this header, the picture's bytes as the body."""
+"""Binary variant: this header has the parameters as ASCII JSON, the body the picture's bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ STANDARD = Codec(
     to_base64=lambda data: base64.b64encode(data).decode("ascii"),
     from_base64=base64.b64decode,
 )
-# validate=True is pybase64's fast path: .06 against .35 ms for a VGA frame
+# validate=True is pybase64's fast path: 0.06 ms instead of 0.35 ms for a VGA frame
 FAST = Codec(
     dumps=orjson.dumps,
     loads=orjson.loads,
@@ -77,11 +77,11 @@ CODECS = {AS_DEPLOYED: STANDARD, BEST_EFFORT: FAST, BINARY: FAST, LLAMA_SERVER: 
 
 
 STATUSES = ((Busy, 503), (TooLarge, 413), (Overdue, 504), (BadRequest, 400), (EngineError, 500))
-"""By what an error is, the first that fits; every other one is 400."""
+"""Kinds of errors and their statuses; the first match counts."""
 
 
 def status_of(error: S2AError) -> int:
-    """Return the status of an error that is told before the answer begins."""
+    """Return the status of an error before the answer begins."""
     return next((status for kind, status in STATUSES if isinstance(error, kind)), 400)
 
 
@@ -92,7 +92,7 @@ def error_json(status: int, message: str) -> dict[str, Any]:
 
 
 def headers_of(error: S2AError) -> dict[str, str]:
-    """Return the header that asks to come again later, where an error does."""
+    """Return the Retry-After header of an error, if it has one."""
     return {"retry-after": f"{error.retry_after_s:.0f}"} if isinstance(error, Busy) else {}
 
 
@@ -105,33 +105,31 @@ def head_of(status: int, headers: Mapping[str, str], *, keep: bool) -> bytes:
 def answer(status: int, value: Any, headers: Mapping[str, str] | None = None, *, keep: bool) -> bytes:
     """Return an answer of JSON."""
     body = FAST.dumps(value)
-    said = {"content-type": "application/json", **(headers or {}), "content-length": str(len(body))}
-    return head_of(status, said, keep=keep) + body
+    headers = {"content-type": "application/json", **(headers or {}), "content-length": str(len(body))}
+    return head_of(status, headers, keep=keep) + body
 
 
 class Refused(Exception):
-    """The request is not answered, and its connection closed: what follows on it is not known."""
+    """A request is refused with `answer`, bytes of HTTP, and its connection closed: the next bytes are unknown."""
 
     def __init__(self, status: int, message: str, headers: Mapping[str, str] | None = None) -> None:
-        """Keep what the client is told, as bytes of HTTP."""
         super().__init__(message)
         self.answer = answer(status, error_json(status, message), headers, keep=False)
 
     @classmethod
     def because(cls, error: S2AError) -> Refused:
-        """Return the refusal of a request that goes beyond a limit."""
         return cls(status_of(error), str(error), headers_of(error))
 
 
 def admit(access: Access, path: str, headers: Iterable[tuple[str, str]]) -> None:
-    """Raise Refused for a request that ``access`` does not let in; the names of its headers are in lower case."""
+    """Raise Refused for a request that ``access`` refuses; the names of its headers are in lower case."""
     if refusal := access.refusal(path == HEALTH, headers):
         status, message = refusal
         raise Refused(status, message, {"www-authenticate": SCHEME} if status == HTTPStatus.UNAUTHORIZED else None)
 
 
 def health(core: Core) -> tuple[int, dict[str, str]]:
-    """Return how the engine is, and the status that says so."""
+    """Return the status and the JSON of the health page."""
     stuck = core.stuck()
     return (503, {"status": "stuck", "reason": stuck}) if stuck else (200, {"status": "ok"})
 
@@ -166,20 +164,20 @@ def parameters(request: Request, model: str) -> dict[str, Any]:
 
 
 def native_parameters(request: Request) -> dict[str, Any]:
-    """Return the fields that only our own server knows."""
-    more = {"grammar": request.grammar, "state": request.state}
-    return {"request_id": request.id, **{name: value for name, value in more.items() if value}}
+    """Return the fields that only our server knows."""
+    optional = {"grammar": request.grammar, "state": request.state}
+    return {"request_id": request.id, **{name: value for name, value in optional.items() if value}}
 
 
 def messages(prompt: str, uris: list[str]) -> list[dict[str, Any]]:
     """Return one user message: the pictures, then the prompt."""
-    parts: list[dict[str, Any]] = [{"type": "image_url", "image_url": {"url": uri}} for uri in uris]
-    return [{"role": "user", "content": [*parts, {"type": "text", "text": prompt}]}]
+    pictures: list[dict[str, Any]] = [{"type": "image_url", "image_url": {"url": uri}} for uri in uris]
+    return [{"role": "user", "content": [*pictures, {"type": "text", "text": prompt}]}]
 
 
 def stream_event(
     request_id: str, delta: dict[str, str], finish_reason: str | None = None, **extra: Any
 ) -> dict[str, Any]:
-    """Return one streamed event; with ``usage`` in ``extra`` it is the last and has no choices."""
+    """Return one streamed event; the last one has ``usage`` and no choices."""
     choices = [] if "usage" in extra else [{"index": 0, "delta": delta, "finish_reason": finish_reason}]
     return {"id": request_id, "object": "chat.completion.chunk", "model": "s2a", "choices": choices, **extra}

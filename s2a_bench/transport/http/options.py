@@ -1,7 +1,8 @@
-"""What the HTTP transport can be told."""
+"""Options of the HTTP transport, and JSON Merge Patch (RFC 7396) for `extra_body`."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -10,16 +11,52 @@ from pydantic import field_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import TextOrFile, one_of, option
+from s2a_bench.secrets import LONG, keep, secrets_in
 from s2a_bench.transport import PROGRAM, SERVING, Program
 from s2a_bench.transport.access import WebOptions
 from s2a_bench.transport.http.dialects import DIALECTS
 
 WHEEL = Path("xllamacpp")
-"""Stands for llama.cpp's server out of the wheel of that name."""
+"""Stands for llama.cpp's server in the wheel of that name."""
+
+
+def read_patch(text: str) -> dict[str, Any]:
+    """Read a user's patch; raises UsageError for anything but a JSON object.
+
+    From now on the value of a secret's name is struck out of everything shown or kept.
+    """
+    try:
+        patch = json.loads(text or "{}")
+        json.dumps(patch, allow_nan=False)
+    except (ValueError, RecursionError) as error:
+        raise UsageError(f"`extra_body`: no JSON: {error}") from error
+    if not isinstance(patch, dict):
+        raise UsageError('`extra_body` should be a JSON object, such as \'{"reasoning_effort": "low"}\'')
+    for name, value in secrets_in(patch):
+        if len(value) < LONG:
+            raise UsageError(
+                f"`extra_body`: '{name}' is a secret's name, and its value is too short to be struck out of the "
+                f"results without harm to other words; {LONG} letters are needed, or `api_key_env`"
+            )
+        keep(value)
+    return patch
+
+
+def merged(target: Any, patch: Any) -> Any:
+    """Return ``target`` with ``patch`` applied; neither is changed. A null removes a field."""
+    if not isinstance(patch, dict):
+        return patch
+    result = dict(target) if isinstance(target, dict) else {}
+    for name, value in patch.items():
+        if value is None:
+            result.pop(name, None)
+        else:
+            result[name] = merged(result.get(name), value)
+    return result
 
 
 class HttpOptions(WebOptions):
-    """How our HTTP server is reached, or somebody else's is asked."""
+    """Options of an HTTP server, ours or an external one."""
 
     SCHEMES: ClassVar[tuple[str, ...]] = ("http", "https")
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 8080}
@@ -44,13 +81,10 @@ class HttpOptions(WebOptions):
     @field_validator("extra_body")
     @classmethod
     def _is_a_patch(cls, text: str) -> str:
-        from s2a_bench.transport.http.merge import read_patch
-
         read_patch(text)
         return text
 
     def check(self) -> None:
-        """Refuse two servers, what is about a server that is not there, and a key that nobody needs."""
         super().check()
         if self.url and self.llama_server:
             raise UsageError("`url` and `llama_server` name two HTTP servers; give one of them")
@@ -60,12 +94,11 @@ class HttpOptions(WebOptions):
 
     @property
     def spoken(self) -> str:
-        """Return the dialect that a black box is known to speak, or nothing."""
+        """The known dialect of a black box, or nothing."""
         return "llama-server" if self.llama_server else self.dialect
 
     @property
     def program(self) -> Program | None:
-        """Return llama.cpp's server where its program is named."""
         if self.llama_server is None:
             return None
         kind = "llama-server-wheel" if self.llama_server == WHEEL else "llama-server"

@@ -1,4 +1,4 @@
-"""What a foreign HTTP server does that is dangerous, as far as its list of models tells."""
+"""Security risks of an external HTTP server, as far as its list of models shows them."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from s2a_bench.transport.http.dialects.common import NO_LIST, first_model
 from s2a_bench.transport.risks import no_key, printable
 
 
-def examine(parts: SplitResult) -> Iterator[Finding]:
-    """Ask for the list of models without a key."""
-    url = urlunsplit(parts)
+def examine(address: SplitResult) -> Iterator[Finding]:
+    """Request the list of models without a key."""
+    url = urlunsplit(address)
     try:
         with probe(url) as client:
             owner, model = first_model(url, getter(client, {}))
     except ServerDied as error:
         raise OSError(str(error).rpartition(": ")[2]) from error
     except (*NO_LIST, S2AError, httpx.HTTPError, httpx.InvalidURL) as error:
-        yield Finding("server", "state", f"it answers, and has no list of models for everybody: {error}")
+        yield Finding("server", "state", f"it answers, and shows no list of models without a key: {error}")
         return
     if model:
-        said = f"{printable(model)} of {printable(owner)}" if owner else printable(model)
+        shown = f"{printable(model)} of {printable(owner)}" if owner else printable(model)
         yield no_key(
-            parts,
-            f"it tells everybody its models ({said}), so it answers them too",
+            address,
+            f"it shows its models to every client ({shown}), so it answers every client too",
             "start it with a key, as llama-server --api-key, and name its variable with --api-key-env",
         )
     else:
-        yield Finding("server", "state", "it answers, and has no list of models for everybody")
+        yield Finding("server", "state", "it answers, and shows no list of models without a key")

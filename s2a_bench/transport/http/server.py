@@ -1,7 +1,7 @@
-"""*As deployed*: FastAPI on uvicorn, as llama-cpp-python's own server and most robot code are.
+"""*As deployed*: FastAPI on uvicorn, like llama-cpp-python's server and most robot code.
 
-A pydantic body, the standard library's JSON and Base64, and an answer that is computed on a thread of the pool. What
-neither bounds `protocol` does.
+It has a pydantic body, the standard library's JSON and Base64, and computes answers on a thread pool. `protocol` adds
+the missing bounds.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from s2a_bench.types import Request
 
 
 class ImageUrl(BaseModel):
-    """Where a picture is: a data URI."""
+    """A picture as a data URI."""
 
     url: str
 
 
 class MessagePart(BaseModel):
-    """One part of a message: text or a picture."""
+    """An item of a message: text or a picture."""
 
     type: Literal["text", "image_url"]
     text: str = ""
@@ -55,7 +55,7 @@ class Message(BaseModel):
 
 
 class ChatRequest(BaseModel):
-    """The body of ``POST /v1/chat/completions``, as far as it is understood here."""
+    """The supported fields of ``POST /v1/chat/completions``."""
 
     messages: Annotated[list[Message], Field(fail_fast=True)]
     stream: bool = False
@@ -67,10 +67,9 @@ class ChatRequest(BaseModel):
 
 
 class DeployedExchange(ChatExchange):
-    """One request whose body is there; what its thread writes goes to the loop as ASGI's messages."""
+    """A request with its body; its thread passes ASGI messages to the event loop in `messages`."""
 
     def __init__(self, body: ChatRequest, protocol: Protocol, limits: Limits) -> None:
-        """Keep `messages` on the loop that runs, for as long as the client is there."""
         super().__init__(native.STANDARD, protocol.trace)
         self.held = protocol.held.pop_all()
         self.given_up = False
@@ -92,9 +91,9 @@ class DeployedExchange(ChatExchange):
         self._put({"type": "http.response.body", "body": data, "more_body": not last})
 
     def whole(self, status: int, value: Any, headers: dict[str, str]) -> None:
-        whole = JSONResponse(value, status, headers)
-        self._put({"type": "http.response.start", "status": status, "headers": whole.raw_headers})
-        self._put({"type": "http.response.body", "body": whole.body})
+        response = JSONResponse(value, status, headers)
+        self._put({"type": "http.response.start", "status": status, "headers": response.raw_headers})
+        self._put({"type": "http.response.body", "body": response.body})
 
     def _put(self, message: dict[str, Any]) -> None:
         try:
@@ -104,10 +103,9 @@ class DeployedExchange(ChatExchange):
 
 
 class ExchangeResponse(Response):
-    """What a thread of the pool computes for an exchange."""
+    """Sends an exchange's messages, for ``most_s`` at most."""
 
     def __init__(self, exchange: DeployedExchange, most_s: float) -> None:
-        """Send for so long at most."""
         super().__init__()
         self._exchange, self._most_s = exchange, most_s
 
@@ -117,15 +115,15 @@ class ExchangeResponse(Response):
                 while (message := await self._exchange.messages.get()) is not None:
                     await send(message)
                 return
-            scope["state"]["protocol"].transport.abort()  # it does not read
+            scope["state"]["protocol"].transport.abort()  # the client does not read
         finally:
             self._exchange.given_up = True
 
 
 def application(core: Core, *, documented: bool = False) -> FastAPI:
-    """Build the application: chat completions as deployed, and what tools expect beside them."""
+    """Build the application: chat completions as deployed, and the pages that tools expect."""
     app = FastAPI(title="s2a-bench", openapi_url="/openapi.json" if documented else None)  # /docs and /redoc follow it
-    threads = ThreadPoolExecutor(core.limits.waiting + 2, "http")  # one is answered, and one is told that too many wait
+    threads = ThreadPoolExecutor(core.limits.waiting + 2, "http")  # one is answered, one refused, the others wait
 
     @app.exception_handler(RequestValidationError)
     async def invalid(_: HttpRequest, error: RequestValidationError) -> Response:
@@ -135,8 +133,8 @@ def application(core: Core, *, documented: bool = False) -> FastAPI:
 
     @app.get(native.HEALTH)
     async def health() -> Response:
-        status, said = native.health(core)
-        return JSONResponse(said, status)
+        status, body = native.health(core)
+        return JSONResponse(body, status)
 
     @app.get(native.MODELS)
     async def models() -> dict[str, Any]:
@@ -153,20 +151,16 @@ def application(core: Core, *, documented: bool = False) -> FastAPI:
 
 
 class _Server(uvicorn.Server):
-    """uvicorn without its signal handlers: whoever runs the server has some."""
+    """uvicorn without its signal handlers: the process of the server has some."""
 
     def capture_signals(self) -> AbstractContextManager[None]:  # type: ignore[override]
         return nullcontext()
 
 
 class HttpServer:
-    """uvicorn on a socket that is bound before anything is promised."""
+    """uvicorn on a socket that is bound first; `bound_socket` says what it raises."""
 
     def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
-        """Bind ``host:port`` of ``wiring.address`` or what `address` was, without it 127.0.0.1 and any port.
-
-        Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
-        """
         self._socket, key = bound_socket(wiring.address, "http", wiring.options)
         host, port = self._socket.getsockname()
         self.address = f"http://{host}:{port}"
@@ -197,5 +191,4 @@ class HttpServer:
         self._server.run(sockets=[self._socket])
 
     def stop(self) -> None:
-        """Finish the requests under way, for a second at most."""
         self._server.should_exit = True

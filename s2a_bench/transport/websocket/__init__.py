@@ -73,7 +73,7 @@ class Websocket(PolicyTransport[WebsocketOptions]):
     def ready(self, wiring: Wiring[WebsocketOptions]) -> str:
         """Return where policies are asked, and by whom."""
         address = wiring.address
-        whom = wiring.options.callers("has the key in {}, /healthz for all")
+        whom = wiring.options.callers("have the key in {}, /healthz for all")
         return f"serving openpi's protocol at {address}, streamed at {address}{STREAM_PATH}{whom}"
 
 

@@ -85,7 +85,7 @@ class Zmq(PolicyTransport[ZmqOptions]):
     def ready(self, wiring: Wiring[ZmqOptions]) -> str:
         """Return where policies are asked, and by whom."""
         address = wiring.address
-        return f"serving GR00T's protocol at {address}{wiring.options.callers('sends the key in {}')}"
+        return f"serving GR00T's protocol at {address}{wiring.options.callers('send the key in {}')}"
 
 
 ZMQ = Zmq()

@@ -24,7 +24,7 @@ import zmq
 from s2a_bench.errors import Busy, RequestFailed, S2AError, TransportError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring, observed
-from s2a_bench.transport.listening import cannot_bind, key_for, split
+from s2a_bench.transport.listening import cannot_bind, key_for, split_address
 from s2a_bench.transport.serving import RETRY_AFTER_S, Core, Exchange, SharedSourceWorkers, client_error
 from s2a_bench.transport.zmq import ZmqOptions, layouts
 from s2a_bench.transport.zmq.watch import Connection, ConnectionWatch
@@ -53,7 +53,7 @@ class ZmqServer:
 
         Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
         """
-        told, port = split(wiring.address, "tcp")
+        told, port = split_address(wiring.address, "tcp")
         options, limits = wiring.options, wiring.limits
         host = _resolved(told)
         self._key = key_for(host, options.api_key_env, everybody=options.no_auth).encode()
