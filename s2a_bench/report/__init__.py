@@ -1,1 +1,1 @@
-"""Over runs of all experiments: the page, comparisons, and the paper's claims."""
+"""Reports on runs of all experiments: the page, comparisons, and the paper's claims."""

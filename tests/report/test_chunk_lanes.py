@@ -38,8 +38,8 @@ def test_a_panel_is_a_source_and_a_bar_a_chunk_or_a_stall(run: StoredRun) -> Non
     assert [bar.colour for bar in sync.bars[:4]] == [COLOURS[0], "", COLOURS[1], ""]
     assert sync.bars[0].text == "sync: chunk 0, actions 0 to 15, ticks 3 to 18, observation 3 to 18 ticks old"
     assert sync.bars[1].text == "sync: stall of 3 ticks, ticks 19 to 21"
-    assert sync.words == "9 of the first 60 ticks stall"
-    assert replace.words == "no stall"
+    assert sync.summary == "9 of the first 60 ticks stall"
+    assert replace.summary == "no stall"
     assert replace.bars[1].text.endswith(
         "actions 3 to 10, ticks 14 to 21, observation 3 to 10 ticks old, 8 actions thrown away"
     )

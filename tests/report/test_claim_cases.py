@@ -39,9 +39,9 @@ class Kit:
     def __init__(self, root: Path, beside: MakeRun, spoken: MakeRun) -> None:
         self.root, self.beside, self.spoken = root, beside, spoken
 
-    def timeline(self, **asked: Any) -> StoredRun:
+    def timeline(self, **settings: Any) -> StoredRun:
         """Compute a timeline run."""
-        return read_run(run_timeline(TimelineConfig(**asked), self.root, NullProgress()))
+        return read_run(run_timeline(TimelineConfig(**settings), self.root, NullProgress()))
 
     def live(self, provenance: Provenance, rate: float, **facts: Any) -> StoredRun:
         """Make a live run of the four L, with timings as one at that rate has them."""
@@ -53,7 +53,7 @@ class Kit:
         return replace(run, manifest=manifest, tables=run.tables | {"timelines": rows})
 
     def latency(self, *, ratio: float = 6.57, manifest: dict[str, Any] | None = None, **facts: Any) -> StoredRun:
-        """Make a latency run on an AGX Orin with the paper's setting, unless told otherwise."""
+        """Make a latency run on an AGX Orin with the paper's setting by default."""
         sent = {"base64_encode": 9.13 * ratio, "network": 0.87 * ratio, "inference": 5, "return": 0}
         cells = {"http/as-deployed": sent, "ros/topic": {"convert": 10, "inference": 5, "return": 0}}
         return self.beside(cells, spread=0.02, manifest={"environment": ORIN, **(manifest or {})}, **facts)
@@ -90,9 +90,9 @@ class Kit:
         origins = {} if provenance is None else {"provenance": Origins(provenance).to_manifest()}
         return self.spoken(rate, environment=RTX, model=model, **origins, **facts)
 
-    def ccrb(self, **asked: Any) -> StoredRun:
+    def ccrb(self, **settings: Any) -> StoredRun:
         """Drive a CCRB run."""
-        return read_run(run_ccrb(CcrbConfig(**asked), self.root, NullProgress()))
+        return read_run(run_ccrb(CcrbConfig(**settings), self.root, NullProgress()))
 
 
 @pytest.fixture

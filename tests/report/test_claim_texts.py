@@ -1,4 +1,4 @@
-"""What is said of each claim, word by word: tests/data/claims.md has it for runs that cover what can be said.
+"""The text of every claim: tests/data/claims.md has it for runs that cover all cases.
 
 Where another text is meant, the failing test says where the new page lies.
 """
@@ -29,8 +29,8 @@ MakeRow = Callable[..., SampleRow]
 SENT = {"convert": 10, "inference": 5, "return": 0}
 
 
-def said(*runs: StoredRun) -> list[str]:
-    """Return what is said of all claims that these runs can judge or nearly so."""
+def claim_lines(*runs: StoredRun) -> list[str]:
+    """Return the text of every claim that these runs can judge, or nearly so."""
     judged = [each for each in judge_claims(runs) if each.findings]
     texts = []
     for row in claim_table(judged).rows:
@@ -49,8 +49,8 @@ def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_ro
     def elsewhere(run: StoredRun, **environment: object) -> StoredRun:
         return replace(run, manifest={**run.manifest, "environment": environment})
 
-    def boundary(**asked: object) -> StoredRun:
-        return read_run(run_boundary(BoundaryConfig(**asked), tmp_path, NullProgress()))  # type: ignore[arg-type]
+    def boundary(**settings: object) -> StoredRun:
+        return read_run(run_boundary(BoundaryConfig(**settings), tmp_path, NullProgress()))  # type: ignore[arg-type]
 
     def bodies(coded: int, plain: int) -> StoredRun:
         sizes = {"http/as-deployed": coded, "http/binary": plain}
@@ -97,7 +97,7 @@ def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_ro
     page = "# What is said of the paper's claims\n"
     for title, made in runs.items():
         heading, _, about = title.rstrip(")").partition(" (")
-        page += f"\n## {heading}\n\n" + "".join(f"{each}\n" for each in said(made()) if re.search(about, each))
+        page += f"\n## {heading}\n\n" + "".join(f"{each}\n" for each in claim_lines(made()) if re.search(about, each))
     page = re.sub(r"off by \S+ s", "off by ~0 s", page)
     (tmp_path / "claims.md").write_text(page, "utf-8")
     lines = difflib.unified_diff(PAGE.read_text("utf-8").splitlines(), page.splitlines(), n=0, lineterm="")

@@ -352,8 +352,8 @@ def test_where_skills_cannot_end_early_the_papers_line_is_not_tried(tmp_path: Pa
     run = read_run(run_boundary(BoundaryConfig(t_min=1.0), tmp_path, NullProgress()))
     assert claim_of("suffices", run).verdict == SUPPORTED
     assert not claim_of("Below R", run).verdicts
-    told = replace(run, manifest=run.manifest | {"configuration": {}})  # an older folder: T_min was T_nom
-    assert not claim_of("Below R", told).verdicts
+    older = replace(run, manifest=run.manifest | {"configuration": {}})  # an older folder: T_min was T_nom
+    assert not claim_of("Below R", older).verdicts
 
 
 def test_the_operating_point_is_reproduced_and_the_diagram_does_not_bear_all_of_it_out(ccrb: StoredRun) -> None:
@@ -369,8 +369,8 @@ def test_the_operating_point_is_reproduced_and_the_diagram_does_not_bear_all_of_
 
 
 def test_the_chosen_point_is_the_default_of_the_command() -> None:
-    asked = json.loads(json.dumps(CcrbConfig().to_manifest()))
-    assert {name: asked[name] for name in CHOSEN} == CHOSEN
+    settings = json.loads(json.dumps(CcrbConfig().to_manifest()))
+    assert {name: settings[name] for name in CHOSEN} == CHOSEN
 
 
 def test_another_outcome_decides_nothing_as_the_paper_gives_no_settings(ccrb: StoredRun) -> None:

@@ -167,7 +167,7 @@ def test_cells_without_a_partner_are_listed_and_not_compared(launch: Launch) -> 
 
 
 @pytest.mark.parametrize(
-    ("part", "facts", "said"),
+    ("part", "facts", "message"),
     [
         ("environment", {"cpu": "EPYC"}, "cpu: Cortex-A78AE against EPYC"),
         ("environment", {"cores": 6}, "cores: 12 against 6"),
@@ -178,16 +178,16 @@ def test_cells_without_a_partner_are_listed_and_not_compared(launch: Launch) -> 
     ],
 )
 def test_another_machine_or_model_is_refused_unless_told(
-    launch: Launch, part: str, facts: dict[str, Any], said: str
+    launch: Launch, part: str, facts: dict[str, Any], message: str
 ) -> None:
     first, second = launch(1, n=6), launch(2, n=6, manifest=with_(MANIFEST, part, **facts))
     with pytest.raises(UnlikeRuns) as caught:
         opened(first, second)
-    assert str(caught.value) == f"the runs are unlike: {said}; `unlike` compares them anyway"
-    told = next(
+    assert str(caught.value) == f"the runs are unlike: {message}; `unlike` compares them anyway"
+    warning = next(
         warning for warning in warnings_of(compared(first, second, "e2e", unlike=True)) if warning.code == "unlike"
     )
-    assert told.message == f"the runs are unlike: {said}"
+    assert warning.message == f"the runs are unlike: {message}"
 
 
 def test_other_latencies_of_an_echo_are_refused_unless_told(launch: Launch) -> None:
@@ -243,11 +243,11 @@ def test_what_went_wrong_in_a_run_is_told(launch: Launch, tmp_path: Path, make_r
             run.sample(make_row("loopback", STAGES, block, error="lost" if block < 3 else ""))
         run.finish("interrupted")
     found = warnings_of(compared(launch(1, cells=("loopback",)), read_run(run.path), "e2e"))
-    said = {warning.code: warning.message for warning in found}
-    assert said["state"].endswith("is interrupted, not finished")
-    assert said["warnings"].endswith("has warnings: load")
-    assert said["errors"] == "loopback: 3 of 20 requests failed in B"
-    assert "one-launch" in said
+    messages = {warning.code: warning.message for warning in found}
+    assert messages["state"].endswith("is interrupted, not finished")
+    assert messages["warnings"].endswith("has warnings: load")
+    assert messages["errors"] == "loopback: 3 of 20 requests failed in B"
+    assert "one-launch" in messages
 
 
 def test_repeated_launches_are_compared_by_launch(launch: Launch) -> None:

@@ -176,8 +176,8 @@ def test_the_command_can_be_pasted_into_a_shell(make_run: MakeRun) -> None:
     argv = ["/somewhere/__main__.py", "latency", "--prompt", 'it\'s "one" $HOME', "--runs", "3"]
     page = Page(page_of(make_run({}, manifest={"argv": argv}).path))
     command = next(line for line in page.text.splitlines() if line.startswith("s2a-bench latency"))
-    said = subprocess.run(["sh", "-c", f"printf '%s\\n' {command}"], capture_output=True, text=True, check=True)
-    assert said.stdout.splitlines() == ["s2a-bench", *argv[1:]]
+    done = subprocess.run(["sh", "-c", f"printf '%s\\n' {command}"], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["s2a-bench", *argv[1:]]
 
 
 def test_timelines_stand_in_the_page_where_they_were(computed: Path) -> None:
@@ -189,7 +189,7 @@ def test_timelines_stand_in_the_page_where_they_were(computed: Path) -> None:
     assert [lane.start_s for lane in six.lanes] == pytest.approx([1.75, 10.5, 3.5])
     assert naive.bars[1].text == "naive: stall of 0.25 s before skill 2, 2.75 to 3.00 s"
     assert ours.bars[0].text == "stream-to-act: skill 1 arrives at 1.75 s, runs 3.50 to 4.50 s, no stall before it"
-    assert (naive.words, wait.words) == (
+    assert (naive.summary, wait.summary) == (
         "starts 1.75 s, ends 11.50 s, 7 stalls, 1.75 s",
         "starts 10.50 s, ends 18.50 s, no stalls",
     )
@@ -267,15 +267,15 @@ def test_measured_cells_stand_side_by_side_and_are_not_pooled(tmp_path: Path, ma
 
 
 @pytest.mark.parametrize(
-    ("state", "error", "said"),
+    ("state", "error", "caveat"),
     [("running", None, "still running, or was killed"), ("failed", "the server died", "(failed: the server died)")],
 )
-def test_an_unfinished_run_is_shown_and_told(make_run: MakeRun, state: str, error: str | None, said: str) -> None:
+def test_an_unfinished_run_is_shown_and_told(make_run: MakeRun, state: str, error: str | None, caveat: str) -> None:
     run = make_run(n=3)
     (run.path / "manifest.json").write_text(json.dumps({**run.manifest, "state": state, "error": error}))
     (chapter,) = read_chapters([run.path], against_paper=False)
-    assert said in chapter.caveats[0]
-    assert said in Page(page_of(run.path)).text
+    assert caveat in chapter.caveats[0]
+    assert caveat in Page(page_of(run.path)).text
 
 
 def test_a_run_without_rows_is_told(make_run: MakeRun) -> None:
@@ -323,8 +323,8 @@ def test_another_version_or_setting_is_no_other_machine_and_one_line_for_all_run
         settings = {"configuration": {"seed": place}, "tuning": {"process": place > 0}}
         runs.append(make_run(n=2, manifest={**facts, **settings}).path)
     report = make_report(read_chapters(runs, against_paper=False), against_paper=False)
-    said = "The runs are not alike in governor, tuning process, package numpy, configuration seed."
-    assert report.caveats == [said]
+    caveat = "The runs differ in governor, tuning process, package numpy, configuration seed."
+    assert report.caveats == [caveat]
 
 
 def test_a_folder_given_twice_is_one_chapter(computed: Path) -> None:
@@ -454,4 +454,4 @@ def test_a_chapter_of_another_command_is_named_and_not_guessed_at(make_run: Make
     run = make_run(n=2)
     (run.path / "manifest.json").write_text(json.dumps({**run.manifest, "command": "dance"}))
     (chapter,) = read_chapters([run.path], against_paper=False)
-    assert chapter.content.sentences[0].startswith("There is no view of dance runs; this one holds samples (")
+    assert chapter.content.sentences[0].startswith("There is no view of dance runs; this one has samples (")

@@ -1,7 +1,7 @@
-"""The paper's claims beside ours: what a claim is, how the parts of a run are judged, and what all runs say together.
+"""The paper's claims beside results: the kinds of claims, the verdict of a part of a run, and that of all runs.
 
-`table` has a row a claim. A row names a trial (what to run, how such a run splits into parts, which facts a part must
-have) and checks (a measure of a part, the sentence it is said in, and the bounds in which its interval has to lie).
+`table` has a row a claim. A row has a trial (the command, how its run splits into parts, and the facts that a part must
+have) and checks (a measure of a part, its sentence, and the bounds of its interval).
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ if TYPE_CHECKING:
 
 SUPPORTED: Final = "supported"
 REPRODUCED: Final = "reproduced at the chosen point"
-"""Supported where the paper names no settings: at one point, chosen so that it comes about."""
+"""Supported where the paper names no settings: at one point, chosen so that the outcome occurs."""
 CONTRADICTED: Final = "contradicted"
 UNDECIDED: Final = "undecided or not testable"
 
 
 @dataclass(frozen=True, slots=True)
 class RunPart:
-    """What of a run is judged at once: cells that belong together, its facts by the names that needs give them.
+    """The cells of a run that are judged together, and their facts by the names of needs.
 
-    ``about`` is said of it behind the evidence.
+    ``about`` follows the evidence.
     """
 
     run: StoredRun
@@ -38,7 +38,7 @@ class RunPart:
 
 
 class Met(NamedTuple):
-    """A need beside what a part has, in words."""
+    """A fact of a part beside its need, as text."""
 
     text: str
     met: bool
@@ -46,7 +46,7 @@ class Met(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Need:
-    """A fact that a part must have to count, in words and as a test of its value."""
+    """A fact that a part must have to count: a text, and a test of its value."""
 
     name: str
     wanted: str
@@ -60,7 +60,7 @@ class Need:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """The command that tests a claim, how its runs split into parts, and what a part must be to count."""
+    """The command that tests a claim, how its runs split into parts, and the needs of a part."""
 
     run: str
     parts: Callable[[StoredRun], Iterable[RunPart]]
@@ -72,27 +72,27 @@ class Trial:
 
 
 Measure: TypeAlias = "Callable[[RunPart], tuple[Sequence[Ratio], str]]"
-"""Measures a part: values with their intervals, and how they read."""
+"""Measures a part: values with their intervals, and a text of them."""
 
 
 def within(low: float, high: float, least: float, most: float) -> str:
-    """Return the verdict of an interval on "between least and most": wholly inside, wholly outside, or undecided."""
+    """Return the verdict on "between least and most": the interval is inside, outside, or it is undecided."""
     if least <= low and high <= most:
         return SUPPORTED
     return CONTRADICTED if high < least or low > most else UNDECIDED
 
 
 def all_of(verdicts: Iterable[str]) -> str:
-    """Return the verdict on what is claimed of all: one that contradicts is enough."""
+    """Return the verdict on a claim about all: one contradiction is enough."""
     found = set(verdicts)
     return CONTRADICTED if CONTRADICTED in found else SUPPORTED if found == {SUPPORTED} else UNDECIDED
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """A measure, the sentence that it is said in, and the bounds of its values; without bounds it is only stated.
+    """A measure, its sentence, and the bounds of its values; without bounds it is only stated.
 
-    The bounds are those of each value. Of *joint* values only what all say alike contradicts, and *one* is enough.
+    *each* value must be inside. *joint* values support or contradict only together. *one* value inside is enough.
     """
 
     sentence: str
@@ -102,7 +102,7 @@ class Check:
     of: Literal["each", "joint", "one"] = "each"
 
     def verdict(self, values: Sequence[Ratio]) -> str:
-        """Judge measured values; one without an interval may be anything."""
+        """Judge measured values; one without an interval is undecided."""
         known = ((value.low, value.high) for value in values)
         intervals = [(-inf, inf) if low is None or high is None else (low, high) for low, high in known]
         verdicts = [within(low, high, self.least, self.most) for low, high in intervals]
@@ -115,9 +115,9 @@ class Check:
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """One claim: where the paper makes it, the rule it is judged by, the trial that tests it, and the checks.
+    """One claim: its section of the paper, its text, the rule of its verdict, the trial that tests it, and the checks.
 
-    ``reads`` maps what the checks say to the verdict on the claim, where it is another, and a remark.
+    ``reads`` maps a verdict of the checks to another one of the claim, and a remark.
     """
 
     where: str
@@ -128,7 +128,7 @@ class Claim:
     reads: Mapping[str, tuple[str, str]] = field(default_factory=dict)
 
     def judge(self, part: RunPart) -> tuple[str, str]:
-        """Return the verdict of a part that meets all needs, and the evidence in words."""
+        """Return the verdict of a part that meets all needs, and the evidence."""
         shown = [(check, *check.measure(part)) for check in self.checks]
         found = all_of(check.verdict(values) for check, values, _ in shown)
         verdict, remark = self.reads.get(found, (found, ""))
@@ -140,7 +140,7 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class ClaimFinding:
-    """What one part of a run says about a claim, and which needs it meets."""
+    """The verdict of one part of a run on a claim, the evidence, and the needs."""
 
     verdict: str
     evidence: str
@@ -153,24 +153,24 @@ class ClaimFinding:
 
 @dataclass(frozen=True, slots=True)
 class Judged:
-    """A claim with what runs say about it, those that can tell first, by the names of those that say the same."""
+    """A claim with its findings, the testable ones first, and the names of the runs of each."""
 
     claim: Claim
     findings: dict[ClaimFinding, tuple[str, ...]]
 
     @property
     def verdicts(self) -> frozenset[str]:
-        """Return the verdicts of the runs that meet all needs, *undecided* among them; other runs do not count."""
+        """The verdicts of the runs that meet all needs; other runs do not count."""
         return frozenset(finding.verdict for finding in self.findings if finding.testable)
 
     @property
     def verdict(self) -> str:
-        """Return the verdict of all testable runs; undecided if there is none, or if they disagree."""
+        """The verdict of all testable runs; undecided if there is none, or if they disagree."""
         return next(iter(self.verdicts)) if len(self.verdicts) == 1 else UNDECIDED
 
     @property
-    def told(self) -> list[tuple[str, tuple[Met, ...]]]:
-        """Return a text a finding, with the run's name where there are several, and what was required of it."""
+    def texts(self) -> list[tuple[str, tuple[Met, ...]]]:
+        """A text of each finding, with the names of the runs if there are several findings, and its needs."""
         several = len(self.findings) > 1
         return [
             ((f"{', '.join(runs)}: {finding.verdict}. " if several else "") + finding.evidence, finding.needs)
@@ -179,25 +179,25 @@ class Judged:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Return what is to be said of all findings: that they disagree, or what to run where none can tell."""
+        """A note that the findings disagree, or the command to run if none is testable."""
         if len(self.verdicts) > 1:
             return ("Runs disagree: each is listed, none counts more.",)
         return (f"Run: {self.claim.trial.run}",) if not self.verdicts else ()
 
     @property
     def evidence(self) -> tuple[str, ...]:
-        return (*(text for text, _ in self.told), *self.notes)
+        return (*(text for text, _ in self.texts), *self.notes)
 
     @property
     def required(self) -> str:
-        """Return what was required of the runs, in one line: as found, or as needed where there is no run."""
+        """The needs in one line, with the facts of the runs if there are any."""
         if not self.findings:
             return "; ".join(f"{need.name}: {need.wanted}" for need in self.claim.trial.needs)
         return " | ".join(dict.fromkeys("; ".join(need.text for need in finding.needs) for finding in self.findings))
 
 
 def judge(claim: Claim, runs: Iterable[StoredRun]) -> Judged:
-    """Judge one claim by each run; the order of the runs changes the order of the evidence and nothing else."""
+    """Judge one claim by each run; the order of the runs changes only the order of the evidence."""
     found: dict[ClaimFinding, tuple[str, ...]] = {}
     for run in runs:
         if run.manifest.get("command") == claim.trial.command:
@@ -207,18 +207,18 @@ def judge(claim: Claim, runs: Iterable[StoredRun]) -> Judged:
 
 
 def _findings(claim: Claim, run: StoredRun) -> Iterator[ClaimFinding]:
-    """Judge the parts of a run that meet all needs; if none does, yield what the nearest one lacks."""
-    looked = [(part, tuple(need.of(part.facts) for need in claim.trial.needs)) for part in claim.trial.parts(run)]
-    fit = [(part, needs) for part, needs in looked if all(need.met for need in needs)]
+    """Judge the parts of a run that meet all needs; if none does, yield the needs of the nearest one."""
+    every = [(part, tuple(need.of(part.facts) for need in claim.trial.needs)) for part in claim.trial.parts(run)]
+    fit = [(part, needs) for part, needs in every if all(need.met for need in needs)]
     for part, needs in fit:
         yield ClaimFinding(*claim.judge(part), needs)
-    if looked and not fit:
-        nearest = min((needs for _, needs in looked), key=lambda needs: sum(not need.met for need in needs))
+    if every and not fit:
+        nearest = min((needs for _, needs in every), key=lambda needs: sum(not need.met for need in needs))
         yield ClaimFinding(UNDECIDED, "Not testable with this run.", nearest)
 
 
 def claim_table(judged: Sequence[Judged]) -> TextTable:
-    """Lay out the claims, their rules and verdicts, what was required, and the evidence."""
+    """Make a table of the claims, their rules, verdicts, needs and evidence."""
     rows: list[tuple[str, ...]] = [
         (each.claim.where, each.claim.text, each.claim.rule, each.verdict, each.required, " ".join(each.evidence))
         for each in judged

@@ -1,4 +1,4 @@
-"""What timeline, boundary and CCRB runs are judged by: stalls, ends and S0 of plans, and what becomes of cars."""
+"""Measures of timeline, boundary and CCRB runs: stalls, ends and S0 of plans, and collisions of cars."""
 
 from __future__ import annotations
 
@@ -44,12 +44,12 @@ VISIBLE_S: Final = 0.02
 
 
 def listed(name: str, *values: str) -> Need:
-    """Need a fact to list all of these."""
+    """Return the need that a fact lists all of these."""
     return Need(name, ", ".join(dict.fromkeys(values)), lambda found: set(values) <= set(found.split(", ")))
 
 
 def more(name: str, limit: float) -> Need:
-    """Need a fact to be a larger number."""
+    """Return the need that a number exceeds the limit."""
     return Need(name, f"more than {limit:g}", lambda found: found > limit)
 
 
@@ -60,7 +60,7 @@ class _Or(Need):
     others: tuple[Need, ...]
 
     def of(self, facts: Mapping[str, Any]) -> Met:
-        """Look at the facts of a part; where something is missing only that is told."""
+        """Test the facts of a part; if any is missing, the text has only those."""
         rows = [Met(f"{self.name}: {facts[self.name]}", met=True)] if self.test(facts[self.name]) else []
         rows = rows or [need.of(facts) for need in self.others]
         missing = [row.text for row in rows if not row.met]
@@ -68,14 +68,14 @@ class _Or(Need):
 
 
 def timelines(run: StoredRun) -> Iterator[RunPart]:
-    """Yield the timelines of one source of tokens, N and T_nom: L -> policy -> cell, from long to short skills."""
+    """Yield the timelines of each source of tokens, N and T_nom: L -> policy -> cell, from long to short skills."""
 
     def setting(cell: Timelines) -> tuple[str, int, float]:
         title, _, n_skills, t_nom_s = cell.setting
         return title, n_skills, t_nom_s
 
-    asked = run.manifest.get("configuration", {})
-    spread, jitter = asked.get("t_nom_cv") or 0.0, asked.get("jitter", "none")
+    settings = run.manifest.get("configuration", {})
+    spread, jitter = settings.get("t_nom_cv") or 0.0, settings.get("jitter", "none")
     for (title, n_skills, t_nom_s), found in groupby(sorted(timelines_of(run), key=setting), key=setting):
         every = sorted(found, key=lambda cell: -cell.setting[1])
         cells: dict[int, dict[str, Timelines]] = {}
@@ -94,8 +94,8 @@ def timelines(run: StoredRun) -> Iterator[RunPart]:
                 [0.0, *(float(safe_start(arrival, nominal)[0] - arrival[0, 0]) for arrival, nominal, *_ in shown)]
             ),
             "T_max / T_nom": max((float((most / nominal).max()) for _, nominal, _, most in shown), default=1.0),
-            "promised": min(float(asked.get("epsilon") or _PROMISED), _PROMISED),
-            "exact": asked.get("jitter") == "none"
+            "promised": min(float(settings.get("epsilon") or _PROMISED), _PROMISED),
+            "exact": settings.get("jitter") == "none"
             and not spread
             and all(cell.about("mode") == "virtual" for cell in every),
         }
@@ -106,7 +106,7 @@ def timelines(run: StoredRun) -> Iterator[RunPart]:
 
 
 def _shown(cells: Mapping[int, Mapping[str, Timelines]]) -> list[tuple[Floats, ...]]:
-    """Return arrivals, nominal, least and most durations of the shown plan of each L, as columns in s."""
+    """Return arrivals, nominal, least and most durations of the shown plan of each L, as columns, in s."""
     columns = ("arrival_ns", "nominal_ns", "least_ns", "most_ns")
     every = [next(iter(of_length.values())).skills for of_length in cells.values()]
     return [
@@ -126,7 +126,7 @@ STRETCHABLE: Final = more("T_max / T_nom", 1)
 
 
 def figure_5(board: PaperThroughput, *policies: str) -> Trial:
-    """Return the trial of a board: tokens at table II's rate, or of the paper's model on it, and all four L."""
+    """Return the trial of a board: tokens at the rate of table II, or of the paper's model on it, and all four L."""
     profile, rate = board.name.lower().replace(" ", "-"), board.tokens_per_s
     like = Need("tokens/s", f"within {NEAR:.0%} of {rate:g}", lambda found: abs(found / rate - 1) <= NEAR)
     measured = on_board(board.name), *PAPERS_MODEL, like
@@ -138,7 +138,7 @@ def figure_5(board: PaperThroughput, *policies: str) -> Trial:
 
 
 def no_stalls(*policies: str) -> Check:
-    """Check that no more plans stall at any L than is promised: epsilon, but no promise of more than 1 % counts."""
+    """Check that at most the promised share of plans stalls at any L: epsilon, at most 1 %."""
 
     def measure(part: RunPart) -> tuple[list[Ratio], str]:
         promised, even = part.facts["promised"], part.facts["exact"]
@@ -152,17 +152,17 @@ def no_stalls(*policies: str) -> Check:
                 spread = "" if even else f" [{low:.1%}, {high:.1%}]"
                 many = f"{share.k} of {share.n} plans stall{spread}, {_stall_s(cell):.2f} s in the mean"
                 stalled.append(f"{cell.policy} at L = {cell.setting[1]}: {many}")
-        said = "; ".join(stalled) or f"{', '.join(policies)}: no plan stalls"
+        text = "; ".join(stalled) or f"{', '.join(policies)}: no plan stalls"
         regrets = [cell.mean("signed_start_regret") for cell in cells if cell.policy == STREAM]
         starts = [late for late in regrets if late is not None]
         late = f" Stream-to-act starts at S0 {_signed(min(starts))} to {_signed(max(starts))}." if starts else ""
-        return found, f"{said}; promised: at most {promised:.1%}.{late}"
+        return found, f"{text}; promised: at most {promised:.1%}.{late}"
 
     return Check("{}", measure, 0, 1)
 
 
 def after(policy: str, than: str, metric: str, least: float = -inf, most: float = inf) -> Check:
-    """Check how much later a policy's mean start or end is than that of another at every L, as a ratio."""
+    """Check the ratio of the mean starts or ends of two policies at every L."""
 
     def measure(part: RunPart) -> tuple[list[Ratio], str]:
         found = [_compared(part, cells[policy], cells[than], metric) for cells in part.cells.values()]
@@ -175,22 +175,22 @@ def after(policy: str, than: str, metric: str, least: float = -inf, most: float 
 
 
 def stalled_gaps(part: RunPart) -> tuple[list[Ratio], str]:
-    """Measure the share of the gaps between skills that are stalls under naive, at every L."""
+    """Measure the share of the gaps between skills that are stalls of naive, at every L."""
     cells = [of_length[NAIVE] for of_length in part.cells.values()]
     shares = [(cell.mean("stalls") or 0.0) / (cell.setting[2] - 1) for cell in cells]
     return list(map(exact, shares)), _at(part, [f"{share:.0%}" for share in shares])
 
 
 def growth(part: RunPart) -> tuple[list[Ratio], str]:
-    """Measure by how much longer naive stalls at each larger L, from the first that stalls on."""
+    """Measure the increase of naive's stall time at each larger L, from the first that stalls."""
     cells = [of_length[NAIVE] for _, of_length in sorted(part.cells.items())]
     steps = [pair for pair in pairwise(cells) if max(map(_stall_s, pair)) > VISIBLE_S]
-    said = f"{', '.join(f'{_stall_s(cell):.2f}' for cell in cells)} s at L = {', '.join(map(str, sorted(part.cells)))}"
-    return [_compared(part, more, less, "stall_s").difference for less, more in steps], said
+    text = f"{', '.join(f'{_stall_s(cell):.2f}' for cell in cells)} s at L = {', '.join(map(str, sorted(part.cells)))}"
+    return [_compared(part, more, less, "stall_s").difference for less, more in steps], text
 
 
 def early_stalls(part: RunPart) -> tuple[list[Ratio], str]:
-    """Start at five times before S0, T_nom being kept: how far stalls are from what is missing to S0 (theorem T1)."""
+    """Start at five times before S0 with T_nom, and measure how far stalls are from S0 - S (theorem T1)."""
     off_s = []
     for arrival, nominal, *_ in _shown(part.cells):
         safe_s, first_s = float(safe_start(arrival, nominal)[0]), float(arrival[0, 0])
@@ -201,14 +201,14 @@ def early_stalls(part: RunPart) -> tuple[list[Ratio], str]:
 
 
 def stretched(part: RunPart) -> tuple[list[Ratio], str]:
-    """Measure how much before S0 a plan may start without a stall, with the extension that the paper allows."""
+    """Measure how long before S0 a plan can start without a stall, with the extension that the paper allows."""
     found = []
     for arrival, nominal, least, most in _shown(part.cells):
         start_s = float(elastic(Plans(arrival, nominal, np.minimum(least, nominal), most)).start_s[0, 0])
         safe_s = float(safe_start(arrival, nominal)[0])
         found.append((safe_s - start_s, f"{start_s:.2f} s instead of S0 = {safe_s:.2f} s"))
-    early_s, said = max(found)
-    return [exact(early_s)], said
+    early_s, text = max(found)
+    return [exact(early_s)], text
 
 
 def _at(part: RunPart, texts: Sequence[str]) -> str:
@@ -216,19 +216,19 @@ def _at(part: RunPart, texts: Sequence[str]) -> str:
 
 
 def _signed(share: float) -> str:
-    """Write a share with its sign; nothing is +0.0%."""
+    """Format a share with its sign; zero is +0.0%."""
     return f"{round(share, 3) + 0.0:+.1%}"
 
 
 def _compared(part: RunPart, above: Timelines, below: Timelines, metric: str) -> Change:
-    """Compare a metric's mean; plan by plan where both ran the same plans."""
+    """Compare the mean of a metric; plan by plan if both ran the same plans."""
     one, other = above.values(metric), below.values(metric)
     same = above.setting == below.setting and len(one) == len(other)
     return change(one, other, part.run.bootstrap_seed, paired=same, exact=part.facts["exact"])
 
 
 def plane(run: StoredRun) -> Iterator[RunPart]:
-    """Yield a run of points of rate and tokens a skill."""
+    """Yield a boundary run."""
     if not run.table(BOUNDARY).empty:
         least = float(run.manifest.get("configuration", {}).get("t_min", 1.0))
         yield RunPart(run, {"tokens": "with jitter" if is_random(run) else "evenly", "T_min / T_nom": least})
@@ -239,7 +239,7 @@ SHORTER: Final = Need("T_min / T_nom", "less than 1, else both have the same lin
 
 
 def stalls_at(side: str, part: RunPart) -> tuple[list[Ratio], str]:
-    """Measure at which share of the points above or below R = L / T_min skills that run for T_nom stall, as naive's."""
+    """Measure the share of the points above or below R = L / T_min at which naive, which runs for T_nom, stalls."""
     least_s = float(grid_of(part.run, "t_min")["duration_s"].iloc[0])
     points = grid_of(part.run, "t_nom")
     points = points[(points["tokens_per_s"] >= points["tokens_per_skill"] / least_s) == (side == "above")]
@@ -257,17 +257,17 @@ CHOSEN: Final[dict[str, Any]] = {
     "phase_rates": [2.0, 12.0],
     "phase_gaps_m": [6.0, 30.0],
 }
-"""The defaults of `s2a-bench ccrb` besides the scenario's: a test holds them together."""
+"""The defaults of `s2a-bench ccrb` besides the scenario's; a test compares them."""
 _SPANS: Final = ("phase_rates", "phase_gaps_m")
 _VARIED: Final = ("rear_gap_m", "gap")
-"""What the diagram varies itself; its c is the board's."""
+"""The settings that the diagram varies; its c is the board's."""
 
 
 def drives(run: StoredRun) -> Iterator[RunPart]:
-    """Yield a run of drives, with the settings that are not those of the chosen point or diagram."""
-    asked, scenario, rows = run.manifest.get("configuration", {}), CcrbOptions(), run.table(ROLLOUTS)
+    """Yield a CCRB run, with the settings that differ from the chosen point or diagram."""
+    settings, scenario, rows = run.manifest.get("configuration", {}), CcrbOptions(), run.table(ROLLOUTS)
     wanted = {**scenario.to_manifest(), "t_nom_s": scenario.durations.nominal_s, **CHOSEN}
-    other = {name: found for name in wanted if (found := asked.get(name, UNKNOWN)) != wanted[name]}
+    other = {name: found for name in wanted if (found := settings.get(name, UNKNOWN)) != wanted[name]}
     facts = {name: ", ".join(dict.fromkeys(rows[name])) for name in ("study", "policy")}
     for name, free in (("point", _SPANS), ("diagram", _VARIED)):
         facts[name] = ", ".join(f"{key} {found}" for key, found in other.items() if key not in free) or "as chosen"
@@ -278,26 +278,26 @@ BOARD: Final = one_of("source", emulated("jetson-agx-orin", ORIN.tokens_per_s))
 
 
 def outcome(policy: str, part: RunPart) -> tuple[list[Ratio], str]:
-    """Say what becomes of the cars under one policy at the chosen point, and how far that carries."""
-    rows, asked = rollouts_of(part.run, "point"), configuration(part.run)
+    """Measure whether the paper's outcome of a policy occurs at the chosen point, and report its share."""
+    rows, settings = rollouts_of(part.run, "point"), configuration(part.run)
     row = rows[rows["policy"] == policy].iloc[0]
     speed = "" if row["outcome"] == "none" else f" at {row['impact_speed_mps']:.1f} m/s"
     share = "its share of the diagram: run with --phase"
     if has(part.run, "phase"):
-        found = share_of(scenes_of(part.run, "phase", asked["gap"]), "paper").value
+        found = share_of(scenes_of(part.run, "phase", settings["gap"]), "paper").value
         share = f"the paper's outcomes of all three policies hold at {found:.1%} of the diagram"
-    point = f"R = {row['tokens_per_s']:g}, front gap {asked['front_gap_m']:g} m, rear gap {asked['rear_gap_m']:g} m"
-    outcome = f"{OUTCOME_LABELS[str(row['outcome'])]}{speed}; {share}. {tokens_line(part.run)}"
-    note = f"{outcome} {point}, gap behaviour {asked['gap']}; {law(asked)}"
-    return [exact(float(row["outcome"] == PAPER[policy]))], note
+    gaps = f"front gap {settings['front_gap_m']:g} m, rear gap {settings['rear_gap_m']:g} m"
+    point = f"R = {row['tokens_per_s']:g}, {gaps}, gap behaviour {settings['gap']}; {law(settings)}"
+    text = f"{OUTCOME_LABELS[str(row['outcome'])]}{speed}; {share}. {tokens_line(part.run)} {point}"
+    return [exact(float(row["outcome"] == PAPER[policy]))], text
 
 
 def worse(policy: str, part: RunPart) -> tuple[list[Ratio], str]:
-    """Measure at how much more of the phase diagram a policy is worse than stream-to-act than it is better."""
-    found, said = [], []
+    """Measure the share of the phase diagram at which a policy is worse than stream-to-act, minus that of better."""
+    found, texts = [], []
     for gap in GAPS:
         scenes = scenes_of(part.run, "phase", gap)
         bad, good = (share_of(scenes, f"{policy.partition('-')[0]}_{side}").value for side in ("worse", "better"))
-        found.append(exact(bad - good) if bad != good else Ratio(0.0, -1.0, 1.0))  # as many: neither more nor fewer
-        said.append(f"{gap} {bad:.0%} worse and {good:.0%} better")
-    return found, ", ".join(said)
+        found.append(exact(bad - good) if bad != good else Ratio(0.0, -1.0, 1.0))  # undecided
+        texts.append(f"{gap} {bad:.0%} worse and {good:.0%} better")
+    return found, ", ".join(texts)

@@ -1,4 +1,4 @@
-"""What latency and throughput runs are judged by: facts of machine and model, stages of requests, tokens a second."""
+"""Measures of latency and throughput runs: facts of machine and model, stages of requests, tokens a second."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ from s2a_bench.writers.tables import interval, mean_sd
 
 _MODEL: Final = "MiniCPM-V 2.6"
 _MODEL_NAMES: Final = re.compile("minicpmv?26")
-"""As files and headers have it, letters and digits only; the paper writes MiniCPM-2.6."""
+"""Its name in files and headers, letters and digits only; the paper writes MiniCPM-2.6."""
 _LAYERS: Final = 28
-"""Of that model: with as many or more asked for, all are on the GPU."""
+"""Layers of that model: with `--gpu-layers` this or more, all are on the GPU."""
 NEAR: Final = 0.10
-"""Means within this share of the paper's are called the same: it gives no spread from machine to machine."""
+"""Means within this share of the paper's are equal: the paper gives no spread between machines."""
 _METRIC: Final = "e2e_without_inference"
 _HTTP, _BINARY, _LLAMA_SERVER, _ROS = "http/as-deployed", "http/binary", "http/llama-server", "ros"
 _NAMES: Final = ("engine", "model", "quantisation")
-"""What llama-server is called, and our engine on the same file."""
+"""Fields that differ between llama-server and the engine `llama` on the same file."""
 _LAUNCHES: Final = 3
 _SMALL: Final = 50_000
 
 
 def one_of(name: str, *values: str) -> Need:
-    """Need a fact to be one of these texts."""
+    """Return the need that a fact is one of these texts."""
     return Need(name, " or ".join(values), lambda found: found in values)
 
 
 def on_board(board: str) -> Need:
-    """Need a run to be measured on the board of that name; another word behind it would make it another one."""
+    """Return the need for a board of that name; with "super" or "laptop" after it, it is another one."""
     name = re.escape(board.removeprefix("Jetson "))
     known = re.compile(rf"(?<!\S){name}(?![^\s,])(?! (?:super|laptop)\b)", re.IGNORECASE)
     return Need("board", board, lambda found: bool(known.search(found)))
@@ -54,28 +54,28 @@ PAPERS_MODEL: Final = (
     one_of("processor", "all layers on the GPU"),
     one_of("tokens", "measured"),
 )
-"""What a claim about a model needs; an unknown provenance meets none of it."""
+"""The needs of a claim about a model; an unknown provenance meets none."""
 
 
 def facts_of(run: StoredRun, origins: Sequence[Provenance]) -> dict[str, Any]:
-    """Return machine, model and where its numbers come from; what nobody told is unknown."""
+    """Return the facts of machine, model and provenance; an absent one is unknown."""
     facts, model = run.manifest.get("environment", {}), run.manifest.get("model") or {}
     gpus = " + ".join(str(gpu.get("name")) for gpu in facts.get("gpus", []))
-    told = {
+    known = {
         name: ", ".join(filter(None, dict.fromkeys(getattr(origin, name) for origin in origins))) or UNKNOWN
         for name in ("model", "weights", "tokens", "quantisation", "link")
     }
-    names = re.sub(r"[^a-z0-9]", "", f"{told['model']} {model.get('model')}".lower())
-    return told | {
+    names = re.sub(r"[^a-z0-9]", "", f"{known['model']} {model.get('model')}".lower())
+    return known | {
         "board": ", ".join(filter(None, (facts.get("board"), facts.get("cpu"), gpus))) or "a machine that is not known",
-        "model": _MODEL if _MODEL_NAMES.search(names) else told["model"],
+        "model": _MODEL if _MODEL_NAMES.search(names) else known["model"],
         "processor": _processor(model, {origin.model_sha256 for origin in origins}),
         "source": _source(run, origins),
     }
 
 
 def _processor(model: Mapping[str, Any], answered: set[str]) -> str:
-    """Return where the layers of the model are; unknown where it is not the one that answered."""
+    """Return the processor of the model's layers; unknown if another model answered."""
     layers, offload = model.get("gpu_layers"), model.get("gpu_offload_supported")
     if not isinstance(layers, int) or offload is None or answered - {model.get("model_sha256")}:
         return UNKNOWN
@@ -83,7 +83,7 @@ def _processor(model: Mapping[str, Any], answered: set[str]) -> str:
 
 
 def _source(run: StoredRun, origins: Sequence[Provenance]) -> str:
-    """Return which of the paper's boards is emulated, with its rate; else where tokens come from."""
+    """Return the emulated board of the paper with its rate, else the origin of the tokens."""
     profiles = {origin.profile if origin.emulated else "" for origin in origins}
     for board in run.manifest.get("boards", []):
         if board.get("origin") == "paper" and {board["name"]} == profiles:
@@ -92,22 +92,22 @@ def _source(run: StoredRun, origins: Sequence[Provenance]) -> str:
 
 
 def emulated(profile: str, rate: float) -> str:
-    """Return whose tokens are emulated at the paper's rate."""
+    """Return the text of a source that emulates a board at the paper's rate."""
     return f"EMULATED after {profile}, {rate:g} tokens/s of table II"
 
 
 def exact(value: float) -> Ratio:
-    """Return a value that was computed, not sampled."""
+    """Return a computed value, without spread."""
     return Ratio(value, value, value)
 
 
 def change(over: Floats, base: Floats, seed: int, *, paired: bool = False, exact: bool = False) -> Change:
-    """Compare the means of two sides in order of time; ``paired`` where row i of both belongs together."""
+    """Compare the means of two sides in order of time; ``paired`` if rows i of both belong together."""
     return change_between([[*base[:, None]]], [[*over[:, None]]], "mean", seed=seed, paired=paired, exact=exact)
 
 
 def pairs(run: StoredRun) -> Iterator[RunPart]:
-    """Yield HTTP as usually deployed, or llama-server, with ROS: every cell of one with every cell of the other."""
+    """Yield every pair of a cell of HTTP as usually deployed, or llama-server, and a cell of ROS."""
     cells = cells_of(run)
     https = [cell for cell in cells if "/".join(cell.path) in {_HTTP, _LLAMA_SERVER}]
     for pair in product(https, [cell for cell in cells if cell.pipeline == _ROS]):
@@ -123,7 +123,7 @@ def pairs(run: StoredRun) -> Iterator[RunPart]:
 
 
 def bodies(run: StoredRun) -> Iterator[RunPart]:
-    """Yield HTTP with Base64 and without, of the same payload and size."""
+    """Yield pairs of HTTP with Base64 and without, of the same payload and size."""
     cells = [cell for cell in cells_of(run) if cell.good["payload_bytes"].notna().any()]
     coded, plain = ([cell for cell in cells if "/".join(cell.path) == path] for path in (_HTTP, _BINARY))
     for pair in product(coded, plain):
@@ -133,12 +133,12 @@ def bodies(run: StoredRun) -> Iterator[RunPart]:
 
 
 def _pair(run: StoredRun, pair: tuple[RequestCell, RequestCell], facts: dict[str, Any], about: str) -> RunPart:
-    told = {name: " and ".join(dict.fromkeys(cell.about[name] for cell in pair)) for name in ("mode", "payload")}
-    return RunPart(run, facts_of(run, [run.origins.of(cell.name) for cell in pair]) | told | facts, pair, about)
+    both = {name: " and ".join(dict.fromkeys(cell.about[name] for cell in pair)) for name in ("mode", "payload")}
+    return RunPart(run, facts_of(run, [run.origins.of(cell.name) for cell in pair]) | both | facts, pair, about)
 
 
 def _unlike(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
-    """Return in what frames and engines differ; llama-server on the file of our engine counts as that engine."""
+    """Return the differences of frames and engines; llama-server and llama on the same file are equal."""
     http, ros = (run.origins.of(cell.name).to_dict() | {"size": cell.about["size"]} for cell in pair)
     engines = http["engine"], ros["engine"]
     same_file = engines == ("llama-server", "llama") and http["model_sha256"] == ros["model_sha256"] != ""
@@ -151,7 +151,7 @@ def _unlike(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
 
 
 def _others(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
-    """Return which servers the run did not start, and what names them."""
+    """Return the servers that the run did not start, and the options that name them."""
     pipelines = run.manifest.get("configuration", {}).get("pipelines", {})
     found = [f"{cell.name} {UNKNOWN}" for cell in pair if cell.name not in pipelines]
     for cell in pair:
@@ -170,36 +170,36 @@ COMPARED: Final = (
     one_of("servers", "started by the run"),
     Need("launches", f"{_LAUNCHES} or more", lambda found: found >= _LAUNCHES),
 )
-"""What a pair of HTTP/JSON and ROS has to be."""
+"""The needs of a pair of HTTP/JSON and ROS."""
 LARGE: Final = Need("bytes a picture", f"{_SMALL} or more, by a larger --size", lambda found: found >= _SMALL)
 
 
 def times_as_long(part: RunPart) -> tuple[list[Ratio], str]:
-    """Measure how much longer HTTP takes in the mean, launch by launch and block by block."""
+    """Measure the ratio of the mean times of HTTP and ROS, launch by launch and block by block."""
     ratio = ratio_of_launches(*_blocks(part.cells), part.run.bootstrap_seed, "mean") or Ratio(None, None, None)
     return [ratio], interval(ratio)
 
 
 def times_as_large(part: RunPart) -> tuple[list[Ratio], str]:
-    """Measure how much larger bodies are with Base64, in the mean."""
+    """Measure the ratio of the mean bodies with and without Base64."""
     ratio = _bytes(part.cells[0]) / _bytes(part.cells[1])
     return [exact(ratio)], f"{ratio:.4f}"
 
 
 def shares(side: int, groups: Mapping[str, Sequence[str]], part: RunPart) -> tuple[list[Ratio], str]:
-    """Measure what share of the time of one side, inference left out, groups of stages take."""
+    """Measure the shares of groups of stages in the time of one side without inference."""
     cell: RequestCell = part.cells[side]
     whole, seed = cell.values_ms(_METRIC), part.run.bootstrap_seed
     spent = {stage: _spent(cell, [stage]).sum() for stage, of in cell.stages.items() if of != "inference"}
-    parts = [_spent(cell, stages) for stages in groups.values()]
-    found = [change(each, whole, seed, paired=True).ratio if each.any() else exact(0.0) for each in parts]
+    of_groups = [_spent(cell, stages) for stages in groups.values()]
+    found = [change(each, whole, seed, paired=True).ratio if each.any() else exact(0.0) for each in of_groups]
     spread = ["" if each.low is None else f" [{each.low:.0%}, {each.high:.0%}]" for each in found]
-    texts = [f"{each.value or 0:.0%}{more}{said}" for each, more, said in zip(found, spread, groups, strict=True)]
+    texts = [f"{each.value or 0:.0%}{more}{name}" for each, more, name in zip(found, spread, groups, strict=True)]
     return found, f"{', '.join(texts)} of {cell.name}; the longest stage is {max(spent, key=spent.__getitem__)}"
 
 
 def _spent(cell: RequestCell, stages: Sequence[str]) -> Floats:
-    """Return what stages took together, one value a sample that has the metric, in ms."""
+    """Return the sum of stages in ms, for each sample that has the metric."""
     good = cell.good[cell.good[f"{_METRIC}_ns"].notna()]
     names = [f"{stage}_ns" for stage in stages if f"{stage}_ns" in good]
     spent: Floats = good[names].fillna(0).sum(axis=1).to_numpy(dtype="float64") / 1e6
@@ -211,12 +211,12 @@ def _bytes(cell: RequestCell) -> float:
 
 
 def _metric(pair: Sequence[RequestCell]) -> str:
-    """Return what is compared: the `ingest` of a llama-server has work in it that our engine counts as inference."""
+    """Return the metric: the `ingest` of a llama-server includes work that other engines count as inference."""
     return "e2e_without_model" if any(cell.has_ingest for cell in pair) else _METRIC
 
 
 def _blocks(pair: Sequence[RequestCell]) -> tuple[Mapping[int, Blocks], Mapping[int, Blocks]]:
-    """Return the values of both sides by launch and block, without the blocks that one side lacks."""
+    """Return the values of both sides by launch and block, for the blocks that both have."""
     sides = [cell.by_launch(_metric(pair)) for cell in pair]
     both = {launch: sides[0][launch].keys() & sides[1][launch].keys() for launch in sides[0].keys() & sides[1].keys()}
     http, ros = ({launch: {block: side[launch][block] for block in both[launch]} for launch in both} for side in sides)
@@ -227,15 +227,15 @@ def speeds(run: StoredRun) -> Iterator[RunPart]:
     """Yield every cell that has a rate."""
     for speed in throughput_cells(run):
         if speed.values("tokens_per_s").size:
-            told = {"T_eval": "the engine's" if speed.has_engine_time else "the client's"}
-            yield RunPart(run, facts_of(run, [run.origins.of(speed.name)]) | told, speed)
+            source = {"T_eval": "the engine's" if speed.has_engine_time else "the client's"}
+            yield RunPart(run, facts_of(run, [run.origins.of(speed.name)]) | source, speed)
 
 
 KNOWN: Final = Need("quantisation", "known (the paper does not say which it used)", lambda found: found != UNKNOWN)
 
 
 def speed_over(board: PaperThroughput, part: RunPart) -> tuple[list[Ratio], str]:
-    """Measure tokens a second over those of the paper's board."""
+    """Measure the ratio of tokens a second to those of the paper's board."""
     values = part.cells.values("tokens_per_s")
     found = change(values, np.full(len(values), board.tokens_per_s), part.run.bootstrap_seed)
     rate = summarise(values)

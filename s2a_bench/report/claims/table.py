@@ -1,4 +1,4 @@
-"""The paper's claims, a row each: where, the sentence, the rule in words, the trial, and the checks that judge it."""
+"""The paper's claims, a row each: section, sentence, rule, trial, and checks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One page about runs that needs no network, and the same tables and figures as LaTeX, CSV and Markdown."""
+"""One page about runs that needs no network; the same tables and figures as LaTeX, CSV and Markdown."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, option
 
 GENERATOR = "s2a-bench report"
-"""What the page says it was made by: such a file may be written over."""
+"""The mark of a page, which a new report may overwrite."""
 _HEAD_CHARS = 4096
-"""Where a file says who made it."""
+"""A page has its mark in these first characters."""
 
 
 class ReportConfig(Options):
-    """Runs, and where everything about them goes; None: it is not wanted."""
+    """Runs, and the outputs about them; None writes no such output."""
 
     runs: list[Path] = option(..., "run folders, or the folder of a sweep; several side by side", argument=True)
-    output: Path | None = option(None, "the page, one HTML file [default: report.html, if nothing else is asked for]")
+    output: Path | None = option(None, "the page, one HTML file [default: report.html, if there is no other output]")
     latex: Path | None = option(None, "folder for LaTeX tables (booktabs, siunitx) and figures as PDF")
     csv: Path | None = option(None, "folder for CSV tables with every digit")
     markdown: Path | None = option(None, "all tables as one Markdown file")
-    against: str = option("", "paper: put the paper's claims beside ours, each with a verdict and its evidence")
+    against: str = option("", "paper: add the paper's claims, each with a verdict and its evidence")
 
     @property
     def page(self) -> Path | None:
         return self.output if self.output or self.latex or self.csv or self.markdown else Path("report.html")
 
     def check(self) -> None:
-        """Refuse, before any work, to write over what no report wrote; raises UsageError naming the field."""
+        """Raise UsageError if an output would overwrite a file that no report wrote."""
         if self.against not in {"", "paper"}:
             raise UsageError(
                 f"`against`: '{self.against}' should be paper; two runs are compared with s2a-bench compare"
@@ -48,8 +48,8 @@ def _check_file(field: str, path: Path) -> None:
         return
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
-            ours = GENERATOR in file.read(_HEAD_CHARS)
+            is_report = GENERATOR in file.read(_HEAD_CHARS)
     except OSError as error:
         raise UsageError(f"{field}: cannot read {path}: {error.strerror}; name another file") from error
-    if not ours:
-        raise UsageError(f"{field}: {path} is there, and s2a-bench report did not write it; name another file")
+    if not is_report:
+        raise UsageError(f"{field}: {path} exists, and s2a-bench report did not write it; name another file")

@@ -1,4 +1,4 @@
-"""From folders to chapters and what they show: a run is one, a sweep an overview and what its cells' runs come to."""
+"""From run folders to chapters: one for a run; an overview and the runs of the cells for a sweep."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from s2a_bench.store.sweep import Sweep, is_sweep, read_sweep
 from s2a_bench.writers.tables import Note, TextTable
 
 MOST_CHAPTERS = 12
-"""Runs of a sweep that get a chapter each; the others stand in the overview only."""
+"""Runs of a sweep that have a chapter; the others are in the overview only."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chapter:
     """One run on the page, or several of a sweep as one.
 
-    ``name`` is its files' folder, ``command`` what was typed to get it, ``attached`` texts that it needs, by file name.
+    ``name`` is the folder of its files, ``command`` its command line, ``attached`` the texts of files by name.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Chapter:
 
 
 def read_chapters(paths: Sequence[Path], *, against_paper: bool) -> list[Chapter]:
-    """Read run folders and sweeps, each once, in their order; raises StoreError where one is none, or damaged."""
+    """Read run folders and sweeps, each once, in order; raises StoreError for a damaged one."""
     found: list[Chapter] = []
     for path in dict.fromkeys(path.resolve() for path in paths):
         run = read_run(path)
@@ -54,23 +54,23 @@ def read_chapters(paths: Sequence[Path], *, against_paper: bool) -> list[Chapter
 
 
 def title_of(manifest: Mapping[str, Any]) -> str:
-    """Name a run by its command, host and time."""
+    """Return command, host and time of a run."""
     return f"{manifest.get('command', 'a run')} on {manifest.get('host', 'an unknown host')}, {when(manifest)}"
 
 
 def when(manifest: Mapping[str, Any]) -> str:
-    """Return when a run began, for people."""
+    """Return the start of a run as text."""
     return str(manifest.get("started", "at an unknown time")).replace("T", " ").replace("+00:00", " UTC")
 
 
 def repeat_command(manifest: Mapping[str, Any]) -> str:
-    """Write the command line that makes such a run, quoted for a shell."""
+    """Return the command line of a run, quoted for a shell."""
     return shlex.join(["s2a-bench", *map(str, manifest.get("argv", [])[1:])])
 
 
 def differences_of(chapters: Sequence[Chapter]) -> list[str]:
-    """Return which runs come from another machine than the first, and in one line what else is not the same."""
-    said: list[str] = []
+    """Return a line for each run of another machine than the first, and one line of all other differences."""
+    lines: list[str] = []
     others: list[Difference] = []
     of_command: dict[str, StoredRun] = {}
     for chapter in chapters:
@@ -79,16 +79,16 @@ def differences_of(chapters: Sequence[Chapter]) -> list[str]:
         others += [each for each in found if not each.what.startswith(SETTING)]
         others += [each for each in differences(same, chapter.run) if each.what.startswith(SETTING)]
         if what := "; ".join(str(each) for each in found if is_other_machine(each)):
-            said.append(
+            lines.append(
                 f"{chapter.title} ran on another machine than {chapters[0].title} ({what}): "
-                "their numbers stand side by side, and none is made of both."
+                "their numbers are side by side, and none combines both."
             )
     names = differing_names(others)
-    return [*said, f"The runs are not alike in {names}."] if names else said
+    return [*lines, f"The runs differ in {names}."] if names else lines
 
 
 def _chapter(run: StoredRun, title: str, against_paper: bool, **more: Any) -> Chapter:
-    """Make a run's chapter; one that did not end may lack what its command's tables need."""
+    """Make the chapter of a run; an unfinished one may lack the rows of its tables."""
     manifest = run.manifest
     caveats = list(_unfinished(manifest))
     try:
@@ -97,7 +97,7 @@ def _chapter(run: StoredRun, title: str, against_paper: bool, **more: Any) -> Ch
     except StoreError:
         if not caveats:
             raise
-        content = Shown(("What there is of this run is not enough for its tables; its CSV files hold it.",))
+        content = Shown(("This run has too few rows for its tables; its CSV files have them.",))
     command = more.pop("command", repeat_command(manifest))
     return Chapter(_slug(run.path.name), title, run, content, command, caveats, **more)
 
@@ -109,14 +109,14 @@ def _slug(name: str) -> str:
 def _unfinished(manifest: Mapping[str, Any]) -> Iterator[str]:
     state = manifest.get("state")
     if state == "running":
-        yield "This run has not finished: it is still running, or was killed. What follows are its rows so far."
+        yield "This run has not finished: it is still running, or was killed. The following are its rows so far."
     elif state != "finished":
         why = f": {manifest['error']}" if manifest.get("error") else ""
-        yield f"This run did not come to its end ({state}{why}). What follows are its rows until then."
+        yield f"This run ended early ({state}{why}). The following are its rows until then."
 
 
 def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
-    """Yield the overview, runs that are computed as one, and the others one by one."""
+    """Yield the overview, the pools of computed runs, and the other runs."""
     manifest, runs = sweep.manifest, list(sweep.runs())
     head = StoredRun(sweep.path, {**manifest, "provenance": sweep.origins.to_manifest()})
     copy = sweep.path / "sweep.toml"
@@ -128,7 +128,7 @@ def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
     if len(single) > MOST_CHAPTERS:
         caveats.append(
             f"{len(single)} cells were run: the first {MOST_CHAPTERS} have a chapter each, all are in the overview; "
-            "give the folders of others to s2a-bench report to see them."
+            "pass the folders of others to s2a-bench report to see them."
         )
     command = repeat_command(manifest)
     yield Chapter(_slug(sweep.path.name), title_of(manifest), head, content, command, caveats, attached)
@@ -140,23 +140,23 @@ def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
 
 
 def _named(chapter: Chapter, place: int, chapters: Sequence[Chapter]) -> Chapter:
-    """Give a chapter a name that no other has: two of one folder, or of folders of one name, are numbered."""
+    """Append a number to the second and later of equal names."""
     same = [other for other in chapters if other.name == chapter.name]
     number = sum(other.name == chapter.name for other in chapters[: place + 1])
     return chapter if len(same) == 1 or number == 1 else replace(chapter, name=f"{chapter.name}-{number}")
 
 
 def content_of(run: StoredRun, *, against_paper: bool) -> Shown:
-    """Return what a run shows; of a run without rows nothing, of an unknown command the names of its tables."""
+    """Return the content of a run; for an unknown command it is the names of its tables."""
     if not run.row_counts():
         return Shown(("The run has no rows: it ended before anything was measured.",))
     if (experiment := experiment_of(str(run.manifest["command"]))) is not None:
         return experiment.show(run, against="paper" if against_paper else "")
     rows = [f"{name} ({count} rows)" for name, count in run.row_counts().items()]
-    return Shown((f"There is no view of {run.manifest['command']} runs; this one holds {', '.join(rows)}.",))
+    return Shown((f"There is no view of {run.manifest['command']} runs; this one has {', '.join(rows)}.",))
 
 
 def labels_of(tables: Iterable[TextTable]) -> list[str]:
-    """Return the labels that a run carries, since the notes of its tables do."""
+    """Return the labels in the notes of tables, each once."""
     notes = [note for table in tables for note in table.notes if isinstance(note, Note)]
     return list(dict.fromkeys(label for note in notes for label in note.labels))

@@ -1,4 +1,4 @@
-"""What a report writes: figures drawn once, the page, and tables for papers and programs, in a folder a run."""
+"""Write a report: figures, the page, and tables for papers and programs, in a folder a run."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class DrawnFigure:
-    """One figure: SVG to be put into HTML, and PDF where it was asked for.
+    """One figure as SVG for HTML, and as PDF if that is an output.
 
-    ``title`` and ``notes`` are its caption; a ``wide`` one takes both columns of a paper.
+    ``title`` and ``notes`` are its caption; a ``wide`` one spans both columns of a paper.
     """
 
     svg: str
@@ -43,7 +43,7 @@ class DrawnFigure:
 
 
 def draw(name: str, builders: Mapping[str, Callable[[], Figure]], *, pdf: bool) -> dict[str, DrawnFigure]:
-    """Build each figure once; ``name`` makes the ids of its parts differ from those of all other figures."""
+    """Build each figure once; ``name`` makes its ids differ from those of other figures."""
     import matplotlib as mpl
 
     found = {}
@@ -70,7 +70,7 @@ def _saved(figure: Figure, suffix: str, *without: str) -> bytes:
 
 
 def inline(svg: str, prefix: str) -> str:
-    """Make an SVG fit for HTML: no namespaces, metadata and styles (they would be the page's), ids like no others."""
+    """Prepare an SVG for HTML: no namespaces, metadata and styles (they would apply to the page), unique ids."""
     svg = re.sub(r"<!--.*?-->\s*|<(metadata|style)\b.*?</\1>\s*", "", svg, flags=re.DOTALL)
     svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg)
     svg = svg.replace("xlink:href=", "href=")
@@ -79,12 +79,12 @@ def inline(svg: str, prefix: str) -> str:
 
 _MARK = f"<!-- {GENERATOR} -->"
 _LONG_ROWS = 30
-"""A page of a paper holds no more."""
+"""A longer table needs more than one page."""
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A report before it is written: its chapters, the claims judged by their runs, and what must be known first."""
+    """A report: its chapters, the claims judged by their runs, and the caveats."""
 
     chapters: Sequence[Chapter]
     judged: Sequence[Judged]
@@ -96,7 +96,7 @@ class Report:
 
 
 def make_report(chapters: Sequence[Chapter], *, against_paper: bool) -> Report:
-    """Judge the claims where that is wanted, and look for runs that are not alike."""
+    """Judge the claims if ``against_paper``, and find the differences between the runs."""
     runs = [chapter.run for chapter in chapters]
     with fits(*runs):
         judged = judge_claims(runs) if against_paper else []
@@ -104,7 +104,7 @@ def make_report(chapters: Sequence[Chapter], *, against_paper: bool) -> Report:
 
 
 def write_report(report: Report, config: ReportConfig) -> list[Path]:
-    """Write what is wanted and return the files; figures are drawn once. Raises StoreError."""
+    """Write the outputs and return their files; raises StoreError."""
     drawn = {
         chapter.name: draw(chapter.name, chapter.content.figures, pdf=config.latex is not None)
         for chapter in report.chapters
@@ -130,12 +130,12 @@ def write_report(report: Report, config: ReportConfig) -> list[Path]:
 
 
 def _latex(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> Iterator[tuple[str, str | bytes]]:
-    r"""Yield every table as .tex and figure as .pdf by its path, and a report.tex that shows all of them."""
-    parts = []
+    """Yield every table as .tex and figure as .pdf by its path, and a report.tex with all of them."""
+    sections = []
     if report.judged:
         table = _claims(report)
         yield "claims.tex", to_siunitx(table, ("18mm", "34mm", "44mm", "20mm", "46mm", "78mm"), long=True)
-        parts.append(r"\input{claims}")
+        sections.append(r"\input{claims}")
     for chapter in report.chapters:
         lines = [f"\\section*{{{escape(chapter.title)}}}"]
         for name, table in chapter.content.tables.items():
@@ -147,8 +147,8 @@ def _latex(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> Iterator
                 graphic = f"\\includegraphics{{{chapter.name}/{name}.pdf}}"
                 caption = escape(" ".join((f"{figure.title}.", *figure.notes)))
                 lines.append(f"\\begin{{figure}}[htbp]\\centering{graphic}\\caption{{{caption}}}\\end{{figure}}")
-        parts.append("\n".join(lines))
-    yield "report.tex", document("s2a-bench report", parts)
+        sections.append("\n".join(lines))
+    yield "report.tex", document("s2a-bench report", sections)
 
 
 def _csv(report: Report) -> Iterator[tuple[str, str]]:
@@ -165,18 +165,17 @@ def _csv(report: Report) -> Iterator[tuple[str, str]]:
 
 
 def _claims(report: Report) -> TextTable:
-    """Lay out the verdicts, with where the numbers of the judged runs come from."""
     return replace(claim_table(report.judged), provenance=report.origins.line)
 
 
 def _markdown(report: Report) -> str:
-    parts = [_MARK, *(f"> {markdown_text(caveat)}" for caveat in report.caveats)]
+    blocks = [_MARK, *(f"> {markdown_text(caveat)}" for caveat in report.caveats)]
     if report.judged:
-        parts += [f"## The paper's claims\n\n{tally(report.judged)}.", to_markdown(_claims(report))]
+        blocks += [f"## The paper's claims\n\n{tally(report.judged)}.", to_markdown(_claims(report))]
     for chapter in report.chapters:
-        parts.append(f"## {markdown_text(chapter.title)}")
-        parts += [f"> {markdown_text(caveat)}" for caveat in chapter.caveats]
-        parts.append("\n".join(f"- {markdown_text(text)}" for text in chapter.content.sentences))
-        parts.append(f"```sh\n{visible(chapter.command)}\n```")
-        parts += [to_markdown(table) for table in chapter.content.tables.values()]
-    return "\n\n".join(part for part in parts if part) + "\n"
+        blocks.append(f"## {markdown_text(chapter.title)}")
+        blocks += [f"> {markdown_text(caveat)}" for caveat in chapter.caveats]
+        blocks.append("\n".join(f"- {markdown_text(text)}" for text in chapter.content.sentences))
+        blocks.append(f"```sh\n{visible(chapter.command)}\n```")
+        blocks += [to_markdown(table) for table in chapter.content.tables.values()]
+    return "\n\n".join(filter(None, blocks)) + "\n"

@@ -1,4 +1,4 @@
-"""Timelines of plans and control ticks of chunks as the page draws them: panels of lanes of bars, in seconds."""
+"""The page's timelines of plans and control ticks of chunks: panels of lanes of bars, in seconds."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from s2a_bench.experiments.timeline.view.figures import policy_colours
 from s2a_bench.experiments.timeline.view.tables import seconds
 
 MOST_PANELS = 60
-"""More would make the page heavy; the tables and CSV files have all."""
+"""Limit on the size of the page; the tables and CSV files have all."""
 TICKS = 6
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """One skill, chunk or stall; ``text`` says all about it, ``colour`` is its own where lanes have several."""
+    """One skill, chunk or stall; ``text`` describes it, ``colour`` replaces that of the lane."""
 
     kind: str
     start_s: float
@@ -31,7 +31,7 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class PolicyRow:
-    """One policy's plan: where it waits, acts and stalls; S0 if it has one, and the tokens if they are its own."""
+    """One policy's plan: its bars, S0 if it has one, and its tokens if lanes do not share them."""
 
     name: str
     colour: str
@@ -40,12 +40,12 @@ class PolicyRow:
     safe_start_s: float | None
     tokens_s: tuple[float, ...]
     complete_s: tuple[float, ...]
-    words: str
+    summary: str
 
 
 @dataclass(frozen=True, slots=True)
 class BoardPanel:
-    """One board and granularity; ``tokens`` and ``complete`` are those that all lanes share, empty where none do."""
+    """One board and granularity; ``tokens_s`` and ``complete_s`` are empty if lanes do not share them."""
 
     title: str
     end_s: float
@@ -56,7 +56,7 @@ class BoardPanel:
 
 
 def panels_of(cells: Sequence[Timelines]) -> list[BoardPanel]:
-    """Lay out the shown plan of every cell, a panel a setting."""
+    """Return the panels of the shown plans, one for each setting."""
     colours = policy_colours(list(dict.fromkeys(cell.policy for cell in cells)))
     return [_panel(setting, group, colours) for setting, group in list(panels(cells))[:MOST_PANELS]]
 
@@ -79,7 +79,7 @@ def _panel(setting: tuple[str, int, int, float], cells: Sequence[Timelines], col
 
 
 def ticks_of(end_s: float) -> tuple[float, ...]:
-    """Return round times from 0 to the end, at most eight."""
+    """Return round times from 0 to the end."""
     step = next(
         each
         for power in range(-6, 12)
@@ -104,8 +104,8 @@ def _lane(cell: Timelines, colour: str, *, own_tokens: bool) -> PolicyRow:
         )
         bars.append(Segment("skill", start, end - start, text))
     stalls, stall_s = int(cell.rows["stalls"].iloc[0]), cell.moment_s("stall_s")
-    words = f"starts {seconds(cell.moment_s('start_s'))} s, ends {seconds(cell.moment_s('end_s'))} s, "
-    words += f"{stalls} stalls, {seconds(stall_s)} s" if stall_s else "no stalls"
+    summary = f"starts {seconds(cell.moment_s('start_s'))} s, ends {seconds(cell.moment_s('end_s'))} s, "
+    summary += f"{stalls} stalls, {seconds(stall_s)} s" if stall_s else "no stalls"
     return PolicyRow(
         cell.policy,
         colour,
@@ -114,7 +114,7 @@ def _lane(cell: Timelines, colour: str, *, own_tokens: bool) -> PolicyRow:
         cell.moment_s("safe_start_s"),
         tuple(cell.token_s) if own_tokens else (),
         _complete_s(cell) if own_tokens else (),
-        words,
+        summary,
     )
 
 
@@ -123,24 +123,23 @@ def _complete_s(cell: Timelines) -> tuple[float, ...]:
 
 
 def panels_of_chunks(lanes: Sequence[ChunkLane]) -> list[BoardPanel]:
-    """Lay out the first ticks of every mode, in seconds from the first request."""
+    """Return the panels of the first ticks of every mode, in seconds from the first request."""
     groups: dict[str, list[ChunkLane]] = {}
     for lane in lanes:
         groups.setdefault(lane.source, []).append(lane)
-    return [_chunk_panel(source, group) for source, group in groups.items()]
-
-
-def _chunk_panel(source: str, lanes: Sequence[ChunkLane]) -> BoardPanel:
-    end_s = max(len(lane.ticks) * lane.period_s for lane in lanes)
-    return BoardPanel(f"Latency {source}", end_s, ticks_of(end_s), tuple(map(_chunk_lane, lanes)), (), ())
+    panels = []
+    for source, group in groups.items():
+        end_s = max(len(lane.ticks) * lane.period_s for lane in group)
+        panels.append(BoardPanel(f"Latency {source}", end_s, ticks_of(end_s), tuple(map(_chunk_lane, group)), (), ()))
+    return panels
 
 
 def _chunk_lane(lane: ChunkLane) -> PolicyRow:
     bars = tuple(_chunk_bars(lane))
     stalled = int(lane.ticks["stalled"].sum())
     begin = next((bar.start_s for bar in bars), 0.0)
-    words = f"{stalled} of the first {len(lane.ticks)} ticks stall" if stalled else "no stall"
-    return PolicyRow(lane.title, COLOURS[0], bars, begin, None, (), (), words)
+    summary = f"{stalled} of the first {len(lane.ticks)} ticks stall" if stalled else "no stall"
+    return PolicyRow(lane.title, COLOURS[0], bars, begin, None, (), (), summary)
 
 
 def _chunk_bars(lane: ChunkLane) -> Iterator[Segment]:

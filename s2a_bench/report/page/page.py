@@ -1,4 +1,4 @@
-"""The page: one HTML file with its styles, its script and its figures inside, and nothing fetched."""
+"""The page: one HTML file that includes its styles, its script and its figures, and fetches nothing."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def render(
     judged: Sequence[Judged],
     caveats: Sequence[str],
 ) -> str:
-    """Return the page; ``figures`` are those of each chapter by its name. Every text of a run is escaped."""
+    """Return the page; ``figures`` are by the name of the chapter. Every text of a run is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     world = Environment(
@@ -59,7 +59,7 @@ def render(
 
 
 def title_of_page(chapters: Sequence[Chapter]) -> str:
-    """Name the page after its only folder, or count them: a sweep's chapters are of one."""
+    """Return the title of the only folder, or the number of folders; a sweep's chapters count as one."""
     sweeps = {chapter.run.path for chapter in chapters if is_sweep(chapter.manifest)}
     folders = [chapter for chapter in chapters if sweeps.isdisjoint(chapter.run.path.parents)]
     names = {chapter.run.path: chapter.title for chapter in reversed(folders)}
@@ -67,7 +67,7 @@ def title_of_page(chapters: Sequence[Chapter]) -> str:
 
 
 def tally(judged: Sequence[Judged]) -> str:
-    """Count the verdicts in words."""
+    """Return the verdicts with their counts."""
     verdicts = [each.verdict for each in judged]
     return ", ".join(f"{verdicts.count(each)} {each}" for each in dict.fromkeys(verdicts))
 
@@ -100,7 +100,7 @@ def _view(chapter: Chapter, figures: dict[str, DrawnFigure]) -> dict[str, Any]:
 
 
 def _panels(shown: Sequence[Any]) -> dict[str, Any]:
-    """Return the panels of timelines or of control ticks, what their bars are, and how many are left out."""
+    """Return the panels of timelines or of control ticks, a legend, and the number of panels left out."""
     if any(isinstance(each, ChunkLane) for each in shown):
         bars = "Bars are actions, a colour a chunk; dashed boxes are stalls. Time counts from the first request."
         return {"panels": panels_of_chunks(shown), "bars": bars, "left_out": 0}
@@ -110,7 +110,7 @@ def _panels(shown: Sequence[Any]) -> dict[str, Any]:
 
 
 def _facts(facts: Any, prefix: str = "") -> list[tuple[str, str]]:
-    """Return nested facts as lines: a dotted name and its value."""
+    """Return nested facts as pairs of a dotted name and its value."""
     if isinstance(facts, dict):
         return [
             line for name, value in facts.items() for line in _facts(value, f"{prefix}.{name}" if prefix else str(name))

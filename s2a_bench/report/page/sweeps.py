@@ -1,6 +1,6 @@
-"""What a sweep shows: its cells at a glance, and timelines that were computed cell by cell put together again.
+"""The views of a sweep: an overview of its cells, and computed timelines combined into one run.
 
-Only what is computed is put together: measured cells stay runs of their own, since machines and moments differ.
+Measured cells stay separate runs, since machines and moments differ.
 """
 
 from __future__ import annotations
@@ -27,21 +27,22 @@ from s2a_bench.writers.tables import MEAN_SD, TextTable, entries
 if TYPE_CHECKING:
     from s2a_bench.experiments.requests import Split
 
-
 Runs = Sequence[tuple[dict[str, Any], StoredRun]]
 
 _AXES: Final = ("policies", "profiles", "rates", "tokens_per_skill", "n_skills", "t_nom_s")
-"""What may differ between timelines that belong together: the name of a timeline's cell tells these apart."""
+"""Options that may differ between combined timelines; they are in the name of a timeline's cell."""
 
 
 def overview(sweep: Sweep, runs: Runs) -> Shown:
-    """Return the cells of a sweep with what became of them, and the numbers of measured ones side by side."""
+    """Return the states of a sweep's cells, and the numbers of the measured ones side by side."""
     states = sweep.cells["state"].value_counts().to_dict()
-    asked = int(sweep.manifest["configuration"].get("cells", len(sweep.cells)))
+    planned = int(sweep.manifest["configuration"].get("cells", len(sweep.cells)))
     done = int(states.get("finished", 0))
-    said = [f"{done} of {asked} cells of s2a-bench {sweep.manifest['configuration']['command']} are finished."]
+    sentences = [f"{done} of {planned} cells of s2a-bench {sweep.manifest['configuration']['command']} are finished."]
     if failed := int(states.get("failed", 0)):
-        said.append(f"{failed} failed; the table of cells says why, and --resume --retry-failed runs them again.")
+        sentences.append(
+            f"{failed} failed; the table of cells has the errors, --resume --retry-failed runs them again."
+        )
     tables = {"cells": cell_table(sweep)}
     cells = split(run for _, run in runs)
     if measured := measured_table([settings for settings, _ in runs], cells):
@@ -52,11 +53,11 @@ def overview(sweep: Sweep, runs: Runs) -> Shown:
     csvs = {"cells.csv": CsvTable.of_frame(sweep.cells)}
     drawn = {name: partial(marked, build, *(run for _, run in runs)) for name, build in figures.items()}
     main = [*lines, *(["overview"] if measured else [])]
-    return Shown(said, tables, main, csvs=csvs, figures=drawn)
+    return Shown(sentences, tables, main, csvs=csvs, figures=drawn)
 
 
 def cell_table(sweep: Sweep) -> TextTable:
-    """Lay out every cell: what was set, where it ran, how it ended, how long it took."""
+    """Make a table of every cell: settings, host, state and time."""
     rows: list[tuple[str, ...]] = [
         (
             str(row["cell"]),
@@ -73,7 +74,7 @@ def cell_table(sweep: Sweep) -> TextTable:
 
 
 def measured_table(settings: Sequence[Mapping[str, Any]], runs: Split) -> TextTable | None:
-    """Lay out the numbers of latency and throughput cells side by side; None where there are none."""
+    """Make a table of the numbers of latency and throughput cells; None if there are none."""
     pairs = zip(settings, runs, strict=True)
     rows = [row for each, (run, cells) in pairs for row in _measured(settings_text(each), run, cells)]
     if not rows:
@@ -83,38 +84,32 @@ def measured_table(settings: Sequence[Mapping[str, Any]], runs: Split) -> TextTa
 
 
 def settings_text(settings: Mapping[str, Any]) -> str:
-    """Write settings as a person would: payload jpeg, size 640x480."""
-    return ", ".join(f"{name} {value}" for name, value in settings.items()) or "as the command has it"
+    """Return settings as text: payload jpeg, size 640x480."""
+    return ", ".join(f"{name} {value}" for name, value in settings.items()) or "defaults"
 
 
 def pooled(sweep: Sweep, runs: Runs) -> tuple[list[StoredRun], Runs]:
-    """Put computed timelines of like configuration together; return them and the runs that stay alone."""
+    """Combine the computed timelines of equal configurations; return them, and the other runs."""
     groups: dict[str, list[list[StoredRun]]] = {}
     single = []
     for settings, run in runs:
-        if not _is_virtual(run):
+        if run.manifest["command"] != "timeline" or set(run.table(TIMELINES)["mode"]) != {"virtual"}:
             single.append((settings, run))
             continue
-        asked = {name: value for name, value in run.manifest["configuration"].items() if name not in _AXES}
-        parts = groups.setdefault(json.dumps(asked, sort_keys=True), [])
-        free = next((part for part in parts if not any(_overlap(run, other) for other in part)), None)
-        if free is None:
-            parts.append([run])
+        common = {name: value for name, value in run.manifest["configuration"].items() if name not in _AXES}
+        pools = groups.setdefault(json.dumps(common, sort_keys=True), [])
+        cells = set(run.table(TIMELINES)["cell"])
+        for pool in pools:
+            if all(cells.isdisjoint(other.table(TIMELINES)["cell"]) for other in pool):
+                pool.append(run)
+                break
         else:
-            free.append(run)
-    return [_joined(sweep, part) for parts in groups.values() for part in parts], single
-
-
-def _is_virtual(run: StoredRun) -> bool:
-    return run.manifest["command"] == "timeline" and set(run.table(TIMELINES)["mode"]) == {"virtual"}
-
-
-def _overlap(one: StoredRun, other: StoredRun) -> bool:
-    return not set(one.table(TIMELINES)["cell"]).isdisjoint(other.table(TIMELINES)["cell"])
+            pools.append([run])
+    return [_joined(sweep, pool) for pools in groups.values() for pool in pools], single
 
 
 def _joined(sweep: Sweep, runs: Sequence[StoredRun]) -> StoredRun:
-    """Make one run of several: rows one below the other in the order of board, L, N, T; shared tokens once."""
+    """Combine runs into one: their rows in the order of the cells, shared tokens once."""
     import pandas as pd
 
     tables = {
@@ -134,18 +129,18 @@ def _joined(sweep: Sweep, runs: Sequence[StoredRun]) -> StoredRun:
     return StoredRun(sweep.path, manifest, tables)
 
 
-def _measured(words: str, run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[str, ...]]:
+def _measured(setting: str, run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[str, ...]]:
     if run.samples.empty:
         return
     for cell in cells:
         what, values = _quantity(cell, run)
         numbers = entries(values, MEAN_SD, "median", "p99")
         host = str(run.manifest.get("host", ""))
-        yield words, cell.name, what, host, str(cell.n), str(cell.errors), *numbers
+        yield setting, cell.name, what, host, str(cell.n), str(cell.errors), *numbers
 
 
 def _quantity(cell: RequestCell, run: StoredRun) -> tuple[str, Floats]:
-    """Return what a cell is judged by: tokens/s of a throughput run, else e2e without inference where it is known."""
+    """Return name and values of tokens/s of a throughput run, else of e2e without inference if it is known."""
     if run.manifest["command"] == "throughput":
         return "tokens/s", cell.values("tokens_per_s")
     metric = next((name for name in ("e2e_without_inference", "e2e") if cell.values_ms(name).size), "e2e")
