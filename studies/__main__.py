@@ -78,8 +78,8 @@ def main(arguments: list[str]) -> int:
         if name == "figures":
             draw(given["figures"], output)
         elif name == "validity":
-            asked = ValidityConfig(**placed(ValidityConfig, given))
-            show_validity(read_run(run_validity(asked, output, Lines())))
+            validity = ValidityConfig(**placed(ValidityConfig, given))
+            show_validity(read_run(run_validity(validity, output, Lines())))
         else:
             config = StudyConfig(name=name, **placed(StudyConfig, given))
             show_study(read_run(run_study(config, output, Lines())))

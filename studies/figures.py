@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 """Both columns of a two-column paper."""
-_LOOKS: Final = (("#0072B2", "-", "o"), ("#D55E00", "--", "s"), ("#009E73", "-.", "^"), ("#CC79A7", ":", "D"))
+_STYLES: Final = (("#0072B2", "-", "o"), ("#D55E00", "--", "s"), ("#009E73", "-.", "^"), ("#CC79A7", ":", "D"))
 """Colour, line and marker of the first, second, ... thing that is compared."""
 _INK: Final = "#222222"
 _LIMIT: Final[dict[str, Any]] = {"color": _INK, "linestyle": (0, (4, 2)), "linewidth": 0.8, "zorder": 1}
@@ -35,7 +35,7 @@ def build_targets(run: StoredRun) -> Figure:
     whole = figure.subplots(3, 1, sharex=True)
     panels = {"p_any_stall": "P(any stall)", "start_regret": r"start regret over $S_0$", "end_regret": "end regret"}
     for axes, (column, label) in zip(whole, panels.items(), strict=True):
-        for (rate, part), (colour, _, marker) in zip(_by(rows, ["tokens_per_s"]), _LOOKS, strict=False):
+        for (rate, part), (colour, _, marker) in zip(_by(rows, ["tokens_per_s"]), _STYLES, strict=False):
             face = {"facecolors": "none", "edgecolors": colour, "linewidths": 0.7}
             axes.scatter(part["rho"], part[column], 11, marker=marker, label=f"{rate[0]:g} tokens/s", **face)
         axes.axvline(HARD, color="#999999", linewidth=0.6, linestyle=":")
@@ -65,7 +65,7 @@ def build_frontier(run: StoredRun) -> Figure:
     grid = figure.subplots(-(-len(worlds) // 2), 2, sharex=True, squeeze=False)
     families = list(rows["family"].unique())
     for axes, (_, world) in zip(grid.flat, worlds, strict=False):
-        for family, (colour, line, marker) in zip(families, _LOOKS, strict=False):
+        for family, (colour, line, marker) in zip(families, _STYLES, strict=False):
             points = world[world["family"] == family]
             for policy, width in ((ONLINE, 1.3), ("s2a-quantile", 0.6)):
                 tried = _needed(points[(points["policy"] == policy) & (points["condition"] == "")])
@@ -106,7 +106,7 @@ def build_drift(run: StoredRun) -> Figure:
     for line_of_axes, (_, world) in zip(grid, worlds, strict=True):
         for axes, drift in zip(line_of_axes, drifts, strict=True):
             here = world[world["drift"] == drift]
-            for (arm, part), (colour, line, marker) in zip(_by(here, ["arm"]), _LOOKS, strict=False):
+            for (arm, part), (colour, line, marker) in zip(_by(here, ["arm"]), _STYLES, strict=False):
                 place = part["block"] + 1
                 axes.plot(
                     place, part["p_any_stall"], line, marker=marker, markersize=3, color=colour, label=_ARMS[arm[0]]
@@ -138,7 +138,7 @@ def build_misfit(run: StoredRun) -> Figure:
     figure = new_figure(3.4, caption, WIDE_IN)
     grid = figure.subplots(2, len(kinds), sharex="col", sharey="row")
     for column, (kind, what) in enumerate(kinds.items()):
-        for (_, part), (colour, line, marker) in zip(_by(rows[rows["kind"] == kind], WORLD), _LOOKS, strict=False):
+        for (_, part), (colour, line, marker) in zip(_by(rows[rows["kind"] == kind], WORLD), _STYLES, strict=False):
             for axes, value in zip(grid[:, column], ("p_any_stall", "start_regret"), strict=True):
                 axes.plot(
                     part["step"], part[value], line, marker=marker, markersize=3, color=colour, label=_world(part)
@@ -216,9 +216,9 @@ def _line(label: str, **look: Any) -> Any:
 
 def _frontier_legend(families: list[str], epsilon: float) -> list[Any]:
     """Explain colours, the two rules, and what is marked."""
-    looks = zip(families, _LOOKS, strict=False)
+    styles = zip(families, _STYLES, strict=False)
     return [
-        *(_line(_FAMILIES.get(family, family), color=colour, linestyle=line) for family, (colour, line, _) in looks),
+        *(_line(_FAMILIES.get(family, family), color=colour, linestyle=line) for family, (colour, line, _) in styles),
         _line(f"bold: {ONLINE}", color=_INK, linewidth=1.3),
         _line("thin: s2a-quantile (never stretches)", color=_INK, linewidth=0.6),
         *(

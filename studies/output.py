@@ -38,7 +38,7 @@ class Lines(NullProgress):
         self.expected = samples
 
     def advance(self) -> None:
-        """Count, where somebody watches."""
+        """Count on a terminal."""
         super().advance()
         if sys.stderr.isatty():
             print(f"\r{self.done} of {self.expected}", end="\n" * (self.done == self.expected), file=sys.stderr)

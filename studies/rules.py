@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.run import StoredRun
 
-_LOOKS: Final = {
+_STYLES: Final = {
     "fixed": ("#D55E00", "s"),
     "tracked": ("#0072B2", "o"),
     "detected": ("#009E73", "^"),
@@ -84,7 +84,7 @@ def build_shift(run: StoredRun) -> Figure:
     shifts = list(dict.fromkeys(rows["shift"]))
     figure = new_figure(0.8 + 0.32 * len(shifts), f"Calibrated without shift{seeds(rows)}\n{DRAWN_PLANS}", WIDE_IN)
     axes = figure.subplots()
-    for step, (arm, (colour, marker)) in enumerate(_LOOKS.items()):
+    for step, (arm, (colour, marker)) in enumerate(_STYLES.items()):
         for place, shift in enumerate(shifts):
             mine = rows[(rows["arm"] == arm) & (rows["shift"] == shift)]
             shares = 100 * mine.groupby("seed")["p_any_stall"].mean()
@@ -99,7 +99,7 @@ def build_shift(run: StoredRun) -> Figure:
     axes.set_xlim(0, 100)
     axes.set_xticks([0, 1, 10, 100], ["0", "1", "10", "100"])
     axes.set_xlabel("P(any stall) (%), mean over the settings")
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=len(_LOOKS))
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=len(_STYLES))
     return figure
 
 

@@ -1,4 +1,4 @@
-"""How many of a model's skills are valid, with a grammar and without: plans asked of a model in this process.
+"""The share of valid skills of a model, with a grammar and without: plans of a model in this process.
 
 The table gives the shares of valid skills and of answers as ordered, the paper's control of hallucinations.
 """
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 PAPER: Final = "paper"
-"""The paper's format, among the tokens a skill that are asked for."""
+"""The paper's format, among the requested tokens a skill."""
 ROOM: Final = 2
 """An answer may have as many times the tokens of the longest plan: without a grammar a model uses more words."""
 TEMPLATE_TOKENS: Final = 256
@@ -56,7 +56,7 @@ TAIL: Final = 0.975
 
 
 class ValidityConfig(Options):
-    """Which model is asked for which plans, and how often."""
+    """The model, the plans, and how often."""
 
     engine: EngineConfig = group(EngineConfig, only=("model", "mmproj", "threads", "gpu_layers"))
     skills: str = option("household", "household, driving, or a TOML file")
@@ -86,9 +86,9 @@ class ValidityConfig(Options):
 
 @dataclass(frozen=True, slots=True)
 class ValidityRow:
-    """One answer of a model that was asked for a plan of ``n_skills``, with the grammar or without.
+    """One answer of a model to the request of a plan of ``n_skills``, with the grammar or without.
 
-    ``format`` is what was asked for: paper, or tokens a skill; ``wording`` what that is with this model. ``lines`` are
+    ``format`` is the requested one: paper, or tokens a skill; ``wording`` what that is with this model. ``lines`` are
     those that count, the first ``n_skills`` of the answer; ``skills`` the valid ones, ``problems`` the others by kind.
     ``cut`` says that the answer ended because its tokens were used up.
     """
@@ -109,12 +109,12 @@ class ValidityRow:
 
 
 VALIDITY: Final[Table[ValidityRow]] = Table("validity", ValidityRow)
-"""One row an answer that was asked for to see whether its skills are valid."""
+"""One row an answer."""
 
 
 @dataclass(frozen=True)
 class _Ask:
-    """One format, ready to be asked for."""
+    """One format and its prompt."""
 
     name: str
     format: Format
@@ -124,7 +124,7 @@ class _Ask:
     max_tokens: int
 
     def to_manifest(self) -> dict[str, Any]:
-        """Return what is asked for."""
+        """Return the prompt."""
         return {
             "name": self.name,
             "skill_set": self.format.skills.name,
@@ -137,7 +137,7 @@ class _Ask:
 
 
 def run_validity(config: ValidityConfig, folder: Path, progress: Progress) -> Path:
-    """Ask for all plans and return the run folder; raises S2AError for what a user can mend.
+    """Ask for all plans and return the run folder; raises S2AError for an error that the user can fix.
 
     A model gets the same prompt and the same seeds with the grammar and without. Rows are kept answer by answer.
     """
@@ -160,8 +160,8 @@ def run_validity(config: ValidityConfig, folder: Path, progress: Progress) -> Pa
         progress.opened(writer.path)
         progress.stage("loading the model")
         with closing(open_engine(chosen)) as engine:
-            told = engine.describe()
-            writer.update(model=told, provenance=Origins(Provenance.of_engine(told, link=NONE)).to_manifest())
+            facts = engine.describe()
+            writer.update(model=facts, provenance=Origins(Provenance.of_engine(facts, link=NONE)).to_manifest())
             progress.expect(len(asks) * 2 * config.answers)
             for ask in asks:
                 progress.stage(f"{ask.name}: {ask.format.name}")
@@ -322,12 +322,12 @@ def _names(arm: Arm) -> tuple[str, str]:
 
 def _shares(run: StoredRun, arms: list[Arm]) -> TextTable:
     """Lay out the shares, a line a format and way to ask."""
-    asked = run.manifest["configuration"]
+    settings = run.manifest["configuration"]
     lines: list[tuple[str, ...]] = [
         (*_names(arm), f"{arm.valid.count} of {arm.valid.of}", str(arm.valid), str(arm.as_ordered)) for arm in arms
     ]
-    header = ("L", "grammar", "valid lines", "share (%)", f"answers of exactly {asked['n_skills']} skills (%)")
-    title = f"Valid skills: {arms[0].about['skill_set']}, N = {asked['n_skills']}, {asked['answers']} answers each"
+    header = ("L", "grammar", "valid lines", "share (%)", f"answers of exactly {settings['n_skills']} skills (%)")
+    title = f"Valid skills: {arms[0].about['skill_set']}, N = {settings['n_skills']}, {settings['answers']} answers"
     rules = frozenset(
         place for place, arm in enumerate(arms) if place and arms[place - 1].about["name"] != arm.about["name"]
     )
@@ -335,7 +335,7 @@ def _shares(run: StoredRun, arms: list[Arm]) -> TextTable:
 
 
 def _formats(run: StoredRun) -> TextTable:
-    """Return what was asked for, and what it costs with this model."""
+    """Return the requested format, and its cost with this model."""
     lines: list[tuple[str, ...]] = [
         (
             about["name"],

@@ -90,9 +90,9 @@ class QuantileStart(MeanStart):
 
 
 def calibrated(config: StudyConfig, world: World, plans: int) -> tuple[StreamToAct, Plans]:
-    """Return stream-to-act with prior and lambda from calibration plans of a world, and other plans, as many as asked.
+    """Return stream-to-act with prior and lambda from calibration plans of a world, and other plans.
 
-    ``plans`` is the study's own number, where none was asked for.
+    ``plans`` is the study's default number.
     """
     rng = generator(config.seed, config.name, world.key)
     calibration = world.draw(rng, config.calibration_plans)

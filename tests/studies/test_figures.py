@@ -77,9 +77,9 @@ def test_targets_show_every_setting_of_stream_to_act_with_the_limits(tmp_path: P
     points = [np.asarray(part.get_offsets()) for part in stalls.collections]
     np.testing.assert_allclose(np.concatenate(points), [[0.2, 0], [1.25, 0.015], [10.3, 0.002]])
     assert [heights(axes) for axes in (stalls, start, end)] == [[0.02], [0.05], [0.06]]
-    said = [text.get_text() for axes in (start, end) for text in axes.texts]
-    assert r"mean for $\rho$ > 0.8: 5.0 %" in said
-    assert said.count("limit of the mean: 6 %") == 1
+    texts = [text.get_text() for axes in (start, end) for text in axes.texts]
+    assert r"mean for $\rho$ > 0.8: 5.0 %" in texts
+    assert texts.count("limit of the mean: 6 %") == 1
 
 
 def test_a_frontier_ends_at_its_first_point_without_stalls_and_the_calibrated_one_is_marked(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The studies: repeatable by seed, right about a few settings, and told as tables."""
+"""The studies: repeatable by seed, right about a few settings, and written as tables."""
 
 from __future__ import annotations
 
@@ -241,7 +241,7 @@ def test_a_study_is_kept_and_shown(
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("settings", "message"),
     [
         ({}, "`name` is needed"),
         ({"name": "targets", "jobs": 0}, "`jobs`: 0 should be"),
@@ -252,9 +252,9 @@ def test_a_study_is_kept_and_shown(
         ({"name": "frontier", "profile": "rtx-4080"}, "`profile`: rtx-4080 holds no recorded gaps"),
     ],
 )
-def test_a_configuration_that_makes_no_sense_is_refused(asked: dict[str, Any], message: str) -> None:
+def test_a_configuration_that_makes_no_sense_is_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        StudyConfig(**asked)
+        StudyConfig(**settings)
 
 
 def test_cells_can_be_sent_to_another_process() -> None:
