@@ -25,14 +25,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--transport", default="http/binary?payload=raw")
     parser.add_argument("--requests", type=int, default=300)
-    asked = parser.parse_args()
-    cell = one_pipeline(asked.transport)
-    plan = resolve(RequestsConfig(transports=asked.transport, max_tokens=4))
+    arguments = parser.parse_args()
+    cell = one_pipeline(arguments.transport)
+    plan = resolve(RequestsConfig(transports=arguments.transport, max_tokens=4))
     e2e_ms: dict[bool, list[float]] = {True: [], False: []}
     with ExitStack() as stack:
         sessions = {pixels: _session(cell, plan, stack, pixels=pixels) for pixels in e2e_ms}
         random = Random(0)  # noqa: S311 - an order, not a secret
-        for block in range(asked.requests):
+        for block in range(arguments.requests):
             for pixels in random.sample([True, False], 2):
                 sample = sessions[pixels].measure(Place(block, 0, warmup=False)).sample
                 if sample.error:

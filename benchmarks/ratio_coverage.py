@@ -1,7 +1,7 @@
 """How often the intervals of ratios hold the truth, and what comparisons see, at known noise: ``make bench-coverage``.
 
 Two cells are simulated whose ratio is known. A launch changes it by a share of its own (``launch sd``; 4 to 13 % were
-measured), requests by 15 %, half of which both cells share and of which neighbours remember 0.4 unless said.
+measured), requests by 15 %, half of which both cells share; the correlation of neighbours is 0.4 by default.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def simulate(rng: np.random.Generator, launches: int, launch_sd: float, correlat
 
 
 def _remembering(rng: np.random.Generator, shape: tuple[int, int], correlation: float) -> np.ndarray:
-    """Draw series of standard deviation 1 whose neighbours are alike (AR(1))."""
+    """Draw series of standard deviation 1 whose neighbours are correlated (AR(1))."""
     noise = rng.standard_normal((shape[0], shape[1] + 100)) * math.sqrt(1 - correlation**2)
     return np.asarray(lfilter([1], [1, -correlation], noise)[:, 100:])
 
@@ -66,12 +66,12 @@ def coverage(launches: int, launch_sd: float, trials: int, correlation: float = 
         widths.append(math.sqrt(high / low) - 1)
         warned += launches == 1 and any(RowCorrelation.of(cell[0]).dependent for cell in cells)
     low, high = stats.binomtest(held, trials).proportion_ci(method="wilson")
-    said = f"; warned of in {warned / trials:.0%}" if launches == 1 else ""
-    return f"{held / trials:6.1%} [{low:.1%}, {high:.1%}], about +- {np.median(widths):.0%}{said}"
+    dependent = f"; a warning in {warned / trials:.0%}" if launches == 1 else ""
+    return f"{held / trials:6.1%} [{low:.1%}, {high:.1%}], about +- {np.median(widths):.0%}{dependent}"
 
 
-def sees(launches: int, launch_sd: float) -> str:
-    """Return what a comparison of so many launches a side sees where launches differ by so much."""
+def detectable(launches: int, launch_sd: float) -> str:
+    """Return the smallest change that a comparison of so many launches a side finds, by their spread."""
     noise = Noise(launch_sd * math.sqrt(2 / launches), 2 * launches - 2)
     return f"{noise.detectable(0.05):5.0%} in 80 of 100 repeats; 10 % in {noise.power(0.1, 0.05):.0%}"
 
@@ -83,13 +83,13 @@ def lines(trials: int) -> Iterator[str]:
         for spread in LAUNCH_SDS:
             few = max(FEWEST, trials // 5) if launches == 1 else trials
             yield f"  --launches {launches}, launch sd {spread:4.0%}: {coverage(launches, spread, few)}"
-    yield "one launch, no spread from launch to launch, neighbours that are alike"
+    yield "one launch, no spread from launch to launch, correlated neighbours"
     for n, correlation in ((50, 0.0), (50, 0.4), (50, 0.8), (200, 0.8)):
         yield f"  n = {n:3}, correlation {correlation}: {coverage(1, 0.0, max(FEWEST, trials // 5), correlation, n)}"
-    yield "the smallest change that compare sees at p < 0.05, one comparison"
+    yield "the smallest change that compare finds at p < 0.05, one comparison"
     for launches in (3, 5, 10, 20):
         for spread in LAUNCH_SDS:
-            yield f"  {launches:2} launches a side, launch sd {spread:4.0%}: {sees(launches, spread)}"
+            yield f"  {launches:2} launches a side, launch sd {spread:4.0%}: {detectable(launches, spread)}"
 
 
 def main() -> None:

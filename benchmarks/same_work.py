@@ -1,7 +1,7 @@
 """Null experiment: e2e without model of the same requests, by our marks and as of a llama-server.
 
 ``python -m benchmarks.same_work [--requests N]``. Our engine answers behind our HTTP as deployed. From inside, e2e
-without model is what the marks leave beside the model; from outside, as where a server tells its times only, it is e2e
+without model is what the marks leave beside the model; from outside, for a server that reports its times, it is e2e
 less the time that the engine reports for its prompt. What differs is what a black box hides: changing threads, choosing
 the first token.
 """
@@ -27,11 +27,11 @@ REQUESTS = 50
 
 def both(output: Path, requests: int = REQUESTS, **options: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return e2e without model in ms of every request, from inside and from outside."""
-    asked = {"transports": ["http/as-deployed"], "payload": "jpeg", "engine": "llama", "requests": requests, **options}
-    run = s2a.latency(**asked, output=output)
+    settings = {"transports": ["http/as-deployed"], "payload": "jpeg", "engine": "llama", "requests": requests}
+    run = s2a.latency(**settings | options, output=output)
     good = run.samples[run.samples["error"] == ""]
-    facts = [json.loads(str(told)) for told in good["facts"]]
-    model_ms = np.array([told[PROMPT_MS] - told[PREPROCESS_MS] for told in facts])
+    facts = [json.loads(str(row)) for row in good["facts"]]
+    model_ms = np.array([row[PROMPT_MS] - row[PREPROCESS_MS] for row in facts])
     inside, e2e = (good[f"{name}_ns"].to_numpy(dtype=float) / 1e6 for name in ("e2e_without_model", "e2e"))
     return inside, e2e - model_ms
 

@@ -1,6 +1,6 @@
 """Hostile and honest clients together on a server: ``python -m benchmarks.soak http|ros|... [--minutes M]``.
 
-The server is a `serve` process, and so is its twin, which nobody attacks: the idle latency of the one is divided by
+The server is a `serve` process, and so is its twin, which is not attacked: the idle latency of the one is divided by
 that of the other in interleaved blocks, before the load and after it, so that what else the machine does cancels out.
 The hostile clients are those of `tests/hostile/wires`. They load the server before anything is measured too: the
 memory that a pool keeps for good is no growth. Prints what came of it, writes it as JSON, and exits with 1 where a
@@ -100,9 +100,9 @@ class Result:
     asked: int = 0
     answered: int = 0
     refused: int = 0
-    """Times that an honest request was told to come again."""
+    """Honest requests that the server refused for now."""
     lost: int = 0
-    """Times that messages of an answer were lost, which the client was told or saw by the silence; it came again."""
+    """Answers with lost messages, by an error or a timeout; the client repeated the request."""
     failed: list[str] = field(default_factory=list)
     attacks: int = 0
     not_met: list[str] = field(default_factory=list)
@@ -148,7 +148,7 @@ class Result:
             f"these hostile clients never came: {self.not_met}": not self.not_met,
             f"SIGTERM ended it in {self.ended_s:.1f} s with {self.exit_code}": self.exit_code == 0,
         }
-        return [said for said, kept in promises.items() if not kept]
+        return [text for text, kept in promises.items() if not kept]
 
 
 @contextmanager
@@ -171,10 +171,10 @@ def served(transport: str, engine: str, name: str, log: Path) -> Iterator[Served
         try:
             assert process.stdout  # noqa: S101 - a pipe
             if not select.select([process.stdout], [], [], READY_S)[0]:
-                raise TimeoutError(f"the server said nothing for {READY_S:g} s")
-            said = process.stdout.readline()
-            if (found := re.search(address, said)) is None:
-                raise RuntimeError(f"the server said: {said}")
+                raise TimeoutError(f"the server printed nothing for {READY_S:g} s")
+            first = process.stdout.readline()
+            if (found := re.search(address, first)) is None:
+                raise RuntimeError(f"the server printed no address: {first}")
             yield Served(process, found[0])
         finally:
             process.kill()
@@ -187,7 +187,7 @@ def wiring(name: str, address: str) -> Wiring[Any]:
 
 
 class Honest:
-    """A client that means well: it comes again when told to, and looks at its answer."""
+    """An honest client: it repeats a refused request, and checks its answer."""
 
     def __init__(self, name: str, address: str) -> None:
         """Connect."""
@@ -214,7 +214,7 @@ class Honest:
 
 
 class Load:
-    """Clients of both kinds, each on a thread of its own, until told to stop."""
+    """Clients of both kinds, each on its own thread, until the end."""
 
     def __init__(self, result: Result, address: str, cases: Sequence[Case[Attack]]) -> None:
         """Start nothing yet."""
@@ -296,15 +296,15 @@ def idle(client: Client, twin: Client, blocks: int, of: int) -> tuple[list[float
     relative: Blocks = {}
     for block in range(blocks):
         taken: dict[bool, list[float]] = {}
-        for ours in (True, False) if block % 2 else (False, True):
-            taken[ours] = [latency_ms(client if ours else twin) for _ in range(of)]
+        for loaded in (True, False) if block % 2 else (False, True):
+            taken[loaded] = [latency_ms(client if loaded else twin) for _ in range(of)]
         plain += taken[True]
         relative[block] = [value / median(taken[False]) for value in taken[True]]
     return plain, relative
 
 
 def latency_ms(client: Client, tries: int = 5) -> float:
-    """Return how long one whole answer takes; one whose messages were lost is asked for again."""
+    """Return how long one whole answer takes; a lost one is requested again."""
     began = time.perf_counter()
     try:
         ask(client, Request("idle", PROMPT, max_tokens=TOKENS))

@@ -1,6 +1,6 @@
 """How long it takes until something answers: ``python -m benchmarks.start_up [--times N]``.
 
-Each is a Python process of its own, in turn with one that does nothing, so that what is shown is ours.
+Each is a Python process of its own, in turn with one that does nothing; the difference is the cost of the package.
 """
 
 from __future__ import annotations

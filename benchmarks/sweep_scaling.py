@@ -1,6 +1,6 @@
 """Monte Carlo timelines on several processes, with and without Ray: ``make bench-ray``.
 
-The plans are drawn in chunks, each from a seed of its own, so that the numbers do not depend on who computes a chunk:
+The plans are drawn in blocks, each from its own seed, so that the numbers do not depend on which worker computes one:
 the check sums of all lines must be equal. A timeline is one plan under naive, wait-then-act and clairvoyant
 stream-to-act; every token's gap is drawn.
 """
@@ -25,7 +25,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.policy.arrivals import fragments, tokens
 from s2a_bench.policy.evaluate import evaluate
 
-CHUNK: Final = 1 << 14
+BLOCK: Final = 1 << 14
 """Plans drawn from one seed."""
 N_SKILLS: Final = 8
 TOKENS_PER_SKILL: Final = 6
@@ -37,7 +37,7 @@ GAPS: Final = Lognormal(1 / 4.8, 0.2)
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What a chunk comes to: sums over its plans, and the digest of every number."""
+    """The result of a block: sums over its plans, and the digest of every number."""
 
     plans: int
     stalled: int
@@ -47,7 +47,7 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One way to compute all chunks."""
+    """One way to compute all blocks."""
 
     how: str
     workers: int
@@ -58,7 +58,7 @@ class Line:
 
 
 def part(seed: np.random.SeedSequence, plans: int) -> Part:
-    """Draw and evaluate one chunk."""
+    """Draw and evaluate one block."""
     rng = np.random.default_rng(seed)
     arrival_s = fragments(tokens(GAPS, PROMPT_S, N_SKILLS * TOKENS_PER_SKILL, plans, rng), TOKENS_PER_SKILL)
     found = evaluate(arrival_s, rng.uniform(0.65, 1.35, arrival_s.shape) * T_NOM_S)
@@ -70,28 +70,28 @@ def part(seed: np.random.SeedSequence, plans: int) -> Part:
 
 
 def work(timelines: int, seed: int) -> list[tuple[np.random.SeedSequence, int]]:
-    """Split timelines into chunks, each with its seed."""
-    sizes = [min(CHUNK, timelines - done) for done in range(0, timelines, CHUNK)]
+    """Split timelines into blocks, each with its seed."""
+    sizes = [min(BLOCK, timelines - done) for done in range(0, timelines, BLOCK)]
     return list(zip(np.random.SeedSequence(seed).spawn(len(sizes)), sizes, strict=True))
 
 
 def measure(timelines: int, seed: int, workers: Sequence[int], *, ray: bool) -> Iterator[Line]:
-    """Compute the same timelines in this process, in pools of processes and, where asked, on Ray; start-up left out."""
-    chunks = work(timelines, seed)
-    part(*chunks[0])
+    """Compute the same timelines in this process, in pools of processes and, with --ray, on Ray; without start-up."""
+    blocks = work(timelines, seed)
+    part(*blocks[0])
     before_ns = now_ns()
-    yield _line("this process", 1, [part(*chunk) for chunk in chunks], before_ns)
+    yield _line("this process", 1, [part(*block) for block in blocks], before_ns)
     for count in workers:
         with ProcessPoolExecutor(count, mp_context=get_context("spawn")) as pool:
-            list(pool.map(part, *zip(*chunks[:1] * count * 2, strict=True)))
+            list(pool.map(part, *zip(*blocks[:1] * count * 2, strict=True)))
             before_ns = now_ns()
-            yield _line("processes", count, list(pool.map(part, *zip(*chunks, strict=True))), before_ns)
+            yield _line("processes", count, list(pool.map(part, *zip(*blocks, strict=True))), before_ns)
     for count in workers if ray else ():
-        yield _on_ray(chunks, count)
+        yield _on_ray(blocks, count)
 
 
-def _on_ray(chunks: list[tuple[np.random.SeedSequence, int]], count: int) -> Line:
-    """Compute the chunks on a local cluster of ``count`` cores."""
+def _on_ray(blocks: list[tuple[np.random.SeedSequence, int]], count: int) -> Line:
+    """Compute the blocks on a local cluster of ``count`` cores."""
     from s2a_bench.sweep.on_ray import LOCAL, connect
 
     connect(LOCAL, count)
@@ -99,15 +99,15 @@ def _on_ray(chunks: list[tuple[np.random.SeedSequence, int]], count: int) -> Lin
 
     try:
         remote = ray.remote(part)
-        ray.get([remote.remote(*chunks[0]) for _ in range(count * 2)])
+        ray.get([remote.remote(*blocks[0]) for _ in range(count * 2)])
         before_ns = now_ns()
-        return _line("Ray, local", count, ray.get([remote.remote(*chunk) for chunk in chunks]), before_ns)
+        return _line("Ray, local", count, ray.get([remote.remote(*block) for block in blocks]), before_ns)
     finally:
         ray.shutdown()
 
 
 def _line(how: str, workers: int, parts: Sequence[Part], before_ns: int) -> Line:
-    """Add up the chunks in their order."""
+    """Add up the blocks in their order."""
     seconds = (now_ns() - before_ns) / 1e9
     plans = sum(each.plans for each in parts)
     checksum = sha256(b"".join(each.digest for each in parts)).hexdigest()[:16]
@@ -121,18 +121,18 @@ def main() -> int:
     parser.add_argument("--timelines", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, nargs="+", help="default: 1, 2, 4 ... to the number of cores")
-    asked = parser.parse_args()
+    arguments = parser.parse_args()
     cores = len(os.sched_getaffinity(0))
-    workers = asked.workers or [1 << power for power in range(cores.bit_length())]
+    workers = arguments.workers or [1 << power for power in range(cores.bit_length())]
     ray = find_spec("ray") is not None
     say = sys.stdout.write
-    say(f"{asked.timelines} timelines, N = {N_SKILLS}, L = {TOKENS_PER_SKILL}, drawn tokens, {cores} cores\n")
+    say(f"{arguments.timelines} timelines, N = {N_SKILLS}, L = {TOKENS_PER_SKILL}, drawn tokens, {cores} cores\n")
     say(f"{'how':14}{'workers':>8}{'s':>9}{'million/s':>11}{'speed-up':>10}  P(naive stalls)  mean stall  check sum\n")
     lines: list[Line] = []
-    for line in measure(asked.timelines, asked.seed, workers, ray=ray):
+    for line in measure(arguments.timelines, arguments.seed, workers, ray=ray):
         lines.append(line)
         say(
-            f"{line.how:14}{line.workers:8}{line.seconds:9.2f}{asked.timelines / line.seconds / 1e6:11.2f}"
+            f"{line.how:14}{line.workers:8}{line.seconds:9.2f}{arguments.timelines / line.seconds / 1e6:11.2f}"
             f"{lines[0].seconds / line.seconds:10.2f}  {line.p_any_stall:15.6f}  {line.mean_stall_s:8.6f} s  "
             f"{line.checksum}\n"
         )

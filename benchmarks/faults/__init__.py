@@ -1,8 +1,8 @@
 """What is killed, when, over which transport, and what comes of it: ``python -m benchmarks.faults [--docs]``.
 
 A server and its client are processes of their own; the fault falls at a moment of a request of 24 tokens, 40 ms each.
-Then it is asked of the client whether it ended with one line and within its bound, and of the server whether it answers
-somebody else. With ``--docs`` the table is written into docs/reliability.md.
+Then the client must have ended with one line and within its bound, and the server must answer another client. With
+``--docs`` the table is written into docs/reliability.md.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TRANSPORTS = (
 WHOLE = ("zmq/gr00t",)
 """Those whose answers come as one."""
 BEGUN_S = 0.3
-"""How long after a request its answer has begun, where nobody sees it."""
+"""Time after a request at which its answer has begun, if no event shows it."""
 WHATS = ("server killed", "server told to end", "server stopped", "client killed", "client stopped", "connection cut")
 WHENS = ("before the first request", "in the queue", "in the middle of an answer", "between requests", "while closing")
 ENDS_THE_SERVER = ("server killed", "server told to end")
@@ -51,7 +51,7 @@ class Fault:
 
     @property
     def applies(self) -> bool:
-        """Whether there is such a thing: DDS has no connection, and who waits for its turn asked for something."""
+        """Return True if the fault can occur: DDS has no connection, and a client in the queue has sent a request."""
         return self.what != "connection cut" or self.transport.startswith(("http", "websocket", "zmq"))
 
     @property
@@ -120,7 +120,7 @@ def happens(fault: Fault, server: OwnServer) -> str:
 
 
 def _occupied(server: OwnServer, transport: str, over: Event) -> Thread:
-    """Let somebody else have the engine for a while."""
+    """Occupy the engine with another client for a while."""
     started = Event()
 
     def hold() -> None:
@@ -181,16 +181,16 @@ def _outcome(fault: Fault, server: OwnServer, peer: Peer) -> str:
         if error := others(server, fault.transport):
             return f"others are not answered meanwhile: {error}"
         _signal(peer.pid, signal.SIGCONT)
-    said = _said(fault, peer) if client_lives else "the next is answered"
+    outcome = _message(fault, peer) if client_lives else "the next is answered"
     if fault.what == "server stopped":
         _signal(server.pid, signal.SIGCONT)
     if fault.what in ENDS_THE_SERVER:
-        return said if server.ends_within(10) else "the server did not end"
+        return outcome if server.ends_within(10) else "the server did not end"
     error = others(server, fault.transport)
-    return f"others are not answered afterwards: {error}" if error else said
+    return f"others are not answered afterwards: {error}" if error else outcome
 
 
-def _said(fault: Fault, peer: Peer) -> str:
+def _message(fault: Fault, peer: Peer) -> str:
     """Return how the client ended."""
     later = " when it goes on" if fault.what == "client stopped" else ""
     if fault.when == "while closing":

@@ -1,4 +1,4 @@
-"""Run the fault matrix, print it, and write it into docs/reliability.md if told to."""
+"""Run the fault matrix, print it, and write it into docs/reliability.md with --docs."""
 
 from __future__ import annotations
 

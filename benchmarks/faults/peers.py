@@ -32,7 +32,7 @@ _numbers = count()
 
 
 class Peer:
-    """The client's process, as the matrix sees it."""
+    """The client's process."""
 
     def __init__(self, wiring: Wiring[Any], server_pid: int) -> None:
         """Start it: a fork of a process that has imported all this already."""
@@ -56,9 +56,9 @@ class Peer:
         """Return the next of these events; raises TimeoutError, or EOFError where the client ended."""
         deadline = time.monotonic() + seconds
         while self._pipe.poll(max(0.0, deadline - time.monotonic())):
-            said: dict[str, Any] = self._pipe.recv()
-            if said["event"] == event:
-                return said
+            message: dict[str, Any] = self._pipe.recv()
+            if message["event"] == event:
+                return message
         raise TimeoutError(f"the client came to no {event} within {seconds:g} s")
 
     def close(self) -> None:
