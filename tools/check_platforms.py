@@ -33,7 +33,7 @@ CONSTRAINTS = "constraints.txt"
 OURS = "s2a-bench"
 COMPILED = "llama-cpp-python"
 NO_WHEEL = ("empy",)
-"""Published as source only; pure Python, so that a wheel made here is everybody's. colcon-core needs it."""
+"""Published as source only; its wheel is pure Python, so that one is built here. colcon-core needs it."""
 PROBE = "rosbags"
 OFFLINE = 3
 """The exit code where no index answers and ``--offline-ok`` is not given."""
@@ -107,17 +107,15 @@ TARGETS = (
 def requirements(target: Target) -> list[str]:
     """List what pyproject.toml asks for on a platform, and what the compiled package needs in its place."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    asked = [Requirement(text) for text in project["dependencies"]]
-    asked += added(project["optional-dependencies"], target.extras)
+    requirements = [Requirement(text) for text in project["dependencies"]]
+    requirements += added(project["optional-dependencies"], target.extras)
     try:
         needed = [Requirement(text) for text in requires(COMPILED) or ()]
     except PackageNotFoundError:
         raise SystemExit(f"check-platforms: {COMPILED} is not installed here; run `make setup` first") from None
-    asked = [requirement for requirement in asked if requirement.name != COMPILED] + needed
+    requirements = [requirement for requirement in requirements if requirement.name != COMPILED] + needed
     environment = {**target.markers(), "extra": ""}
-    wanted = [
-        requirement for requirement in asked if not requirement.marker or requirement.marker.evaluate(environment)
-    ]
+    wanted = [each for each in requirements if not each.marker or each.marker.evaluate(environment)]
     for requirement in wanted:
         requirement.marker = None
     return [str(requirement) for requirement in wanted]

@@ -1,4 +1,4 @@
-"""Draw docs/figures/architecture.png: the rooms of the package, floor by floor, and who imports whom.
+"""Draw docs/figures/architecture.png: the rooms of the package, floor by floor, and their imports.
 
 `.venv/bin/python tools/docs_architecture.py`. Floors come from the import-linter contract in pyproject.toml, rooms and
 arrows from the code, so the drawing cannot say what is not so.

@@ -42,7 +42,7 @@ SLOW_ONES = "bimodal:mean_ms=80,cv=.2,pause_share=.05,pause_ratio=3"
 
 
 class Quiet:
-    """Progress that nobody looks at."""
+    """Progress without output."""
 
     def opened(self, folder: Path) -> None:
         """Do nothing."""

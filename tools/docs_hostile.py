@@ -22,8 +22,8 @@ def table(xml: str) -> str:
     costs: dict[str, list[tuple[int, float, str]]] = defaultdict(list)
     for test in ET.fromstring(xml).iter("testcase"):  # noqa: S314 - pytest's own
         case = re.sub(r".*\[(.*)\]", r"\1", test.attrib["name"])
-        for told in test.iter("property"):
-            if told.attrib["name"] == "cost" and (found := COST.fullmatch(told.attrib["value"])):
+        for each in test.iter("property"):
+            if each.attrib["name"] == "cost" and (found := COST.fullmatch(each.attrib["value"])):
                 costs[found[1]].append((int(found[3]), float(found[2]), case))
     lines = ["| end | cases | most memory, MiB | longest, s |", "|---|---|---|---|"]
     for end, cases in costs.items():

@@ -165,13 +165,13 @@ def run_tests(tree: Path, package: str, mutated: Path | None, limit_s: float | N
     for test in TESTS[package]:
         files += sorted((tree / test).rglob("test_*.py")) if (tree / test).is_dir() else [tree / test]
     files.sort(key=lambda file: mutated is not None and mutated.stem not in file.stem)
-    asked = ["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--hypothesis-seed=0", *map(str, files)]
+    arguments = ["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--hypothesis-seed=0", *map(str, files)]
     variables = {"PYTHONPATH": str(tree), "OPENBLAS_NUM_THREADS": "1"}
     if mutated:
         variables["PYTHONDONTWRITEBYTECODE"] = "1"  # it would be taken for that of the next mutant
     with TemporaryFile("w+", errors="replace") as output:
         child = subprocess.Popen(  # noqa: S603
-            [sys.executable, "-c", PYTEST, *asked],
+            [sys.executable, "-c", PYTEST, *arguments],
             cwd=tree,
             env=os.environ | variables,
             stdout=output,
@@ -202,8 +202,8 @@ def judge(mutant: Mutant, tree: Path, limit_s: float) -> str:
         os.utime(file, ns=(times.st_atime_ns, times.st_mtime_ns))
     if code is None:
         return "timeout"
-    told = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR"))]
-    return (told[0][:200] if told else f"exit code {code}") if code else SURVIVED
+    failures = [line for line in output.splitlines() if line.startswith(("FAILED", "ERROR"))]
+    return (failures[0][:200] if failures else f"exit code {code}") if code else SURVIVED
 
 
 class Workers:
@@ -267,15 +267,15 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     parser.add_argument("--packages", nargs="+", choices=[*TESTS], default=[*TESTS], metavar="PACKAGE")
     parser.add_argument("--again", action="store_true", help="only those not known to be noticed")
-    asked = parser.parse_args()
-    drawn = sample(asked.mutants, asked.seed, asked.packages)
-    known = noticed() if asked.again and RESULTS.exists() else {}
+    arguments = parser.parse_args()
+    drawn = sample(arguments.mutants, arguments.seed, arguments.packages)
+    known = noticed() if arguments.again and RESULTS.exists() else {}
     rest = [mutant for mutant in drawn if mutant not in known]
     RESULTS.parent.mkdir(parents=True, exist_ok=True)
-    with TemporaryDirectory() as folder, ThreadPoolExecutor(asked.workers) as pool:
-        workers = Workers(Path(folder), asked.workers)
+    with TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.workers) as pool:
+        workers = Workers(Path(folder), arguments.workers)
         list(pool.map(workers.try_unchanged, {mutant.package for mutant in rest}))
-        with RESULTS.open("a" if asked.again else "w") as kept:
+        with RESULTS.open("a" if arguments.again else "w") as kept:
             for number, done in enumerate(as_completed([pool.submit(workers.judge, mutant) for mutant in rest]), 1):
                 mutant, verdict = done.result()
                 known[mutant] = verdict

@@ -45,7 +45,7 @@ CUDA_COMPILERS = ("nvcc", "/usr/local/cuda/bin/nvcc")
 
 
 class SetupError(Exception):
-    """Something is missing; the message is the one line that the user sees."""
+    """Something is missing; the message is the one line for the user."""
 
 
 def check_python() -> None:
@@ -138,15 +138,15 @@ def built_for() -> str:
 
 
 def wanted_build() -> str:
-    """Return what llama-cpp-python should be built for: what the user said last, and what AMX was judged once.
+    """Return what llama-cpp-python should be built for: the user's last choice, and the one check of AMX.
 
     On a CPU with AMX a build that says nothing of it, or that broke, is made again.
     """
-    asked = os.environ.get("S2A_BENCH_CUDA", "")
-    if asked not in {"", "0", "1"}:
-        raise SetupError(f"CUDA={asked}: should be 1 (build for an NVIDIA GPU) or 0 (for the CPU)")
+    wanted = os.environ.get("S2A_BENCH_CUDA", "")
+    if wanted not in {"", "0", "1"}:
+        raise SetupError(f"CUDA={wanted}: should be 1 (build for an NVIDIA GPU) or 0 (for the CPU)")
     built = built_for()
-    kind = {"": built.partition(" ")[0] or "cpu", "0": "cpu", "1": "cuda"}[asked]
+    kind = {"": built.partition(" ")[0] or "cpu", "0": "cpu", "1": "cuda"}[wanted]
     return built if built in {f"{kind} amx", f"{kind} no-amx"} else f"{kind} {amx()}".strip()
 
 
@@ -183,9 +183,9 @@ def cache_for(build: str) -> list[str]:
     its own, and what is for one GPU, or follows a build that broke, is not kept.
     """
     kind, _, verdict = build.partition(" ")
-    asked = [str(PYTHON), "-m", "pip", "cache", "dir"]
+    wanted = [str(PYTHON), "-m", "pip", "cache", "dir"]
     if kind == "cpu" and verdict and not built_for().endswith("broken"):
-        done = subprocess.run(asked, capture_output=True, text=True, check=False)  # noqa: S603 - our own interpreter
+        done = subprocess.run(wanted, capture_output=True, text=True, check=False)  # noqa: S603 - our own interpreter
         if done.returncode == 0 and done.stdout.strip():  # fails where the user has switched the cache off
             return ["--cache-dir", str(Path(done.stdout.strip()) / f"s2a-bench-{verdict}")]
     return ["--no-cache-dir"]
@@ -290,12 +290,12 @@ def install() -> None:
     pip("--quiet", "--editable", f"{ROOT}[dev]")
 
 
-def main(*asked: str) -> int:
+def main(*wanted: str) -> int:
     """Bring `.venv` up to date, and see that llama.cpp works on this processor; with ``core`` its first part alone."""
     stamp, core = VENV / "s2a-bench-installed", VENV / "s2a-bench-core"
     installed, _, tried_on = stamp.read_text().partition("\n") if stamp.exists() else ("", "", "")
     try:
-        if asked == ("core",):
+        if wanted == ("core",):
             done = installed or (core.read_text() if core.exists() else "")
             if done != fingerprint() or not PYTHON.exists():
                 install_core()

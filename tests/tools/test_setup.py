@@ -86,7 +86,7 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 @pytest.fixture
 def calls(script: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Calls:
-    """Stand in for pip: note what it is asked for, and leave what it would install."""
+    """Stand in for pip: record its arguments, and leave what it would install."""
     calls: Calls = []
     version = script.requirement("llama-cpp-python").partition("==")[2]
     python = script.PYTHON
@@ -283,8 +283,8 @@ def test_a_gpu_build_leaves_broken_amx_out_too(
     assert script.built_for() == "cuda no-amx"
 
 
-def break_llama(script: ModuleType, code: int, *said: str) -> None:
-    lines = "\n".join(f"echo '{line}' >&2" for line in said)
+def break_llama(script: ModuleType, code: int, *messages: str) -> None:
+    lines = "\n".join(f"echo '{line}' >&2" for line in messages)
     write_program(script.PYTHON, f'case "$*" in *smoke*) {lines}\nexit {code};; esac')
 
 
