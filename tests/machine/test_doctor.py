@@ -241,15 +241,15 @@ def test_one_change_gives_one_finding(
 
 def test_a_power_mode_is_asked_of_the_program_where_its_files_are_missing(make: Make) -> None:
     tree = {path: text for path, text in JETSON.items() if "nvpmodel" not in path}
-    asked: list[Sequence[str]] = []
+    commands: list[Sequence[str]] = []
 
     def run(command: Sequence[str]) -> str:
-        asked.append(command)
+        commands.append(command)
         return "NV Power Mode: MODE_30W\n2\n"
 
     assert current_power_mode(make(RTX, run=run)) is None
     assert current_power_mode(make(tree, run=run)) == ("MODE_30W", {})
-    assert asked == [["nvpmodel", "-q"]]
+    assert commands == [["nvpmodel", "-q"]]
 
 
 @pytest.mark.parametrize(

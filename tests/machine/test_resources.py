@@ -38,7 +38,7 @@ JETPACK_4 = "RAM 220/3964MB (lfb 1x1MB) CPU [1%@102,off] GR3D_FREQ 12%@921 GPU@4
 
 
 class Scripted:
-    """A reader that returns what it is told."""
+    """A reader that returns given values."""
 
     about = "scripted"
 
@@ -347,12 +347,12 @@ def test_the_thread_polls_until_it_is_told_and_closes_its_readers() -> None:
     with ResourceSampler({"nvml": reader}, 1000, {"rapl": "no package zone"}) as sampler:
         assert polled_often.wait(30)
     assert reader.closed == 1
-    told = sampler.describe()
-    assert told["readers"] == {"nvml": "scripted"}
-    assert told["left_out"] == {"rapl": "no package zone"}
-    assert told["polls"] >= 5
-    assert 0 < told["core_share"] < 1
-    assert set(told["cost_us"]) == {"nvml"}
+    facts = sampler.describe()
+    assert facts["readers"] == {"nvml": "scripted"}
+    assert facts["left_out"] == {"rapl": "no package zone"}
+    assert facts["polls"] >= 5
+    assert 0 < facts["core_share"] < 1
+    assert set(facts["cost_us"]) == {"nvml"}
 
 
 def test_a_reader_that_fails_is_left_out_from_then_on_and_ends_no_run() -> None:
