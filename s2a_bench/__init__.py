@@ -1,7 +1,7 @@
-"""s2a-bench: what wiring a vision-language model to a robot costs, and when the robot may act on what it streams.
+"""s2a-bench measures the transport between a robot and a vision-language model, and when the robot may act.
 
-The library's face: every experiment is a function (`latency`, `throughput`, `timeline`, `chunks`, `boundary`,
-`ccrb`), `load` opens a run folder, `compare` compares two. See docs/library.md; their types are in __init__.pyi.
+Every experiment is a function (`latency`, `throughput`, `timeline`, `chunks`, `boundary`, `ccrb`), `load` opens a run
+folder, `compare` compares two. See docs/library.md; the types are in __init__.pyi.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import the library when a name of it is first asked for: importing the package stays light."""
+    """Import the library at the first use of a name, so that importing the package stays fast."""
     if name not in __all__:
         raise AttributeError(f"module 's2a_bench' has no attribute '{name}'")
     from s2a_bench import library
@@ -36,5 +36,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the names of the library."""
     return [*__all__, "__version__"]

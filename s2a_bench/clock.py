@@ -1,7 +1,7 @@
-"""Time as a dependency: CLOCK_MONOTONIC for measuring, a virtual clock for tests and studies.
+"""Clocks: CLOCK_MONOTONIC for measuring, a virtual clock for tests and studies.
 
-All times are integer nanoseconds. Times of two processes on one host are comparable because Linux keeps
-one CLOCK_MONOTONIC per boot; `clock_id` names that clock, so that times of two hosts are never subtracted.
+All times are integer nanoseconds. Times of two processes on one host are comparable because Linux keeps one
+CLOCK_MONOTONIC per boot; `clock_id` names that clock, so that times of two hosts are never subtracted.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def realtime_offset_ns() -> int:
 
 
 class Clock(Protocol):
-    """Something that tells the time and can wait for a time."""
+    """Reads the time and waits for a time."""
 
     def now_ns(self) -> int: ...
 
@@ -50,7 +50,7 @@ class SystemClock:
 
 
 class VirtualClock:
-    """A clock that jumps: sleeping takes no time and moves the clock to the deadline."""
+    """A clock without waiting: sleeping moves it to the deadline, never backwards."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
@@ -59,5 +59,4 @@ class VirtualClock:
         return self._now_ns
 
     def sleep_until_ns(self, deadline_ns: int) -> None:
-        """Jump to the deadline; never backwards."""
         self._now_ns = max(self._now_ns, deadline_ns)

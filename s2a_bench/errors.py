@@ -1,6 +1,6 @@
-"""Every error a user can meet, as one tree; the message names the field, path or key and the way out. And exit codes.
+"""All errors of the package, as one tree; the message names the field, path or key and the way out. And exit codes.
 
-A field of a configuration stands in backquotes, as `requests`: the command line shows it as its flag, --requests.
+A field of a configuration is in backquotes, as `requests`: the command line shows it as its flag, --requests.
 
 S2AError
 ├── UsageError, MissingExtra, SourceError, SimulatorError, RobotError, StoreError, UnlikeRuns
@@ -17,13 +17,13 @@ from s2a_bench.secrets import struck
 from s2a_bench.text import one_line
 
 TRIPPED = 3
-"""Exit code of `compare` where a gate trips."""
+"""Exit code of `compare` if a gate trips."""
 UNDECIDED = 4
-"""Exit code of `compare` where no gate trips and one could not have seen a change of the size of its limit."""
+"""Exit code of `compare` if no gate trips and one could not have detected a change of the size of its limit."""
 
 SETUP_AGAIN = "run `make setup` again"
 COMPILE_AGAIN = "compile it on this machine"
-"""The way out for a program that is the user's own."""
+"""The way out for a user's program."""
 
 
 class S2AError(Exception):
@@ -32,7 +32,7 @@ class S2AError(Exception):
     exit_code = 1
 
     def __str__(self) -> str:
-        """Return the message on one line that shows every letter, without secrets: servers word part of many."""
+        """Return the message on one line, every letter visible, without secrets: servers write part of many."""
         return one_line(struck(super().__str__()))
 
 
@@ -43,7 +43,7 @@ class UsageError(S2AError):
 
 
 class MissingExtra(S2AError):
-    """A library that this needs is not installed, or does not load."""
+    """A required library is not installed, or does not load."""
 
 
 class SourceError(S2AError):
@@ -59,7 +59,7 @@ class ModelError(EngineError):
 
 
 class BadRequest(EngineError):
-    """No engine like this can answer this request: its grammar, its pictures, its length."""
+    """The engine cannot answer this request: its grammar, its pictures, its length."""
 
 
 class Overdue(EngineError):
@@ -67,11 +67,11 @@ class Overdue(EngineError):
 
 
 class TransportError(S2AError):
-    """A request did not make its way to the server and back."""
+    """A request failed between client and server."""
 
 
 class RequestFailed(TransportError):
-    """The server refused or broke off this one request; the next may succeed, perhaps after ``retry_after_s``."""
+    """The server refused or cancelled this request; the next may succeed, perhaps after ``retry_after_s``."""
 
     def __init__(self, message: str = "", *, retry_after_s: float | None = None) -> None:
         super().__init__(message)
@@ -83,7 +83,7 @@ class Busy(RequestFailed):
 
 
 class TooLarge(RequestFailed):
-    """The request is larger than the server takes."""
+    """The request is larger than the server's limit."""
 
 
 class MessagesLost(RequestFailed):
@@ -91,7 +91,7 @@ class MessagesLost(RequestFailed):
 
 
 class MissingInterface(TransportError):
-    """The ROS 2 workspace has not built a message's package, or another version of it."""
+    """The ROS 2 workspace lacks a message's package, or has another version of it."""
 
 
 class PortInUse(TransportError):
@@ -99,11 +99,11 @@ class PortInUse(TransportError):
 
 
 class ServerDied(TransportError):
-    """The server's process is gone."""
+    """The server's process has ended."""
 
 
 class SimulatorError(S2AError):
-    """A simulator cannot start, or goes away."""
+    """A simulator cannot start, or ends."""
 
 
 class RobotError(S2AError):
@@ -115,11 +115,11 @@ class StoreError(S2AError):
 
 
 class UnlikeRuns(S2AError):
-    """Runs of other machines, models or settings, which are not to be compared."""
+    """Runs of different machines, models or settings, which must not be compared."""
 
 
 def how_it_ended(code: int | None, cure: str = SETUP_AGAIN) -> str:
-    """Describe a `returncode` of `subprocess`; an illegal instruction says where it comes from, and the ``cure``."""
+    """Describe a `returncode` of `subprocess`, an illegal instruction with its cause and ``cure``."""
     if code is None or code >= 0:
         return f"exit code {code}"
     if -code != SIGILL:

@@ -1,4 +1,4 @@
-"""Optional libraries: which extra of this package brings each, and the one line where it is missing.
+"""Optional libraries: the extra of this package for each, and the one line about a missing one.
 
 No optional library is imported by a statement: ``gguf = extras.require("gguf", "model")``.
 """
@@ -28,7 +28,7 @@ EXTRAS: Final = {
     "carla": "the carla simulator",
     "zenoh": "ROS 2 over Zenoh, as rmw_zenoh speaks it",
 }
-"""Extra -> what it is for."""
+"""Extra -> its purpose."""
 _NOTED: ContextVar[dict[str, None] | None] = ContextVar("extras that are missing", default=None)
 
 
@@ -38,7 +38,7 @@ def installed(module: str) -> bool:
 
 
 def need(extra: str, *modules: str) -> None:
-    """Raise MissingExtra where a top-level module that an extra brings is not installed, without importing it."""
+    """Raise MissingExtra if a top-level module of an extra is not installed, without importing it."""
     if missing := [module for module in modules if not installed(module)]:
         if (noted := _NOTED.get()) is not None:
             noted[extra] = None
@@ -48,7 +48,7 @@ def need(extra: str, *modules: str) -> None:
 
 @contextmanager
 def noted() -> Iterator[dict[str, None]]:
-    """Yield the extras that `need` finds missing meanwhile, which then raises nothing."""
+    """Yield the extras that `need` finds missing in this context, in which it raises nothing."""
     missing: dict[str, None] = {}
     token = _NOTED.set(missing)
     try:
@@ -58,7 +58,7 @@ def noted() -> Iterator[dict[str, None]]:
 
 
 def require(module: str, extra: str) -> Any:
-    """Import and return a module, as ``gguf.constants``; raises MissingExtra where it is missing or does not load."""
+    """Import and return a module, as ``gguf.constants``; raises MissingExtra if it is missing or does not load."""
     need(extra, module.partition(".")[0])
     try:
         return import_module(module)

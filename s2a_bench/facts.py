@@ -1,7 +1,7 @@
-"""Facts: numbers that are told of a request besides its marks.
+"""Facts: numbers about a request besides its marks.
 
-Who tells a fact (a transport, a dialect, an engine, the harness) declares it among its ``tells``. Those that several
-tell, or that somebody else reads, are declared here.
+A transport, a dialect, an engine or the harness declares the facts that it reports. This module declares those with
+several sources, and those that another room reads.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 
 class Fact(str):
-    """The name of a fact, with its unit and its meaning; the key of ``trace.facts``, whose values are floats."""
+    """The name of a fact, with its unit and its meaning; a key of ``Trace.facts``, whose values are floats."""
 
     __slots__ = ("about", "unit")
 
@@ -18,14 +18,14 @@ class Fact(str):
     unit: str
 
     def __new__(cls, name: str, unit: str = "", about: str = "") -> Fact:  # noqa: PYI034 - Self is typing's since 3.11
-        """Name a fact; ``about`` is one line, ``unit`` empty where it is a pure number."""
+        """Name a fact; ``about`` is one line, ``unit`` empty for a pure number."""
         fact = super().__new__(cls, name)
         fact.about, fact.unit = about, unit
         return fact
 
 
 def facts_json(facts: Iterable[Fact]) -> dict[str, dict[str, str]]:
-    """Return what is declared as plain data, for the manifest."""
+    """Return declared facts as plain data, for the manifest."""
     return {str(fact): {"unit": fact.unit, "about": fact.about} for fact in facts}
 
 
@@ -60,4 +60,4 @@ LLAMA: tuple[Fact, ...] = (
     *(PROMPT_N, PROMPT_MS, PREPROCESS_MS, VISION_ENCODE_MS, PROMPT_EVAL_MS),
     *(FIRST_DECODE_MS, PREDICTED_N, PREDICTED_MS),
 )
-"""What the llama engine tells of a request, here and behind our own servers."""
+"""The facts of the llama engine, in this process and behind the package's servers."""

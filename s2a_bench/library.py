@@ -1,6 +1,6 @@
-"""The library: every experiment as a function, run folders as objects that show themselves, comparisons.
+"""The library: every experiment as a function, run folders as objects, comparisons.
 
-docs/library.md has examples. Nothing here prints; what a run changes in the caller's process is put back after it.
+docs/library.md has examples. Nothing prints; a run restores the settings of the caller's process.
 """
 
 from __future__ import annotations
@@ -33,14 +33,16 @@ if TYPE_CHECKING:
 Folder: TypeAlias = "str | Path | Run"
 Known = TypeVar("Known")
 SHOWN_DPI: Final = 150
-"""At which notebooks show figures, drawn twice as fine: 7 point text is legible and sharp."""
+"""Resolution of figures in notebooks, which are drawn twice as fine: 7 point text is legible and sharp."""
 
 
 class Run:
-    """One run, read from its folder: its rows, its tables and figures. Shows its main tables in a notebook."""
+    """One run, read from its folder: its rows, tables and figures. A notebook shows its main tables.
+
+    Raises StoreError if the folder is no run.
+    """
 
     def __init__(self, path: str | Path) -> None:
-        """Open a run folder; raises StoreError where it is none."""
         self._run = store.read_run(Path(path))
 
     @property
@@ -49,12 +51,12 @@ class Run:
 
     @property
     def manifest(self) -> Mapping[str, Any]:
-        """What was asked, where it ran, how it ended."""
+        """The configuration, the environment and the state of the run."""
         return self._run.manifest
 
     @property
     def samples(self) -> pd.DataFrame:
-        """One row a request that counts, failures marked and warm-ups left out; times in integer ns."""
+        """One row a request without warm-ups, failures marked; times in integer ns."""
         every = self.all_samples
         return every[~every["warmup"]].reset_index(drop=True)
 
@@ -70,11 +72,11 @@ class Run:
 
     @property
     def tables(self) -> tuple[str, ...]:
-        """The names that `table` knows."""
+        """The names of the tables."""
         return tuple(self._shown.tables)
 
     def table(self, name: str) -> pd.DataFrame:
-        """Return one of the run's tables: as CSV has it, every digit kept, else as people read it."""
+        """Return one of the run's tables: with every digit if it has a CSV file, else as text."""
         import pandas as pd
 
         shown = self._shown
@@ -87,8 +89,8 @@ class Run:
         """Draw one of the run's figures, which a notebook shows with its caption."""
         with paper_column():
             figure = self._one(self._shown.figures, "figure", name)()
-        for asked, shown in (("_repr_png_", _png), ("_repr_html_", _figure_html)):  # by IPython
-            setattr(figure, asked, partial(shown, figure))
+        for method, shown in (("_repr_png_", _png), ("_repr_html_", _figure_html)):  # IPython calls them
+            setattr(figure, method, partial(shown, figure))
         return figure
 
     def figures(self) -> dict[str, Figure]:
@@ -96,11 +98,11 @@ class Run:
         return {name: self.plot(name) for name in self._shown.figures}
 
     def json(self) -> dict[str, Any]:
-        """Return the object that the command's ``--json`` prints."""
+        """Return the object of the command's ``--json``."""
         return self._shown.json()
 
     def save(self) -> Path:
-        """Write tables and figures into the run folder, as the command does, and return it."""
+        """Write tables and figures into the run folder, as the command does, and return its path."""
         write_shown(self._run, self._shown)
         return self.path
 
@@ -114,7 +116,7 @@ class Run:
     def _shown(self) -> Shown:
         experiment = experiment_of(str(self.manifest["command"]))
         if experiment is None:
-            raise UsageError(f"{self.path}: no experiment here shows {self.manifest['command']} runs")
+            raise UsageError(f"{self.path}: no installed experiment shows {self.manifest['command']} runs")
         return experiment.show(self._run)
 
     def __repr__(self) -> str:
@@ -123,18 +125,18 @@ class Run:
     def _repr_html_(self) -> str:
         shown = self._shown
         tables = [shown.tables[name] for name in shown.main or shown.tables]
-        said = "".join(f"<p>{escape(sentence)}</p>" for sentence in shown.sentences)
-        return f"<p><code>{escape(repr(self)[1:-1])}</code></p>{said}{''.join(map(_html, tables))}"
+        sentences = "".join(f"<p>{escape(sentence)}</p>" for sentence in shown.sentences)
+        return f"<p><code>{escape(repr(self)[1:-1])}</code></p>{sentences}{''.join(map(_html, tables))}"
 
 
 class Comparison:
-    """What changed between two runs. Shows its table in a notebook."""
+    """The changes between two runs. A notebook shows its table."""
 
     def __init__(self, compared: ComparedRuns) -> None:
         self._compared = compared
 
     def table(self) -> pd.DataFrame:
-        """Return a row a cell and metric: both values, the change with its interval, the verdict."""
+        """Return one row a cell and metric: both values, the change with its interval, the verdict."""
         import pandas as pd
 
         from s2a_bench.report.compare.shown import compare_csv
@@ -150,10 +152,10 @@ class Comparison:
 def run(
     name: str, *, output: str | Path = "results", progress: Progress | None = None, tune: bool = True, **options: Any
 ) -> Run:
-    """Run an experiment by its name; ``options`` are its fields, those of its groups by their own names.
+    """Run an experiment by its name; ``options`` are its fields, and those of its groups.
 
-    While it measures, this process keeps freed memory and limits threads, as the command line does, unless ``tune``
-    is False; runs with and without are not compared. Raises S2AError for what the caller can mend.
+    During the run this process keeps freed memory and limits threads, as the command line does, unless ``tune``
+    is False; runs with and without are not compared. Raises S2AError for what the caller can fix.
     """
     experiment: Experiment = EXPERIMENTS[name]
     config_class: type[Options] = resolve_name(experiment.config)
@@ -163,7 +165,7 @@ def run(
 
 
 def load(path: str | Path) -> Run:
-    """Open a run folder; raises StoreError where it is none."""
+    """Open a run folder; raises StoreError if the folder is no run."""
     return Run(path)
 
 
@@ -175,7 +177,7 @@ def compare(
     metrics: Sequence[str] = (),
     least: float = 0.05,
 ) -> Comparison:
-    """Compare two runs, or two sets of launches; ``least`` is the smallest share that is called a change.
+    """Compare two runs, or two sets of launches; ``least`` is the smallest share that counts as a change.
 
     Raises UnlikeRuns for runs of other machines, models or settings, unless ``unlike``.
     """
@@ -207,7 +209,7 @@ def _opened(side: Folder | Sequence[Folder]) -> list[store.StoredRun]:
 
 
 def _png(figure: Figure) -> tuple[bytes, dict[str, int]]:
-    """Return a figure as PNG, and the size at which a notebook shows it."""
+    """Return a figure as PNG, and its size in a notebook."""
     drawn = io.BytesIO()
     with paper_column():
         figure.savefig(drawn, dpi=2 * SHOWN_DPI)

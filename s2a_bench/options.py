@@ -1,7 +1,7 @@
-"""Options declared once: a documented, typed, bounded field of a configuration, and all else follows from it.
+"""Options, declared once: a documented, typed, bounded field of a configuration.
 
-From a field come its flag and ``--help``, its validation, the sweep axis, the manifest's entry and the table in docs/.
-A configuration that exists is valid: what makes no sense raises UsageError, which names the field, where it is made.
+Its flag and ``--help``, its validation, the sweep axis, the manifest's entry and the table in docs/ follow from the
+field. Every configuration is valid: its constructor raises UsageError, which names the field.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class Options(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     PANEL: ClassVar[str] = ""
-    """The heading in ``--help`` over the options that this class declares, those with one of their own aside."""
+    """The heading in ``--help`` of the options without a panel that this class declares."""
 
     OLD: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    """Names that options had -> the field that is given instead, and what goes before each of its values."""
+    """Former name of an option -> the field that replaces it, and the prefix of its values."""
 
     def __init__(self, **given: Any) -> None:
-        """Keep what is given, the defaults for the rest; raises UsageError naming the field."""
+        """Raise UsageError, naming the field, for an invalid value."""
         try:
             super().__init__(**given)
         except ValidationError as error:
@@ -45,11 +45,11 @@ class Options(BaseModel):
         self.check()
 
     def check(self) -> None:
-        """Raise UsageError, naming the fields, for values that make no sense together."""
+        """Raise UsageError, naming the fields, for values that contradict each other."""
 
     @property
     def virtual(self) -> bool:
-        """Whether a run computes in virtual time, so that several may share a machine; a measuring one may not."""
+        """Whether a run computes in virtual time, so that several may share a machine; measuring runs may not."""
         return False
 
     def but(self: Made, **changes: Any) -> Made:  # noqa: PYI019 - typing has Self since Python 3.11
@@ -61,14 +61,14 @@ class Options(BaseModel):
         return {name: getattr(self, name) for name in self.model_fields_set}
 
     def given(self, options: type[Options] | None = None) -> Iterator[str]:
-        """Yield the fields, of ``options`` that this class is derived from if told, that were given a value."""
+        """Yield the fields that were given a value; with ``options``, a base class, only its fields."""
         for name in type(self).model_fields:
             if name in self.model_fields_set and (options is None or name in options.model_fields):
                 value = getattr(self, name)
                 yield from value.given() if isinstance(value, Options) else [name]
 
     def risks(self) -> Iterator[tuple[str, str, str]]:
-        """Yield the fields given whose value a file of somebody else's should not decide: name, `risk` and value."""
+        """Yield name, `risk` and value of the given fields that an untrusted file should not set."""
         for name in self.model_fields_set:
             value = getattr(self, name)
             if isinstance(value, Options):
@@ -94,14 +94,14 @@ def option(
     names: Callable[[], Iterable[str]] | None = None,
     **bounds: Any,
 ) -> Any:
-    """Declare a field: ``about`` is its help, ``flag`` its name on the command line where that is not the field's.
+    """Declare a field: ``about`` is its help, ``flag`` its name on the command line unless that is the field's.
 
-    On the command line an ``argument`` is given by its place instead of a flag, and a ``hidden`` flag is left out of
-    the help. ``side`` is for the options of a transport, see `transport`. ``risk`` says that the value names
-    a program to run, a server that requests go to, or a key for it. ``panel`` is the heading in ``--help`` where that
-    is not its class's; ``--help`` of a command with many flags shows those that are ``first``. ``names`` returns what a
-    shell completes, for a value that `one_of` does not check. A field whose ``default`` is `...` has to be given.
-    ``bounds`` are pydantic's: ge, gt, le, lt, min_length, pattern.
+    On the command line an ``argument`` is given by its position instead of a flag, and the help omits a ``hidden``
+    flag. ``side`` is for the options of a transport, see `transport`. ``risk``: the value names a program to run, a
+    server that receives requests, or a key for it. ``panel`` is the heading in ``--help``, by default that of the
+    class; ``--help`` of a command with many flags shows those that are ``first``. ``names`` returns the completions of
+    a shell, for a value that `one_of` does not check. A field whose ``default`` is `...` is required. ``bounds`` are
+    pydantic's: ge, gt, le, lt, min_length, pattern.
     """
     extra: dict[str, Any] = {"flag": flag, "argument": argument, "hidden": hidden, "side": side, "risk": risk}
     extra |= {"panel": panel, "first": first, "names": names}
@@ -111,29 +111,29 @@ def option(
 def group(
     options: type[Options], *, only: Iterable[str] = (), about: str = "", first: Iterable[str] | None = None
 ) -> Any:
-    """Declare a group of options, of which ``only`` some are flags; ``about`` stands before the help of each.
+    """Declare a group of options, of which ``only`` some are flags; ``about`` precedes the help of each.
 
-    The flags that are ``first`` in ``--help`` are those that ``options`` declares so, unless they are named here.
+    ``first`` names the flags that come first in ``--help``; by default ``options`` declares them.
     """
     extra: dict[str, Any] = {"only": [*only], "about": about, "first": None if first is None else [*first]}
     return Field(default_factory=options, json_schema_extra=extra)
 
 
 def group_of(field: FieldInfo) -> type[Options] | None:
-    """Return the class of a group of options; None for a field that is one option."""
+    """Return the class of a group of options; None for a single option."""
     kind = field.annotation
     return kind if isinstance(kind, type) and issubclass(kind, Options) else None
 
 
 def extra_of(field: FieldInfo) -> Mapping[str, Any]:
-    """Return what `option` or `group` declared of a field besides what pydantic knows."""
+    """Return the arguments of `option` or `group` that pydantic does not have."""
     return field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
 
 
 def help_place(options: type[Options], name: str) -> tuple[str, bool]:
     """Return the heading of a field's option in ``--help``, and whether it is one of the first there.
 
-    A class that declares a field anew, with another default, need not repeat them.
+    A class that declares a field again, with another default, inherits them.
     """
     bases = [each for each in options.__mro__ if issubclass(each, Options) and name in each.model_fields]
     extras = [extra_of(each.model_fields[name]) for each in bases]
@@ -142,27 +142,27 @@ def help_place(options: type[Options], name: str) -> tuple[str, bool]:
 
 
 Place: TypeAlias = tuple[str, ...]
-"""The field of an option, behind the fields of the groups that it is in."""
+"""The field of an option, after the fields of its groups."""
 
 
 def beside(path: Place, other: Place) -> bool:
-    """Whether two options are in groups beside each other, so that by one name they are one: the port of any server."""
+    """Whether two options are in sibling groups, where one name sets both: the port of any server."""
     return len(path) == len(other) and path[:-2] == other[:-2]
 
 
 def places(options: type[Options]) -> dict[str, list[Place]]:
-    """Return every name under which one option can be given, its field's and its flag's, and the paths to its fields.
+    """Return every name of an option, its field's and its flag's, with the paths to its fields.
 
-    The options of a group are there by their own names; groups beside each other share those that they all have.
+    The options of a group keep their names; sibling groups share the names that both have.
     """
     found: dict[str, list[Place]] = {name: [(name,)] for name in options.OLD}
     for name, field in options.model_fields.items():
         if inner := group_of(field):
             for each, paths in places(inner).items():
-                mine = [(name, *path) for path in paths]
-                known = found.setdefault(each, mine)
-                if known is not mine and beside(known[0], mine[0]):
-                    known += mine
+                new = [(name, *path) for path in paths]
+                known = found.setdefault(each, new)
+                if known is not new and beside(known[0], new[0]):
+                    known += new
     for name, field in options.model_fields.items():
         if group_of(field) is None:
             found |= {name: [(name,)], str(extra_of(field).get("flag") or name).replace("-", "_"): [(name,)]}
@@ -170,7 +170,7 @@ def places(options: type[Options]) -> dict[str, list[Place]]:
 
 
 def placed(options: type[Options], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options, each given by one of its names, as the class takes them; unknown ones stay as they are."""
+    """Return options, each given by one of its names, as arguments of the class; unknown names stay."""
     known = places(options)
 
     def at(name: str, value: Any) -> list[Place]:
@@ -181,7 +181,7 @@ def placed(options: type[Options], given: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def nested(values: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
-    """Return values, each with the path to its field, as a class of options takes them: groups as dictionaries."""
+    """Return values, each with the path to its field, as arguments of a class of options: groups as dictionaries."""
     found: dict[str, Any] = {}
     for (*groups, last), value in values:
         inner = found
@@ -206,12 +206,12 @@ def _line(error: ErrorDetails, options: type[Options]) -> str:
         return f"`{field}`: name at least one"
     if error["type"] == "value_error":
         return f"`{field}`: {error['ctx']['error']}"
-    said = re.sub("^(Input|Value|String) ", "", error["msg"])
-    return f"`{field}`: {error['input']!r} {said}"
+    message = re.sub("^(Input|Value|String) ", "", error["msg"])
+    return f"`{field}`: {error['input']!r} {message}"
 
 
 def need_program(field: str, path: Path) -> None:
-    """Raise UsageError where the path of a field is no program that can be run."""
+    """Raise UsageError if the path of a field is no program that can be run."""
     if not (path.is_file() and os.access(path, os.X_OK)):
         raise UsageError(f"`{field}`: {path} is no program that can be run")
 
@@ -219,20 +219,20 @@ def need_program(field: str, path: Path) -> None:
 def listed(value: Any) -> tuple[Any, ...]:
     """Split text at commas, make a tuple of any other value, and keep each element once."""
     if isinstance(value, str):
-        value = [part.strip() for part in value.split(",") if part.strip()]
+        value = [text.strip() for text in value.split(",") if text.strip()]
     elif not isinstance(value, Iterable):
         value = [value]
     return tuple(dict.fromkeys(value))
 
 
 def one_of(names: Callable[[], Iterable[str]]) -> AfterValidator:
-    """Return a validator: the value, or each of several, is one of ``names()``, asked when it is needed."""
+    """Return a validator: the value, or each of several, is one of ``names()``, called on validation."""
     return AfterValidator(OneOf(names))
 
 
 @dataclass(frozen=True, slots=True)
 class OneOf:
-    """The check of `one_of`, which knows the names."""
+    """The check of `one_of`."""
 
     names: Callable[[], Iterable[str]]
 
@@ -244,7 +244,7 @@ class OneOf:
 
 
 def completions(field: FieldInfo) -> Callable[[], Iterable[str]] | None:
-    """Return what lists the names that an option's value may be, or begin with; None where there are none."""
+    """Return the function that lists the names for an option's value, or None."""
     checks = (getattr(each, "func", None) for each in field.metadata)
     kinds = (field.annotation, *get_args(field.annotation))
     literal = next((get_args(each) for each in kinds if get_origin(each) is Literal), ())
@@ -253,7 +253,6 @@ def completions(field: FieldInfo) -> Callable[[], Iterable[str]] | None:
 
 
 def _size(value: Any) -> Any:
-    """Read WIDTHxHEIGHT."""
     if not isinstance(value, str):
         return value
     width, cross, height = value.lower().partition("x")
@@ -263,7 +262,6 @@ def _size(value: Any) -> Any:
 
 
 def _square(value: Any) -> Any:
-    """Read WIDTHxHEIGHT, or one number for both."""
     return (int(value),) * 2 if isinstance(value, str) and value.isdecimal() else _size(value)
 
 
@@ -290,7 +288,7 @@ def _sound(text: Any) -> Any:
 
 
 SEVERAL = BeforeValidator(listed)
-"""What makes a tuple of text with commas between its elements, each once."""
+"""Splits text at commas to a tuple, each element once."""
 
 Names = Annotated[tuple[str, ...], SEVERAL]
 Numbers = Annotated[tuple[float, ...], SEVERAL]
@@ -306,4 +304,4 @@ TextOrFile = Annotated[str, BeforeValidator(_text)]
 """A text, or the content of the file that @FILE names."""
 
 Grammar = Annotated[str, BeforeValidator(_grammar)]
-"""A grammar in GBNF, or the content of the file that has it."""
+"""A grammar in GBNF, or the content of its file."""

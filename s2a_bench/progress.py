@@ -1,4 +1,4 @@
-"""How a run tells what it is doing."""
+"""The progress of a run."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from typing import Any, Protocol
 
 
 class Progress(Protocol):
-    """How a run tells what it is doing."""
+    """Receives the progress of a run."""
 
     def opened(self, folder: Path) -> None:
-        """Say where the results go, before the first of them."""
+        """Show the run folder, before the first result."""
 
     def say(self, line: str) -> None:
-        """Say one line that stays."""
+        """Show one line that stays."""
 
     def stage(self, text: str) -> None:
-        """Say what is being done now."""
+        """Show the current stage."""
 
     def expect(self, samples: int) -> None:
-        """Say how many samples are to come."""
+        """Set the number of samples."""
 
     def advance(self) -> None:
-        """Say that one more sample is done."""
+        """Count one more sample."""
 
 
 class NullProgress:
-    """Shows nothing, and keeps what it was told last."""
+    """Shows nothing, and keeps the last values."""
 
     folder: Path | None = None
     text = ""
@@ -37,8 +37,7 @@ class NullProgress:
     def opened(self, folder: Path) -> None:
         self.folder = folder
 
-    def say(self, line: str) -> None:
-        """Say nothing."""
+    def say(self, line: str) -> None: ...
 
     def stage(self, text: str) -> None:
         self.text = text
@@ -51,17 +50,17 @@ class NullProgress:
 
 
 class LiveView(Protocol):
-    """What can be watched while it happens."""
+    """A view that changes during a run."""
 
     def draw(self, width: int) -> Any:
-        """Return how it looks now, so many columns wide, as rich renders it."""
+        """Return the present view as a renderable of rich, ``width`` columns wide."""
 
     def lines(self) -> Iterable[str]:
-        """Return what came of it, for where there is no terminal."""
+        """Return the result as text, for an output without a terminal."""
 
 
-def watching(progress: Progress, picture: LiveView) -> AbstractContextManager[None]:
-    """Show a picture for as long as the context lasts, where ``progress`` has a method ``watch`` for it."""
+def watching(progress: Progress, view: LiveView) -> AbstractContextManager[None]:
+    """Show a view within the context, if ``progress`` has a method ``watch``."""
     watch = getattr(progress, "watch", None)
-    shown: AbstractContextManager[None] = watch(picture) if watch else nullcontext()
+    shown: AbstractContextManager[None] = watch(view) if watch else nullcontext()
     return shown

@@ -1,8 +1,8 @@
-"""Where numbers come from: who answered, with which weights, and whether its tokens, the link and the clock were real.
+"""The origin of numbers: the engine and its weights, and whether its tokens, the link and the clock were real.
 
-Who makes a number says so once (an engine in what it tells of itself, an experiment that computes in its manifest); the
-manifest carries it by cell, and every table, CSV, figure, page and JSON object that is written has it. What was not
-told is *unknown*, never what was configured.
+The source of a number declares it once (an engine in its description, a computing experiment in its manifest); the
+manifest holds it by cell, and every written table, CSV, figure, page and JSON object repeats it. A field without a
+report is *unknown*, never the configured value.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Final
 UNKNOWN: Final = "unknown"
 NONE: Final = "none"
 ORIGIN: Final = "Provenance: "
-"""How a line begins that says where numbers come from."""
+"""The beginning of a line of provenance."""
 
 LABELS: Final = {
     ("weights", "dummy"): "dummy weights",
@@ -28,11 +28,11 @@ LABELS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Provenance:
-    """Where the numbers of one cell come from.
+    """The origin of one cell's numbers.
 
-    ``weights`` are real, dummy, or none where no model takes part; ``tokens`` measured, emulated (their times come from
-    a profile, a rate or a distribution) or paced (held back); ``link`` real, emulated, or none; ``clock`` monotonic or
-    virtual. ``profile`` names what was emulated: a profile, or latencies. Each is "unknown" where nobody told.
+    ``weights`` are real, dummy, or none without a model; ``tokens`` measured, emulated (their times come from a
+    profile, a rate or a distribution) or paced (held back); ``link`` real, emulated, or none; ``clock`` monotonic or
+    virtual. ``profile`` names the emulated profile or latencies. "unknown": there was no report.
     """
 
     engine: str = UNKNOWN
@@ -46,65 +46,64 @@ class Provenance:
     clock: str = "monotonic"
 
     @classmethod
-    def of_engine(cls, told: Mapping[str, Any], *, link: str = "real") -> Provenance:
-        """Read what an engine says of itself (`Engine.describe`); what it does not say is unknown."""
-        weights = {True: "dummy", False: "real"}.get(told.get("dummy", ""), UNKNOWN)
-        if not told.get("engine"):
+    def of_engine(cls, facts: Mapping[str, Any], *, link: str = "real") -> Provenance:
+        """Read an engine's description (`Engine.describe`); an absent fact is unknown."""
+        weights = {True: "dummy", False: "real"}.get(facts.get("dummy", ""), UNKNOWN)
+        if not facts.get("engine"):
             return cls(link=link, weights=weights)
-        emulated, paced = bool(told.get("emulated")), "paced_tokens_per_s" in told
-        no_model = told.get("model") == NONE
+        emulated, paced = bool(facts.get("emulated")), "paced_tokens_per_s" in facts
+        no_model = facts.get("model") == NONE
         return cls(
-            engine=_text(told["engine"]),
-            model="" if no_model else _text(told.get("name") or told.get("model")),
-            model_sha256=_text(told.get("model_sha256")),
-            quantisation=_text(told.get("quantisation")),
+            engine=_text(facts["engine"]),
+            model="" if no_model else _text(facts.get("name") or facts.get("model")),
+            model_sha256=_text(facts.get("model_sha256")),
+            quantisation=_text(facts.get("quantisation")),
             weights=NONE if no_model else weights,
             tokens="emulated" if emulated else "paced" if paced else "measured",
-            profile=_text(told.get("profile")) or _latencies(_text(told.get("latency"))),
+            profile=_text(facts.get("profile")) or _latencies(_text(facts.get("latency"))),
             link=link,
         )
 
     @classmethod
     def computed(cls, profile: str = "", weights: str = NONE) -> Provenance:
-        """Describe what no model answered and no clock measured: arrivals of a profile or a rate, in virtual time."""
+        """Describe numbers without a model and a measurement: arrivals of a profile or a rate, in virtual time."""
         return cls(engine=NONE, weights=weights, tokens="emulated", profile=profile, link=NONE, clock="virtual")
 
     @classmethod
-    def from_dict(cls, told: Mapping[str, Any]) -> Provenance:
-        """Read what a manifest or a peer says; a field that is missing or no text has its default."""
-        return cls(**{name: _text(value) for name in _FIELDS if isinstance(value := told.get(name), str) and value})
+    def from_dict(cls, values: Mapping[str, Any]) -> Provenance:
+        """Read the entry of a manifest or a peer; a field that is missing or no text has its default."""
+        return cls(**{name: _text(value) for name in _FIELDS if isinstance(value := values.get(name), str) and value})
 
     def to_dict(self) -> dict[str, str]:
         return asdict(self)
 
     @property
     def known(self) -> bool:
-        """Whether it was told who answered."""
+        """Whether the engine is known."""
         return self.engine != UNKNOWN
 
     @property
     def emulated(self) -> bool:
-        """Whether the times of tokens come from something else than a model that answers."""
         return self.tokens == "emulated"
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Return the labels of what is not plainly a real model, measured."""
+        """Return the labels of everything except a real, measured model."""
         found = tuple(label for (name, value), label in LABELS.items() if getattr(self, name) == value)
         no_model = self.weights == NONE and self.engine not in {NONE, UNKNOWN}
         return (*found, f"{self.engine} engine") if no_model else found
 
     @property
     def code(self) -> str:
-        """Return it in one word for a column: engine/weights/tokens, and what else is not plain."""
+        """Return the text of a column: engine/weights/tokens, with an emulated link and a virtual clock."""
         more = [f"{name}-{value}" for name, value in (("link", self.link), ("clock", self.clock)) if value in _UNPLAIN]
         return "/".join((self.engine, self.weights, self.tokens, *more))
 
     @property
     def line(self) -> str:
-        """Return it in words: "llama (tiny-f16.gguf, DUMMY WEIGHTS), tokens measured"."""
+        """Return a sentence: "llama (tiny-f16.gguf, DUMMY WEIGHTS), tokens measured"."""
         if not self.known:
-            return "engine UNKNOWN (the server does not tell)"
+            return "engine UNKNOWN (the server does not report it)"
         model = ", ".join(filter(None, (self.model, self.quantisation, _WEIGHTS.get(self.weights, ""))))
         engine = "no engine" if self.engine == NONE else self.engine + (f" ({model})" if model else "")
         tokens = f"tokens {self.tokens.upper() if self.tokens in _LOUD else self.tokens}"
@@ -120,24 +119,24 @@ _WEIGHTS: Final = {"dummy": "DUMMY WEIGHTS", NONE: "no model", UNKNOWN: "weights
 _LOUD: Final = {"emulated", "paced", UNKNOWN}
 _UNPLAIN: Final = {"emulated", "virtual"}
 _LONGEST: Final = 200
-"""A peer's text is no longer than this."""
+"""Limit on a peer's text."""
 
 
 @dataclass(frozen=True, slots=True)
 class Origins:
-    """The provenance of a run: of its cells where they differ, else of all."""
+    """The provenance of a run: of its cells if they differ, else of all."""
 
     run: Provenance
     cells: dict[str, Provenance] = field(default_factory=dict)
 
     @classmethod
     def of_manifest(cls, manifest: Mapping[str, Any]) -> Origins:
-        """Read a manifest's ``provenance``; where it has none, as before anything answered, nothing is known."""
-        told = manifest.get("provenance")
-        if not isinstance(told, Mapping):
+        """Read a manifest's ``provenance``; without it, as before the first answer, nothing is known."""
+        entry = manifest.get("provenance")
+        if not isinstance(entry, Mapping):
             return cls(Provenance())
-        cells = {str(name): Provenance.from_dict(cell) for name, cell in (told.get("cells") or {}).items()}
-        return cls(Provenance.from_dict(told.get("run") or {}), cells)
+        cells = {str(name): Provenance.from_dict(cell) for name, cell in (entry.get("cells") or {}).items()}
+        return cls(Provenance.from_dict(entry.get("run") or {}), cells)
 
     def to_manifest(self) -> dict[str, Any]:
         return {"run": self.run.to_dict(), "cells": {name: cell.to_dict() for name, cell in self.cells.items()}}
@@ -146,7 +145,7 @@ class Origins:
         return self.cells.get(cell, self.run)
 
     def of_row(self, cell: str) -> str:
-        """Return in one word where a row's numbers come from: its cell's, or everybody's if there is no such cell."""
+        """Return the code of a row: its cell's, or that of all cells if there is no such cell."""
         return self.cells[cell].code if cell in self.cells else self.code
 
     @property
@@ -160,21 +159,21 @@ class Origins:
 
     @property
     def line(self) -> str:
-        return f"{ORIGIN}{self._alike('profile', lambda each: replace(each, profile=''))}."
+        return f"{ORIGIN}{self._grouped('profile', lambda each: replace(each, profile=''))}."
 
     @property
     def brief(self) -> str:
-        """Return the line without the names of models and profiles, for where there is room for one line only."""
+        """Return the line without the names of models and profiles, for a place of one line."""
 
         def kind(each: Provenance) -> Provenance:
             engine = each.engine if each.engine in {NONE, UNKNOWN} else ""
             link = each.link if each.link in _UNPLAIN else ""
             return replace(each, engine=engine, model="", model_sha256="", quantisation="", profile="", link=link)
 
-        return self._alike("engine", kind)
+        return self._grouped("engine", kind)
 
-    def _alike(self, name: str, kind: Callable[[Provenance], Provenance]) -> str:
-        """Return a line for each kind of provenance, with all values of a field that its own have."""
+    def _grouped(self, name: str, kind: Callable[[Provenance], Provenance]) -> str:
+        """Return a line for each kind of provenance, with all values of one field in that kind."""
         found: dict[Provenance, dict[str, None]] = {}
         for each in self.every:
             found.setdefault(kind(each), {})[getattr(each, name)] = None
@@ -183,19 +182,19 @@ class Origins:
 
     @property
     def code(self) -> str:
-        """Return one word for what is made of several cells."""
+        """Return the codes of all cells, each once."""
         return " ".join(dict.fromkeys(each.code for each in self.every))
 
 
 def joined(origins: Iterable[Origins]) -> Origins:
-    """Return the provenance of what is made of several runs."""
+    """Return the provenance of several runs together."""
     every = dict.fromkeys(each for one in origins for each in one.every)
     cells = {str(place): each for place, each in enumerate(every)}
     return Origins(next(iter(every), Provenance()), cells)
 
 
 def _latencies(written: str) -> str:
-    """Return in words which latencies somebody waits for: a number is ms."""
+    """Describe an engine's latencies; a number is ms."""
     return f"latencies {written}{' ms' if written[-1].isdigit() and ':' not in written else ''}" if written else ""
 
 

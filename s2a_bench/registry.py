@@ -1,7 +1,7 @@
-"""Names by table or by package: what of one kind there is, built in or offered by installed packages.
+"""The implementations of one kind by name, built in or offered by installed packages.
 
 Built-ins are a table ``name -> "module:attribute"``; other packages add to a kind with entry points of the group
-``s2a_bench.<kind>`` (Python packaging user guide, "entry points"). Nothing is imported before it is asked for by name.
+``s2a_bench.<kind>`` (Python packaging user guide, "entry points"). A look-up by name imports the module.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Registry(Mapping[str, T], Generic[T]):
 
     @cached_property
     def _offered(self) -> dict[str, EntryPoint]:
-        """Return what installed packages add; a built-in name cannot be taken over."""
+        """Return the entry points of installed packages, except those with a built-in's name."""
         found = {point.name: point for point in entry_points(group=self.group)}
         return {name: point for name, point in sorted(found.items()) if name not in self._builtins}
 
@@ -65,7 +65,7 @@ class Registry(Mapping[str, T], Generic[T]):
         return tuple(self._builtins)
 
     def where(self, name: str) -> str:
-        """Return the module of an implementation of our own."""
+        """Return the module of a built-in implementation."""
         return self._builtins[name].partition(":")[0]
 
     def loaded(self) -> Iterator[tuple[str, T]]:

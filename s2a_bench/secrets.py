@@ -1,7 +1,7 @@
-"""Secrets that this process was given: kept here to strike them out of whatever is shown or stored.
+"""The secrets of this process, which are removed from everything that is shown or stored.
 
-A server may send a key back in an error, a header or its answer: as it is, percent-encoded, in JSON's escapes, in
-Base64 at any offset, in other case.
+A server may send a key back in an error, a header or its answer: plain, percent-encoded, in JSON's escapes, in Base64
+at any offset, in other case.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 LONG: Final = 8
-"""Letters from which a secret is no word: shorter ones are struck out of what servers say only, where they stand
-alone. A placeholder such as `ollama` would be struck out of settings otherwise."""
+"""A secret of fewer letters is removed from servers' messages only, and only as a separate word: a placeholder such as
+`ollama` would otherwise disappear from settings."""
 
 STRUCK: Final = "***"
 
@@ -30,12 +30,12 @@ _NO_SECRET = re.compile(r"(?:stop|eos|bos|pad|unk|cls|sep|mask)_token$|cache_key
 
 def is_secret(name: str) -> bool:
     """Return whether a name looks like that of a secret: ``api_key``, ``accessToken``, ``X-Auth``."""
-    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[^A-Za-z0-9]+", "_", name).strip("_").lower()
-    return bool(_NAME.search(words)) and not _NO_SECRET.search(words)
+    snake_case = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|[^A-Za-z0-9]+", "_", name).strip("_").lower()
+    return bool(_NAME.search(snake_case)) and not _NO_SECRET.search(snake_case)
 
 
 def secrets_in(value: Any, name: str = "", *, inside: bool = False) -> Iterator[tuple[str, str]]:
-    """Yield name and text of every value of a JSON object that is under a secret's name, however deep."""
+    """Yield name and text of every value of a JSON object under a secret's name, at any depth."""
     if isinstance(value, dict):
         for key, item in value.items():
             found = inside or is_secret(key)
@@ -48,7 +48,7 @@ def secrets_in(value: Any, name: str = "", *, inside: bool = False) -> Iterator[
 
 
 def keep(secret: str) -> None:
-    """Strike a secret out from now on."""
+    """Remove a secret from now on."""
     if len(secret) >= LONG:
         _long.setdefault(secret, "|".join([_letters(secret), *_in_base64(secret)]))
     elif secret:
@@ -56,13 +56,13 @@ def keep(secret: str) -> None:
 
 
 def struck(text: str, *, short: bool = True) -> str:
-    """Return a text without the secrets; ``short`` ones too, as in what servers say."""
+    """Return a text without the secrets; with the ``short`` ones too, as in servers' messages."""
     patterns = [*_long.values(), *(_short.values() if short else ())]
     return re.sub("|".join(patterns), STRUCK, text, flags=re.IGNORECASE) if patterns else text
 
 
 def struck_pieces(texts: Sequence[str]) -> list[str]:
-    """Return the pieces of one text without the secrets, which may go over several of them."""
+    """Return the pieces of one text without the secrets, which may span several pieces."""
     whole, patterns = "".join(texts), [*_long.values(), *_short.values()]
     found = list(re.finditer("|".join(patterns), whole, re.IGNORECASE)) if patterns else []
     if not found:
@@ -83,7 +83,7 @@ def _letters(secret: str) -> str:
 
 
 def _in_base64(secret: str) -> Iterator[str]:
-    """Yield a pattern for each offset that a text can have inside of what was encoded."""
+    """Yield a pattern for each offset of a text inside encoded data."""
     for before in range(3):
         data = bytes(before) + secret.encode()
         whole = base64.b64encode(data).decode()

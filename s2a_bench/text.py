@@ -1,4 +1,4 @@
-"""Text from outside: read within bounds; shown so that no letter moves the cursor, forges a line or turns others."""
+"""Text from outside: read within bounds; shown without letters that move the cursor, forge a line or reverse others."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ _HIDDEN = re.compile(
 )
 """Control characters (C0, C1), marks and overrides of direction, invisible letters, halves of surrogate pairs."""
 
-
 FILE_LETTERS: Final = 8 << 20
-"""The longest text file that is read where a user names one."""
+"""Limit on a user's text files."""
 
 
 def read_text(path: str | Path, most: int = FILE_LETTERS) -> str:
-    """Read a UTF-8 file that a user names; raises UnicodeDecodeError, OSError, for one longer than ``most`` too."""
+    """Read a user's UTF-8 file; raises UnicodeDecodeError, and OSError, also for more than ``most`` letters."""
     with Path(path).open(encoding="utf-8") as file:
         text = file.read(most + 1)
     if len(text) > most:
@@ -38,11 +37,11 @@ def one_line(text: str) -> str:
 
 
 def like(name: str, names: Iterable[str]) -> str:
-    """Return the question that ends an error about an unknown name; nothing where no known name is close."""
+    """Return the question at the end of an error about an unknown name, or nothing if no known name is close."""
     close = get_close_matches(name.lower(), [*names], 1)
     return f"; did you mean {close[0]}?" if close else ""
 
 
 def none_of(name: str, names: Collection[str], more: str = "") -> str:
-    """Return that a name is unknown, which ones there are, ``more``, and which one was perhaps meant."""
+    """Return the error about an unknown name: the known ones, ``more``, and the closest."""
     return f"'{name}' is none of {', '.join(filter(None, names))}{more}{like(name, names)}"

@@ -1,6 +1,6 @@
-"""TOML files that users write: read strictly, so that a typing error becomes no number that figures show.
+"""TOML files of users, read strictly, so that a typing error does not become a number in a figure.
 
-Every complaint is one line that names the file and the key.
+Every error is one line that names the file and the key.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _SHOULD_BE = {
     "float_type": "a number",
     "bool_type": "true or false",
 }
-"""Type of an error of pydantic -> what there should be, in TOML's words."""
+"""pydantic's type of an error -> the right type in TOML's terms."""
 _WRONG = {"missing": "is missing", "too_short": "is empty"}
 
 
@@ -49,19 +49,19 @@ Line = Annotated[str, AfterValidator(_one_line)]
 
 
 class TomlTable(BaseModel):
-    """Base of what a table may hold: every key is known, nothing is converted, numbers are finite."""
+    """Base of a table's schema: every key is known, nothing is converted, numbers are finite."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
 _DEEP = re.compile(r"""(?<![\w-])(?:("[^"\n]*"|'[^'\n]*'|[\w-]+)[ \t]*\.[ \t]*){32}""")
-"""A key of more parts than anybody writes: tomllib's time goes with the square of their number."""
+"""A dotted key of more than 32 names: tomllib's time grows with the square of their number."""
 
 
 def loads(text: str, where: str, parse_float: Callable[[str], Any] = float) -> dict[str, Any]:
     """Read TOML text; ``where`` begins every error. Raises UsageError."""
     if _DEEP.search(text):
-        raise UsageError(f"{where}: no TOML that can be read: it has a dotted key of more than 32 parts")
+        raise UsageError(f"{where}: no TOML that can be read: it has a dotted key of more than 32 names")
     try:
         return tomllib.loads(text, parse_float=parse_float)
     except RecursionError:
@@ -92,18 +92,18 @@ def _line(error: ErrorDetails, table: type[TomlTable], content: Any) -> str:
 
 
 def wrong(error: ErrorDetails) -> str:
-    """Return what is wrong with the value of a key, in TOML's words."""
+    """Return the error of a key's value, in TOML's terms."""
     if error["type"] in _WRONG:
         return _WRONG[error["type"]]
     if error["type"] == "value_error":
         return str(error["ctx"]["error"])
     should = error["msg"].partition(" should ")[2] or error["msg"]
-    wanted = _SHOULD_BE.get(error["type"])
-    return f"{reprlib.repr(error['input'])} should {f'be {wanted}' if wanted else should}"
+    kind = _SHOULD_BE.get(error["type"])
+    return f"{reprlib.repr(error['input'])} should {f'be {kind}' if kind else should}"
 
 
 def _path(steps: Iterable[int | str], content: Any) -> str:
-    """Write a key with the tables that it is in; an element of an array is known by its name, if it has one."""
+    """Write a key after its tables; an element of an array appears with its ``name``, if it has one."""
     path = ""
     for step in steps:
         known = (isinstance(content, Mapping) and step in content) or isinstance(step, int)

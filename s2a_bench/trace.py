@@ -1,8 +1,8 @@
-"""Marks and stages: where the time of one request went.
+"""Marks and stages: how the time of one request is spent.
 
-A *mark* closes the stretch of time since the mark before it and says which stage that stretch was; the empty
-name says that it belongs to no stage. The marks of client and server, on one clock, form one chain in order of
-time, so the stages and the residual (the unnamed stretches) add up to the whole by construction.
+A *mark* closes the stretch of time since the mark before it and names the stage of that stretch; the empty name means
+no stage. The marks of client and server, on one clock, form one chain in order of time, so the stages and the residual
+(the unnamed stretches) add up to the whole by construction.
 
 The chain starts with an unnamed mark when capture (request mode) or the prompt (stream mode) starts, and the
 first token seen by the client is the mark `return`. Everything is in integer nanoseconds of CLOCK_MONOTONIC.
@@ -46,19 +46,19 @@ STAGES: dict[str, str] = {
     "server": "server",
     "return": "return",
 }
-"""Fine stage -> group, in the order of the path: those that any transport may have; it declares the others itself.
-`connect` appears where a client is built per request, `preprocess` (what an engine does before its model: slicing,
-resizing, tokenising) where the engine tells it, `server` where the server is a black box that tells nothing
-(last byte packed -> first token)."""
+"""Fine stage -> group, in the order of the path, for any transport; a transport declares further ones.
+`connect` appears if a client is built per request, `preprocess` (an engine's work before its model: slicing, resizing,
+tokenising) if the engine reports it, `server` if the server is a black box without reports (last byte packed -> first
+token)."""
 
 
-def path_of(own: Iterable[Mapping[str, str]]) -> dict[str, str]:
-    """Join the common stages and those of transports, in the order of the path.
+def path_of(transports: Iterable[Mapping[str, str]]) -> dict[str, str]:
+    """Join the common stages and those that transports declare, in the order of the path.
 
-    In each group a transport's own come last on the way out, up to `network`, and first on the way in: what is
-    wrapped last is unwrapped first.
+    In each group the declared stages come last up to `network`, and first after it: what is packed last is unpacked
+    first.
     """
-    declared = {stage: group for stages in own for stage, group in stages.items() if stage not in STAGES}
+    declared = {stage: group for stages in transports for stage, group in stages.items() if stage not in STAGES}
     out = GROUPS.index("network")
     table: dict[str, str] = {}
     for place, name in enumerate(GROUPS):
@@ -71,18 +71,18 @@ NAME_LIMIT: Final = 64
 """Letters of a fact's name."""
 
 FACT_LIMIT: Final = 1 << 53
-"""No fact is larger: beyond, floats skip whole numbers; in ms these are 300,000 years."""
+"""No fact is larger: floats skip whole numbers above; in ms these are 300,000 years."""
 
 STAMPS: Final = range(1 << 62)
-"""Times that can be, in ns: their differences fit 64 bits."""
+"""Valid times in ns: their differences fit 64 bits."""
 
 
 @dataclass(slots=True)
 class Remote:
-    """What a server tells about one request, in its last message.
+    """A server's report about one request, in its last message.
 
-    ``frame_stamp_ns`` and ``frame_marks`` are there in stream mode: the ROS-time stamp of the cached frame that
-    was used, and that frame's own way through the server.
+    ``frame_stamp_ns`` and ``frame_marks`` belong to stream mode: the ROS-time stamp of the cached frame that was used,
+    and its marks in the server.
     """
 
     clock: str
@@ -92,11 +92,11 @@ class Remote:
     frame_marks: list[Mark] = field(default_factory=list)
     facts: dict[str, float] = field(default_factory=dict)
     provenance: dict[str, str] = field(default_factory=dict)
-    """Who answered, as `provenance.Provenance` has it; empty where the server does not tell."""
+    """`provenance.Provenance.to_dict`; empty if the server reports none."""
 
     @staticmethod
     def of_json(value: Mapping[str, Any]) -> Remote:
-        """Read what a server sent as JSON; raises ValueError, KeyError or TypeError for what can be none."""
+        """Read a server's JSON; raises ValueError, KeyError or TypeError if it is no report."""
         return Remote(
             clock=value["clock"],
             marks=[(stage, stamp) for stage, stamp in value["marks"]],
@@ -111,7 +111,7 @@ class Remote:
         return asdict(self)
 
     def check(self) -> Remote:
-        """Return it; raises ValueError for what came from outside and can be no server's marks."""
+        """Return the report; raises ValueError if its values, which come from outside, are impossible."""
         marks = [*self.marks, *self.frame_marks]
         if not all(isinstance(text, str) for text in (self.clock, *(stage for stage, _ in marks))):
             raise ValueError("marks whose stages are no text")
@@ -119,7 +119,7 @@ class Remote:
             if type(stamp) is not int or stamp not in STAMPS:
                 raise ValueError("marks whose times are none")
         if not isinstance(self.facts, Mapping):
-            raise ValueError("facts without names")  # noqa: TRY004 - one error for all that comes from outside
+            raise ValueError("facts without names")  # noqa: TRY004 - one type of error for data from outside
         if not isinstance(self.provenance, Mapping):
             raise ValueError("a provenance without names")  # noqa: TRY004 - as above
         return self
@@ -129,10 +129,9 @@ class Remote:
 class Trace:
     """The record of one request on one side of the wire.
 
-    ``token_ns`` holds the times at which tokens left the engine; ``facts`` what the engine or a black-box server
-    says about itself (llama.cpp's ``timings`` and the like); a client's ``remote`` what the server sent back.
-    ``odd`` holds the names of what it said that can be no fact. ``later`` holds facts that take time to find: they are
-    computed once the answer is on its way.
+    ``token_ns`` holds the times at which tokens left the engine; ``facts`` are reported by the engine or a black-box
+    server (llama.cpp's ``timings`` and the like), and ``odd`` names those with impossible values. A client's ``remote``
+    is the server's report. ``later`` holds facts that take time: they are computed once the answer is sent.
     """
 
     marks: list[Mark] = field(default_factory=list)
@@ -146,16 +145,15 @@ class Trace:
     provenance: dict[str, str] = field(default_factory=dict)
 
     def mark(self, stage: str) -> None:
-        """Say that the time since the previous mark was spent in ``stage``; costs about 0.15 us."""
+        """Attribute the time since the previous mark to ``stage``; costs about 0.15 us."""
         self.marks.append((stage, now_ns()))
 
     def receive(self, remote: Remote) -> None:
-        """Keep what the server sent back about this request."""
         self.remote = remote
         self.learn(remote.facts)
 
     def learn(self, facts: Mapping[str, Any]) -> None:
-        """Keep what a server says of itself; what can be no fact (NaN, 1e300, text) stays absent and is ``odd``."""
+        """Keep a server's facts; an impossible value (NaN, 1e300, text) stays absent and is ``odd``."""
         for name, value in facts.items():
             if not (isinstance(name, str) and name.isidentifier() and len(name) < NAME_LIMIT):
                 self.odd.add("a name that is none")
@@ -165,7 +163,7 @@ class Trace:
                 self.odd.add(name)
 
     def to_remote(self) -> Remote:
-        """Return what a server sends back about this request, last of all."""
+        """Return the server's report about this request, for its last message."""
         self.facts |= {name: find() for name, find in self.later.items()}
         self.later = {}
         frame = self.frame_stamp_ns, self.frame_marks
@@ -173,7 +171,7 @@ class Trace:
         return Remote(clock_id(), self.marks, self.token_ns, *frame, facts, self.provenance)
 
     def chain(self) -> list[Mark]:
-        """Join both sides' marks in order of time; the server's are left out if its clock is not ours."""
+        """Join both sides' marks in order of time, without those of another clock."""
         if self.remote is None or self.remote.clock != clock_id():
             return list(self.marks)
         return sorted([*self.marks, *self.remote.marks], key=lambda mark: mark[1])
@@ -189,14 +187,14 @@ class Budget:
 
     @property
     def e2e_without_inference_ns(self) -> int | None:
-        """Return e2e minus inference, preprocessing included: what the paper's 101.8 and 15.5 ms can only be."""
+        """Return e2e minus inference and preprocessing: the only reading of the paper's 101.8 and 15.5 ms."""
         if "inference" not in self.stages_ns:
             return None
         return self.e2e_ns - self.stages_ns["inference"] - self.stages_ns.get("preprocess", 0)
 
     @property
     def e2e_without_model_ns(self) -> int | None:
-        """Return e2e minus what the model computed, or None where the engine does not tell its preprocessing apart."""
+        """Return e2e minus the model's time, or None if the engine does not report its preprocessing."""
         known = {"preprocess", "inference"} <= self.stages_ns.keys()
         return self.e2e_ns - self.stages_ns["inference"] if known else None
 
@@ -207,7 +205,7 @@ class Budget:
 
 
 def budget(chain: Iterable[Mark]) -> Budget:
-    """Derive the durations of a chain; a stage that was marked twice is the sum of both stretches."""
+    """Derive the durations of a chain; stretches of one stage are summed."""
     marks = iter(chain)
     spent = {RESIDUAL: 0}
     _, first = next(marks, (RESIDUAL, 0))
@@ -219,7 +217,7 @@ def budget(chain: Iterable[Mark]) -> Budget:
 
 
 def mark_cost_ns(repeats: int = 20_000) -> float:
-    """Measure what one mark costs on this machine, in ns."""
+    """Measure the cost of one mark on this machine, in ns."""
     trace = Trace()
     mark = trace.mark
     start = now_ns()

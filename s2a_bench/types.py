@@ -1,4 +1,4 @@
-"""The nouns every package shares: a frame, a request about frames, a piece of the answer: a token or an action."""
+"""The types that all rooms share: a frame, a request about frames, a piece of the answer: a token or an action."""
 
 from __future__ import annotations
 
@@ -21,13 +21,12 @@ Encoding: TypeAlias = Literal["bgr8", "rgb8", "bgra8", "rgba8", "mono8", "mono16
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One picture, in the format its source delivers.
+    """One picture in the format of its source.
 
     ``data`` is uint8: (height, width, 2) for ``yuv422_yuy2``, ``yuv422`` (UYVY) and ``mono16`` (in this machine's order
     of bytes), (height, width, 3) for ``bgr8`` and ``rgb8``, (height, width, 4) for ``bgra8`` and ``rgba8``,
     (height, width) for ``mono8`` and mosaics, (height * 3 / 2, width) for ``nv12`` and ``nv21``, (n,) for ``jpeg`` and
-    ``png``. ``stamp_ns`` is the instant
-    of capture on CLOCK_MONOTONIC; ``index`` counts frames of one source from 0.
+    ``png``. ``stamp_ns`` is the time of capture on CLOCK_MONOTONIC; ``index`` counts frames of one source from 0.
     """
 
     index: int
@@ -39,17 +38,17 @@ class Frame:
 
 
 Sampling: TypeAlias = "tuple[tuple[str, float], ...]"
-"""What a client wants of sampling: llama.cpp's names of numbers, and their values; engines ignore what they cannot."""
+"""A client's sampling settings: llama.cpp's names, and their values; an engine ignores those it does not support."""
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One question to a model: a prompt about zero or more pictures and the robot's state.
+    """One request to a model: a prompt about zero or more pictures and the robot's state.
 
     A client receives it with frames as captured; a handler and an engine receive it with ``rgb8`` frames.
-    ``max_tokens`` is the most pieces of the answer, tokens or actions. ``grammar`` is GBNF text (llama.cpp
-    ``grammars/README.md``); an empty string means none. ``state`` is what a policy is told of the robot (joint angles,
-    gripper) in the robot's own units, each a float32; empty: nothing.
+    ``max_tokens`` limits the pieces of the answer, tokens or actions. ``grammar`` is GBNF text (llama.cpp
+    ``grammars/README.md``); an empty string means none. ``state`` is the robot's (joint angles, gripper) in its units,
+    each a float32; empty: none.
     """
 
     id: str
@@ -73,9 +72,9 @@ class Token:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Action:
-    """One piece of a policy's answer: what the robot does in one control tick, as part of a chunk of such.
+    """One piece of a policy's answer: the robot's action in one control tick, part of a chunk.
 
-    ``index`` counts ticks of the chunk from 0; ``values`` is float32 (D,), in the robot's own units.
+    ``index`` counts ticks of the chunk from 0; ``values`` is float32 (D,), in the robot's units.
     """
 
     index: int
@@ -84,9 +83,9 @@ class Action:
 
     @property
     def text(self) -> str:
-        """Return the values as a JSON list, each as short as reads back to the same float32."""
+        """Return the values as a JSON list, each in the shortest text of the same float32."""
         return json.dumps([float(str(value)) for value in self.values])
 
 
 Piece: TypeAlias = Token | Action
-"""What an answer is made of; all pieces of one answer are of one kind."""
+"""A piece of an answer; all pieces of one answer are of one kind."""

@@ -29,7 +29,7 @@ LLAMA = {"engine": "llama", "model": "/m/tiny.gguf", "name": "tiny", "dummy": Tr
 @pytest.mark.parametrize(
     ("told", "line", "code", "labels"),
     [
-        ({}, "engine UNKNOWN (the server does not tell)", "unknown/unknown/unknown", ("engine unknown",)),
+        ({}, "engine UNKNOWN (the server does not report it)", "unknown/unknown/unknown", ("engine unknown",)),
         (LLAMA, "llama (tiny, DUMMY WEIGHTS), tokens measured", "llama/dummy/measured", ("dummy weights",)),
         (LLAMA | {"dummy": False}, "llama (tiny), tokens measured", "llama/real/measured", ()),
         (

@@ -43,7 +43,7 @@ WRONG = {
         ("--jitter fog", "--jitter fog: family: 'fog' is none of"),
         ("--pace 4.8", "--pace is about a model that answers; it needs --live"),
         ("--live --transport ros/post", "--transport: 'post' is none of ros's topic, action"),
-        ("--live --url http://localhost:1 --pace 3", "--pace needs our own server"),
+        ("--live --url http://localhost:1 --pace 3", "--pace needs the package's server"),
     ],
     "boundary": [
         ("--rates 60,0.3", "--rates: should be two tokens/s, the lower first"),

@@ -328,8 +328,8 @@ def test_a_guarantee_is_kept_with_the_calibration_and_said(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({"policies": ("naive",), "track": True}, "`track`: no policy here has a lambda to follow"),
-        ({"policies": ("stream-to-act?caution=1",), "track": True}, "`track`: no policy here has a lambda to follow"),
+        ({"policies": ("naive",), "track": True}, "`track`: no policy has a lambda to follow"),
+        ({"policies": ("stream-to-act?caution=1",), "track": True}, "`track`: no policy has a lambda to follow"),
         ({"jitter": "none", "plans": None, "track": True}, "`track`: without `jitter` or `t_nom_cv`"),
         ({"live": True, "jitter": "none", "plans": None, "epsilon": 0.05}, "`epsilon`: nothing is calibrated"),
     ],

@@ -1,1 +1,1 @@
-"""Runs of plans: policies on boards, drawn or live; what is compared, what a model is asked, what policies learn."""
+"""Runs of plans, drawn or live: their options, the requests for plans, and the knowledge of policies."""

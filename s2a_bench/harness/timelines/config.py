@@ -1,4 +1,4 @@
-"""What a timeline run compares: policies on boards, granularities, lengths and durations; and what it refuses."""
+"""The options of a timeline run: policies on boards, granularities, lengths and durations; and their checks."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ REAL_TIME_PROFILE: Final = "jetson-agx-orin"
 LENGTHS: Final = (6, 4, 2, 1)
 LIVE_LENGTH: Final = 6
 PLANS: Final = 1000
-"""Plans a cell where something is random; one where nothing is."""
+"""Default number of plans a cell if plans are random; else 1."""
 MOST_SKILLS: Final = 2_000_000
-"""Skills that one run computes: beyond that, studies are the tool."""
+"""Limit on the skills of a run: above it, studies are the tool."""
 MOST_TOKENS: Final = 20_000_000
-"""Tokens of a cell: they are held in memory at once."""
+"""Limit on the tokens of a cell, which are in memory at once."""
 MOST_CV: Final = 3**-0.5
 """Uniform durations of a larger spread could be negative."""
 LEAST_T_NOM_S: Final = 1e-6
@@ -51,20 +51,19 @@ Seconds = Annotated[tuple[Annotated[float, Field(ge=LEAST_T_NOM_S, allow_inf_nan
 
 @dataclass(frozen=True, slots=True)
 class PlanSetting:
-    """What plans have in common, whatever the policy."""
+    """The parameters of plans, without the policy."""
 
     board: str
-    """A profile's name; empty where only a rate was given."""
+    """A profile's name; empty for a bare rate."""
     title: str
     tokens_per_s: float
     prompt_s: float | None
-    """c; None where a model took what it took."""
+    """c; None for a model."""
     tokens_per_skill: int
     n_skills: int
     t_nom_s: float
     mode: str = "virtual"
     emulated: bool = True
-    """Whether no model answered."""
 
     @property
     def name(self) -> str:
@@ -83,7 +82,7 @@ class PlanSetting:
 
 
 class ComparedOptions(Options):
-    """Options about what is compared, wherever the tokens are from."""
+    """Options for tokens of any source."""
 
     PANEL: ClassVar[str] = "Plans"
 
@@ -119,24 +118,21 @@ class ComparedOptions(Options):
     epsilon: float = option(0.01, "share of plans that may stall: lambda is calibrated or tracked for it")
     track: bool = option(False, "let online policies follow lambda from plan to plan (needs jitter, or --live)")
     real_time: bool = option(False, "play the boards' tokens on the clock and execute while you watch", first=True)
-    live: bool = option(False, "execute what a model really answers, as it arrives", first=True)
+    live: bool = option(False, "execute a model's real answers as they arrive", first=True)
 
 
 class Modelled(Options):
-    """Options about tokens that no model writes."""
+    """Options for tokens without a model."""
 
     PANEL: ClassVar[str] = "Tokens that are modelled"
 
-    rates: Rates = option(
-        (), "boards of which only the tokens/s are known; several with commas", flag="rate", first=True
-    )
+    rates: Rates = option((), "boards known by their tokens/s alone; several with commas", flag="rate", first=True)
     prompt_s: float | None = PROMPT_TIME
     t_nom_cv: float = option(0.0, "how much T_nom differs from skill to skill: sd / mean", ge=0, le=MOST_CV)
     plans: int | None = option(None, "plans a cell [default: 1; with jitter 1000]", ge=1)
     jitter: str = option(
         NO_JITTER,
-        "none (tokens come evenly, as in the paper), profile (as the profile says), or a family of gaps, as "
-        "lognormal:cv=0.2",
+        "none (even gaps, as in the paper), profile (the profile's), or a family of gaps, as lognormal:cv=0.2",
         first=True,
     )
     guarantee: Guarantee = option("high-confidence", GUARANTEE)
@@ -147,7 +143,7 @@ class Modelled(Options):
 
 
 class LiveOptions(Options):
-    """Options about a model that answers."""
+    """Options for tokens of a model."""
 
     PANEL: ClassVar[str] = "A model that answers"
 
@@ -155,8 +151,8 @@ class LiveOptions(Options):
         "", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]", first=True, names=paths
     )
     skills: str = option("household", "--live: household, driving, or a TOML file", names=lambda: SKILL_SETS)
-    requests: int = option(1, "--live: plans that the model is asked for, a cell", ge=1)
-    task: TextOrFile = option("", "--live: what the robot should do, text or @FILE")
+    requests: int = option(1, "--live: requests for a plan, a cell", ge=1)
+    task: TextOrFile = option("", "--live: the robot's task, text or @FILE")
     robot: str = option(
         "timed", "--live: timed, ros, call?function=MODULE:NAME; timed only waits", names=lambda: ROBOTS
     )
@@ -166,17 +162,17 @@ class LiveOptions(Options):
     source: str = option("synthetic", "--live: the camera", names=lambda: SOURCES)
     size: Size = option((640, 480), "--live: WIDTHxHEIGHT of the frames [default: 640x480]")
     url: str = option("", "--live: an HTTP server that runs already (a black box)")
-    dialect: str = option("", "--live: what --url speaks [default: ask]")
+    dialect: str = option("", "--live: the dialect of --url [default: detected]")
     nonce: str = option("", "--live: nonce of another run, to send its very pictures again [default: a new one]")
-    no_grammar: bool = option(False, "--live: let the model write what it likes")
-    warmup: int = option(1, "--live: answers before, which policies learn the rate from", ge=0)
+    no_grammar: bool = option(False, "--live: do not constrain the model's answer")
+    warmup: int = option(1, "--live: first answers, from which policies learn the rate", ge=0)
     timeout_s: float = option(
         60.0, "--live: seconds without a token after which the robot holds", flag="timeout", ge=0.1, le=86_400
     )
 
 
 class TimelineConfig(LiveOptions, Modelled, ComparedOptions):
-    """What is compared with what: computed, played in real time, or live."""
+    """The options of a run of plans: computed, played in real time, or live."""
 
     @property
     def virtual(self) -> bool:
@@ -188,7 +184,7 @@ class TimelineConfig(LiveOptions, Modelled, ComparedOptions):
 
     @cached_property
     def boards(self) -> list[Board]:
-        """Find the boards; raises UsageError for a profile or jitter that there is not."""
+        """Load the boards; raises UsageError for an unknown profile or jitter."""
         found = [board_of_profile(load_profile(name), self.jitter, self.prompt_s) for name in self._profiles]
         return found + [board_of_rate(rate, self.jitter, self.prompt_s) for rate in self.rates]
 
@@ -204,12 +200,12 @@ class TimelineConfig(LiveOptions, Modelled, ComparedOptions):
 
     @cached_property
     def skill_set(self) -> SkillSet:
-        """Load the skills that a model is asked for; raises UsageError."""
+        """Load the skills of requested plans; raises UsageError."""
         return load_skills(self.skills)
 
     @property
     def random(self) -> bool:
-        """Whether one plan differs from the next."""
+        """Whether plans differ."""
         return self.t_nom_cv > 0 or not all(board.even for board in self.boards)
 
     @property
@@ -254,39 +250,38 @@ class TimelineConfig(LiveOptions, Modelled, ComparedOptions):
             )
 
     def shape(self, setting: PlanSetting) -> PlanShape:
-        """Return what is known of a plan before its first token."""
+        """Return the facts about a plan before its first token."""
         t_nom_s = setting.t_nom_s
         timing = Timing(t_nom_s, self.t_min * t_nom_s, self.t_max * t_nom_s)
         return PlanShape(setting.n_skills, setting.tokens_per_skill, timing, self.t_nom_cv)
 
     def risks(self) -> Iterator[tuple[str, str, str]]:
-        """Yield those of the requests, live, and a robot that runs code."""
         yield from requests_of(self).risks() if self.live else super().risks()
         if self.live and (risk := kind(self.robot, SkillKind).risk):
             yield "robot", risk, self.robot
 
     def to_manifest(self) -> dict[str, Any]:
-        """Return the options that hold in this kind of run, with the values that follow from others."""
-        own = self.model_dump(include=set(ComparedOptions.model_fields) - {"profiles", "real_time", "live"})
-        own |= {"tokens_per_skill": self.lengths, "plans": self.plans_a_cell}
+        """Return the options of this kind of run, with the values that follow from others."""
+        fields = self.model_dump(include=set(ComparedOptions.model_fields) - {"profiles", "real_time", "live"})
+        fields |= {"tokens_per_skill": self.lengths, "plans": self.plans_a_cell}
         if self.live:
-            asked = {"skills": self.skills, "task": self.task, "robot": self.robot, "constrained": not self.no_grammar}
-            return {**requests_of(self).to_manifest(), **own, **asked, "time": "live"}
-        own |= self.model_dump(include=set(Modelled.model_fields))
-        own |= {"profiles": self._profiles, "t_nom_s": self.t_nom_s or (1.0,)}
-        return own | ({"time": "real-time"} if self.real_time else {})
+            plan = {"skills": self.skills, "task": self.task, "robot": self.robot, "constrained": not self.no_grammar}
+            return {**requests_of(self).to_manifest(), **fields, **plan, "time": "live"}
+        fields |= self.model_dump(include=set(Modelled.model_fields))
+        fields |= {"profiles": self._profiles, "t_nom_s": self.t_nom_s or (1.0,)}
+        return fields | ({"time": "real-time"} if self.real_time else {})
 
 
 def check_tracking(config: TimelineConfig) -> None:
-    """Refuse to track what does not vary or has no lambda to follow; raises UsageError."""
+    """Refuse `track` if nothing varies or no lambda is free; raises UsageError."""
     if not any(policy.learns and policy.caution is None for policy in config.chosen.values()):
-        raise UsageError("`track`: no policy here has a lambda to follow; take stream-to-act without caution")
+        raise UsageError("`track`: no policy has a lambda to follow; take stream-to-act without caution")
     if not config.live and not config.random:
         raise UsageError("`track`: without `jitter` or `t_nom_cv` all plans are the same; nothing can be learned")
 
 
 def settings(config: TimelineConfig) -> Iterator[tuple[Board, PlanSetting]]:
-    """List what is compared, board by board."""
+    """Yield the settings of the run, board by board."""
     for n_skills, t_nom_s, board, tokens in product(
         config.n_skills, config.t_nom_s or (1.0,), config.boards, config.lengths
     ):
@@ -294,7 +289,7 @@ def settings(config: TimelineConfig) -> Iterator[tuple[Board, PlanSetting]]:
 
 
 def requests_of(config: TimelineConfig) -> RequestsConfig:
-    """Return how the model is asked: one transport in one variant; prompt and length follow from the plan."""
+    """Return the configuration of the requests: one transport in one variant, without prompt and length."""
     from s2a_bench.harness.config import FirstVariants
 
     transport = config.transport or (BLACK_BOX if config.url else FOLLOWED)
@@ -315,7 +310,7 @@ def requests_of(config: TimelineConfig) -> RequestsConfig:
 
 
 def check_live(config: TimelineConfig) -> None:
-    """Refuse what no model, robot or policy can do; raises UsageError naming the fields."""
+    """Raise UsageError, naming the fields, for options that model, robot or policy do not support."""
     requests = requests_of(config)
     if len(requests.pipelines) != 1:
         raise UsageError("`transport`: `live` follows one stream; name one, as ros, ros/action or http/binary")
@@ -326,7 +321,7 @@ def check_live(config: TimelineConfig) -> None:
         raise UsageError(f"`robot`: {config.robot} follows one policy at a time; choose it with `policies`")
     engine = config.engine
     if engine.pace and config.url:
-        raise UsageError("`pace` needs our own server, which holds its engine back")
+        raise UsageError("`pace` needs the package's server, which holds its engine back; leave out `url`")
     if not engine.kind.computes:
         raise UsageError(f"`engine` {engine.name} writes no plans; `live` needs llama, or replay")
     if engine.kind.plays:

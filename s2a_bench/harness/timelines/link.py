@@ -1,4 +1,4 @@
-"""A model to ask for plans: what is asked of it, its server, a client, warm-ups, and requests."""
+"""Requests for plans: their prompts, the run's session with a model, and its warm-up."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins
 from s2a_bench.store.manifest import RunWarning
 
-ROOM: Final = 16
+TOKENS_A_SKILL: Final = 16
 """Tokens a skill that a model of unknown tokenizer may need for the paper's format."""
 MODE = "live"
 LATE = 1.05
-"""An answer that takes so many times what the pace allows was not paced, but slow."""
+"""An answer slower than the pace by this factor was not held back."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanPrompt:
-    """One setting, ready to be asked for."""
+    """The request for the plans of one setting."""
 
     skills: SkillSet
     format: Format
@@ -52,7 +52,7 @@ class PlanPrompt:
 
     @property
     def shape(self) -> PlanShape:
-        """Return what is known of the plan before its first token: every call is as likely as any other."""
+        """Return the facts about the plan before its first token: all calls are equally likely."""
         times = [call.skill.durations for call in self.skills.calls]
         nominal_s = np.array([time.nominal_s for time in times])
         mean_s = float(nominal_s.mean())
@@ -63,7 +63,7 @@ class PlanPrompt:
 
 
 def plan_prompts(config: TimelineConfig, model: Path | None) -> list[PlanPrompt]:
-    """Word every setting for the tokenizer of ``model``; raises UsageError where there is no such format."""
+    """Write the prompts of all settings for the tokenizer of ``model``; raises UsageError if no format fits."""
     tokenize = None
     if not in_paper_format(config):
         from s2a_bench.inference.tokenizer import Tokenizer
@@ -73,30 +73,21 @@ def plan_prompts(config: TimelineConfig, model: Path | None) -> list[PlanPrompt]
     for tokens, n_skills, t_nom_s in product(config.lengths, config.n_skills, config.t_nom_s or (None,)):
         skills = skills_lasting(config, t_nom_s)
         format_ = paper_format(skills) if tokenize is None else choose_format(skills, tokens, tokenize, n_skills)
-        # Token ids mean something to our own server only, which has the same model files.
-        pinned = None if config.url else tokenize
-        counted = tokens if tokenize is not None or config.engine.kind.plays else ROOM
-        found.append(
-            PlanPrompt(
-                skills,
-                format_,
-                tokens,
-                n_skills,
-                prompt(format_, n_skills, config.task),
-                grammar(format_, n_skills, pinned) if not config.no_grammar else "",
-                n_skills * counted,
-            )
-        )
+        pinned = None if config.url else tokenize  # only the package's server has the same model files, and token ids
+        rules = grammar(format_, n_skills, pinned) if not config.no_grammar else ""
+        most = n_skills * (tokens if tokenize is not None or config.engine.kind.plays else TOKENS_A_SKILL)
+        text = prompt(format_, n_skills, config.task)
+        found.append(PlanPrompt(skills, format_, tokens, n_skills, text, rules, most))
     return found
 
 
 def in_paper_format(config: TimelineConfig) -> bool:
-    """Return True if plans are written as in the paper, for want of a tokenizer to choose a format with."""
+    """Return True if plans have the paper's format, as no tokenizer is known."""
     return not config.engine.kind.needs_model or bool(config.url)
 
 
 def skills_lasting(config: TimelineConfig, t_nom_s: float | None) -> SkillSet:
-    """Return the skill set, every skill of which takes ``t_nom_s`` if that is given."""
+    """Return the skill set; ``t_nom_s`` replaces the duration of every skill."""
     if t_nom_s is None:
         return config.skill_set
     times = Durations(config.t_min * t_nom_s, t_nom_s, config.t_max * t_nom_s)
@@ -105,7 +96,7 @@ def skills_lasting(config: TimelineConfig, t_nom_s: float | None) -> SkillSet:
 
 
 def prepare_requests(config: TimelineConfig, progress: Progress) -> tuple[RunPlan, list[PlanPrompt]]:
-    """Find the model's files, word what it is asked, and plan requests with the room that it needs; raises S2AError."""
+    """Find the model's files, write the prompts, and plan requests of sufficient length; raises S2AError."""
     limit_threads()
     requests = requests_of(config)
     if not in_paper_format(config):
@@ -118,22 +109,22 @@ def prepare_requests(config: TimelineConfig, progress: Progress) -> tuple[RunPla
 
 @dataclass
 class ModelLink:
-    """The way to one model, for one run."""
+    """The requests of one run to one model."""
 
     config: TimelineConfig
     launch: RunningLaunch
     robot: str
-    """What will act, for the record."""
+    """For the manifest."""
     blocks: Iterator[int] = field(default_factory=count)
     answers: int = 0
-    """Plans that came as they should."""
+    """Plans without an error."""
 
     def __post_init__(self) -> None:
         (self.session,) = self.launch.sessions
         self.cell, self.writer = self.session.cell, self.launch.writer
         self.pace = self.rate = self.launch.plan.servers.engine.pace
-        """Tokens/s: set, or as first seen."""
-        self._tell_origin()
+        """Tokens/s: set, or of the first answer."""
+        self._write_origin()
         self.writer.update(
             live={
                 "transport": self.cell.name,
@@ -144,8 +135,8 @@ class ModelLink:
             },
         )
 
-    def _tell_origin(self) -> None:
-        """Write down where the tokens come from, and ``dummy`` where that is known of the weights."""
+    def _write_origin(self) -> None:
+        """Write the provenance of the tokens, and ``dummy`` if the weights are known."""
         self.origin = self.session.origin
         dummy = {"dummy": True, "real": False}.get(self.origin.weights)
         live = {"engine": self.origin.engine, "emulated": self.origin.emulated}
@@ -154,7 +145,7 @@ class ModelLink:
         )
 
     def warm_up(self, prompt: PlanPrompt) -> GapPrior | None:
-        """Ask as often as the configuration wants, and return what policies learn from that."""
+        """Make the warm-up requests and return the prior that policies learn from them."""
         warmups, progress = self.launch.plan.blocks.warmup, self.launch.progress
         arrivals_ns = []
         for _ in range(warmups):
@@ -165,12 +156,12 @@ class ModelLink:
         prior = prior_of(arrivals_ns, self.rate)
         if prior is not None:
             self.rate = self.rate or 1 / prior.mean_s
-            about = {"mean_s": prior.mean_s, "plan_cv": prior.plan_cv, "token_cv": prior.token_cv}
-            self.writer.update(prior={**about, "warmups": warmups})
+            values = {"mean_s": prior.mean_s, "plan_cv": prior.plan_cv, "token_cv": prior.token_cv}
+            self.writer.update(prior={**values, "warmups": warmups})
         return prior
 
     def request(self, prompt: PlanPrompt, plan: int, feed: PlanFeed | None) -> Measured:
-        """Make one request and keep its rows; raises what ends the run."""
+        """Make one request and write its rows; raises an error that ends the run."""
         run = self.session.request
         request = replace(
             run, prompt=prompt.prompt, grammar=prompt.grammar, max_pieces=prompt.max_tokens, seed=run.seed + plan
@@ -178,18 +169,18 @@ class ModelLink:
         place = Place(next(self.blocks), 0, warmup=feed is None)
         measured = self.session.measure(place, RequestContext(plan=feed, request=request))
         if self.session.origin != self.origin:
-            self._tell_origin()
+            self._write_origin()
         self.answers += feed is not None and not measured.sample.error
         try:
             self.launch.keep(self.session, measured)
         except UsageError as error:
             if "grammar" not in str(error):
                 raise
-            raise UsageError(f"{error} (here: `no_grammar`)") from error
+            raise UsageError(f"{error} (`no_grammar` leaves it out)") from error
         return measured
 
     def setting(self, prompt: PlanPrompt) -> PlanSetting:
-        """Return the setting of what was asked, at the rate that was seen."""
+        """Return the setting of a request, with the measured rate."""
         return PlanSetting(
             board="",
             title=f"live {self.cell.name}",
@@ -203,19 +194,18 @@ class ModelLink:
         )
 
     def learn_rate(self, token_ns: Sequence[int]) -> None:
-        """Learn the rate from an answer if nobody set it, and warn where the model was slower."""
+        """Learn the rate from an answer unless it is set, and warn if the model was slower."""
         if len(token_ns) < 2:  # noqa: PLR2004 - no gap
             return
-        came = (len(token_ns) - 1) / (token_ns[-1] - token_ns[0]) * 1e9
-        self.rate = self.rate or came
-        if self.pace and came * LATE < self.pace:
-            what = f"{came:.3g} tokens/s came, not the {self.pace:g} of --pace: the model is slower"
-            self.launch.warnings.append(
-                RunWarning("pace-missed", what, "stop what else runs, try --threads 1, or a lower --pace")
-            )
+        rate = (len(token_ns) - 1) / (token_ns[-1] - token_ns[0]) * 1e9
+        self.rate = self.rate or rate
+        if self.pace and rate * LATE < self.pace:
+            what = f"the model sent {rate:.3g} tokens/s, not the {self.pace:g} of --pace: it is slower"
+            advice = "stop other programs, try --threads 1, or a lower --pace"
+            self.launch.warnings.append(RunWarning("pace-missed", what, advice))
 
     def require_answers(self) -> None:
-        """Raise TransportError where no plan came as it should."""
+        """Raise TransportError if no request for a plan succeeded."""
         if not self.answers:
             raise TransportError(
                 f"no request of {self.cell.name} succeeded; {self.writer.path / 'samples.csv'} says why"

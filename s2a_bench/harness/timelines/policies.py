@@ -1,4 +1,4 @@
-"""What policies know: of a board's tokens before the first one comes, and from plan to plan in executed runs."""
+"""The knowledge of policies: of a board's tokens before the first one, and from plan to plan in executed runs."""
 
 from __future__ import annotations
 
@@ -25,23 +25,23 @@ from s2a_bench.stats.seeds import generator
 
 @dataclass(slots=True)
 class Knowledge:
-    """What is learned of one setting before its plans."""
+    """Knowledge about one setting before its plans."""
 
     prior: GapPrior
     plans: Plans | None
-    """What lambda is calibrated on; None where nothing is random."""
+    """The plans for calibrating lambda; None if nothing is random."""
     epsilon: float
     guarantee: Guarantee
     calibrations: dict[Policy, Calibration] = field(default_factory=dict)
-    """Of the online rules as they were chosen, each for itself."""
+    """Of each online policy."""
     scores: dict[Policy, Floats] = field(default_factory=dict)
 
     def prepare(self, policy: Policy) -> Policy:
-        """Tell online rules what they were not told yet, the prior and lambda."""
+        """Give a policy the prior, and lambda if it is not set."""
         return policy.informed(self.prior, self._caution(policy) if _open(policy) else None)
 
     def tracked(self, policy: Policy) -> TrackedPolicy | None:
-        """Return what follows the lambda of a policy from plan to plan; None where it has none, or was told it."""
+        """Return the tracker of a policy's lambda; None if it has none, or a set one."""
         if not _open(policy) or self.plans is None:
             return None
         self._caution(policy)
@@ -56,7 +56,7 @@ class Knowledge:
         return self.calibrations[policy].caution
 
     def facts(self, setting: PlanSetting) -> dict[str, Any]:
-        """Return the calibrations as plain data, stream-to-act's by the setting's name, others by their cell's."""
+        """Return the calibrations as plain data, stream-to-act's by the setting's name, others by the cell's."""
         named = {canonical(policy.name, policy): found for policy, found in self.calibrations.items()}
         return {
             setting.name if name == ONLINE else f"{setting.name}/{name}": asdict(found)
@@ -66,19 +66,19 @@ class Knowledge:
 
 
 def _open(policy: Policy) -> bool:
-    """Whether a policy has a lambda that nobody has set."""
+    """Whether a policy has a lambda that is not set."""
     return policy.learns and policy.caution is None
 
 
 def finite(caution: float | None) -> float | None:
-    """Return lambda, or None where it is infinite: JSON has no infinity."""
+    """Return lambda, or None if it is infinite: JSON has no infinity."""
     return None if caution is None or caution == float("inf") else caution
 
 
 def learn(config: TimelineConfig, board: Board, setting: PlanSetting, answers: Sequence[Floats] = ()) -> Knowledge:
-    """Learn a prior, and what to calibrate on, from other plans of the same kind: drawn ones, or recorded ``answers``.
+    """Learn a prior, and get plans for calibration, from drawn plans of the same kind or recorded ``answers``.
 
-    Where nothing is random the prior is as certain as the arrivals, and the online rule starts at S0.
+    If nothing is random the prior is as certain as the arrivals, and the online rule starts at S0.
     """
     plans = None
     if answers:
@@ -95,7 +95,7 @@ def learn(config: TimelineConfig, board: Board, setting: PlanSetting, answers: S
 
 
 def plans_of(config: TimelineConfig, setting: PlanSetting, answers: Sequence[Floats]) -> Plans:
-    """Make plans of recorded answers; raises UsageError where too few are long enough."""
+    """Make plans of recorded answers; raises UsageError if too few are long enough."""
     rng = generator(config.seed, "timeline", "calibration", setting.key)
     plans = recorded_plans(answers, config.shape(setting), rng)
     count, tokens = plans.arrival_s.shape[1], setting.n_skills * setting.tokens_per_skill
@@ -108,7 +108,7 @@ def plans_of(config: TimelineConfig, setting: PlanSetting, answers: Sequence[Flo
 
 
 def draw(config: TimelineConfig, board: Board, setting: PlanSetting, plans: int, purpose: str) -> tuple[Floats, Plans]:
-    """Draw plans and the tokens that they come in; each purpose has random numbers of its own."""
+    """Draw the arrivals of tokens, and the plans in them; each purpose has separate random numbers."""
     rng = generator(config.seed, "timeline", purpose, setting.key)
     shape = config.shape(setting)
     token_s = board.tokens(setting.n_skills * setting.tokens_per_skill, rng, plans)
@@ -117,7 +117,7 @@ def draw(config: TimelineConfig, board: Board, setting: PlanSetting, plans: int,
 
 @dataclass(slots=True)
 class Following:
-    """The policies of one setting, and the trackers of those that follow their lambda, by their names."""
+    """The policies of one setting by name, and the trackers of their lambda."""
 
     shape: PlanShape
     made: Mapping[str, Policy]
@@ -127,7 +127,7 @@ class Following:
         return {name: self.tracked[name].policy if name in self.tracked else each for name, each in self.made.items()}
 
     def learn(self, records: Sequence[Record]) -> None:
-        """Learn from a plan that was executed; what did not come whole teaches nothing."""
+        """Learn from the records of an executed plan; an incomplete one is ignored."""
         for record in records:
             plan = observed(record, self.shape)
             if plan is not None and record.policy in self.tracked:
@@ -136,7 +136,7 @@ class Following:
 
 
 def prepare(config: TimelineConfig, shape: PlanShape, prior: GapPrior | None) -> Following:
-    """Tell online policies the prior, and lambda where it was not given: nothing is calibrated here, but tracked."""
+    """Give online policies the prior, and a lambda that is tracked, not calibrated, unless it is set."""
     made, tracked = dict(config.chosen), {}
     for name, policy in config.chosen.items():
         made[name] = policy.informed(prior)
@@ -149,7 +149,7 @@ def prepare(config: TimelineConfig, shape: PlanShape, prior: GapPrior | None) ->
 
 
 def drawn(prior: GapPrior, shape: PlanShape, rng: np.random.Generator, plans: int) -> Plans:
-    """Draw plans as a prior expects them: lognormal rates and gaps, uniform durations."""
+    """Draw plans of a prior: lognormal rates and gaps, uniform durations."""
 
     def lognormal(cv: float, *size: int) -> Any:
         variance = np.log1p(cv**2)
@@ -165,7 +165,7 @@ def drawn(prior: GapPrior, shape: PlanShape, rng: np.random.Generator, plans: in
 
 
 def prior_of(arrivals_ns: Sequence[Sequence[int]], rate: float | None) -> GapPrior | None:
-    """Learn the gaps from warm-ups; with a set rate but no warm-up only their mean; None where nothing is known."""
+    """Learn the gaps from warm-ups, else their mean from a set rate; None without both."""
     gaps_s = np.array([float(gap) for times in arrivals_ns for gap in np.diff(times)]) / 1e9
     if gaps_s.size > 1 and gaps_s.mean() > 0:
         mean_s = float(gaps_s.mean())
@@ -174,7 +174,7 @@ def prior_of(arrivals_ns: Sequence[Sequence[int]], rate: float | None) -> GapPri
 
 
 def _spread_s(gaps_s: Floats) -> float:
-    """Return sigma of a gap: of single gaps or, where gaps come in bursts and that says more, from sums over blocks."""
+    """Return sigma of a gap, of single gaps or of sums over blocks, if that is larger, as with bursts."""
     size = max(1, round(gaps_s.size**0.5))
     blocks = gaps_s[: gaps_s.size // size * size].reshape(-1, size).sum(axis=1)
     of_blocks = float(blocks.std(ddof=1)) / size**0.5 if blocks.size > 1 else 0.0

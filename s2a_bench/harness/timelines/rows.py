@@ -1,4 +1,4 @@
-"""Plans as rows: the tokens and skills of those that are kept, in the integers of a run folder."""
+"""Rows of plans: the tokens and skills of kept plans, in the integers of a run folder."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from s2a_bench.policy.schedule import align
 from s2a_bench.store.requests import SkillRow, TokenRow
 
 KEPT_PLANS: Final = 10
-"""As many plans of a cell keep their tokens, skills and motion; the others only their metrics."""
+"""Plans of a cell that keep tokens, skills and motion; the others keep their metrics."""
 
 
 def skill_rows(
@@ -26,9 +26,9 @@ def skill_rows(
     texts: Sequence[Sequence[str]] | None = None,
     due_s: Floats | None = None,
 ) -> list[SkillRow]:
-    """List every skill of the plans that are kept; ``texts`` are the calls, a sequence a plan.
+    """List every skill of the kept plans; ``texts`` are the calls, a sequence a plan.
 
-    ``due_s``, shape (N, M), says when there was reason to start each skill that was really executed.
+    ``due_s``, shape (N, M), is the earliest time of each executed skill's start.
     """
     arrival_s, nominal_s, least_s, most_s, start_s, duration_s = align(
         plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s, schedule.start_s, schedule.duration_s
@@ -54,12 +54,12 @@ def skill_rows(
 
 
 def token_rows(cell: str, token_s: Floats, request_ids: Sequence[str]) -> Iterable[TokenRow]:
-    """List every token of the plans that are kept, shape (tokens, M); nobody wrote them, so they have no text."""
+    """List every token of the kept plans, shape (tokens, M); drawn tokens have no text."""
     for place, request_id in enumerate(request_ids[:KEPT_PLANS]):
         for index, at_s in enumerate(token_s[:, place]):
             yield TokenRow(request_id, cell, index, -1, "", None, to_ns(at_s))
 
 
 def to_ns(seconds: float) -> int:
-    """Round to nanoseconds."""
+    """Round seconds to nanoseconds."""
     return round(float(seconds) * 1e9)

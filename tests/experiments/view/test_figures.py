@@ -86,4 +86,4 @@ def test_the_line_stays_one_line_and_fits_whatever_answered(make_run: Any) -> No
 
 
 def test_what_a_manifest_does_not_say_is_left_out() -> None:
-    assert source_line([StoredRun(Path(), {})]) == "engine UNKNOWN (the server does not tell)"
+    assert source_line([StoredRun(Path(), {})]) == "engine UNKNOWN (the server does not report it)"

@@ -202,7 +202,7 @@ def test_markdown_and_latex_are_tables(make_run: MakeRun) -> None:
     assert r"encode & image\_encode & 3.00 (3.00 $\pm$ 0.00) & -- \\" in latex
     assert latex.count(r"\midrule") == 2
     assert latex.endswith(
-        "\\end{tabular}\n\\par{\\footnotesize Provenance: engine UNKNOWN (the server does not tell).}\n"
+        "\\end{tabular}\n\\par{\\footnotesize Provenance: engine UNKNOWN (the server does not report it).}\n"
     )
     # Nothing outside comments that LaTeX would take for something else.
     body = [line for line in latex.splitlines() if not line.startswith("%")]
