@@ -94,7 +94,6 @@ class Run:
         return figure
 
     def figures(self) -> dict[str, Figure]:
-        """Draw every figure of the run."""
         return {name: self.plot(name) for name in self._shown.figures}
 
     def json(self) -> dict[str, Any]:

@@ -57,7 +57,6 @@ class Options(BaseModel):
         return type(self)(**self.given_values() | changes)
 
     def given_values(self) -> dict[str, Any]:
-        """Return the fields that were given, and their values."""
         return {name: getattr(self, name) for name in self.model_fields_set}
 
     def given(self, options: type[Options] | None = None) -> Iterator[str]:
@@ -281,7 +280,6 @@ def _content(path: str | Path) -> str:
 
 
 def _sound(text: Any) -> Any:
-    """Refuse text that cannot be sent."""
     if isinstance(text, str) and ("\0" in text or any("\ud800" <= letter <= "\udfff" for letter in text)):
         raise ValueError("the text is not valid UTF-8, or has a NUL")
     return text

@@ -79,7 +79,6 @@ class Provenance:
 
     @property
     def known(self) -> bool:
-        """Whether the engine is known."""
         return self.engine != UNKNOWN
 
     @property
@@ -194,7 +193,6 @@ def joined(origins: Iterable[Origins]) -> Origins:
 
 
 def _latencies(written: str) -> str:
-    """Describe an engine's latencies; a number is ms."""
     return f"latencies {written}{' ms' if written[-1].isdigit() and ':' not in written else ''}" if written else ""
 
 

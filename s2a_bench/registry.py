@@ -65,7 +65,6 @@ class Registry(Mapping[str, T], Generic[T]):
         return tuple(self._builtins)
 
     def where(self, name: str) -> str:
-        """Return the module of a built-in implementation."""
         return self._builtins[name].partition(":")[0]
 
     def loaded(self) -> Iterator[tuple[str, T]]:

@@ -117,7 +117,6 @@ def _path(steps: Iterable[int | str], content: Any) -> str:
 
 
 def _table_of(annotation: Any) -> type[TomlTable]:
-    """Find the table in a field's type: Table, list[Table], Table | None."""
     if isinstance(annotation, type) and issubclass(annotation, TomlTable):
         return annotation
     return next(_table_of(each) for each in get_args(annotation) if each is not type(None))

@@ -163,7 +163,6 @@ class Trace:
                 self.odd.add(name)
 
     def to_remote(self) -> Remote:
-        """Return the server's report about this request, for its last message."""
         self.facts |= {name: find() for name, find in self.later.items()}
         self.later = {}
         frame = self.frame_stamp_ns, self.frame_marks

@@ -63,13 +63,10 @@ class Profile:
 
     @property
     def weights(self) -> str:
-        """Return `Provenance.weights` of the model."""
         return "dummy" if self.dummy else "real"
 
 
 class _Trace(TomlTable):
-    """Requests as recorded, warm-ups first."""
-
     gaps_ns: list[list[Count]]
     ttft_ns: list[Count] | None = None
     warmups: Count = Field(0, validate_default=True)
@@ -96,8 +93,6 @@ class _Trace(TomlTable):
 
 
 class _ProfileFile(TomlTable):
-    """The schema of the file."""
-
     title: Line
     origin: Literal["paper", "measured"]
     tokens_per_s: Annotated[float, Field(gt=0, le=1e9)]

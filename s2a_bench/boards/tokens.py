@@ -48,7 +48,6 @@ class Board:
 
     @property
     def provenance(self) -> Provenance:
-        """Return the provenance of numbers computed with its tokens."""
         return Provenance.computed(self.name or self.title, self.weights)
 
     @property

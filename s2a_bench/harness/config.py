@@ -167,7 +167,6 @@ class RequestsConfig(Options):
 
     @cached_property
     def pipelines(self) -> list[Pipeline]:
-        """Return the pipelines that are compared, one a cell; raises UsageError."""
         return pipelines(
             self.names,
             {name: options.given_values() for name, options in self.options},
@@ -186,7 +185,6 @@ class RequestsConfig(Options):
 
     @cached_property
     def answer(self) -> str:
-        """Return the kind of the answers of all cells; raises UsageError."""
         return answer_over(self.engine.answer, self.pipelines)
 
     @property
@@ -253,7 +251,6 @@ class RequestsConfig(Options):
 
     @property
     def reads_model(self) -> bool:
-        """Whether a server of this run loads a model's files."""
         return self.serves_engine or self.starts_program
 
     def check(self) -> None:
@@ -331,7 +328,6 @@ class RequestsConfig(Options):
             yield from pipeline.risks()
 
     def to_manifest(self) -> dict[str, Any]:
-        """Return the settings as plain data, with the options of every pipeline."""
         settings = {
             each.name: {**each.options.model_dump(mode="json", exclude_defaults=True), **dict(each.engine)}
             for each in self.pipelines

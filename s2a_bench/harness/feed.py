@@ -32,7 +32,6 @@ class RequestFeed:
         self._ready: tuple[Frame, ...] = ()
 
     def get_ready(self) -> None:
-        """Encode the pictures beforehand if the camera is one that delivers JPEG."""
         if self._preencoded:
             self._ready = tuple(
                 replace(frame, encoding="jpeg", data=encode_jpeg(to_bgr(frame), JPEG_QUALITY)) for frame in self._read()
@@ -130,7 +129,6 @@ class Camera:
             return self._newest
 
     def drain(self) -> list[StreamedFrame]:
-        """Return the frames since the last call."""
         with self._changed:
             frames, self._frames = self._frames, []
             return frames

@@ -106,7 +106,6 @@ class RunPlan:
     """The manifest's entries about the plan."""
 
     def with_manifest(self, **facts: Any) -> RunPlan:
-        """Return a copy with entries of the manifest added or replaced."""
         return replace(self, manifest={**self.manifest, **facts})
 
 

@@ -94,7 +94,6 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
         self._process.wait()
 
     def death(self) -> ServerDied:
-        """Describe how the process ended, with the last line of its output."""
         return ServerDied(f"the {self.name} server (pid {self.pid}) died, {self._end()}{self._last_lines(1)}")
 
     def no_start(self, why: str = "") -> ServerDied:
@@ -251,7 +250,6 @@ class LlamaServerProcess(ServerProcess):
         self.facts = {"command": command, "engine": {"engine": "llama-server", **_described(files)}}
 
     def wait_ready(self) -> None:
-        """Poll ``/health`` until the model is loaded."""
         clock = SystemClock()
         deadline = now_ns() + int(READY_TIMEOUT_S * 1e9)
         while now_ns() < deadline:
@@ -294,7 +292,6 @@ PROGRAMS: dict[str, Callable[..., ServerProcess]] = {
 
 
 def _described(files: ModelFiles) -> dict[str, Any]:
-    """Return the manifest's entry about the model files of a server that reports none."""
     return {
         "name": str(files.model.fields.get("general.name", "")),
         "model": str(files.model.path),
@@ -306,7 +303,6 @@ def _described(files: ModelFiles) -> dict[str, Any]:
 
 
 def _free_port(wanted: int) -> int:
-    """Return ``wanted``, or any port for 0, if it is free now; raises PortInUse."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

@@ -32,7 +32,6 @@ class RunRecorder(AbstractContextManager["RunRecorder"]):
     """The recording of one run. Use as a context manager."""
 
     def __init__(self, path: Path, namespace: str, *, live: bool) -> None:
-        """Create the file, whose topics are under ``namespace``; raises StoreError, naming the path."""
         self._recorder = BagRecorder(path, live=live)
         self._namespace = namespace
         self._offset_ns = realtime_offset_ns()

@@ -147,8 +147,6 @@ class _Sources:
 
 @dataclass(slots=True)
 class _Run:
-    """The state that the launches of one run share."""
-
     task: Task
     plan: RunPlan
     sources: _Sources
@@ -159,7 +157,6 @@ class _Run:
     warnings: list[RunWarning] = field(default_factory=list)
 
     def measure(self) -> None:
-        """Measure every launch and write the warnings."""
         plan, warnings = self.plan, self.warnings
         watches_udp = any(cell.transport.udp_checks for cell in plan.cells)
         warnings += before_run(plan.checks, Machine(output=self.writer.path))
@@ -176,7 +173,6 @@ class _Run:
             self.writer.update(warnings=[warning.to_manifest() for warning in warnings])
 
     def _launch(self, number: int, stack: ExitStack) -> None:
-        """Start the servers and measure all blocks of one launch."""
         writer = self.writer
         servers = ServerSet(self.plan.cells, self.plan.servers, stack, writer.path, number)
         if servers.count:
@@ -206,7 +202,6 @@ class _Run:
             writer.update(resources=sampler.describe())
 
     def _sessions(self, servers: ServerSet, sampler: ResourceSampler, stack: ExitStack) -> Iterator[Session]:
-        """Open a client and a feed for each cell."""
         plan, recorder = self.plan.feed, self.recorder
         clients = stack.enter_context(ExitStack())  # closed after the camera, which publishes through them, has stopped
         camera: Camera | None = None
@@ -233,7 +228,6 @@ class _Run:
             yield made[0]
 
     def _keep(self, servers: ServerSet, sampler: ResourceSampler, session: Session, measured: Measured) -> None:
-        """Write a request; raises if the run cannot go on."""
         name, sample, writer = session.cell.name, measured.sample, self.writer
         keep_origin(writer, name, session.origin)
         writer.sample(sample)

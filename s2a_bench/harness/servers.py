@@ -160,7 +160,6 @@ class ServerSet:
 
     @contextmanager
     def death_explained(self, pipeline: Pipeline) -> Iterator[None]:
-        """Add how the process ended to ServerDied."""
         try:
             yield
         except ServerDied:

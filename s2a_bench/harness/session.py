@@ -161,7 +161,6 @@ class Session:
         return replace(rows, fatal=fatal, retry_after_s=retry_after_s)
 
     def _pieces(self, request: Request, trace: Trace, context: RequestContext) -> Iterator[tuple[Piece, int]]:
-        """Yield the pieces with their times of arrival in ns, and pass them to the receivers of ``context``."""
         plan = context.plan
         if plan is not None:
             plan.requested(trace.marks[0][1])
@@ -249,7 +248,6 @@ class Session:
         return Measured(sample, tokens, picture, odd=frozenset(trace.odd))
 
     def _doubt(self, trace: Trace, rgb_source: int | None, rgb_engine: int | None) -> str:
-        """Return why an answered request does not count, or nothing."""
         if unknown := {stage for stage, _ in trace.chain() if stage} - self.request.stages.keys():
             return f"TransportError: {self.cell.transport.name} does not declare the stage {', '.join(sorted(unknown))}"
         if self.cell.payload in LOSSLESS and None not in {rgb_source, rgb_engine} and rgb_source != rgb_engine:

@@ -159,7 +159,6 @@ class SampleGuard:
         self._launches: set[int] = set()
 
     def see(self, row: SampleRow, fingerprint: int, odd: Iterable[str] = ()) -> None:
-        """Check one sample, the fingerprint of its picture, and the names of its impossible facts."""
         cell, counts = row.cell, self._counts
         self._odd[cell].update(odd)
         if self._frames.setdefault((cell, fingerprint), row.request_id) != row.request_id:
@@ -192,7 +191,6 @@ class SampleGuard:
         self._times_ns[cell].append(spent.e2e_ns if whole_ns is None else whole_ns)
 
     def see_hits(self, before: Mapping[str, float], after: Mapping[str, float]) -> None:
-        """Compare the servers' counters of cache hits before the run and after it."""
         self._counts[HITS] += Counter({name: round(after[name] - before.get(name, 0.0)) for name in after})
 
     def warnings(self) -> list[RunWarning]:
@@ -213,7 +211,6 @@ class SampleGuard:
         return [RunWarning("odd-facts", what, advice)] if where else []
 
     def advice(self, cells: Iterable[str]) -> str:
-        """Return the advice against loss of the cells' transports, each once."""
         return "; ".join(dict.fromkeys(self._against_loss[cell] for cell in cells if cell in self._against_loss))
 
     def _correlated(self) -> list[RunWarning]:

@@ -196,7 +196,6 @@ class EngineConfig(Options):
 
     @property
     def kind(self) -> type[Engine]:
-        """Return the engine's class; raises UsageError for an unknown name."""
         return ENGINES[self.name]
 
     @property

@@ -309,7 +309,6 @@ def write_dummy(
 
 @contextmanager
 def _writer(path: Path, architecture: str) -> Iterator[GGUFWriter]:
-    """Open a temporary file, which gets its name once it is complete."""
     gguf = extras.require("gguf", "model")
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
     os.close(handle)
@@ -326,7 +325,6 @@ def _writer(path: Path, architecture: str) -> Iterator[GGUFWriter]:
 
 
 def _write(writer: GGUFWriter, tensors: Iterable[Tensor], seed: int, written: Callable[[int], None]) -> None:
-    """Write header and keys with gguf-py, then stream the tensors."""
     kinds = extras.require("gguf", "model").GGMLQuantizationType
     for tensor in tensors:
         kind = kinds[tensor.kind.upper()]

@@ -54,7 +54,6 @@ class HubFile:
 
     @property
     def part(self) -> Path:
-        """Return the path of the incomplete file."""
         return self.blob.with_name(f"{self.blob.name}.s2a-bench.part")
 
 
@@ -170,8 +169,6 @@ def _fetch_file(repository: str, commit: str, file: HubFile, progress: Progress 
 
 
 class _Part(io.BufferedWriter):
-    """A file that is appended to, and reports its size."""
-
     def __init__(self, path: Path, report: Callable[[int], None]) -> None:
         super().__init__(io.FileIO(path, "a"))
         self._report = report
@@ -241,7 +238,6 @@ def _unreachable(error: Any, want: Wanted) -> str:
 
 @contextmanager
 def _one_line(want: Wanted) -> Iterator[None]:
-    """Translate the hub library's exceptions to ModelError, one line that names the way out."""
     errors = extras.require("huggingface_hub.errors", "model")
     # the hub library has changed its HTTP client twice: the client's base error is found through the library
     client_error: Any = errors.HfHubHTTPError.__mro__[1]

@@ -78,7 +78,6 @@ class GgufHeader:
 
     @property
     def is_mmproj(self) -> bool:
-        """Whether this is a vision tower with its projector, and not a language model."""
         return self.architecture == "clip"
 
     @property
@@ -91,8 +90,6 @@ class GgufHeader:
 
 
 class _Cursor:
-    """A position in the mapped file; every read moves it."""
-
     __slots__ = ("at", "data")
 
     def __init__(self, data: mmap.mmap, at: int = 0) -> None:
@@ -141,7 +138,6 @@ def read_header(path: Path, flag: str) -> GgufHeader:
 
 @contextmanager
 def _mapped(path: Path, flag: str) -> Iterator[mmap.mmap]:
-    """Map a file, and translate errors of reading it to ModelError."""
     try:
         if path.is_fifo() or path.is_char_device():
             raise ModelError(f"{flag} {path}: not a GGUF file; give one that llama.cpp can load")
@@ -320,7 +316,6 @@ def _plain(value: Value) -> Value:
 
 
 def _file_type(number: Value | None) -> str | None:
-    """Name the mixture of types that the converter or ``llama-quantize`` was started with."""
     kinds = extras.require("gguf.constants", "model").LlamaFileType
     names = {int(kind): kind.name.removeprefix("MOSTLY_").removeprefix("ALL_") for kind in kinds}
     return names.get(int(number)) if isinstance(number, int) else None
@@ -331,7 +326,6 @@ def _type_name(kind: int) -> str:
 
 
 def _types(tensors: Sequence[TensorInfo]) -> list[TypeShare]:
-    """Sum by type, the largest first."""
     shares = []
     for kind in {tensor.kind for tensor in tensors}:
         members = [tensor for tensor in tensors if tensor.kind == kind]
@@ -341,7 +335,6 @@ def _types(tensors: Sequence[TensorInfo]) -> list[TypeShare]:
 
 
 def _groups(tensors: Sequence[TensorInfo]) -> list[TensorGroup]:
-    """Group the same tensor of all layers, in the file's order."""
     members: dict[tuple[str, tuple[int, ...]], list[TensorInfo]] = {}
     for tensor in tensors:
         members.setdefault((re.sub(r"\.\d+\.", ".N.", tensor.name), tensor.shape[::-1]), []).append(tensor)

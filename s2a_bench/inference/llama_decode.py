@@ -115,7 +115,6 @@ class TokenBatch:
             position += 1
 
     def close(self) -> None:
-        """Free the batch; may be called twice."""
         if self._batch is not None:
             llama_cpp.llama_batch_free(self._batch)
             self._batch = None
@@ -209,6 +208,5 @@ def beyond_limits(grammar: str) -> str:
 
 
 def _most(braces: str) -> int:
-    """Return the largest number in braces, at least 1."""
     numbers = re.findall(r"\d+", braces)
     return max([1, *(int(digits) if len(digits) <= _DIGITS else REPETITIONS + 1 for digits in numbers)])

@@ -34,7 +34,6 @@ class Steps:
         return getattr(mtmd_cpp, name)
 
     def mtmd_tokenize(self, *arguments: Any) -> int:
-        """Slice, resize and tokenise: all work before the model."""
         failed: int = mtmd_cpp.mtmd_tokenize(*arguments)
         self.prepared_ns, self.encode_ns = now_ns(), 0
         return failed
@@ -60,7 +59,6 @@ class PixelHandler(chat_format.MiniCPMv26ChatHandler):  # type: ignore[misc, nam
     """The library's handler, except that a picture is an RGB array and not the bytes of a JPEG."""
 
     def __init__(self, mmproj: str, *, use_gpu: bool) -> None:
-        """Prepare; `_init_mtmd_context` loads the vision tower."""
         super().__init__(clip_model_path=mmproj, verbose=False)
         self._mtmd_cpp = self.steps = Steps()
         self.mtmd_ctx: Any = None
@@ -90,7 +88,6 @@ class PixelHandler(chat_format.MiniCPMv26ChatHandler):  # type: ignore[misc, nam
         return self.frames[int(image_url.rstrip("/").rpartition("/")[2])]
 
     def _create_bitmap_from_bytes(self, image_bytes: Frame) -> Any:
-        """Hand the pixels over; MTMD copies them."""
         pixels = np.ascontiguousarray(image_bytes.data)
         pointer = pixels.ctypes.data_as(ctypes.POINTER(ctypes.c_uint8))
         return self._mtmd_cpp.mtmd_bitmap_init(image_bytes.width, image_bytes.height, pointer)

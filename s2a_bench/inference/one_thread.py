@@ -26,8 +26,6 @@ AHEAD = 8
 
 
 class _Answer:
-    """The tokens of one request between the engine's thread and the reader's."""
-
     def __init__(self) -> None:
         self.wanted = True
         self._tokens: SimpleQueue[Piece | None] = SimpleQueue()
@@ -36,7 +34,6 @@ class _Answer:
             self._places.put(None)
 
     def write(self, tokens: Iterator[Piece]) -> None:
-        """Compute tokens while they are wanted; raises the engine's exception."""
         try:
             while self._wait_for_place() and (token := next(tokens, None)) is not None:
                 self._tokens.put(token)
@@ -63,7 +60,6 @@ class OneThreadEngine(Engine):
     """Calls an engine on a separate thread, or on another engine's ``thread``."""
 
     def __init__(self, make: Callable[[], Engine], thread: ThreadPoolExecutor | None = None) -> None:
-        """Call ``make`` on the thread; raises its exception."""
         self._closed = False
         self._answer = _Answer()
         self._thread = thread or ThreadPoolExecutor(1, "engine")

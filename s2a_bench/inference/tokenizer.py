@@ -57,5 +57,4 @@ class Tokenizer:
         return list(ids[:count])
 
     def piece(self, token: int) -> bytes:
-        """Return the bytes of a token, none for a special one."""
         return self._pieces[token]

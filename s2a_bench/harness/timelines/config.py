@@ -77,7 +77,6 @@ class PlanSetting:
         return Verbatim(f"Setting({values})")  # a name in the seeds of all published runs
 
     def request_id(self, plan: int, policy: str = "") -> str:
-        """Name a request; policies that share arrivals share the request."""
         return f"{self.name}/{policy}/{plan}" if policy else f"{self.name}/{plan}"
 
 
@@ -184,13 +183,11 @@ class TimelineConfig(LiveOptions, Modelled, ComparedOptions):
 
     @cached_property
     def boards(self) -> list[Board]:
-        """Load the boards; raises UsageError for an unknown profile or jitter."""
         found = [board_of_profile(load_profile(name), self.jitter, self.prompt_s) for name in self._profiles]
         return found + [board_of_rate(rate, self.jitter, self.prompt_s) for rate in self.rates]
 
     @cached_property
     def chosen(self) -> dict[str, Policy]:
-        """Build the policies, by their canonical names; raises UsageError."""
         return policies(self.policies)
 
     @property
@@ -200,12 +197,10 @@ class TimelineConfig(LiveOptions, Modelled, ComparedOptions):
 
     @cached_property
     def skill_set(self) -> SkillSet:
-        """Load the skills of requested plans; raises UsageError."""
         return load_skills(self.skills)
 
     @property
     def random(self) -> bool:
-        """Whether plans differ."""
         return self.t_nom_cv > 0 or not all(board.even for board in self.boards)
 
     @property
@@ -250,7 +245,6 @@ class TimelineConfig(LiveOptions, Modelled, ComparedOptions):
             )
 
     def shape(self, setting: PlanSetting) -> PlanShape:
-        """Return the facts about a plan before its first token."""
         t_nom_s = setting.t_nom_s
         timing = Timing(t_nom_s, self.t_min * t_nom_s, self.t_max * t_nom_s)
         return PlanShape(setting.n_skills, setting.tokens_per_skill, timing, self.t_nom_cv)
@@ -261,7 +255,6 @@ class TimelineConfig(LiveOptions, Modelled, ComparedOptions):
             yield "robot", risk, self.robot
 
     def to_manifest(self) -> dict[str, Any]:
-        """Return the options of this kind of run, with the values that follow from others."""
         fields = self.model_dump(include=set(ComparedOptions.model_fields) - {"profiles", "real_time", "live"})
         fields |= {"tokens_per_skill": self.lengths, "plans": self.plans_a_cell}
         if self.live:

@@ -136,7 +136,6 @@ class ModelLink:
         )
 
     def _write_origin(self) -> None:
-        """Write the provenance of the tokens, and ``dummy`` if the weights are known."""
         self.origin = self.session.origin
         dummy = {"dummy": True, "real": False}.get(self.origin.weights)
         live = {"engine": self.origin.engine, "emulated": self.origin.emulated}
@@ -180,7 +179,6 @@ class ModelLink:
         return measured
 
     def setting(self, prompt: PlanPrompt) -> PlanSetting:
-        """Return the setting of a request, with the measured rate."""
         return PlanSetting(
             board="",
             title=f"live {self.cell.name}",
@@ -205,7 +203,6 @@ class ModelLink:
             self.launch.warnings.append(RunWarning("pace-missed", what, advice))
 
     def require_answers(self) -> None:
-        """Raise TransportError if no request for a plan succeeded."""
         if not self.answers:
             raise TransportError(
                 f"no request of {self.cell.name} succeeded; {self.writer.path / 'samples.csv'} says why"

@@ -66,7 +66,6 @@ class Knowledge:
 
 
 def _open(policy: Policy) -> bool:
-    """Whether a policy has a lambda that is not set."""
     return policy.learns and policy.caution is None
 
 
