@@ -153,3 +153,12 @@ def test_what_a_run_has_no_rows_for_is_not_drawn(run: StoredRun, tmp_path: Path)
     run = read_run(run_chunks(config, tmp_path, NullProgress()))
     assert list(EXPERIMENT.show(run).figures) == ["stability", "reactions"]
     assert "smoothness" not in EXPERIMENT.show(run).tables
+
+
+@pytest.mark.parametrize("modes", ["sync", "sync,replace"])
+def test_few_lanes_have_room_for_their_labels(tmp_path: Path, modes: str) -> None:
+    few = read_run(run_chunks(ChunksConfig(latency="60", modes=modes, rules="", cycles=100), tmp_path, NullProgress()))
+    assert len(lanes_of(few)) == modes.count(",") + 1
+    drawn(few, build_lanes).savefig(
+        tmp_path / "lanes.png"
+    )  # a warning where they have none

@@ -76,7 +76,7 @@ def build_lanes(run: StoredRun) -> Figure:
     several = len({lane.source for lane in lanes}) > 1
     source = "" if several else f" @ {lanes[0].source}"
     caption = _caption(run, f"What each control tick executes{source}")
-    figure = new_figure(0.75 + 0.55 * len(lanes), caption, WIDE_IN)
+    figure = new_figure(0.85 + 0.55 * len(lanes), caption, WIDE_IN)
     axes = figure.subplots()
     oldest = max(int(lane.ticks["age_ticks"].fillna(0).max()) for lane in lanes) or 1
     for place, lane in enumerate(lanes):
@@ -89,7 +89,7 @@ def build_lanes(run: StoredRun) -> Figure:
     ages = axes.secondary_yaxis("right")
     bounds = [_age_at(place, age) for place in range(len(lanes)) for age in (0, 1)]
     ages.set_yticks(bounds, ["0", str(oldest)] * len(lanes), fontsize=5)
-    ages.set_ylabel("age of the observation (ticks)")
+    ages.set_ylabel("age (ticks)")
     legend = _legend()
     figure.legend(
         legend.values(),
