@@ -27,15 +27,12 @@ class Running(Protocol):
 
     def retime(self, end_ns: int) -> None:
         """End at ``end_ns`` instead: later (extend) or sooner, perhaps now (compress)."""
-        ...
 
     def ended(self) -> bool:
         """Return, at the commanded end, whether it is over; if not, it reports its end later."""
-        ...
 
     def abort(self) -> None:
         """Stop as soon as that is safe."""
-        ...
 
 
 class SkillRobot(Protocol):
@@ -46,15 +43,12 @@ class SkillRobot(Protocol):
 
     def start(self, call: Call, end_ns: int, report: Report) -> Running:
         """Start a skill that should end at ``end_ns`` (CLOCK_MONOTONIC)."""
-        ...
 
     def hold(self, gap: Gap) -> None:
         """Fill the time until the next skill or plan."""
-        ...
 
     def close(self) -> None:
         """Let go of the robot; may be called twice."""
-        ...
 
 
 class ActionRobot(Protocol):
@@ -65,11 +59,9 @@ class ActionRobot(Protocol):
 
         None is a stall: hold. The array is not to be kept. Raises S2AError, which ends the run.
         """
-        ...
 
     def state(self) -> tuple[float, ...]:
         """Return the state that a request sends to the policy, in the robot's units; empty: none."""
-        ...
 
     def moved(self, most: int) -> tuple[PlantMotion, Floats] | None:  # noqa: ARG002 - for subclasses
         """Return the motion from the first action on, and the actions, of ``most`` ticks; None: unknown."""
@@ -77,11 +69,9 @@ class ActionRobot(Protocol):
 
     def describe(self) -> dict[str, str]:
         """Return its parameters for the manifest."""
-        ...
 
     def close(self) -> None:
         """Let go of the robot; may be called twice."""
-        ...
 
 
 class RobotKind:
@@ -159,5 +149,4 @@ def open_robot(written: str, dims: int, period_ns: int) -> ActionRobot:
 
 
 def _is(entry: object, able: type[_Able]) -> TypeGuard[type[_Able]]:
-    """Check the type of an entry, which another package may provide."""
     return isinstance(entry, type) and issubclass(entry, able)

@@ -35,11 +35,9 @@ class PythonCall(SkillKind, ActionKind):
             raise UsageError(f"function = '{self.function}' should look like module:name")
 
     def open_skills(self, skills: SkillSet) -> CallableRobot:
-        """Import the function, which is called for every skill of the set; raises UsageError if that fails."""
         return CallableRobot(skills, dict.fromkeys((skill.name for skill in skills.skills), self._imported()))
 
     def open_actions(self, dims: int, period_ns: int) -> CallableActions:
-        """Import the function; raises UsageError if that fails."""
         del dims, period_ns
         return CallableActions(self.function, self._imported())
 
@@ -65,7 +63,6 @@ class CallableActions(ActionRobot):
         self._name, self._function = name, function
 
     def send(self, action: Vector | None, at_ns: int) -> None:
-        """Call the function; translates its exceptions into RobotError."""
         del at_ns
         if action is None:
             return
@@ -102,7 +99,6 @@ class SkillMotion:
 
     @property
     def remaining_s(self) -> float:
-        """Return the time until the commanded end in s; 0 if it is past."""
         return max(self._end_ns - now_ns(), 0) / 1e9
 
     def wait(self, longest_s: float | None = None) -> bool:
@@ -160,7 +156,6 @@ class CallableRobot:
         self._fill = hold
 
     def start(self, call: Call, end_ns: int, report: Report) -> Running:
-        """Call the skill's function on a new daemon thread."""
         motion = SkillMotion(call, end_ns)
         Thread(target=motion.run, args=(self._functions[call.skill.name], report), daemon=True).start()
         return motion

@@ -52,7 +52,6 @@ class Acted:
 
     @property
     def whole(self) -> int:
-        """Return the number of complete answers before the first incomplete one."""
         missing = [request for request, arrivals in enumerate(self.arrival_ns) if arrivals[-1] < 0]
         return missing[0] if missing else len(self.arrival_ns)
 
@@ -113,7 +112,6 @@ class ControlLoop:
         self._inbox.append((at_ns, request, len(actions)))
 
     def run(self) -> None:
-        """Run all ticks on the calling thread."""
         period_ns, floor = self._setting.period_ns, self._setting.rounding == "floor"
         for tick in range(self._ticks + floor):
             begins_ns = self._start_ns + tick * period_ns
@@ -171,7 +169,6 @@ class ControlLoop:
                 self._inbox.append(arrival)
 
     def _blend(self, actions: Sequence[Vector]) -> None:
-        """Blend a chunk, from the next due action on, into the actions that are left."""
         due = actions[self.stepper.past :]
         weight, left = self._weight, self._blended
         self._blended = deque(

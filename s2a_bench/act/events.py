@@ -93,7 +93,6 @@ class PlanFeed:
         self._put(Requested(at_ns))
 
     def token(self, text: str | bytes, at_ns: int) -> None:
-        """Deliver a token that arrived at ``at_ns``, and the skills that it completes."""
         self.token_ns.append(at_ns)
         self._put(TokenArrived(at_ns))
         self._parsed(self._parser.feed(text), at_ns)
@@ -118,11 +117,9 @@ class EventQueue(Protocol):
 
     def put(self, event: Event) -> None:
         """Deliver an event, from any thread."""
-        ...
 
     def wait(self, until_ns: int | None) -> list[Event]:
         """Wait for events until ``until_ns`` (None: for ever) and return them in order; an empty list at that time."""
-        ...
 
 
 class LiveInbox:
@@ -155,7 +152,6 @@ class ScriptedInbox:
             self.put(event)
 
     def put(self, event: Event) -> None:
-        """Deliver an event at its time, or now if that is past."""
         heapq.heappush(self._events, (event.at_ns, next(self._order), event))
 
     def wait(self, until_ns: int | None) -> list[Event]:

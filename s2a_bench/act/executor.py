@@ -122,7 +122,6 @@ class Executor:
         return len(self.record.arrivals) >= self._announced
 
     def _policy_time_s(self, at_ns: int) -> float:
-        """Return a time in s from the request, not before the last returned one."""
         self._policy_s = max((at_ns - (self.record.requested_ns or 0)) / 1e9, self._policy_s)
         return self._policy_s
 
@@ -167,7 +166,6 @@ class Executor:
         return self._last_token_ns + self._silence_ns if waiting else NEVER
 
     def _decide(self, now_ns: int, due_ns: int) -> int:
-        """Follow the policy's decision while no skill runs; return when to act again, 0 for at once."""
         started, requested_ns = len(self.record.skills), self.record.requested_ns
         if self._failure is not None:
             return self._settle(now_ns, *self._failure)
@@ -264,7 +262,6 @@ class Executor:
         self.record.commands.append(RobotCommand(at_ns, what, index))
 
     def _order(self, otherwise: _T, call: Callable[[], _T]) -> _T:
-        """Call the robot; an exception fails the plan."""
         try:
             return call()
         except Exception as error:  # noqa: BLE001 - the robot is the user's code and must not end the executor

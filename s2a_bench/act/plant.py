@@ -113,11 +113,9 @@ class PlantRobot(ActionRobot):
 
     @property
     def actions(self) -> Floats:
-        """Return the executed actions, shape (K, D): a row per tick from the first action on, held ones included."""
         return np.array(self._sent).reshape(-1, self._dims)
 
     def motion(self, most: int | None = None) -> PlantMotion | None:
-        """Return the motion from the first action on, of ``most`` ticks (None: all); None before the first action."""
         return self._plant.respond(self.actions[:most], self._period_s) if self._sent else None
 
     def moved(self, most: int) -> tuple[PlantMotion, Floats] | None:
@@ -135,7 +133,6 @@ class PlantRobot(ActionRobot):
 
 
 def _hold(actions: Floats) -> Floats:
-    """Replace NaN by each joint's last action."""
     rows = np.where(np.isnan(actions), 0, np.arange(len(actions))[:, np.newaxis])
     held: Floats = np.take_along_axis(actions, np.maximum.accumulate(rows, axis=0), axis=0)
     return held

@@ -76,7 +76,6 @@ class Record:
 
     @property
     def stalls_ns(self) -> list[int]:
-        """Return the times between the end of one skill and the start of the next."""
         return [after.start_ns - (before.end_ns or 0) for before, after in zip(self.ran, self.skills[1:], strict=False)]
 
 

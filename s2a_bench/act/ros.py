@@ -88,7 +88,6 @@ class RosRobot(SkillKind, ActionKind):
         return self.joints.split(":") if self.joints else []
 
     def open_skills(self, skills: SkillSet) -> RosSkills:
-        """Join the domain and find the robot's action server; raises TransportError without one."""
         del skills
         self._refuse(FOR_ACTIONS, "actions, not skills")
         return self._join("/s2a_bench/executor", lambda node: RosSkills(node, self.namespace, self.wait_s))
@@ -102,7 +101,6 @@ class RosRobot(SkillKind, ActionKind):
         return self._join("/s2a_bench/robot", lambda node: RosActions(self, node, names, period_ns))
 
     def _refuse(self, names: Sequence[str], about: str) -> None:
-        """Refuse parameters without effect on this robot."""
         for field in fields(self):
             if field.name in names and getattr(self, field.name) != field.default:
                 raise UsageError(f"`robot`: ros: {field.name} is about {about}")
@@ -125,7 +123,6 @@ class RosActions(ActionRobot):
     """Publishes actions."""
 
     def __init__(self, kind: RosRobot, middleware: Middleware, joints: list[str], period_ns: int) -> None:
-        """Announce the topic and take over ``middleware``; raises RobotError without a subscription in time."""
         self._kind, self._middleware = kind, middleware
         type_name = TRAJECTORY if kind.type == "JointTrajectory" else ARRAY
         self._publisher = middleware.publisher(kind.topic, type_name, QoS(depth=1))
@@ -166,7 +163,6 @@ class RosSkills:
     """Sends skills as goals; its own thread receives the results."""
 
     def __init__(self, middleware: Middleware, namespace: str, wait_s: float) -> None:
-        """Find the action server and take over ``middleware``; raises TransportError if none appears in time."""
         name = f"{namespace}/execute_skill"
         self._middleware = middleware
         self._client: ActionClient = middleware.action_client(name, EXECUTE_SKILL)
@@ -183,7 +179,6 @@ class RosSkills:
         self._thread.start()
 
     def start(self, call: Call, end_ns: int, report: Report) -> Running:
-        """Send a goal with the time until ``end_ns``."""
         times = call.skill.durations
         goal = ros.default(
             EXECUTE_SKILL + "_Goal",
@@ -219,7 +214,6 @@ class RosSkills:
                     report(self._error(event))
 
     def _error(self, event: ActionEvent) -> str:
-        """Return the error of a goal, empty on success."""
         if not isinstance(event, Result):
             return "the robot rejected the goal"
         succeeded = event.status == Status.SUCCEEDED
@@ -233,8 +227,6 @@ class RosSkills:
 
 
 class _Goal:
-    """A pending goal."""
-
     def __init__(self, client: ActionClient, goal_id: bytes) -> None:
         self._client, self._id = client, goal_id
 

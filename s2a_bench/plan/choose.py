@@ -67,7 +67,6 @@ def _stream(skills: SkillSet, tokenize: Tokenize) -> Format:
 
 
 def _plain_formats(skills: SkillSet, tokenize: Tokenize) -> Iterator[Format]:
-    """Yield the formats without fillers, the most readable first."""
     labels: list[Calls] = [Calls(), Words()]
     with suppress(ValueError):  # too many names for one letter each
         labels.append(Letters(skills))
@@ -121,7 +120,6 @@ def _padded(plain: Format, text: str, fillers: Sequence[str], target: int, token
 
 
 def _holds(chosen: Format, target: int, tokenize: Tokenize, n_skills: int) -> bool:
-    """Check the cost of every call at every number, and of all calls in a row."""
     numbers = range(1, n_skills + 1) if chosen.numbered else (1,)
     if any(count != target for count in chosen.counts(tokenize, numbers)):
         return False
@@ -155,7 +153,6 @@ def stream_codes(count: int, tokenize: Tokenize) -> list[str]:
 
 
 def _apart(count: int, tokenize: Tokenize, candidates: Iterator[str]) -> list[str]:
-    """Return candidates that are single tokens and do not merge with each other."""
     found: dict[str, int] = {}
     for text in candidates:
         tokens = tokenize(text)

@@ -51,7 +51,6 @@ class Format:
         return {call: index for index, call in enumerate(self.skills.calls)}
 
     def line(self, number: int, text: str) -> str:
-        """Return the line of the ``number``-th skill, counted from 1, with ``text``."""
         prefix = f"{number}.{self.labels.glue}" if self.numbered else ""
         return f"{prefix}{text}{self.delimiter}"
 
@@ -69,7 +68,6 @@ class Format:
         return Cost(min(counts), sum(counts) / len(counts), max(counts))
 
     def counts(self, tokenize: Tokenize, numbers: Sequence[int]) -> list[int]:
-        """Return the tokens of each line with each of the numbers."""
         return [len(tokenize(line)) for number in numbers for line in self.lines(number)]
 
 
@@ -107,7 +105,6 @@ def prompt(format_: Format, n_skills: int, task: str = "") -> str:
 
 
 def _what(format_: Format, *, coded: bool) -> str:
-    """Describe the output, in the paper's words if they apply."""
     if not format_.delimiter:
         return f"codes in one line, such as {''.join(format_.texts[:2]).strip()}"
     numbered = "numbered " if format_.numbered else ""

@@ -71,20 +71,17 @@ def _common(lines: Sequence[_Symbols], longest: int) -> int:
 
 
 def _row(symbols: Sequence[str | int]) -> str:
-    """Return the expression of a sequence of symbols."""
     if not symbols or isinstance(symbols[0], int):
         return " ".join(f"<[{symbol}]>" for symbol in symbols)
     return f'"{_escaped(symbols, _IN_QUOTES)}"'
 
 
 def _choice(symbols: Sequence[str | int]) -> str:
-    """Return the expression of one symbol out of several."""
     if isinstance(symbols[0], int):
         return f"({' | '.join(f'<[{symbol}]>' for symbol in symbols)})"
     return f"[{_escaped(symbols, _IN_CLASS)}]"
 
 
 def _escaped(symbols: Sequence[str | int], special: str) -> str:
-    """Return characters with special ones escaped."""
     codes = {ord(char): f"\\x{ord(char):02X}" for char in special} | {ord("\n"): "\\n"}
     return "".join(map(str, symbols)).translate(codes)

@@ -109,8 +109,6 @@ _Found: TypeAlias = int | _Bad
 
 
 class _Lines:
-    """Reads a format with a delimiter, line by line."""
-
     def __init__(self, format_: Format) -> None:
         self._format = format_
         self._limit = 64 + 2 * max(map(len, format_.texts))
@@ -174,7 +172,6 @@ class _Codes:
         return found
 
     def _take(self, char: str) -> list[_Found]:
-        """Add a character to the code, and look the code up if it cannot continue."""
         if self._after_code and self._apart:
             self._skipping = True
             return [_Bad("malformed", char, "codes should be apart")]

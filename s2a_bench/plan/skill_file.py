@@ -105,8 +105,6 @@ Vocabulary = Annotated[Any, BeforeValidator(_values)]
 
 
 class _Skill(TomlTable):
-    """One ``[[skill]]``."""
-
     name: Identifier
     arguments: list[str] = Field([])
     t_nom_s: Number
@@ -116,7 +114,6 @@ class _Skill(TomlTable):
 
     @property
     def durations(self) -> tuple[Decimal, Decimal, Decimal]:
-        """Return T_min, T_nom and T_max."""
         nominal = self.t_nom_s
         least = nominal * LEAST_RATIO if self.t_min_s is None else self.t_min_s
         return least, nominal, nominal * MOST_RATIO if self.t_max_s is None else self.t_max_s
@@ -130,8 +127,6 @@ class _Skill(TomlTable):
 
 
 class _SkillFile(TomlTable):
-    """The whole file."""
-
     name: Line
     role: Line
     gap: Gap
@@ -168,7 +163,6 @@ def parse_skills(text: str, origin: str) -> SkillSet:
 
 
 def _skill_set(file: _SkillFile) -> SkillSet:
-    """Build the skills with their vocabularies; raises ValueError naming the key."""
     skills = tuple(_skill(table, file) for table in file.skill)
     _refuse_twins((skill.name for skill in skills), "skill: ")
     used = {argument.vocabulary for skill in skills for argument in skill.arguments}

@@ -47,7 +47,6 @@ class Skill:
 
     @property
     def signature(self) -> str:
-        """Return the skill as in the paper's prompt: ``place(object, location)``."""
         return f"{self.name}({', '.join(map(str, self.arguments))})"
 
 
@@ -87,5 +86,4 @@ class SkillSet:
 
     @property
     def vocabularies(self) -> dict[str, tuple[Value, ...]]:
-        """Return the vocabularies in the order in which skills use them."""
         return {argument.vocabulary: argument.values for skill in self.skills for argument in skill.arguments}

@@ -171,7 +171,6 @@ class Tracker:
 
     @property
     def caution(self) -> float:
-        """Return lambda for the next plan."""
         count = len(self._sorted)
         above = min(math.floor((count + 1) * self.level + ROUNDING), count) - 1
         return math.inf if above < 0 else self._sorted[count - 1 - above]

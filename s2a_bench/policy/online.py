@@ -73,8 +73,6 @@ class _Arrivals:
 
 @dataclass(frozen=True, slots=True)
 class _Known:
-    """Values known before the first token."""
-
     prior: GapPrior
     caution: Floats
     shape: PlanShape
@@ -83,7 +81,6 @@ class _Known:
     """`GapPrior.learned` after each token, where changes of the rate are detected."""
 
     def view(self, stream: _Arrivals, plans: Ints, event: Ints) -> _View:
-        """Return the state of some plans after one event each."""
         tokens, parsed = stream.tokens[event, plans], stream.parsed[event, plans]
         last_s = stream.token_s[np.maximum(tokens, 1) - 1, plans]
         if self.learned is None:
@@ -128,7 +125,6 @@ class _View:
         return np.where(self.missing > 0, at_s, -np.inf)
 
     def cautious_start_s(self, known_s: Floats, unknown_s: float, caution: Floats) -> Floats:
-        """Return the same for the cautious forecasts, with one lambda per plan."""
         forecast_s, overdue_s = self._forecasts(unknown_s, caution)
         budget_s = known_s + self.unknown * unknown_s
         each_s = self.last_s + forecast_s - budget_s

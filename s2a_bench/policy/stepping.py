@@ -35,8 +35,6 @@ class Stream:
 
 @dataclass(slots=True)
 class _Robot:
-    """Execution of a stepper's decisions."""
-
     stepper: Stepper
     stream: Stream
     n_skills: int
@@ -68,7 +66,6 @@ class _Robot:
                 self.running = None
 
     def _decide(self, now_s: float) -> float:
-        """Execute the stepper's decision; raises ValueError for an impossible one."""
         answer = self.stepper.decide(now_s)
         if not isinstance(answer, Start):
             if not answer > now_s:

@@ -222,14 +222,12 @@ class OnlineStepper:
         return tokens * mean + (caution * noise if noise else 0.0)  # zero noise stays zero, also with infinite caution
 
     def _learned(self) -> tuple[float, float]:
-        """Return `GapPrior.learned` of the tokens so far."""
         if self.watch is None:
             return self.prior.learned(float(max(self.tokens - 1, 0)), self.last_token_s - self.first_token_s)
         mean_s, variance = self.watch.learned
         return mean_s.item(), variance.item()
 
     def _start_s(self) -> float:
-        """Return the present start time; infinity: not before another token."""
         rule, expected = self.rule, self.shape.expected
         nominal_s = sum(timing.nominal_s for timing in self.parsed)
         if not rule.elastic:
@@ -265,7 +263,6 @@ class OnlineStepper:
         return at_s
 
     def _ratio(self, now_s: float, timing: Timing) -> float:
-        """Return the factor of the next skill's nominal duration."""
         unknown_s = self.shape.expected.nominal_s
         known_s = sum(timing.nominal_s for timing in self.parsed[self.started :])
         demand = -math.inf

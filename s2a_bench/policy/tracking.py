@@ -42,7 +42,6 @@ class TrackedPolicy:
         return self.made.informed(caution=self.tracker.caution)
 
     def learn(self, plan: Plans, *, stalled: bool) -> None:
-        """Update lambda from a plan, one column with ``token_s`` and ``shape``, and from whether it stalled."""
         self.tracker.learn(float(scores(self.made, plan)[0]), stalled=stalled)
 
     def follow(self, plans: Plans) -> tuple[Floats, Schedule]:

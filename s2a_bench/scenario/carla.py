@@ -60,7 +60,6 @@ class Carla:
             ) from error
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
-        """Spawn the three cars on a straight lane, let them settle, and start them."""
         self._remove_cars()
         start = self._straight()
         self._along, self._right = start.transform.get_forward_vector(), start.transform.get_right_vector()
@@ -86,7 +85,6 @@ class Carla:
         return self._state()
 
     def close(self) -> None:
-        """Remove the cars and restore the server's settings."""
         self._remove_cars()
         if self._before is not None:
             self._world.apply_settings(self._before)

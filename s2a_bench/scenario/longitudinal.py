@@ -15,7 +15,6 @@ class LockStep:
     """An object with state: every array has the roll-outs along its last axis, from which decided ones are dropped."""
 
     def keep(self, columns: NDArray[np.int64]) -> None:
-        """Continue with these roll-outs only."""
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray):
                 setattr(self, name, value[..., columns])

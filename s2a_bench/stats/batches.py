@@ -56,12 +56,10 @@ class LaunchValues:
         )
 
     def statistic(self, name: str) -> float:
-        """Return the statistic of all values; percentiles interpolate linearly, as in `stats.summarise`."""
         quantile = STATISTICS[name]
         return float(self.values.mean() if quantile is None else np.quantile(self.values, quantile))
 
     def draw(self, rng: np.random.Generator) -> NDArray[np.int64]:
-        """Draw batches with replacement: one row per resample with the count of each batch."""
         n = len(self.batches)
         return rng.multinomial(n, [1 / n] * n, size=_RESAMPLES)
 
@@ -99,7 +97,6 @@ class RowCorrelation:
 
     @classmethod
     def of(cls, levels: Floats) -> RowCorrelation:
-        """Compute it from one number per row, in order of time."""
         from scipy import stats
 
         ranks = stats.rankdata(levels) - (len(levels) + 1) / 2

@@ -46,7 +46,6 @@ class Noise:
         return -math.expm1(-shift) if falls else math.expm1(min(shift, _MOST))
 
     def power(self, change: float, level: float) -> float:
-        """Return the probability that the test finds a change of this share."""
         from scipy import stats
 
         shift = math.log1p(change) if self.logarithmic else change
@@ -86,7 +85,6 @@ class Change:
 
     @property
     def bounds(self) -> tuple[float, float] | None:
-        """Return the interval of `relative`, or None."""
         if self.ratio.low is not None and self.ratio.high is not None:
             return self.ratio.low - 1, self.ratio.high - 1
         low, high = self.difference.low, self.difference.high
@@ -215,7 +213,6 @@ class _Side:
 
     @property
     def positive(self) -> bool:
-        """Whether all values have a logarithm."""
         return all((values > 0).all() for values in (self.points, self.copies) if values is not None)
 
     def log(self) -> _Side:
@@ -224,7 +221,6 @@ class _Side:
         return _Side(np.log(self.points), copies, levels, self.exact)
 
     def less(self, other: _Side) -> _Side:
-        """Return the differences, block by block, to a side measured in the same blocks."""
         copies = None if self.copies is None or other.copies is None else self.copies - other.copies
         return _Side(self.points - other.points, copies, self.levels - other.levels, self.exact)
 
@@ -234,19 +230,16 @@ class _Side:
 
     @property
     def level(self) -> float:
-        """Return the only value, else the geometric mean of the launches if it exists."""
         if len(self.points) == 1 or not self.positive:
             return self.mean
         return math.exp(self.log().mean)
 
     @property
     def dependent(self) -> bool:
-        """Whether it is one launch with correlated neighbours."""
         return len(self.points) == 1 and RowCorrelation.of(self.levels).dependent
 
     @property
     def variance(self) -> tuple[float, int] | None:
-        """Return the variance of the mean with its degrees of freedom; None if unknown."""
         if self.exact:
             return 0.0, 1
         if (n := len(self.points)) > 1:
@@ -317,5 +310,4 @@ def _superiority(
 
 
 def _wins(values: Floats, ordered: Floats) -> float:
-    """Count the pairs in which the value is the larger one, ties half."""
     return float(sum(np.searchsorted(ordered, values, side).sum() for side in ("left", "right"))) / 2

@@ -64,7 +64,6 @@ class ControlSetting:
         return latency_ns // self.period_ns if self.rounding == "floor" else self.known_ticks(latency_ns)
 
     def known_ticks(self, latency_ns: Ints) -> Ints:
-        """Return the ticks until the answer can trigger a request: ceil(L / Delta t)."""
         return -(-latency_ns // self.period_ns)
 
     def length(self, execute: int) -> int:

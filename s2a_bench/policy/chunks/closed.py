@@ -33,7 +33,6 @@ class Closed:
 
     @property
     def mean_reaction_ticks(self) -> float | None:
-        """Return E[w] + E[c^2] / (2 E[c])."""
         if self.wait_ticks is None or self.cycle_ticks is None:
             return None
         return mean_reaction_s(self.wait_ticks, self.cycle_ticks)

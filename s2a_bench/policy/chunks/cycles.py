@@ -95,7 +95,6 @@ def lay(cycles: Cycles) -> Ticks:
 
 
 def _executed_before(tick: Ints, start: Ints, length: Ints, done_before: Ints) -> Ints:
-    """Return the number of actions executed before each tick."""
     run = np.searchsorted(start, tick, "right") - 1
     inside = np.minimum(tick - start[run], length[run])
     return np.where(run < 0, 0, done_before[run] + inside)

@@ -125,7 +125,6 @@ def follow(rule: TriggerRule, latency_ns: Ints, setting: ControlSetting, most: i
 
 
 def _ticks(latency_ns: float, setting: ControlSetting) -> int:
-    """Return d of a latency with a fraction of ns."""
     whole = math.ceil(latency_ns)
     return whole // setting.period_ns if setting.rounding == "floor" else -(-whole // setting.period_ns)
 

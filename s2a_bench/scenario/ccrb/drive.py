@@ -159,7 +159,6 @@ class _Drive(LockStep):
         acceleration[REAR] = self._rear.acceleration(seen, step_s)
 
     def _decided(self, resting_mps: float) -> NDArray[np.bool_]:
-        """Return a mask of the roll-outs in which nothing more can happen."""
         speed = self._state.speed_mps
         over = self._ego.phase == DONE
         # Until the driver behind has seen the ego at rest, the rear car may stop and start again.

@@ -88,7 +88,6 @@ class Ego(LockStep):
         self.acceleration_mps2 = np.where((speed <= 0) & (self.acceleration_mps2 < 0), 0.0, self.acceleration_mps2)
 
     def _advance(self, now_s: float) -> None:
-        """Start the skills that are due, and update the phases."""
         now_s += 1e-12
         while (due := now_s >= self._next_s).any():
             columns = np.flatnonzero(due)

@@ -93,7 +93,6 @@ class Brake(LockStep):
         self.force_mps2 = np.zeros(rollouts)
 
     def press(self, want_mps2: Floats, step_s: float) -> Floats:
-        """Return the force after one step towards ``want_mps2``."""
         change = np.minimum(want_mps2, MOST_MPS2) - self.force_mps2
         self.force_mps2 += np.clip(change, -MOST_MPS2 / RELEASE_S * step_s, self._build_mps3 * step_s)
         return self.force_mps2.copy()
@@ -153,7 +152,6 @@ class Idm(Follower):
         return np.where(force > 0, -force, going)
 
     def _perceived(self, seen: DriverView) -> tuple[Floats, Floats, Floats, CarMotion]:
-        """Return the law's inputs: gap, rear speed, closing speed, and the ego."""
         ego, rear = seen.ego, seen.rear
         return ego.position_m - rear.position_m, rear.speed_mps, rear.speed_mps - ego.speed_mps, ego
 

@@ -65,7 +65,6 @@ class CcrbOptions(Options):
 
     @property
     def skills(self) -> int:
-        """Return the number of skills, the lane change included."""
         return self.n_skills + self.lane_change
 
     @property
@@ -87,14 +86,12 @@ class CcrbOptions(Options):
 
     @cached_property
     def follower_survives(self) -> bool:
-        """Return whether the car behind stops behind an ego whose tokens arrive at once."""
         from s2a_bench.scenario.ccrb.drive import follower_survives
 
         return bool(follower_survives(self.cars, self.driving, self.skills, self.durations.nominal_s)[0])
 
     @property
     def decel_mps2(self) -> float:
-        """Return a_p, the plan's deceleration."""
         if self.plan_decel_mps2 is not None:
             return self.plan_decel_mps2
         return float(plan_decel(self.cars, self.n_skills, self.durations.nominal_s, lane_change=self.lane_change))
@@ -108,12 +105,10 @@ class CcrbOptions(Options):
 
     @property
     def deadline_s(self) -> float:
-        """Return S_front, the latest start that keeps the distance to the lead."""
         return float(start_deadline(self.cars, self.decel_mps2))
 
     @property
     def texts(self) -> list[str]:
-        """Return the plan's calls in the driving skill set."""
         plan = self.driving
         points = plan.set_point_mps[1:, 0] / KMH
         return [

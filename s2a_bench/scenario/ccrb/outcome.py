@@ -39,7 +39,6 @@ class Outcomes:
 
     @property
     def impact_speed_mps(self) -> Floats:
-        """Return the speed of the harder impact; NaN without one."""
         return np.fmax(self.front_impact_mps, self.rear_impact_mps)
 
 

@@ -47,11 +47,9 @@ class Scenes:
         return Scenes({name: values[part] for name, values in self.numbers.items()})
 
     def times(self, count: int) -> Scenes:
-        """Repeat all scenarios ``count`` times."""
         return Scenes({name: np.tile(values, count) for name, values in self.numbers.items()})
 
     def cars(self, gap: NDArray[np.str_], options: CcrbOptions) -> Cars:
-        """Return their cars, with one gap behaviour each, and the laws of ``options``."""
         names = ("front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s", "speed_mps")
         numbers = {name: self.numbers[name] for name in names}
         return Cars(**numbers, gap=gap, follower=options.follower, reflex=options.reflex)

@@ -44,7 +44,6 @@ def ttc_aware(plans: Plans, deadline_s: ArrayLike) -> TimedStart:
 
 
 def _durations(start_s: Floats, nominal_s: Floats, most_s: Floats) -> Floats:
-    """Return durations until the next start, at most the longest; the last one as planned."""
     duration: Floats = nominal_s.copy()
     np.minimum(np.diff(start_s, axis=0), most_s[:-1], out=duration[:-1])
     return duration
