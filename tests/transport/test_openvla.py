@@ -87,7 +87,7 @@ def test_an_action_in_any_of_its_forms_is_read(encode: Callable[[np.ndarray], st
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        ('"error"', "the server answered 'error': its own output says why"),
+        ('"error"', "the server answered 'error'; the reason is in the server's output"),
         ('{"detail": "no such route"}', "broke off: no such route"),
         ("[]", "no finite numbers"),
         ("null", "no finite numbers"),

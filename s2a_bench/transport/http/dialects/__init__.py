@@ -1,7 +1,7 @@
-"""What HTTP servers speak: one adapter a dialect, without any I/O, built in or offered by a package.
+"""Dialects of HTTP servers: one adapter for each, without any I/O, built in or from a package.
 
-An adapter builds a request's body and says what one message of the answer means. Cutting the bytes into messages is
-the `Decoder`'s; sending, marking stages and telling errors are the client's.
+An adapter builds a request's body and reads one message of an answer. The `Decoder` cuts bytes into messages; the
+client sends, marks stages and reports errors.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from s2a_bench.transport.http.dialects.common import Dialect
 
 NATIVE = "s2a"
-"""The dialect of our own server, in all its variants."""
+"""The dialect of our server, in all its variants."""
 
 
 @dataclass(frozen=True, slots=True)
 class EncodedPicture:
-    """A picture that is ready to be packed; ``shape`` is that of the bytes: (n,) or (height, width, 3)."""
+    """A picture ready to be packed; ``shape`` is that of its bytes: (n,) or (height, width, 3)."""
 
     media_type: str
     base64: str
@@ -32,10 +32,10 @@ class EncodedPicture:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What one message of an answer says; a field at its default says nothing.
+    """The content of one message of an answer; a field at its default is absent.
 
-    ``text`` is a piece of the answer itself, ``thinking`` what a model says to itself before, ``finish`` why the
-    answer is complete, ``error`` that it will never be.
+    ``text`` is a piece of the answer, ``thinking`` a piece of a model's thoughts before it, ``finish`` the reason why
+    the answer is complete, ``error`` the reason why it never will be.
     """
 
     text: str | None = None
@@ -48,7 +48,7 @@ class Event:
     actions: Sequence[Action] = ()
     """Pieces of a policy's answer, which has no text."""
     status: int = 0
-    """The HTTP status that the error would have had before the stream began, 0 if unknown."""
+    """The HTTP status of the error if it had come before the stream, 0 if unknown."""
 
 
 DIALECTS: Final[Registry[Callable[[], Dialect]]] = Registry(
@@ -65,9 +65,8 @@ DIALECTS: Final[Registry[Callable[[], Dialect]]] = Registry(
         "openvla": "s2a_bench.transport.http.dialects.openvla:OpenVla",
     },
 )
-"""Dialect -> what builds it, without arguments."""
 
 
 def open_dialect(name: str) -> Dialect:
-    """Return an adapter by its name; raises UsageError for an unknown one."""
+    """Return a new adapter; raises UsageError for an unknown name."""
     return DIALECTS[name]()

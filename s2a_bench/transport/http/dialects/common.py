@@ -1,4 +1,4 @@
-"""What a dialect is, and what dialects share: joining URLs, reading numbers."""
+"""The base of dialects, and their shared functions: joining URLs, reading numbers."""
 
 from __future__ import annotations
 
@@ -16,47 +16,45 @@ from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Frame, Pixels, Request
 
 TEMPERATURE, TOP_P = 0.7, 0.8
-"""As our own llama engine samples."""
+"""The sampling of our llama engine."""
 
 Get: TypeAlias = Callable[[str], Any]
-"""Return the JSON at a URL; raises ValueError where there is none, ServerDied where nothing answers."""
+"""Returns the JSON at a URL; raises ValueError if there is none, ServerDied if nothing answers."""
 
 NO_MODEL = "default"
-"""What a server is asked for that names no model of its own."""
+"""The requested model if a server lists none."""
 
 NO_LIST = (ValueError, KeyError, IndexError, TypeError, AttributeError, RecursionError)
-"""What reading a list of another form, or none, raises."""
+"""Exceptions of reading a missing or malformed list."""
 
 VOCABULARY = 1 << 31
-"""Larger than any."""
+"""More than the tokens of any vocabulary."""
 
 
 class Dialect:
-    """One dialect, pure and without state: a chat that streams server-sent events, unless a subclass says otherwise."""
+    """One dialect, stateless and without I/O: by default a chat that streams server-sent events."""
 
     name: str
     root, path = "", ""
-    """Where it is asked, below a server's URL: the root of the API, and the rest."""
+    """The path below a server's URL: the root of the API, and the rest."""
     lists_models = True
-    """Whether a model is chosen among those that the server lists."""
+    """Whether the server lists its models."""
     takes_grammar = False
     """Whether it has a field for a GBNF grammar."""
     media_type = "text/event-stream"
-    """What a good answer's content-type starts with."""
+    """The beginning of a good answer's content-type."""
     payloads: tuple[str, ...] = ("jpeg", "jpeg-preencoded", "png")
-    """How pictures can travel."""
     framing: Callable[[], Framing] = ServerSentEvents
     facts: Sequence[Fact] = ()
     """The facts of its events."""
 
     def met(self, base: str, model: str, get: Get) -> tuple[str, str]:
-        """Return the URL and the model to ask: as told, else the first that the server lists."""
+        """Return the URL and the model of requests: as given, else the first model that the server lists."""
         if not self.lists_models:
             return base, model
         return base, model or first_model(base, get)[1] or NO_MODEL
 
     def url(self, base: str, model: str) -> str:  # noqa: ARG002 - some have the model in the path
-        """Return where to post, for the URL that a user gave."""
         return endpoint(base, self.root, self.path)
 
     def authorization(self, key: str) -> dict[str, str]:
@@ -64,36 +62,35 @@ class Dialect:
         return {"authorization": f"Bearer {key}"}
 
     def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
-        """Return the media type and the bytes of a picture, marking each stage."""
         return encoded(frame, payload, trace)
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
-        """Return the request's body; raises UsageError for what the dialect cannot say."""
+        """Return the request's body; raises UsageError for what the dialect cannot express."""
         raise NotImplementedError
 
     def event(self, message: Any) -> Event:
-        """Return what one message means; whatever it raises for a message of another form is the Decoder's to catch."""
+        """Read one message; the Decoder catches the exceptions for a malformed one."""
         raise NotImplementedError
 
-    def starts_with_headers(self, facts: dict[str, float]) -> bool:  # noqa: ARG002 - llama-server's tell
-        """Return whether the response's headers are known to have left when inference started."""
+    def starts_with_headers(self, facts: dict[str, float]) -> bool:  # noqa: ARG002 - for llama-server
+        """Return True if the server is known to send the response's headers when inference starts."""
         return False
 
 
 def endpoint(base: str, root: str, path: str, query: str = "") -> str:
-    """Join a user's URL with a dialect's path: it may end with the server, with the API's root, or be whole."""
+    """Join a user's URL with a dialect's path; the URL may end with the server, the API's root, or the path."""
     try:
-        parts = urlsplit(base)
+        url = urlsplit(base)
     except ValueError as error:
         raise UsageError(f"`url`: '{base}' is no URL: {error}") from error
-    here = parts.path.rstrip("/")
-    if not here.endswith(path):
-        here = here.removesuffix(root) + root + path
-    return urlunsplit((parts.scheme, parts.netloc, here, "&".join(filter(None, (parts.query, query))), ""))
+    whole = url.path.rstrip("/")
+    if not whole.endswith(path):
+        whole = whole.removesuffix(root) + root + path
+    return urlunsplit((url.scheme, url.netloc, whole, "&".join(filter(None, (url.query, query))), ""))
 
 
 def first_model(base: str, get: Get) -> tuple[str, str]:
-    """Return by whom the first model on OpenAI's list is owned, and its name; empty where there is no such list."""
+    """Return the owner and the name of the first model on OpenAI's list; empty without such a list."""
     try:
         first = get(endpoint(base.removesuffix("/chat/completions"), "/v1", "/models"))["data"][0]
         return text_of(first.get("owned_by") or ""), text_of(first["id"])
@@ -102,18 +99,17 @@ def first_model(base: str, get: Get) -> tuple[str, str]:
 
 
 def sampled(request: Request, max_tokens: str = "max_tokens", top_p: str = "top_p") -> dict[str, Any]:
-    """Return how an answer is sampled, under a dialect's names."""
+    """Return the sampling of an answer, under a dialect's names."""
     return {max_tokens: request.max_tokens, "temperature": TEMPERATURE, top_p: TOP_P, "seed": request.seed}
 
 
 def numbers(source: Any, names: dict[str, Fact], scale: float = 1.0) -> dict[str, float]:
-    """Return the numbers of a JSON object as facts, times ``scale``; what is missing or null stays absent.
+    """Return the numbers of a JSON object as facts, times ``scale``; missing and null values are left out.
 
-    NaN stands for anything but a number of 0 to 2^53: `Trace.learn` tells of it.
+    NaN stands for anything but a number of 0 to 2^53: `Trace.learn` reports it.
     """
-    found = source or {}
-    told = ((ours, found.get(theirs)) for theirs, ours in names.items())
-    return {ours: _number(value) * scale for ours, value in told if value is not None}
+    values = ((fact, (source or {}).get(name)) for name, fact in names.items())
+    return {fact: _number(value) * scale for fact, value in values if value is not None}
 
 
 def _number(value: Any) -> float:
@@ -121,25 +117,25 @@ def _number(value: Any) -> float:
 
 
 def evaluated(facts: dict[str, float]) -> dict[str, float]:
-    """Count the prompt as llama.cpp does: the tokens that were evaluated, without those from the cache."""
+    """Count the prompt like llama.cpp: the evaluated tokens, without those from the cache."""
     if PROMPT_N not in facts:
         return facts
     return {**facts, PROMPT_N: _number(facts[PROMPT_N] - facts.get(CACHE_N, 0.0))}
 
 
 def token_id(value: Any) -> int:
-    """Return a token's place in a vocabulary, or -1 for what can be none."""
+    """Return a token's index in a vocabulary, or -1 for an invalid one."""
     return value if type(value) is int and 0 <= value < VOCABULARY else -1
 
 
 def usage_of(source: Any, names: dict[str, Fact]) -> dict[str, float]:
-    """Return the counts of a usage object as facts; one of zeros alone tells nothing, which is noted."""
+    """Return the counts of a usage object as facts; one of zeros alone becomes `USAGE_ZERO`."""
     counts = numbers(source, names)
     return {USAGE_ZERO: 1.0} if counts and not any(counts.values()) else counts
 
 
 def text_of(value: Any) -> str:
-    """Return a text as it is; raises TypeError for anything else, which would fail far from here."""
+    """Return a text unchanged; raises TypeError for anything else."""
     if not isinstance(value, str):
         raise TypeError(f"{type(value).__name__} where text should be")
     return value

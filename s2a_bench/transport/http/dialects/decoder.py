@@ -1,7 +1,6 @@
-"""Bytes of an answer in, events out: a sans-I/O decoder for every dialect.
+"""A sans-I/O decoder of all dialects: bytes of an answer in, events out.
 
-Whatever a server sends, it yields events and never raises: what cannot be understood is an event with an error, and
-nothing follows an error.
+It never raises, whatever a server sends: malformed bytes become an event with an error, and nothing follows an error.
 """
 
 from __future__ import annotations
@@ -24,16 +23,15 @@ QUOTED = 120
 """Characters of a message that an error quotes."""
 
 ODD = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError, RecursionError)
-"""What reading a message of an unexpected form raises; JSON and Unicode errors are ValueErrors."""
+"""Exceptions of reading a malformed message; JSON and Unicode errors are ValueErrors."""
 
 
 class Decoder:
-    """One answer's decoder."""
+    """One answer's decoder, by default with the dialect's framing."""
 
     def __init__(
         self, dialect: Dialect, loads: Callable[[Any], Any] = json.loads, framing: Callable[[], Framing] | None = None
     ) -> None:
-        """Start at the beginning of a body, cut as the dialect has it unless told."""
         self._dialect = dialect
         self._loads = loads
         self._framing = (framing or dialect.framing)()
@@ -47,7 +45,6 @@ class Decoder:
         yield from self._events(self._framing.end())
 
     def _events(self, messages: Iterator[str | bytes]) -> Iterator[Event]:
-        """Read each message until one is an error."""
         if self._failed:
             return
         try:
@@ -57,7 +54,7 @@ class Decoder:
                 yield event
                 if self._failed:
                     return
-        except ValueError as error:  # of the framing: too large
+        except ValueError as error:  # a message is too large
             self._failed = True
             yield Event(error=f"the server sent {error}")
 
@@ -74,13 +71,13 @@ class Decoder:
             return Event(error=f"the server sent {problem}")
         except ODD as problem:
             text = message if isinstance(message, str) else message.decode("utf-8", "replace")
-            start = struck(text)[:QUOTED].strip()  # before the cut, which could leave half a key
+            start = struck(text)[:QUOTED].strip()  # struck first, because a cut could leave half a key
             return Event(error=f"this is not the dialect '{self._dialect.name}' ({problem!r}): {start}")
         return _storable(event)
 
 
 def error_in(value: Any) -> str:
-    """Return the message of an error object in any of the forms that servers give it, or nothing.
+    """Return the message of a server's error object in any of its forms, or nothing.
 
     OpenAI, llama-server and Gemini send ``{"error": {"message": ...}}`` (Gemini at times in a list), Ollama and TGI
     ``{"error": "..."}``, vLLM until 0.10 ``{"object": "error", "message": ...}``, FastAPI ``{"detail": ...}``.
@@ -93,17 +90,17 @@ def error_in(value: Any) -> str:
 
 
 def _first(value: Any) -> dict[str, Any]:
-    """Return an object, or the first of a list; an empty one for anything else."""
+    """Return an object, or the first in a list; an empty one for anything else."""
     value = value[0] if isinstance(value, list) and value else value
     return value if isinstance(value, dict) else {}
 
 
 ERROR_TYPES = {"overloaded": 429, "validation": 422, "generation": 424, "incomplete_generation": 500}
-"""TGI's ``error_type``, which comes in a stream with status 200, and the status of its other routes."""
+"""TGI's ``error_type`` in a stream with status 200 -> the status of its other routes."""
 
 
 def status_in(value: Any) -> int:
-    """Return the HTTP status that an error object stands for, 0 if it does not say."""
+    """Return the HTTP status of an error object, 0 if it has none."""
     value = _first(value)
     error = value.get("error")
     code = error.get("code") if isinstance(error, dict) else value.get("code")
@@ -113,7 +110,7 @@ def status_in(value: Any) -> int:
 
 
 def _storable(event: Event) -> Event:
-    """Replace lone surrogates, which JSON can carry and no file can keep."""
+    """Replace lone surrogates, which JSON allows and no file can store."""
     if event.text is None or event.text.isascii():
         return event
     return replace(event, text=event.text.encode("utf-8", "replace").decode())

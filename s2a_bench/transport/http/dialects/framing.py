@@ -1,4 +1,4 @@
-"""Cutting a body into messages, with the same result for any cut of the bytes: events, lines of JSON, or the whole."""
+"""Framings, which cut a body into messages, however its bytes arrive: events, lines of JSON, or the whole body."""
 
 from __future__ import annotations
 
@@ -6,49 +6,49 @@ from collections.abc import Iterator
 from typing import Protocol
 
 LIMIT = 4 << 20
-"""Bytes of one message: far above any token, and a bound for a server that never ends its line."""
+"""The most bytes of a message: far more than any token, for a server that never ends its line."""
 
 
 class Framing(Protocol):
-    """How messages are cut out of a body."""
+    """Cuts one body into messages."""
 
     def feed(self, data: bytes) -> Iterator[str | bytes]:
         """Yield the messages that these bytes complete; raises ValueError for one that is too large."""
         ...
 
     def end(self) -> Iterator[str | bytes]:
-        """Yield what is left when the body has ended."""
+        """Yield the last message after the end of the body."""
         ...
 
 
 class Lines:
-    """Bytes in, lines out; a line ends with CR LF, LF or CR (WHATWG HTML, 9.2.6)."""
+    """Lines that end with CR LF, LF or CR (WHATWG HTML, 9.2.6); bytes that are no UTF-8 become U+FFFD."""
+
+    unit = "line"
 
     def __init__(self) -> None:
-        """Start at the beginning of a body."""
         self._pieces: list[bytes] = []
         self._size = 0
         self._after_cr = False
 
     def feed(self, data: bytes) -> Iterator[str]:
-        """Yield the lines that these bytes complete; bytes that are no UTF-8 become U+FFFD."""
         if self._after_cr and data:
             data = data.removeprefix(b"\n")
             self._after_cr = False
         if b"\r" in data:
             self._after_cr = data.endswith(b"\r")
             data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-        *ended, rest = data.split(b"\n")
-        for part in ended:
-            self._keep(part)
+        *complete, rest = data.split(b"\n")
+        for block in complete:
+            self._keep(block)
             yield from self.end()
         self._keep(rest)
 
-    def _keep(self, part: bytes) -> None:
-        self._pieces.append(part)
-        self._size += len(part)
+    def _keep(self, block: bytes) -> None:
+        self._pieces.append(block)
+        self._size += len(block)
         if self._size > LIMIT:
-            raise ValueError(f"a line of more than {LIMIT} bytes")
+            raise ValueError(f"a {self.unit} of more than {LIMIT} bytes")
 
     def end(self) -> Iterator[str]:
         line = b"".join(self._pieces)
@@ -56,29 +56,31 @@ class Lines:
         yield line.decode("utf-8", "replace")
 
 
-class JsonLines:
-    """One JSON text a line (NDJSON)."""
-
-    def __init__(self) -> None:
-        """Start at the beginning of a body."""
-        self._lines = Lines()
-
-    def feed(self, data: bytes) -> Iterator[str]:
-        yield from filter(str.strip, self._lines.feed(data))
+class JsonLines(Lines):
+    """One JSON text on each line (NDJSON)."""
 
     def end(self) -> Iterator[str]:
-        yield from filter(str.strip, self._lines.end())
+        yield from filter(str.strip, super().end())
+
+
+class WholeBody(Lines):
+    """A body that is one message."""
+
+    unit = "body"
+
+    def feed(self, data: bytes) -> Iterator[str]:
+        self._keep(data)
+        yield from ()
 
 
 class ServerSentEvents:
     """The data of server-sent events (WHATWG HTML, 9.2.6), comments and other fields left out.
 
-    Two liberties: a last event without its empty line counts, and JSON that stands bare between events, as Gemini and
-    some gateways send their errors, is a message too, until an empty line or one of data.
+    Unlike the standard it accepts a last event without its empty line, and bare JSON between events, which Gemini and
+    some gateways send as errors, until an empty line or one of data.
     """
 
     def __init__(self) -> None:
-        """Start at the beginning of a body."""
         self._lines = Lines()
         self._data: list[str] = []
         self._size = 0
@@ -90,7 +92,6 @@ class ServerSentEvents:
             yield from self._line(line)
 
     def end(self) -> Iterator[str]:
-        """Yield an event without its empty line."""
         for line in (*self._lines.end(), ""):
             yield from self._line(line)
 
@@ -114,26 +115,7 @@ class ServerSentEvents:
             raise ValueError(f"an event of more than {LIMIT} characters")
 
     def _event(self) -> Iterator[str]:
-        """Yield what an empty line, or one of another kind, ends."""
         data = "\n".join(self._data)
         self._data, self._size, self._bare = [], 0, False
         if data:
             yield data
-
-
-class WholeBody:
-    """A body that is one message."""
-
-    def __init__(self) -> None:
-        self._pieces: list[bytes] = []
-        self._size = 0
-
-    def feed(self, data: bytes) -> Iterator[str]:
-        self._pieces.append(data)
-        self._size += len(data)
-        if self._size > LIMIT:
-            raise ValueError(f"a body of more than {LIMIT} bytes")
-        yield from ()
-
-    def end(self) -> Iterator[str]:
-        yield b"".join(self._pieces).decode("utf-8", "replace")

@@ -30,7 +30,7 @@ USAGE = {
 VERSIONS = ("/v1beta", "/v1")
 """Roots of the API, the usual one first."""
 COMPLETE = frozenset({"STOP", "MAX_TOKENS"})
-"""Every other reason (SAFETY, RECITATION, ...) means that the answer was cut."""
+"""All other reasons (SAFETY, RECITATION, ...) mean that the answer was cut."""
 
 
 class Gemini(Dialect):
@@ -40,30 +40,29 @@ class Gemini(Dialect):
     facts = (*USAGE.values(), USAGE_ZERO)
 
     def met(self, base: str, model: str, get: Get) -> tuple[str, str]:
-        """Return the URL with the version that the server has, and the first model that it lists unless one is told."""
-        here = base.rstrip("/")
-        versions = [version for version in VERSIONS if here.endswith(version)]
+        """Return the URL with the server's version, and the model, by default the first that the server lists."""
+        url = base.rstrip("/")
+        versions = [version for version in VERSIONS if url.endswith(version)]
         if versions and model:
             return base, model
         for version in versions or VERSIONS:
-            root = here.removesuffix(version) + version
+            root = url.removesuffix(version) + version
             try:
                 names = [text_of(one["name"]) for one in get(f"{root}/models")["models"] if _answers(one)]
                 return root, model or names[0].removeprefix("models/")
             except NO_LIST:
                 continue
-        return base, model or first_model(here.removesuffix("/v1beta"), get)[1] or NO_MODEL  # a gateway's list
+        return base, model or first_model(url.removesuffix("/v1beta"), get)[1] or NO_MODEL  # a gateway's list
 
     def url(self, base: str, model: str) -> str:
         root = next((version for version in VERSIONS if base.rstrip("/").endswith(version)), VERSIONS[0])
         return endpoint(base, root, f"/models/{quote(model, safe='')}:streamGenerateContent", "alt=sse")
 
     def authorization(self, key: str) -> dict[str, str]:
-        """Return Google's own header."""
         return {"x-goog-api-key": key}
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:  # noqa: ARG002
-        """Return one turn of the user; how much the model thinks is left to its default."""
+        """Return one turn of the user; thinking is left to the model's default."""
         inline = [{"inline_data": {"mime_type": picture.media_type, "data": picture.base64}} for picture in pictures]
         return {
             "generationConfig": sampled(request, "maxOutputTokens", "topP"),
@@ -71,25 +70,24 @@ class Gemini(Dialect):
         }
 
     def event(self, message: Any) -> Event:
-        """Read one chunk, which may hold several parts, thoughts among them."""
-        said, thought, finish = "", "", ""
+        """Read one message, whose parts may be thoughts."""
+        text, thinking, finish = "", "", ""
         for candidate in message.get("candidates") or ():
             finish = text_of(candidate.get("finishReason") or "")
             for part in (candidate.get("content") or {}).get("parts") or ():
-                text = text_of(part.get("text") or "")
                 if part.get("thought"):
-                    thought += text
+                    thinking += text_of(part.get("text") or "")
                 else:
-                    said += text
+                    text += text_of(part.get("text") or "")
         if blocked := (message.get("promptFeedback") or {}).get("blockReason"):
             return Event(error=f"the prompt was refused: {blocked}")
         if finish and finish not in COMPLETE:
             return Event(error=f"the answer was cut: {finish}")
         facts = evaluated(usage_of(message.get("usageMetadata"), USAGE))
-        return Event(said or None, -1, thought, finish, facts)
+        return Event(text or None, -1, thinking, finish, facts)
 
 
 def _answers(model: Any) -> bool:
-    """Whether a model of the list writes text; one that does not say might."""
+    """Return True if a listed model writes text, or does not state its methods."""
     methods = model.get("supportedGenerationMethods")
     return not methods or "generateContent" in methods

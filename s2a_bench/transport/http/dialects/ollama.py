@@ -22,11 +22,11 @@ DURATIONS = {
     "prompt_eval_duration": PROMPT_MS,
     "eval_duration": PREDICTED_MS,
 }
-"""``api/types.go``; all in ns, and left out where zero."""
+"""``api/types.go``; all in ns, and left out if zero."""
 
 
 class Ollama(Dialect):
-    """The native chat route, which alone tells timings."""
+    """The native chat route, the only one with timings."""
 
     name = "ollama"
     root, path = "/api", "/chat"
@@ -35,21 +35,16 @@ class Ollama(Dialect):
     facts = (*COUNTS.values(), *DURATIONS.values(), OUTSIDE_MODEL_MS)
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
-        """Return one user message; whether the model thinks is left to the server's default."""
+        """Return one user message; thinking is left to the server's default."""
         message = {"role": "user", "content": request.prompt, "images": [picture.base64 for picture in pictures]}
-        return {
-            "model": model,
-            "stream": True,
-            "options": sampled(request, "num_predict"),
-            "messages": [message],
-        }
+        return {"model": model, "stream": True, "options": sampled(request, "num_predict"), "messages": [message]}
 
     def event(self, message: Any) -> Event:
-        said = message.get("message") or {}
+        content = message.get("message") or {}
         finish = text_of(message.get("done_reason") or "stop") if message.get("done") else ""
         facts = {**numbers(message, COUNTS), **numbers(message, DURATIONS, 1e-6)}
         if {TOTAL_MS, PROMPT_MS, PREDICTED_MS} <= facts.keys():
             known = facts[PROMPT_MS] + facts[PREDICTED_MS] + facts.get(LOAD_MS, 0.0)
             facts[OUTSIDE_MODEL_MS] = facts[TOTAL_MS] - known
-        thinking = text_of(said.get("thinking") or "")
-        return Event(text_of(said.get("content") or "") or None, -1, thinking, finish, facts)
+        thinking = text_of(content.get("thinking") or "")
+        return Event(text_of(content.get("content") or "") or None, -1, thinking, finish, facts)

@@ -1,7 +1,7 @@
-"""OpenAI's ``chat/completions`` with server-sent events: clouds, TGI's chat route, llama-server, vLLM and our own.
+"""OpenAI's ``chat/completions`` with server-sent events: clouds, TGI's chat route, llama-server, vLLM and our server.
 
-*openai* sends standard fields only, as strict clouds refuse others. *llama-server* and *vllm* add what turns their
-prompt cache off, and their names for a GBNF grammar.
+*openai* sends standard fields only, because strict clouds refuse others. *llama-server* and *vllm* add the fields that
+turn their prompt caches off, and their names for a GBNF grammar.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from s2a_bench.transport.limits import whole_number
 from s2a_bench.types import Action, Request
 
 TIMINGS = {str(fact): fact for fact in (CACHE_N, PROMPT_N, PROMPT_MS, PREDICTED_N, PREDICTED_MS)}
-"""What of llama-server's ``timings`` is kept."""
+"""Numbers of llama-server's ``timings``."""
 
 RATE = Fact("predicted_per_second", "tokens/s", "becomes `predicted_steps`")
 
@@ -53,13 +53,13 @@ METRICS = {
     "queue_time_ms": Fact("queue_ms", "ms", "waiting to be scheduled"),
     "mean_itl_ms": Fact("mean_itl_ms", "ms", "mean gap between tokens"),
 }
-"""What of vLLM's per-request ``metrics`` is kept."""
+"""Numbers of vLLM's per-request ``metrics``."""
 
 USAGE = {"prompt_tokens": PROMPT_N, "completion_tokens": PREDICTED_N}
 CACHED = {"cached_tokens": CACHE_N}
 REASONING = {"reasoning_tokens": THINKING_N}
 
-TELLING = frozenset({"usage", "metrics", "timings"})
+WITH_FACTS = frozenset({"usage", "metrics", "timings"})
 
 
 class OpenAI(Dialect):
@@ -76,11 +76,10 @@ class OpenAI(Dialect):
         return {**native.parameters(request, model), **extra, "messages": native.messages(request.prompt, uris)}
 
     def _extra(self, request: Request) -> dict[str, Any]:  # noqa: ARG002 - for subclasses
-        """Return the fields that are this server's own."""
         return {}
 
     def event(self, message: Any) -> Event:
-        """Read one chunk; reasoning has two names."""
+        """Read one message; reasoning has two names."""
         text, thinking, finish = None, "", ""
         for choice in message.get("choices") or ():
             delta = choice.get("delta") or {}
@@ -93,8 +92,8 @@ class OpenAI(Dialect):
 
     @staticmethod
     def _facts(message: dict[str, Any]) -> dict[str, float]:
-        """Return what the usage chunk says, llama-server's and vLLM's own numbers last."""
-        if not (message.keys() & TELLING):
+        """Return the numbers of the usage, then those of llama-server and vLLM."""
+        if not (message.keys() & WITH_FACTS):
             return {}
         usage = message.get("usage") or {}
         facts = {
@@ -103,13 +102,13 @@ class OpenAI(Dialect):
             **numbers(usage.get("completion_tokens_details"), REASONING),
         }
         timings = numbers(message.get("timings"), TIMINGS | {RATE: RATE})
-        if rate := timings.pop(RATE, 0.0):  # over n tokens or n - 1, as the build sees it
+        if rate := timings.pop(RATE, 0.0):  # over n tokens or n - 1, depending on the build
             steps = rate * timings.get(PREDICTED_MS, 0.0) / 1e3
             timings[PREDICTED_STEPS] = float(round(steps)) if isfinite(steps) else steps
         return {**evaluated(facts), **numbers(message.get("metrics"), METRICS), **timings}
 
     def starts_with_headers(self, facts: dict[str, float]) -> bool:
-        """Tell a llama-server by its timings: it sends the headers when its slot starts."""
+        """Recognise a llama-server by its timings: it sends the headers when its slot starts."""
         return PROMPT_MS in facts
 
 
@@ -131,15 +130,15 @@ class Vllm(OpenAI):
     facts = (*OpenAI.facts, END_N)
 
     def _extra(self, request: Request) -> dict[str, Any]:
-        """Keep prefixes apart by a salt of the request's own, and ask for metrics, which some versions want."""
+        """Separate prefixes by a new salt for each request, and request metrics, as some versions require."""
         grammar = {"structured_outputs": {"grammar": request.grammar}} if request.grammar else {}
         return {"cache_salt": uuid4().hex, "include_metrics": True, **grammar}
 
     def event(self, message: Any) -> Event:
-        """Read one chunk.
+        """Read one message.
 
-        An answer that ends by itself ends with a token that is counted and never shown; ``generation_time_ms`` is from
-        the first token to the last, that one included.
+        An answer that ends by itself has a last token that is counted and never sent; ``generation_time_ms`` is from
+        the first token to that one.
         """
         event = super().event(message)
         facts = dict(event.facts)
@@ -151,7 +150,7 @@ class Vllm(OpenAI):
 
 
 class Native(OpenAI):
-    """Our own server: it wants the request's id, and sends empty tokens, token ids and its marks."""
+    """Our server: it takes the request's id, and sends empty tokens, token ids and its marks."""
 
     name = NATIVE
     takes_grammar = True
@@ -162,7 +161,7 @@ class Native(OpenAI):
         return native.native_parameters(request)
 
     def event(self, message: Any) -> Event:
-        """Read one chunk, the last of which carries the marks."""
+        """Read one message, the last of which has the marks."""
         text, token, finish = None, -1, ""
         actions: Sequence[Action] = ()
         for choice in message.get("choices") or ():

@@ -23,16 +23,16 @@ from s2a_bench.types import Frame, Pixels, Request
 json_numpy = extras.require("json_numpy", "openvla")
 
 FAILED = "error"
-"""The whole body of a failure, with status 200 (``vla-scripts/deploy.py``)."""
+"""The body of a failure, with status 200 (``vla-scripts/deploy.py``)."""
 
 ACTION_N = Fact("action_n", "", "numbers of the action")
 
 NUMBERS = re.compile(r"[<>|=]?[fiu][0-9]+")
-"""The element types that are read."""
+"""Accepted element types."""
 
 
 class OpenVla(Dialect):
-    """An action server; the model's name of a request is its ``unnorm_key``."""
+    """An action server; a request's model is its ``unnorm_key``."""
 
     name = "openvla"
     path = "/act"
@@ -51,7 +51,7 @@ class OpenVla(Dialect):
         return "", pixels
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
-        """Return what ``json_numpy.dumps`` makes of the array, and the instruction."""
+        """Return the array in the form of ``json_numpy.dumps``, and the instruction."""
         fields: dict[str, Any] = {"instruction": request.prompt}
         if model:
             fields["unnorm_key"] = model
@@ -62,7 +62,7 @@ class OpenVla(Dialect):
     def event(self, message: Any) -> Event:
         """Read the action: an array, an array in a JSON text (a server that was sent ``encoded``), or a list."""
         if message == FAILED:
-            return Event(error="the server answered 'error': its own output says why")
+            return Event(error="the server answered 'error'; the reason is in the server's output")
         if isinstance(message, str):
             message = json.loads(message)
         if isinstance(message, dict):

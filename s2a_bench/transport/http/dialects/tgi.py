@@ -21,13 +21,13 @@ class Tgi(Dialect):
     facts = tuple(DETAILS.values())
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:  # noqa: ARG002
-        """Return the prompt with its pictures in Markdown, and ask for details."""
+        """Return the prompt with its pictures in Markdown, and request details."""
         marked = [f"![](data:{picture.media_type};base64,{picture.base64})" for picture in pictures]
         parameters = {**sampled(request, "max_new_tokens"), "details": True}
         return {"inputs": "".join([*marked, request.prompt]), "parameters": parameters}
 
     def event(self, message: Any) -> Event:
-        """Read one token; the last event carries the whole text as well, and special tokens are no text."""
+        """Read one token; the last event has the whole text too, and special tokens are no text."""
         token = message.get("token") or {}
         details = message.get("details") or {}
         finish = ""
