@@ -91,7 +91,6 @@ class Recording(NumberedSource):
         raise SourceError(f"`source`: {self._path} holds no picture on {self._connection.topic}; record some")
 
     def _delivered(self, message: Any) -> Encoding:
-        """Return the encoding in which this source delivers such a message."""
         if not hasattr(message, "encoding"):
             return "bgr8"
         if message.encoding not in CHANNELS:
@@ -170,7 +169,6 @@ def _connection(connections: list[Any], path: str, topic: str) -> Any:
 
 
 def _unreadable(path: str, error: Exception) -> str:
-    """Return one line that a recording cannot be read, and what may help."""
     reason = " ".join(str(error).split()) or type(error).__name__
     reason = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in reason[:MOST_QUOTED])
     return (

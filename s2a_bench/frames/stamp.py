@@ -47,7 +47,6 @@ class Stamped:
         self._source.close()
 
     def _stamp(self, frame: Frame) -> None:
-        """Write the hash into the corner, cut off in a smaller picture."""
         digest = blake2b(f"{self._nonce}/{frame.index}".encode(), digest_size=SIDE * SIDE // 8).digest()
         bits = np.unpackbits(np.frombuffer(digest, np.uint8)).reshape(SIDE, SIDE)
         corner = frame.data[: 2 * SIDE, : 2 * SIDE]

@@ -81,7 +81,6 @@ class V4L2Camera(NumberedSource):
         self._capture.release()
 
     def _configure(self, capture: cv2.VideoCapture, fps: float) -> None:
-        """Set YUYV of our size; raises SourceError unless the camera agrees."""
         if not capture.isOpened():
             raise SourceError(
                 f"`source`: cannot start {self._path}; `fuser -v {self._path}` shows whether another program uses it"
@@ -204,7 +203,6 @@ def _formats(device: int, kind: int, ioctl: Ioctl) -> dict[str, list[tuple[int, 
 
 
 def _sizes(device: int, code: int, ioctl: Ioctl) -> list[tuple[int, int]]:
-    """List the sizes of a format, as far as the driver knows them."""
     sizes: list[tuple[int, int]] = []
     for index in range(MOST):
         try:

@@ -1,7 +1,7 @@
-"""What the author of a plug-in needs for its tests: one conformance suite a seam, a virtual clock, a null progress.
+"""Tools for the tests of plug-ins: one conformance suite for each seam, a virtual clock, a null progress.
 
-A suite is a class of tests for pytest. A test module subclasses it under a name with ``Test`` and gives the fixtures
-that its docstring names:
+A suite is a class of pytest tests. A test module subclasses it under a name that begins with ``Test`` and provides the
+fixtures that the suite's docstring names:
 
     import pytest
     from s2a_bench.testing.policy import PolicySuite
@@ -13,14 +13,14 @@ that its docstring names:
 
 | seam | suite | fixtures |
 |---|---|---|
-| transport | `transport.TransportSuite` | ``told``, or the pipeline's ``name`` as an attribute |
+| transport | `transport.TransportSuite` | ``wiring``, or the pipeline's ``name`` as an attribute |
 | transport, against hostile peers | `hostile.HostileSuite` | the pipeline's ``name``, ``clients``, ``servers`` |
 | engine | `engine.EngineSuite` | ``engine``, and ``fresh_engine``, which is closed |
-| frame source | `frame_source.FrameSourceSuite` | ``make_source``: open it with this width and height |
+| frame source | `frame_source.FrameSourceSuite` | ``make_source``: opens it with a width and a height |
 | policy | `policy.PolicySuite` | ``policy`` |
 | mode of acting on chunks | `mode.ModeSuite` | ``mode`` |
 
-`VirtualClock` jumps where a real one sleeps; `NullProgress` keeps what a run says. The suites need pytest, those of
+`VirtualClock` jumps instead of sleeping; `NullProgress` records a run's messages. The suites need pytest, those of
 policies and modes hypothesis too.
 """
 

@@ -1,4 +1,4 @@
-"""What every engine promises, as one suite."""
+"""The conformance suite of engines."""
 
 from __future__ import annotations
 
@@ -24,11 +24,7 @@ def ask(
 
 
 class EngineSuite:
-    """What every engine does.
-
-    Fixtures: ``engine``, which may live as long as the class, and ``fresh_engine``, an engine of its own for one test,
-    which closes it.
-    """
+    """Fixtures: ``engine``, which may live as long as the class, and ``fresh_engine``, which one test closes."""
 
     def test_tokens_are_counted_from_0(self, engine: Engine) -> None:
         tokens = ask(engine)
@@ -79,9 +75,9 @@ class EngineSuite:
 
     def test_every_fact_that_it_tells_is_declared(self, engine: Engine) -> None:
         ask(engine, images=(rgb_frame(),))
-        told = declared_engine(str(engine.describe()["engine"])).declared_facts
-        assert set(engine.facts) <= set(told)
-        assert all(fact.about for fact in told)
+        facts = declared_engine(str(engine.describe()["engine"])).declared_facts
+        assert set(engine.facts) <= set(facts)
+        assert all(fact.about for fact in facts)
 
     def test_it_closes_twice_and_then_refuses_requests(self, fresh_engine: Engine) -> None:
         fresh_engine.close()

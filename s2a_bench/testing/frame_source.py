@@ -1,4 +1,4 @@
-"""What every frame source promises, as one suite."""
+"""The conformance suite of frame sources."""
 
 from __future__ import annotations
 
@@ -18,10 +18,9 @@ SIZES = [(64, 48), (98, 30)]
 
 
 class FrameSourceSuite:
-    """What every frame source does.
+    """Fixture: ``make_source`` opens a new source with this width and height; its frames differ.
 
-    Fixture: ``make_source``, called with width and height, opens a new source of frames that are not all alike; it
-    raises UsageError for a size without pixels.
+    It raises UsageError for a size without pixels.
     """
 
     @pytest.fixture

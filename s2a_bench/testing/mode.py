@@ -1,4 +1,4 @@
-"""What every mode of acting on chunks promises, as one suite."""
+"""The conformance suite of modes of acting on chunks."""
 
 from __future__ import annotations
 
@@ -6,13 +6,12 @@ from dataclasses import fields
 from typing import Any, TypeAlias
 
 import numpy as np
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.policy.chunks import MODES, ControlSetting, Mode
 from s2a_bench.policy.chunks.cycles import step
-
-shared = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+from s2a_bench.testing.policy import shared
 
 Case: TypeAlias = tuple[Any, ControlSetting]
 
@@ -37,10 +36,7 @@ drawn = st.builds(
 
 
 class ModeSuite:
-    """What every mode does: its arrays, where it has some, and its stepper give the same result.
-
-    Fixture: ``mode``, whose name is found in `MODES`, and which needs no chunk of more than 8 actions.
-    """
+    """Fixture: ``mode``, whose name is in `MODES` and which needs no chunk of more than 8 actions."""
 
     def test_its_name_is_the_one_it_is_found_by(self, mode: Mode) -> None:
         assert mode.name in MODES
@@ -56,10 +52,10 @@ class ModeSuite:
     @shared
     @given(case=drawn)
     def test_it_asks_at_once_and_then_at_most_once_a_tick(self, mode: Mode, case: Case) -> None:
-        asked = mode.cycles(*case).request_tick
-        assert asked.size == case[0].size
-        assert (asked[:1] == 0).all()
-        assert (np.diff(asked) > 0).all()
+        request_tick = mode.cycles(*case).request_tick
+        assert request_tick.size == case[0].size
+        assert (request_tick[:1] == 0).all()
+        assert (np.diff(request_tick) > 0).all()
 
     @shared
     @given(case=drawn)

@@ -1,4 +1,4 @@
-"""What every policy promises, as one suite."""
+"""The conformance suite of policies."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from s2a_bench.policy.schedule import least_end, safe_start
 from s2a_bench.policy.stepping import Stream, follow, step
 
 EXACT = 1e-9
-"""Seconds within which two ways to add up the same times agree."""
+"""Tolerance, in seconds, between two ways to add up the same times."""
 
 shared = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def draw(seed: int, n_skills: int, tokens_per_skill: int, rho: float, plans: int, gap_cv: float = 0.3) -> Plans:
-    """Make random plans without ties, with skills of 0.6 to 1.4 s and gaps of ``rho`` seconds a skill in the mean."""
+    """Make random plans without ties, with skills of 0.6 to 1.4 s and gaps of ``rho`` seconds a skill on average."""
     rng = np.random.default_rng(seed)
     variance = np.log1p(gap_cv**2)
     gaps = rng.lognormal(-variance / 2, np.sqrt(variance), (n_skills * tokens_per_skill, plans))
@@ -38,7 +38,6 @@ def draw(seed: int, n_skills: int, tokens_per_skill: int, rho: float, plans: int
 
 
 def one(plans: Plans, column: int) -> Plans:
-    """Take one plan, still as arrays (N, 1)."""
     cut = slice(column, column + 1)
     assert plans.token_s is not None
     return replace(
@@ -63,10 +62,7 @@ seeded = st.builds(
 
 
 class PolicySuite:
-    """What every policy does: its arrays, where it has some, and its stepper give the same result.
-
-    Fixture: ``policy``, whose name is found in `POLICIES`.
-    """
+    """Fixture: ``policy``, whose name is in `POLICIES`."""
 
     def test_its_name_is_the_one_it_is_found_by(self, policy: Policy) -> None:
         assert policy.name in POLICIES

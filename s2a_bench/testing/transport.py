@@ -1,6 +1,6 @@
-"""What every transport promises, as one suite: subclass `TransportSuite` and name the pipeline.
+"""The conformance suite of transports: subclass `TransportSuite` and name the pipeline.
 
-A package that offers a transport tests it like this, once for each of its variants and payloads::
+A package tests its transport like this, once for each of its variants and payloads::
 
     from s2a_bench.testing.transport import TransportSuite
 
@@ -46,7 +46,7 @@ Connect = Callable[[Handler], Client]
 
 
 class RecordingHandler:
-    """A handler that remembers what it got and answers what it is told: texts, or the actions of an array (H, D)."""
+    """A handler that records requests and answers with these texts, or with the actions of an array (H, D)."""
 
     def __init__(self, answer: Sequence[Any]) -> None:
         self.answer = answer
@@ -71,13 +71,12 @@ class RecordingHandler:
 
 
 def yuyv_frame(width: int = 64, height: int = 48, seed: int = 0) -> Frame:
-    """A camera frame of noise."""
     data = np.random.default_rng(seed).integers(0, 256, (height, width, 2), np.uint8)
     return Frame(seed, now_ns(), width, height, "yuv422_yuy2", data)
 
 
 def ask(client: Client, request: Request) -> tuple[list[Piece], Trace]:
-    """Make one request the way a session does."""
+    """Make one request like a session."""
     trace = Trace()
     trace.mark(RESIDUAL)
     return list(client.request(request, trace)), trace
@@ -92,7 +91,7 @@ def wiring_of(
     max_tokens: int = 512,
     **options: Any,
 ) -> Wiring[Any]:
-    """What a client or server of a pipeline's name is told, in a test; a black box is where its options say."""
+    """Return the wiring of a client or server for a pipeline's name; a black box has its address in its options."""
     pipeline = one_pipeline(name, **options)
     address = address or pipeline.options.external_address
     return pipeline.wiring(address, timeout_s=timeout_s, deadline_s=deadline_s, max_tokens=max_tokens)
@@ -100,7 +99,7 @@ def wiring_of(
 
 @contextmanager
 def served(wiring: Wiring[Any], handler: Handler) -> Iterator[tuple[Server, Thread]]:
-    """Serve on a thread of its own for as long as the context lasts."""
+    """Serve on a new thread for as long as the context lasts."""
     server = open_server(wiring, handler)
     thread = Thread(target=server.serve)
     thread.start()
@@ -112,7 +111,6 @@ def served(wiring: Wiring[Any], handler: Handler) -> Iterator[tuple[Server, Thre
 
 
 def connector(wiring: Wiring[Any]) -> Iterator[Connect]:
-    """Connect through a server on a thread of its own; everything is stopped afterwards."""
     with ExitStack() as stack:
 
         def connect(handler: Handler) -> Client:
@@ -125,21 +123,20 @@ def connector(wiring: Wiring[Any]) -> Iterator[Connect]:
 
 
 class TransportSuite:
-    """Run by every transport and variant. Name the pipeline, or override `told`; say what its wire does not carry."""
+    """Run by every transport and variant. Name the pipeline, or override `wiring`; set the limits of its protocol."""
 
     name: ClassVar[str]
     """As in ``--transport``: the transport, perhaps a variant, perhaps options."""
     lossless = True
-    """Whether the engine should see the camera's very pixels."""
+    """Whether the engine gets the camera's exact pixels."""
     carries_id_and_limit = True
     carries: ClassVar[frozenset[str]] = frozenset({"grammar", "seed"})
     """The further fields of a request that reach the handler."""
     whole = False
-    """Whether an answer is sent as one piece: then none of it comes before a break."""
+    """Whether an answer is sent as a whole: then none of it arrives before an error."""
 
     @pytest.fixture
     def wiring(self) -> Wiring[Any]:
-        """What client and server are told; override it for options that only a fixture knows."""
         return wiring_of(self.name)
 
     @pytest.fixture
@@ -150,11 +147,11 @@ class TransportSuite:
     def transport(self, wiring: Wiring[Any]) -> Transport[Any]:
         return TRANSPORTS[wiring.transport]
 
-    def handler(self, wiring: Wiring[Any], words: Sequence[str]) -> RecordingHandler:
-        """A handler that answers with words, or where those cannot travel with as many actions."""
+    def handler(self, wiring: Wiring[Any], texts: Sequence[str]) -> RecordingHandler:
+        """Return a handler that answers with these texts, or if the transport has no tokens with as many actions."""
         if TOKENS in wiring.capabilities.answer_kinds:
-            return RecordingHandler(words)
-        return RecordingHandler([[place / 8, -place] for place in range(len(words))])
+            return RecordingHandler(texts)
+        return RecordingHandler([[index / 8, -index] for index in range(len(texts))])
 
     def test_it_is_found_by_the_name_that_it_declares(self, transport: Transport[Any], wiring: Wiring[Any]) -> None:
         assert transport.name == wiring.transport
@@ -177,15 +174,15 @@ class TransportSuite:
         assert Wiring.from_json(json.loads(json.dumps(wiring.to_json()))) == wiring
 
     def test_the_name_of_a_cell_names_the_same_cell(self, transport: Transport[Any], wiring: Wiring[Any]) -> None:
-        said = {transport.name: wiring.options.model_dump(exclude_unset=True)}
-        for cell in pipelines([transport.name], said):
-            assert pipelines([cell.name], said) == [cell]
+        options = {transport.name: wiring.options.model_dump(exclude_unset=True)}
+        for cell in pipelines([transport.name], options):
+            assert pipelines([cell.name], options) == [cell]
 
     def test_tokens_arrive_in_order_with_text_and_id(self, connect: Connect, wiring: Wiring[Any]) -> None:
         self._needs(TOKENS, wiring)
-        words = ["go", "_to(", "キッチン", ")\n", ""]
-        tokens, _ = ask(connect(RecordingHandler(words)), Request("a", "plan", (yuyv_frame(),)))
-        assert tokens == [Token(index, text, 7 + index) for index, text in enumerate(words)]
+        texts = ["go", "_to(", "キッチン", ")\n", ""]
+        tokens, _ = ask(connect(RecordingHandler(texts)), Request("a", "plan", (yuyv_frame(),)))
+        assert tokens == [Token(index, text, 7 + index) for index, text in enumerate(texts)]
 
     def test_actions_arrive_in_order_with_every_bit(self, connect: Connect, wiring: Wiring[Any]) -> None:
         self._needs(ACTIONS, wiring)
@@ -266,7 +263,7 @@ class TransportSuite:
 
     def test_every_fact_that_it_tells_is_declared(self, connect: Connect, wiring: Wiring[Any]) -> None:
         _, trace = ask(connect(self.handler(wiring, ["x", "y"])), Request("a", "plan", (yuyv_frame(),)))
-        assert set(trace.facts) <= {*wiring.capabilities.facts, PROMPT_N}  # which the handler tells
+        assert set(trace.facts) <= {*wiring.capabilities.facts, PROMPT_N}  # the handler's
         assert all(fact.about for fact in wiring.capabilities.facts)
 
     def test_an_engine_that_refuses_fails_this_request_only(self, connect: Connect, wiring: Wiring[Any]) -> None:
@@ -283,11 +280,11 @@ class TransportSuite:
     def test_tokens_before_a_break_are_seen(self, connect: Connect, wiring: Wiring[Any], fail_at: int) -> None:
         handler = self.handler(wiring, ["a", "b", "c"])
         handler.fail_at = fail_at
-        seen: list[int] = []
+        indices: list[int] = []
         with pytest.raises(RequestFailed, match="the engine has had enough"):
-            seen.extend(token.index for token in connect(handler).request(Request("a", "plan"), Trace()))
-        # what a generator hands to extend before it raises is kept
-        assert seen == ([] if self.whole else [0, 1, 2][:fail_at])
+            indices.extend(token.index for token in connect(handler).request(Request("a", "plan"), Trace()))
+        # extend keeps the items before an exception
+        assert indices == ([] if self.whole else [0, 1, 2][:fail_at])
 
     def test_an_empty_answer_is_no_error(self, connect: Connect, wiring: Wiring[Any]) -> None:
         self._needs(TOKENS, wiring)

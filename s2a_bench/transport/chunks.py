@@ -33,7 +33,6 @@ def state_of(values: Any) -> tuple[float, ...]:
 
 
 def _numbers(what: str, values: Any, dimensions: tuple[int, ...]) -> Vector:
-    """Return finite float32 of one of these numbers of dimensions; raises RequestFailed."""
     try:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError) as error:

@@ -70,7 +70,6 @@ class Template:
     """The template of one policy's observations."""
 
     def __init__(self, content: Any, name: str) -> None:
-        """Compile parsed TOML or JSON; raises UsageError naming an invalid key."""
         self.name = name
         self.pictures = 0
         """Number of pictures that it has placeholders for."""
@@ -98,7 +97,6 @@ class Template:
         return filled
 
     def check_pictures(self, cameras: int) -> None:
-        """Raise UsageError unless requests with so many pictures fit."""
         why = f"has places for {self.pictures}" if cameras > self.pictures else ""
         try:
             self._make(_Values([np.zeros((1, 1, 3), np.uint8)] * cameras, np.zeros(STATE, np.float32), ""))
@@ -261,7 +259,6 @@ class PolicyOptions(ListeningOptions):
 
     @property
     def template_name(self) -> str:
-        """The name or the path of the template."""
         raise NotImplementedError
 
 
@@ -278,7 +275,6 @@ class PolicyTransport(Transport[P]):
     """Modules that the extra of its name installs."""
 
     def capabilities(self, choice: Choice[P]) -> Capabilities[P]:
-        """Return a policy's capabilities: it takes pixels, unless its template has files."""
         options, template = choice.options, template_of(choice.options.template_name)
         pixels = self.payloads[:1] if options.url else self.payloads
         payloads = self.payloads[1:] if template.encoded else pixels

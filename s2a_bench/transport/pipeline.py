@@ -138,7 +138,6 @@ class _Payloads:
         return self.names[0] if self.strict and len(self.names) == 1 else ""
 
     def over(self, possible: Sequence[str]) -> Sequence[str]:
-        """Return the payloads of a pipeline that can carry ``possible`` ones; "" if it sends no picture."""
         if not possible:
             return ("",)
         return [each for each in self.names if each in possible] or ((self.strict and self.names) or possible)[:1]

@@ -48,7 +48,6 @@ class Turn:
     __slots__ = ("_answer_s", "_turns", "alive_ns", "deadline_ns", "ready")
 
     def __init__(self, turns: Turns, answer_s: float) -> None:
-        """Take a place; only `Turns.join` does."""
         self.ready: Event | None = None
         """Set when the turn starts; None if it started at once."""
         self.alive_ns = now_ns()
@@ -107,7 +106,6 @@ class Turns:
         return turn
 
     def leave(self, turn: Turn) -> None:
-        """Remove ``turn``; if it ran, start the next one."""
         with self._lock:
             if turn is not self._running:
                 if turn in self._waiting:
@@ -149,7 +147,6 @@ class Queued:
 
     @staticmethod
     def around(handler: Handler, limits: Limits = LIMITS) -> Queued:
-        """Return ``handler``, with a queue in front of it if it has none."""
         if isinstance(handler, Queued):
             return handler
 
@@ -162,7 +159,6 @@ class Queued:
         return Queued(answering, limits)
 
     def __call__(self, request: Request, trace: Trace) -> Generator[Piece, None, None]:
-        """Wait for a turn and answer; raises Busy or Overdue."""
         turn = self.turns.join()
         try:
             if turn.ready is not None:
@@ -174,7 +170,6 @@ class Queued:
             turn.leave()
 
     def answer(self, request: Request, trace: Trace, turn: Turn) -> Generator[Piece, None, None]:
-        """Answer in a turn that has started, and leave it."""
         trace.provenance = self.provenance
         trace.mark(RESIDUAL)
         try:
@@ -205,7 +200,6 @@ class Exchange:
             self.trace.marks.append(("inference", self.trace.token_ns[-1]))
 
     def left_s(self) -> float:
-        """Return the time until the deadline."""
         return max(0.0, (self.ends_ns - now_ns()) / 1e9)
 
     def request(self) -> Request:
@@ -284,7 +278,6 @@ class Core:
         self._reading = Semaphore(READERS)
 
     def join(self, exchange: Exchange) -> Turn:
-        """Add a request to the queue; raises Busy."""
         turn = self.queued.turns.join()
         exchange.ends_ns = turn.deadline_ns
         try:
@@ -320,7 +313,6 @@ class Core:
         return True
 
     def _answer(self, exchange: Exchange, request: Request, turn: Turn) -> None:
-        """Send the pieces once the request's turn has come, as long as they are wanted."""
         waits = turn.ready is not None
         if waits:
             exchange.trace.mark(RESIDUAL)
@@ -338,7 +330,6 @@ class Core:
                     break
 
     def stuck(self) -> str:
-        """Return the problem of a stuck answer, or nothing."""
         silent_s = self.queued.turns.silent_s()
         return f"the answer under way has shown no sign of life for {silent_s:.0f} s" if silent_s > STUCK_S else ""
 

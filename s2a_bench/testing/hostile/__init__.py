@@ -1,6 +1,6 @@
-"""Hostile peers against both ends of a transport, from tables: subclass `HostileSuite`.
+"""Tables of hostile peers for both ends of a transport: subclass `HostileSuite`.
 
-A package that offers a transport over TCP tests it like this, and adds cases that know its messages::
+A package tests a transport over TCP like this, and adds cases that know its messages::
 
     from s2a_bench.testing.hostile import Case, HostileSuite, tcp
 
@@ -9,9 +9,8 @@ A package that offers a transport over TCP tests it like this, and adds cases th
         clients = (*tcp.CLIENTS, Case("no JSON", tcp.sends(b"{]"), says="no JSON"))
         servers = tcp.SERVERS
 
-Each case has bounds: on the time until the other side has told its error in one line, and on its memory, both measured.
-Most peers are silent most of the time. So several are met at once, each by a process of ours that has nothing else to
-do: what is measured of that is one case's.
+Each case has measured bounds: the time until the other side has reported its error in one line, and its memory. Most
+peers are silent most of the time, so several run at once, each with a process of ours alone, whose use is measured.
 """
 
 from __future__ import annotations
@@ -43,45 +42,45 @@ from s2a_bench.transport.limits import PIECES, PIECES_A_TOKEN
 from s2a_bench.types import Request
 
 Attack: TypeAlias = "Callable[[Wiring[Any]], str]"
-"""A hostile client: is given the wiring of a server that runs, and returns what that said."""
+"""A hostile client: takes the wiring of a running server, and returns the server's reply."""
 Trap: TypeAlias = "Callable[[Wiring[Any]], AbstractContextManager[str]]"
 """A hostile server: its address, for as long as the context lasts."""
 Does = TypeVar("Does")
 End = TypeVar("End")
-Came = TypeVar("Came")
+Outcome = TypeVar("Outcome")
 FAILED = "^(RequestFailed|MessagesLost|ServerDied|TransportError): ."
-"""What a client says, where the words are its own affair."""
+"""Any error of a client."""
 PATIENCE_S = 2.0
-"""The longest silence that the client bears, its ``timeout_s``."""
+"""The client's ``timeout_s``, the longest silence."""
 SETTLES_S = 10.0
 AT_ONCE = 6
-"""Hostile peers that are met at once."""
+"""Hostile peers that run at once."""
 
 
 @dataclass(frozen=True, slots=True)
 class Case(Generic[Does]):
-    """One hostile peer: what it does, what the other side says to that, and what it may cost that side."""
+    """One hostile peer: its behaviour, the other side's reply, and what it may cost the other side."""
 
     name: str
     does: Does
     says: str = ""
-    """A regular expression that is found in what the other side says; a client that says nothing answered."""
+    """A regular expression for the other side's error; empty for a client that is answered."""
     seconds: float = 30.0
     mib: float = 1024.0
 
 
 class ClientProcess:
-    """The process that asks hostile servers; one that hangs is ended, and the next question starts another."""
+    """The process that sends requests to hostile servers; if it hangs it is killed and replaced."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[str] | None = None
 
     def ask(self, wiring: Wiring[Any], seconds: float) -> dict[str, Any]:
-        """Return what came of one request; fails the test after ``seconds``."""
+        """Return the outcome of one request; fails the test after ``seconds``."""
         process = self._process
         if process is None or process.poll() is not None:
-            line = [sys.executable, "-c", "from s2a_bench.testing.hostile.client import main; main()"]
-            process = self._process = subprocess.Popen(line, stdin=-1, stdout=-1, text=True)  # noqa: S603 - ours
+            command = [sys.executable, "-c", "from s2a_bench.testing.hostile.client import main; main()"]
+            process = self._process = subprocess.Popen(command, stdin=-1, stdout=-1, text=True)  # noqa: S603 - ours
         assert process.stdin
         assert process.stdout
         process.stdin.write(json.dumps(wiring.to_json()) + "\n")
@@ -92,10 +91,10 @@ class ClientProcess:
                 peak = usage(process.pid).peak_mib
                 self.close()
                 pytest.fail(f"the client was still asking after {seconds + SETTLES_S:g} s, with {peak:.0f} MiB")
-        got = process.stdout.readline()
-        assert got, f"the client's process ended: {process.wait()}"
-        answer: dict[str, Any] = json.loads(got)
-        return answer
+        line = process.stdout.readline()
+        assert line, f"the client's process ended: {process.wait()}"
+        outcome: dict[str, Any] = json.loads(line)
+        return outcome
 
     def close(self) -> None:
         if self._process is not None:
@@ -105,25 +104,24 @@ class ClientProcess:
 
 @dataclass(frozen=True, slots=True)
 class Attacked:
-    """What came of a hostile client: what our server said to it, and what an honest client was answered afterwards."""
+    """The outcome of a hostile client: our server's reply to it, and its answer to an honest client afterwards."""
 
-    said: str
+    reply: str
     seconds: float
     peak_mib: float
     answer: list[str]
     expected: list[str]
-    """What the honest client was answered before all of them."""
+    """The answer to the honest client before all hostile ones."""
     alive: bool
     tidy: bool
-    """Whether no descriptors are left."""
+    """Whether all descriptors were closed."""
 
 
 class HostileTarget:
-    """Our server in a process of its own, and a client that means well, connected all the while."""
+    """Our server in a separate process, with an honest client that stays connected."""
 
     def __init__(self, wiring: Wiring[Any], server: OwnServer, honest: Client) -> None:
-        """Ask a first time: the connection is there from now on."""
-        self._told, self._server, self._honest = wiring, server, honest
+        self._wiring, self._server, self._honest = wiring, server, honest
         self._expected = answer_of(honest)
 
     def attacked(self, case: Case[Attack]) -> Attacked:
@@ -131,30 +129,28 @@ class HostileTarget:
         before = usage(pid)
         forget_peak(pid)
         began = now_ns()
-        said = case.does(self._told)
+        reply = case.does(self._wiring)
         seconds = (now_ns() - began) / 1e9
         answer, peak_mib = answer_of(self._honest), usage(pid).peak_mib
         tidy = _settled(lambda: usage(pid).descriptors <= before.descriptors)
-        return Attacked(said, seconds, peak_mib, answer, self._expected, self._server.alive(), tidy)
+        return Attacked(reply, seconds, peak_mib, answer, self._expected, self._server.alive(), tidy)
 
 
 class HostileSuite:
-    """Name the pipeline, and the cases; override `told` for options that a name cannot say."""
+    """Name the pipeline, and the cases; override `wiring` for settings that a name cannot have."""
 
     name: ClassVar[str]
     """As in ``--transport``."""
     clients: ClassVar[Sequence[Case[Attack]]] = ()
     servers: ClassVar[Sequence[Case[Trap]]] = ()
     targets: ClassVar[int] = AT_ONCE
-    """Servers of ours that hostile clients meet, each one after the other; 1 where their address is told."""
+    """Number of our servers, each attacked by one client at a time; 1 if their address is fixed."""
 
     @classmethod
     def wiring(cls) -> Wiring[Any]:
-        """Return what client and server are told."""
         return wiring_of(cls.name, timeout_s=PATIENCE_S, max_tokens=TOKENS)
 
     def pytest_generate_tests(self, metafunc: pytest.Metafunc) -> None:
-        """Run each test once for each of its cases."""
         for fixture, cases in (("hostile_client", self.clients), ("hostile_server", self.servers)):
             if fixture in metafunc.fixturenames:
                 metafunc.parametrize(fixture, cases, ids=[case.name for case in cases])
@@ -164,29 +160,29 @@ class HostileSuite:
     def attacked(
         cls, request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     ) -> Iterator[dict[Case[Attack], Future[Attacked]]]:
-        """What comes of the hostile clients of all tests that were chosen."""
+        """The outcomes of the hostile clients of all selected tests."""
         wiring, folder = cls.wiring(), tmp_path_factory.mktemp("servers")
         with ExitStack() as stack:
             targets: list[HostileTarget] = []
             for number in range(cls.targets):
                 server = stack.enter_context(own_server(wiring, folder / f"log-{number}"))
-                here = replace(wiring, address=server.address)
-                honest = stack.enter_context(closing(open_client(replace(here, timeout_s=60.0))))
-                targets.append(HostileTarget(here, server, honest))
+                bound = replace(wiring, address=server.address)
+                honest = stack.enter_context(closing(open_client(replace(bound, timeout_s=60.0))))
+                targets.append(HostileTarget(bound, server, honest))
             yield stack.enter_context(_at_once(targets, HostileTarget.attacked, _chosen(request, "hostile_client")))
 
     @pytest.fixture(scope="class")
     @classmethod
-    def asked(cls, request: pytest.FixtureRequest) -> Iterator[dict[Case[Trap], Future[dict[str, Any]]]]:
-        """What comes of asking the hostile servers of all tests that were chosen."""
+    def trapped(cls, request: pytest.FixtureRequest) -> Iterator[dict[Case[Trap], Future[dict[str, Any]]]]:
+        """The outcomes of requests to the hostile servers of all selected tests."""
 
-        def ask_it(asker: ClientProcess, case: Case[Trap]) -> dict[str, Any]:
+        def send(client: ClientProcess, case: Case[Trap]) -> dict[str, Any]:
             with case.does(wiring := cls.wiring()) as address:
-                return asker.ask(replace(wiring, address=address), case.seconds)
+                return client.ask(replace(wiring, address=address), case.seconds)
 
         with ExitStack() as stack:
-            askers = [stack.enter_context(closing(ClientProcess())) for _ in range(AT_ONCE)]
-            yield stack.enter_context(_at_once(askers, ask_it, _chosen(request, "hostile_server")))
+            clients = [stack.enter_context(closing(ClientProcess())) for _ in range(AT_ONCE)]
+            yield stack.enter_context(_at_once(clients, send, _chosen(request, "hostile_server")))
 
     def test_the_server_outlives_a_hostile_client(
         self,
@@ -194,51 +190,55 @@ class HostileSuite:
         attacked: dict[Case[Attack], Future[Attacked]],
         record_property: Callable[[str, object], None],
     ) -> None:
-        came = attacked[hostile_client].result()
-        record_property("cost", f"{self.name}, server: {came.seconds:.2f} s, {came.peak_mib:.0f} MiB")
-        assert came.answer == came.expected != []
-        assert came.alive
-        assert re.search(hostile_client.says, came.said, re.DOTALL), came.said[:1000]
-        assert came.seconds < hostile_client.seconds
-        assert came.peak_mib < hostile_client.mib
-        assert came.tidy, "descriptors are left"
+        outcome = attacked[hostile_client].result()
+        record_property("cost", f"{self.name}, server: {outcome.seconds:.2f} s, {outcome.peak_mib:.0f} MiB")
+        assert outcome.answer == outcome.expected != []
+        assert outcome.alive
+        assert re.search(hostile_client.says, outcome.reply, re.DOTALL), outcome.reply[:1000]
+        assert outcome.seconds < hostile_client.seconds
+        assert outcome.peak_mib < hostile_client.mib
+        assert outcome.tidy, "descriptors are left"
 
     def test_the_client_outlives_a_hostile_server(
         self,
         hostile_server: Case[Trap],
-        asked: dict[Case[Trap], Future[dict[str, Any]]],
+        trapped: dict[Case[Trap], Future[dict[str, Any]]],
         record_property: Callable[[str, object], None],
     ) -> None:
-        got = asked[hostile_server].result()
-        record_property("cost", f"{self.name}, client: {got['seconds']:.2f} s, {got['peak_mib']:.0f} MiB")
-        error = got["error"]
+        outcome = trapped[hostile_server].result()
+        record_property("cost", f"{self.name}, client: {outcome['seconds']:.2f} s, {outcome['peak_mib']:.0f} MiB")
+        error = outcome["error"]
         assert re.search(hostile_server.says, error) if hostile_server.says else not error, error
         assert error.isprintable(), f"not one line of plain text: {error!r}"
-        assert got["tokens"] <= PIECES + PIECES_A_TOKEN * TOKENS
-        assert got["seconds"] < hostile_server.seconds
-        assert got["peak_mib"] < hostile_server.mib
+        assert outcome["tokens"] <= PIECES + PIECES_A_TOKEN * TOKENS
+        assert outcome["seconds"] < hostile_server.seconds
+        assert outcome["peak_mib"] < hostile_server.mib
 
 
 def _chosen(request: pytest.FixtureRequest, name: str) -> list[Case[Any]]:
-    """Return the cases of the tests of a class that were chosen."""
+    """Return the cases of a class's selected tests."""
     items: list[Any] = request.session.items
-    ours = [item for item in items if getattr(item, "cls", None) is request.cls and hasattr(item, "callspec")]
-    return [item.callspec.params[name] for item in ours if name in item.callspec.params]
+    params = [
+        item.callspec.params
+        for item in items
+        if getattr(item, "cls", None) is request.cls and hasattr(item, "callspec")
+    ]
+    return [each[name] for each in params if name in each]
 
 
 @contextmanager
 def _at_once(
-    ends: Sequence[End], meets: Callable[[End, Case[Any]], Came], cases: Sequence[Case[Any]]
-) -> Iterator[dict[Case[Any], Future[Came]]]:
-    """Let ends of ours meet cases on threads, each one at a time; what comes of each is kept for its test."""
+    ends: Sequence[End], run: Callable[[End, Case[Any]], Outcome], cases: Sequence[Case[Any]]
+) -> Iterator[dict[Case[Any], Future[Outcome]]]:
+    """Run the cases on threads, each with one of our ends alone; yield their outcomes."""
     free: SimpleQueue[End] = SimpleQueue()
     for end in ends:
         free.put(end)
 
-    def meet(case: Case[Any]) -> Came:
+    def meet(case: Case[Any]) -> Outcome:
         end = free.get()
         try:
-            return meets(end, case)
+            return run(end, case)
         finally:
             free.put(end)
 
@@ -251,9 +251,8 @@ def _at_once(
 
 @contextmanager
 def own_server(wiring: Wiring[Any], log: Path, **engine: Any) -> Iterator[OwnServer]:
-    """Run a server in a process of its own, with the echo engine, which may be told more."""
-    can = wiring.capabilities.answer_kinds
-    config = EngineConfig(**{"name": STAND_IN, "answer": can[0], **engine})
+    """Run a server in a separate process, with the echo engine unless ``engine`` names another."""
+    config = EngineConfig(**{"name": STAND_IN, "answer": wiring.capabilities.answer_kinds[0], **engine})
     server = OwnServer("hostile", ServerJob(wiring, config), log)
     with server:
         server.wait_ready()
@@ -261,7 +260,7 @@ def own_server(wiring: Wiring[Any], log: Path, **engine: Any) -> Iterator[OwnSer
 
 
 def answer_of(client: Client) -> list[str]:
-    """Return what one short question is answered; while it is told to come again it does, for `SETTLES_S`."""
+    """Return the answer to one short request; while the server is busy it is repeated, for `SETTLES_S`."""
     deadline = now_ns() + round(SETTLES_S * 1e9)
     while True:
         try:
@@ -273,7 +272,7 @@ def answer_of(client: Client) -> list[str]:
 
 
 def _settled(met: Callable[[], bool]) -> bool:
-    """Whether something comes about within `SETTLES_S`."""
+    """Return True if a condition holds within `SETTLES_S`."""
     clock, deadline = SystemClock(), now_ns() + round(SETTLES_S * 1e9)
     while not met():
         if now_ns() > deadline:

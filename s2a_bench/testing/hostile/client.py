@@ -1,7 +1,6 @@
-"""A process that asks one server after the other, and what processes use: a wiring a line on standard input.
+"""A process that makes one request for each wiring on a line of its standard input, and the memory that processes use.
 
-What came of it goes to standard output. It is a process of its own so that its memory is its own, and so that it can be
-ended where it hangs.
+Outcomes go to standard output. A separate process can be measured alone, and killed if it hangs.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import os
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ PROC = Path("/proc")
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Of a process and its children together."""
+    """The resources of a process and its descendants together."""
 
     rss_mib: float
     peak_mib: float
@@ -37,7 +36,6 @@ class Usage:
 
 
 def family(pid: int) -> Iterator[int]:
-    """Yield a process and all its descendants that run."""
     with suppress(OSError):
         tasks = [*(PROC / str(pid) / "task").iterdir()]
         yield pid
@@ -48,23 +46,20 @@ def family(pid: int) -> Iterator[int]:
 
 
 def usage(pid: int) -> Usage:
-    """Return what a process and its descendants use."""
     rss, peak, threads, descriptors = 0, 0, 0, 0
     for member in family(pid):
         with suppress(OSError):  # it has just ended
             lines = (PROC / str(member) / "status").read_text().splitlines()
-            said = {
-                name: value.split()[0] for name, _, value in (line.partition(":\t") for line in lines) if value.strip()
-            }
-            rss += int(said.get("VmRSS", 0))
-            peak += int(said.get("VmHWM", 0))
-            threads += int(said["Threads"])
+            status = {name: value.split() for name, _, value in (line.partition(":\t") for line in lines)}
+            rss += int(status.get("VmRSS", "0")[0])
+            peak += int(status.get("VmHWM", "0")[0])
+            threads += int(status["Threads"][0])
             descriptors += len([*(PROC / str(member) / "fd").iterdir()])
     return Usage(rss / 1024, peak / 1024, threads, descriptors)
 
 
 def forget_peak(pid: int) -> None:
-    """Let the peak begin anew (proc(5), clear_refs), where that is allowed."""
+    """Reset the peak (proc(5), clear_refs), if that is allowed."""
     for member in family(pid):
         with suppress(OSError):
             (PROC / str(member) / "clear_refs").write_text("5")
@@ -73,29 +68,25 @@ def forget_peak(pid: int) -> None:
 TOKENS = 8
 
 
-def asked(told: Wiring[Any]) -> dict[str, Any]:
-    """Make one request; return its tokens and error, and what it cost."""
+def one_request(wiring: Wiring[Any]) -> dict[str, Any]:
+    """Make one request; return its number of tokens, its error, and its cost."""
     forget_peak(pid := os.getpid())
-    began, error, texts = now_ns(), "", []
+    began, error, tokens = now_ns(), "", 0
     trace = Trace()
     trace.mark(RESIDUAL)
     try:
-        client = open_client(told)
-        try:
-            for token in client.request(Request("honest", "go on", max_tokens=TOKENS), trace):
-                texts.append(token.text[:100])  # noqa: PERF401 - those before an error are kept
-        finally:
-            client.close()
+        with closing(open_client(wiring)) as client:
+            for _ in client.request(Request("honest", "go on", max_tokens=TOKENS), trace):
+                tokens += 1
     except S2AError as failure:
         error = f"{type(failure).__name__}: {failure}"
     except Exception as failure:  # noqa: BLE001 - the finding
         error = f"Traceback: {failure!r} {traceback.format_exc(limit=-3)}"
-    took = {"seconds": (now_ns() - began) / 1e9, "peak_mib": usage(pid).peak_mib}
-    return {"tokens": len(texts), "error": error, **took}
+    cost = {"seconds": (now_ns() - began) / 1e9, "peak_mib": usage(pid).peak_mib}
+    return {"tokens": tokens, "error": error, **cost}
 
 
 def main() -> None:
-    """Answer until standard input ends."""
     for line in sys.stdin:
-        sys.stdout.write(json.dumps(asked(Wiring.from_json(json.loads(line)))) + "\n")
+        sys.stdout.write(json.dumps(one_request(Wiring.from_json(json.loads(line)))) + "\n")
         sys.stdout.flush()

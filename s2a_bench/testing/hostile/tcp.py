@@ -1,4 +1,4 @@
-"""Hostile peers of any transport over TCP, which know nothing of its messages, and what makes others of bytes alone."""
+"""Hostile peers for any transport over TCP, without knowledge of its messages, and functions that build others."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import random
 import socket
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from threading import Event, Thread
 from typing import Any, Literal, TypeAlias
@@ -15,26 +16,24 @@ from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
 from s2a_bench.transport import Wiring
 
 Then: TypeAlias = Literal["waits", "goes", "resets"]
-"""What a peer does after its last byte: it listens until the other side closes, or closes itself, orderly or not."""
-Pieces: TypeAlias = "Sequence[bytes] | Callable[[], Sequence[bytes]]"
-Said: TypeAlias = "bytes | Callable[[bytes], bytes]"
-"""Bytes, or what makes them of those that came first."""
+"""A peer's last act: it reads until the other side closes, closes in order, or resets the connection."""
+Block: TypeAlias = "bytes | Callable[[bytes], bytes]"
+"""Bytes, or a function that makes them from the first bytes received."""
 GIB = 1 << 30
 NOISE = random.Random(1).randbytes(1 << 16)
 ENDLESS = [bytes(1 << 16)] * (1 << 16)
 """4 GiB."""
 RESET = struct.pack("ii", 1, 0)
-SAID_BYTES = 1 << 20
+REPLY_BYTES = 1 << 20
 
 
 def connect(wiring: Wiring[Any], seconds: float) -> socket.socket:
-    """Connect to ``host:port``, or to a URL with them."""
     host, _, port = wiring.address.rpartition("//")[2].partition("/")[0].rpartition(":")
     return socket.create_connection((host, int(port)), timeout=seconds)
 
 
 def sends(*pieces: bytes, **more: Any) -> Attack:
-    """Return a client like that of `sends_made`, whose pieces are known."""
+    """Return a client like that of `sends_made`, with constant pieces."""
     return sends_made(lambda: pieces, **more)
 
 
@@ -46,56 +45,47 @@ def sends_made(
     every_s: float = 0.0,
     first: int = 0,
 ) -> Attack:
-    """Return a client that sends pieces, one each ``every_s``; it listens for ``seconds`` at most.
+    """Return a client that sends pieces, one each ``every_s``, and then reads for ``seconds`` at most.
 
-    After its first piece it goes on when ``first`` bytes have come.
+    After its first piece it waits for ``first`` bytes.
     """
 
     def attack(wiring: Wiring[Any]) -> str:
-        said, clock = b"", SystemClock()
+        reply, clock = b"", SystemClock()
         with connect(wiring, seconds) as connection:
-            try:
+            with suppress(OSError):  # the server refuses the rest
                 for piece in make():
                     connection.sendall(piece)
-                    while len(said) < first and (heard := connection.recv(1 << 16)):
-                        said += heard
+                    while len(reply) < first and (received := connection.recv(1 << 16)):
+                        reply += received
                     if every_s:
                         clock.sleep_until_ns(now_ns() + round(every_s * 1e9))
-            except OSError:
-                pass  # it has heard enough
             if then == "resets":
                 connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
             with suppress(OSError):
-                while then == "waits" and len(said) < SAID_BYTES and (piece := connection.recv(1 << 16)):
-                    said += piece
-        return said.decode(errors="replace")
+                while then == "waits" and len(reply) < REPLY_BYTES and (received := connection.recv(1 << 16)):
+                    reply += received
+        return reply.decode(errors="replace")
 
     return attack
 
 
 def crowd(number: int, attack: Attack) -> Attack:
-    """Return many clients at once."""
-
     def together(wiring: Wiring[Any]) -> str:
-        said: list[str] = []
-        threads = [Thread(target=lambda: said.append(attack(wiring))) for _ in range(number)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        return "\n".join(said)
+        with ThreadPoolExecutor(number) as pool:
+            return "\n".join(pool.map(attack, [wiring] * number))
 
     return together
 
 
-def answers(*pieces: Said, then: Then = "waits", scheme: str = "", again: Sequence[bytes] = ()) -> Trap:
-    """Return a server that answers whatever comes with pieces, and then with those of ``again`` for ever."""
+def answers(*pieces: Block, then: Then = "waits", scheme: str = "", again: Sequence[bytes] = ()) -> Trap:
+    """Return a server that answers any bytes with pieces, and then with those of ``again`` for ever."""
 
     @contextmanager
     def trap(_: Wiring[Any]) -> Iterator[str]:
         over = Event()
 
-        def endless() -> Iterator[Said]:
+        def endless() -> Iterator[Block]:
             yield from pieces
             while again and not over.is_set():
                 yield from again
@@ -117,17 +107,17 @@ def answers(*pieces: Said, then: Then = "waits", scheme: str = "", again: Sequen
     return trap
 
 
-def _answer(connection: socket.socket, pieces: Iterator[Said], then: Then, over: Event) -> None:
+def _answer(connection: socket.socket, pieces: Iterator[Block], then: Then, over: Event) -> None:
     with connection, suppress(OSError):
         connection.settimeout(0.5)
-        heard = connection.recv(1 << 16)
+        received = connection.recv(1 << 16)
         for piece in pieces:
-            connection.sendall(piece(heard) if callable(piece) else piece)
+            connection.sendall(piece(received) if callable(piece) else piece)
         if then == "resets":
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, RESET)
             return
         if then == "goes":
-            connection.shutdown(socket.SHUT_WR)  # closing what has come unread would reset
+            connection.shutdown(socket.SHUT_WR)  # closing with unread bytes would reset
         while not over.is_set():
             with suppress(TimeoutError):
                 if not connection.recv(1 << 16):
@@ -150,11 +140,11 @@ CLIENTS: tuple[Case[Attack], ...] = (
     Case("100 silent connections", crowd(100, sends(seconds=1))),
     Case("100 that come and go", crowd(100, sends(NOISE[:10], then="resets"))),
 )
-"""What any server over TCP outlives."""
+"""Hostile clients for any server over TCP."""
 
 
 def servers(scheme: str = "") -> tuple[Case[Trap], ...]:
-    """Return what any client over TCP outlives."""
+    """Return hostile servers for any client over TCP."""
     return (
         Case("silence", answers(scheme=scheme), FAILED),
         Case("gone at once", answers(then="goes", scheme=scheme), FAILED),

@@ -82,7 +82,6 @@ class Http(Transport[HttpOptions]):
         return HttpClient(wiring, alive)
 
     def server(self, wiring: Wiring[HttpOptions], handler: Handler) -> Server:
-        """Bind ``host:port``; raises PortInUse."""
         if wiring.variant in FAST:
             from s2a_bench.transport.http.fast import FastServer
 
@@ -126,7 +125,6 @@ class Http(Transport[HttpOptions]):
         )
 
     def require(self, choice: Choice[HttpOptions]) -> None:
-        """Raise UsageError for a variant that the server does not have, and for a missing key or program."""
         variant, options = choice.variant, choice.options
         if options.url and variant in {BINARY, LLAMA_SERVER}:
             raise UsageError(f"`transport` {self.name}/{variant} needs our own server; leave it out with `url`")

@@ -13,7 +13,7 @@ from websockets.utils import accept_key
 
 from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
 from s2a_bench.testing.hostile.tcp import CLIENTS as ANY_CLIENT
-from s2a_bench.testing.hostile.tcp import NOISE, Said, answers, crowd, sends, sends_made, servers
+from s2a_bench.testing.hostile.tcp import NOISE, Block, answers, crowd, sends, sends_made, servers
 from tests.hostile.wires.http import CONTROL, MIB, bomb
 
 SCHEME = "ws://"
@@ -147,11 +147,11 @@ def tells(value: Any) -> bytes:
     return frame(msgpack.packb(value), mask=False)
 
 
-def _answers(*pieces: Said, **more: Any) -> Trap:
+def _answers(*pieces: Block, **more: Any) -> Trap:
     return answers(*pieces, scheme=SCHEME, **more)
 
 
-def _greets(*pieces: Said, **more: Any) -> Trap:
+def _greets(*pieces: Block, **more: Any) -> Trap:
     """Return a server that shakes hands, greets, and then says what it says."""
     return _answers(accepted, tells({}), *pieces, **more)
 
