@@ -123,7 +123,7 @@ class TransportOptions(base.Options):
 
     @property
     def against_loss(self) -> str:
-        return "look at the network"
+        return "check the network"
 
     def addresses(self) -> Iterable[str]:
         """Return the addresses that a new server tries to bind, in order."""

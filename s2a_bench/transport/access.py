@@ -51,10 +51,10 @@ class Access:
         return None
 
     def _is_known(self, host: str) -> bool:
-        found = HOST.fullmatch(host)
-        if found is None:
+        match = HOST.fullmatch(host)
+        if match is None:
             return False
-        name = found[1].strip("[]")
+        name = match[1].strip("[]")
         try:
             return name.lower() in self._names or ip_address(name).is_loopback
         except ValueError:

@@ -151,10 +151,10 @@ def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
         return None
     at = 2
     for _ in range(_SEGMENTS):
-        found = _MARKER.match(data, at)
-        if found is None or found.end() + 7 > len(data):
+        match = _MARKER.match(data, at)
+        if match is None or match.end() + 7 > len(data):
             return None
-        marker, at = found[1][0], found.end()
+        marker, at = match[1][0], match.end()
         if marker in _FRAME:
             return int.from_bytes(data[at + 5 : at + 7], "big"), int.from_bytes(data[at + 3 : at + 5], "big")
         if marker not in _ALONE:

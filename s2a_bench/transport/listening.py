@@ -46,7 +46,7 @@ class ListeningOptions(TransportOptions):
         risk="key",
         first=True,
     )
-    no_auth: bool = option(False, "let everybody in who reaches the host, without a key", side=SERVING)
+    no_auth: bool = option(False, "serve every client that reaches the host, without a key", side=SERVING)
 
     @field_validator("url")
     @classmethod
@@ -55,7 +55,7 @@ class ListeningOptions(TransportOptions):
 
     def check(self) -> None:
         if self.no_auth and self.api_key_env:
-            raise UsageError("`no_auth` lets everybody in without the key of `api_key_env`; give one of them")
+            raise UsageError("`no_auth` serves every client without the key of `api_key_env`; give one of them")
 
     def addresses(self) -> Iterable[str]:
         return f"{self.host}:{self.port}", f"{self.host}:0"
@@ -83,7 +83,7 @@ def bound_socket(address: str, scheme: str, options: ListeningOptions) -> tuple[
     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         bound.bind((host, int(port)))
-        key = key_for(bound.getsockname()[0], options.api_key_env, everybody=options.no_auth)
+        key = key_for(bound.getsockname()[0], options.api_key_env, no_auth=options.no_auth)
         bound.listen()  # only now is the port ours
     except UsageError:
         bound.close()
@@ -140,16 +140,16 @@ def read_key(variable: str) -> str:
     return key
 
 
-def key_for(host: str, variable: str, *, everybody: bool) -> str:
+def key_for(host: str, variable: str, *, no_auth: bool) -> str:
     """Return the key that a server's clients must send, from the environment ``variable``; "" for none.
 
-    Raises UsageError if other hosts can connect to ``host`` without a key and ``everybody`` is not set.
+    Raises UsageError if other hosts can connect to ``host`` without a key and `no_auth` is not set.
     """
     key = read_key(variable)
-    if not (key or everybody or ip_address(host).is_loopback):
+    if not (key or no_auth or ip_address(host).is_loopback):
         raise UsageError(
             f"`host`: others reach {host}; name the environment variable that holds the key that they must send with "
-            "`api_key_env`, or let everybody in with `no_auth`"
+            "`api_key_env`, or serve every client with `no_auth`"
         )
     return key
 

@@ -50,7 +50,7 @@ def unpacked(data: Any, of_map: Callable[[dict[Any, Any]], Any]) -> Any:
 
 
 def _no_extension(code: int, _: bytes) -> Any:
-    raise ValueError(f"an extension of type {code}, which nobody knows")
+    raise ValueError(f"an extension of type {code}, which is not allowed")
 
 
 def array_in(data: Any, shape: Any, dtype: np.dtype[Any], start: int = 0, *, fortran: bool = False) -> NDArray[Any]:

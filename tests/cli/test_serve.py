@@ -169,7 +169,7 @@ def test_off_loopback_it_wants_a_key_or_to_be_told_that_there_is_none(start: Sta
     strangers = ("http", "--engine", "echo", "--port", "0", "--host", "0.0.0.0")  # noqa: S104 - what is tested
     error = refused("serve", *strangers)
     assert "--host: others reach 0.0.0.0" in error
-    assert "--api-key-env, or let everybody in with --no-auth" in error
+    assert "--api-key-env, or serve every client with --no-auth" in error
     _, line = start(*strangers, "--no-auth")
     assert "for every client" in line
 

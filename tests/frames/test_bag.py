@@ -183,7 +183,7 @@ MERGED = "a0: &a0 {k: 1}\n" + "".join(f"a{i}: &a{i}\n  <<: [{', '.join([f'*a{i -
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "reason"),
     [
         ("a: [1, 2\nb: }", "metadata.yaml, line 2: expected ',' or ']', but got ':'"),
         ("a:\n\t- b", "metadata.yaml, line 2: found character '\\t' that cannot start any token"),
@@ -195,12 +195,12 @@ MERGED = "a0: &a0 {k: 1}\n" + "".join(f"a{i}: &a{i}\n  <<: [{', '.join([f'*a{i -
     ],
     ids=["syntax", "tab", "deep", "merged", "laughs", "large", "list"],
 )
-def test_yaml_that_is_none_or_has_no_end_is_one_line(tmp_path: Path, text: str, said: str, opened: Open) -> None:
+def test_yaml_that_is_none_or_has_no_end_is_one_line(tmp_path: Path, text: str, reason: str, opened: Open) -> None:
     (tmp_path / "metadata.yaml").write_text(text)
     with pytest.raises(SourceError) as error:
         opened(tmp_path)
     (line,) = str(error.value).splitlines()
-    assert f"{tmp_path} is no recording that can be read ({said}" in line
+    assert f"{tmp_path} is no recording that can be read ({reason}" in line
     assert len(line) < 600
 
 

@@ -32,7 +32,7 @@ class Driver:
     layout: tuple[int, ...] | None = None
     stamps_ms: list[float] = field(default_factory=list)
     opened: list[tuple[str, int]] = field(default_factory=list)
-    asked: dict[int, float] = field(default_factory=dict)
+    settings: dict[int, float] = field(default_factory=dict)
     released: int = 0
     grabs: int = 0
 
@@ -50,7 +50,7 @@ class Capture:
         return self.open
 
     def set(self, key: int, value: float) -> bool:
-        self.driver.asked[key] = value
+        self.driver.settings[key] = value
         self.properties[key] = value
         return True
 
@@ -96,7 +96,7 @@ class TestContract(FrameSourceSuite):
 def test_it_asks_for_unconverted_yuyv_at_the_rate(driver: Driver) -> None:
     camera = V4L2Camera("/dev/video0", 320, 240, fps=15)
     assert driver.opened == [("/dev/video0", cv2.CAP_V4L2)]
-    assert driver.asked == {
+    assert driver.settings == {
         cv2.CAP_PROP_FOURCC: YUYV,
         cv2.CAP_PROP_FRAME_WIDTH: 320,
         cv2.CAP_PROP_FRAME_HEIGHT: 240,

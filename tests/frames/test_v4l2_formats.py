@@ -1,4 +1,4 @@
-"""What cameras offer, asked of a stand-in for the kernel's V4L2 answers."""
+"""Formats and sizes of cameras, from a stand-in for the kernel's V4L2."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Who may ask an HTTP server with a key, and what the others are told."""
+"""Access to an HTTP server with a key, and the refusals of other clients."""
 
 from __future__ import annotations
 

@@ -86,8 +86,8 @@ def test_a_run_keeps_a_row_for_each_and_ends_with_the_reason(name: str, tmp_path
         "8",
     ]
     with serving(lambda _: case.pieces()) as url:
-        asked = [*small, "--url", url, "--dialect", DIALECT, "--deadline", str(case.deadline_s or 60)]
-        command = [sys.executable, "-m", "s2a_bench", "latency", *asked, "--output", str(tmp_path)]
+        options = [*small, "--url", url, "--dialect", DIALECT, "--deadline", str(case.deadline_s or 60)]
+        command = [sys.executable, "-m", "s2a_bench", "latency", *options, "--output", str(tmp_path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr

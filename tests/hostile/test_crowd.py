@@ -32,15 +32,15 @@ def test_1000_clients_at_once(
     with own_server(wiring, tmp_path / "log") as server:
         here = replace(wiring, address=server.address)
         began = now_ns()
-        said = crowd(CLIENTS, sends(chat(fields=fields, path=PATHS[variant]), seconds=120))(here)
+        replies = crowd(CLIENTS, sends(chat(fields=fields, path=PATHS[variant]), seconds=120))(here)
         seconds = (now_ns() - began) / 1e9
-        whole = said.count("data: [DONE]") if stream == "true" else said.count('"completion_tokens":3')
-        answered, refused = said.count("HTTP/1.1 200 "), said.count("HTTP/1.1 503 ")
+        whole = replies.count("data: [DONE]") if stream == "true" else replies.count('"completion_tokens":3')
+        answered, refused = replies.count("HTTP/1.1 200 "), replies.count("HTTP/1.1 503 ")
         peak = usage(server.pid).peak_mib
         record_property("cost", f"1000 clients: {answered} answered, {seconds:.1f} s, {peak:.0f} MiB")
         assert answered + refused == CLIENTS
         assert whole == answered >= 65
-        assert said.count("retry-after: ") == refused
+        assert replies.count("retry-after: ") == refused
         assert peak < 1024
         client = open_client(here)
         try:

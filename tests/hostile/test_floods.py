@@ -1,7 +1,7 @@
 """Floods and overfull documents: what they cost a server, beside a twin that nobody attacks.
 
 Honest requests go to both in turn for as long as an attack lasts. How long they waited is printed (their ratio); that
-each was answered, what the attacker was told, and the memory above the twin's are judged.
+each was answered, the reply to the attacker, and the memory above the twin's are judged.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MIB = 1 << 20
 
 @dataclass(frozen=True)
 class Flood:
-    """One attack, and the one line that it is told."""
+    """One attack, and the one line of its refusal."""
 
     name: str
     pipeline: str
@@ -50,10 +50,10 @@ def lasting(attack: Attack, seconds: float = 5.0) -> Attack:
     """Return an attack that begins again until the time is over."""
 
     def again(wiring: Wiring[Any]) -> str:
-        ends_ns, said = now_ns() + round(seconds * 1e9), ""
+        ends_ns, reply = now_ns() + round(seconds * 1e9), ""
         while now_ns() < ends_ns:
-            said = attack(wiring)
-        return said
+            reply = attack(wiring)
+        return reply
 
     return again
 
@@ -136,8 +136,8 @@ def test_honest_clients_are_answered_beside_it(
         expected = [answer_of(client) for client in honest]
         for server in servers:
             forget_peak(server.pid)
-        said: list[str] = []
-        attacker = Thread(target=lambda: said.append(flood.does(replace(wiring, address=servers[0].address))))
+        replies: list[str] = []
+        attacker = Thread(target=lambda: replies.append(flood.does(replace(wiring, address=servers[0].address))))
         attacker.start()
         waits: list[tuple[float, float]] = []
         while attacker.is_alive() or len(waits) < ROUNDS:
@@ -156,7 +156,7 @@ def test_honest_clients_are_answered_beside_it(
             sys.stdout.write(f"\n{line}\n")
         assert all(server.alive() for server in servers)
         assert "Traceback" not in (tmp_path / "attacked").read_text()
-        assert any(word in said[0] for word in flood.says.split("|")), said[0][-1000:]
+        assert any(word in replies[0] for word in flood.says.split("|")), replies[0][-1000:]
         assert peak - calm <= (MORE_MIB if flood.pipeline != "zmq/gr00t" else 1024), line
 
 

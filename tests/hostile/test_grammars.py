@@ -85,8 +85,8 @@ def test_the_engine_outlives_them_and_what_is_just_within_the_limits() -> None:
         f'root ::= "a"{{0,{REPETITIONS}}}',
         'root ::= ("a"?){0,2000}',
     ]
-    told = repr([text for text, _ in HOSTILE.values()] + brim)
-    done = subprocess.run([sys.executable, "-c", LLAMA], input=told, capture_output=True, text=True, check=False)
+    texts = repr([text for text, _ in HOSTILE.values()] + brim)
+    done = subprocess.run([sys.executable, "-c", LLAMA], input=texts, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.count("is not valid GBNF") >= len(HOSTILE)
     assert done.stdout.endswith("alive 2\n")

@@ -1,4 +1,4 @@
-"""The client that means well comes again when it is told to, beside hostile ones."""
+"""An honest client repeats a refused request as the server asks, beside hostile ones."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Refused:
     def __init__(self, times: int, retry_after_s: float | None) -> None:
         self.times, self._retry_after_s = times, retry_after_s
 
-    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:  # noqa: ARG002 - whatever is asked
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:  # noqa: ARG002 - any request
         if self.times:
             self.times -= 1
             raise RequestFailed("too many requests are under way", retry_after_s=self._retry_after_s)

@@ -187,9 +187,9 @@ class TestDoor:
                         connection.sendall(b" " * 600_000)
                     time.sleep(0.2)
                     connection.sendall(b"GET /health HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
-                    status, said = reply(connection)
+                    status, body = reply(connection)
                     assert status == 404
-                    assert said.endswith('{"status":"ok"}')
+                    assert body.endswith('{"status":"ok"}')
 
     def test_trailers_without_end_are_hung_up_on(self) -> None:
         begun = b"GET /health HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n0\r\na: "

@@ -37,7 +37,7 @@ def test_bodies_that_no_framework_lets_go_are_not_kept(tmp_path: Path) -> None:
 def came(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Soaks:
     """What came of the soaks of all tests that were chosen, which happen at once, each in a process of its own.
 
-    A soak that broke off left no file: its test fails, and shows what the process said.
+    A soak that broke off left no file: its test fails, and shows its output.
     """
     specs = [item.callspec.params for item in request.session.items if hasattr(item, "callspec")]
     folder = tmp_path_factory.mktemp("soaks")
@@ -45,8 +45,8 @@ def came(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
     with ExitStack() as stack:
         for name, path in paths.items():
             line = [sys.executable, "-m", "benchmarks.soak", name, "--minutes", str(MINUTES), "--blocks", "5"]
-            said = stack.enter_context(path.with_suffix(".said").open("w"))
-            process = subprocess.Popen([*line, "--output", str(path)], stdout=said, stderr=said)
+            log = stack.enter_context(path.with_suffix(".log").open("w"))
+            process = subprocess.Popen([*line, "--output", str(path)], stdout=log, stderr=log)
             stack.callback(process.wait)
     return paths
 
@@ -55,7 +55,7 @@ def came(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 def test_no_promise_is_broken_within_a_minute(soaked: str, came: Soaks) -> None:
     """But for the idle latency, which tells of whatever else the machine does; growth takes longer to be judged."""
     path = came[soaked]
-    assert path.exists(), path.with_suffix(".said").read_text()[-3000:]
+    assert path.exists(), path.with_suffix(".log").read_text()[-3000:]
     whole = json.loads(path.read_text())
-    assert [said for said in whole["broken"] if not said.startswith(("the idle latency", "the memory"))] == []
+    assert [line for line in whole["broken"] if not line.startswith(("the idle latency", "the memory"))] == []
     assert whole["growth_mib"] < KEPT_MIB

@@ -59,9 +59,9 @@ class TestLetters:
         assert visible("a\n\tb") == "a\n\tb"
 
     def test_every_error_is_one_line(self) -> None:
-        said = str(RequestFailed(f"the server: {FORGED}"))
-        assert said.startswith(r"the server: no\nerror: forged\u000d\u001b[2J")
-        assert len(said.splitlines()) == 1
+        message = str(RequestFailed(f"the server: {FORGED}"))
+        assert message.startswith(r"the server: no\nerror: forged\u000d\u001b[2J")
+        assert len(message.splitlines()) == 1
 
     def test_progress_and_tables_show_them(self, capsys: pytest.CaptureFixture[str]) -> None:
         with RunProgress() as progress:
@@ -160,18 +160,18 @@ class TestSecrets:
 
 def test_a_run_holds_no_secret(tmp_path: Path) -> None:
     """In files, names and messages, though the server repeats them in tokens, in pieces, and in errors."""
-    said = " ".join(variants(KEY))
+    leak = " ".join(variants(KEY))
     answers = [
-        [head(), *[delta(content=said[at : at + 3]) for at in range(0, len(said), 3)], b"data: [DONE]\n\n"],
-        [head("401 No", "application/json"), json.dumps({"error": f"{FORGED[:-1]} {said}"}).encode()],
+        [head(), *[delta(content=leak[at : at + 3]) for at in range(0, len(leak), 3)], b"data: [DONE]\n\n"],
+        [head("401 No", "application/json"), json.dumps({"error": f"{FORGED[:-1]} {leak}"}).encode()],
     ]
     body = json.dumps({"provider": {"api_key": KEY}})
     with serving(lambda _: answers[0] if len(list(tmp_path.rglob("tokens.csv"))) < 2 else answers[1]) as url:
         small = ["--transport", "http/as-deployed", "--size", "64x48", "--requests", "2", "--warmup", "0"]
-        asked = [*small, "--max-tokens", "64", "--url", url, "--dialect", "openai", "--extra-body", body, "--output"]
+        options = [*small, "--max-tokens", "64", "--url", url, "--dialect", "openai", "--extra-body", body, "--output"]
         runs = [
             subprocess.run(
-                [sys.executable, "-m", "s2a_bench", "latency", *asked, str(tmp_path)],
+                [sys.executable, "-m", "s2a_bench", "latency", *options, str(tmp_path)],
                 capture_output=True,
                 text=True,
                 check=False,

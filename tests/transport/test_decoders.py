@@ -89,8 +89,8 @@ def test_any_cut_of_an_answer_gives_the_same_events(
     speaker: Speaker, texts: list[str], error: bool, places: list[int]
 ) -> None:
     tokens = [Token(index, text, index) for index, text in enumerate(texts)]
-    said = [speaker.opening(), *map(speaker.token, tokens)]
-    body = b"".join([*said, speaker.error("lost") if error else speaker.closing(tokens)])
+    messages = [speaker.opening(), *map(speaker.token, tokens)]
+    body = b"".join([*messages, speaker.error("lost") if error else speaker.closing(tokens)])
     found = events(speaker.dialect, cut(body, places))
     assert found == events(speaker.dialect, [body])
     assert [event.text for event in found if event.text is not None] == [text for text in texts if text]

@@ -44,7 +44,7 @@ def client_of(speaker: Speaker, reply: Reply, **more: object) -> Iterator[Client
             client.close()
 
 
-def said(speaker: Speaker, pieces: Pieces, **more: object) -> tuple[list[str], Trace]:
+def answered(speaker: Speaker, pieces: Pieces, **more: object) -> tuple[list[str], Trace]:
     """What a client makes of these pieces."""
     with client_of(speaker, lambda _: pieces, **more) as client:
         tokens, trace = ask(client, Request("a", "plan", (yuyv_frame(),)))
@@ -133,20 +133,20 @@ FACTS = {
 
 
 def test_what_a_server_tells_of_itself_is_kept_by_clear_names(speaker: Speaker) -> None:
-    texts, trace = said(speaker, answer(speaker))
+    texts, trace = answered(speaker, answer(speaker))
     assert texts == ["go", "_to"]
     facts = {name: value for name, value in trace.facts.items() if name not in HTTP.facts}
     assert facts == pytest.approx(FACTS[speaker.dialect])
 
 
 def test_only_llama_server_shows_where_ingest_ends(speaker: Speaker) -> None:
-    _, trace = said(speaker, answer(speaker))
+    _, trace = answered(speaker, answer(speaker))
     after_packing = [stage for stage, _ in trace.chain()][-2:]
     assert after_packing == (["ingest", "inference"] if speaker.dialect == "llama-server" else ["json_pack", "server"])
 
 
 def test_missing_usage_and_timings_are_absent_not_zero(speaker: Speaker) -> None:
-    texts, trace = said(speaker, answer(speaker, speaker.bare_closing))
+    texts, trace = answered(speaker, answer(speaker, speaker.bare_closing))
     assert texts == ["go", "_to"]
     assert not {"predicted_n", "prompt_ms", "predicted_ms", "total_ms", "outside_model_ms", "cache_n"} & set(
         trace.facts
@@ -165,7 +165,7 @@ def test_a_failure_on_the_way_keeps_the_tokens_before_it(speaker: Speaker) -> No
 
 def test_an_answer_without_its_end_is_a_failure(speaker: Speaker) -> None:
     with pytest.raises(RequestFailed, match="before the answer was complete"):
-        said(speaker, answer(speaker)[:-1])
+        answered(speaker, answer(speaker)[:-1])
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_an_answer_without_its_end_is_a_failure(speaker: Speaker) -> None:
 )
 def test_a_connection_that_breaks_is_a_failure(broken: Pieces) -> None:
     with pytest.raises(RequestFailed, match="broke the connection"):
-        said(Cloud(), broken)
+        answered(Cloud(), broken)
 
 
 @pytest.mark.parametrize(
@@ -202,44 +202,44 @@ def test_a_refusal_says_what_and_the_way_out(
 ) -> None:
     body = speaker.refusal(int(status[:3]), "no\n  way")
     with pytest.raises(RequestFailed, match=says) as failure:
-        said(speaker, [head(status, "application/json", *more), body])
+        answered(speaker, [head(status, "application/json", *more), body])
     assert failure.value.retry_after_s == retry_after_s
 
 
 def test_googles_retry_delay_is_in_the_body() -> None:
     body = b'{"error":{"message":"quota","details":[{"@type":"x"},{"retryDelay":"34.5s"}]}}'
     with pytest.raises(RequestFailed, match=r"it asks to wait 34\.5 s") as failure:
-        said(Gemini(), [head("429 Too Many Requests", "application/json"), body])
+        answered(Gemini(), [head("429 Too Many Requests", "application/json"), body])
     assert failure.value.retry_after_s == 34.5
 
 
 def test_a_moved_server_is_not_followed(speaker: Speaker) -> None:
     with pytest.raises(RequestFailed, match="answered 307: nothing; it moved: give https://elsewhere/ to `url`"):
-        said(speaker, [head("307 Moved", "text/plain", "Location: https://elsewhere/")])
+        answered(speaker, [head("307 Moved", "text/plain", "Location: https://elsewhere/")])
 
 
 @pytest.mark.parametrize("kind", ["application/json", "text/html; charset=utf-8", ""])
 def test_an_error_with_status_200_is_a_failure(speaker: Speaker, kind: str) -> None:
     with pytest.raises(RequestFailed, match="answered 200: model is gone"):
-        said(speaker, [head(kind=kind), speaker.refusal(400, "model is gone")])
+        answered(speaker, [head(kind=kind), speaker.refusal(400, "model is gone")])
 
 
 def test_a_page_of_another_server_is_named(speaker: Speaker) -> None:
     with pytest.raises(RequestFailed, match=r"answered 200: <html>.* \(as text/html where .* see `dialect`"):
-        said(speaker, [head(kind="text/html"), b"<html>\n<title>router</title>" + b"x" * 500_000])
+        answered(speaker, [head(kind="text/html"), b"<html>\n<title>router</title>" + b"x" * 500_000])
 
 
 def test_text_that_is_no_json_is_a_failure(speaker: Speaker) -> None:
     garbage = b"data: {not json}\n\n" if "stream" in speaker.kind else b"{not json}\n"
     with pytest.raises(RequestFailed, match=f"not the dialect '{speaker.dialect}'"):
-        said(speaker, [head(kind=speaker.kind), garbage])
+        answered(speaker, [head(kind=speaker.kind), garbage])
 
 
 @pytest.mark.parametrize("value", [b"[1,2]", b'{"choices":7,"message":7,"token":7,"candidates":7}', b'"x"', b"7"])
 def test_json_of_another_shape_is_a_failure(speaker: Speaker, value: bytes) -> None:
     line = b"data: " + value + b"\n\n" if "stream" in speaker.kind else value + b"\n"
     with pytest.raises(RequestFailed, match=f"not the dialect '{speaker.dialect}'"):
-        said(speaker, [head(kind=speaker.kind), line])
+        answered(speaker, [head(kind=speaker.kind), line])
 
 
 def test_pings_empty_pieces_and_single_bytes_do_no_harm(speaker: Speaker) -> None:
@@ -247,7 +247,7 @@ def test_pings_empty_pieces_and_single_bytes_do_no_harm(speaker: Speaker) -> Non
     texts = ["キッチン", "", "é\n", "🤖"]
     tokens = [Token(index, text, index) for index, text in enumerate(texts)]
     body = ping.join([speaker.opening(), *map(speaker.token, tokens), speaker.closing(tokens)]) + ping
-    got, _ = said(speaker, [head(kind=speaker.kind), *(body[i : i + 1] for i in range(len(body)))])
+    got, _ = answered(speaker, [head(kind=speaker.kind), *(body[i : i + 1] for i in range(len(body)))])
     assert got == ["キッチン", "é\n", "🤖"]
 
 
@@ -271,7 +271,7 @@ class TestThinking:
     def test_is_no_token_and_becomes_a_fact(self, speaker: Speaker) -> None:
         thoughts = [speaker.thinking("hm"), speaker.thinking(", well")]
         pieces = answer(speaker)
-        texts, trace = said(speaker, [*pieces[:2], *thoughts, *pieces[2:]])
+        texts, trace = answered(speaker, [*pieces[:2], *thoughts, *pieces[2:]])
         assert texts == ["go", "_to"]
         assert trace.facts["thinking_pieces"] == 2
         assert 0 <= trace.facts["thinking_ms"] < 20_000
@@ -279,7 +279,7 @@ class TestThinking:
     def test_alone_is_no_answer(self, speaker: Speaker) -> None:
         pieces = [head(kind=speaker.kind), speaker.thinking("hm"), speaker.closing([])]
         with pytest.raises(RequestFailed, match="thought and gave no answer: raise `max_tokens`"):
-            said(speaker, pieces)
+            answered(speaker, pieces)
 
 
 @pytest.mark.parametrize("speaker", [Cloud(), Ollama()], ids=lambda one: one.dialect)
@@ -343,9 +343,9 @@ def kept_until_the_second(speaker: Speaker) -> Reply:
 
 def test_a_request_that_had_to_be_sent_again_says_so_and_no_other(speaker: Speaker) -> None:
     with client_of(speaker, kept_until_the_second(speaker)) as client:
-        asked = [ask(client, Request(str(number), "plan")) for number in range(3)]
-    assert [len(tokens) for tokens, _ in asked] == [2, 2, 2]
-    assert [trace.facts.get("reconnects") for _, trace in asked] == [None, 1, None]
+        outcomes = [ask(client, Request(str(number), "plan")) for number in range(3)]
+    assert [len(tokens) for tokens, _ in outcomes] == [2, 2, 2]
+    assert [trace.facts.get("reconnects") for _, trace in outcomes] == [None, 1, None]
 
 
 def test_a_new_connection_that_is_closed_is_an_error_and_not_a_second_request(speaker: Speaker) -> None:
@@ -384,7 +384,7 @@ class TestKeys:
         monkeypatch.setenv("MY_KEY", "sekret")
         pieces = [head("401 No", "application/json"), speaker.refusal(401, "the key sekret is wrong")]
         with pytest.raises(RequestFailed, match=r"the key \*\*\* is wrong; the key in \$MY_KEY is not accepted"):
-            said(speaker, pieces, api_key_env="MY_KEY")
+            answered(speaker, pieces, api_key_env="MY_KEY")
 
     @pytest.mark.parametrize(
         ("name", "value"), [("sk-12-34", None), ("NO_SUCH", None), ("EMPTY", " "), ("ODD", "a\nb")]
@@ -431,16 +431,16 @@ def test_a_url_may_end_at_the_server_the_api_or_the_route(dialect: str, base: st
     [("llamacpp", "llama-server"), ("vllm", "vllm"), ("s2a-bench", "s2a"), ("library", "openai"), (None, "openai")],
 )
 def test_an_openai_server_is_told_by_whom_its_model_is_owned(owner: str | None, dialect: str) -> None:
-    asked = []
+    requests = []
 
     def reply(received: Received) -> Pieces:
-        asked.append((received.method, received.path))
+        requests.append((received.method, received.path))
         body = b'{"object":"list","data":[{"id":"m","owned_by":"%s"}]}' % (owner or "").encode()
         return [head(kind="application/json"), body] if owner else [head("404 Not Found", "text/html"), b"no"]
 
     with client_of(LlamaServer(), reply, dialect="") as client:
         assert client.describe()["dialect"] == dialect
-    assert asked == [("GET", "/v1/models")]
+    assert requests == [("GET", "/v1/models")]
 
 
 def test_a_grammar_reaches_the_servers_that_know_it_and_is_refused_elsewhere(speaker: Speaker) -> None:
@@ -476,10 +476,10 @@ def test_extra_fields_are_merged_and_null_takes_one_out() -> None:
 def test_an_answer_that_a_filter_cut_is_a_failure(reason: str) -> None:
     last = b'data: {"candidates":[{"finishReason":"%s"}]}\n\n' % reason.encode()
     with pytest.raises(RequestFailed, match=f"the answer was cut: {reason}"):
-        said(Gemini(), [*answer(Gemini())[:-1], last])
+        answered(Gemini(), [*answer(Gemini())[:-1], last])
     last = b'data: {"promptFeedback":{"blockReason":"%s"}}\n\n' % reason.encode()
     with pytest.raises(RequestFailed, match=f"the prompt was refused: {reason}"):
-        said(Gemini(), [head(), last])
+        answered(Gemini(), [head(), last])
 
 
 def test_both_variants_say_the_same(speaker: Speaker) -> None:
@@ -580,15 +580,15 @@ class TestWhatAServerHas:
 def test_a_model_that_is_not_there_has_its_hint_whatever_the_status(status: str, said_: str) -> None:
     pieces = [head(status, "application/json"), Cloud().refusal(int(status[:3]), said_)]
     with pytest.raises(RequestFailed, match=r"name a model that it has with `served_model` \(now 'default'\)"):
-        said(Cloud(), pieces)
+        answered(Cloud(), pieces)
     with pytest.raises(RequestFailed, match="`served_model`"):
-        said(Cloud(), [head(), Cloud().error(said_)])
+        answered(Cloud(), [head(), Cloud().error(said_)])
 
 
 def test_an_overloaded_tgi_says_so_in_its_stream_and_has_the_advice_of_a_429() -> None:
     refusal = b'data:{"error":"Model is overloaded","error_type":"overloaded"}\n\n'
     with pytest.raises(RequestFailed, match="Model is overloaded; it wants fewer requests: see its quota"):
-        said(Tgi(), [head(kind=Tgi().kind), refusal])
+        answered(Tgi(), [head(kind=Tgi().kind), refusal])
 
 
 @pytest.mark.parametrize("speaker", [Cloud(), Gemini()], ids=lambda one: one.dialect)
@@ -599,7 +599,7 @@ def test_a_usage_of_zeros_is_absent_and_noted(speaker: Speaker) -> None:
     }[speaker.dialect]
     pieces = [head(kind=speaker.kind), b"" if speaker.dialect == "gemini" else speaker.token(GO_TO[0])]
     pieces += [b'data: {"candidates":[{"content":{"parts":[{"text":"go"}]}}]}\n\n'] if not pieces[1] else []
-    _, trace = said(speaker, [*pieces, nothing, speaker.bare_closing(GO_TO)])
+    _, trace = answered(speaker, [*pieces, nothing, speaker.bare_closing(GO_TO)])
     assert not {"prompt_n", "predicted_n"} & set(trace.facts)
     assert trace.facts["usage_zero"] == 1
 

@@ -212,9 +212,9 @@ def test_stopping_in_the_middle_of_an_answer_leaves_no_traceback(capsys: pytest.
             list(pieces)
     over.set()
     thread.join()
-    said = capsys.readouterr().err
-    assert "graceful shutdown exceeded" in said
-    assert "Traceback" not in said
+    stderr = capsys.readouterr().err
+    assert "graceful shutdown exceeded" in stderr
+    assert "Traceback" not in stderr
 
 
 @pytest.mark.parametrize("uri", ["http://example.org/x.jpg", "data:image/jpeg;base64,AAAA", "data:image/png;base64,%"])

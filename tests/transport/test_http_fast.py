@@ -70,7 +70,7 @@ def rest_of(connection: socket.socket) -> bytes:
     return data
 
 
-def said(answer: tuple[int, bytes]) -> str:
+def answered(answer: tuple[int, bytes]) -> str:
     status, data = answer
     assert status == 200
     text: str = json.loads(data)["choices"][0]["message"]["content"]
@@ -82,7 +82,7 @@ def test_a_kept_connection_is_answered_again_and_again(size: int) -> None:
     with connected() as connection:
         for _ in range(3):
             connection.sendall(request(body("a" * size)))
-            assert said(read(connection)) == "go_to"
+            assert answered(read(connection)) == "go_to"
 
 
 @pytest.mark.parametrize("cut", [1, 30, 130, 200])
@@ -92,7 +92,7 @@ def test_a_request_may_come_in_pieces(cut: int) -> None:
         for at in range(0, len(data), cut):
             connection.sendall(data[at : at + cut])
             time.sleep(0.001)
-        assert said(read(connection)) == "go_to"
+        assert answered(read(connection)) == "go_to"
 
 
 def test_who_expects_it_is_told_to_go_on() -> None:
@@ -101,7 +101,7 @@ def test_who_expects_it_is_told_to_go_on() -> None:
         connection.sendall(request(b"", f"Content-Length: {len(data)}", "Expect: 100-continue"))
         assert connection.recv(1000) == b"HTTP/1.1 100 Continue\r\n\r\n"
         connection.sendall(data)
-        assert said(read(connection)) == "go_to"
+        assert answered(read(connection)) == "go_to"
 
 
 @pytest.mark.parametrize("stream", [True, False])
@@ -119,7 +119,7 @@ def test_a_connection_is_for_all_paths() -> None:
             header = 'S2A-Request: {"prompt": "a"}'
             data = b"" if path == PATHS["binary"] else body()
             connection.sendall(request(data, header, f"Content-Length: {len(data)}", path=path))
-            assert said(read(connection)) == "go_to"
+            assert answered(read(connection)) == "go_to"
 
 
 @pytest.mark.parametrize(
@@ -156,11 +156,11 @@ def test_an_upgrade_is_ignored() -> None:
     data = body()
     with connected() as connection:
         connection.sendall(request(data, f"Content-Length: {len(data)}", "Upgrade: h2c", "Connection: Upgrade"))
-        assert said(read(connection)) == "go_to"
+        assert answered(read(connection)) == "go_to"
 
 
 class Slow:
-    """Answers when told."""
+    """Answers once it is released."""
 
     def __init__(self) -> None:
         self.began, self.go = Event(), Event()
@@ -178,17 +178,17 @@ def test_a_request_that_comes_before_the_answer_is_kept() -> None:
         assert slow.began.wait(20)
         connection.sendall(request(body("a" * 300_000)))
         slow.go.set()
-        assert said(read(connection)) == "go"
-        assert said(read(connection)) == "go"
+        assert answered(read(connection)) == "go"
+        assert answered(read(connection)) == "go"
 
 
 def test_requests_that_come_together_are_answered_in_order() -> None:
     with connected() as connection:
         connection.sendall(request(body("a" * 100_000)) * 3 + request(body())[:-1])
         for _ in range(3):
-            assert said(read(connection)) == "go_to"
+            assert answered(read(connection)) == "go_to"
         connection.sendall(request(body())[-1:])
-        assert said(read(connection)) == "go_to"
+        assert answered(read(connection)) == "go_to"
 
 
 @pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
@@ -234,7 +234,7 @@ class TestLimits:
             for _ in range(2):
                 time.sleep(0.3)
                 connection.sendall(request(body(), path=PATHS[variant]))
-                assert said(read(connection)) == "go_to"
+                assert answered(read(connection)) == "go_to"
 
     @pytest.mark.parametrize("sent", [b"", b"{", b" " * 500_000])
     def test_a_slow_body_ends(self, variant: str, sent: bytes) -> None:
@@ -255,7 +255,7 @@ class TestLimits:
                 assert b"retry-after: 1\r\n" in answer
             time.sleep(0.2)
             first.sendall(data[-1:])
-            assert said(read(first)) == "go_to"
+            assert answered(read(first)) == "go_to"
             for _ in range(3):
                 first.sendall(whole)
-                assert said(read(first)) == "go_to"
+                assert answered(read(first)) == "go_to"

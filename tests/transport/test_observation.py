@@ -1,4 +1,4 @@
-"""What a foreign policy is told, by a template."""
+"""Observations of policy servers, made from a template."""
 
 from __future__ import annotations
 
@@ -171,7 +171,7 @@ def test_a_file_that_cannot_be_read_is_refused_in_a_line(tmp_path: Path, name: s
         template_of(str(tmp_path / name))
 
 
-@pytest.mark.parametrize(("told", "says"), [("drold", "is none of aloha, droid"), ("no/such.toml", "cannot read")])
-def test_an_unknown_name_is_refused(told: str, says: str) -> None:
+@pytest.mark.parametrize(("name", "says"), [("drold", "is none of aloha, droid"), ("no/such.toml", "cannot read")])
+def test_an_unknown_name_is_refused(name: str, says: str) -> None:
     with pytest.raises(UsageError, match=says):
-        template_of(told)
+        template_of(name)

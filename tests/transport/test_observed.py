@@ -103,9 +103,9 @@ PLAIN = Remote("c", [("queue", 1)], [2]).to_json()
 
 
 def test_a_request_s_own_fields_come_back_and_leave_the_observation() -> None:
-    asked = Request("a", "go", max_tokens=3, seed=7, grammar="root ::= 'x'")
-    message = {"prompt": "go", EXTENSION: extension_of(asked)}
-    assert request_of(message, take_extension(message), Trace(), LIMITS) == asked
+    request = Request("a", "go", max_tokens=3, seed=7, grammar="root ::= 'x'")
+    message = {"prompt": "go", EXTENSION: extension_of(request)}
+    assert request_of(message, take_extension(message), Trace(), LIMITS) == request
     assert message == {"prompt": "go"}
 
 

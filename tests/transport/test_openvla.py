@@ -24,7 +24,7 @@ def json_head(body: bytes) -> bytes:
     return head(kind="application/json") + body
 
 
-def asked(reply: Reply, frame: Frame | None = None, **more: str) -> tuple[list[Token], Trace]:
+def act(reply: Reply, frame: Frame | None = None, **more: str) -> tuple[list[Token], Trace]:
     with serving(reply) as url:
         client = open_client(wiring_of("http/as-deployed", url=url, payload="raw", dialect="openvla", **more))
         try:
@@ -50,7 +50,7 @@ def test_the_pixels_arrive_as_rgb_and_the_action_comes_back_as_one_token(encodin
         seen.append(received)
         return [json_head(json_numpy.dumps(ACTION).encode())]
 
-    (token,), trace = asked(deploy, frame, served_model="bridge_orig")
+    (token,), trace = act(deploy, frame, served_model="bridge_orig")
     payload = json_numpy.loads(seen[0].body)
     assert payload["instruction"] == "pick up the cup"
     assert payload["unnorm_key"] == "bridge_orig"
@@ -65,7 +65,7 @@ def test_the_pixels_arrive_as_rgb_and_the_action_comes_back_as_one_token(encodin
 
 def test_without_a_key_of_statistics_none_is_sent() -> None:
     seen: list[Received] = []
-    asked(lambda received: seen.append(received) or [json_head(json_numpy.dumps(ACTION).encode())])
+    act(lambda received: seen.append(received) or [json_head(json_numpy.dumps(ACTION).encode())])
     assert seen[0].json == {"instruction": "pick up the cup"}
 
 
@@ -73,13 +73,13 @@ def test_without_a_key_of_statistics_none_is_sent() -> None:
     "encode",
     [
         lambda action: json_numpy.dumps(action.astype(np.float32)),
-        lambda action: json.dumps(json_numpy.dumps(action)),  # a server that was asked with `encoded`
+        lambda action: json.dumps(json_numpy.dumps(action)),  # a server that got `encoded`
         lambda action: json.dumps(action.tolist()),
         lambda action: json_numpy.dumps(np.stack([action, action])),
     ],
 )
 def test_an_action_in_any_of_its_forms_is_read(encode: Callable[[np.ndarray], str]) -> None:
-    (token,), trace = asked(says(encode(ACTION)))
+    (token,), trace = act(says(encode(ACTION)))
     np.testing.assert_allclose(np.array(json.loads(token.text)).reshape(-1)[:7], ACTION, rtol=1e-6)
     assert trace.facts["action_n"] in {7, 14}
 
@@ -102,9 +102,9 @@ def test_an_action_in_any_of_its_forms_is_read(encode: Callable[[np.ndarray], st
 )
 def test_what_is_no_action_is_a_failure(body: str, message: str) -> None:
     with pytest.raises(RequestFailed, match=message):
-        asked(says(body))
+        act(says(body))
 
 
 def test_a_body_of_another_type_is_a_failure() -> None:
     with pytest.raises(RequestFailed, match="answered 500: Internal Server Error"):
-        asked(lambda _: [head("500 Internal Server Error", "text/plain") + b"Internal Server Error"])
+        act(lambda _: [head("500 Internal Server Error", "text/plain") + b"Internal Server Error"])

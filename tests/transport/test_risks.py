@@ -1,4 +1,4 @@
-"""`doctor --url`: what is told of servers that somebody else runs, and that nothing is asked of them."""
+"""`doctor --url`: findings about external servers, without a request to their models."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The server core: what an exchange is told, and in which order, whatever carries it."""
+"""The server core: the calls of an exchange and their order, for every transport."""
 
 from __future__ import annotations
 
@@ -19,40 +19,40 @@ from s2a_bench.types import Piece, Request, Token
 
 
 class Told(Exchange):
-    """Keeps what it is told."""
+    """Records its calls."""
 
     def __init__(self, core: Core, *, has_gone: bool = False, breaks: str = "") -> None:
         super().__init__()
         self.trace.mark("network")
-        self.told: list[str] = []
+        self.calls: list[str] = []
         self.held.enter_context(core.in_flight.counted())(1000)
         self.held_at_end = -1
         self._core, self._has_gone, self._breaks = core, has_gone, breaks
 
     def request(self) -> Request:
-        self.told.append("request")
+        self.calls.append("request")
         return Request("a", "go on")
 
     def accept(self) -> None:
-        self.told.append("accept")
+        self.calls.append("accept")
 
     def disconnected(self) -> bool:
         return self._has_gone
 
     def send(self, piece: Piece) -> bool:
-        self.told.append(piece.text)
+        self.calls.append(piece.text)
         if self._breaks == "send":
             raise Disconnected
         return True
 
     def end(self) -> None:
         self.held_at_end = self._core.in_flight.bytes
-        self.told.append("end")
+        self.calls.append("end")
         if self._breaks == "end":
             raise Disconnected
 
     def fail(self, error: S2AError) -> None:
-        self.told.append(str(error))
+        self.calls.append(str(error))
 
 
 def words(request: Request, trace: Trace) -> Generator[Piece, None, None]:
@@ -69,7 +69,7 @@ def test_a_request_is_read_accepted_answered_and_ended() -> None:
     core = core_of()
     exchange = Told(core)
     assert core.answer(exchange)
-    assert exchange.told == ["request", "accept", "go", "on", "end"]
+    assert exchange.calls == ["request", "accept", "go", "on", "end"]
 
 
 def test_its_bytes_are_given_back_before_the_end_which_may_wait_for_a_slow_client() -> None:
@@ -92,14 +92,14 @@ def test_a_client_that_has_gone_is_not_answered_as_if_it_had_all() -> None:
     core = core_of()
     exchange = Told(core, has_gone=True)
     assert not core.answer(exchange)
-    assert exchange.told == ["request", "accept"]
+    assert exchange.calls == ["request", "accept"]
 
 
 @pytest.mark.parametrize(
-    ("raised", "told"),
+    ("raised", "message"),
     [(EngineError("tired"), "tired"), (KeyError("a bug"), "internal error; the server's log has it")],
 )
-def test_what_fails_is_told_in_one_line(raised: Exception, told: str) -> None:
+def test_what_fails_is_told_in_one_line(raised: Exception, message: str) -> None:
     def failing(request: Request, trace: Trace) -> Generator[Piece, None, None]:
         yield from words(request, trace)
         raise raised
@@ -107,7 +107,7 @@ def test_what_fails_is_told_in_one_line(raised: Exception, told: str) -> None:
     core = core_of(failing)
     exchange = Told(core)
     assert core.answer(exchange)
-    assert exchange.told[-1] == told
+    assert exchange.calls[-1] == message
     assert core.answer(Told(core_of()))
 
 

@@ -9,8 +9,9 @@ empty pieces and thinking do not count. Times that a server reports become facts
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from typing import Any
 
 import httpx
@@ -18,6 +19,7 @@ import httpx
 from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError, UsageError
 from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, PROMPT_MS, RECONNECTS, THINKING_N
+from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.http import HEADERS_MS, THINKING_MS, THINKING_PIECES, blocks, native
@@ -25,9 +27,8 @@ from s2a_bench.transport.http.clients import BoundedClient, HttpResponse, LeanCl
 from s2a_bench.transport.http.detect import body_of, met
 from s2a_bench.transport.http.dialects import NATIVE, EncodedPicture, Event, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_MODEL
-from s2a_bench.transport.http.dialects.decoder import Decoder
+from s2a_bench.transport.http.dialects.decoder import Decoder, error_in
 from s2a_bench.transport.http.options import HttpOptions, merged, read_patch
-from s2a_bench.transport.http.refusals import advice_for, refusal
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
 from s2a_bench.transport.pictures import encoded
@@ -35,6 +36,14 @@ from s2a_bench.types import Piece, Request, Token
 
 ERROR_LIMIT = 1 << 16
 """The most bytes of a refusal that are read."""
+UNKNOWN_MODEL = re.compile(
+    r"\bmodel\b.{0,200}?(not found|not exist|n't exist)|model_not_found|(invalid|unknown|no such) model",
+    re.IGNORECASE | re.DOTALL,
+)
+"""Messages of servers, with any status, that they have no such model."""
+
+QUOTED = 200
+"""Characters that are quoted of a body that is no error object."""
 
 
 class HttpClient:
@@ -239,3 +248,51 @@ class HttpClient:
     def close(self) -> None:
         if self._client is not None:
             self._client.close()
+
+
+def refusal(url: str, response: HttpResponse, body: str, options: HttpOptions, expected: str) -> RequestFailed:
+    """Return the error for an answer with a wrong status or content type."""
+    try:
+        value = json.loads(body)
+    except (ValueError, RecursionError):
+        value = None
+    message = error_in(value) or struck(body)[:QUOTED].strip() or "nothing"
+    kind = response.headers.get("content-type", "no content type").partition(";")[0]
+    if response.status_code == httpx.codes.OK and not kind.startswith(expected):
+        message += f" (as {kind} where {expected} belongs; see `dialect`)"
+    wait_s = _retry_after_s(response, value)
+    wait = f"; it asks to wait {wait_s:g} s" if wait_s else ""
+    advice = advice_for(response.status_code, message, options, moved=response.headers.get("location", ""))
+    line = f"{url} answered {response.status_code}: {' '.join(message.split())}{wait}{'; ' if advice else ''}{advice}"
+    return RequestFailed(line, retry_after_s=wait_s)
+
+
+def advice_for(status: int, message: str, options: HttpOptions, *, moved: str = "") -> str:
+    """Return the way out for a status or a known message, or nothing."""
+    if httpx.codes.is_redirect(status):
+        return f"it moved: give {moved or 'its new place'} to `url`"
+    if UNKNOWN_MODEL.search(message):
+        return f"name a model that it has with `served_model` (now '{options.served_model}')"
+    key = f"the key in ${options.api_key_env} is not accepted"
+    no_key = "name the environment variable that holds its key with `api_key_env`"
+    return {
+        401: key if options.api_key_env else no_key,
+        403: key if options.api_key_env else no_key,
+        404: f"see `url`, `dialect` and `served_model` (now '{options.served_model}')",
+        413: "choose a smaller `size`, or `payload` jpeg",
+        429: "it wants fewer requests: see its quota, or `requests`",
+    }.get(status, "")
+
+
+def _retry_after_s(response: HttpResponse, body: Any) -> float | None:
+    """Return how long the server asks to wait: seconds in the header, or Google's RetryInfo in the body.
+
+    A date (RFC 9110, 10.2.3) is ignored: it comes from another host's clock.
+    """
+    with suppress(ValueError):
+        return max(0.0, float(response.headers.get("retry-after", "")))
+    try:
+        delays = [detail["retryDelay"] for detail in body["error"]["details"] if "retryDelay" in detail]
+        return max(0.0, float(delays[0].removesuffix("s")))
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError):
+        return None

@@ -120,14 +120,14 @@ class LeanClient:
     @contextmanager
     def stream(self, method: str, url: str, *, content: Any, headers: Mapping[str, str]) -> Iterator[LeanResponse]:
         """Send a request and yield its answer; the connection of an unfinished answer is closed."""
-        parts = urlsplit(url)
+        target = urlsplit(url)
         response = None
         try:
             with _as_httpx():
-                self._connection = connection = self._connection or HTTPConnection(parts.netloc)
+                self._connection = connection = self._connection or HTTPConnection(target.netloc)
                 if connection.sock is None:
                     connection.sock = self._connected(connection.host, connection.port)
-                path = urlunsplit(("", "", parts.path or "/", parts.query, ""))
+                path = urlunsplit(("", "", target.path or "/", target.query, ""))
                 with suppress(BrokenPipeError, ConnectionResetError):  # a refusal may have arrived already
                     connection.request(method, path, content, headers)
                 response = connection.getresponse()

@@ -56,7 +56,7 @@ class ZmqServer:
         told, port = split_address(wiring.address, "tcp")
         options, limits = wiring.options, wiring.limits
         host = _resolved(told)
-        self._key = key_for(host, options.api_key_env, everybody=options.no_auth).encode()
+        self._key = key_for(host, options.api_key_env, no_auth=options.no_auth).encode()
         self._layout: str = options.layout
         self._core = Core(handler, limits)
         self._marks = Marks()

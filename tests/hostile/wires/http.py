@@ -23,8 +23,8 @@ JSON = "Content-Type: application/json"
 
 def head(*headers: str, path: str = CHAT, length: int | None = None) -> bytes:
     """Return the head of a request whose connection is closed after its answer."""
-    said = [] if length is None else [f"Content-Length: {length}"]
-    lines = [f"POST {path} HTTP/1.1", "Host: localhost", "Connection: close", *headers, *said]
+    lengths = [] if length is None else [f"Content-Length: {length}"]
+    lines = [f"POST {path} HTTP/1.1", "Host: localhost", "Connection: close", *headers, *lengths]
     return "\r\n".join([*lines, "", ""]).encode()
 
 
@@ -88,7 +88,7 @@ def _clients(path: str) -> Iterator[Case[Attack]]:
     yield Case(
         "body a byte at a time", sends(head(JSON, path=path, length=1000), *[b" "] * 20, every_s=0.1, then="goes")
     )
-    yield Case("1 GiB said", sends(head(JSON, path=path, length=1 << 30), bytes(MIB)), "^HTTP/1.1 413 ")
+    yield Case("1 GiB announced", sends(head(JSON, path=path, length=1 << 30), bytes(MIB)), "^HTTP/1.1 413 ")
     yield Case("64 MiB of spaces", sends_made(lambda: [post(b" " * 64 * MIB, path=path)]), REFUSED)
     lines = [b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)]
     yield Case("1 MiB of headers", sends(head(path=path)[:-2], *lines))
@@ -162,12 +162,12 @@ FAST: tuple[Case[Attack], ...] = (
 )
 
 
-def said(*lines: str, status: str = "200 OK") -> bytes:
+def response(*lines: str, status: str = "200 OK") -> bytes:
     """Return the head of an answer."""
     return "\r\n".join([f"HTTP/1.1 {status}", *lines, "", ""]).encode()
 
 
-STREAM = said("Content-Type: text/event-stream", "Connection: close")
+STREAM = response("Content-Type: text/event-stream", "Connection: close")
 
 
 def event(value: Any) -> bytes:
@@ -204,11 +204,13 @@ SERVERS: tuple[Case[Trap], ...] = (
     Case("deep events", _streams(b"[" * 100_000), FAILED),
     Case(
         "another media type",
-        _answers(said("Content-Type: text/html", "Connection: close"), b"<html>", then="goes"),
+        _answers(response("Content-Type: text/html", "Connection: close"), b"<html>", then="goes"),
         FAILED,
     ),
-    Case("a refusal of 4 GiB", _answers(said(status="500 No"), again=[b"no " * (1 << 15)]), "^RequestFailed: .*500"),
-    Case("a redirect", _answers(said("Location: http://127.0.0.1:1/", status="302 Found"), then="goes"), FAILED),
+    Case(
+        "a refusal of 4 GiB", _answers(response(status="500 No"), again=[b"no " * (1 << 15)]), "^RequestFailed: .*500"
+    ),
+    Case("a redirect", _answers(response("Location: http://127.0.0.1:1/", status="302 Found"), then="goes"), FAILED),
     Case(
         "a chunk of 2^60 bytes",
         _answers(STREAM[:-2] + b"Transfer-Encoding: chunked\r\n\r\n1000000000000000\r\ngo"),
@@ -224,11 +226,11 @@ SERVERS: tuple[Case[Trap], ...] = (
     ),
     Case("endless tokens", _answers(STREAM, again=[event(token()) * 1000]), FAILED),
     Case("endless events of nothing", _answers(STREAM, again=[event({}) * 1000]), FAILED),
-    Case("endless interim answers", _answers(again=[said(status="103 Early Hints") * 1000]), FAILED),
+    Case("endless interim answers", _answers(again=[response(status="103 Early Hints") * 1000]), FAILED),
     Case("an error that forges lines", _streams({"error": {"message": CONTROL}}), "^RequestFailed: .*all is well"),
     Case(
         "a refusal that forges lines",
-        _answers(said(status="400 No"), CONTROL.encode(), then="goes"),
+        _answers(response(status="400 No"), CONTROL.encode(), then="goes"),
         "^RequestFailed: .*all is well",
     ),
 )
