@@ -174,11 +174,10 @@ class ChatExchange(Exchange):
 
     def fail(self, error: S2AError) -> None:
         if self._kind:
-            message = {"error": {"message": str(error), "type": type(error).__name__}}
-            self._write(self._framed(message), last=True)
+            self._write(self._framed({"error": {"message": str(error), "type": type(error).__name__}}), last=True)
         else:
-            status = native.status_of(error)
-            self.whole(status, native.error_json(status, str(error)), native.headers_of(error))
+            status, message, headers = native.refusal_of(error)
+            self.whole(status, native.error_json(status, message), headers)
 
     def _write(self, data: bytes, kind: str = EVENTS, *, last: bool = False) -> None:
         first, self._kind = not self._kind, self._kind or kind

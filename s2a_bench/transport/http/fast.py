@@ -117,7 +117,7 @@ class FastServer:
         except Refused as error:
             refused = error
         except S2AError as error:  # too many bytes
-            refused = Refused.because(error)
+            refused = Refused(*native.refusal_of(error))
         else:
             return
         wire.sendall(refused.answer)

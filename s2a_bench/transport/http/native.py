@@ -80,20 +80,17 @@ STATUSES = ((Busy, 503), (TooLarge, 413), (Overdue, 504), (BadRequest, 400), (En
 """Kinds of errors and their statuses; the first match counts."""
 
 
-def status_of(error: S2AError) -> int:
-    """Return the status of an error before the answer begins."""
-    return next((status for kind, status in STATUSES if isinstance(error, kind)), 400)
+def refusal_of(error: S2AError) -> tuple[int, str, dict[str, str]]:
+    """Return the status, the message and the headers for an error before the answer begins."""
+    status = next((status for kind, status in STATUSES if isinstance(error, kind)), 400)
+    headers = {"retry-after": f"{error.retry_after_s:.0f}"} if isinstance(error, Busy) else {}
+    return status, str(error), headers
 
 
 def error_json(status: int, message: str) -> dict[str, Any]:
     """Return an error in OpenAI's form."""
     shown = message.encode(errors="backslashreplace").decode()
     return {"error": {"message": shown, "type": "invalid_request_error", "code": status}}
-
-
-def headers_of(error: S2AError) -> dict[str, str]:
-    """Return the Retry-After header of an error, if it has one."""
-    return {"retry-after": f"{error.retry_after_s:.0f}"} if isinstance(error, Busy) else {}
 
 
 def head_of(status: int, headers: Mapping[str, str], *, keep: bool) -> bytes:
@@ -115,10 +112,6 @@ class Refused(Exception):
     def __init__(self, status: int, message: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(message)
         self.answer = answer(status, error_json(status, message), headers, keep=False)
-
-    @classmethod
-    def because(cls, error: S2AError) -> Refused:
-        return cls(status_of(error), str(error), headers_of(error))
 
 
 def admit(access: Access, path: str, headers: Iterable[tuple[str, str]]) -> None:

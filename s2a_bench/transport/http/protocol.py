@@ -67,7 +67,7 @@ class Protocol(HttpToolsProtocol):
             self._refuse(refused)
         except httptools.HttpParserError as error:
             why = error.__context__  # the exception of a callback
-            why = Refused.because(why) if isinstance(why, S2AError) else why
+            why = Refused(*native.refusal_of(why)) if isinstance(why, S2AError) else why
             self._refuse(why if isinstance(why, Refused) else Refused(400, "Invalid HTTP request received."))
 
     def on_message_begin(self) -> None:
