@@ -32,7 +32,9 @@ DEPTH: Final = 32
 COLOURS: Final = 3
 
 
-def observed(observation: Any, trace: Trace, limits: Limits) -> tuple[tuple[Frame, ...], tuple[float, ...], str]:
+def read_observation(
+    observation: Any, trace: Trace, limits: Limits
+) -> tuple[tuple[Frame, ...], tuple[float, ...], str]:
     """Return pictures as ``rgb8``, state and prompt; marks `image_decode`. Raises RequestFailed with the key."""
     if not isinstance(observation, Mapping):
         raise RequestFailed(f"an observation is a dictionary, not {type(observation).__name__}")
@@ -111,7 +113,7 @@ def take_extension(message: Any) -> dict[Any, Any] | None:
 def request_of(observation: Any, extension: dict[Any, Any] | None, trace: Trace, limits: Limits) -> Request:
     """Read an observation and our client's fields, decode its pictures; raises RequestFailed."""
     fields = extension or {}
-    images, state, prompt = observed(observation, trace, limits)
+    images, state, prompt = read_observation(observation, trace, limits)
     return Request(
         id=text("id", fields.get("id")) or "observation-0",
         prompt=prompt,

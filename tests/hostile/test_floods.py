@@ -21,7 +21,7 @@ from typing import Any
 import pytest
 
 from s2a_bench.clock import SystemClock, now_ns
-from s2a_bench.testing.hostile import Attack, answer_of, own_server
+from s2a_bench.testing.hostile import Attack, honest_answer, own_server
 from s2a_bench.testing.hostile.client import forget_peak, usage
 from s2a_bench.testing.hostile.tcp import RESET, connect, crowd, sends, sends_made
 from s2a_bench.testing.transport import wiring_of
@@ -133,7 +133,7 @@ def test_honest_clients_are_answered_beside_it(
     with ExitStack() as stack:
         servers = [stack.enter_context(own_server(wiring, tmp_path / name)) for name in ("attacked", "twin")]
         honest = [stack.enter_context(closing(open_client(replace(wiring, address=each.address)))) for each in servers]
-        expected = [answer_of(client) for client in honest]
+        expected = [honest_answer(client) for client in honest]
         for server in servers:
             forget_peak(server.pid)
         replies: list[str] = []
@@ -162,7 +162,7 @@ def test_honest_clients_are_answered_beside_it(
 
 def timed(client: Client) -> tuple[float, list[str]]:
     began = now_ns()
-    answer = answer_of(client)
+    answer = honest_answer(client)
     return (now_ns() - began) / 1e9, answer
 
 
@@ -172,13 +172,13 @@ def test_out_of_descriptors_those_that_are_connected_are_answered(variant: str, 
     with own_server(wiring, tmp_path / "log") as server, ExitStack() as stack:
         here = replace(wiring, address=server.address)
         client = stack.enter_context(closing(open_client(here)))
-        expected = answer_of(client)
+        expected = honest_answer(client)
         limits = resource.prlimit(server.pid, resource.RLIMIT_NOFILE)
         resource.prlimit(server.pid, resource.RLIMIT_NOFILE, (usage(server.pid).descriptors + 3, limits[1]))
         for _ in range(20):
             stack.enter_context(connect(here, 5))
         time.sleep(0.5)
-        assert answer_of(client) == expected
+        assert honest_answer(client) == expected
         resource.prlimit(server.pid, resource.RLIMIT_NOFILE, limits)
         assert sends(chat(path=PATHS[variant]), seconds=10)(here).startswith("HTTP/1.1 200 ")
     assert "Traceback" not in (tmp_path / "log").read_text()

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.testing.hostile import answer_of
+from s2a_bench.testing.hostile import honest_answer
 from s2a_bench.trace import Trace
 from s2a_bench.types import Piece, Request, Token
 
@@ -35,12 +35,12 @@ class Refused:
 
 def test_who_is_told_to_come_again_does() -> None:
     client = Refused(3, 0.01)
-    assert answer_of(client) == ["go"]
+    assert honest_answer(client) == ["go"]
     assert client.times == 0
 
 
 def test_who_is_not_does_not() -> None:
     client = Refused(3, None)
     with pytest.raises(RequestFailed, match="under way"):
-        answer_of(client)
+        honest_answer(client)
     assert client.times == 2

@@ -14,7 +14,7 @@ from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.observed import (
     EXTENSION,
     extension_of,
-    observed,
+    read_observation,
     remote_message,
     remote_of,
     request_of,
@@ -26,7 +26,7 @@ PICTURE = np.random.default_rng(1).integers(0, 256, (4, 6, 3), np.uint8)
 
 
 def of(observation: Any, limits: Limits = LIMITS) -> Any:
-    return observed(observation, Trace(), limits)
+    return read_observation(observation, Trace(), limits)
 
 
 def test_keys_of_any_policy() -> None:
@@ -57,7 +57,7 @@ def test_axes_of_batch_and_time_are_pictures_one_after_the_other() -> None:
 @pytest.mark.parametrize("whole", [True, False])
 def test_files_are_decoded(whole: bool) -> None:
     trace, file = Trace(), encode_png(PICTURE[..., ::-1])
-    (image,), _, _ = observed({"image": file.tobytes() if whole else file}, trace, LIMITS)
+    (image,), _, _ = read_observation({"image": file.tobytes() if whole else file}, trace, LIMITS)
     np.testing.assert_array_equal(image.data, PICTURE)
     assert [stage for stage, _ in trace.marks] == ["image_decode"]
 

@@ -122,7 +122,7 @@ class HostileTarget:
 
     def __init__(self, wiring: Wiring[Any], server: OwnServer, honest: Client) -> None:
         self._wiring, self._server, self._honest = wiring, server, honest
-        self._expected = answer_of(honest)
+        self._expected = honest_answer(honest)
 
     def attacked(self, case: Case[Attack]) -> Attacked:
         pid = self._server.pid
@@ -131,7 +131,7 @@ class HostileTarget:
         began = now_ns()
         reply = case.does(self._wiring)
         seconds = (now_ns() - began) / 1e9
-        answer, peak_mib = answer_of(self._honest), usage(pid).peak_mib
+        answer, peak_mib = honest_answer(self._honest), usage(pid).peak_mib
         tidy = _settled(lambda: usage(pid).descriptors <= before.descriptors)
         return Attacked(reply, seconds, peak_mib, answer, self._expected, self._server.alive(), tidy)
 
@@ -259,7 +259,7 @@ def own_server(wiring: Wiring[Any], log: Path, **engine: Any) -> Iterator[OwnSer
         yield server
 
 
-def answer_of(client: Client) -> list[str]:
+def honest_answer(client: Client) -> list[str]:
     """Return the answer to one short request; while the server is busy it is repeated, for `SETTLES_S`."""
     deadline = now_ns() + round(SETTLES_S * 1e9)
     while True:

@@ -34,7 +34,7 @@ def json_block(message: Any) -> bytes:
     return LENGTH.pack(len(block)) + block
 
 
-def read(block: bytes) -> Any:
+def read_block(block: bytes) -> Any:
     """Return a block's content as a message of the native dialect; raises ValueError or RequestFailed."""
     if block[:1] == JSON:
         return orjson.loads(block[1:])

@@ -216,7 +216,7 @@ class HttpClient:
     def _events(self, response: HttpResponse) -> Iterator[Event]:
         """Yield the events of an answer; comments and incomplete events count as silence."""
         if response.headers.get("content-type") == blocks.MEDIA_TYPE:
-            decoder = Decoder(self._dialect, blocks.read, blocks.Blocks)
+            decoder = Decoder(self._dialect, blocks.read_block, blocks.Blocks)
         else:
             decoder = Decoder(self._dialect, self._codec.loads)
         event_ns, patience_ns = now_ns(), int(self._wiring.timeout_s * 1e9)

@@ -184,13 +184,11 @@ class FastServer:
 
     def _page(self, head: Head) -> bytes | None:
         """Return the answer of a page beside the chat, None for any other path."""
-        if head.method != b"GET":
-            return None
-        if head.path == native.HEALTH:
-            return native.answer(*native.health(self._core), keep=head.keep)
-        return (
-            native.answer(200, native.models(self._core.queued), keep=head.keep) if head.path == native.MODELS else None
-        )
+        if head.method == b"GET" and head.path == native.HEALTH:
+            return native.json_answer(*native.health(self._core), keep=head.keep)
+        if head.method == b"GET" and head.path == native.MODELS:
+            return native.json_answer(200, native.models(self._core.queued), keep=head.keep)
+        return None
 
 
 def _body(wire: Wire, begun: bytes, size: int, count: Callable[[int], None]) -> memoryview:
@@ -243,7 +241,7 @@ class FastExchange(ChatExchange):
             self._over()
 
     def whole(self, status: int, value: Any, headers: dict[str, str]) -> None:
-        self._wire.sendall(native.answer(status, value, headers, keep=self._head.keep))
+        self._wire.sendall(native.json_answer(status, value, headers, keep=self._head.keep))
         self._over()
 
     def _over(self) -> None:

@@ -99,7 +99,7 @@ def head_of(status: int, headers: Mapping[str, str], *, keep: bool) -> bytes:
     return "\r\n".join([*lines, *([] if keep else ["connection: close"]), "", ""]).encode()
 
 
-def answer(status: int, value: Any, headers: Mapping[str, str] | None = None, *, keep: bool) -> bytes:
+def json_answer(status: int, value: Any, headers: Mapping[str, str] | None = None, *, keep: bool) -> bytes:
     """Return an answer of JSON."""
     body = FAST.dumps(value)
     headers = {"content-type": "application/json", **(headers or {}), "content-length": str(len(body))}
@@ -111,7 +111,7 @@ class Refused(Exception):
 
     def __init__(self, status: int, message: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(message)
-        self.answer = answer(status, error_json(status, message), headers, keep=False)
+        self.answer = json_answer(status, error_json(status, message), headers, keep=False)
 
 
 def admit(access: Access, path: str, headers: Iterable[tuple[str, str]]) -> None:
