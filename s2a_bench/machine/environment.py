@@ -42,6 +42,8 @@ STATE = ("power_mode", "governor")
 def collect(packages: Iterable[str] = ()) -> dict[str, Any]:
     """Return the environment, with the versions of `PACKAGES` and of ``packages``."""
     machine = Machine()
+    lines = (machine.read("proc/cpuinfo") or "").splitlines()
+    cpu = next((line for line in lines if line.startswith(("model name", "Model"))), "")
     with nvml() as (lib, cards):
         gpus = [names for card in cards if (names := identity(lib, card))]
     facts: dict[str, Any] = {
@@ -51,7 +53,7 @@ def collect(packages: Iterable[str] = ()) -> dict[str, Any]:
         "kernel": platform.release(),
         "machine": platform.machine(),
         "python": platform.python_version(),
-        "cpu": _cpu_model(machine.read("proc/cpuinfo") or ""),
+        "cpu": cpu.partition(":")[2].strip(),
         "cores": os.cpu_count(),
         "affinity": sorted(os.sched_getaffinity(0)),
         "load": [round(value, 2) for value in os.getloadavg()],
@@ -65,11 +67,6 @@ def collect(packages: Iterable[str] = ()) -> dict[str, Any]:
         if text := machine.read(path):
             facts[name] = int(text) if text.isdecimal() else text
     return {name: value for name, value in facts.items() if value not in (None, "", [])}
-
-
-def _cpu_model(cpuinfo: str) -> str:
-    named = (line for line in cpuinfo.splitlines() if line.startswith(("model name", "Model")))
-    return next(named, "").partition(":")[2].strip()
 
 
 def board_facts() -> dict[str, Any]:

@@ -81,18 +81,18 @@ def test_a_run_samples_resources_and_says_what_that_cost(tmp_path: Path) -> None
     done = s2a_bench(*ECHO, "--verbose", "--sample-resources", "50", "--output", str(tmp_path))
     assert "sampling takes" in done.stdout
     run = run_folder(tmp_path)
-    facts = run.manifest["resources"]
-    assert facts["hz"] == 50
-    assert {"cpu", "memory"} <= facts["readers"].keys()
-    assert facts["polls"] >= 1
-    assert facts["core_share"] > 0
+    resources = run.manifest["resources"]
+    assert resources["hz"] == 50
+    assert {"cpu", "memory"} <= resources["readers"].keys()
+    assert resources["polls"] >= 1
+    assert resources["core_share"] > 0
     for cell, facts in zip(run.samples["cell"], run.samples["facts"], strict=True):
         spent = json.loads(facts)
         assert spent["client_cpu_ns"] > 0
         assert spent["server_cpu_ns"] >= (0 if cell == "loopback" else 1)
         assert spent["client_rss_bytes"] > 1 << 20
     table = run.table(RESOURCES)
-    assert set(table["reader"]) == set(facts["readers"])
+    assert set(table["reader"]) == set(resources["readers"])
     edges = table[table["reader"] == "cpu"]["client_cpu_ns"]
     assert edges.is_monotonic_increasing
     assert len(edges) >= 2 * len(run.samples)

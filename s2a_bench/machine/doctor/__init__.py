@@ -81,14 +81,12 @@ class Machine:
             return None
 
     def number(self, path: str) -> int | None:
-        """Return the number in a file; None if there is none."""
         try:
             return int(self.read(path) or "")
         except ValueError:
             return None
 
     def read_all(self, pattern: str) -> dict[str, str]:
-        """Return path below the root -> text of the files that match."""
         found = (str(path.relative_to(self.root)) for path in sorted(self.root.glob(pattern)))
         return {name: text for name in found if (text := self.read(name)) is not None}
 

@@ -87,12 +87,9 @@ def gpu(machine: Machine) -> Finding:
     for path, vendor in machine.read_all("sys/bus/pci/devices/*/vendor").items():
         folder = path.rpartition("/")[0]
         if vendor == NVIDIA_VENDOR and (machine.read(f"{folder}/class") or "").startswith(DISPLAY_CLASS):
-            return Finding(
-                "gpu",
-                "warning",
-                f"an NVIDIA card ({folder.rpartition('/')[2]}) whose driver does not answer",
-                "sudo ubuntu-drivers install, and restart; in a container: --gpus all",
-            )
+            message = f"an NVIDIA card ({folder.rpartition('/')[2]}) whose driver does not answer"
+            fix = "sudo ubuntu-drivers install, and restart; in a container: --gpus all"
+            return Finding("gpu", "warning", message, fix)
     return Finding("gpu", "state", "no NVIDIA GPU: models run on the CPU")
 
 

@@ -29,12 +29,9 @@ def cpus(machine: Machine) -> Finding | None:
     online = len(_listed(machine.read(f"{CPU}/online"))) or len(machine.cpus)
     message = f"{len(machine.cpus)} of {online} CPUs may be used"
     if (quota := cgroup_quota(machine)) is not None and quota < len(machine.cpus):
-        return Finding(
-            "cpus",
-            "warning",
-            f"{message}, but the cgroup stops this process after {quota:g} CPUs' worth of time: jumps of up to 100 ms",
-            "start the container without --cpus; use --cpuset-cpus to give it whole CPUs",
-        )
+        message += f", but the cgroup stops this process after {quota:g} CPUs' worth of time: jumps of up to 100 ms"
+        fix = "start the container without --cpus; use --cpuset-cpus to give it whole CPUs"
+        return Finding("cpus", "warning", message, fix)
     isolated = machine.read(f"{CPU}/isolated")
     return Finding("cpus", "state", message + (f"; isolated: {isolated}" if isolated else ""))
 
@@ -57,15 +54,10 @@ def governor(machine: Machine) -> Finding | None:
         return None
     if is_jetson(machine):
         return Finding("cpu-governor", "state", f"{', '.join(sorted(set(found.values())))}; see jetson-clocks")
-    slow = sorted(set(found.values()) - {"performance"})
-    if not slow:
-        return Finding("cpu-governor", "state", f"performance on {len(found)} CPUs")
-    return Finding(
-        "cpu-governor",
-        "warning",
-        f"the CPU governor is {', '.join(slow)}: the clock changes while measuring",
-        "sudo cpupower frequency-set -g performance",
-    )
+    if slow := sorted(set(found.values()) - {"performance"}):
+        message = f"the CPU governor is {', '.join(slow)}: the clock changes while measuring"
+        return Finding("cpu-governor", "warning", message, "sudo cpupower frequency-set -g performance")
+    return Finding("cpu-governor", "state", f"performance on {len(found)} CPUs")
 
 
 def turbo(machine: Machine) -> Finding | None:
@@ -77,12 +69,8 @@ def turbo(machine: Machine) -> Finding | None:
     if not (boost if no_turbo is None else not no_turbo):
         return Finding("cpu-turbo", "state", "off: the clock stays at the nominal one")
     path, value = ("cpufreq/boost", 0) if no_turbo is None else ("intel_pstate/no_turbo", 1)
-    return Finding(
-        "cpu-turbo",
-        "advice",
-        "on: faster, but the clock falls as the chip warms; off, runs are easier to compare",
-        f"echo {value} | sudo tee /{CPU}/{path}",
-    )
+    message = "on: faster, but the clock falls as the chip warms; off, runs are easier to compare"
+    return Finding("cpu-turbo", "advice", message, f"echo {value} | sudo tee /{CPU}/{path}")
 
 
 def load(machine: Machine) -> Finding | None:
@@ -104,12 +92,9 @@ def throttling(machine: Machine) -> Finding | None:
         return None
     total = sum(int(count) for count in counts.values() if count.isdecimal())
     if total:
-        return Finding(
-            "cpu-throttling",
-            "advice",
-            f"the cores were throttled {total} times since the start: it can happen again under load",
-            "clean or strengthen the cooling; a run that is throttled has a warning",
-        )
+        message = f"the cores were throttled {total} times since the start: it can happen again under load"
+        fix = "clean or strengthen the cooling; a run that is throttled has a warning"
+        return Finding("cpu-throttling", "advice", message, fix)
     return Finding("cpu-throttling", "state", "never since the machine started")
 
 
@@ -126,11 +111,9 @@ def temperature(machine: Machine) -> Finding | None:
         passive = (name.removesuffix("type") + "temp" for name, trip in trips.items() if trip == "passive")
         limit = min((limit for name in passive if (limit := machine.number(name) or 0) > 0), default=None)
         if limit is not None and now / 1e3 > limit / 1e3 - HOT_MARGIN_C:
+            message = f"{kind} is at {now / 1e3:.0f} °C and slows down at {limit / 1e3:.0f} °C"
             return Finding(
-                "temperature",
-                "warning",
-                f"{kind} is at {now / 1e3:.0f} °C and slows down at {limit / 1e3:.0f} °C",
-                "cool it (sudo jetson_clocks --fan on a Jetson), and wait",
+                "temperature", "warning", message, "cool it (sudo jetson_clocks --fan on a Jetson), and wait"
             )
     return Finding("temperature", "state", f"hottest: {hottest[1]}, {hottest[0]:.0f} °C") if hottest else None
 
@@ -171,12 +154,8 @@ def memory(machine: Machine) -> Finding | None:
     usable = min(available, int(limit)) if bounded else available
     message = f"{usable / GIB:.1f} of {total / GIB:.1f} GiB can be used" + (" in this cgroup" if bounded else "")
     if usable < FULL_MODEL_BYTES:
-        return Finding(
-            "memory",
-            "advice",
-            f"{message}: the tiny dummy model fits, MiniCPM-V 2.6 at 4 bits needs {FULL_MODEL_BYTES / GIB:.0f} GiB",
-            "close other programs, or keep to the default model",
-        )
+        message += f": the tiny dummy model fits, MiniCPM-V 2.6 at 4 bits needs {FULL_MODEL_BYTES / GIB:.0f} GiB"
+        return Finding("memory", "advice", message, "close other programs, or keep to the default model")
     return Finding("memory", "state", message)
 
 
@@ -190,16 +169,11 @@ def disk(machine: Machine) -> Finding | None:
     free = shutil.disk_usage(folder).free
     message = f"{free / GIB:.1f} GiB free for results in {folder}"
     if free < LEAST_DISK_BYTES:
-        return Finding(
-            "disk",
-            "warning",
-            f"{message}: the disk may be full before a run ends",
-            f"sudo du -xh {folder} | sort -h | tail",
-        )
+        message += ": a run may fill the disk"
+        return Finding("disk", "warning", message, f"sudo du -xh {folder} | sort -h | tail")
     if free < MODEL_DISK_BYTES:
-        return Finding(
-            "disk", "advice", f"{message}: too little for a full model's file", "S2A_BENCH_CACHE names another disk"
-        )
+        message += ": too little for a full model's file"
+        return Finding("disk", "advice", message, "S2A_BENCH_CACHE names another disk")
     return Finding("disk", "state", message)
 
 
@@ -224,7 +198,6 @@ def cameras(machine: Machine) -> Finding:
         return Finding("cameras", "warning", "; ".join(closed), "sudo usermod -aG video $USER, and log in again")
     message = "; ".join(f"{camera.path} {camera.card}: {camera.summary()}" for camera in found)
     if not any("YUYV" in camera.formats for camera in found):
-        return Finding(
-            "cameras", "advice", f"{message}; none offers YUYV", "use a USB camera that does, or --source bag:FILE"
-        )
+        message += "; none offers YUYV"
+        return Finding("cameras", "advice", message, "use a USB camera that does, or --source bag:FILE")
     return Finding("cameras", "state", message)

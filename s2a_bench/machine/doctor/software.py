@@ -39,8 +39,8 @@ def packages(machine: Machine) -> Finding:  # noqa: ARG001 - the packages of thi
     message = f"{len(needed)} requirements, all met"
     if not missing:
         return Finding("packages", "state", message)
-    without = ", ".join(f"{extra} ({extras.EXTRAS[extra]})" for extra in missing)
-    return Finding("packages", "state", f"{message}; without the extras {without}", extras.how_to_install(*missing))
+    message += "; without the extras " + ", ".join(f"{extra} ({extras.EXTRAS[extra]})" for extra in missing)
+    return Finding("packages", "state", message, extras.how_to_install(*missing))
 
 
 def _applies(requirement: Requirement, extra: str = "") -> bool:
@@ -56,9 +56,7 @@ def installed(package: str) -> str:
 
 
 def _problem(requirement: Requirement) -> str:
-    """Return the problem with a required package, "" if there is none."""
-    found = installed(requirement.name)
-    if not found:
+    if not (found := installed(requirement.name)):
         return f"{requirement.name} is missing"
     fits = requirement.specifier.contains(found, prereleases=True)
     return "" if fits else f"{requirement.name} is {found}, not {requirement.specifier}"
@@ -68,12 +66,8 @@ def compiler(machine: Machine) -> Finding:
     """Report the compilers that llama-cpp-python is built with."""
     name = next((name for name in ("c++", "g++", "clang++") if machine.which(name)), None)
     if name is None:
-        return Finding(
-            "compiler",
-            "advice",
-            "no C++ compiler: fine while llama-cpp-python stays as it is installed",
-            "sudo apt install build-essential",
-        )
+        message = "no C++ compiler: fine while llama-cpp-python stays as it is installed"
+        return Finding("compiler", "advice", message, "sudo apt install build-essential")
     first = (machine.run([name, "--version"]) or name).splitlines()[0]
     cuda = re.search(r"release ([\d.]+)", machine.run(["nvcc", "--version"]) or "") if machine.which("nvcc") else None
     return Finding("compiler", "state", first + (f"; CUDA {cuda[1]}" if cuda else "; no nvcc"))

@@ -46,7 +46,7 @@ class CpuTimes:
         return values
 
     def close(self) -> None:
-        """Nothing is held."""
+        pass
 
 
 class HostMemory:
@@ -81,7 +81,7 @@ class HostMemory:
         return values
 
     def close(self) -> None:
-        """Nothing is held."""
+        pass
 
     def _rss(self, process: str) -> int:
         return int((self._root / process / "statm").read_text().split()[1]) * PAGE_BYTES

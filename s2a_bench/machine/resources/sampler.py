@@ -43,8 +43,6 @@ class Reading:
 
 @dataclass(slots=True)
 class _Source:
-    """One reader, its readings and their costs."""
-
     name: str
     reader: Reader
     readings: deque[Reading] = field(default_factory=lambda: deque(maxlen=KEPT))
@@ -105,7 +103,6 @@ class ResourceSampler:
             self._read(source)
 
     def flush(self, run: RunWriter) -> None:
-        """Append the rows since the last call to a run."""
         if rows := [self._rows.popleft() for _ in range(len(self._rows))]:
             run.append(RESOURCES, rows)
 
