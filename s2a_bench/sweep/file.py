@@ -97,8 +97,6 @@ def find_sweep(name: str) -> Path:
 
 
 class _SweepFile(TomlTable):
-    """The keys of the file."""
-
     command: str
     repeats: int = Field(1, ge=1)
     rest: float = Field(0.0, ge=0)

@@ -21,7 +21,7 @@ from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.machine.environment import collect
 from s2a_bench.store.manifest import utc_now
-from s2a_bench.sweep import Outcome, SweepCell
+from s2a_bench.sweep import CellWorkers, Outcome, SweepCell
 from s2a_bench.sweep.perform import perform
 from s2a_bench.sweep.plan import SweepPlan
 
@@ -37,7 +37,7 @@ OBJECT_STORE_BYTES: Final = 256 << 20
 Packed: TypeAlias = tuple[Outcome, bytes]
 
 
-class RayWorkers:
+class RayWorkers(CellWorkers):
     """A running cluster, or one of this machine's cores made for the sweep."""
 
     def __init__(self, entry: str, address: str, plan: SweepPlan, jobs: int) -> None:
@@ -70,9 +70,6 @@ class RayWorkers:
         with tarfile.open(fileobj=io.BytesIO(data)) as archive:
             archive.extractall(folder, filter="data")
         return outcome
-
-    def __enter__(self) -> RayWorkers:  # noqa: PYI034 - Self is typing's since 3.11
-        return self
 
     def __exit__(self, *_: object) -> None:
         for ref in list(self._refs):

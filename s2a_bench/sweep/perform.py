@@ -21,7 +21,7 @@ from s2a_bench.machine.environment import collect
 from s2a_bench.machine.tuning import end_with_parent
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.manifest import utc_now
-from s2a_bench.sweep import Outcome, SweepCell
+from s2a_bench.sweep import CellWorkers, Outcome, SweepCell
 from s2a_bench.sweep.plan import SweepPlan
 
 LOG: Final = "stderr.txt"
@@ -89,7 +89,7 @@ def _outside(argv: list[str], log: Path) -> str:
     return errors_of_cell[-1] if errors_of_cell else f"{how}: {lines[-1][:200]}" if lines else how
 
 
-class LocalWorkers:
+class LocalWorkers(CellWorkers):
     """Two pools of processes: a cell that crashes or exhausts memory does not end the sweep."""
 
     def __init__(self, entry: str, _address: str, _plan: SweepPlan, jobs: int) -> None:
@@ -103,7 +103,7 @@ class LocalWorkers:
             return self._pool(cell.virtual).submit(perform, cell, folder, self._entry)
         except BrokenProcessPool:  # an earlier cell broke it
             del self._pools[cell.virtual]
-            return self._pool(cell.virtual).submit(perform, cell, folder, self._entry)
+            return self.submit(cell, folder)
 
     def collect(self, future: Future[Outcome], folder: Path) -> Outcome:  # noqa: ARG002 - the worker has written into it
         try:
@@ -117,9 +117,6 @@ class LocalWorkers:
                 self.width if virtual else 1, mp_context=get_context("spawn"), initializer=prepare
             )
         return self._pools[virtual]
-
-    def __enter__(self) -> LocalWorkers:  # noqa: PYI034 - Self is typing's since 3.11
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Close the pools; after an exception end their processes."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -114,21 +115,13 @@ def _text(value: Any) -> str:
 def _files(setting: Setting) -> Iterator[Path]:
     """Yield the files that settings name, also profiles by name: their content is part of the configuration."""
     for key, value in setting.items():
-        for text in _text(value).split(","):
-            if key == "profile" and text:
-                yield find_profile(text.strip())
-                continue
-            if path := _named_file(text.strip()):
-                yield path
-
-
-def _named_file(text: str) -> Path | None:
-    """Return the file of ``PATH``, ``@PATH`` or ``video:PATH``, None if there is none."""
-    path = Path(text.removeprefix("@").rpartition(":")[2])
-    try:
-        return path if path.is_file() else None
-    except OSError:  # too long for a path: a prompt
-        return None
+        for text in map(str.strip, _text(value).split(",")):
+            path = Path(text.removeprefix("@").rpartition(":")[2])  # of PATH, @PATH or video:PATH
+            with suppress(OSError):  # too long for a path: a prompt
+                if key == "profile" and text:
+                    yield find_profile(text)
+                elif path.is_file():
+                    yield path
 
 
 def _content(path: Path) -> list[Any]:
