@@ -64,7 +64,6 @@ class CsvFile:
 
 
 def _field(value: Value) -> str:
-    """Format one field; floats with all digits."""
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -105,7 +104,6 @@ def whole_records(data: bytes) -> bytes:
 
 
 def _ends(data: bytes) -> Iterator[int]:
-    """Yield the end of each whole record."""
     position = quotes = 0
     for line in data.split(b"\n")[:-1]:
         position += len(line) + 1

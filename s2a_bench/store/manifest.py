@@ -174,7 +174,6 @@ def read(folder: Path) -> dict[str, Any]:
 
 
 def _check(manifest: Mapping[str, Any], path: Path) -> None:
-    """Raise StoreError naming the first missing or wrong key."""
     try:
         (_SweepManifest if manifest.get("command") == SWEEP else _Manifest).model_validate(manifest)
     except ValidationError as error:

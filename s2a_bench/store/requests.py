@@ -136,7 +136,6 @@ _OF_SAMPLE: Final[Mapping[str, tuple[Kind, Callable[[SampleRow, Budget], Value]]
 
 
 def _derive_frame(row: FrameRow) -> dict[str, Value]:
-    """Return a frame's durations up to its last mark, from capture and from the intended time."""
     if not row.marks:
         return {}
     spent = budget(row.marks)
@@ -152,7 +151,6 @@ TOKENS: Final[Table[TokenRow]] = Table("tokens", TokenRow)
 
 
 def _derive_skill(row: SkillRow) -> dict[str, Value]:
-    """Return how long a skill waited, its duration over the nominal one, and how late the robot got the command."""
     stretch = (row.end_ns - row.start_ns) / row.nominal_ns if row.nominal_ns else None
     jitter_ns = None if row.due_ns is None else row.start_ns - row.due_ns
     return {"queue_wait_ns": row.start_ns - row.arrival_ns, "stretch": stretch, "start_jitter_ns": jitter_ns}

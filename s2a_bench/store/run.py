@@ -243,7 +243,6 @@ class StoredRun:
         return int(self.manifest.get("seeds", {}).get("bootstrap") or 0)
 
     def row_counts(self) -> dict[str, int]:
-        """Return the number of rows of every file of a table, without the empty ones."""
         counts = {name: len(table) for name, table in self.tables.items()}
         for file in sorted([*self.path.glob("*.parquet"), *self.path.glob("*.csv")]):
             if file.stem not in counts:
@@ -257,7 +256,6 @@ class StoredRun:
 
     @property
     def facts(self) -> dict[str, dict[str, str]]:
-        """Fact of a request -> unit and meaning."""
         return dict(self.manifest.get("facts", {}))
 
     @property

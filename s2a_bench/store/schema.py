@@ -30,10 +30,6 @@ PROVENANCE: Final = "provenance"
 Row = TypeVar("Row")
 
 
-def _nothing(_row: object) -> dict[str, Value]:
-    return {}
-
-
 @dataclass(frozen=True, eq=False)
 class Table(Generic[Row]):
     """One table: the dataclass of its rows, and the columns derived from a row."""
@@ -41,7 +37,7 @@ class Table(Generic[Row]):
     name: str
     row: type[Row]
     derived: dict[str, Kind] = field(default_factory=dict)
-    derive: Callable[[Row], dict[str, Value]] = _nothing
+    derive: Callable[[Row], dict[str, Value]] | None = None
 
     @cached_property
     def columns(self) -> dict[str, Kind]:
@@ -57,7 +53,7 @@ class Table(Generic[Row]):
         """Yield one value a column; lists and dicts become JSON text."""
         for name in self._fields:
             yield _stored(getattr(row, name))
-        derived = self.derive(row)
+        derived = self.derive(row) if self.derive else {}
         for name in self.derived:
             yield _stored(derived.get(name))
         yield provenance

@@ -64,7 +64,6 @@ class Sweep:
         return joined(run.origins for _, run in self.runs())
 
     def runs(self) -> Iterator[tuple[dict[str, Any], StoredRun]]:
-        """Yield the settings and the run of every finished cell, in the cells' order."""
         for row in self.cells[self.cells["state"] == "finished"].to_dict("records"):
             yield json.loads(row["settings"]), read_run(self.path / row["folder"])
 

@@ -99,7 +99,6 @@ class Bar:
 
     @classmethod
     def of(cls, name: str, values: NDArray[np.float64], colour: str) -> Bar:
-        """Return a bar of the median with `WHISKERS`."""
         import numpy as np
 
         low, median, high = np.percentile(values, (10, 50, 90)).tolist()

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from s2a_bench.stats import Ratio, Summary
 
-
 ABSENT = "\N{EN DASH}"
 """The entry of an absent stage or ratio."""
 
@@ -41,7 +40,6 @@ class Note(str):
         return note
 
     def sentence(self) -> Note:
-        """Return the note with a capital and a full stop."""
         return Note(f"{self[0].upper()}{self[1:]}.", *self.labels)
 
 
