@@ -55,7 +55,6 @@ class Flag:
 
     @property
     def spelled(self) -> str:
-        """Return --max-tokens, or NAME for an argument."""
         return self.name.upper() if self.argument else f"--{self.name}"
 
     @property
@@ -131,8 +130,6 @@ def command(function: Callable[..., None], *options: type[Options], about: str =
 
 
 def _help_all(count: int) -> inspect.Parameter:
-    """Return --help-all of a command with ``count`` flags."""
-
     def show(ctx: typer.Context, value: bool) -> None:
         if value and not ctx.resilient_parsing:
             ctx.meta[HELP_ALL] = True
@@ -220,7 +217,6 @@ def with_flags(message: str, spelled: Mapping[str, str] | None = None) -> str:
 
 
 def _keywords(function: Callable[..., None]) -> dict[str, inspect.Parameter]:
-    """Return the keyword-only parameters that are annotated for typer."""
     every = inspect.signature(function, eval_str=True).parameters.values()
     declared = (each for each in every if each.kind is each.KEYWORD_ONLY and get_origin(each.annotation) is Annotated)
     return {each.name: each for each in declared}

@@ -57,7 +57,6 @@ def _show(findings: list[Finding]) -> None:
 
 
 def _as_json(findings: list[Finding]) -> dict[str, Any]:
-    """Return the ``--json`` object: every finding, and the warnings and errors as runs store them."""
     packages = [package for _, transport in TRANSPORTS.loaded() for package in transport.packages]
     return {
         "schema": SCHEMA,

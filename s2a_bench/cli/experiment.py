@@ -50,7 +50,6 @@ class Commands(TyperGroup):
         return super().get_command(ctx, cmd_name)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Show the help if there is no argument."""
         parsed: list[str] = super().parse_args(ctx, args or ["--help"])
         return parsed
 

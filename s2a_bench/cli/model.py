@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -126,12 +126,18 @@ for _name, _function, _config, _about in (
 
 def info_sections(info: GgufInfo) -> list[str | TextTable]:
     """Return the texts and tables of a file, in the order of printing."""
-    types = "type", "tensors", "parameters", "MB", "bits/weight"
-    groups = "tensor", "shape", "type", "tensors", "MB"
+    types: list[tuple[str, ...]] = []
+    for each in info.types:
+        bits = f"{each.bytes * 8 / each.parameters:.2f}" if each.parameters else ""
+        types.append((each.kind, str(each.tensors), f"{each.parameters:,}", f"{each.bytes / 1e6:,.1f}", bits))
+    groups: list[tuple[str, ...]] = []
+    for group in info.groups:
+        shape, megabytes = " x ".join(map(str, group.shape)), f"{group.bytes / 1e6:,.1f}"
+        groups.append((_clean(group.name), shape, ", ".join(group.kinds), str(group.tensors), megabytes))
     sections: list[str | TextTable] = [
         "\n".join(_head(info)),
-        TextTable("weights by type", types, [*_types(info)], 1),
-        TextTable("weights by tensor (N: the layer)", groups, [*_groups(info)], 3),
+        TextTable("weights by type", ("type", "tensors", "parameters", "MB", "bits/weight"), types, 1),
+        TextTable("weights by tensor (N: the layer)", ("tensor", "shape", "type", "tensors", "MB"), groups, 3),
         "settings: " + _clean(_pairs(info.settings)),
     ]
     if info.vocabulary is not None:
@@ -161,18 +167,6 @@ def _head(info: GgufInfo) -> list[str]:
         size + (f", file type {info.file_type}" if info.file_type else ""),
         f"sha256: {info.sha256}" if info.sha256 else "sha256: not computed; --hash computes it",
     ]
-
-
-def _types(info: GgufInfo) -> Iterator[tuple[str, ...]]:
-    for each in info.types:
-        bits = f"{each.bytes * 8 / each.parameters:.2f}" if each.parameters else ""
-        yield each.kind, str(each.tensors), f"{each.parameters:,}", f"{each.bytes / 1e6:,.1f}", bits
-
-
-def _groups(info: GgufInfo) -> Iterator[tuple[str, ...]]:
-    for each in info.groups:
-        shape = " x ".join(map(str, each.shape))
-        yield _clean(each.name), shape, ", ".join(each.kinds), str(each.tensors), f"{each.bytes / 1e6:,.1f}"
 
 
 def _vocabulary(vocabulary: Vocabulary, tokenizer: dict[str, Any]) -> list[str]:

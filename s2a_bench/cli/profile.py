@@ -95,7 +95,6 @@ def _readable() -> list[tuple[Profile, Path]]:
 
 
 def _gaps(profile: Profile, *, full: bool = True) -> str:
-    """Return the family of gaps, with its parameters if ``full``, and the number of recorded gaps."""
     table = to_table(profile.gaps)
     numbers = "".join(f" {key} {value:.3g}" for key, value in table.items() if full and isinstance(value, int | float))
     recorded = f", {len(profile.trace_s)} recorded" if profile.trace_s else ""

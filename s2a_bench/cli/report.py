@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
 import typer
 
 from s2a_bench.cli.adapter import command
@@ -13,52 +10,39 @@ from s2a_bench.errors import TRIPPED, UNDECIDED
 from s2a_bench.report.compare import CompareConfig
 from s2a_bench.report.page import ReportConfig
 
-if TYPE_CHECKING:
-    from s2a_bench.report.compare.gates import Judgement
-
 
 def _compare(config: CompareConfig, *, json_: Json = False) -> None:
-    from s2a_bench.report.compare.comparison import compare as compare_runs
-    from s2a_bench.report.compare.comparison import metrics_of, open_comparison, read_side, shown_metrics, warnings_of
-    from s2a_bench.report.compare.gates import concerned, judge, read_gate
-    from s2a_bench.report.compare.shown import compare_json, compare_table, write_comparison
+    from s2a_bench.report.compare import comparison, gates, shown
 
-    gates = [read_gate(text) for text in config.fail_if]
-    sides = read_side(config.baseline, "A"), read_side(config.other, "B")
-    compared = open_comparison(*sides, unlike=config.unlike, least=config.min_effect / 100)
+    conditions = [gates.read_gate(text) for text in config.fail_if]
+    sides = comparison.read_side(config.baseline, "A"), comparison.read_side(config.other, "B")
+    compared = comparison.open_comparison(*sides, unlike=config.unlike, least=config.min_effect / 100)
     names = config.metrics
-    wanted = metrics_of(compared, names) if names else shown_metrics(compared)
-    compared = compare_runs(compared, [*wanted, *concerned(compared, gates)])
-    judgements = judge(compared, gates, strict=config.strict)
-    found = warnings_of(compared)
-    whole = compare_json(compared, judgements, found)
+    wanted = comparison.metrics_of(compared, names) if names else comparison.shown_metrics(compared)
+    compared = comparison.compare(compared, [*wanted, *gates.concerned(compared, conditions)])
+    judgements = gates.judge(compared, conditions, strict=config.strict)
+    found = comparison.warnings_of(compared)
+    whole = shown.compare_json(compared, judgements, found)
     for warning in found:
         print_error(f"note [{warning.code}]: {warning.message}; {warning.advice}")
-    written = write_comparison(config.output, compared, whole) if config.output else []
+    written = shown.write_comparison(config.output, compared, whole) if config.output else []
     if json_:
         print_json(whole)
     else:
-        table = compare_table(compared)
+        table = shown.compare_table(compared)
         print_table(table)
         for line in (*table.notes, *(f"written: {path}" for path in written)):
             print_line(line)
-    raise typer.Exit(_gate_code(judgements))
-
-
-def _gate_code(judgements: Sequence[Judgement]) -> int:
-    """Print the outcome of every gate and return the exit code: a tripped gate before an undecided one."""
-    from s2a_bench.report.compare import gates as compare_gates
-    from s2a_bench.report.compare.shown import change_text, detectable_text
-
     for one in judgements:
-        line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {change_text(one.comparison)}"
+        line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {shown.change_text(one.comparison)}"
         line += "" if one.comparison.p_holm is None else f", p = {one.comparison.p_holm:.2g}"
-        line += "; too few values for a test" if one.detectable is None else f", sees {detectable_text(one.detectable)}"
-        if one.outcome == compare_gates.UNDECIDED:
+        least = one.detectable
+        line += "; too few values for a test" if least is None else f", sees {shown.detectable_text(least)}"
+        if one.outcome == gates.UNDECIDED:
             line += "; measure more launches (--launches), compare less (--metric), or --strict"
         print_error(line)
-    outcomes = {one.outcome for one in judgements}
-    return TRIPPED if compare_gates.TRIPPED in outcomes else UNDECIDED if compare_gates.UNDECIDED in outcomes else 0
+    outcomes = {one.outcome for one in judgements}  # a tripped gate comes before an undecided one
+    raise typer.Exit(TRIPPED if gates.TRIPPED in outcomes else UNDECIDED if gates.UNDECIDED in outcomes else 0)
 
 
 compare = command(_compare, CompareConfig)

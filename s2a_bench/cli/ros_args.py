@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from s2a_bench.errors import UsageError
-from s2a_bench.text import none_of, read_text
+from s2a_bench.text import dotted, none_of, read_text
 
 FLAG: Final = "--ros-args"
 END: Final = "--"
@@ -129,14 +129,14 @@ def _read_file(found: Read, path: Path, known: Sequence[str], node_name: str) ->
         raise UsageError(f"`ros_args`: --params-file {path} has no '{PARAMETERS}'")
     matching = [(pattern, values) for pattern, values in sections if _matches(pattern, node_name)]
     for pattern, values in matching:
-        _take(found, dict(_flat(values, "")), known, f"--params-file {path}, {pattern}", shared="*" in pattern)
+        parameters = dict(dotted(values)) if isinstance(values, dict) else {}
+        _take(found, parameters, known, f"--params-file {path}, {pattern}", shared="*" in pattern)
     if not matching:
         listed = ", ".join(pattern for pattern, _ in sections)
         found.notes.append(f"--params-file {path} has nothing for {node_name}, only for {listed}")
 
 
 def _sections(tree: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield (node pattern, parameters) of a file, whose keys may nest."""
     for key, inner in tree.items() if isinstance(tree, dict) else ():
         if key == PARAMETERS:
             yield path, inner
@@ -148,15 +148,6 @@ def _matches(pattern: str, node_name: str) -> bool:
     """Return True if a pattern matches: * stands for one part of the name, ** for any number."""
     parts = ({"**": "(/[^/]+)*", "*": "/[^/]+"}.get(part, "/" + re.escape(part)) for part in pattern.split("/") if part)
     return re.fullmatch("".join(parts), node_name) is not None
-
-
-def _flat(tree: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield parameters, nested ones under dotted names."""
-    for key, value in tree.items() if isinstance(tree, dict) else ():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{path}{key}.")
-        else:
-            yield f"{path}{key}", value
 
 
 def _yaml(text: str, where: str) -> Any:

@@ -34,12 +34,10 @@ _NUMBER = EngineConfig.model_fields["threads"]
 
 def served_options(transport: Transport[Any]) -> list[str]:
     """Return the names of the options that the server of a transport has."""
-    names: list[str] = transport.options.of_sides(SERVER, SERVING)
-    return names
+    return list(transport.options.of_sides(SERVER, SERVING))
 
 
 def _as_served(transport: Transport[Any]) -> type[Options]:
-    """Return a transport's options with the defaults of `serve`."""
     fields: dict[str, Any] = {}
     for name, default in transport.options.SERVE_DEFAULTS.items():
         field = copy(transport.options.model_fields[name])
@@ -74,20 +72,16 @@ def _serve(config: Any) -> None:
     for other, _ in TRANSPORTS.loaded():
         if stray := [each for each in getattr(config, other, Options()).given() if each not in served_options(chosen)]:
             raise UsageError(f"`{stray[0]}` is no option of {chosen.name}; it has {', '.join(served_options(chosen))}")
-    flags = _given(getattr(config, chosen.name, Options()))
+    flags = getattr(config, chosen.name, Options()).given_values()
     values = _toml(config.config) if config.config else {}
     of_file = _sorted(values, f"`config` {config.config}", chosen)
     of_args = _ros_args(config.ros_args, chosen, {**of_file[1], **flags})
     of_engine, of_transport, of_limits = (low | high for low, high in zip(of_file, of_args, strict=True))
-    limits = Limits(**of_limits | _given(config.limits))
+    limits = Limits(**of_limits | config.limits.given_values())
     pipeline = one_pipeline(config.pipeline, **{**chosen.options.SERVE_DEFAULTS, **of_transport, **flags})
-    engine = EngineConfig(**of_engine | _given(config.engine))
+    engine = EngineConfig(**of_engine | config.engine.given_values())
     address = next(iter(pipeline.options.addresses()))
     _run(pipeline.wiring(address, limits=limits), _answering(engine, pipeline))
-
-
-def _given(options: Options) -> dict[str, Any]:
-    return {name: getattr(options, name) for name in options.given()}
 
 
 def _answering(engine: EngineConfig, pipeline: Pipeline) -> EngineConfig:
@@ -109,7 +103,6 @@ def _toml(path: Path) -> dict[str, Any]:
 
 
 def _ros_args(text: str, chosen: Transport[Any], given: Mapping[str, Any]) -> Sorted:
-    """Read --ros-args for the node that ``given`` names, and print what is left out."""
     if not text:
         return {}, {}, {}
     if "node_name" not in served_options(chosen):
@@ -122,7 +115,6 @@ def _ros_args(text: str, chosen: Transport[Any], given: Mapping[str, Any]) -> So
 
 
 def _known(chosen: Transport[Any]) -> list[str]:
-    """Return the names of all options of a server, as keys of a file."""
     limits = [flag.name.replace("-", "_") for flag in flags_of(Limits) if flag.path[0] in SET]
     return ["engine", *ENGINE[1:], *served_options(chosen), *limits]
 

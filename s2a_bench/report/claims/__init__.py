@@ -190,7 +190,6 @@ class Judged:
 
     @property
     def required(self) -> str:
-        """The needs in one line, with the facts of the runs if there are any."""
         if not self.findings:
             return "; ".join(f"{need.name}: {need.wanted}" for need in self.claim.trial.needs)
         return " | ".join(dict.fromkeys("; ".join(need.text for need in finding.needs) for finding in self.findings))

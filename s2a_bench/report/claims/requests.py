@@ -151,7 +151,6 @@ def _unlike(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
 
 
 def _others(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
-    """Return the servers that the run did not start, and the options that name them."""
     pipelines = run.manifest.get("configuration", {}).get("pipelines", {})
     found = [f"{cell.name} {UNKNOWN}" for cell in pair if cell.name not in pipelines]
     for cell in pair:
@@ -216,7 +215,6 @@ def _metric(pair: Sequence[RequestCell]) -> str:
 
 
 def _blocks(pair: Sequence[RequestCell]) -> tuple[Mapping[int, Blocks], Mapping[int, Blocks]]:
-    """Return the values of both sides by launch and block, for the blocks that both have."""
     sides = [cell.by_launch(_metric(pair)) for cell in pair]
     both = {launch: sides[0][launch].keys() & sides[1][launch].keys() for launch in sides[0].keys() & sides[1].keys()}
     http, ros = ({launch: {block: side[launch][block] for block in both[launch]} for launch in both} for side in sides)

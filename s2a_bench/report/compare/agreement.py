@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.provenance import Origins
+from s2a_bench.text import dotted
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
@@ -51,7 +52,8 @@ def differences(baseline: StoredRun, other: StoredRun) -> list[Difference]:
     sides = baseline.manifest, other.manifest
     machines = [manifest.get("environment", {}) for manifest in sides]
     models = [manifest.get("model") or {} for manifest in sides]
-    others = [_flat({name: each[name] for name in each if name not in (*_MACHINE, *_PASSING)}) for each in machines]
+    ignored = *_MACHINE, *_PASSING
+    others = [dict(dotted({name: each[name] for name in each if name not in ignored})) for each in machines]
     found = [
         *_of("", *({name: facts[name] for name in _MACHINE if name in facts} for facts in machines), fatal=True),
         *_of("", *(_gpus(facts, "name") for facts in machines), fatal=True),
@@ -61,7 +63,7 @@ def differences(baseline: StoredRun, other: StoredRun) -> list[Difference]:
         *_of("", *others, fatal=False),
         *_of("", *(_gpus(facts, "driver") for facts in machines), fatal=False),
         *_of("package ", *(facts.get("packages", {}) for facts in machines), fatal=False),
-        *_of(SETTING, *(_flat(manifest.get("configuration", {})) for manifest in sides), fatal=False),
+        *_of(SETTING, *(dict(dotted(manifest.get("configuration", {}))) for manifest in sides), fatal=False),
     ]
     return sorted(found, key=lambda difference: not difference.fatal)
 
@@ -108,14 +110,3 @@ def _origin(manifest: Mapping[str, Any]) -> dict[str, Any]:
 def _gpus(facts: Mapping[str, Any], key: str) -> dict[str, Any]:
     gpus = facts.get("gpus") or []
     return {f"GPU {key}": ", ".join(str(gpu.get(key)) for gpu in gpus)} if gpus else {}
-
-
-def _flat(facts: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return nested facts under dotted names."""
-    found: dict[str, Any] = {}
-    for name, value in facts.items():
-        if isinstance(value, Mapping):
-            found |= _flat(value, f"{prefix}{name}.")
-        else:
-            found[f"{prefix}{name}"] = value
-    return found

@@ -19,7 +19,6 @@ from s2a_bench.store.run import StoredRun, fits, read_run
 if TYPE_CHECKING:
     from s2a_bench.experiments import Rows
 
-
 LEVEL: Final = 0.05
 """The probability of any false difference, over all comparisons together."""
 
@@ -137,7 +136,6 @@ def _launches(subjects: Iterable[Subject]) -> list[dict[str, Subject]]:
 
 
 def _comparable(command: str) -> Comparable:
-    """Return the declaration of a command's comparisons; raises UsageError if there is none."""
     if (experiment := experiment_of(command)) and (by := experiment.compared_by()):
         return by
     known = ", ".join(name for name, found in EXPERIMENTS.loaded() if found.compared)

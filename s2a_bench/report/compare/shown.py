@@ -114,7 +114,6 @@ def _row(one: CellComparison) -> tuple[str, ...]:
 
 
 def _p(value: float | None) -> str:
-    """Format a p-value with three decimals, a small one as a power of ten."""
     if value is None:
         return ABSENT
     return f"{value:.3f}" if value >= _LEAST_P or value == 0 else f"{value:.0e}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from s2a_bench.report.compare.agreement import SETTING, Difference, differences,
 from s2a_bench.report.page.sweeps import overview, pooled, settings_text
 from s2a_bench.store.run import StoredRun, fits, read_run
 from s2a_bench.store.sweep import Sweep, is_sweep, read_sweep
-from s2a_bench.writers.tables import Note, TextTable
 
 MOST_CHAPTERS = 12
 """Runs of a sweep that have a chapter; the others are in the overview only."""
@@ -116,7 +115,6 @@ def _unfinished(manifest: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
-    """Yield the overview, the pools of computed runs, and the other runs."""
     manifest, runs = sweep.manifest, list(sweep.runs())
     head = StoredRun(sweep.path, {**manifest, "provenance": sweep.origins.to_manifest()})
     copy = sweep.path / "sweep.toml"
@@ -154,9 +152,3 @@ def content_of(run: StoredRun, *, against_paper: bool) -> Shown:
         return experiment.show(run, against="paper" if against_paper else "")
     rows = [f"{name} ({count} rows)" for name, count in run.row_counts().items()]
     return Shown((f"There is no view of {run.manifest['command']} runs; this one has {', '.join(rows)}.",))
-
-
-def labels_of(tables: Iterable[TextTable]) -> list[str]:
-    """Return the labels in the notes of tables, each once."""
-    notes = [note for table in tables for note in table.notes if isinstance(note, Note)]
-    return list(dict.fromkeys(label for note in notes for label in note.labels))

@@ -130,7 +130,6 @@ def write_report(report: Report, config: ReportConfig) -> list[Path]:
 
 
 def _latex(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> Iterator[tuple[str, str | bytes]]:
-    """Yield every table as .tex and figure as .pdf by its path, and a report.tex with all of them."""
     sections = []
     if report.judged:
         table = _claims(report)

@@ -10,11 +10,12 @@ from s2a_bench import __version__
 from s2a_bench.experiments.chunks.view.figures import CellTicks as ChunkLane
 from s2a_bench.report.claims import Judged
 from s2a_bench.report.page import GENERATOR
-from s2a_bench.report.page.chapters import labels_of, when
+from s2a_bench.report.page.chapters import when
 from s2a_bench.report.page.lanes import MOST_PANELS, panels_of, panels_of_chunks
 from s2a_bench.store.manifest import utc_now
 from s2a_bench.store.sweep import is_sweep
 from s2a_bench.text import visible
+from s2a_bench.writers.tables import Note
 
 if TYPE_CHECKING:
     from s2a_bench.report.page.chapters import Chapter
@@ -75,13 +76,15 @@ def tally(judged: Sequence[Judged]) -> str:
 def _view(chapter: Chapter, figures: dict[str, DrawnFigure]) -> dict[str, Any]:
     content, manifest = chapter.content, chapter.manifest
     main = [content.tables[name] for name in content.main]
+    notes = [note for table in content.tables.values() for note in table.notes if isinstance(note, Note)]
+    labels = [label for note in notes for label in note.labels]
     return {
         "id": "run-" + re.sub(r"[^A-Za-z0-9_-]", "-", chapter.name),
         "title": chapter.title,
         "folder": str(chapter.run.path),
         "state": manifest.get("state", "unknown"),
         "started": when(manifest),
-        "labels": list(dict.fromkeys((*chapter.run.origins.labels, *labels_of(content.tables.values())))),
+        "labels": list(dict.fromkeys((*chapter.run.origins.labels, *labels))),
         "summary": content.sentences,
         "caveats": chapter.caveats,
         "warnings": manifest.get("warnings", []),
@@ -100,7 +103,6 @@ def _view(chapter: Chapter, figures: dict[str, DrawnFigure]) -> dict[str, Any]:
 
 
 def _panels(shown: Sequence[Any]) -> dict[str, Any]:
-    """Return the panels of timelines or of control ticks, a legend, and the number of panels left out."""
     if any(isinstance(each, ChunkLane) for each in shown):
         bars = "Bars are actions, a colour a chunk; dashed boxes are stalls. Time counts from the first request."
         return {"panels": panels_of_chunks(shown), "bars": bars, "left_out": 0}
@@ -110,7 +112,6 @@ def _panels(shown: Sequence[Any]) -> dict[str, Any]:
 
 
 def _facts(facts: Any, prefix: str = "") -> list[tuple[str, str]]:
-    """Return nested facts as pairs of a dotted name and its value."""
     if isinstance(facts, dict):
         return [
             line for name, value in facts.items() for line in _facts(value, f"{prefix}.{name}" if prefix else str(name))
