@@ -183,7 +183,7 @@ def compare(
     from s2a_bench.report.compare import comparison
 
     opened = comparison.open_comparison(_opened(baseline), _opened(other), unlike=unlike, least=least)
-    wanted = comparison.metrics_of(opened, metrics) if metrics else comparison.shown_metrics(opened)
+    wanted = comparison.metrics_of(opened, metrics)
     return Comparison(comparison.compare(opened, wanted))
 
 

@@ -17,8 +17,7 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
     conditions = [gates.read_gate(text) for text in config.fail_if]
     sides = comparison.read_side(config.baseline, "A"), comparison.read_side(config.other, "B")
     compared = comparison.open_comparison(*sides, unlike=config.unlike, least=config.min_effect / 100)
-    names = config.metrics
-    wanted = comparison.metrics_of(compared, names) if names else comparison.shown_metrics(compared)
+    wanted = comparison.metrics_of(compared, config.metrics)
     compared = comparison.compare(compared, [*wanted, *gates.concerned(compared, conditions)])
     judgements = gates.judge(compared, conditions, strict=config.strict)
     found = comparison.warnings_of(compared)

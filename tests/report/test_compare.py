@@ -26,7 +26,6 @@ from s2a_bench.report.compare.comparison import (
     metrics_of,
     open_comparison,
     read_side,
-    shown_metrics,
     warnings_of,
 )
 from s2a_bench.report.compare.gates import Judgement, concerned, judge, read_gate
@@ -92,7 +91,7 @@ def opened(first: StoredRun, second: StoredRun, *, unlike: bool = False, least: 
 
 def compared(first: StoredRun, second: StoredRun, *names: str, **settings: Any) -> ComparedRuns:
     both = opened(first, second, **settings)
-    return compare(both, metrics_of(both, names) if names else shown_metrics(both))
+    return compare(both, metrics_of(both, names))
 
 
 def verdicts(found: ComparedRuns) -> list[str]:

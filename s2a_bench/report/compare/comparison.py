@@ -163,7 +163,12 @@ def _match(
 
 
 def metrics_of(compared: ComparedRuns, names: Sequence[str]) -> list[tuple[Metric, str]]:
-    """Return metric and statistic of each NAME or NAME.STATISTIC; ``all`` is every metric. Raises UsageError."""
+    """Return metric and statistic of each NAME or NAME.STATISTIC, or the default ones; ``all`` is every metric.
+
+    Raises UsageError for an unknown metric.
+    """
+    if not names:
+        return [(compared.metrics[name], compared.metrics[name].statistic) for name in compared.by.shown]
     wanted: dict[tuple[Metric, str], None] = {}
     for name in names:
         if name == "all":
@@ -171,11 +176,6 @@ def metrics_of(compared: ComparedRuns, names: Sequence[str]) -> list[tuple[Metri
         else:
             wanted[metric_of(compared, name, "`metric`")] = None
     return list(wanted)
-
-
-def shown_metrics(compared: ComparedRuns) -> list[tuple[Metric, str]]:
-    """Return the default metrics with their statistics."""
-    return [(compared.metrics[name], compared.metrics[name].statistic) for name in compared.by.shown]
 
 
 def metric_of(compared: ComparedRuns, name: str, flag: str) -> tuple[Metric, str]:
