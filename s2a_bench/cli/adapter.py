@@ -42,16 +42,12 @@ class Flag:
     about: str
     needed: bool = False
     argument: bool = False
-    """True for a positional argument."""
     hidden: bool = False
     prefix: str = ""
-    """Text of the group before the help."""
     panel: str = ""
-    """Its heading in the help."""
     first: bool = False
     """True if the help of a command with many flags shows it."""
     names: Callable[[], Iterable[str]] | None = None
-    """Lists the names that complete its value, or each of several with commas."""
 
     @property
     def spelled(self) -> str:

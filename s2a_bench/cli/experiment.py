@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 PLAIN: dict[str, Any] = {"rich_markup_mode": None, "pretty_exceptions_enable": False, "add_completion": False}
-"""Keywords of typer for every group of commands."""
 ParseError: Any = typer.BadParameter.__mro__[1]
 """Click's UsageError, which newer typer brings with it, so that it cannot be imported by name."""
 
@@ -34,7 +33,6 @@ class Commands(TyperGroup):
     """The commands of one group; those in ``lazy`` and its ``experiments`` are imported when they are looked up."""
 
     experiments: ClassVar[Collection[str]] = ()
-    """Names of experiments."""
     lazy: ClassVar[Mapping[str, tuple[str, str]]] = {}
     """Name of a command -> its function or group, as "module:attribute", and its help."""
 
@@ -91,7 +89,6 @@ class Flagged(TyperCommand):
     """A command with many flags: its help has them under headings, and only the `first` ones without --help-all."""
 
     rest: Collection[str] = ()
-    """The parameters that only `--help-all` shows."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """List the flags under their headings in the order of declaration, those without a heading last."""

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from s2a_bench.inference.fetch import Fetched
 
 SCHEMA = "s2a-bench-model/1"
-"""The schema of `--json`, ``docs/schema/s2a-bench-model-1.json``."""
 _TEMPLATE_CHARACTERS = 300
 _CONTROL_TOKENS = 24
 

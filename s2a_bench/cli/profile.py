@@ -20,7 +20,6 @@ from s2a_bench.writers.tables import TextTable
 
 app = typer.Typer(cls=Commands, help="Measure this machine as a hardware profile, and show profiles.", **PLAIN)
 SCHEMA = "s2a-bench-profile/1"
-"""The schema of `--json`, ``docs/schema/s2a-bench-profile-1.json``."""
 
 
 @app.command("list")

@@ -54,9 +54,7 @@ class Read:
     """The parsed arguments."""
 
     options: dict[str, Any] = field(default_factory=dict)
-    """Options of `serve ros`."""
     notes: list[str] = field(default_factory=list)
-    """A line for everything that was left out."""
 
 
 def read(text: str, known: Sequence[str], node: Mapping[str, str]) -> Read:

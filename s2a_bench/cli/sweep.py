@@ -144,14 +144,10 @@ def duration(seconds: float) -> str:
 
 
 ENTRY = f"{__name__}:run"
-"""`run`, as a worker imports it."""
 
 
 def command_of(name: str, key: str = "command", *, trusted: bool = False) -> SweepCommand:
-    """Describe a command; raises UsageError for one that cannot be swept.
-
-    Cells of a ``trusted`` file may run programs, and send keys and files to a URL.
-    """
+    """Describe a command; cells of a ``trusted`` file may run programs, and send keys and files to a URL."""
     known = sorted(EXPERIMENTS)
     if name not in known:
         raise UsageError(f"{key}: {none_of(name, known)}")

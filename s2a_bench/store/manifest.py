@@ -22,7 +22,6 @@ from s2a_bench.store.schema import SCHEMA
 
 NAME = "manifest.json"
 SWEEP: Final = "sweep"
-"""The command of a sweep."""
 MAX_BYTES: Final = 64 * 2**20
 """Limit on a manifest; that of a sweep of 100,000 cells is far smaller."""
 

@@ -165,16 +165,13 @@ SKILLS: Final[Table[SkillRow]] = Table(
 
 
 def samples_table(stages: Mapping[str, str]) -> Table[SampleRow]:
-    """Return the table with one row a request, and a column for each of a run's stages."""
+    """Return the table of requests, with a column for each of a run's stages."""
     derived = {name: kind for name, (kind, _) in _OF_SAMPLE.items()}
     return Table("samples", SampleRow, _columns(stages) | derived, _derive_sample)
 
 
 def frames_table(stages: Mapping[str, str]) -> Table[FrameRow]:
-    """Return the table with one row a frame in stream mode, and a column for each of a run's stages.
-
-    `latency_ns` counts from the intended time (no coordinated omission).
-    """
+    """Return the table of frames in stream mode; `latency_ns` has no coordinated omission."""
     derived: dict[str, Kind] = {"path_ns": "int64", "latency_ns": "int64", "residual_ns": "int64"}
     return Table("frames", FrameRow, _columns(stages) | derived, _derive_frame)
 

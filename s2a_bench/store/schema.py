@@ -20,7 +20,6 @@ SCHEMA: Final = "s2a-bench/1"
 """The version of folder, columns and ``--json``; it changes if a column changes its meaning or is removed."""
 
 Kind: TypeAlias = Literal["string", "int64", "float64", "bool"]
-"""The type of a column, by its Arrow name."""
 
 Value: TypeAlias = str | int | float | bool | None
 

@@ -31,7 +31,6 @@ class SweepCommand:
 
     name: str
     flags: Mapping[str, Flag]
-    """By name, without dashes."""
     check: Callable[[Sequence[str]], bool]
     """Parses arguments without running them; raises UsageError. Returns True for a virtual cell: it is computed, so
     that many may run at once, anywhere. Returns False for one that measures."""
@@ -45,7 +44,6 @@ class SweepCell:
     repeat: int
     settings: dict[str, Any]
     argv: tuple[str, ...]
-    """The command and its flags, without the output folder."""
     virtual: bool
     board: str
     """The machine that it needs, empty for any."""
@@ -72,14 +70,12 @@ class Outcome:
     wall_s: float
     started: str
     machine: dict[str, Any]
-    """The environment in its manifest."""
 
 
 class CellWorkers(AbstractContextManager["CellWorkers"], Protocol):
     """Runs cells, as a context manager; leaving it early ends the running ones."""
 
     width: int
-    """Virtual cells at once."""
 
     def submit(self, cell: SweepCell, folder: Path) -> Future[Any]:
         """Start or queue a cell; ``folder`` must not exist yet."""
@@ -95,7 +91,6 @@ WORKERS: dict[str, str] = {
     "ray": "s2a_bench.sweep.on_ray:RayWorkers",
 }
 COPY: Final = "sweep.toml"
-"""The copy of the sweep file in the sweep's folder."""
 
 
 class SweepConfig(Options):

@@ -77,7 +77,6 @@ class SweepFile:
     """Pause between measured cells, in which the board cools down."""
     seed: int
     settings: tuple[Setting, ...]
-    """Fixed settings and one point of the axes, for each cell."""
 
 
 def sweep_files() -> dict[str, Path]:

@@ -26,8 +26,7 @@ from s2a_bench.sweep.perform import perform
 from s2a_bench.sweep.plan import SweepPlan
 
 LOCAL: Final = "local"
-TRIES: Final = 5
-"""Retries of a cell whose node or process was lost."""
+RETRIES: Final = 5
 AHEAD: Final = 2
 """Virtual cells submitted for each core: one runs, one waits."""
 PROBE_S: Final = 5.0
@@ -52,7 +51,7 @@ class RayWorkers(CellWorkers):
             ray.shutdown()
             raise
         self.width = max(AHEAD * int(resources.get("CPU", 1)), 1)
-        self._remote = ray.remote(max_retries=TRIES)(packed)
+        self._remote = ray.remote(max_retries=RETRIES)(packed)
 
     def submit(self, cell: SweepCell, folder: Path) -> Future[Packed]:  # noqa: ARG002 - `collect` unpacks into it
         wants = {} if cell.virtual else {"resources": {resource(cell.board): 1}}

@@ -13,7 +13,7 @@ from functools import partial
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, Final
+from typing import Any
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError, StoreError, how_it_ended
@@ -24,18 +24,13 @@ from s2a_bench.store.manifest import utc_now
 from s2a_bench.sweep import CellWorkers, Outcome, SweepCell
 from s2a_bench.sweep.plan import SweepPlan
 
-LOG: Final = "stderr.txt"
-
 
 def perform(cell: SweepCell, folder: Path, entry: str) -> Outcome:
-    """Run a cell's command with ``--output`` at a new folder; ``entry`` is "module:function" of the command line.
-
-    Every exception of the cell is the outcome's error.
-    """
+    """Run a cell with ``--output`` at a new folder; ``entry`` is the command line as "module:function"."""
     folder.mkdir(parents=True)
     argv = [*cell.argv, f"--output={folder}"]
     started, before_ns = utc_now(), now_ns()
-    error = _inside(argv, entry) if cell.virtual else _outside(argv, folder / LOG)
+    error = _inside(argv, entry) if cell.virtual else _outside(argv, folder / "stderr.txt")
     wall_s = (now_ns() - before_ns) / 1e9
     path = run_folder(folder)
     if path is None and not error:

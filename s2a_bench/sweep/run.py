@@ -201,9 +201,7 @@ class SweepRun:
 
 
 KIND = ("s2a_bench", "machine", "board", "cpu", "cores", "gpus", "power_mode")
-"""Facts of the environment that two boards of one kind share."""
 IDENTITY = ("host", *KIND)
-"""Facts that identify one machine."""
 
 
 def facts_of(environment: dict[str, Any], names: tuple[str, ...] = IDENTITY) -> dict[str, Any]:

@@ -186,10 +186,7 @@ def marked(build: Callable[[], Figure], *runs: StoredRun) -> Figure:
 
 
 def save(folder: Path, builders: Mapping[str, Callable[[], Figure]]) -> list[Path]:
-    """Build and write each figure as ``<name>.png`` and ``<name>.pdf``, and the captions as ``captions.md``.
-
-    Raises StoreError if it cannot be written, ValueError for a figure without the origin of its numbers.
-    """
+    """Write each figure as .png and .pdf, and ``captions.md``; raises StoreError, ValueError for one not `marked`."""
     written, captions = [], []
     try:
         folder.mkdir(exist_ok=True)

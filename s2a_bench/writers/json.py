@@ -56,10 +56,7 @@ def frame(
 def cell_of_row(
     name: str, about: str, row: type, *, without: Sequence[str], own: Mapping[str, Any] | None = None
 ) -> type:
-    """Return the class of a cell with the fields of a row, ``without`` some, and with ``own`` ones.
-
-    A field that may be None is an absent key.
-    """
+    """Return the class of a cell: a row's fields, absent if None, ``without`` some, and with ``own`` ones."""
     hints = {key: hint for key, hint in get_type_hints(row, include_extras=True).items() if key not in without}
     made: type = with_fields(name, about, object, hints, own)
     return made

@@ -13,7 +13,6 @@ WIDTH_IN: Final = 3.5
 """One column of a two-column paper."""
 
 WIDE_IN: Final = 7.16
-"""Both columns."""
 
 STALL_STYLE: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}
 

@@ -66,11 +66,9 @@ class Machine:
     environ: Mapping[str, str] = field(default_factory=lambda: os.environ)
     cpus: frozenset[int] = field(default_factory=lambda: frozenset(os.sched_getaffinity(0)))
     output: Path = Path("results")
-    """The folder for run folders."""
     run: Callable[[Sequence[str]], str | None] = _run
     which: Callable[[str], str | None] = shutil.which
     finds: Callable[[str], bool] = extras.installed
-    """Returns True if this Python has a package."""
     cameras: Callable[[], list[CameraInfo]] = _cameras
 
     def read(self, path: str) -> str | None:

@@ -76,7 +76,6 @@ class Reader(Protocol):
     """Reads one source. Built as ``Class(pids)`` with the servers' process ids; raises Unreadable."""
 
     about: str
-    """Name of the device or program, for the manifest."""
     cheap: bool
     """True if a reading takes microseconds, so that it is taken before and after every request."""
 

@@ -17,10 +17,7 @@ PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
 def cpu_clock(pid: int) -> int:
-    """Return the CPU-time clock of a process with all its threads, as clock_getcpuclockid(3) does.
-
-    clock_gettime reads it in nanoseconds, whereas /proc has ticks of 10 ms.
-    """
+    """Return the CPU-time clock of a process (clock_getcpuclockid(3)); /proc has ticks of 10 ms only."""
     return (~pid << 3) | 2
 
 
@@ -121,10 +118,7 @@ class Zone:
 
 
 class Rapl:
-    """The packages' energy in joules, cores and memory controller included.
-
-    The source is RAPL in the kernel's powercap interface (Intel, and AMD since Zen).
-    """
+    """The packages' energy from RAPL in the kernel's powercap interface (Intel, and AMD since Zen)."""
 
     cheap = True
 

@@ -26,10 +26,7 @@ UNDECIDED: Final = "undecided or not testable"
 
 @dataclass(frozen=True, slots=True)
 class RunPart:
-    """The cells of a run that are judged together, and their facts by the names of needs.
-
-    ``about`` follows the evidence.
-    """
+    """Cells of a run that are judged together, and their facts by the names of needs; ``about`` ends the evidence."""
 
     run: StoredRun
     facts: Mapping[str, Any]

@@ -60,10 +60,7 @@ class CellComparison:
 
 @dataclass(frozen=True, slots=True)
 class ComparedRuns:
-    """Two sides: what their command declares, the pairs of cells, and the comparisons.
-
-    ``only`` has the cells without a partner, of either side.
-    """
+    """Two sides, their pairs of cells, and the comparisons; ``only`` has the cells of each side without a partner."""
 
     baseline: tuple[StoredRun, ...]
     other: tuple[StoredRun, ...]
@@ -163,10 +160,7 @@ def _match(
 
 
 def metrics_of(compared: ComparedRuns, names: Sequence[str]) -> list[tuple[Metric, str]]:
-    """Return metric and statistic of each NAME or NAME.STATISTIC, or the default ones; ``all`` is every metric.
-
-    Raises UsageError for an unknown metric.
-    """
+    """Return metric and statistic of each NAME or NAME.STATISTIC or ``all``, or the default ones; raises UsageError."""
     if not names:
         return [(compared.metrics[name], compared.metrics[name].statistic) for name in compared.by.shown]
     wanted: dict[tuple[Metric, str], None] = {}

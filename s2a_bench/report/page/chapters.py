@@ -22,10 +22,7 @@ MOST_CHAPTERS = 12
 
 @dataclass(frozen=True, slots=True)
 class Chapter:
-    """One run on the page, or several of a sweep as one.
-
-    ``name`` is the folder of its files, ``command`` its command line, ``attached`` the texts of files by name.
-    """
+    """One run on the page, or several of a sweep; ``name`` is a folder, ``attached`` has texts by file name."""
 
     name: str
     title: str
