@@ -231,7 +231,7 @@ class Expected:
 
 def earlier(output: Path, command: str) -> list[Sweep]:
     """Return the sweeps of a command on this machine below a folder, the newest first."""
-    here = facts_of(environment.collect())
+    machine = facts_of(environment.collect())
     found = []
     for folder in sorted(output.glob("*-sweep-*"), reverse=True):
         try:
@@ -239,7 +239,7 @@ def earlier(output: Path, command: str) -> list[Sweep]:
         except StoreError:
             continue
         swept = sweep.manifest["configuration"].get("command")
-        if swept == command and not difference(here, facts_of(sweep.manifest["environment"])):
+        if swept == command and not difference(machine, facts_of(sweep.manifest["environment"])):
             found.append(sweep)
     return found
 

@@ -100,9 +100,9 @@ def to_siunitx(table: TextTable, widths: Sequence[str] = (), *, long: bool = Fal
     return "\n".join(lines) + "\n"
 
 
-def document(title: str, parts: Sequence[str]) -> str:
-    """Return a document that compiles, with parts of LaTeX, each on a new page."""
-    body = "\n\\clearpage\n".join(parts)
+def document(title: str, sections: Sequence[str]) -> str:
+    """Return a document that compiles, with sections, each on a new page."""
+    body = "\n\\clearpage\n".join(sections)
     head = f"{PREAMBLE}\\title{{{escape(title)}}}\n\\date{{}}\n"
     return f"{head}\\begin{{document}}\n\\maketitle\n{body}\n\\end{{document}}\n"
 

@@ -42,12 +42,10 @@ class Nvml:
         except MissingExtra as error:
             raise Unreadable(str(error)) from error
         self._failed = pynvml.NVMLError
+        self._open = False
         try:
             pynvml.nvmlInit()
-        except self._failed as error:
-            raise Unreadable(f"NVML: {error}") from error
-        self._open = True
-        try:
+            self._open = True
             self._gpus = [pynvml.nvmlDeviceGetHandleByIndex(place) for place in range(pynvml.nvmlDeviceGetCount())]
             names = [pynvml.nvmlDeviceGetName(gpu) for gpu in self._gpus]
             driver = pynvml.nvmlSystemGetDriverVersion()

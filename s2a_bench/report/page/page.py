@@ -31,8 +31,9 @@ def render(
     """Return the page; ``figures`` are by the name of the chapter. Every text of a run is escaped."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
+    loader = PackageLoader("s2a_bench.report.page", "templates")
     world = Environment(
-        loader=PackageLoader("s2a_bench.report.page", "templates"),
+        loader=loader,
         autoescape=True,
         finalize=lambda value: visible(value) if type(value) is str else value,
         undefined=StrictUndefined,
@@ -42,15 +43,13 @@ def render(
     world.filters["parts"] = re.compile(r" (?=[(\[])").split  # a number, and its spread or interval
     world.filters["short"] = lambda value: f"{value:.6g}"
     world.globals.update(most_panels=MOST_PANELS)
-    source = world.loader
-    assert source is not None  # noqa: S101 - it was just given
     shown = [_view(chapter, figures.get(chapter.name, {})) for chapter in chapters]
     return world.get_template("page.html").render(
         generator=GENERATOR,
         version=__version__,
         made=utc_now().replace("T", " ").replace("+00:00", " UTC"),
-        style=source.get_source(world, "page.css")[0],
-        script=source.get_source(world, "page.js")[0],
+        style=loader.get_source(world, "page.css")[0],
+        script=loader.get_source(world, "page.js")[0],
         title=title_of_page(chapters),
         chapters=shown,
         judged=judged,
