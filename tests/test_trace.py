@@ -129,7 +129,7 @@ REMOTE = Remote("clock", [("network", 2**62 - 1)], [0], -1, [("queue", 0)], {}, 
 
 
 @pytest.mark.parametrize(
-    ("wrong", "said"),
+    ("wrong", "message"),
     [
         ({"clock": 5}, "stages are no text"),
         ({"marks": [(5, 1)]}, "stages are no text"),
@@ -143,9 +143,9 @@ REMOTE = Remote("clock", [("network", 2**62 - 1)], [0], -1, [("queue", 0)], {}, 
         ({"provenance": "llama"}, "a provenance without names"),
     ],
 )
-def test_what_can_be_no_server_s_marks_is_refused(wrong: dict[str, Any], said: str) -> None:
+def test_what_can_be_no_server_s_marks_is_refused(wrong: dict[str, Any], message: str) -> None:
     assert REMOTE.check() is REMOTE
-    with pytest.raises(ValueError, match=said):
+    with pytest.raises(ValueError, match=message):
         replace(REMOTE, **wrong).check()
 
 

@@ -1,4 +1,4 @@
-"""What answers are made of, and what a request brings: said once, the same for all cells of a run."""
+"""The kind of answers and the observation of a request, the same for all cells of a run."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from s2a_bench.types import Action, Request
 def actions_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let HTTP carry nothing but actions, as policy servers' wires do."""
     able = type(HTTP).capabilities
-    monkeypatch.setattr(type(HTTP), "capabilities", lambda *told: replace(able(*told), answer_kinds=(ACTIONS,)))
+    monkeypatch.setattr(type(HTTP), "capabilities", lambda *choice: replace(able(*choice), answer_kinds=(ACTIONS,)))
 
 
 def config(transports: str = "http,loopback", **more: Any) -> LatencyConfig:
@@ -58,9 +58,9 @@ def test_one_that_carries_nothing_else_decides_for_all() -> None:
 def test_an_engine_of_tokens_is_refused_in_one_line() -> None:
     with pytest.raises(UsageError, match=r"^`engine` llama answers with tokens, and http/as-deployed carries actions"):
         config(engine="llama")
-    said: list[str] = []
-    assert config().answered(said.append).engine.name == "echo"
-    assert said == ["the echo engine answers with actions; a model's are those of its own server, see `url`"]
+    lines: list[str] = []
+    assert config().answered(lines.append).engine.name == "echo"
+    assert lines == ["the echo engine answers with actions; a model's are those of its own server, see `url`"]
 
 
 @pytest.mark.usefixtures("actions_alone")
@@ -131,9 +131,9 @@ def test_what_is_no_state_is_refused(values: Any) -> None:
 
 
 def test_a_request_brings_several_pictures_scaled_and_the_state() -> None:
-    asked = config("http,ros/topic", engine="echo", cameras=3, resize="224", state=14)
-    assert asked.resize == (224, 224)
-    assert asked.to_manifest()["observation"] == "3 x 640x480 as 224x224, state of 14"
+    observed = config("http,ros/topic", engine="echo", cameras=3, resize="224", state=14)
+    assert observed.resize == (224, 224)
+    assert observed.to_manifest()["observation"] == "3 x 640x480 as 224x224, state of 14"
     assert config(engine="echo", resize="320x240").resize == (320, 240)
 
 

@@ -1,4 +1,4 @@
-"""What a run of requests is asked to do."""
+"""The options of a run of requests."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def llama_server_alone(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "there"),
+    ("options", "there"),
     [
         ({}, True),
         ({"payload": "jpeg"}, True),
@@ -50,10 +50,10 @@ def llama_server_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_llama_cpps_own_server_is_a_cell_where_it_has_the_same_to_do(
-    asked: dict[str, Any], there: bool, monkeypatch: pytest.MonkeyPatch
+    options: dict[str, Any], there: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(http, "found_llama_server", lambda: http.WHEEL)
-    config = RequestsConfig(**asked)
+    config = RequestsConfig(**options)
     assert ("http/llama-server" in names(config)) is there
     for cell in config.pipelines:
         program = cell.options.program
@@ -67,7 +67,7 @@ def test_a_named_llama_server_adds_its_cell() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("options", "message"),
     [
         ({}, "there is none on PATH"),
         ({"engine": EngineConfig(name="echo"), "options": {"http": {"llama_server": PROGRAM}}}, "runs a model"),
@@ -78,25 +78,25 @@ def test_a_named_llama_server_adds_its_cell() -> None:
         ({"options": {"http": {"url": "http://x"}}}, "leave it out with `url`"),
     ],
 )
-def test_asked_for_by_name_it_is_an_error_where_it_cannot_be(asked: dict[str, Any], message: str) -> None:
+def test_named_it_is_an_error_where_it_cannot_be(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        RequestsConfig(transports=("http/llama-server",), **asked)
+        RequestsConfig(transports=("http/llama-server",), **options)
 
 
 @pytest.mark.usefixtures("llama_server_alone")
 def test_without_our_own_engine_its_cell_and_servers_that_run_already_are_measured_alone() -> None:
-    said: list[str] = []
-    assert names(RequestsConfig().answered(said.append)) == ["http/llama-server"]
-    assert said == ["only http/llama-server: our own servers have no engine here; " + extras.how_to_install("llama")]
+    lines: list[str] = []
+    assert names(RequestsConfig().answered(lines.append)) == ["http/llama-server"]
+    assert lines == ["only http/llama-server: our own servers have no engine here; " + extras.how_to_install("llama")]
     running = RequestsConfig(options={"ros": {"action": "/llama/generate_response"}})
-    assert names(running.answered(said.append)) == ["http/llama-server", "ros/action"]
-    config = RequestsConfig(engine={"model": Path("m.gguf")}).answered(said.append)
+    assert names(running.answered(lines.append)) == ["http/llama-server", "ros/action"]
+    config = RequestsConfig(engine={"model": Path("m.gguf")}).answered(lines.append)
     assert (names(config), config.engine.model) == (["http/llama-server"], Path("m.gguf"))
 
 
 @pytest.mark.usefixtures("llama_server_alone")
 @pytest.mark.parametrize(
-    "asked",
+    "options",
     [
         {"transports": ("http", "ros/topic", "ros/action")},
         {"transports": ("http", "ros")},
@@ -106,10 +106,10 @@ def test_without_our_own_engine_its_cell_and_servers_that_run_already_are_measur
     ],
 )
 def test_without_our_own_engine_what_is_named_is_refused_rather_than_left_out(
-    asked: dict[str, Any],
+    options: dict[str, Any],
 ) -> None:
     with pytest.raises(UsageError, match=r"no engine here.*`engine` echo.*\[llama\]"):
-        RequestsConfig(**asked).answered(pytest.fail)
+        RequestsConfig(**options).answered(pytest.fail)
 
 
 def test_of_two_urls_both_are_asked_or_refused() -> None:
@@ -141,15 +141,15 @@ def test_a_model_is_never_answered_for_by_another_engine(
 
 
 @pytest.mark.parametrize(
-    ("asked", "wanted"),
+    ("options", "wanted"),
     [
         ({"transports": "http/best-effort"}, "http/llama-server"),
         ({"transports": "ros"}, "http"),
     ],
 )
-def test_a_llama_server_that_no_cell_runs_is_refused(asked: dict[str, Any], wanted: str) -> None:
+def test_a_llama_server_that_no_cell_runs_is_refused(options: dict[str, Any], wanted: str) -> None:
     with pytest.raises(UsageError, match=f"`llama_server` needs {wanted} among `transport`"):
-        RequestsConfig(options={"http": {"llama_server": "x"}}, **asked)
+        RequestsConfig(options={"http": {"llama_server": "x"}}, **options)
 
 
 def test_all_http_variants_and_ros_are_shown_unless_told() -> None:
@@ -169,7 +169,7 @@ HTTP_AND_ROS = ["http/binary", "http/binary?payload=jpeg", "ros/topic", "ros/top
 
 
 @pytest.mark.parametrize(
-    ("asked", "cells"),
+    ("options", "cells"),
     [
         ({}, [*HTTP_AND_ROS, "loopback"]),
         ({"quick": True}, ["http/binary", "ros/topic", "loopback"]),
@@ -181,8 +181,8 @@ HTTP_AND_ROS = ["http/binary", "http/binary?payload=jpeg", "ros/topic", "ros/top
         ({"transports": "http/as-deployed,ros", "url": "http://x"}, ["http/as-deployed", *HTTP_AND_ROS[2:]]),
     ],
 )
-def test_a_latency_run_sends_the_same_payloads_over_every_transport(asked: dict[str, Any], cells: list[str]) -> None:
-    config = LatencyConfig(**{"transports": ("http/binary", "ros", "loopback"), "engine": {"name": "echo"}, **asked})
+def test_a_latency_run_sends_the_same_payloads_over_every_transport(options: dict[str, Any], cells: list[str]) -> None:
+    config = LatencyConfig(**{"transports": ("http/binary", "ros", "loopback"), "engine": {"name": "echo"}, **options})
     assert names(config) == cells
 
 

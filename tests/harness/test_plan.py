@@ -77,9 +77,9 @@ def test_the_facts_are_those_that_transport_dialect_engine_and_harness_may_tell(
     }
     assert over_ros["payload_bytes"] == {"unit": "bytes", "about": "what the payload weighs on the wire"}
     ollama = {"http": {"url": "http://x", "dialect": "ollama"}}
-    asked = facts(transports=("http",), options=ollama, sample_resources_hz=0)
-    assert {"reconnects", "load_ms"} < asked.keys()
-    assert "prompt_eval_ms" not in asked
+    names = facts(transports=("http",), options=ollama, sample_resources_hz=0)
+    assert {"reconnects", "load_ms"} < names.keys()
+    assert "prompt_eval_ms" not in names
     llama = facts(transports=("http", "loopback"), engine=EngineConfig(name="llama"))
     assert {"prompt_eval_ms", "energy_j"} < llama.keys()
     assert "load_ms" not in llama

@@ -1,4 +1,4 @@
-"""How a process that died is told: a server, and a cell of a sweep."""
+"""The error of a process that died: a server, and a cell of a sweep."""
 
 from __future__ import annotations
 

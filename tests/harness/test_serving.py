@@ -1,4 +1,4 @@
-"""The handler around an engine, and what a server process is told."""
+"""The handler around an engine, and the job of a server process."""
 
 from __future__ import annotations
 

@@ -18,16 +18,18 @@ from tests.servers.sockets import head, serving
 from tests.servers.speakers import Cloud
 
 
-@pytest.mark.parametrize(("asked_s", "waited_s"), [(0.0, 0), (1.5, 1.5), (60.0, 60), (3600.0, 60)])
-def test_the_wait_is_what_was_asked_up_to_a_minute(asked_s: float, waited_s: float) -> None:
-    clock, said = VirtualClock(5), []
-    back_off("http/as-deployed", asked_s, clock, said.append)
+@pytest.mark.parametrize(("retry_after_s", "waited_s"), [(0.0, 0), (1.5, 1.5), (60.0, 60), (3600.0, 60)])
+def test_the_wait_is_what_was_asked_up_to_a_minute(retry_after_s: float, waited_s: float) -> None:
+    clock, lines = VirtualClock(5), []
+    back_off("http/as-deployed", retry_after_s, clock, lines.append)
     assert clock.now_ns() - 5 == waited_s * 1e9
-    assert said == ([f"waiting {waited_s:g} s, as the server of http/as-deployed asks"] if asked_s else [])
+    assert lines == ([f"waiting {waited_s:g} s, as the server of http/as-deployed asks"] if retry_after_s else [])
 
 
-@pytest.mark.parametrize(("more", "asked_s"), [(["Retry-After: 7"], 7.0), ([], 0.0)])
-def test_a_refused_sample_is_one_row_with_its_error_and_is_not_sent_again(more: list[str], asked_s: float) -> None:
+@pytest.mark.parametrize(("more", "retry_after_s"), [(["Retry-After: 7"], 7.0), ([], 0.0)])
+def test_a_refused_sample_is_one_row_with_its_error_and_is_not_sent_again(
+    more: list[str], retry_after_s: float
+) -> None:
     requests = []
 
     def busy(received: object) -> list[bytes]:
@@ -42,7 +44,7 @@ def test_a_refused_sample_is_one_row_with_its_error_and_is_not_sent_again(more: 
         measured = session.measure(Place(0, 0, warmup=False))
         client.close()
         source.close()
-    assert measured.retry_after_s == asked_s
+    assert measured.retry_after_s == retry_after_s
     assert "answered 429: slow down" in measured.sample.error
     assert (measured.fatal, measured.tokens, len(requests)) == (None, [], 1)
 

@@ -55,8 +55,8 @@ def test_the_tiny_model_says_only_what_a_server_sends(tmp_path: Path) -> None:
     header = gguf.GGUFReader(write_dummy(tmp_path).model)
     (bias,) = (tensor.data for tensor in header.tensors if tensor.name == "output.bias")
     names = header.fields["tokenizer.ggml.tokens"].contents()
-    said = {name for name, value in zip(names, bias, strict=True) if value == 0}
-    assert said == {*map(chr, range(33, 127)), "\u0120", "\u010a", "\u0120t"}
+    texts = {name for name, value in zip(names, bias, strict=True) if value == 0}
+    assert texts == {*map(chr, range(33, 127)), "\u0120", "\u010a", "\u0120t"}
     assert max(bias[bias != 0]) < -1000
 
 

@@ -106,7 +106,7 @@ def test_an_echo_that_answers_at_once_tells_and_emulates_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("options", "message"),
     [
         ({"name": "llama", "latency": "80"}, "`latency` needs `engine` echo; `engine` llama answers at its own speed"),
         ({"name": "replay", "latency": "80"}, "`latency` needs `engine` echo"),
@@ -117,9 +117,9 @@ def test_an_echo_that_answers_at_once_tells_and_emulates_nothing() -> None:
         ({"name": "echo", "latency": "none.csv"}, "`latency`: cannot read none.csv"),
     ],
 )
-def test_a_latency_that_makes_no_sense_is_one_line(asked: dict[str, Any], message: str) -> None:
+def test_a_latency_that_makes_no_sense_is_one_line(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError) as error:
-        check_engine(EngineConfig(**asked))
+        check_engine(EngineConfig(**options))
     assert message in str(error.value)
 
 

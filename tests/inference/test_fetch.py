@@ -35,7 +35,7 @@ SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-model-1.
 
 @dataclass
 class Hub:
-    """What the hub holds, how it misbehaves, and what it was asked."""
+    """What the hub holds, how it misbehaves, and the requests that it received."""
 
     files: dict[str, bytes]
     sha256: dict[str, str] = field(default_factory=dict)
@@ -49,13 +49,13 @@ class Hub:
     ranges: bool = True
     listing: bytes | None = None
     port: int = 0
-    asked: list[tuple[str, str, str | None, str | None]] = field(default_factory=list)
+    requests: list[tuple[str, str, str | None, str | None]] = field(default_factory=list)
     """(method, path, Range, Authorization) of each request."""
 
     def gets(self, name: str) -> list[str | None]:
         """Return the ranges of the downloads of one file."""
         digest = hashlib.sha256(self.files[name]).hexdigest()
-        return [range_ for method, path, range_, _ in self.asked if method == "GET" and path == f"/store/{digest}"]
+        return [range_ for method, path, range_, _ in self.requests if method == "GET" and path == f"/store/{digest}"]
 
     def digest(self, name: str) -> str:
         return self.sha256.get(name, hashlib.sha256(self.files[name]).hexdigest())
@@ -73,7 +73,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         hub, path = self.hub, self.path.split("?", 1)[0]
-        hub.asked.append((self.command, path, self.headers["Range"], self.headers["Authorization"]))
+        hub.requests.append((self.command, path, self.headers["Range"], self.headers["Authorization"]))
         if path.startswith("/store/"):
             return self.content(path.removeprefix("/store/"))
         refuse = hub.refuse or (hub.refuse_files if "/resolve/" in path else None)
@@ -182,7 +182,7 @@ def test_both_files_arrive_whole_in_the_hubs_own_cache_and_are_not_fetched_twice
 
 def test_the_token_goes_to_the_hub_and_not_to_where_it_leads(hub: Hub) -> None:
     fetch(wanted(NAME, None, None))
-    sent = {(path.startswith("/store/"), authorization) for _, path, _, authorization in hub.asked}
+    sent = {(path.startswith("/store/"), authorization) for _, path, _, authorization in hub.requests}
     assert sent == {(False, f"Bearer {TOKEN}"), (True, None)}
 
 
@@ -286,9 +286,9 @@ def test_the_case_of_a_quantisation_does_not_matter(hub: Hub) -> None:
 )
 def test_a_refusal_by_the_hub_is_one_line(hub: Hub, status: int, headers: dict[str, str], message: str) -> None:
     hub.refuse = (status, headers)
-    said = refusal()
-    assert said.startswith(f"{REPOSITORY}: ")
-    assert message in said
+    shown = refusal()
+    assert shown.startswith(f"{REPOSITORY}: ")
+    assert message in shown
 
 
 def test_files_can_be_gated_where_the_listing_is_not(hub: Hub, tmp_path: Path) -> None:
@@ -315,7 +315,7 @@ def test_a_checksum_cannot_lead_out_of_the_cache(hub: Hub, tmp_path: Path) -> No
 
 
 def test_no_network_names_the_ways_out(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert hub.asked == []
+    assert hub.requests == []
     point_at(monkeypatch, "http://127.0.0.1:1")
     message = refusal()
     assert message.startswith(f"{REPOSITORY}: cannot be fetched from http://127.0.0.1:1 (ConnectError")
@@ -325,7 +325,7 @@ def test_no_network_names_the_ways_out(hub: Hub, monkeypatch: pytest.MonkeyPatch
 
 @pytest.mark.parametrize("endpoint", ["nonsense", "ftp://x", "http://[", ""])
 def test_an_endpoint_that_is_none_is_one_line(hub: Hub, monkeypatch: pytest.MonkeyPatch, endpoint: str) -> None:
-    assert hub.asked == []
+    assert hub.requests == []
     point_at(monkeypatch, endpoint)
     assert "HF_ENDPOINT" in refusal()
 
@@ -337,7 +337,7 @@ def test_offline_by_choice_says_so(hub: Hub, monkeypatch: pytest.MonkeyPatch) ->
         assert "HF_HUB_OFFLINE is set" in refusal()
     finally:
         huggingface_hub.close_session()
-    assert hub.asked == []
+    assert hub.requests == []
 
 
 def test_a_disk_without_room_is_refused_before_the_first_byte(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -178,7 +178,7 @@ def test_no_alignment_is_a_damaged_header(tmp_path: Path) -> None:
         read_header(path, FLAG)
 
 
-def told(path: Path) -> str:
+def error_of(path: Path) -> str:
     error = CliRunner().invoke(app, ["info", str(path)]).exception
     assert isinstance(error, ModelError)
     (line,) = str(error).splitlines()
@@ -188,7 +188,7 @@ def told(path: Path) -> str:
 def test_a_token_that_is_no_text_is_one_line(tmp_path: Path) -> None:
     path = written(tmp_path / "m.gguf", lambda writer: writer.add_token_list(["a", "bcdefgh"]))
     path.write_bytes(path.read_bytes().replace(b"bcdefgh", b"bcd\xff\xfegh"))
-    assert told(path) == f"model info {path}: the GGUF header is damaged or cut short; fetch the file again"
+    assert error_of(path) == f"model info {path}: the GGUF header is damaged or cut short; fetch the file again"
 
 
 @pytest.mark.parametrize("at", [8, 16])
@@ -198,11 +198,11 @@ def test_a_count_without_sense_is_told_at_once(tmp_path: Path, at: int) -> None:
     with path.open("r+b") as file:
         file.seek(at)
         file.write(struct.pack("<Q", 2**40))
-    assert "the GGUF header is damaged" in told(path)
+    assert "the GGUF header is damaged" in error_of(path)
 
 
 def test_what_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")
-    assert "not a GGUF file" in told(tmp_path / "fifo")
+    assert "not a GGUF file" in error_of(tmp_path / "fifo")
     (tmp_path / "empty").touch()
-    assert "it is empty" in told(tmp_path / "empty")
+    assert "it is empty" in error_of(tmp_path / "empty")

@@ -80,10 +80,12 @@ def test_the_grammar_is_obeyed_and_ends_the_answer(shared: LlamaCppEngine) -> No
 def test_a_grammar_that_allows_what_the_model_says_costs_no_second_look(
     shared: LlamaCppEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seed, said = next((seed, said) for seed in range(99) if (said := text(shared, seed=seed, max_tokens=1)).isalnum())
+    seed, first = next(
+        (seed, first) for seed in range(99) if (first := text(shared, seed=seed, max_tokens=1)).isalnum()
+    )
     looks: list[int] = []
     monkeypatch.setattr(GrammarSampler, "_among_allowed", lambda *_: looks.append(1) or 0)
-    assert text(shared, seed=seed, max_tokens=1, grammar=f'root ::= "{said}"') == said
+    assert text(shared, seed=seed, max_tokens=1, grammar=f'root ::= "{first}"') == first
     assert looks == []
     ask(shared, seed=seed, max_tokens=1, grammar='root ::= "!" | "?"')
     assert looks == [1]
@@ -152,10 +154,10 @@ def test_timing_a_picture_step_by_step_changes_no_token(
     shared: LlamaCppEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pictures = (rgb_frame(5, 640, 480), rgb_frame(6))
-    said = ask(shared, images=pictures, max_tokens=24)
+    answer = ask(shared, images=pictures, max_tokens=24)
     monkeypatch.setattr(Steps, "mtmd_helper_eval_chunk_single", lambda _, *rest: single(*rest))
     single = mtmd_cpp.mtmd_helper_eval_chunk_single
-    assert ask(shared, images=pictures, max_tokens=24) == said
+    assert ask(shared, images=pictures, max_tokens=24) == answer
 
 
 def test_the_bitmap_holds_exactly_the_pixels(shared: LlamaCppEngine) -> None:

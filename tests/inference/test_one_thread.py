@@ -1,4 +1,4 @@
-"""An engine on one thread behaves as the engine itself, from whichever thread it is asked."""
+"""An engine on one thread behaves as the engine itself, from any thread."""
 
 from __future__ import annotations
 
