@@ -44,7 +44,7 @@ def test_lines_are_what_made_the_times(runs: list[StoredRun]) -> None:
     for name, each in found.items():
         assert each.line is not None
         assert (each.line.fixed.value, each.line.slope.value) == pytest.approx((FIXED[name], A_MB[name]), rel=1e-3)
-        assert (each.payload, each.travels) == ("raw", 2.0)
+        assert (each.payload, each.wire_share) == ("raw", 2.0)
     ((below, above, met),) = crossings([found["http/binary"], found["ros/topic"]])
     assert (below.name, above.name) == ("ros/topic", "http/binary")
     assert met.value == pytest.approx(0.8 / 0.6, rel=1e-2)

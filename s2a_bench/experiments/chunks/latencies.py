@@ -68,7 +68,12 @@ def sources(written: str, tokens: int) -> Iterator[Source]:
     elif Path(folder := written.partition("#")[0]).is_dir():
         yield from measured(Path(folder), written.partition("#")[2])
     else:
-        yield _of_profile(written, tokens)
+        from s2a_bench.boards.profile import load_profile, profile_files
+
+        if written not in profile_files() and not (written.endswith(".toml") and Path(written).is_file()):
+            kinds = "a number of ms, a family, a .csv file, a run folder, or a profile of 'profile list'"
+            raise UsageError(f"`latency`: '{written}' should be {kinds}")
+        yield Source(written, profile=written, tokens=tokens, weights=load_profile(written).weights)
 
 
 def split(value: object) -> object:
@@ -80,15 +85,6 @@ def split(value: object) -> object:
         continues = found and ":" in found[-1] and _PARAMETER.match(text)
         found[-1:] = [f"{found[-1]},{text}"] if continues else [*found[-1:], text]
     return tuple(dict.fromkeys(found))
-
-
-def _of_profile(written: str, tokens: int) -> Source:
-    from s2a_bench.boards.profile import load_profile, profile_files
-
-    if written not in profile_files() and not (written.endswith(".toml") and Path(written).is_file()):
-        kinds = "a number of ms, a family, a .csv file, a run folder, or a profile of 'profile list'"
-        raise UsageError(f"`latency`: '{written}' should be {kinds}")
-    return Source(written, profile=written, tokens=tokens, weights=load_profile(written).weights)
 
 
 def measured(folder: Path, only: str = "") -> Iterator[Source]:
@@ -183,14 +179,17 @@ All times are whole ns of one clock. `boards.latency` reads the file back.
 
 def delay_rows(drawn: LatencyDraw, mode: Mode, setting: ControlSetting) -> Iterator[dict[str, object]]:
     """Yield a row a request: all measured requests at their times, or those of ``mode``."""
+    import numpy as np
+
     source = drawn.source
-    requests = source.requests or _simulated(drawn, mode, setting)
-    for number, request in enumerate(requests):
+    requests = source.requests or list(_simulated(drawn, mode, setting))
+    delays = setting.delay_ticks(np.array([request["latency_ns"] for request in requests], np.int64))
+    for number, (request, delay) in enumerate(zip(requests, delays.tolist(), strict=True)):
         yield {
             "request": number,
             "provenance": source.provenance.code,
             **{name: "" if value is None else value for name, value in request.items()},
-            "d": _delay(request["latency_ns"], setting),
+            "d": delay,
             "rounding": setting.rounding,
             "delta_t_ns": setting.period_ns,
         }
@@ -200,12 +199,6 @@ def _simulated(drawn: LatencyDraw, mode: Mode, setting: ControlSetting) -> Itera
     request_ns = mode.cycles(drawn.judged, setting).request_tick * setting.period_ns
     for at_ns, latency_ns in zip(request_ns.tolist(), drawn.judged.tolist(), strict=True):
         yield {"observation_ns": at_ns, "received_ns": at_ns + latency_ns, "latency_ns": latency_ns}
-
-
-def _delay(latency_ns: object, setting: ControlSetting) -> int:
-    import numpy as np
-
-    return int(setting.delay_ticks(np.array([latency_ns], np.int64))[0])
 
 
 def write_delays(path: Path, rows: Iterable[Mapping[str, object]]) -> None:

@@ -6,7 +6,7 @@ A latency counts from the start of the tick of a request until its chunk is comp
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count, groupby, product
@@ -149,7 +149,9 @@ def _drive(config: ChunksConfig, launch: RunningLaunch) -> None:
     launch.progress.expect(len(tried))
     for cell, sessions, dims in Random(config.seed).sample(tried, len(tried)):  # noqa: S311 - an order, not a secret
         launch.progress.stage(f"acting for {config.seconds:g} s: {cell.cell}")
-        with _robot_of(config, cell, dims) as robot:
+        period_ns = config.setting.slowed(cell.slower).period_ns
+        robot = open_robot(config.robot, dims, period_ns) if config.robot else None
+        with nullcontext() if robot is None else closing(robot):
             launch.writer.update(robot={} if robot is None else robot.describe())
             write(config, launch.writer, _act(config, cell, sessions, launch, blocks, robot))
         launch.progress.advance()
@@ -171,18 +173,6 @@ def _warm_up(
     if not dims:
         raise TransportError(f"no request of {sessions[0].cell.name} succeeded while warming up, at last with {error}")
     return np.array(latency_ns, np.int64), dims
-
-
-@contextmanager
-def _robot_of(config: ChunksConfig, cell: ChunkCell, dims: int) -> Iterator[ActionRobot | None]:
-    if not config.robot:
-        yield None
-        return
-    robot = open_robot(config.robot, dims, config.setting.slowed(cell.slower).period_ns)
-    try:
-        yield robot
-    finally:
-        robot.close()
 
 
 def _act(

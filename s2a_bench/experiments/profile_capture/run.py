@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import count, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,7 @@ from s2a_bench.inference.models import resolve
 from s2a_bench.machine import environment
 from s2a_bench.machine.environment import board_facts
 from s2a_bench.machine.tuning import limit_threads
-from s2a_bench.types import Frame, Request
+from s2a_bench.types import Request
 
 if TYPE_CHECKING:
     from s2a_bench.progress import Progress
@@ -59,29 +59,17 @@ class TimedAnswer:
 
 
 def answers(engine: Engine, config: CaptureConfig) -> Iterator[TimedAnswer]:
-    """Yield the times of requests without end, each with a new picture and seed."""
-    with ExitStack() as stack:
-        source = Stamped(open_source(config.source, *config.size, seed=config.seed), "capture")
-        stack.callback(source.close)
-        number = 0
-        while True:
-            request = Request(
-                f"capture-{number}", config.prompt, (_rgb(source.read()),), config.tokens, seed=config.seed + number
-            )
-            yield _timed(engine, request)
-            number += 1
-
-
-def _rgb(frame: Frame) -> Frame:
-    return replace(frame, encoding="rgb8", data=bgr_to_rgb(to_bgr(frame)))
-
-
-def _timed(engine: Engine, request: Request) -> TimedAnswer:
-    started = now_ns()
-    times = [now_ns() for _ in engine.generate(request)]
-    if not times:
-        raise EngineError(f"request {request.id}: the answer was empty; give another `prompt`")
-    return TimedAnswer(times[0] - started, [after - before for before, after in pairwise(times)])
+    """Yield the times of requests without end, each with a new picture and seed; raises EngineError if empty."""
+    with closing(Stamped(open_source(config.source, *config.size, seed=config.seed), "capture")) as source:
+        for number in count():
+            frame = source.read()
+            picture = replace(frame, encoding="rgb8", data=bgr_to_rgb(to_bgr(frame)))
+            request = Request(f"capture-{number}", config.prompt, (picture,), config.tokens, seed=config.seed + number)
+            started = now_ns()
+            times = [now_ns() for _ in engine.generate(request)]
+            if not times:
+                raise EngineError(f"request {request.id}: the answer was empty; give another `prompt`")
+            yield TimedAnswer(times[0] - started, [after - before for before, after in pairwise(times)])
 
 
 def open_model(config: EngineConfig) -> Engine:

@@ -79,7 +79,7 @@ def test_a_live_run_is_shown_and_its_latencies_are_a_source(tmp_path: Path) -> N
     cell = json.loads(json.dumps(shown.json()))["cells"][0]
     assert cell["emulated"] is False
     assert {"agreement", "jitter_s_p99", "blocked_s_max", "late_ticks", "bytes_up_per_s"} <= set(cell)
-    assert "as virtual time has them" in " ".join(shown.sentences)
+    assert "equal those of virtual time" in " ".join(shown.sentences)
     assert Run(folder).table("loop").shape[0] == 2
     again = ChunksConfig(latency=f"{folder}#loopback", modes="queue?trigger=3", rules="")
     assert again.sources[0].recorded_ns is not None

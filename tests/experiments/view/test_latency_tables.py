@@ -53,7 +53,7 @@ def test_without_model_reads_as_a_sum_where_it_is_told(make_run: MakeRun) -> Non
         ("", "e2e", "114", "104"),
     ]
     assert group_table(run).header[-5:] == ("e2e w/o infer.", "preproc.", "e2e w/o model", "infer.", "e2e")
-    assert "e2e less the prompt_ms it reports, assumed to be all" in " ".join(printed(run).split())
+    assert "e2e less the prompt_ms it reports, which is assumed to be all" in " ".join(printed(run).split())
     assert show(run).sentences[-1].startswith("Without model, http/llama-server takes 1.39 times as long as ros/topic")
 
 

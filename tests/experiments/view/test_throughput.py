@@ -112,7 +112,7 @@ def test_both_rates_by_hand(make: Make) -> None:
     assert list(cell.values("prompt_tokens")) == [30.0] * 3
     assert list(cell.values("tokens_per_joule")) == [2.0] * 3
     assert list(cell.values("ttft_ms")) == [100.0] * 3  # without the capture
-    assert cell.told
+    assert cell.has_engine_time
     assert list(cell.values("itl")) == [20.0] * 12
 
 
@@ -241,7 +241,7 @@ def test_the_tables_fit_a_terminal(make: Make) -> None:
     assert "1000 ± 0" in text
     notes = " ".join(tables["throughput"].notes)
     assert "Dummy weights." in notes
-    assert "llama-bench decodes behind 42 tokens" in notes
+    assert "llama-bench decodes after 42 tokens" in notes
 
 
 def test_the_csv_keeps_every_digit(make: Make) -> None:

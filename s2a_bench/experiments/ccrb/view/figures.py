@@ -75,7 +75,12 @@ def build_scenario(run: StoredRun) -> Figure:
     survives, rows = survives_of(found), found.to_dict("records")
     paths = {row["policy"]: _path(run, row) for row in rows}
     skills = dict(list(run.table(SKILLS).groupby("cell", sort=False)))
-    figure = new_figure(4.5, (_title(run), *origin_notes(run)), WIDE_IN)
+    settings = configuration(run)
+    title = (
+        f"CCRB with a car behind ({settings['simulator']} simulator): {operating_point(settings)}, "
+        f"N = {settings['n_skills']}, L = {settings['tokens_per_skill']}"
+    )
+    figure = new_figure(4.5, (title, *origin_notes(run)), WIDE_IN)
     grid = figure.subplots(3, len(rows), squeeze=False, sharex=True, sharey="row")
     token_s = token_times_s(run)
     until_s = max(float(path["time_s"].iloc[-1]) for path in paths.values())
@@ -172,14 +177,6 @@ def _verdict(row: dict[Any, Any], survives: bool) -> str:
     return outcome_label(row["outcome"], survives) + (" (late)" if row["late"] is True else "")
 
 
-def _title(run: StoredRun) -> str:
-    settings = configuration(run)
-    return (
-        f"CCRB with a car behind ({settings['simulator']} simulator): {operating_point(settings)}, "
-        f"N = {settings['n_skills']}, L = {settings['tokens_per_skill']}"
-    )
-
-
 def _legend() -> list[object]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -229,8 +226,10 @@ def build_phase(run: StoredRun) -> Figure:
     for axes, gap in zip(grid.flat, GAPS, strict=True):
         scenes = scenes_of(run, "phase", gap)
         seen |= _draw_panel(axes, scenes, settings, run)
-        share = share_of(scenes, "paper").value
-        axes.set_title(f"{gap}: the paper's ordering {share:.1%}, {_span_at_point(run, gap, settings)}", loc="left")
+        share, span = share_of(scenes, "paper").value, rate_span_at_point(run, gap)
+        where = f"R {span[0]:.1f}\N{EN DASH}{span[1]:.1f}" if span else "no R"
+        at = f"at {settings['rear_gap_m']:g} m: {where}"
+        axes.set_title(f"{gap}: the paper's ordering {share:.1%}, {at}", loc="left")
     for axes in grid[-1]:
         axes.set_xlabel("R (tokens/s)")
     for axes in grid[:, 0]:
@@ -270,12 +269,6 @@ def _draw_panel(axes: Axes, scenes: pd.DataFrame, settings: dict[str, Any], run:
     rate = run.manifest["boards"][0]["tokens_per_s"]
     axes.plot(rate, settings["rear_gap_m"], **_POINT)
     return set(np.unique(named))
-
-
-def _span_at_point(run: StoredRun, gap: str, settings: dict[str, Any]) -> str:
-    span = rate_span_at_point(run, gap)
-    where = f"R {span[0]:.1f}\N{EN DASH}{span[1]:.1f}" if span else "no R"
-    return f"at {settings['rear_gap_m']:g} m: {where}"
 
 
 def build_sensitivity(run: StoredRun) -> Figure:

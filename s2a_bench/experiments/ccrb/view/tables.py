@@ -205,7 +205,9 @@ def _outcome_table(run: StoredRun) -> TextTable:
     settings = configuration(run)
     title = f"CCRB with a car behind, {settings['simulator']} simulator: {operating_point(settings)}"
     header = ("policy", "outcome", *map(_title, shown))
-    return TextTable(title, header, rows, 2, notes=(*origin_notes(run), *_deadline_note(run), NO_SCORE))
+    deadline_s = float(rollouts_of(run, "point")["deadline_ns"].iloc[0]) / 1e9
+    deadline = f"S_front = {deadline_s:.2f} s: planned braking that starts by then keeps 2 m to the lead."
+    return TextTable(title, header, rows, 2, notes=(*origin_notes(run), deadline, NO_SCORE))
 
 
 def _margin_table(run: StoredRun) -> TextTable:
@@ -371,11 +373,6 @@ def _study(run: StoredRun, study: str, gap: str) -> dict[str, Any]:
     span = rate_span(run, gap) if study == "phase" else None
     rates = {} if span is None else {"paper_rates_tokens_per_s": list(span)}
     return {"study": study, "gap_behaviour": gap, "scenarios": len(scenes), "orderings": shares, **check, **rates}
-
-
-def _deadline_note(run: StoredRun) -> tuple[str, ...]:
-    deadline_s = float(rollouts_of(run, "point")["deadline_ns"].iloc[0]) / 1e9
-    return (f"S_front = {deadline_s:.2f} s: planned braking that starts by then keeps 2 m to the lead.",)
 
 
 def _title(metric: Metric) -> str:
