@@ -19,7 +19,7 @@ FIXED = {"http/binary": 1.0, "ros/topic": 0.2, "loopback": 0.1}
 A_MB = {"http/binary": 0.3, "ros/topic": 0.9, "loopback": 0.2}
 
 
-def asked(width: int, height: int, cameras: int, **more: Any) -> dict[str, Any]:
+def settings(width: int, height: int, cameras: int, **more: Any) -> dict[str, Any]:
     return {"configuration": {"width": width, "height": height, "cameras": cameras, **more}}
 
 
@@ -33,7 +33,7 @@ def runs(make_run: MakeRun) -> list[StoredRun]:
             for name in FIXED
         }
         payloads = {"http": "raw", "ros": "raw", "loopback": "none"}
-        manifest = asked(width, height, cameras)
+        manifest = settings(width, height, cameras)
         made.append(make_run(cells, n=8, spread=0, manifest=manifest, payloads=payloads, payload_bytes=2 * pixels))
     return made
 
@@ -54,7 +54,8 @@ def test_in_process_a_cell_stands_beside_each_payload(make_run: MakeRun) -> None
     cells = {name: {"capture": 1.0, "inference": 1.0, "return": 0.0} for name in FIXED}
     payloads = {"http": "raw", "ros": "jpeg", "loopback": "none"}
     made = [
-        make_run(cells, n=5, spread=0, manifest=asked(*size, 1), payloads=payloads) for size in ((64, 48), (640, 480))
+        make_run(cells, n=5, spread=0, manifest=settings(*size, 1), payloads=payloads)
+        for size in ((64, 48), (640, 480))
     ]
     found = [(each.name, each.payload) for each in against_bytes(split(made))]
     assert found == [("http/binary", "raw"), ("loopback", "raw"), ("ros/topic", "jpeg"), ("loopback", "jpeg")]
@@ -62,14 +63,14 @@ def test_in_process_a_cell_stands_beside_each_payload(make_run: MakeRun) -> None
 
 def test_scaled_pictures_count_as_scaled(make_run: MakeRun) -> None:
     cells = {"ros/topic": {"capture": 1.0, "inference": 1.0, "return": 0.0}}
-    sizes = [asked(640, 480, 1, resize=[224, 224]), asked(640, 480, 1)]
+    sizes = [settings(640, 480, 1, resize=[224, 224]), settings(640, 480, 1)]
     made = [make_run(cells, n=5, spread=0, manifest=each, payloads={"ros": "raw"}) for each in sizes]
     ((pipeline),) = against_bytes(split(made))
     assert [size for size, _ in pipeline.groups] == [224 * 224 * 3 / 1e6, 640 * 480 * 3 / 1e6]
 
 
 def test_runs_of_one_size_show_nothing(make_run: MakeRun) -> None:
-    same = [make_run(n=5, manifest=asked(640, 480, 1)) for _ in range(2)]
+    same = [make_run(n=5, manifest=settings(640, 480, 1)) for _ in range(2)]
     assert against_bytes(split(same)) == []
     assert shown(split(same)) == ({}, {})
     assert against_bytes(split([make_run(n=5)])) == []  # a folder that says no size

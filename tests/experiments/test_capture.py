@@ -131,7 +131,7 @@ def test_answers_too_short_to_time_say_what_to_do() -> None:
 
 
 class Asked(EchoEngine):
-    """Remembers what it was asked."""
+    """Remembers its requests."""
 
     requests: list[Request]
 
@@ -143,8 +143,8 @@ class Asked(EchoEngine):
 def test_every_request_is_about_another_picture_with_another_seed() -> None:
     engine = Asked(EngineConfig(name="echo"))
     engine.requests = []
-    asked = answers(engine, CaptureConfig(name="x", size=(64, 48), tokens=5, seed=3))
-    timed = [next(asked) for _ in range(4)]
+    timings = answers(engine, CaptureConfig(name="x", size=(64, 48), tokens=5, seed=3))
+    timed = [next(timings) for _ in range(4)]
     assert all(len(answer.gaps_ns) == 4 and answer.ttft_ns > 0 for answer in timed)
     assert [request.seed for request in engine.requests] == [3, 4, 5, 6]
     frames = [request.images[0] for request in engine.requests]
@@ -184,11 +184,11 @@ def test_a_real_recording_does_not_reject_the_parametric_replay_of_another(
         name="x", engine=EngineConfig(threads=1), size=(64, 48), requests=100, warmup=4, tokens=16, prompt="go"
     )
     engine = open_model(config.engine)
-    asked = answers(engine, config)
+    timings = answers(engine, config)
     rejected = []
     for attempt in range(5):
-        warm = [next(asked) for _ in range(config.warmup)]
-        pairs = [random.sample([next(asked), next(asked)], 2) for _ in range(config.requests)]
+        warm = [next(timings) for _ in range(config.warmup)]
+        pairs = [random.sample([next(timings), next(timings)], 2) for _ in range(config.requests)]
         path = tmp_path / f"{attempt}.toml"
         recorded = [pair[0] for pair in pairs]
         write_profile(document(config, [*warm, *recorded], engine.describe(), []), path, force=False)

@@ -45,9 +45,9 @@ GRID = {"phase": True, "phase_points": (21, 13)}
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., StoredRun]:
     @cache
-    def make(**asked: Any) -> StoredRun:
+    def make(**options: Any) -> StoredRun:
         with RunProgress() as progress:
-            return read_run(run_ccrb(CcrbConfig(**asked), tmp_path_factory.mktemp("runs"), progress))
+            return read_run(run_ccrb(CcrbConfig(**options), tmp_path_factory.mktemp("runs"), progress))
 
     return make
 
@@ -151,9 +151,9 @@ def test_studies_are_driven_fast_enough_to_be_of_use(made: Callable[..., StoredR
 
 def test_the_findings_name_every_gap_behaviour(made: Callable[..., StoredRun]) -> None:
     run = made(**GRID)
-    said = findings(run)
-    assert [line.split(":")[0] for line in said] == list(GAPS)
-    assert "holds nowhere" in said[GAPS.index("hold")]
+    lines = findings(run)
+    assert [line.split(":")[0] for line in lines] == list(GAPS)
+    assert "holds nowhere" in lines[GAPS.index("hold")]
     assert rate_span(run, "hold") is None
     assert findings(made()) == []
 
@@ -204,7 +204,7 @@ def test_the_run_shows_what_its_options_ask_for(made: Callable[..., StoredRun]) 
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("options", "message"),
     [
         ({"scenario": {"follower": "drunk"}}, "`follower`: 'drunk' is none of careful, hdm, idm, hybrid"),
         ({"scenario": {"gap": "panic"}}, "`gap`: 'panic' should be 'stop', 'coast', 'hold' or 'cruise'"),
@@ -219,9 +219,9 @@ def test_the_run_shows_what_its_options_ask_for(made: Callable[..., StoredRun]) 
         ({"policies": ("hope",)}, "'hope' is none of"),
     ],
 )
-def test_what_makes_no_sense_is_refused(asked: dict[str, Any], message: str) -> None:
+def test_what_makes_no_sense_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        CcrbConfig(**asked)
+        CcrbConfig(**options)
 
 
 FEW: dict[str, Any] = {"seeds": 2, "seed_points": 16}
@@ -244,17 +244,17 @@ def test_every_follower_meets_the_four_combinations_and_says_whether_it_survives
     table = tables["followers"]
     assert [row[0] for row in table.rows[::4]] == list(FOLLOWERS)
     assert [row[1] for row in table.rows[:4]] == ["12 m, -2", "12 m, -6", "40 m, -2", "40 m, -6"]
-    said = {(row[0], row[1]): row for row in table.rows}
-    assert said["careful", "40 m, -2"][2:] == ("yes", "rear", "front", "none")
-    assert said["hdm", "40 m, -2"][2:] == ("yes", "none", "front", "none")
-    assert said["idm", "40 m, -2"][2:] == ("yes", "none", "front", "none")
-    assert said["hybrid", "40 m, -2"][2:] == ("no", f"rear {MARK}", "front", f"rear {MARK}")
+    by_follower = {(row[0], row[1]): row for row in table.rows}
+    assert by_follower["careful", "40 m, -2"][2:] == ("yes", "rear", "front", "none")
+    assert by_follower["hdm", "40 m, -2"][2:] == ("yes", "none", "front", "none")
+    assert by_follower["idm", "40 m, -2"][2:] == ("yes", "none", "front", "none")
+    assert by_follower["hybrid", "40 m, -2"][2:] == ("no", f"rear {MARK}", "front", f"rear {MARK}")
     shares = {row[:2]: row for row in tables["follower-shares"].rows}
     assert shares["idm", "40 m, -6"][3:] == ("100", "0", "0", "0", "0")
     assert NO_SCORE in table.notes
-    told = json_of(run)["followers"]
-    assert (len(told), sum("seed" not in row for row in told)) == (len(rows), 4 * 4 * 3)
-    assert sum(row["rear"] for row in told) == rows["rear"].sum()
+    followers = json_of(run)["followers"]
+    assert (len(followers), sum("seed" not in row for row in followers)) == (len(rows), 4 * 4 * 3)
+    assert sum(row["rear"] for row in followers) == rows["rear"].sum()
 
 
 def test_who_never_stalls_is_not_hit_where_the_follower_survives(made: Callable[..., StoredRun]) -> None:
@@ -281,7 +281,7 @@ def test_six_numbers_are_varied_over_the_same_points(made: Callable[..., StoredR
     assert shares["build_s"].max() > 2 * at_defaults["build_s"] > 0
     assert set(show(run).figures) == {"scenario", "sensitivity"}
     assert len(build_sensitivity(run).axes) == len(VARIED)
-    assert any("build" in said for said in show(run).sentences)
+    assert any("build" in sentence for sentence in show(run).sentences)
     assert [row["varied"] for row in json_of(run)["sensitivity"]] == list(rows["varied"])
 
 

@@ -1,4 +1,4 @@
-"""Live and real-time timelines: what is streamed is executed, and whatever goes wrong is told and kept."""
+"""Live and real-time timelines: what is streamed is executed, and errors are reported and kept."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ class Watched:
 
     def __init__(self) -> None:
         self.scenes: list[Scene] = []
-        self.said: list[str] = []
+        self.lines: list[str] = []
 
     def opened(self, folder: Path) -> None:
         self.folder = folder
 
     def stage(self, text: str) -> None:
-        self.said.append(text)
+        self.lines.append(text)
 
     def expect(self, samples: int) -> None: ...
 
@@ -152,15 +152,15 @@ def test_a_real_model_is_held_to_its_grammar_and_its_pace(
 ) -> None:
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
     engine = EngineConfig(threads=1, pace=60.0)
-    asked = config.but(
+    changed = config.but(
         engine=engine, profiles=(), transport="http", timeout_s=120.0, t_nom_s=(0.05,), task="Tidy up.", requests=2
     )
     view = Watched()
-    run = read_run(run_live(asked, tmp_path / "runs", view))
+    run = read_run(run_live(changed, tmp_path / "runs", view))
     outcomes = [found["outcome"] for found in run.manifest["executions"].values()]
     assert outcomes == ["completed"] * 6
-    told = run.manifest["live"]
-    assert (told["engine"], told["emulated"], told["dummy"], told["paced_tokens_per_s"]) == ("llama", False, True, 60.0)
+    live = run.manifest["live"]
+    assert (live["engine"], live["emulated"], live["dummy"], live["paced_tokens_per_s"]) == ("llama", False, True, 60.0)
     cells = timelines_of(run)
     assert {(cell.about("emulated"), cell.about("tokens_per_s"), cell.n) for cell in cells} == {(False, 60.0, 2)}
     tokens = run.tokens.groupby("request_id")["client_ns"]
@@ -187,10 +187,10 @@ def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
             yield token
 
     monkeypatch.setattr(ReplayEngine, "generate", dies)
-    asked = config.but(warmup=0)
+    changed = config.but(warmup=0)
     view = Watched()
     with pytest.raises(TransportError, match="no request of loopback succeeded"):
-        run_live(asked, tmp_path / "runs", view)
+        run_live(changed, tmp_path / "runs", view)
     run = read_run(view.folder)
     assert run.manifest["state"] == "failed"
     assert run.samples["error"].tolist() == ["RequestFailed: the board fell off the robot"]
@@ -231,9 +231,9 @@ def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
 
     monkeypatch.setattr(LoopbackClient, "request", dies)
     view = Watched()
-    asked = config.but(warmup=0, t_nom_s=(0.3,))
+    changed = config.but(warmup=0, t_nom_s=(0.3,))
     with pytest.raises(ServerDied, match="pid 7"):
-        run_live(asked, tmp_path / "runs", view)
+        run_live(changed, tmp_path / "runs", view)
     run = read_run(view.folder)
     assert run.manifest["state"] == "failed"
     assert {found["outcome"] for found in run.manifest["executions"].values()} == {"stream-error"}

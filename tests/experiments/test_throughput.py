@@ -1,4 +1,4 @@
-"""What a throughput run is asked to do, its rounds, and the reference beside it."""
+"""The options of a throughput run, its rounds, and the reference."""
 
 from __future__ import annotations
 

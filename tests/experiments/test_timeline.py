@@ -326,7 +326,7 @@ def test_a_guarantee_is_kept_with_the_calibration_and_said(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("options", "message"),
     [
         ({"policies": ("naive",), "track": True}, "`track`: no policy has a lambda to follow"),
         ({"policies": ("stream-to-act?caution=1",), "track": True}, "`track`: no policy has a lambda to follow"),
@@ -334,6 +334,6 @@ def test_a_guarantee_is_kept_with_the_calibration_and_said(tmp_path: Path) -> No
         ({"live": True, "jitter": "none", "plans": None, "epsilon": 0.05}, "`epsilon`: nothing is calibrated"),
     ],
 )
-def test_what_cannot_be_followed_is_refused(asked: dict[str, Any], message: str) -> None:
+def test_what_cannot_be_followed_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        JITTERY.but(**asked)
+        JITTERY.but(**options)

@@ -118,10 +118,10 @@ def test_without_a_terminal_every_policy_gets_a_line(capsys: pytest.CaptureFixtu
     view = RunProgress()
     with view, watching(view, scene(finished(*THREE))):
         pass
-    said = capsys.readouterr().err.splitlines()
-    assert said[0] == "  naive: started at 2.00 s, ended at 9.00 s, 3 stalls of 3.00 s"
-    assert said[1] == "  wait-then-act: started at 8.00 s, ended at 12.00 s, 0 stalls of 0.00 s"
-    assert len(said) == 3
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "  naive: started at 2.00 s, ended at 9.00 s, 3 stalls of 3.00 s"
+    assert lines[1] == "  wait-then-act: started at 8.00 s, ended at 12.00 s, 0 stalls of 0.00 s"
+    assert len(lines) == 3
 
 
 def test_a_plan_of_which_nothing_came_is_said_in_words() -> None:

@@ -19,9 +19,9 @@ from s2a_bench.testing import NullProgress
 from tests.made_runs import MakeRun
 
 
-def exported(folder: Path, **asked: Any) -> list[dict[str, str]]:
+def exported(folder: Path, **options: Any) -> list[dict[str, str]]:
     file = folder / "delays.csv"
-    run_chunks(ChunksConfig(export_delays=file, **asked), folder / "runs", NullProgress())
+    run_chunks(ChunksConfig(export_delays=file, **options), folder / "runs", NullProgress())
     with file.open(newline="") as text:
         return list(csv.DictReader(text))
 

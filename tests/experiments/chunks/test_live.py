@@ -23,10 +23,10 @@ from s2a_bench.types import Action, Request, Token, Vector
 ECHO = {"name": "echo"}
 
 
-def act(tmp_path: Path, *, transport: str = "loopback", **asked: object) -> pd.DataFrame:
+def act(tmp_path: Path, *, transport: str = "loopback", **options: object) -> pd.DataFrame:
     """Act for a moment and return a row a mode."""
     requests = {"transports": transport, "engine": ECHO, "size": "64x48", "warmup": 1}
-    config = ChunksConfig(**{"live": True, "seconds": 1.5, "requests": requests, **asked})
+    config = ChunksConfig(**{"live": True, "seconds": 1.5, "requests": requests, **options})
     folder = run_chunks(config, tmp_path, NullProgress())
     return pd.read_csv(folder / "chunks.csv")
 
@@ -95,8 +95,8 @@ def test_delays_of_a_live_run_are_exported(tmp_path: Path) -> None:
 
 def test_rules_choose_triggers_as_they_go(tmp_path: Path) -> None:
     requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
-    asked = {"rules": "calibrated,tracked,maximum,mean", "epsilon": 0.05, "latency": "lognormal:mean_ms=50,cv=.5"}
-    rows = act(tmp_path, modes="queue,sync", requests=requests, seconds=2.5, **asked)
+    options = {"rules": "calibrated,tracked,maximum,mean", "epsilon": 0.05, "latency": "lognormal:mean_ms=50,cv=.5"}
+    rows = act(tmp_path, modes="queue,sync", requests=requests, seconds=2.5, **options)
     assert rows["rule"].value_counts().to_dict() == {"given": 2, "calibrated": 1, "tracked": 1, "maximum": 1, "mean": 1}
     assert (rows["agreement"] >= 0.99).all()
     trigger = rows.set_index("rule")["trigger"]
@@ -112,8 +112,8 @@ def test_rules_choose_triggers_as_they_go(tmp_path: Path) -> None:
 
 def test_a_slow_server_slows_actions_down(tmp_path: Path) -> None:
     requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
-    asked = {"rules": "calibrated", "epsilon": 0.05, "latency": "150", "slowest": 4.0, "horizon": 4}
-    rows = act(tmp_path, modes="queue", requests=requests, seconds=4, **asked).set_index("rule")
+    options = {"rules": "calibrated", "epsilon": 0.05, "latency": "150", "slowest": 4.0, "horizon": 4}
+    rows = act(tmp_path, modes="queue", requests=requests, seconds=4, **options).set_index("rule")
     assert rows.loc["given", "p_stall_cycle"] == 1
     assert rows.loc["calibrated", "slower"] > 150 / 60
     assert rows.loc["calibrated", "delta_t_s"] == pytest.approx(0.02 * rows.loc["calibrated", "slower"], rel=1e-3)
@@ -135,10 +135,10 @@ def drop(action: Vector) -> None:
 
 
 def test_a_plant_moves_and_the_policy_is_told_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[tuple[float, ...]] = []
+    states: list[tuple[float, ...]] = []
 
     def chunk_of(config: EngineConfig, request: Request) -> Iterator[Action]:
-        told.append(request.state)
+        states.append(request.state)
         return chunk(config, request)
 
     monkeypatch.setattr("s2a_bench.inference.echo.chunk", chunk_of)
@@ -151,8 +151,8 @@ def test_a_plant_moves_and_the_policy_is_told_where_it_is(tmp_path: Path, monkey
     table = show(read_run(folder_of(tmp_path))).tables["smoothness"]
     assert table.header == ("mode", "jerk", "jump", "p99", "step")
     assert not any("EMULATED" in note for note in table.notes)
-    assert {len(state) for state in told[2:]} == {7}
-    assert len(set(told[2:])) > 1
+    assert {len(state) for state in states[2:]} == {7}
+    assert len(set(states[2:])) > 1
 
 
 def test_a_function_is_called_with_every_action(tmp_path: Path) -> None:
@@ -222,7 +222,7 @@ def test_where_no_warm_up_succeeds_it_says_why(tmp_path: Path, monkeypatch: pyte
 
 
 def test_a_chunk_of_another_length_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.inference.echo.chunk", lambda *asked: islice(chunk(*asked), 5))
+    monkeypatch.setattr("s2a_bench.inference.echo.chunk", lambda *args: islice(chunk(*args), 5))
     with pytest.raises(UsageError, match=r"`horizon`: loopback answers with chunks of 5 actions, not 16"):
         act(tmp_path, modes="sync")
 
@@ -234,7 +234,7 @@ def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.parametrize(
-    ("asked", "said"),
+    ("options", "message"),
     [
         ({"live": True, "rules": "mean,oracle"}, "`rules`: a live run has no oracle"),
         (
@@ -257,9 +257,9 @@ def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         ({"live": True, "export_delays": "d.csv", "requests": {"transports": "http,ros"}}, "one `transport` at a time"),
     ],
 )
-def test_what_makes_no_sense_is_refused(asked: dict[str, object], said: str) -> None:
-    with pytest.raises(UsageError, match=said):
-        ChunksConfig(**asked)
+def test_what_makes_no_sense_is_refused(options: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        ChunksConfig(**options)
 
 
 def test_without_websockets_packages_it_goes_over_http() -> None:
@@ -269,5 +269,5 @@ sys.modules["websockets"] = None
 from s2a_bench.experiments.chunks.config import ChunksConfig
 print(*ChunksConfig(live=True).live_requests.transports)
 """
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert told.stdout.split() == ["http/binary"]
+    program_run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert program_run.stdout.split() == ["http/binary"]

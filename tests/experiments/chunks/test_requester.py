@@ -1,4 +1,4 @@
-"""Requests of a control loop: what is heard of answers that fail, and when a request is made again."""
+"""Requests of a control loop: the actions of answers that fail, and when a request is repeated."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from s2a_bench.types import Action, Vector
 
 @dataclass
 class Server:
-    """A session whose answers are as long, and end, as they are told to."""
+    """A session with answers of given lengths and errors."""
 
     answers: list[tuple[int, str]]
     """Actions, and the error."""
@@ -29,36 +29,36 @@ class Server:
     cell: Any = field(default_factory=lambda: SimpleNamespace(name="fake"))
     request: RequestPlan = field(default_factory=lambda: resolve(RequestsConfig(transports="loopback")).request)
 
-    def measure(self, place: Place, asked: RequestContext) -> Measured:
+    def measure(self, place: Place, context: RequestContext) -> Measured:
         self.places.append(place)
         actions, error = self.answers[len(self.places) - 1]
         for index in range(actions):
-            asked.on_piece(Action(index, np.full(1, len(self.places), np.float32)), 100 * len(self.places) + index)
+            context.on_piece(Action(index, np.full(1, len(self.places), np.float32)), 100 * len(self.places) + index)
         sample: Any = SimpleNamespace(error=error, request_id=f"fake-{place.block}", payload_bytes=7)
         return Measured(sample, [], 0)
 
 
-def ask(
+def send_request(
     *answers: tuple[int, str], streams: bool = False
 ) -> tuple[list[tuple[list[float], int]], ChunkRequester, Server]:
-    """Ask once, and return what was heard: the chunk so far, and when."""
+    """Send one request, and return the chunks so far with their times."""
     server = Server(list(answers))
-    heard: list[tuple[list[float], int]] = []
+    received: list[tuple[list[float], int]] = []
 
     def hear(_request: int, actions: Sequence[Vector], at_ns: int) -> None:
-        heard.append(([float(action[0]) for action in actions], at_ns))
+        received.append(([float(action[0]) for action in actions], at_ns))
 
     requester = ChunkRequester([cast("Session", server)], 3, 0, streams, hear, count())
     with requester.running():
         requester.jobs.put(Job(0, 0, ()))
         while requester.done.qsize() < len(answers) and requester.failure is None:
             pass
-    return heard, requester, server
+    return received, requester, server
 
 
 def test_a_request_that_fails_is_made_again_and_its_chunk_is_that_of_one_answer() -> None:
-    heard, requester, server = ask((2, "broken"), (3, ""))
-    assert heard == [([2.0] * 3, 202)]
+    received, requester, server = send_request((2, "broken"), (3, ""))
+    assert received == [([2.0] * 3, 202)]
     assert [place.position for place in server.places] == [0, 1]
     assert requester.done.qsize() == 2
     assert requester.sent_bytes == 14
@@ -66,18 +66,18 @@ def test_a_request_that_fails_is_made_again_and_its_chunk_is_that_of_one_answer(
 
 
 def test_of_a_second_answer_only_actions_count_that_had_not_come() -> None:
-    heard, _, _ = ask((2, "broken"), (3, ""), streams=True)
-    assert heard == [([1.0], 100), ([1.0] * 2, 101), ([1.0, 1.0, 2.0], 202)]
+    received, _, _ = send_request((2, "broken"), (3, ""), streams=True)
+    assert received == [([1.0], 100), ([1.0] * 2, 101), ([1.0, 1.0, 2.0], 202)]
 
 
 @pytest.mark.parametrize("streams", [False, True])
 def test_an_answer_that_fails_once_it_is_whole_is_not_asked_for_again(streams: bool) -> None:
-    heard, requester, server = ask((3, "the marks were lost"), streams=streams)
-    assert heard[-1] == ([1.0] * 3, 102)
+    received, requester, server = send_request((3, "the marks were lost"), streams=streams)
+    assert received[-1] == ([1.0] * 3, 102)
     assert len(server.places) == 1
     assert requester.failure is None
 
 
 def test_a_chunk_of_another_length_fails_the_loop() -> None:
-    _, requester, _ = ask((2, ""))
+    _, requester, _ = send_request((2, ""))
     assert isinstance(requester.failure, UsageError)

@@ -20,8 +20,8 @@ from s2a_bench.testing import NullProgress
 LATENCIES = "40,lognormal:mean_ms=80,cv=.5"
 
 
-def ran(folder: Path, **asked: Any) -> StoredRun:
-    return read_run(run_chunks(ChunksConfig(**asked), folder, NullProgress()))
+def ran(folder: Path, **options: Any) -> StoredRun:
+    return read_run(run_chunks(ChunksConfig(**options), folder, NullProgress()))
 
 
 @pytest.fixture(scope="module")
@@ -74,10 +74,10 @@ def test_at_a_constant_latency_rows_are_what_the_closed_forms_say(rounding: str,
 
 def test_with_random_latencies_closed_forms_lie_within_the_interval(run: StoredRun) -> None:
     table = run.table(CHUNKS)
-    told = table[table["p_stall_closed"].notna()]
-    assert {"sync", "queue", "queue?trigger=6", "replace", "aggregate?trigger=6"} <= set(told["mode"])
-    assert (told["p_stall_low"] <= told["p_stall_closed"] + 1e-9).all()
-    assert (told["p_stall_closed"] <= told["p_stall_high"] + 1e-9).all()
+    with_form = table[table["p_stall_closed"].notna()]
+    assert {"sync", "queue", "queue?trigger=6", "replace", "aggregate?trigger=6"} <= set(with_form["mode"])
+    assert (with_form["p_stall_low"] <= with_form["p_stall_closed"] + 1e-9).all()
+    assert (with_form["p_stall_closed"] <= with_form["p_stall_high"] + 1e-9).all()
 
 
 def test_blended_actions_are_older_than_the_newest_observation_in_them(tmp_path: Path) -> None:
@@ -166,16 +166,16 @@ def test_a_mode_that_never_acts_has_no_numbers_instead_of_wrong_ones(tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("asked", "message"),
+    ("options", "message"),
     [
         ({"modes": ""}, "`modes`: name at least one"),
         ({"latency": ""}, "`latency`: name at least one"),
         ({"control_hz": 0}, "`control_hz`"),
     ],
 )
-def test_what_makes_no_sense_is_refused_by_its_field(asked: dict[str, Any], message: str) -> None:
+def test_what_makes_no_sense_is_refused_by_its_field(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError) as error:
-        ChunksConfig(**asked)
+        ChunksConfig(**options)
     assert message in str(error.value)
 
 
@@ -186,8 +186,8 @@ def test_what_would_not_fit_into_memory_is_refused_before_a_folder_is_made(tmp_p
 
 
 def test_where_no_trigger_is_enough_calibrated_and_oracle_slow_actions_down(tmp_path: Path) -> None:
-    asked = {"latency": "400,lognormal:mean_ms=200,cv=.5", "modes": "queue", "cycles": 10_000}
-    run = ran(tmp_path, **asked, slowest=4.0)
+    options = {"latency": "400,lognormal:mean_ms=200,cv=.5", "modes": "queue", "cycles": 10_000}
+    run = ran(tmp_path, **options, slowest=4.0)
     for latency in run.table(CHUNKS)["latency"].unique():
         needed = row(run, "queue", latency)["slow_down"]
         for rule in ("calibrated", "oracle"):
@@ -196,7 +196,7 @@ def test_where_no_trigger_is_enough_calibrated_and_oracle_slow_actions_down(tmp_
             assert found["delta_t_s"] == pytest.approx(0.02 * found["slower"], rel=1e-6)
             assert found["p_stall_cycle"] <= 0.015
         assert row(run, "queue", latency, "tracked")["p_stall_cycle"] > 0.05
-    never = ran(tmp_path, **asked, rules="calibrated")
+    never = ran(tmp_path, **options, rules="calibrated")
     assert row(never, "queue", "400", "calibrated")["p_stall_cycle"] == 1
     assert row(never, "queue", "400", "calibrated")["slower"] == 1
 

@@ -35,8 +35,8 @@ PERIOD_S = 0.02
 NAMES = [name for name in METRICS if name.startswith(("tracking", "jerk", "boundary_jump", "action_step"))]
 
 
-def ran(folder: Path, **asked: Any) -> StoredRun:
-    return read_run(run_chunks(ChunksConfig(**asked), folder, NullProgress()))
+def ran(folder: Path, **options: Any) -> StoredRun:
+    return read_run(run_chunks(ChunksConfig(**options), folder, NullProgress()))
 
 
 @pytest.fixture(scope="module")
@@ -108,15 +108,15 @@ class TestWhatIsExecuted:
         latency_ns = np.random.default_rng(3).integers(0, 250 * MS, 80)
         made = Aggregate(6, kind)  # type: ignore[arg-type]
         cycles, done = made.cycles(latency_ns, SETTING), made.ticks(latency_ns, SETTING)
-        asked, usable = cycles.request_tick.tolist(), cycles.usable_tick.tolist()
+        request_tick, usable = cycles.request_tick.tolist(), cycles.usable_tick.tolist()
         queue: dict[int, float] = {}  # by how many actions were executed before
         due: dict[int, int] = {}
         expected, executed_so_far = [], 0
         for tick in range(cycles.ticks):
-            due |= {place: executed_so_far for place, at in enumerate(asked) if at == tick}
+            due |= {place: executed_so_far for place, at in enumerate(request_tick) if at == tick}
             for place in (place for place, at in enumerate(usable) if at == tick):
                 for index in range(16):
-                    new = float(target.forecast(np.array(asked[place]), np.array(index)))
+                    new = float(target.forecast(np.array(request_tick[place]), np.array(index)))
                     at, weight = due[place] + index, WEIGHTS[made.kind]
                     queue[at] = weight * new + (1 - weight) * queue[at] if at in queue else new
             expected.append(queue.get(executed_so_far, math.nan))

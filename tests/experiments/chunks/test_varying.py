@@ -52,9 +52,9 @@ def test_simulated_reactions_have_the_quantiles_of_the_closed_form(written: str,
     made = mode(written)
     simulated = reactions_s(made.cycles(latency_ns, setting), made.ticks(latency_ns, setting), setting, rng)
     shares = np.linspace(0.02, 0.98, 25)
-    told = closed(made, latency_ns, setting).reaction_ticks(shares)
-    assert told is not None
-    np.testing.assert_allclose(np.quantile(simulated, shares) / 0.02, told, atol=0.25)
+    expected = closed(made, latency_ns, setting).reaction_ticks(shares)
+    assert expected is not None
+    np.testing.assert_allclose(np.quantile(simulated, shares) / 0.02, expected, atol=0.25)
 
 
 @pytest.mark.parametrize("written", ["sync", "queue?trigger=3", "replace?execute=5", "aggregate?trigger=5"])

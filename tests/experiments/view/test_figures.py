@@ -75,9 +75,9 @@ def test_a_figure_has_one_line_of_provenance_and_a_caption(name: str, tmp_path: 
 def test_the_line_stays_one_line_and_fits_whatever_answered(make_run: Any) -> None:
     names = [f"engine-{place}" for place in range(6)]
     cells = {name: Provenance(name, weights="dummy", tokens="paced", link="emulated") for name in names}
-    told = {"provenance": Origins(Provenance(), cells).to_manifest(), "host": "a$b$c"}
+    facts = {"provenance": Origins(Provenance(), cells).to_manifest(), "host": "a$b$c"}
     run = make_run(n=3)
-    run = StoredRun(run.path, {**run.manifest, **told}, run.tables)
+    run = StoredRun(run.path, {**run.manifest, **facts}, run.tables)
     with paper_column():
         figure = EXPERIMENTS["latency"].show(run).figures["latency_bars"]()
     assert all(name in figure.get_suptitle() for name in (*names, "a$b$c", "DUMMY WEIGHTS", "PACED", "link EMULATED"))

@@ -64,9 +64,9 @@ def test_bars_are_medians_and_whiskers_are_seen_on_every_colour(make_run: MakeRu
 
 
 def test_the_caption_says_how_many_and_what_did_not_really_answer(make_run: MakeRun) -> None:
-    title, asked, _, engine = caption_of(build_latency_bars(make_run(HAND, n=4)))
+    title, observation, _, engine = caption_of(build_latency_bars(make_run(HAND, n=4)))
     assert title == "Medians: end to end without inference"
-    assert asked == "n = 4 a cell, 640x480, request mode."
+    assert observation == "n = 4 a cell, 640x480, request mode."
     assert engine == "Echo engine."
     dummy = make_run(HAND, n=4, engine="llama", manifest={"model": {"dummy": True}})
     for build in (build_latency_bars, build_stage_breakdown, build_latency_distribution):

@@ -171,13 +171,13 @@ def test_payloads_are_blocks_and_ratios_stay_inside_them(make_run: MakeRun) -> N
     assert other.startswith("http/as-deployed takes 2.00 times as long as ros/topic with jpeg pictures")
 
 
-@pytest.mark.parametrize("asked", [True, False])
-def test_unlike_payloads_are_compared_where_that_was_asked_for(make_run: MakeRun, asked: bool) -> None:
-    names = ("http?payload=jpeg", "ros") if asked else ("http", "ros")
+@pytest.mark.parametrize("named", [True, False])
+def test_unlike_payloads_are_compared_where_a_name_has_its_payload(make_run: MakeRun, named: bool) -> None:
+    names = ("http?payload=jpeg", "ros") if named else ("http", "ros")
     run = make_run(HAND, n=4, spread=0, payloads={"http": "jpeg"}, manifest={"configuration": {"transports": names}})
-    said = "http/as-deployed with jpeg pictures takes 5.76 times as long as ros/topic with raw pictures"
-    assert any(sentence.startswith(said) for sentence in show(run).sentences) is asked
-    assert any("ratio" in name for name in summary_table(run).header) is asked
+    sentence_start = "http/as-deployed with jpeg pictures takes 5.76 times as long as ros/topic with raw pictures"
+    assert any(sentence.startswith(sentence_start) for sentence in show(run).sentences) is named
+    assert any("ratio" in name for name in summary_table(run).header) is named
 
 
 def test_a_black_box_is_absent_where_its_inference_is_unknown(make_run: MakeRun, black_box: Any) -> None:
@@ -289,14 +289,14 @@ def test_the_terminal_shows_the_stages_what_they_say_and_where_the_rest_is(
     run = make_run(cells, n=8)
     text = printed(run, width)
     assert "…" not in text
-    tables, _, said = text.partition("8 requests a cell")
+    tables, _, sentences = text.partition("8 requests a cell")
     assert all(len(line.rstrip()) <= width for line in tables.splitlines())
     assert {row[-1] for row in (group_table(run) if count > 5 else stage_table(run, full=False)).rows} <= {
         *tables.split()
     }
-    assert "Echo engine." in " ".join(said.split())
+    assert "Echo engine." in " ".join(sentences.split())
     assert "mean ± sd" not in tables or count < 3
-    assert "more tables (summary, summary-e2e" in said
+    assert "more tables (summary, summary-e2e" in sentences
 
 
 def test_an_empty_run_prints_a_line(make_run: MakeRun) -> None:

@@ -75,8 +75,8 @@ def make(tmp_path: Path, make_row: MakeRow) -> Make:
                     engine = "llama-server" if name == "http/llama-server" else "llama"
                     row = make_row(name, PATHS.get(name, PATHS["http/as-deployed"]), block, engine=engine)
                     pipeline = "loopback" if name == "in-process" else name.partition("/")[0]
-                    told = dict((facts or {}).get(name, {}))
-                    row = replace(row, pipeline=pipeline, warmup=block < 0, n_tokens=len(ms) + 1, facts=told)
+                    own_facts = dict((facts or {}).get(name, {}))
+                    row = replace(row, pipeline=pipeline, warmup=block < 0, n_tokens=len(ms) + 1, facts=own_facts)
                     run.sample(row)
                     times = [row.marks[-1][1]]
                     for gap in ms:
@@ -137,8 +137,8 @@ def test_another_engine_is_compared_by_the_engines_own_figures_too(make: Make) -
         ("tokens_per_s", "http/llama-server", 0.8),
     ]
     assert "tokens_per_s,http/llama-server,in-process,0.8" in throughput_csv(run)["ratios.csv"].text(run.origins)
-    said = throughput_sentences(run)[-1]
-    assert said == "By their own figures the engine of http/llama-server has 0.800 of the rate of in-process."
+    sentence = throughput_sentences(run)[-1]
+    assert sentence == "By their own figures the engine of http/llama-server has 0.800 of the rate of in-process."
     untold = make(dict.fromkeys(names, [10] * 4), facts={"in-process": facts["in-process"]})
     assert {ratio["metric"] for ratio in throughput_json(untold)["ratios"]} == {"decode_tokens_per_s"}
 
@@ -214,9 +214,9 @@ def test_a_reference_that_broke_off_is_compared_all_the_same(make: Make) -> None
 
 def test_the_json_is_strict_and_valid(make: Make) -> None:
     facts = {"predicted_n": 70.0, "predicted_ms": 700.0, "prompt_ms": 20.0, "prompt_eval_ms": 5.0, "prompt_n": 9.0}
-    told = {"in-process": {**facts, "energy_j": 3.0}}
+    joules = {"in-process": {**facts, "energy_j": 3.0}}
     gaps = {"in-process": [10.0] * 69, "http/as-deployed": [11.0] * 69}
-    run = make(gaps, facts=told, reference=[9.0, 99.0, 98.0, 97.0], reference_command=["x"])
+    run = make(gaps, facts=joules, reference=[9.0, 99.0, 98.0, 97.0], reference_command=["x"])
     whole = json.loads(json.dumps(throughput_json(run), allow_nan=False))
     jsonschema.validate(whole, SCHEMA, cls=jsonschema.Draft202012Validator)
     cell = whole["cells"][0]
