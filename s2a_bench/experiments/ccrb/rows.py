@@ -171,10 +171,6 @@ class TrajectoryRow:
 
 
 ROLLOUTS: Final[Table[AboutRollout]] = Table("rollouts", RolloutRow)
-"""One row a roll-out of the driving scenario."""
 TRAJECTORIES: Final[Table[TrajectoryRow]] = Table("trajectories", TrajectoryRow)
-"""One row a moment of a recorded roll-out."""
 FOLLOWER_STUDY: Final[Table[FollowerRow]] = Table("followers", FollowerRow)
-"""One row a policy, follower, lead and seed."""
 SENSITIVITY: Final[Table[SensitivityRow]] = Table("sensitivity", SensitivityRow)
-"""One row a value of a varied number and seed."""

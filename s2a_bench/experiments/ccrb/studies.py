@@ -215,7 +215,7 @@ def follower_rows(config: CcrbConfig) -> Iterator[tuple[int, list[FollowerRow]]]
         changed: dict[str, Any] = {"follower": follower, "front_gap_m": front_m, "lead_decel_mps2": decel}
         scenario = config.scenario.but(lane_change=False, **changed)
         seeds, scenes = _points(config, scenario)
-        cars = scenes.cars(_gaps(scenes, scenario), scenario)
+        cars = _cars(scenes, scenario)
         safe = survived(scenes, cars)
         codes = _codes(config, scenes, cars)
         paper = _paper(codes)
@@ -251,7 +251,7 @@ def sensitivity_rows(config: CcrbConfig) -> Iterator[tuple[int, list[Sensitivity
     for varied, values in VARIED.items():
         for value in values:
             changed: dict[str, Any] = {varied: np.full(len(scenes), value)}
-            cars = replace(scenes.cars(_gaps(scenes, scenario), scenario), **changed)
+            cars = replace(_cars(scenes, scenario), **changed)
             paper = _paper(_codes(config, scenes, cars))
             yield (
                 len(FORMS) * len(scenes),
@@ -291,8 +291,8 @@ def _points(config: CcrbConfig, scenario: CcrbOptions) -> tuple[NDArray[np.int64
     return np.append(np.repeat(np.array(seeds), config.seed_points), -1), scenes
 
 
-def _gaps(scenes: Scenes, scenario: CcrbOptions) -> NDArray[np.str_]:
-    return np.full(len(scenes), scenario.gap)
+def _cars(scenes: Scenes, scenario: CcrbOptions) -> Cars:
+    return scenes.cars(np.full(len(scenes), scenario.gap), scenario)
 
 
 def _codes(config: CcrbConfig, scenes: Scenes, cars: Cars) -> dict[str, NDArray[np.int64]]:

@@ -189,12 +189,15 @@ def _act(
     def on_actions(request: int, actions: Sequence[Any], at_ns: int) -> None:
         loop.arrived(request, actions, at_ns)
 
+    def send(action: Vector | None, at_ns: int) -> None:
+        if robot is not None:
+            robot.send(action, at_ns)
+
     requester = ChunkRequester(sessions, config.horizon, config.seed, cell.mode.streams, on_actions, blocks)
 
     def request_chunk(request: int, tick: int) -> None:
         requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else ()))
 
-    send = _discard if robot is None else robot.send
     loop = ControlLoop(
         cell.acting, setting, send, request_chunk, max(2, round(config.seconds * 1e9 / setting.period_ns))
     )
@@ -209,10 +212,6 @@ def _act(
             loop.stop()
     _keep(requester, launch)
     return LiveResult(cell, setting, sessions[0], loop.acted(), requester, robot, tuple(loop.stepper.triggers))
-
-
-def _discard(action: Vector | None, at_ns: int) -> None:
-    """Ignore an action: there is no robot."""
 
 
 def _accepts_state(config: ChunksConfig, session: Session, robot: ActionRobot) -> bool:

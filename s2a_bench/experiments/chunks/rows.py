@@ -213,14 +213,8 @@ class MeanRow:
 
 
 CHUNKS: Final[Table[AboutCell]] = Table("chunks", ChunkRow)
-"""One row a mode, rule and source of latencies."""
 TICKS: Final[Table[TickRow]] = Table("chunk_ticks", TickRow)
-"""One row a control tick, the first of each cell."""
 REQUESTS: Final[Table[RequestRow]] = Table("chunk_requests", RequestRow)
-"""One row a request that left within those ticks."""
 TRIGGERS: Final[Table[TriggerRow]] = Table("chunk_triggers", TriggerRow)
-"""One row a trigger and source of latencies."""
 REACTIONS: Final[Table[ReactionRow]] = Table("chunk_reactions", ReactionRow)
-"""One row a cell and quantile."""
 MEANS: Final[Table[MeanRow]] = Table("chunk_means", MeanRow)
-"""One row a mode and mean latency."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,15 +67,12 @@ class LlamaBench:
         started_ns = now_ns()
         test = self._run(command)
         row = ReferenceRow(
-            block=place.block,
-            position=place.position,
-            warmup=place.warmup,
+            **asdict(place),
             started_ns=started_ns,
             finished_ns=now_ns(),
             n_gen=test["n_gen"],
             depth=test.get("n_depth", 0),
             decode_ns=test["samples_ns"][0],
-            launch=place.launch,
             facts={name: test[name] for name in test if not name.startswith(("samples", "avg", "stddev"))},
         )
         self._writer.append(REFERENCE, [row])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -47,6 +48,7 @@ def timeline_rows(
     time of the picture from the request.
     """
     found = metrics_of(plans, schedule, observed_s=observed_s, tolerance_s=tolerance_s)
+    shared = asdict(setting)
     rows = []
     for place, request_id in enumerate(request_ids):
         plan = first_plan + place
@@ -55,15 +57,7 @@ def timeline_rows(
             TimelineRow(
                 cell=f"{setting.name}/{policy}",
                 policy=policy,
-                board=setting.board,
-                title=setting.title,
-                mode=setting.mode,
-                emulated=setting.emulated,
-                tokens_per_s=setting.tokens_per_s,
-                prompt_s=setting.prompt_s,
-                tokens_per_skill=setting.tokens_per_skill,
-                n_skills=setting.n_skills,
-                t_nom_s=setting.t_nom_s,
+                **shared,
                 plan=plan,
                 request_id=request_id,
                 requested_ns=requested_ns[place] if requested_ns else 0,

@@ -144,4 +144,3 @@ TimelineRow: Final = with_fields(
 
 
 TIMELINES: Final[Table[PlanRow]] = Table("timelines", TimelineRow)
-"""One row a plan and policy."""

@@ -153,26 +153,6 @@ def recordings(folder: Path) -> list[Floats]:
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class _Play:
-    """One plan to play: the times of its tokens, and the plan of shape (N, 1)."""
-
-    token_s: Floats
-    plans: Plans
-
-    @property
-    def calls(self) -> list[Call]:
-        times = zip(self.plans.least_s[:, 0], self.plans.nominal_s[:, 0], self.plans.most_s[:, 0], strict=True)
-        return [
-            Call(Skill(f"skill{number}", (), Durations(*map(float, durations)), "hold"), ())
-            for number, durations in enumerate(times, start=1)
-        ]
-
-    @property
-    def span_s(self) -> float:
-        return float(self.plans.arrival_s[-1, 0] + self.plans.nominal_s.sum())
-
-
 def run_real_time(config: TimelineConfig, output: Path, progress: Progress) -> Path:
     """Play all timelines, one setting after the other, and return the run folder; raises S2AError.
 
@@ -189,7 +169,12 @@ def run_real_time(config: TimelineConfig, output: Path, progress: Progress) -> P
             for board, setting in work:
                 run.play(board, setting)
         finally:
-            run.conclude()
+            warnings = [*run.warnings, *calibration_warnings(run.calibrations)]
+            writer.update(
+                calibrations=run.calibrations,
+                start_jitter=jitter_facts(run.records),
+                warnings=[warning.to_manifest() for warning in warnings],
+            )
         return writer.path
 
 
@@ -218,44 +203,41 @@ class _RealTime:
         for plan in range(config.plans_a_cell):
             cut = slice(plan, plan + 1)
             one = Plans(plans.arrival_s[:, cut], plans.nominal_s[:, cut], plans.least_s[:, cut], plans.most_s[:, cut])
-            self._execute(setting, plan, _Play(token_s[:, plan], one), following)
+            self._execute(setting, plan, token_s[:, plan], one, following)
             self.progress.advance()
 
-    def _execute(self, setting: PlanSetting, plan: int, play: _Play, following: Following) -> None:
-        self.progress.stage(f"{setting.title}, L = {setting.tokens_per_skill}: about {play.span_s:.0f} s")
-        safe_s = float(safe_start(play.plans.arrival_s, play.plans.nominal_s)[0])
+    def _execute(self, setting: PlanSetting, plan: int, token_s: Floats, plans: Plans, following: Following) -> None:
+        span_s = float(plans.arrival_s[-1, 0] + plans.nominal_s.sum())  # the end of the policy that waits for the plan
+        self.progress.stage(f"{setting.title}, L = {setting.tokens_per_skill}: about {span_s:.0f} s")
+        safe_s = float(safe_start(plans.arrival_s, plans.nominal_s)[0])
         shape = replace(self.config.shape(setting), safe_start_s=safe_s)
         policies = following.policies()
         robots = [TimedRobot() for _ in policies]
-        executors = SideBySide(policies, shape, "hold", robots, max(SILENCE_S, 2 * play.span_s))
+        executors = SideBySide(policies, shape, "hold", robots, max(SILENCE_S, 2 * span_s))
         title = f"{setting.title}, {setting.tokens_per_s:g} tokens/s, L = {setting.tokens_per_skill} (EMULATED)"
         try:
-            with executors, watching(self.progress, Scene(title, executors.records, setting.n_skills, play.span_s)):
-                _play(play, setting.tokens_per_skill, executors)
+            with executors, watching(self.progress, Scene(title, executors.records, setting.n_skills, span_s)):
+                _play(token_s, plans, setting.tokens_per_skill, executors)
         finally:  # also after an interruption
             self.records += executors.records
             request_id = setting.request_id(plan)
             if plan < KEPT_PLANS:
-                self.writer.append(TOKENS, _token_rows(setting, request_id, executors.records[0]))
+                token_ns = enumerate(executors.records[0].token_ns)
+                rows = [TokenRow(request_id, setting.name, index, -1, "", None, at_ns) for index, at_ns in token_ns]
+                self.writer.append(TOKENS, rows)
             self.warnings += keep(self.writer, setting, plan, request_id, policies, executors.records)
         following.learn(executors.records)
 
-    def conclude(self) -> None:
-        warnings = [*self.warnings, *calibration_warnings(self.calibrations)]
-        self.writer.update(
-            calibrations=self.calibrations,
-            start_jitter=jitter_facts(self.records),
-            warnings=[warning.to_manifest() for warning in warnings],
-        )
 
-
-def _play(play: _Play, tokens_per_skill: int, executors: SideBySide) -> None:
+def _play(token_s: Floats, plans: Plans, tokens_per_skill: int, executors: SideBySide) -> None:
     """Send every token to the executors at its time, and wait until they finish."""
     clock = SystemClock()
     requested_ns = clock.now_ns()
     executors.send(Requested(requested_ns))
-    calls = iter(play.calls)
-    for place, due_s in enumerate(play.token_s, start=1):
+    durations = zip(plans.least_s[:, 0], plans.nominal_s[:, 0], plans.most_s[:, 0], strict=True)
+    skills = (Durations(*map(float, each)) for each in durations)
+    calls = (Call(Skill(f"skill{number}", (), each, "hold"), ()) for number, each in enumerate(skills, start=1))
+    for place, due_s in enumerate(token_s, start=1):
         clock.sleep_until_ns(requested_ns + round(float(due_s) * 1e9))
         at_ns = clock.now_ns()
         executors.send(TokenArrived(at_ns))
@@ -263,9 +245,3 @@ def _play(play: _Play, tokens_per_skill: int, executors: SideBySide) -> None:
             executors.send(SkillArrived(at_ns, next(calls)))
     executors.send(StreamEnded(clock.now_ns()))
     executors.finish()
-
-
-def _token_rows(setting: PlanSetting, request_id: str, record: Record) -> list[TokenRow]:
-    return [
-        TokenRow(request_id, setting.name, index, -1, "", None, at_ns) for index, at_ns in enumerate(record.token_ns)
-    ]

@@ -125,7 +125,7 @@ def delay_table(run: StoredRun) -> TextTable:
             rows.append((str(place), *left, *latency, *(_cell(one, name) for name in names)))
     names_left = ("L", "mode") if live(run) else ("L", "latency", "requests")
     header = (*names_left, "ms", "p99", *(_TITLES[name] for name in names))
-    title = f"Delays, d = {_rounding(run)} of L over Delta t"
+    title = f"Delays, d = {run.manifest['configuration']['rounding']} of L over Delta t"
     return TextTable(title, header, rows, 2, notes=(_convention(run),))
 
 
@@ -158,7 +158,7 @@ def _table(run: StoredRun, title: str, names: Sequence[str], notes: Iterable[str
     settings = run.manifest["configuration"]
     of = "" if several else f" @ {found[0][0]}" if found else ""
     slower = f" / {settings['slow_down']:g}" if settings.get("slow_down", 1) > 1 else ""
-    what = f"{title}{of}, H = {settings['horizon']}, {settings['control_hz']:g}{slower} Hz, d by {_rounding(run)}"
+    what = f"{title}{of}, H = {settings['horizon']}, {settings['control_hz']:g}{slower} Hz, d by {settings['rounding']}"
     header = (*("L",) * several, *named, *(_TITLES[name] for name in names))
     return TextTable.grouped(what, header, groups, several + len(named), _notes(run) if notes is None else notes)
 
@@ -190,12 +190,8 @@ def entry(value: float) -> str:
     return str(int(value)) if float(value).is_integer() else number(value)
 
 
-def _rounding(run: StoredRun) -> str:
-    return str(run.manifest["configuration"]["rounding"])
-
-
 def _convention(run: StoredRun) -> str:
-    return _CONVENTION[_rounding(run)]
+    return _CONVENTION[run.manifest["configuration"]["rounding"]]
 
 
 def _notes(run: StoredRun) -> Iterator[str]:
