@@ -52,8 +52,8 @@ class Acted:
 
     @property
     def whole(self) -> int:
-        missing = [request for request, arrivals in enumerate(self.arrival_ns) if arrivals[-1] < 0]
-        return missing[0] if missing else len(self.arrival_ns)
+        missing = (request for request, arrivals in enumerate(self.arrival_ns) if arrivals[-1] < 0)
+        return next(missing, len(self.arrival_ns))
 
 
 class ControlLoop:

@@ -115,12 +115,9 @@ class PlantRobot(ActionRobot):
     def actions(self) -> Floats:
         return np.array(self._sent).reshape(-1, self._dims)
 
-    def motion(self, most: int | None = None) -> PlantMotion | None:
-        return self._plant.respond(self.actions[:most], self._period_s) if self._sent else None
-
     def moved(self, most: int) -> tuple[PlantMotion, Floats] | None:
-        motion = self.motion(most)
-        return None if motion is None else (motion, self.actions[:most])
+        actions = self.actions[:most]
+        return (self._plant.respond(actions, self._period_s), actions) if self._sent else None
 
     def state(self) -> tuple[float, ...]:
         return tuple(self._state[0].tolist())

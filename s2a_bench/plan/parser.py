@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import codecs
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, TypeAlias
 
 from s2a_bench.plan.formats import Format
 from s2a_bench.plan.labels import normalise
@@ -98,12 +98,8 @@ class Parser:
         return events
 
 
-class _Bad(NamedTuple):
-    problem: Problem
-    text: str
-    why: str
-
-
+_Bad: TypeAlias = tuple[Problem, str, str]
+"""Problem, text and reason of a `BadLine`."""
 _Found: TypeAlias = int | _Bad
 """An index in ``skills.calls``, or an error."""
 
@@ -133,7 +129,7 @@ class _Lines:
         if line and text is not None:
             longer = next((key for key in self._format.table if key.startswith(text) and key != text), None)
             if longer is not None:
-                return [_Bad("incomplete", line, f"the answer ended where '{longer}' was still possible")]
+                return [("incomplete", line, f"the answer ended where '{longer}' was still possible")]
         return self._finish()
 
     def _collect(self, text: str, start: int, end: int) -> list[_Found]:
@@ -143,7 +139,7 @@ class _Lines:
         if len(self._line) <= self._limit:
             return []
         cut, self._line, self._skipping = self._line[: self._limit], "", True
-        return [_Bad("too-long", cut, f"more than {self._limit} characters without the end of a line")]
+        return [("too-long", cut, f"more than {self._limit} characters without the end of a line")]
 
     def _finish(self) -> list[_Found]:
         line, self._line, self._skipping = self._line.strip(), "", False
@@ -174,7 +170,7 @@ class _Codes:
     def _take(self, char: str) -> list[_Found]:
         if self._after_code and self._apart:
             self._skipping = True
-            return [_Bad("malformed", char, "codes should be apart")]
+            return [("malformed", char, "codes should be apart")]
         self._code += char
         self._after_code = self._code in self._format.table
         if not self._after_code and self._code in self._starts:
@@ -186,7 +182,7 @@ class _Codes:
     def end(self) -> list[_Found]:
         if not self._code:
             return []
-        return [_Bad("incomplete", self._code, "the answer ended within a code")]
+        return [("incomplete", self._code, "the answer ended within a code")]
 
 
 def _text(line: str, format_: Format) -> str | None:
@@ -200,7 +196,7 @@ def _text(line: str, format_: Format) -> str | None:
 def _look_up(line: str, format_: Format) -> _Found:
     text = _text(line, format_)
     if text is None:
-        return _Bad("malformed", line, "a number and a dot should come first")
+        return "malformed", line, "a number and a dot should come first"
     index = format_.table.get(text)
     return _explain(text, line, format_) if index is None else index
 
@@ -209,14 +205,14 @@ def _explain(text: str, line: str, format_: Format) -> _Bad:
     labels = format_.labels
     fields = labels.fields(text)
     if not fields:
-        return _Bad("malformed", line, f"should look like '{format_.texts[0].strip()}'")
+        return "malformed", line, f"should look like '{format_.texts[0].strip()}'"
     head, *rest = fields
     skill = next((skill for skill in format_.skills.skills if labels.head(skill) == head), None)
     if skill is None:
-        return _Bad("unknown-skill", line, f"'{head}' is none of the skills")
+        return "unknown-skill", line, f"'{head}' is none of the skills"
     for argument, given in zip(skill.arguments, rest, strict=False):
         if given not in {labels.value(argument.vocabulary, value) for value in argument.values}:
-            return _Bad("bad-argument", line, f"'{given}' is no {argument.name} of {skill.name}")
+            return "bad-argument", line, f"'{given}' is no {argument.name} of {skill.name}"
     if len(rest) < len(skill.arguments):
-        return _Bad("bad-argument", line, f"{skill.name} has {len(skill.arguments)} arguments, {len(rest)} are given")
-    return _Bad("malformed", line, f"{skill.name} is not written as listed")
+        return "bad-argument", line, f"{skill.name} has {len(skill.arguments)} arguments, {len(rest)} are given"
+    return "malformed", line, f"{skill.name} is not written as listed"

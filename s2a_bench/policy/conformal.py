@@ -223,10 +223,7 @@ def stalled(policy: Policy, plans: Plans) -> NDArray[np.bool_]:
 
 
 def take(plans: Plans, columns: NDArray[np.intp]) -> Plans:
-    """Return the plans of these columns."""
-
-    def cut(rows: Floats | None) -> Any:
-        return rows if rows is None or rows.shape[1] == 1 else rows[:, columns]
-
-    names = ("arrival_s", "nominal_s", "least_s", "most_s", "token_s")
-    return replace(plans, **{name: cut(getattr(plans, name)) for name in names})
+    """Return the plans of these columns; an array of one column stands for all plans."""
+    arrays = {name: getattr(plans, name) for name in ("arrival_s", "nominal_s", "least_s", "most_s", "token_s")}
+    wide = {name: rows for name, rows in arrays.items() if rows is not None and rows.shape[1] > 1}
+    return replace(plans, **{name: rows[:, columns] for name, rows in wide.items()})

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from s2a_bench.boards.gaps import Gaps
 from s2a_bench.policy import Floats
@@ -87,15 +87,10 @@ class Grid:
     tokens_per_s: tuple[float, ...]
 
 
-def slowest_rate(tokens_per_skill: ArrayLike, duration_s: float) -> Floats:
-    """Return the line R = L / T, in tokens/s: naive is stall-free at this rate and above."""
-    return np.asarray(tokens_per_skill, dtype=np.float64) / duration_s
-
-
 def analytic(grid: Grid, duration_s: float) -> Flags:
     """Return where steady arrivals are stall-free, shape (K, J): L / R <= T."""
-    rates: Floats = np.array(grid.tokens_per_s, dtype=np.float64)
-    return slowest_rate(grid.tokens_per_skill, duration_s)[:, np.newaxis] <= rates
+    slowest = np.array(grid.tokens_per_skill, dtype=np.float64) / duration_s
+    return np.less_equal.outer(slowest, np.array(grid.tokens_per_s, dtype=np.float64))
 
 
 def simulate(

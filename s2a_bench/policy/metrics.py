@@ -158,19 +158,20 @@ def speed_profile(
 
 
 def jerk(speed_mps: Floats, sample_s: float) -> Floats:
-    """Return the jerk in m/s^3 at the inner samples by the second central difference: shape (n,) -> (n - 2,)."""
-    speed = np.asarray(speed_mps, dtype=np.float64)
-    return np.diff(speed, 2) / sample_s**2
+    """Return the jerk in m/s^3 by second central differences: shape (n,) -> (n - 2,); raises ValueError for n < 3."""
+    if len(speed_mps) < 3:  # noqa: PLR2004 - a second difference
+        raise ValueError("a speed profile needs 3 samples or more to have a jerk")
+    return np.diff(np.asarray(speed_mps, dtype=np.float64), 2) / sample_s**2
 
 
 def rms_jerk(speed_mps: Floats, sample_s: float) -> float:
     """Return the root of the mean squared jerk in m/s^3; raises ValueError for fewer than 3 samples."""
-    return float(np.sqrt(np.mean(_enough(jerk(speed_mps, sample_s)) ** 2)))
+    return float(np.sqrt(np.mean(jerk(speed_mps, sample_s) ** 2)))
 
 
 def peak_jerk(speed_mps: Floats, sample_s: float) -> float:
     """Return the greatest absolute jerk in m/s^3; raises ValueError for fewer than 3 samples."""
-    return float(np.abs(_enough(jerk(speed_mps, sample_s))).max())
+    return float(np.abs(jerk(speed_mps, sample_s)).max())
 
 
 def sparc(
@@ -198,12 +199,6 @@ def sparc(
     width_hz = frequency_hz[strong[-1]] - frequency_hz[strong[0]]
     steps = np.diff(frequency_hz[chosen]) / width_hz
     return -float(np.sum(np.hypot(steps, np.diff(amplitude[chosen]))))
-
-
-def _enough(values: Floats) -> Floats:
-    if not values.size:
-        raise ValueError("a speed profile needs 3 samples or more to have a jerk")
-    return values
 
 
 def _share(part: Floats, whole: Floats) -> Floats:

@@ -19,15 +19,10 @@ T = TypeVar("T")
 def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
     """Build ``name?parameter=value&...``; raises UsageError naming ``field``, the parameter, and the known ones."""
     name, _, given = written.partition("?")
-    if not given:
-        try:
-            return made_by()
-        except UsageError as error:
-            raise UsageError(f"`{field}`: {name}: {error}") from error
-    types = _types(made_by)
+    types = _types(made_by) if given else {}
     known = f"its parameters are {', '.join(types)}" if types else "it has no parameters"
     values: dict[str, Any] = {}
-    for pair in given.split("&"):
+    for pair in given.split("&") if given else ():
         parameter, _, text = pair.partition("=")
         if parameter not in types or parameter in values:
             wrong = "is given twice" if parameter in values else "is no parameter"
@@ -37,7 +32,7 @@ def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
     try:
         return made_by(**values)
     except UsageError as error:
-        raise UsageError(f"`{field}`: {name}: {error}; {known}") from error
+        raise UsageError(f"`{field}`: {name}: {error}" + f"; {known}" * bool(given)) from error
 
 
 def canonical(name: str, policy: object) -> str:

@@ -53,7 +53,7 @@ class Embedded:
             # A car may come to rest within the step, but not go backwards.
             least = -vehicle.speed / self.step_s
             acceleration = max(float(command.acceleration_mps2[car, 0]), least)
-            steering = vehicle.steering_control(lane_index(int(command.lane[0]))) if car == EGO else 0.0
+            steering = vehicle.steering_control(("0", "1", LANES[int(command.lane[0])])) if car == EGO else 0.0
             # As Vehicle.act does: ControlledVehicle.act would overwrite the command.
             vehicle.action = {"steering": steering, "acceleration": acceleration}
             vehicle.step(self.step_s)
@@ -82,8 +82,3 @@ def build_road() -> Any:
 def centre(car: int, position_m: float, lateral_m: float, length_m: float) -> Floats:
     """Return highway-env's coordinates of a car, in m."""
     return np.array([position_m + LENGTHS[car] * length_m, MIDDLE_M - lateral_m])
-
-
-def lane_index(lane: int) -> tuple[str, str, int]:
-    """Return highway-env's index of a lane."""
-    return ("0", "1", LANES[lane])

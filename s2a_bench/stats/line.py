@@ -75,17 +75,12 @@ def fit_line(groups: Sequence[tuple[float, Floats]], seed: int = 0) -> Line | No
 
 def crossing(one: Line, other: Line) -> Estimate | None:
     """Return the x above 0 at which two lines cross; None if they do not, or fewer than 95 % of the draws do."""
-
-    def meet(fixed: Floats, slope: Floats) -> Floats:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.where(slope == 0, -1.0, -fixed / slope)
-
-    apart = one.draws - other.draws
-    met = meet(apart[:, 0], apart[:, 1])
-    point = meet(
-        np.array([one.fixed.value - other.fixed.value]), np.array([one.slope.value - other.slope.value])
-    ).item()
-    same_way = np.sign(apart[:, 1]) == np.sign(one.slope.value - other.slope.value)
+    best = [[one.fixed.value - other.fixed.value, one.slope.value - other.slope.value]]
+    fixed, slope = np.vstack([best, one.draws - other.draws]).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        met = np.where(slope == 0, -1.0, -fixed / slope)
+    point, met = met[0].item(), met[1:]
+    same_way = np.sign(slope[1:]) == np.sign(slope[0])
     if point <= 0 or np.mean((met > 0) & same_way) < SURE:
         return None
     low, high = np.percentile(met[(met > 0) & same_way], LIMITS)

@@ -42,8 +42,9 @@ def test_one_action_at_a_time_is_all_at_once(plant: Plant, actions: list[np.ndar
         robot.send(action, tick * PERIOD_NS)
     motion = plant.respond(as_array(actions), PERIOD_S)
     np.testing.assert_allclose(np.array(seen[1:]), motion.position[1:, 0], atol=1e-9)
-    mine = robot.motion()
-    assert mine is not None
+    moved = robot.moved(len(actions))
+    assert moved is not None
+    mine, _ = moved
     np.testing.assert_array_equal(mine.position, motion.position)
     np.testing.assert_array_equal(mine.jerk, motion.jerk)
 
@@ -91,7 +92,7 @@ def test_before_its_first_action_it_does_not_move() -> None:
     robot = PlantRobot(Plant(), 3, PERIOD_NS)
     robot.send(None, 0)
     assert robot.state() == (0, 0, 0)
-    assert robot.motion() is None
+    assert robot.moved(1) is None
     assert robot.actions.shape == (0, 3)
     with pytest.raises(ValueError, match="nothing to hold"):
         Plant().respond(np.array([[np.nan]]), PERIOD_S)

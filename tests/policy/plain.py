@@ -69,7 +69,7 @@ def learned(mean: float, plan: float, token: float, gaps: Seconds) -> tuple[floa
 
 def watched(mean: float, plan_cv: float, token_cv: float, tokens: Seconds) -> list[tuple[float, float, bool]]:
     """Say after each token what is learned of the gaps, and whether the plan has slowed down (docs/shift.md)."""
-    told: list[tuple[float, float, bool]] = []
+    learned_rows: list[tuple[float, float, bool]] = []
     slow, first, believed = False, 0, (mean, plan_cv**2)
     for now in range(len(tokens)):
         gaps = [later - earlier for earlier, later in pairwise(tokens[first : now + 1])]
@@ -84,5 +84,5 @@ def watched(mean: float, plan_cv: float, token_cv: float, tokens: Seconds) -> li
         elif slow and min(surprises)[0] < -4:
             slow, first, believed = False, 0, (mean, plan_cv**2)
         gaps = [later - earlier for earlier, later in pairwise(tokens[first : now + 1])]
-        told.append((*learned(*believed, token_cv**2, gaps), slow))
-    return told
+        learned_rows.append((*learned(*believed, token_cv**2, gaps), slow))
+    return learned_rows

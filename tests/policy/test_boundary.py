@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -11,7 +10,7 @@ from s2a_bench.boards.gaps import Constant, Lognormal
 from s2a_bench.policy import Plans
 from s2a_bench.policy import policy as build
 from s2a_bench.policy.arrivals import uniform
-from s2a_bench.policy.evaluate import Grid, analytic, evaluate, simulate, slowest_rate
+from s2a_bench.policy.evaluate import Grid, analytic, evaluate, simulate
 from s2a_bench.policy.metrics import measure
 from s2a_bench.testing.policy import draw
 
@@ -24,7 +23,10 @@ def p_stall(cv: float, grid: Grid = GRID, plans: int = 400, seed: int = 1) -> np
 
 
 def test_the_line_is_tokens_over_duration() -> None:
-    assert slowest_rate([1, 2, 4, 6], 0.8).tolist() == pytest.approx([1.25, 2.5, 5.0, 7.5])
+    assert analytic(Grid((2, 4), (2.49, 2.5, 4.99, 5.0)), 0.8).tolist() == [
+        [False, True, True, True],
+        [False] * 3 + [True],
+    ]
 
 
 def test_the_papers_line_leaves_out_what_runs_smoothly_at_nominal_durations() -> None:

@@ -45,8 +45,8 @@ def test_it_is_the_plain_rule_for_plans_side_by_side(
         watch.token(at_s)
         found.append((*watch.learned, watch.slow.copy()))
     for column in range(2):
-        told = plain.watched(0.2, plan_cv, token_cv, token_s[:, column].tolist())
-        for row, (mean_s, variance, slow) in enumerate(told):
+        learned_rows = plain.watched(0.2, plan_cv, token_cv, token_s[:, column].tolist())
+        for row, (mean_s, variance, slow) in enumerate(learned_rows):
             assert found[row][0][column] == pytest.approx(mean_s)
             assert found[row][1][column] == pytest.approx(variance)
             assert found[row][2][column] == slow

@@ -90,7 +90,7 @@ def test_the_promises_hold_for_scores_of_any_distribution() -> None:
     risks = np.array([1 - choose(rng.random(400)).caution for _ in range(4000)])  # P(score > lambda), exactly
     error = risks.std() / 4000**0.5
     assert risks.mean() <= 1 / 401 + 4 * error
-    assert risks.mean() >= 1 / 401 - 4 * error  # and no more careful than said
+    assert risks.mean() >= 1 / 401 - 4 * error  # and no more careful than promised
     assert (risks > 0.02).mean() <= 0.001 + 4 * (0.001 / 4000) ** 0.5
     expected = np.array([1 - choose(rng.random(400), 0.01, "expected").caution for _ in range(4000)])
     assert expected.mean() == pytest.approx(4 / 401, abs=4 * expected.std() / 4000**0.5)

@@ -48,5 +48,5 @@ def test_the_table_names_every_parameter() -> None:
             assert list(policies([f"{name}?{parameter}={each}"])) == [name]
     written = {"detect": "True", "spend": "0.7"}
     for name, parameter in documented:
-        asked = f"{name}?{parameter}={written.get(parameter, '7')}"
-        assert list(policies([asked])) == [asked]
+        text = f"{name}?{parameter}={written.get(parameter, '7')}"
+        assert list(policies([text])) == [text]

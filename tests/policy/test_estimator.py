@@ -72,14 +72,14 @@ def test_what_a_gap_varies_is_told_by_sums_over_about_the_square_root_of_their_n
 
 
 @pytest.mark.parametrize(
-    ("token_s", "said"),
+    ("token_s", "message"),
     [
         *((np.cumsum(np.ones(shape), axis=0), "a prior needs 2 plans of 3 tokens or more, not") for shape in SHORT),
         (np.ones((5, 5)), "all at once"),
     ],
 )
-def test_too_little_is_refused(token_s: np.ndarray, said: str) -> None:
-    with pytest.raises(UsageError, match=said):
+def test_too_little_is_refused(token_s: np.ndarray, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
         GapPrior.fit(token_s)
 
 

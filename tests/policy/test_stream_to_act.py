@@ -94,7 +94,7 @@ def test_the_start_is_when_mean_meets_nominal_and_caution_meets_stretched(cautio
 
 
 def test_the_caution_is_what_was_asked_for_else_the_99_per_cent_quantile() -> None:
-    cautions = [StreamToAct(PRIOR, asked).stepper(SHAPE).caution for asked in (None, 0.0, 1.5)]  # type: ignore[attr-defined]
+    cautions = [StreamToAct(PRIOR, caution).stepper(SHAPE).caution for caution in (None, 0.0, 1.5)]  # type: ignore[attr-defined]
     assert cautions == [2.33, 0.0, 1.5]
     assert MeanStart().caution == 0.0
 

@@ -29,6 +29,17 @@ class Appending(Laid):
     def execution_horizon(self, setting: ControlSetting) -> int:
         return setting.length(self.execute)
 
+    def stepper(self, setting: ControlSetting) -> ChunkStepper:
+        return QueueStepper(self.execution_horizon(setting), self.trigger or 0)
+
+    def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:
+        delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
+        return appended(delay, known, self.trigger or 0, self.execution_horizon(setting))
+
+    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
+        delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
+        return _append(delay, known, delay, self.trigger or 0, self.execution_horizon(setting), setting.horizon)
+
 
 @dataclass(frozen=True, slots=True)
 class Queue(Appending):
@@ -40,19 +51,8 @@ class Queue(Appending):
     trigger: Annotated[int, Field(ge=0)] = 0
     execute: Execute = 0
 
-    def stepper(self, setting: ControlSetting) -> ChunkStepper:
-        return QueueStepper(self.execution_horizon(setting), self.trigger)
-
     def varied(self, triggers: tuple[int, ...]) -> Mode:
         return VariedQueue(self, triggers) if len(triggers) > 1 else replace(self, trigger=triggers[0])
-
-    def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:
-        delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
-        return appended(delay, known, self.trigger, self.execution_horizon(setting))
-
-    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
-        delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
-        return _append(delay, known, delay, self.trigger, self.execution_horizon(setting), setting.horizon)
 
 
 class VariedQueue(Varied):
@@ -85,15 +85,6 @@ class Sync(Appending):
     assumed_ticks: ClassVar[int] = 0
 
     execute: Execute = 0
-
-    def stepper(self, setting: ControlSetting) -> ChunkStepper:
-        return Queue(0, self.execute).stepper(setting)
-
-    def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:
-        return Queue(0, self.execute).closed_form(latency_ns, setting)
-
-    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
-        return Queue(0, self.execute).cycles(latency_ns, setting)
 
 
 @dataclass(frozen=True, slots=True)

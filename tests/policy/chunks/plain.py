@@ -5,7 +5,7 @@ ends (floor) or begins (ceil), and answers come whenever they come. Each mode is
 actions that lie ready.
 """
 
-# ruff: noqa: ARG002 - what a robot is told is the same for all of them
+# ruff: noqa: ARG002 - the calls of a robot are the same for all of them
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Robot:
         raise NotImplementedError
 
     def asks(self, request: int, tick: int) -> None:
-        """Remember that it asked."""
+        """Remember the request."""
 
     def gets(self, request: int, index: int, now: int) -> None:
         """Take an action."""

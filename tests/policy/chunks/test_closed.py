@@ -62,10 +62,10 @@ def boundaries(log: Log) -> list[int]:
 
 def ages(log: Log, skip: int) -> list[int]:
     """Return the ages of the executed actions of whole cycles after the first ``skip`` chunks."""
-    asked = [at // PERIOD for at in log.asked_ns]
-    last = len(asked) - 1
+    left_at = [at // PERIOD for at in log.asked_ns]
+    last = len(left_at) - 1
     acted = [(act[0], tick) for tick, act in enumerate(log.acts) if act is not None]
-    return [tick - asked[chunk] for chunk, tick in acted if skip <= chunk < last]
+    return [tick - left_at[chunk] for chunk, tick in acted if skip <= chunk < last]
 
 
 def spread(values: list[int]) -> tuple[float, float, float]:
@@ -175,9 +175,9 @@ def test_replace_stalls_for_what_a_cycle_and_a_delay_exceed_the_chunk_by(
         assert (stall == 0) == (s + delay <= setting.horizon)
     if delay < setting.horizon:
         age = replace_age_ticks(delay, cycle, setting.horizon)
-        asked = [at // PERIOD for at in log.asked_ns]
+        left_at = [at // PERIOD for at in log.asked_ns]
         found = [
-            tick - asked[act[0]] for tick, act in enumerate(log.acts) if act and from_tick <= tick < from_tick + cycle
+            tick - left_at[act[0]] for tick, act in enumerate(log.acts) if act and from_tick <= tick < from_tick + cycle
         ]
         assert spread(found) == (age.least, age.mean, age.most)
 
@@ -218,9 +218,9 @@ def test_a_reaction_takes_the_wait_and_up_to_a_cycle(latency: int, s: int, trigg
         if act is not None:
             first.setdefault(act[0], at)
     moments = range(log.asked_ns[4] + 1, log.asked_ns[5] + 1)
-    asked = log.asked_ns[5]
+    left_at = log.asked_ns[5]
     reactions = [first[5] - moment for moment in moments]
-    assert asked == max(moments)
+    assert left_at == max(moments)
     expected = reaction_s(wait * PERIOD, cycle * PERIOD)
     assert (min(reactions), max(reactions) + 1) == (expected.least, expected.most)
     assert np.mean(reactions) + 0.5 == expected.mean  # moments are whole ns
@@ -360,8 +360,8 @@ def test_no_start_delay_helps_where_progress_asks_but_playing_back_late_does() -
         assert (Replace(6).cycles(latency_ns, setting).stall_ticks[1:] == 2).all()
         assert (Aggregate(2).cycles(latency_ns, setting).stall_ticks[1:] == 2).all()
     # One that asks by the clock and executes what was due S0 = d ticks ago never stalls, for older actions.
-    asked = 6 * np.arange(20)
-    assert safe_start_ticks(earliest_arrivals(asked, np.full(20, 4), 8)) == 4
+    left_at = 6 * np.arange(20)
+    assert safe_start_ticks(earliest_arrivals(left_at, np.full(20, 4), 8)) == 4
 
 
 # (g) a wrong estimate
@@ -382,8 +382,8 @@ def test_a_fixed_estimate_makes_the_robot_jump_by_its_error(
     assert takeovers
     for tick in takeovers:
         chunk, index = log.acts[tick] or (0, 0)
-        asked = log.asked_ns[chunk] // PERIOD
-        done = sum(act is not None for act in log.acts[asked:tick])
+        left_at = log.asked_ns[chunk] // PERIOD
+        done = sum(act is not None for act in log.acts[left_at:tick])
         assert abs(index - done) == jump_actions(np.array(assumed), np.array(delay))
     assert set(
         np.abs(mode(f"replace?execute={s}&assumed={assumed}").cycles(constant(latency), setting).jump[1:-1])

@@ -53,10 +53,10 @@ def test_the_robot_chooses_what_is_computed_of_its_latencies(begin: Callable[[],
             return steppers[-1]
 
     cycles, _ = step(Watched(Queue(), begin), latency_ns, SETTING)
-    said = follow(begin(), latency_ns, SETTING, 15)
-    assert steppers[0].triggers[: latency_ns.size] == said.tolist()
+    triggers = follow(begin(), latency_ns, SETTING, 15)
+    assert steppers[0].triggers[: latency_ns.size] == triggers.tolist()
     late = cycles.settled
-    stall_ticks = np.maximum(0, SETTING.delay_ticks(latency_ns) - said)
+    stall_ticks = np.maximum(0, SETTING.delay_ticks(latency_ns) - triggers)
     np.testing.assert_array_equal(cycles.stall_ticks[late], stall_ticks[late])
 
 

@@ -21,7 +21,7 @@ SETTING = ControlSetting(10, 4)
 def test_a_run_by_hand() -> None:
     latency_ns = np.array([15, 15, 35, 5])
     replace = Replace(2)
-    # chunk -1 0 0 0 1 1 1 -1 2 3 3, asked for at 0, 3, 5, 9
+    # chunk -1 0 0 0 1 1 1 -1 2 3 3, requested at 0, 3, 5, 9
     found = measure(replace, replace.cycles(latency_ns, SETTING), replace.ticks(latency_ns, SETTING))
     assert (found.first_action_tick, found.ticks, found.requests) == (1, 10, 4)
     assert (found.stall_ticks, found.stall_share, found.longest_stall_ticks) == (1, 0.1, 1)

@@ -33,8 +33,8 @@ def test_ticks_are_those_of_a_robot_in_continuous_time(name: str, data: st.DataO
     assert (cycles.request_tick * setting.period_ns).tolist() == log.asked_ns
     begun = next((tick for tick, act in enumerate(expected) if act != (-1, -1)), cycles.ticks)
     assert ticks.stalled.tolist() == [tick > begun and act == (-1, -1) for tick, act in enumerate(expected)]
-    asked = [at // setting.period_ns for at in log.asked_ns]
-    ages = [tick - asked[chunk] if chunk >= 0 else -1 for tick, (chunk, _) in enumerate(expected)]
+    left_at = [at // setting.period_ns for at in log.asked_ns]
+    ages = [tick - left_at[chunk] if chunk >= 0 else -1 for tick, (chunk, _) in enumerate(expected)]
     assert ticks.age.tolist() == ages
 
 

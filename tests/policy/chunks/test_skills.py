@@ -69,12 +69,12 @@ def test_a_safe_start_is_never_early_and_at_most_a_tick_late(latency: int, gap: 
     assert last == exact + s - 1  # T1: naive ends when an exact start does
 
 
-@given(asked=st.lists(st.integers(0, 5), min_size=1, max_size=8), delays=st.data(), horizon=st.integers(1, 9))
+@given(gaps=st.lists(st.integers(0, 5), min_size=1, max_size=8), delays=st.data(), horizon=st.integers(1, 9))
 def test_the_earliest_arrival_is_the_least_over_the_chunks_that_cover_an_action(
-    asked: list[int], delays: st.DataObject, horizon: int
+    gaps: list[int], delays: st.DataObject, horizon: int
 ) -> None:
-    request = np.cumsum(asked)
-    delay = np.array(delays.draw(st.lists(st.integers(0, 12), min_size=len(asked), max_size=len(asked))))
+    request = np.cumsum(gaps)
+    delay = np.array(delays.draw(st.lists(st.integers(0, 12), min_size=len(gaps), max_size=len(gaps))))
     found = earliest_arrivals(request, delay, horizon)
     for tick, at in enumerate(found.tolist(), int(request[0])):
         covering = [r + d - request[0] for r, d in zip(request, delay, strict=True) if r <= tick < r + horizon]

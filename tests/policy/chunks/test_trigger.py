@@ -221,10 +221,10 @@ def test_a_trigger_is_safe_at_its_latency_slowed_down_or_not(
     slowed = setting.slowed(found.beta)
     assert found.ticks <= most
     assert (found.beta == 1) == (setting.delay_ticks(np.array(latency)) <= most or latency <= most * 20_000)
-    asked = np.full(6, latency)
-    assert not Queue(found.ticks, 13).cycles(asked, slowed).stall_ticks.any()
+    latencies = np.full(6, latency)
+    assert not Queue(found.ticks, 13).cycles(latencies, slowed).stall_ticks.any()
     if found.ticks and found.beta == 1:
-        assert Queue(found.ticks - 1, 13).cycles(asked, setting).stall_ticks[1:].all()
+        assert Queue(found.ticks - 1, 13).cycles(latencies, setting).stall_ticks[1:].all()
 
 
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
