@@ -76,7 +76,6 @@ def yuyv_frame(width: int = 64, height: int = 48, seed: int = 0) -> Frame:
 
 
 def ask(client: Client, request: Request) -> tuple[list[Piece], Trace]:
-    """Make one request like a session."""
     trace = Trace()
     trace.mark(RESIDUAL)
     return list(client.request(request, trace)), trace
@@ -99,7 +98,6 @@ def wiring_of(
 
 @contextmanager
 def served(wiring: Wiring[Any], handler: Handler) -> Iterator[tuple[Server, Thread]]:
-    """Serve on a new thread for as long as the context lasts."""
     server = open_server(wiring, handler)
     thread = Thread(target=server.serve)
     thread.start()

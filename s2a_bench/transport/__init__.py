@@ -57,7 +57,6 @@ LOSSLESS: Final = frozenset({"", "raw", "yuyv", "png"})
 """Payloads that give the engine the camera's exact pixels; "" where no picture is sent."""
 
 TRANSPORT: Final = "Transport"
-"""The heading of transport options in ``--help``."""
 
 SERVER: Final = "server"
 """``side`` of an option that the server process needs too: cells that differ in it get separate servers."""
@@ -73,7 +72,6 @@ PROGRAM: Final = "program"
 
 
 Payload = Annotated[str, base.one_of(lambda: ("", *PAYLOADS))]
-"""One of `PAYLOADS`, or nothing."""
 Payloads = Annotated[tuple[Payload, ...], base.SEVERAL]
 
 
@@ -109,7 +107,6 @@ class TransportOptions(base.Options):
 
     @property
     def external_address(self) -> str:
-        """The address of a running external server, or nothing."""
         return next((getattr(self, name) for name in self.of_sides(EXTERNAL)), "")
 
     @property
@@ -251,7 +248,6 @@ class Choice(Generic[O]):
     mode: str = ""
     engine: str = ""
     cameras: int = 1
-    """Pictures a request."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +281,6 @@ class Transport(Generic[O]):
 
     name: ClassVar[str] = ""
     options: type[O]
-    """The model of its options."""
     variants: ClassVar[tuple[str, ...]] = ()
     """What follows its name, as ``http/binary``; the first is the default."""
     payloads: ClassVar[tuple[str, ...]] = ()
@@ -293,13 +288,11 @@ class Transport(Generic[O]):
     answer_kinds: ClassVar[tuple[str, ...]] = (TOKENS,)
     """What answers can consist of: tokens, actions."""
     accepts_state: ClassVar[bool] = False
-    """Whether a request can carry the robot's state."""
     stages: ClassVar[Mapping[str, str]] = {}
     """Stage -> group (one of `trace.GROUPS`), in addition to `trace.STAGES`."""
     facts: ClassVar[Sequence[Fact]] = ()
     """Facts of its client and server, without those of the handler."""
     order: ClassVar[float] = 50
-    """Sort key of its cells among others."""
     style: ClassVar[Mapping[str, tuple[str, str]]] = {}
     """Variant ("" for none) -> colour and line style, in every figure."""
     compared_with: ClassVar[tuple[str, ...]] = ("loopback",)

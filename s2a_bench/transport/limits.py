@@ -20,7 +20,6 @@ VALUES: Final = 20_000
 """The most values of a JSON or MessagePack document from outside."""
 
 STEP: Final = 1 << 16
-"""Bytes of a document that are examined together."""
 
 
 class Limits(Options):

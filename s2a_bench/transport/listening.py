@@ -24,7 +24,6 @@ from s2a_bench.secrets import is_secret, keep
 from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
 
 ANY: Final = "127.0.0.1:0"
-"""The default address of a server."""
 VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
@@ -32,7 +31,6 @@ class ListeningOptions(TransportOptions):
     """Options of a server with an address, ours or an external one."""
 
     SCHEMES: ClassVar[tuple[str, ...]] = ()
-    """Schemes of `url`."""
 
     host: str = option(
         "127.0.0.1", "address that our server binds; others than this machine need a key", side=SERVING, first=True

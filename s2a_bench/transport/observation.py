@@ -41,7 +41,6 @@ FILE_LETTERS, VALUES, DEPTH, CAMERAS = 1 << 16, 1024, 16, 64
 STATE: Final = 10**6
 """More numbers than a placeholder of the state can need."""
 WHOLE: Final = range(-(1 << 63), 1 << 64)
-"""The integers of MessagePack."""
 
 _PLACE = re.compile(
     r"\{(?:(?P<picture>image)(?::(?P<image>\d{1,3}))?(?:\|(?P<form>\w+))?"

@@ -24,7 +24,6 @@ Examine: TypeAlias = Callable[[SplitResult], Iterator[Finding]]
 PATIENCE_S: Final = 5.0
 GRPC: Final = "grpc"
 GRPC_PORT: Final = 8080
-"""The default port of lerobot's policy server."""
 PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 """The connection preface of HTTP/2 and an empty SETTINGS frame (RFC 9113, 3.4 and 6.5)."""
 FRAME_HEADER: Final = 9

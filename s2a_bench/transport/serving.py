@@ -222,11 +222,9 @@ class Exchange:
         raise NotImplementedError
 
     def fail(self, error: S2AError) -> None:
-        """Send the error in one line. Raises Disconnected."""
         raise NotImplementedError
 
     def disconnected(self) -> bool:
-        """Whether the client has disconnected or cancelled."""
         return False
 
     def abandon(self) -> None:

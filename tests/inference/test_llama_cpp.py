@@ -80,9 +80,7 @@ def test_the_grammar_is_obeyed_and_ends_the_answer(shared: LlamaCppEngine) -> No
 def test_a_grammar_that_allows_what_the_model_says_costs_no_second_look(
     shared: LlamaCppEngine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seed, one = next(
-        (seed, one) for seed in range(99) if (one := text(shared, seed=seed, max_tokens=1)).isalnum()
-    )
+    seed, one = next((seed, one) for seed in range(99) if (one := text(shared, seed=seed, max_tokens=1)).isalnum())
     looks: list[int] = []
     monkeypatch.setattr(GrammarSampler, "_among_allowed", lambda *_: looks.append(1) or 0)
     assert text(shared, seed=seed, max_tokens=1, grammar=f'root ::= "{one}"') == one

@@ -54,7 +54,6 @@ PATIENCE_S = 2.0
 """The client's ``timeout_s``, the longest silence."""
 SETTLES_S = 10.0
 AT_ONCE = 6
-"""Hostile peers that run at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +113,6 @@ class Attacked:
     """The answer to the honest client before all hostile ones."""
     alive: bool
     tidy: bool
-    """Whether all descriptors were closed."""
 
 
 class HostileTarget:
@@ -140,7 +138,6 @@ class HostileSuite:
     """Name the pipeline, and the cases; override `wiring` for settings that a name cannot have."""
 
     name: ClassVar[str]
-    """As in ``--transport``."""
     clients: ClassVar[Sequence[Case[Attack]]] = ()
     servers: ClassVar[Sequence[Case[Trap]]] = ()
     targets: ClassVar[int] = AT_ONCE
@@ -160,7 +157,6 @@ class HostileSuite:
     def attacked(
         cls, request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
     ) -> Iterator[dict[Case[Attack], Future[Attacked]]]:
-        """The outcomes of the hostile clients of all selected tests."""
         wiring, folder = cls.wiring(), tmp_path_factory.mktemp("servers")
         with ExitStack() as stack:
             targets: list[HostileTarget] = []
@@ -216,7 +212,6 @@ class HostileSuite:
 
 
 def _chosen(request: pytest.FixtureRequest, name: str) -> list[Case[Any]]:
-    """Return the cases of a class's selected tests."""
     items: list[Any] = request.session.items
     params = [
         item.callspec.params

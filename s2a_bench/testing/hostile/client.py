@@ -26,8 +26,6 @@ PROC = Path("/proc")
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """The resources of a process and its descendants together."""
-
     rss_mib: float
     peak_mib: float
     """The most resident memory (VmHWM) since the start, or since `forget_peak`."""

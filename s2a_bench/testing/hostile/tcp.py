@@ -144,7 +144,6 @@ CLIENTS: tuple[Case[Attack], ...] = (
 
 
 def servers(scheme: str = "") -> tuple[Case[Trap], ...]:
-    """Return hostile servers for any client over TCP."""
     return (
         Case("silence", answers(scheme=scheme), FAILED),
         Case("gone at once", answers(then="goes", scheme=scheme), FAILED),

@@ -184,7 +184,6 @@ class ChatExchange(Exchange):
         self.write(data, self._kind if first else "", last=last)
 
     def _framed(self, value: Any) -> bytes:
-        """Return a message in the framing of the running answer."""
         if self._kind == blocks.MEDIA_TYPE:
             return blocks.json_block(value)
         return b"data: " + self._codec.dumps(value) + b"\n\n"

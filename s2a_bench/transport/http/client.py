@@ -35,7 +35,6 @@ from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Piece, Request, Token
 
 ERROR_LIMIT = 1 << 16
-"""The most bytes of a refusal that are read."""
 UNKNOWN_MODEL = re.compile(
     r"\bmodel\b.{0,200}?(not found|not exist|n't exist)|model_not_found|(invalid|unknown|no such) model",
     re.IGNORECASE | re.DOTALL,
@@ -230,7 +229,6 @@ class HttpClient:
 
     @contextmanager
     def _translated(self) -> Iterator[None]:
-        """Translate httpx's exceptions into this project's."""
         url = self._url
         try:
             yield

@@ -50,8 +50,6 @@ class BoundedClient(httpx.Client):
 
 
 class _Network(httpcore.NetworkBackend):
-    """Opens bounded streams."""
-
     def __init__(self, backend: httpcore.NetworkBackend, client: BoundedClient) -> None:
         self._backend, self._client = backend, client
 
@@ -175,7 +173,6 @@ class _Socket(socket.socket):
 
 @contextmanager
 def _as_httpx() -> Iterator[None]:
-    """Translate exceptions into httpx's."""
     try:
         yield
     except InvalidURL as error:

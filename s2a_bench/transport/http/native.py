@@ -33,7 +33,6 @@ PATHS = {
     BEST_EFFORT: "/best-effort/v1/chat/completions",
     BINARY: "/binary/v1/chat/completions",
 }
-"""Variant -> path on our server."""
 
 SCHEME = "Bearer"
 HEALTH, MODELS = "/health", "/v1/models"

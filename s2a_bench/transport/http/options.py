@@ -94,7 +94,6 @@ class HttpOptions(WebOptions):
 
     @property
     def spoken(self) -> str:
-        """The known dialect of a black box, or nothing."""
         return "llama-server" if self.llama_server else self.dialect
 
     @property

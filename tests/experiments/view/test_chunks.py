@@ -159,6 +159,4 @@ def test_what_a_run_has_no_rows_for_is_not_drawn(run: StoredRun, tmp_path: Path)
 def test_few_lanes_have_room_for_their_labels(tmp_path: Path, modes: str) -> None:
     few = read_run(run_chunks(ChunksConfig(latency="60", modes=modes, rules="", cycles=100), tmp_path, NullProgress()))
     assert len(lanes_of(few)) == modes.count(",") + 1
-    drawn(few, build_lanes).savefig(
-        tmp_path / "lanes.png"
-    )  # a warning where they have none
+    drawn(few, build_lanes).savefig(tmp_path / "lanes.png")  # a warning where they have none

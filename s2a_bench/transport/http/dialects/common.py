@@ -16,7 +16,6 @@ from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Frame, Pixels, Request
 
 TEMPERATURE, TOP_P = 0.7, 0.8
-"""The sampling of our llama engine."""
 
 Get: TypeAlias = Callable[[str], Any]
 """Returns the JSON at a URL; raises ValueError if there is none, ServerDied if nothing answers."""
@@ -28,7 +27,6 @@ NO_LIST = (ValueError, KeyError, IndexError, TypeError, AttributeError, Recursio
 """Exceptions of reading a missing or malformed list."""
 
 VOCABULARY = 1 << 31
-"""More than the tokens of any vocabulary."""
 
 
 class Dialect:
@@ -40,13 +38,11 @@ class Dialect:
     lists_models = True
     """Whether the server lists its models."""
     takes_grammar = False
-    """Whether it has a field for a GBNF grammar."""
     media_type = "text/event-stream"
     """The beginning of a good answer's content-type."""
     payloads: tuple[str, ...] = ("jpeg", "jpeg-preencoded", "png")
     framing: Callable[[], Framing] = ServerSentEvents
     facts: Sequence[Fact] = ()
-    """The facts of its events."""
 
     def met(self, base: str, model: str, get: Get) -> tuple[str, str]:
         """Return the URL and the model of requests: as given, else the first model that the server lists."""

@@ -38,7 +38,6 @@ class Decoder:
         self._failed = False
 
     def feed(self, data: bytes) -> Iterator[Event]:
-        """Yield the events that these bytes complete."""
         yield from self._events(self._framing.feed(data))
 
     def end(self) -> Iterator[Event]:

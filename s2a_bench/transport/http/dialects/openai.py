@@ -43,7 +43,6 @@ from s2a_bench.transport.limits import whole_number
 from s2a_bench.types import Action, Request
 
 TIMINGS = {str(fact): fact for fact in (CACHE_N, PROMPT_N, PROMPT_MS, PREDICTED_N, PREDICTED_MS)}
-"""Numbers of llama-server's ``timings``."""
 
 RATE = Fact("predicted_per_second", "tokens/s", "becomes `predicted_steps`")
 
@@ -53,7 +52,6 @@ METRICS = {
     "queue_time_ms": Fact("queue_ms", "ms", "waiting to be scheduled"),
     "mean_itl_ms": Fact("mean_itl_ms", "ms", "mean gap between tokens"),
 }
-"""Numbers of vLLM's per-request ``metrics``."""
 
 USAGE = {"prompt_tokens": PROMPT_N, "completion_tokens": PREDICTED_N}
 CACHED = {"cached_tokens": CACHE_N}
@@ -70,7 +68,6 @@ class OpenAI(Dialect):
     facts = (*TIMINGS.values(), *METRICS.values(), THINKING_N, PREDICTED_STEPS, USAGE_ZERO)
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
-        """Return standard fields and one user message."""
         extra = self._extra(request)
         uris = [native.data_uri(picture.media_type, picture.base64) for picture in pictures]
         return {**native.parameters(request, model), **extra, "messages": native.messages(request.prompt, uris)}

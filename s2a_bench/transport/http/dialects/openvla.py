@@ -28,7 +28,6 @@ FAILED = "error"
 ACTION_N = Fact("action_n", "", "numbers of the action")
 
 NUMBERS = re.compile(r"[<>|=]?[fiu][0-9]+")
-"""Accepted element types."""
 
 
 class OpenVla(Dialect):
