@@ -64,9 +64,6 @@ class Registry(Mapping[str, T], Generic[T]):
     def built_in(self) -> tuple[str, ...]:
         return tuple(self._builtins)
 
-    def where(self, name: str) -> str:
-        return self._builtins[name].partition(":")[0]
-
     def loaded(self) -> Iterator[tuple[str, T]]:
         """Yield every name with its implementation, leaving out packages that do not load."""
         for name in self:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import re
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from typing import Any, Final
 
 LONG: Final = 8
@@ -70,11 +71,8 @@ def struck_pieces(texts: Sequence[str]) -> list[str]:
     letters = list(whole)
     for match in found:
         letters[match.start() : match.end()] = [STRUCK, *[""] * (match.end() - match.start() - 1)]
-    pieces, at = [], 0
-    for text in texts:
-        pieces.append("".join(letters[at : at + len(text)]))
-        at += len(text)
-    return pieces
+    rest = iter(letters)
+    return ["".join(islice(rest, len(text))) for text in texts]
 
 
 def _letters(secret: str) -> str:

@@ -69,7 +69,7 @@ def named(path: Path) -> Iterator[str]:
         for name in registry.built_in():
             if where.startswith((home.format(name), declared)):
                 continue
-            module = registry.where(name)
+            module = registry._builtins[name].partition(":")[0]
             robot = where.startswith(ROBOTS_AT) and name in ROBOTS.built_in()
             if any(within(each, module) for each in modules) or (name in texts and name not in COMMON and not robot):
                 yield f"{kind} {name}"

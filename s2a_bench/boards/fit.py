@@ -13,7 +13,6 @@ from itertools import chain
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from s2a_bench.boards.gaps import Floats, Gaps, Lognormal, Markov, Quantiles
 
@@ -44,7 +43,8 @@ def fit_gaps(rows: Rows) -> Fit:
     rows = [row for row in rows if len(row)]
     if sum(map(len, rows)) < _LEAST_GAPS:
         raise ValueError(f"a fit needs {_LEAST_GAPS} gaps, there are {sum(map(len, rows))}")
-    halves = (rows[::2], rows[1::2]) if len(rows) > 1 else _halved(rows[0])
+    half = len(rows[0]) // 2
+    halves: tuple[Rows, Rows] = (rows[::2], rows[1::2]) if len(rows) > 1 else ([rows[0][:half]], [rows[0][half:]])
     distances = {}
     for name, fit in FITS.items():
         gap, total = np.mean([_distances(fit(halves[side]), halves[1 - side]) for side in (0, 1)], axis=0).tolist()
@@ -85,7 +85,7 @@ def fit_markov(rows: Rows) -> Markov:
         variance = max(float(np.mean((1 - pause) * (logs - low) ** 2 + pause * (logs - high) ** 2)), 1e-9)
     if high < low:
         low, high, share, pause = high, low, 1 - share, 1 - pause
-    rest = _split(pause > 0.5, rows)  # noqa: PLR2004 - more likely than not
+    rest = np.split(pause > 0.5, np.cumsum([len(row) for row in rows])[:-1])  # noqa: PLR2004 - more likely than not
     followed = sum(int(row[:-1].sum()) for row in rest)
     left = sum(int((row[:-1] & ~row[1:]).sum()) for row in rest)
     stay = followed / left if left else float(max(followed, 1))
@@ -141,11 +141,3 @@ def _distances(gaps: Gaps, rows: Rows) -> tuple[float, float]:
 
 def _flat(rows: Rows) -> Floats:
     return np.maximum(np.fromiter(chain.from_iterable(rows), np.float64), 1e-9)  # a clock's tick, for the logarithm
-
-
-def _split(values: NDArray[np.bool_], rows: Rows) -> list[NDArray[np.bool_]]:
-    return np.split(values, np.cumsum([len(row) for row in rows])[:-1])
-
-
-def _halved(row: Sequence[float]) -> tuple[Rows, Rows]:
-    return [row[: len(row) // 2]], [row[len(row) // 2 :]]

@@ -237,12 +237,11 @@ class RequestsConfig(Options):
 
     def _is_named(self, cell: Pipeline, others: Sequence[Pipeline]) -> bool:
         """Whether the user named a cell, or its transport, of which ``others`` has none."""
-        transport = cell.transport.name
-        written = {name.partition("?")[0] for name in self.names} if "transports" in self.model_fields_set else set()
-        if cell.name.partition("?")[0] in written:
-            return True
-        named = transport in written or transport in self.options.model_fields_set
-        return named and all(each.transport is not cell.transport for each in others)
+        transport, given = cell.transport.name, "transports" in self.model_fields_set
+        written = {name.partition("?")[0] for name in self.names} if given else set()
+        named = transport in {*written, *self.options.model_fields_set}
+        alone = all(each.transport is not cell.transport for each in others)
+        return cell.name.partition("?")[0] in written or (named and alone)
 
     @property
     def sent_prompt(self) -> str:

@@ -94,14 +94,13 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
         self._process.wait()
 
     def death(self) -> ServerDied:
-        return ServerDied(f"the {self.name} server (pid {self.pid}) died, {self._end()}{self._last_lines(1)}")
+        end = how_it_ended(self._process.poll(), self._cure)
+        return ServerDied(f"the {self.name} server (pid {self.pid}) died, {end}{self._last_lines(1)}")
 
     def no_start(self, why: str = "") -> ServerDied:
         """Describe a failed start by the last lines of its output."""
-        return ServerDied(f"the {self.name} server {why or f'did not start, {self._end()}'}{self._last_lines(4)}")
-
-    def _end(self) -> str:
-        return how_it_ended(self._process.poll(), self._cure)
+        why = why or f"did not start, {how_it_ended(self._process.poll(), self._cure)}"
+        return ServerDied(f"the {self.name} server {why}{self._last_lines(4)}")
 
     def _last_lines(self, count: int) -> str:
         """Return the end of the log and where it is; a run keeps the folder of a log that its error names."""

@@ -160,7 +160,7 @@ class SampleGuard:
 
     def see(self, row: SampleRow, fingerprint: int, odd: Iterable[str] = ()) -> None:
         cell, counts = row.cell, self._counts
-        self._odd[cell].update(odd)
+        self._odd[cell].update(odd)  # names of impossible facts
         if self._frames.setdefault((cell, fingerprint), row.request_id) != row.request_id:
             counts[REPEATED][cell] += 1
         if lost := row.facts.get(FRAMES_LOST):

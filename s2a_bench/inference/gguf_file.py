@@ -81,10 +81,6 @@ class GgufHeader:
         return self.architecture == "clip"
 
     @property
-    def has_vision(self) -> bool:
-        return self.fields.get("clip.has_vision_encoder") is True
-
-    @property
     def is_dummy(self) -> bool:
         return self.fields.get("s2a_bench.dummy") is True
 

@@ -121,7 +121,7 @@ def load_headers(config: EngineConfig) -> ModelFiles:
             f"`mmproj` {mmproj.path}: this is a language model ({mmproj.architecture or 'no architecture'}), "
             "not an mmproj; give it as `model`"
         )
-    if not mmproj.has_vision:
+    if mmproj.fields.get("clip.has_vision_encoder") is not True:
         raise ModelError(f"`mmproj` {mmproj.path}: has no vision tower; give the mmproj of a model that takes pictures")
     return ModelFiles(model, mmproj)
 
