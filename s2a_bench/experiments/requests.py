@@ -67,7 +67,6 @@ class RequestMetric(Metric):
 
     of: Of | None = None
     shown: tuple[str, ...] = ()
-    """Its statistics in the table of tokens."""
 
     @property
     def key(self) -> str:
@@ -277,7 +276,6 @@ ANSWER_METRICS: Final = (
         lambda cell: cell.n_tokens / _some(cell.fact(ENERGY_J)),
     ),
 )
-"""Metrics of the tokens and the facts of a request."""
 
 TOKEN_METRICS: Final = (
     _ms(
@@ -293,7 +291,6 @@ TOKEN_METRICS: Final = (
         ("median", "p90", "p99"),
     ),
 )
-"""Metrics of tokens: a row has several values."""
 
 OF_ANSWERS: Final = by_name((*ANSWER_METRICS, *TOKEN_METRICS))
 

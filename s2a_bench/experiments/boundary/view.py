@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 DURATIONS = ("t_nom", "t_min")
-"""The durations of naive execution, and of the paper's line."""
 _FREE, _BETWEEN, _STALLS = "#009E73", "#F0E442", "#D55E00"
 _SHADE: Final = 0.3
 _INK: Final = "#222222"

@@ -43,7 +43,6 @@ class PlanRequest(Options):
 
 
 LONG_S: Final = 600.0
-"""The longest time until a plan is whole."""
 SPANS: Final = {"phase_rates": 10_000.0, "phase_gaps_m": 1000.0}
 """Fields with a span (from, to) -> its greatest end."""
 MODELLED: Final = ("rate", "prompt_s", "phase", "random", "all_followers", "sensitivity")

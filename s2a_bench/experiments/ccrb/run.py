@@ -54,7 +54,6 @@ class Prepared:
     plans: Plans
     schedules: dict[str, Schedule]
     late: bool | None
-    """Whether s2a-ttc missed its deadline; None without `ttc`."""
 
 
 def prepare(config: CcrbConfig) -> Prepared:

@@ -105,7 +105,6 @@ def _finite(value: float) -> float | None:
 
 
 FORMS: Final = {name: policy(name).foreseeing for name in COMPARED}
-"""The paper's three policies, with all arrivals known."""
 SCENES: Final = 1366
 """Scenarios of a block, driven in lock step: about 8,000 roll-outs."""
 VARIED: Final[dict[str, tuple[float, ...]]] = {
@@ -116,7 +115,6 @@ VARIED: Final[dict[str, tuple[float, ...]]] = {
     "rear_gap_m": (8.0, 11.0, 14.0, 17.0, 20.0, 24.0),
     "onset_s": (-0.5, -0.25, 0.0, 0.25, 0.5, 1.0),
 }
-"""Field of `Cars` that is varied -> its values."""
 
 
 def studies(config: CcrbConfig) -> Iterator[tuple[str, Scenes]]:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 FIXED: Final = ("calibrated", "oracle")
 """Rules that choose one trigger for all requests, and may slow actions down."""
 GIVEN: Final = "given"
-"""The rule of a mode with the trigger of its parameters."""
 _ORACLE_DRAWS: Final = 1_000_000
 
 

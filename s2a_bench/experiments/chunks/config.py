@@ -60,13 +60,11 @@ class LiveRequests(FirstVariants):
 
 
 RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
-"""Rules for the trigger of queue."""
 PROMISING: Final = ("calibrated", "tracked")
 """Rules that keep to `epsilon`, given enough latencies."""
 CYCLES: Final = 10_000
 CALIBRATION: Final = 8_000
 VIRTUAL: Final = ("cycles", "calibration_cycles", "tokens_per_action")
-"""Options of virtual time."""
 FASTEST_LIVE_HZ: Final = 10_000.0
 MOST_LIVE_TICKS: Final = 1_000_000
 

@@ -36,7 +36,6 @@ class Source:
     recorded_ns: Ints | None = None
     profile: str = ""
     tokens: int = 0
-    """Tokens of a chunk, for a profile."""
     weights: str = NONE
     requests: tuple[Mapping[str, object], ...] = ()
     """Measured requests, as the columns of `COLUMNS`."""

@@ -57,7 +57,6 @@ class ChunkRequester:
     names: dict[int, str] = field(default_factory=dict)
     """Request -> the id of its sample."""
     sent_bytes: int = 0
-    """Bytes of the pictures on the wire."""
     failure: BaseException | None = None
     over: Event = field(default_factory=Event)
 

@@ -27,12 +27,9 @@ if TYPE_CHECKING:
     from s2a_bench.progress import Progress
 
 MOST_POINTS: Final = 64
-"""The most triggers that are tried."""
 MEANS_TRIED: Final = 33
 REQUESTS_TRIED: Final = 2000
-"""For each mean latency."""
 SMOOTH: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal")
-"""The metrics of motion at each mean latency."""
 
 
 def trigger_rows(config: ChunksConfig, drawn: LatencyDraw) -> Iterator[TriggerRow]:

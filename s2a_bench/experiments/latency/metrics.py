@@ -52,7 +52,6 @@ METRICS: Final = (
     RequestMetric("residual", "ms", title="residual", about="The time between the stages."),
     RequestMetric("residual_share", about="The residual as a share of e2e without inference."),
 )
-"""A metric is a row: JSON and its schema, CSV, comparison and tables follow from it."""
 
 
 def compared(metrics: Sequence[RequestMetric] = METRICS) -> Comparable:

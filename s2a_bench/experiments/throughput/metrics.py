@@ -49,14 +49,12 @@ class ReferenceRow:
 
 
 REFERENCE: Final[Table[ReferenceRow]] = Table("reference", ReferenceRow)
-"""One row a run of llama-bench."""
 RATIO_METRIC: Final = "decode_tokens_per_s"
 """The metric of ratios of cells and llama-bench."""
 ENGINE_METRIC: Final = "tokens_per_s"
 """The metric of ratios of engines: without sending."""
 LLAMA_BENCH: Final = "llama-bench"
 BIN: Final = 32
-"""Tokens of one bin of the rates by position."""
 
 METRICS: Final = (*ANSWER_METRICS, *TOKEN_METRICS)
 COMPARED: Final = compared_by(METRICS, (ENGINE_METRIC, RATIO_METRIC, "ttft_ms", "prefill_tokens_per_s", "itl"))

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from s2a_bench.policy import Floats
 
 SAMPLE_S: Final = 0.01
-"""Sampling period of the speed, for jerk and SPARC."""
 SHORTEST_MOTION_S: Final = 1e-9
 """Shorter motions have no jerk and no SPARC: none of their samples moves."""
 LONGEST_MOTION_S: Final = 1000.0

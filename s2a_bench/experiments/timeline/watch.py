@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from s2a_bench.act.record import Record
 
 STATUS = 21
-"""Columns to the right of the lanes."""
 LEAST_LANE = 20
 NARROW = 90
 """Terminals with fewer columns get short texts beside the lanes."""
@@ -33,7 +32,6 @@ class Scene:
     records: Sequence[Record]
     n_skills: int
     span_s: float
-    """Expected duration."""
 
     def draw(self, width: int) -> Group:
         return draw(self, now_ns(), width)

@@ -29,7 +29,6 @@ FRAMES_A_S: Final = 20
 WIDTH, ROAD_HEIGHT, TEXT_HEIGHT, FOOT_HEIGHT = 880, 96, 46, 40
 """Pixels; video codecs need even numbers."""
 LAST_S: Final = 2.0
-"""Duration of the last frame."""
 _PHASES: Final = {"waiting": "no skill yet: keeps its speed", "gap": "STALL: no skill is valid", "done": "plan done"}
 _HITS: Final[dict[str, frozenset[int]]] = {
     "front": frozenset({LEAD, EGO}),

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.run import StoredRun
 
-LOOKS: Final[dict[str, tuple[str, Literal["-", "--", ":"]]]] = {
+CAR_STYLES: Final[dict[str, tuple[str, Literal["-", "--", ":"]]]] = {
     "lead": ("#0072B2", "--"),
     "ego": ("#000000", "-"),
     "rear": ("#D55E00", ":"),
@@ -120,7 +120,7 @@ def path_of(run: StoredRun, cell: str) -> pd.DataFrame:
     rows = run.table(TRAJECTORIES)
     path: pd.DataFrame = rows[rows["cell"] == cell].reset_index(drop=True)
     path["time_s"] = path["at_ns"] / 1e9
-    for car in LOOKS:
+    for car in CAR_STYLES:
         path[f"{car}_speed_kmh"] = path[f"{car}_speed_mps"] * 3.6
     path["front_gap_m"] = path["lead_position_m"] - path["ego_position_m"]
     path["rear_gap_m"] = path["ego_position_m"] - path["rear_position_m"]
@@ -129,7 +129,7 @@ def path_of(run: StoredRun, cell: str) -> pd.DataFrame:
 
 def rest_of(path: pd.DataFrame) -> int:
     """Return the last row in which a car moves."""
-    moving = path[[f"{car}_speed_mps" for car in LOOKS]].max(axis=1) > _REST_MPS
+    moving = path[[f"{car}_speed_mps" for car in CAR_STYLES]].max(axis=1) > _REST_MPS
     return int(moving[moving].index[-1]) if moving.any() else 0
 
 
@@ -157,7 +157,7 @@ def _shade(axes: Axes, path: pd.DataFrame, skills: pd.DataFrame) -> None:
 
 
 def _draw_cars(axes: Axes, path: pd.DataFrame, what: str) -> None:
-    for car, (colour, style) in LOOKS.items():
+    for car, (colour, style) in CAR_STYLES.items():
         axes.plot(path["time_s"], path[f"{car}_{what}"], style, color=colour, linewidth=1.2)
 
 
@@ -183,10 +183,10 @@ def _legend() -> list[object]:
 
     names = {"lead": "lead; gap to it", "ego": "ego", "rear": "car behind; gap to it"}
     lines: list[object] = [
-        Line2D([], [], color=colour, linestyle=style, label=names[car]) for car, (colour, style) in LOOKS.items()
+        Line2D([], [], color=colour, linestyle=style, label=names[car]) for car, (colour, style) in CAR_STYLES.items()
     ]
     lines.append(Line2D([], [], color="#555555", marker="|", linestyle="", label="a token arrives"))
-    return lines + [Patch(label=_CAPTIONS[name], **look) for name, look in _PHASES.items()]
+    return lines + [Patch(label=_CAPTIONS[name], **style) for name, style in _PHASES.items()]
 
 
 def region_of(scenes: pd.DataFrame) -> list[str]:

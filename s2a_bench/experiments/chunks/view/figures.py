@@ -25,12 +25,9 @@ if TYPE_CHECKING:
 MOST_LANES: Final = 12
 """More are not legible; chunk_ticks.csv has all."""
 COLOURS: Final = ("#0072B2", "#56B4E9", "#009E73")
-"""Colours of consecutive chunks."""
 _BAR: Final = 0.34
 _AGE: Final = 0.42
-"""Height of the greatest age."""
-LOOKS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
-"""Colours of modes or sources."""
+LINE_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
 _RULES: Final = {"calibrated": "o", "tracked": "s", "maximum": "^", "mean": "v", "oracle": "*"}
 _INK: Final = "#222222"
 _MOST_PANELS: Final = 8
@@ -196,7 +193,7 @@ def build_smoothness(run: StoredRun) -> Figure:
 def _over_means(run: StoredRun, what: str, shown: Mapping[str, str]) -> Figure:
     """Draw columns over mean latency, a panel each; dashed: their ideal, if any."""
     rows = run.table(MEANS)
-    modes = [str(mode) for mode in rows["mode"].unique()][: len(LOOKS)]
+    modes = [str(mode) for mode in rows["mode"].unique()][: len(LINE_COLOURS)]
     columns = 2 if max(map(len, modes)) <= LINE_CHARS // 3 else 1
     foot_in = 0.17 * -(-(len(modes) + 1) // columns)
     caption = _caption(run, what, f"Latencies are those of {rows['latency'].iloc[0]}, all scaled by one factor.")
@@ -205,7 +202,7 @@ def _over_means(run: StoredRun, what: str, shown: Mapping[str, str]) -> Figure:
     latency_ms = rows["latency_s"].to_numpy(dtype="float64") * 1e3
     for axes, (name, label) in zip(panels, shown.items(), strict=True):
         values = rows[name].to_numpy(dtype="float64", na_value=np.nan)
-        for mode, colour in zip(modes, LOOKS, strict=False):
+        for mode, colour in zip(modes, LINE_COLOURS, strict=False):
             mine = (rows["mode"] == mode).to_numpy()
             axes.plot(latency_ms[mine], values[mine], color=colour, label=short(mode, LINE_CHARS - 8))
         if f"{name}_ideal" in rows:
@@ -232,7 +229,7 @@ def build_triggers(run: StoredRun) -> Figure:
     rules: list[Any] = []
     floor = min(epsilon, 1 / max(int(rows["boundaries"].max()), 1)) / 2
     for place, (name, cells) in enumerate(groups):
-        colour = LOOKS[place % len(LOOKS)]
+        colour = LINE_COLOURS[place % len(LINE_COLOURS)]
         mine = rows[rows["latency"] == name]
         with_form = mine[mine["p_stall_closed"].notna()]
         closed = np.maximum(with_form["p_stall_closed"].to_numpy(dtype="float64"), floor)
@@ -284,7 +281,7 @@ def build_reactions(run: StoredRun) -> Figure:
         for cell in filter(_drawn, cells):
             mine = rows[rows["cell"] == cell["cell"]]
             with_form = mine[mine["closed_s"].notna()]
-            colour = LOOKS[names.index(_line_name(cell)) % len(LOOKS)]
+            colour = LINE_COLOURS[names.index(_line_name(cell)) % len(LINE_COLOURS)]
             axes.step(mine["reaction_s"] * 1e3, mine["share"], where="post", color=colour)
             axes.plot(with_form["closed_s"] * 1e3, with_form["share"], ":", color="black", linewidth=0.8)
         axes.set_title(short(source, LINE_CHARS), loc="left", pad=2)
@@ -294,7 +291,8 @@ def build_reactions(run: StoredRun) -> Figure:
         axes.set_ylabel("share")
     panels[-1].set_xlabel("reaction time (ms)")
     handles: list[Any] = [
-        panels[-1].plot([], [], color=LOOKS[place % len(LOOKS)], label=name)[0] for place, name in enumerate(names)
+        panels[-1].plot([], [], color=LINE_COLOURS[place % len(LINE_COLOURS)], label=name)[0]
+        for place, name in enumerate(names)
     ]
     handles += panels[-1].plot([], [], ":", color="black", label="closed form")
     figure.legend(handles=handles, loc="outside lower center", ncols=2, columnspacing=1.0)

@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 _STAGE_CELLS = 5
 """With more cells than this a narrow table has the cells as rows."""
 _MOST = 6
-"""Sentences of one kind."""
 
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
@@ -104,7 +103,6 @@ def _times(cell: RequestCell, base: RequestCell, ratio: Ratio) -> str:
 
 
 _FOOT = ("residual", "e2e_without_inference", "preprocess", "e2e_without_model", "inference", "e2e")
-"""Rows below the stages, each sum below its terms."""
 _HEADINGS = {"preprocess": "preproc.", "inference": "infer.", **{metric.name: metric.title for metric in METRICS}}
 
 _FRAME_FOOT = {
@@ -112,7 +110,6 @@ _FRAME_FOOT = {
     "path": "frame path",
     "latency": "frame path from the intended time",
 }
-"""Column -> row below the stages of frames."""
 
 
 def stage_table(run: StoredRun, *, full: bool = True) -> TextTable:

@@ -25,7 +25,6 @@ _OTHERS: Final = ("#56B4E9", "#CC79A7", "#D55E00", "#999999")
 _VISIBLE_NS: Final = 20_000_000
 """Shorter stalls and stretches are rounding or jitter, and too narrow to see."""
 _LANE: Final = 0.7
-"""Height of a lane's bars."""
 
 
 def policy_colours(policies: Sequence[str]) -> dict[str, str]:
