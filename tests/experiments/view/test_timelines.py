@@ -143,7 +143,7 @@ def test_each_panel_has_the_time_axis_it_needs(computed: StoredRun) -> None:
 def test_the_figure_says_what_is_emulated_and_assumed(computed: StoredRun, live: StoredRun) -> None:
     caption = " ".join(caption_of(drawn(computed)))
     assert "EMULATED in virtual time" in caption
-    assert "assumption of ours" in caption
+    assert "our assumption" in caption
     assert "EMULATED" not in " ".join(caption_of(drawn(live)))
 
 
