@@ -67,5 +67,5 @@ def require(module: str, extra: str) -> Any:
 
 
 def how_to_install(*extras: str) -> str:
-    """Return the command that installs extras."""
-    return f"pip install 's2a-bench[{','.join(extras)}]'"
+    """Return the command that installs extras, and where: the package is on no index."""
+    return f"pip install '.[{','.join(extras)}]' in the clone of s2a-bench"

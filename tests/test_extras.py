@@ -76,7 +76,7 @@ def test_a_missing_library_is_one_line_with_the_command_and_leaves_nothing(
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
     line = refused(*arguments, code=1)
-    ending = f": the package {module} is not installed; pip install 's2a-bench[{extra}]'"
+    ending = f": the package {module} is not installed; pip install '.[{extra}]' in the clone of s2a-bench"
     assert line == f"error: {extras.EXTRAS[extra]}{ending}"
     assert not (tmp_path / "results").exists()
 
@@ -84,7 +84,7 @@ def test_a_missing_library_is_one_line_with_the_command_and_leaves_nothing(
 def test_a_sweep_is_listed_without_extras_and_names_all_of_them_at_once(tmp_path: Path) -> None:
     missing = {"msgpack", "websockets", "zmq", "zenoh"}
     listed = without(missing, tmp_path, "sweep", "transports", "--dry-run")
-    hint = "pip install 's2a-bench[websocket,zmq,zenoh]'"
+    hint = "pip install '.[websocket,zmq,zenoh]' in the clone of s2a-bench"
     assert listed.returncode == 0
     assert "48 of 48 cells to run" in listed.stdout
     assert listed.stderr.endswith(f"its cells need packages that are not installed; {hint}\n")
@@ -110,7 +110,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert done.returncode == 0, done.stderr
     assert "Echo engine" in done.stdout
     (advice,) = (line for line in done.stderr.splitlines() if "pip install" in line)
-    assert advice.endswith("the echo engine answers, without a model; pip install 's2a-bench[llama]'")
+    assert advice.endswith("the echo engine answers, without a model; pip install '.[llama]' in the clone of s2a-bench")
     return folder
 
 
@@ -163,7 +163,7 @@ def test_a_library_that_does_not_load_is_one_line_with_its_reason(
 
 def test_without_nvml_a_gpu_is_not_watched_and_the_reason_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pynvml", None)
-    with pytest.raises(Unreadable, match=r"pynvml is not installed; pip install 's2a-bench\[nvidia\]'"):
+    with pytest.raises(Unreadable, match=r"pynvml is not installed; pip install '.\[nvidia\]'"):
         Nvml()
 
 
@@ -191,7 +191,7 @@ def test_every_extra_is_described_and_in_all() -> None:
             {"numpy": "2", "gguf": "1"},
             "state",
             "2 requirements, all met; without the extras ray (sweeps on a Ray cluster)",
-            "pip install 's2a-bench[ray]'",
+            "pip install '.[ray]' in the clone of s2a-bench",
         ),
         ({"numpy": "2", "gguf": "0.1", "ray": "2"}, "error", "gguf is 0.1, not >=1", "make setup"),
         ({"gguf": "1", "ray": "2"}, "error", "numpy is missing", "make setup"),

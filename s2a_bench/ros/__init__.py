@@ -14,6 +14,7 @@ from pkgutil import resolve_name
 from typing import Any, Literal, Protocol, TypeAlias
 
 from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.extras import how_to_install
 from s2a_bench.ros.router import Router
 from s2a_bench.text import none_of
 
@@ -307,10 +308,10 @@ MIDDLEWARES: dict[str, str] = {
 ROUTED = frozenset({"zenoh"})
 """Middlewares whose nodes meet at a router."""
 WAYS_OUT = {
-    "cyclonedds": "it has wheels for x86-64 only: elsewhere use --middleware zenoh (pip install 's2a-bench[zenoh]'), "
+    "cyclonedds": f"it has wheels for x86-64 only: elsewhere use --middleware zenoh ({how_to_install('zenoh')}), "
     "or the rclpy of a ROS 2 (source /opt/ros/<distribution>/setup.bash), or leave ros out of --transport",
     "rclpy": "it comes with ROS 2: source /opt/ros/<distribution>/setup.bash, or use --middleware cyclonedds",
-    "zenoh": "pip install 's2a-bench[zenoh]', or use --middleware cyclonedds",
+    "zenoh": f"{how_to_install('zenoh')}, or use --middleware cyclonedds",
 }
 
 

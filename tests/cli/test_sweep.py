@@ -401,4 +401,4 @@ def test_without_ray_the_flag_says_how_to_install_it(tmp_path: Path) -> None:
     )
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
-    assert "pip install 's2a-bench[ray]'" in done.stderr
+    assert "pip install '.[ray]' in the clone of s2a-bench" in done.stderr

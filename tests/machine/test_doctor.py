@@ -362,7 +362,7 @@ def test_zenohs_router_is_looked_for(make: Make, tree: dict[str, str], says: str
 def test_how_to_get_zenoh_is_told(make: Make) -> None:
     finding = see(make({}, finds=lambda _package: False), "zenoh")
     assert (finding.level, finding.message) == ("state", "not installed")
-    assert finding.fix.startswith("pip install 's2a-bench[zenoh]'")
+    assert finding.fix.startswith("pip install '.[zenoh]' in the clone of s2a-bench")
 
 
 def test_cameras_are_listed_with_their_formats(make: Make) -> None:

@@ -132,7 +132,7 @@ class Http(Transport[HttpOptions]):
             if options.llama_server is None:
                 raise UsageError(
                     f"`transport` http/{LLAMA_SERVER}: there is none on PATH; name one with `llama_server`, or take "
-                    "the wheel: pip install 's2a-bench[llama-server]'"
+                    f"the wheel: {extras.how_to_install(LLAMA_SERVER)}"
                 )
             if options.llama_server != WHEEL:
                 need_program("llama_server", options.llama_server)
