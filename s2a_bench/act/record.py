@@ -68,7 +68,6 @@ class Record:
     outcome: Outcome | None = None
     """None while it runs."""
     why: str = ""
-    """The error; empty without one."""
 
     @property
     def ran(self) -> list[SkillRun]:

@@ -21,11 +21,8 @@ NCAP_SPEED_MPS: Final = 50 * KMH
 NCAP_GAPS_M: Final = (12.0, 40.0)
 NCAP_DECELS_MPS2: Final = (2.0, 6.0)
 LEAD_JERK_MPS3: Final = 6.0
-"""Ramp of the lead's braking."""
 EGO_MOST_MPS2, EGO_LEAST_MPS2 = 2.0, -8.0
-"""Limits of the ego's acceleration."""
 EGO_LOOP_S: Final = 0.3
-"""Time constant of the ego's speed control."""
 LEAST_IMPACT_MPS: Final = 0.5
 """Slower contacts are no impacts."""
 SAFETY_M: Final = 2.0

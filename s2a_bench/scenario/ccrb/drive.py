@@ -23,7 +23,6 @@ AFTER_S: Final = 25.0
 """Limit of a roll-out after the end of its plan; nearly all are decided earlier."""
 RECORD_S: Final = 0.01
 LOOK_STEPS: Final = 40
-"""Number of steps between two checks for decided roll-outs."""
 RESTING_MPS: Final = 0.01
 DROP_SHARE: Final = 0.2
 """Decided roll-outs are dropped when their share reaches this."""

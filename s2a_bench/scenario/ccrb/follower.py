@@ -38,7 +38,6 @@ LEAST_ROOM_M: Final = 0.05
 MOST_MPS2: Final = 7.0
 RELEASE_S: Final = 0.2
 SPARE_M: Final = 1.0
-"""Distance that the careful driver keeps to the ego."""
 LEAST_MPS2: Final = 1e-6
 """Smaller decelerations count as zero."""
 ACTS_MPS2: Final = 0.7
