@@ -90,7 +90,7 @@ def test_one_setting_shows_every_skill_and_says_what_is_emulated_and_assumed(tmp
     )
     assert "stall before" in done.stdout
     assert "EMULATED in virtual time" in done.stdout
-    assert "assumption of ours" in done.stdout
+    assert "our assumption" in done.stdout
     assert "11.50" in done.stdout
 
 
