@@ -2,9 +2,10 @@
 
 The first word after three backticks says what a block is. `console` is commands after ``$ ``, with what they print;
 `python` and `sql` run as they stand; `toml` and `json` are parsed; `text` and `latex` are only shown. The words after
-it say what the block needs: the extras by their names, and `NEEDS`. A block that begins with ``# NAME.EXT`` is a file
-of the page's folder. `make docs` runs the slow ones too. Of lines that stand in by four spaces, which set a machine up,
-the commands are parsed.
+it say what the block needs: the extras by their names, and `NEEDS`. The command of a `SERVER` block runs until it is
+ended, as in a terminal of its own; a `CLIENT` block runs beside the last of them before it. A block that begins with
+``# NAME.EXT`` is a file of the page's folder. `make docs` runs the slow ones too. Of lines that stand in by four
+spaces, which set a machine up, the commands are parsed.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import contextmanager, nullcontext, suppress
 from importlib.metadata import PackageNotFoundError, distribution, requires
 from itertools import dropwhile, groupby
 from pathlib import Path
@@ -53,6 +54,8 @@ NEEDS: Final[dict[str, tuple[Callable[[], object], str]]] = {
     "setup": (lambda: False, "changes the machine; CI does it, or tests/recipes"),
 }
 """Word -> whether it is there, and what it is, for people."""
+SERVER: Final = "server"
+CLIENT: Final = "client"
 COMMENT: Final = re.compile(r"(?:^|\s)#\s(.*)$")
 WAIT_S: Final = 900
 
@@ -75,6 +78,14 @@ class Block(NamedTuple):
     def commands(self) -> list[str]:
         """The commands of a session, whole."""
         return re.findall(r"^\$ ((?:.*\\\n> )*.*)$", self.code, re.MULTILINE) if self.language == "console" else []
+
+    @property
+    def server(self) -> Block | None:
+        """The block whose server runs meanwhile."""
+        if SERVER in self.needs:
+            return self
+        before = (each for each in BLOCKS if each.page == self.page and each.line < self.line and SERVER in each.needs)
+        return [*before][-1] if CLIENT in self.needs else None
 
 
 def blocks() -> Iterator[Block]:
@@ -110,13 +121,13 @@ def lacking(block: Block) -> Iterator[str]:
             found, what = NEEDS[need]
             if not found():
                 yield what
-        elif not there(need):
+        elif need not in {SERVER, CLIENT} and not there(need):
             yield f"the extra {need}"
 
 
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Path]:
-    """Return each page's folder, with the reference runs, two runs A and B, a board of one's own, a model's files."""
+    """Return each page's folder, with the reference runs, two runs A and B, two environments, a board, a model."""
     made: dict[Path, Path] = {}
 
     def folder(page: Path) -> Path:
@@ -126,6 +137,8 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Path]:
             (found / "results" / "reference").symlink_to(ROOT / "results" / "reference")
             for run in "AB":
                 (found / run).symlink_to(ROOT / "results" / "reference" / "bench-raw")
+            for environment in ("old", "new"):
+                (found / environment).symlink_to(sys.prefix)
             (found / "profiles").mkdir()
             shutil.copy(ROOT / "results/reference/vm-2core-full-dummy.toml", found / "profiles" / "my-board.toml")
             if there("model"):
@@ -138,20 +151,9 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Callable[[Path], Path]:
     return folder
 
 
-@pytest.fixture
-def servers() -> Iterator[list[subprocess.Popen[str]]]:
-    """What a session starts with ``&``; it ends with it."""
-    running: list[subprocess.Popen[str]] = []
-    yield running
-    for server in running:
-        server.terminate()
-    for server in running:
-        server.communicate()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("block", RUN, ids=str)
-def test_an_example_runs(block: Block, folders: Callable[[Path], Path], servers: list[subprocess.Popen[str]]) -> None:
+def test_an_example_runs(block: Block, folders: Callable[[Path], Path]) -> None:
     if without := ", ".join(lacking(block)):
         pytest.skip(f"{block} needs: {without}")
     folder = folders(block.page)
@@ -165,10 +167,8 @@ def test_an_example_runs(block: Block, folders: Callable[[Path], Path], servers:
             assert duckdb.sql(block.code).fetchall()
     if block.language == "python":
         run([sys.executable, "-W", "error", "-c", block.code], folder)
-    for command in block.commands:
-        if (plain := COMMENT.sub("", command).rstrip()).endswith("&"):
-            start(plain.removesuffix("&"), folder, servers)
-        else:
+    with serving(block.server.commands[0], folder) if block.server else nullcontext():
+        for command in block.commands if block.server != block else ():
             run(["bash", "-c", command], folder)
 
 
@@ -189,14 +189,19 @@ def run(command: list[str], folder: Path) -> None:
     assert done.returncode in codes, f"{command[-1]}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
 
 
-def start(command: str, folder: Path, servers: list[subprocess.Popen[str]]) -> None:
-    """Start one of the servers, and return once it says that it serves."""
-    server = subprocess.Popen(
+@contextmanager
+def serving(command: str, folder: Path) -> Iterator[None]:
+    """Start a server, wait until it says that it serves, and end it afterwards."""
+    with subprocess.Popen(
         ["bash", "-c", f"exec {command}"], cwd=folder, env=environ(), stdout=subprocess.PIPE, text=True
-    )
-    servers.append(server)
-    assert server.stdout is not None
-    assert "serving" in server.stdout.readline()
+    ) as server:
+        try:
+            assert server.stdout is not None
+            assert "serving" in server.stdout.readline()
+            yield
+        finally:
+            server.terminate()
+            server.communicate()
 
 
 def written() -> Iterator[tuple[str, str]]:
@@ -217,7 +222,7 @@ def test_every_command_of_a_page_can_be_given(page: Path) -> None:
             words = shlex.shlex(COMMENT.sub("", line.replace("\\\n> ", "")), posix=True, punctuation_chars=True)
             words.whitespace_split, words.commenters = True, ""
             for punctuation, command in groupby(words, lambda word: {*word} <= {*"();<>|&"}):
-                given = [*dropwhile(lambda word: re.match(r"\w+=", word), command)]
+                given = [*dropwhile(lambda word: re.match(r"\w+=|do$", word), command)]
                 if not punctuation and given and Path(given[0]).name == "s2a-bench":
                     with suppress(typer.Exit):  # as of --help
                         parse(given[1:])
@@ -235,7 +240,10 @@ def parse(words: list[str]) -> None:
 @pytest.mark.parametrize("block", BLOCKS, ids=str)
 def test_a_block_is_what_it_says(block: Block) -> None:
     assert block.language in {"console", "python", "sql", "toml", "json", "text", "latex"}
-    assert {*block.needs} <= {*NEEDS, *extras.EXTRAS}
+    assert {*block.needs} <= {*NEEDS, *extras.EXTRAS, SERVER, CLIENT}
+    assert CLIENT not in block.needs or block.server, "no server before it"
+    assert SERVER not in block.needs or len(block.commands) == 1
+    assert not any(COMMENT.sub("", command).rstrip().endswith("&") for command in block.commands), "a server's block"
     if block.language == "toml":
         loads(block.code, str(block))
     if block.language == "json":
