@@ -130,7 +130,7 @@ def test_a_model_is_never_answered_for_by_another_engine(
 ) -> None:
     (field,) = given
     monkeypatch.setattr(extras, "installed", lambda module: module != "llama_cpp")
-    with pytest.raises(MissingExtra, match=rf"`{field}`.*s2a-bench\[llama\]"):
+    with pytest.raises(MissingExtra, match=rf"`{field}`.*\[llama\]"):
         need_engine(RequestsConfig(engine=given).answered(pytest.fail).engine)
     with pytest.raises(UsageError, match=f"`{field}`.*leave it out with `engine` echo"):
         RequestsConfig(engine={"name": "echo", **given})
