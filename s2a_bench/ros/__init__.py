@@ -79,7 +79,7 @@ class Subscription(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
-    """The server took the goal; its result has been asked for."""
+    """The server accepted the goal; the client has requested its result."""
 
     goal_id: bytes
 
@@ -193,7 +193,7 @@ class ServerGoal(Protocol):
 
     @property
     def cancel_requested(self) -> bool:
-        """Whether a client has asked to cancel this goal."""
+        """Return True once a client has requested a cancel."""
         ...
 
     def other_version(self) -> str:
@@ -205,11 +205,11 @@ class ServerGoal(Protocol):
         ...
 
     def accept(self) -> None:
-        """Take the goal: the client is told, then the status published."""
+        """Accept the goal: reply to the client, then publish the status."""
         ...
 
     def reject(self) -> None:
-        """Refuse the goal: the client is told, and nothing is kept."""
+        """Reject the goal: reply to the client and keep nothing."""
         ...
 
     def executing(self) -> bool:

@@ -183,7 +183,7 @@ def _goal_info(goal_id: bytes, stamp_ns: int) -> Any:
     return ros.message("action_msgs/msg/GoalInfo", goal_id=ros.uuid(goal_id), stamp=ros.stamp(stamp_ns))
 
 
-class AskingAction:
+class ClientAction:
     """Events are taken on the consuming thread; sending and cancelling may happen on any."""
 
     def __init__(
@@ -220,7 +220,6 @@ class AskingAction:
         return ""
 
     def server_version(self) -> str | None:
-        """Compare the type hash of the server's goal reader with those of the versions we know."""
         announced = self._goals.peer_type_hash()
         if not announced:
             return None
@@ -361,7 +360,7 @@ class ServedAction(Generic[Caller]):
         self._feedback_type = type_name + "_FeedbackMessage"
         self._goals = Goals(int(result_timeout_s * 1e9))
         self._waiting: dict[bytes, list[Caller]] = {}
-        """Goal -> whom to answer when it ends."""
+        """Goal -> the callers that wait for its result."""
         self._unknown = self._pack_result(Status.UNKNOWN, ros.default(type_name + "_Result", version))
         self._lock = RLock()
         self.interrupt = self._goal_waiter.interrupt
@@ -402,7 +401,6 @@ class ServedAction(Generic[Caller]):
             self._service_waiter.wait_until(now_ns() + HOUSEKEEPING_NS)
 
     def _understood(self, caller: Caller) -> bool:  # noqa: ARG002 - for middlewares that know
-        """Return whether a client's requests can be read."""
         return True
 
     def _look_around(self) -> None:
@@ -459,7 +457,7 @@ class ServedAction(Generic[Caller]):
         self._send_feedback(ros.serialise(message, self._feedback_type, self.version))
 
     def end(self, goal_id: bytes, status: Status, result: Any) -> None:
-        """End a goal: publish the status, then answer who waits for the result."""
+        """End a goal: publish the status, then send the result to waiting callers."""
         packed = self._pack_result(status, result)
         with self._lock:
             self._goals.end(goal_id, status, packed, now_ns())
@@ -468,7 +466,7 @@ class ServedAction(Generic[Caller]):
                 self._get_result.respond(packed, caller)
 
     def _pack_result(self, status: Status, result: Any) -> bytearray:
-        """Serialise a result reply once for all who ask."""
+        """Serialise a result reply once for all callers."""
         response = ros.typestore(self.version).types[self._get_result.reply_type]
         return self._get_result.pack(response(status=int(status), result=result))
 
@@ -478,7 +476,7 @@ class ServedAction(Generic[Caller]):
     def _answer(self, service: ServiceEnd[Caller], answer: Callable[[Any, Caller], None]) -> None:
         """Answer the requests that have arrived; what cannot be read is dropped.
 
-        A cancel counts though its client has left since; who has left waits for no result.
+        A cancel counts even if its client has left since; a result is not kept for one that has left.
         """
         for packed, caller in service.arrived():
             try:
@@ -490,7 +488,7 @@ class ServedAction(Generic[Caller]):
                 _log.warning("%s: dropped a request: %s", self._name, error or type(error).__name__)
 
     def _answer_result(self, request: Any, caller: Caller) -> None:
-        """Send a result, or remember who wants it; a goal nobody knows has status 0 and an empty result."""
+        """Send a result, or remember the caller; an unknown goal has status 0 and an empty result."""
         goal_id = request.goal_id.uuid.tobytes()
         goal = self._goals.find(goal_id)
         if goal is None or goal.result is not None:

@@ -1,4 +1,4 @@
-"""Cyclone DDS configuration: loopback unless the user's ROS environment asks for more, tuned unless told not to.
+"""Cyclone DDS configuration: loopback and tuned unless the user's ROS environment or options choose otherwise.
 
 Honoured when set: CYCLONEDDS_URI (replaces everything here), ROS_AUTOMATIC_DISCOVERY_RANGE
 (OFF, LOCALHOST, SUBNET, SYSTEM_DEFAULT) and ROS_STATIC_PEERS (REP-2021-style, separated by ';').
@@ -23,7 +23,7 @@ TUNED_INTERNAL = '<Internal><SocketReceiveBufferSize max="16MB"/></Internal>'
 image, and no lost fragments at 1920x1080."""
 
 PATIENT = "<InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>"
-"""Cyclone 11 stops announcing itself to addresses where nobody has answered for 30 s; a peer that finds others by
+"""Cyclone 11 stops announcing itself to addresses that have not answered for 30 s; a peer that finds others by
 multicast alone, as Fast DDS does on a subnet, and starts later than that would never be met on loopback."""
 
 

@@ -20,7 +20,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.action import CANCEL_GOAL, FEEDBACK_QOS, STATUS_ARRAY, STATUS_QOS, AskingAction, ServedAction
+from s2a_bench.ros.action import CANCEL_GOAL, FEEDBACK_QOS, STATUS_ARRAY, STATUS_QOS, ClientAction, ServedAction
 from s2a_bench.ros.config import configuration
 from s2a_bench.ros.dds import DdsWaiter, RawReader, RawWriter, dds_qos
 from s2a_bench.ros.dds_service import Caller, DdsServiceClient, DdsServiceServer
@@ -83,8 +83,6 @@ def _reader(
 
 
 class _CyclonePublisher(RawWriter):
-    """Sends messages to a ROS topic."""
-
     def __init__(
         self, participant: DomainParticipant, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION
     ) -> None:
@@ -116,7 +114,7 @@ class _CycloneSubscription:
         return deserialise(packed, self._type_name)
 
 
-class CycloneActionClient(AskingAction):
+class CycloneActionClient(ClientAction):
     """Waits for all readers at once."""
 
     _goals: DdsServiceClient
@@ -154,7 +152,7 @@ class CycloneActionServer(ServedAction[Caller]):
         feedback_type = type_name + "_FeedbackMessage"
         feedback = _CyclonePublisher(participant, prefix + "feedback", feedback_type, FEEDBACK_QOS, version)
         status = _CyclonePublisher(participant, prefix + "status", STATUS_ARRAY, STATUS_QOS)
-        self._told: set[str] = set()
+        self._warned: set[str] = set()
         self.ends = (*goals.ends, *results.ends, *cancels.ends, feedback, status)
         waiters = DdsWaiter(participant, [goals.reader]), DdsWaiter(participant, [results.reader, cancels.reader])
         services, senders = (goals, results, cancels), (feedback.send, status.send)
@@ -166,8 +164,8 @@ class CycloneActionServer(ServedAction[Caller]):
     def _understood(self, caller: Caller) -> bool:
         """Log once that a client is there whose requests cannot be read, and which will hear nothing."""
         other, _ = self.send_goal.client(caller)
-        if other and other not in self._told:
-            self._told.add(other)
+        if other and other not in self._warned:
+            self._warned.add(other)
             _log.warning(
                 "%s: a client on %s waits in vain, as its services have another form on the wire: start it with "
                 "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or serve in a sourced ROS 2 of its RMW (--middleware rclpy)",

@@ -94,7 +94,6 @@ class _Loan:
 
 @cache
 def _raw_type(type_name: str) -> type:
-    """Make the empty IdlStruct that stands for a ROS type."""
     name = "Raw_" + type_name.replace("/", "_")
     return dataclass(types.new_class(name, (IdlStruct,), {"typename": dds_type_name(type_name)}))
 
@@ -150,8 +149,6 @@ def _known(ask: Callable[[int], Any], handle: int) -> Any:
 
 
 class _Endpoint:
-    """What is known of the peers that a DataReader or DataWriter is matched with."""
-
     def __init__(self, entity: Any, handles: Callable[[], list[int]], known: Callable[[int], Any]) -> None:
         self.entity = entity
         self._reference = entity._ref  # noqa: SLF001 - the handle ctypes needs
@@ -220,7 +217,6 @@ class RawReader(_Endpoint):
         return islice(iter(self.take, None), AT_ONCE)
 
     def sender(self) -> int:
-        """Return the handle of the writer whose sample was taken last."""
         return int(self._info.publication_handle)
 
     def publishers(self) -> int:
@@ -246,7 +242,6 @@ class DdsWaiter:
     """Waits for any of some readers on the calling thread, which is the fastest way that does not spin."""
 
     def __init__(self, participant: DomainParticipant, readers: Sequence[RawReader]) -> None:
-        """Attach the readers and a condition of our own."""
         self._guard = GuardCondition(participant)
         self._conditions: list[ReadCondition] = []
         self._waitset = WaitSet(participant)

@@ -45,15 +45,13 @@ def endpoint_id(prefix: bytes, number: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """Who asked: the writer of a request, and the request's header, under which its reply goes."""
+    """The writer of a request, and the request's header, which its reply repeats."""
 
     sender: int
     header: tuple[int, int]
 
 
 class _End:
-    """What client and server have in common."""
-
     body_at = HEADER_AT + HEADER.size
 
     def __init__(
@@ -73,12 +71,12 @@ class _End:
         request, reply = ("rq" + name + "Request", self.request_type), ("rr" + name + "Reply", self.reply_type)
         sent, received = (request, reply) if own == "clientid" else (reply, request)
 
-        def told(type_name: str) -> str:
+        def announced(type_name: str) -> str:
             return f"{own}={identity};typehash={type_hash(type_name, version)};"
 
         writer_qos = qos or (SERVICE_QOS if sent is request else REPLY_QOS)
-        self.writer = RawWriter(participant, *sent, dds_qos(writer_qos, told(sent[1])))
-        self.reader = RawReader(participant, *received, dds_qos(qos or READER_QOS, told(received[1])))
+        self.writer = RawWriter(participant, *sent, dds_qos(writer_qos, announced(sent[1])))
+        self.reader = RawReader(participant, *received, dds_qos(qos or READER_QOS, announced(received[1])))
         self.ends = self.writer, self.reader
         self._sent_wire, self._received_wire = sent[1] + "__wire", received[1] + "__wire"
 
@@ -95,7 +93,6 @@ class _End:
         return next(filter(None, hashes), "")
 
     def pack(self, body: Any) -> bytearray:
-        """Serialise a body behind a header that is filled in when it is sent."""
         return serialise(SimpleNamespace(guid=0, seq=0, body=body), self._sent_wire, self._version)
 
     def unpack(self, packed: memoryview) -> Any:
@@ -131,7 +128,7 @@ class DdsServiceClient(_End):
 
 
 class DdsServiceServer(_End):
-    """Takes requests and sends replies to who asked."""
+    """Takes requests and sends replies to their clients."""
 
     def __init__(
         self, participant: DomainParticipant, name: str, type_name: str, version: str, qos: QoS | None = None
@@ -154,7 +151,7 @@ class DdsServiceServer(_End):
         """Nothing is kept of it."""
 
     def client(self, caller: Caller) -> tuple[str, str]:
-        """Return a client's other DDS and the type hash it announces, asked once: they stay; "" is not known."""
+        """Return a client's other DDS and the type hash it announces, "" where unknown; kept, as they never change."""
         found = self._clients.get(caller.sender)
         if found is None:
             endpoint = self.reader.endpoint(caller.sender)
@@ -182,6 +179,6 @@ class DdsServiceServer(_End):
                 self._reachable.add(caller.sender)
                 return True
             if now_ns() > deadline_ns:
-                return True  # as rmw_cyclonedds: send, whoever may hear it
+                return True  # as rmw_cyclonedds: send all the same
             time.sleep(REPLY_READER_POLL_S)
         return False

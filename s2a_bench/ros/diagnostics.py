@@ -1,4 +1,4 @@
-"""What a node says of itself: how it is, on ``/diagnostics``, for aggregators and monitors; its log, on ``/rosout``."""
+"""A node's health on ``/diagnostics``, for aggregators and monitors, and its log on ``/rosout``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LOG: Final = "rcl_interfaces/msg/Log"
 ROSOUT_QOS: Final = QoS(depth=1000, latched=True, lifespan_s=10.0)
 """ROS's ``rcl_qos_profile_rosout_default``."""
 LONGEST: Final = 4096
-"""Letters of a message; what follows is cut off, as texts of strangers may be in it."""
+"""Letters of a message; what follows is cut off, as they may quote peers."""
 
 
 class Level(IntEnum):
@@ -97,6 +97,6 @@ def log_message(record: logging.LogRecord, name: str) -> Any:
     )
 
 
-def _text(said: str) -> str:
+def _text(text: str) -> str:
     """Return what CDR can hold of a text: no NUL, no half of a surrogate pair."""
-    return said[:LONGEST].replace("\0", "\ufffd").encode("utf-8", "replace").decode()
+    return text[:LONGEST].replace("\0", "\ufffd").encode("utf-8", "replace").decode()

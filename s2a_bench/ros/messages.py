@@ -127,7 +127,6 @@ def _derived(name: str, kind: str) -> Iterator[tuple[str, Definition]]:
 
 
 def _definition(**kinds: str) -> Definition:
-    """Define a type whose fields are basic types and messages."""
     fields = kinds.items()
     return [], [(name, (Nodetype.NAME, kind) if "/" in kind else (Nodetype.BASE, (kind, 0))) for name, kind in fields]
 

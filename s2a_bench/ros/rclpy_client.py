@@ -1,6 +1,6 @@
 """The action client on rclpy.
 
-rclpy tells a goal's acceptance, feedback and result by callbacks, newest first where several are due, and takes one
+rclpy reports a goal's acceptance, feedback and result by callbacks, newest first where several are due, and takes one
 message of each kind at a time; so a result can overtake feedback. `_DrainingClient` takes all that has arrived and
 keeps the seam's order. It overrides two methods of rclpy's Waitable interface, the same in Humble and Jazzy, which
 the consuming thread calls instead of an executor's.
@@ -79,9 +79,9 @@ class RclpyActionClient:
         self._uuid = interface_class("unique_identifier_msgs/msg/UUID")
         self._cancel_goal = interface_class("action_msgs/srv/CancelGoal")
         self.lock = RLock()
-        self._asked: list[tuple[bytes, Any]] = []
+        self._sent: list[tuple[bytes, Any]] = []
         self._results: list[tuple[bytes, Any]] = []
-        """Goals, and the futures of what was asked about them."""
+        """Goals, and the futures of requests about them."""
         self._active: set[bytes] = set()
         self._early: dict[bytes, list[Feedback]] = {}
         """Feedback on goals whose acceptance is still under way."""
@@ -131,9 +131,9 @@ class RclpyActionClient:
     def pack(self, goal: Any) -> _Packed:
         if self._version != self._installed:
             raise TransportError(f"this workspace has llama_msgs {self._installed}, not {self._version}")
-        told = self._type + "_Goal", self._version
-        size = serialised_bytes(goal, *told)
-        return _Packed(to_ros(goal, self._action.Goal, *told), size + -size % 4)  # as `serialise` pads it
+        goal_type = self._type + "_Goal", self._version
+        size = serialised_bytes(goal, *goal_type)
+        return _Packed(to_ros(goal, self._action.Goal, *goal_type), size + -size % 4)  # as `serialise` pads it
 
     def send(self, packed: _Packed, goal_id: bytes | None = None) -> bytes:
         self._node.check_open()
@@ -141,7 +141,7 @@ class RclpyActionClient:
         with self.lock:
             self._active.add(goal_id)
             future = self._client.send_goal_async(packed.goal, goal_uuid=self._uuid(uuid=list(goal_id)))
-            self._asked.append((goal_id, future))
+            self._sent.append((goal_id, future))
         return goal_id
 
     def get_result(self, goal_id: bytes) -> None:
@@ -168,14 +168,14 @@ class RclpyActionClient:
     def tell(self, feedback: list[Any]) -> None:
         """Turn what has arrived into events; on the consuming thread, under the lock."""
         events: list[ActionEvent] = []
-        for goal_id, handle in _settled(self._asked):
+        for goal_id, handle in _settled(self._sent):
             if handle.accepted:
                 self.get_result(goal_id)
                 events += [Accepted(goal_id), *self._early.pop(goal_id, [])]
             else:
                 self._active.discard(goal_id)
                 events.append(Rejected(goal_id))
-        waiting = {goal_id for goal_id, _ in self._asked}
+        waiting = {goal_id for goal_id, _ in self._sent}
         for message in feedback:
             event = Feedback(bytes(message.goal_id.uuid), message.feedback)
             if event.goal_id in waiting:
@@ -194,10 +194,10 @@ class RclpyActionClient:
         return from_ros(packed, self._type + "_Result", self._version)
 
 
-def _settled(asked: list[tuple[bytes, Any]]) -> Iterator[tuple[bytes, Any]]:
-    """Remove from ``asked`` what has been answered, and yield the goals with their answers."""
-    for entry in [entry for entry in asked if entry[1].done()]:
-        asked.remove(entry)
+def _settled(pending: list[tuple[bytes, Any]]) -> Iterator[tuple[bytes, Any]]:
+    """Remove the finished futures from ``pending``, and yield their goals and results."""
+    for entry in [entry for entry in pending if entry[1].done()]:
+        pending.remove(entry)
         yield entry[0], entry[1].result()
 
 

@@ -54,10 +54,10 @@ class RclpyServiceClient:
             self._node.check_open()
             raise TransportError(f"no server of the service {self._name} appeared in {timeout_s:g} s")
         outcome: Future[Any] = Future()
-        asked = self._client.call_async(
+        pending = self._client.call_async(
             to_ros(request, self._class.Request, self._type_name + "_Request", DEFAULT_VERSION)
         )
-        asked.add_done_callback(lambda done: outcome.set_result(done.result()))
+        pending.add_done_callback(lambda done: outcome.set_result(done.result()))
         try:
             response = outcome.result(max(0.0, (deadline_ns - now_ns()) / 1e9))
         except NoAnswer as error:
@@ -66,8 +66,6 @@ class RclpyServiceClient:
 
 
 class _RclpyPublisher:
-    """Sends messages to a ROS topic."""
-
     def __init__(self, node: SpinningNode, topic: str, type_name: str, qos: QoS) -> None:
         self._node = node
         self._type_name = type_name

@@ -33,15 +33,15 @@ _log = logging.getLogger(__name__)
 
 def qos_profile(qos: QoS) -> Any:
     """Return rclpy's QoS profile."""
-    asked: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "reliability": ReliabilityPolicy.RELIABLE if qos.reliable else ReliabilityPolicy.BEST_EFFORT,
         "durability": DurabilityPolicy.TRANSIENT_LOCAL if qos.latched else DurabilityPolicy.VOLATILE,
     }
     if qos.lifespan_s:
-        asked["lifespan"] = Duration(seconds=qos.lifespan_s)
+        settings["lifespan"] = Duration(seconds=qos.lifespan_s)
     if not qos.depth:
-        return QoSProfile(history=HistoryPolicy.KEEP_ALL, **asked)
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=qos.depth, **asked)
+        return QoSProfile(history=HistoryPolicy.KEEP_ALL, **settings)
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=qos.depth, **settings)
 
 
 class SpinningNode:
@@ -168,7 +168,7 @@ class RclpyWaiter:
                 raise TransportError(f"rclpy: {error}") from error
 
     def close(self) -> None:
-        """Interrupt, and return when nobody waits any more."""
+        """Interrupt, and return once no thread waits."""
         self.interrupt()
         with self.busy:
             pass

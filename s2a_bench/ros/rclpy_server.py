@@ -1,8 +1,8 @@
 """The action server on rclpy.
 
 rclpy decides on a goal, executes it and fetches its result in callbacks on the executor's thread; the seam's goals are
-decided and worked on by whoever took them. `_PullingServer` hands a request over instead of deciding; decisions and
-ends then run rclpy's own code on the thread of whoever took the goal. A thread of the server's own, instead of an
+decided and worked on by their consumer. `_PullingServer` hands a request over instead of deciding; decisions and
+ends then run rclpy's own code on the consumer's thread. A thread of the server's own, instead of an
 executor, waits for requests, and serves cancels and results. It overrides two public methods, the same in Humble and
 Jazzy, reads ``_goal_handles``, the goals rclpy remembers, and calls ``_execute_goal``, which ends a goal.
 """
@@ -47,7 +47,6 @@ class RclpyServerGoal:
 
     @property
     def size_bytes(self) -> int:
-        """Return the letters of its prompt and the bytes of its pictures."""
         goal = self._request[1].goal
         return len(goal.prompt) + sum(len(image.data) for image in images_of(goal))
 
@@ -157,7 +156,7 @@ class _PullingServer(ActionServer):  # type: ignore[misc]
             raise TransportError(f"rclpy: {failed[0]}") from failed[0]
 
     def notify_execute(self, goal_handle: Any, execute_callback: Any) -> None:
-        """Schedule nothing when a goal starts: its work is done by whoever took it."""
+        """Schedule nothing when a goal starts: its consumer does the work."""
 
 
 class RclpyActionServer:
@@ -201,7 +200,7 @@ class RclpyActionServer:
                     with self._server:
                         if self._server.is_ready(self._waiter.wait_set):
                             run_now(self._server.execute(self._server.take_data()))
-            except Exception:  # noqa: BLE001 - whatever the request of a stranger raised
+            except Exception:  # noqa: BLE001 - whatever a request from outside raised
                 _log.exception("a request to the action %s failed", self._type)
                 time.sleep(PAUSE_S)
 

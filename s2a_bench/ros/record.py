@@ -132,7 +132,7 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
             shutil.rmtree(self.path) if self.path.is_dir() else self.path.unlink()
 
     def _work(self) -> None:
-        """Write messages as they come, until told to stop; what goes wrong is raised where messages come from."""
+        """Write messages as they arrive, until `close`; `write` raises the errors."""
         while self._more.get():
             with suppress(StoreError):
                 self.flush()

@@ -34,7 +34,7 @@ def endpoint_of(text: str) -> tuple[str, str, int]:
 
 
 def listens(endpoint: str) -> bool:
-    """Return whether somebody listens there; of what is not TCP, as if so."""
+    """Return True if a TCP peer listens there; always True for other protocols."""
     protocol, host, port = endpoint_of(endpoint)
     if protocol != "tcp":
         return True
@@ -46,7 +46,7 @@ def listens(endpoint: str) -> bool:
 
 
 def may_host(endpoint: str) -> bool:
-    """Return whether a server of ours may be the router there without asking who comes: on loopback."""
+    """Return whether a server of ours may be the router there without authentication: on loopback only."""
     protocol, host, _ = endpoint_of(endpoint)
     try:
         return protocol == "tcp" and (host == "localhost" or ipaddress.ip_address(host).is_loopback)
@@ -55,7 +55,7 @@ def may_host(endpoint: str) -> bool:
 
 
 def free_endpoint() -> str:
-    """Return an endpoint on loopback where nobody listens."""
+    """Return a free endpoint on loopback."""
     with closing(socket.socket()) as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -1,4 +1,4 @@
-"""Plain ROS 2 services on any middleware: both ends of one, how a node answers strangers' requests, how all wait."""
+"""Plain ROS 2 services on any middleware: both ends of one, how a node answers requests from outside, how all wait."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MATCH_POLL_S: Final = 0.01
 
 _log = logging.getLogger(__name__)
 Caller = TypeVar("Caller")
-"""What a middleware keeps of a request so that its reply finds who asked."""
+"""What a middleware keeps of a request to address its reply."""
 
 
 class Waits(Protocol):
@@ -41,7 +41,7 @@ class Waits(Protocol):
 
 
 def appeared(present: Callable[[], bool], timeout_s: float, given_up: Callable[[], bool] = lambda: False) -> bool:
-    """Look every 10 ms whether somebody is there; False after ``timeout_s``, or where it is given up."""
+    """Poll ``present`` every 10 ms; False after ``timeout_s``, or once ``given_up`` is True."""
     deadline_ns = now_ns() + int(timeout_s * 1e9)
     while not present():
         if now_ns() > deadline_ns or given_up():
@@ -70,13 +70,13 @@ class ServiceEnd(End, Protocol[Caller]):
     reply_type: str
 
     def arrived(self) -> Iterator[tuple[memoryview, Caller]]:
-        """Take the requests that have arrived, a bounded number: CDR, and who asked."""
+        """Take the requests that have arrived, a bounded number: CDR and caller."""
         ...
 
     def respond(self, packed: bytearray, caller: Caller, /) -> None: ...
 
     def reaches(self, caller: Caller, /) -> bool:
-        """Wait, a moment at most, until replies reach who asked; False if it has left."""
+        """Wait, 100 ms at most, until replies reach the caller; False if it has left."""
         ...
 
     def drop(self, caller: Caller, /) -> None:
@@ -112,7 +112,7 @@ class Services(Generic[Caller]):
         """Start the thread; ``waiter`` wakes it for requests."""
         self._waiter = waiter
         self._offered: dict[str, tuple[ServiceEnd[Caller], Callable[[Any], Any]]] = {}
-        self._said: dict[str, str] = {}
+        self._logged: dict[str, str] = {}
         """Service -> what was logged of it last."""
         self._thread = Thread(target=self._serve, name="services", daemon=True)
         self._thread.start()
@@ -143,33 +143,33 @@ class Services(Generic[Caller]):
             response = service.pack(answer(service.unpack(packed)))
             if service.reaches(caller):
                 service.respond(response, caller)
-        except Exception as error:  # noqa: BLE001 - a stranger's request is no reason to stop
-            said = type(error).__name__  # not its text, which a stranger can make a new one each time
-            if said != self._said.get(name):
-                self._said[name] = said
+        except Exception as error:  # noqa: BLE001 - a bad request is no reason to stop
+            kind = type(error).__name__  # not its text, which a client can vary each time
+            if kind != self._logged.get(name):
+                self._logged[name] = kind
                 _log.warning("%s: dropped a request: %s", name, str(error)[:200])
 
 
 class Calling:
     """Calls one service and waits for the answer."""
 
-    def __init__(self, name: str, asker: ClientEnd, waiter: Waits) -> None:
-        self._name, self._asker, self._waiter = name, asker, waiter
-        self._asked = 0
+    def __init__(self, name: str, client: ClientEnd, waiter: Waits) -> None:
+        self._name, self._client, self._waiter = name, client, waiter
+        self._calls = 0
 
     def call(self, request: Any, timeout_s: float) -> Any:
         deadline_ns = now_ns() + int(timeout_s * 1e9)
-        if not appeared(self._asker.matched, timeout_s):
+        if not appeared(self._client.matched, timeout_s):
             raise TransportError(f"no server of the service {self._name} appeared in {timeout_s:g} s")
-        self._asked += 1
-        key = self._asked.to_bytes(8, "big")
-        self._asker.call(self._asker.pack(request), key)
+        self._calls += 1
+        key = self._calls.to_bytes(8, "big")
+        self._client.call(self._client.pack(request), key)
         silent = f"the service {self._name} did not answer in {timeout_s:g} s"
         while True:
-            for answered, packed in self._asker.replies():
+            for answered, packed in self._client.replies():
                 if answered == key:
                     if packed is None:
                         raise TransportError(f"{silent}: it has dropped the request")
-                    return self._asker.unpack(packed)
+                    return self._client.unpack(packed)
             if not self._waiter.wait_until(deadline_ns):
                 raise TransportError(silent)

@@ -1,7 +1,7 @@
 """Topics and services over Zenoh as rmw_zenoh has them.
 
 Topics are CDR with an attachment; latched ones are cached by their publisher. A service is a complete queryable, which
-answers queries under the asker's name.
+answers queries under the client's name.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CACHED_AT_MOST: Final = 1000
 SMALL_BYTES: Final = 16 * REQUEST_BYTES
 """So much of a service's requests may wait, where they hold no pictures."""
 ANSWER_S: Final = 86_400.0
-"""A query may wait so long for its reply, as that for a goal's result does; whoever calls waits less."""
+"""A query may wait so long for its reply, as that for a goal's result does; callers wait less."""
 
 _log = logging.getLogger(__name__)
 
@@ -66,7 +66,7 @@ class ZenohPublisher:
         give_way()
 
     def matched(self) -> int:
-        """Count the subscriptions that are announced, once the router has told that there are any."""
+        """Count the subscriptions that are announced, once the router reports any."""
         with refusals(self._topic):
             if not (self._latched or self._publisher.matching_status.matching):
                 return 0
@@ -88,7 +88,7 @@ class ZenohSubscription:
         """Declare the subscriber of ``/topic``, then announce it; ``bell`` is rung by what arrives."""
         self._node, self.topic, self._type_name, self._version = node, topic, type_name, version
         self._oldest_ns = round(qos.lifespan_s * 1e9)
-        self._said = False
+        self._warned = False
         self._bell = bell or Bell()
         self._inbox: SampleQueue[Any] = SampleQueue(topic, self._bell, qos.depth)
         self.interrupt = self._bell.interrupt
@@ -123,12 +123,12 @@ class ZenohSubscription:
         return None
 
     def _wanted(self, sample: Any) -> bool:
-        """Whether a sample is a message of ROS's, and young enough; what is none is told once."""
+        """Return True for a ROS message within its lifespan; log the first that is no ROS message."""
         try:
             _, source_ns, _ = names.attached(sample.attachment.to_bytes() if sample.attachment else b"")
         except TransportError as error:
-            if not self._said:
-                self._said = True
+            if not self._warned:
+                self._warned = True
                 _log.warning("%s: dropped a message: %s", self.topic, error)
             return False
         return not self._oldest_ns or time.time_ns() - source_ns <= self._oldest_ns
@@ -153,7 +153,7 @@ class ZenohSubscription:
 
 @dataclass(frozen=True, slots=True)
 class QueryOrigin:
-    """Who asked: a query, and what of its attachment goes back with the reply."""
+    """A query, and the part of its attachment that the reply repeats."""
 
     query: zenoh.Query
     sequence: int
@@ -184,7 +184,7 @@ class ZenohServiceServer:
         self._name, self._version = name, version
         self._key = node.key(name, type_name, version)
         self._inbox: SampleQueue[zenoh.Query] = SampleQueue(name, bell, most_bytes=most_bytes)
-        self._said = False
+        self._warned = False
         held = ref(self._inbox)
 
         def put(query: zenoh.Query) -> None:
@@ -197,15 +197,15 @@ class ZenohServiceServer:
         self.seen = node.announce(names.SERVICE, name, type_name, version, qos)
 
     def arrived(self) -> Iterator[tuple[memoryview, QueryOrigin]]:
-        """Take what has arrived, a bounded number; a query that rmw_zenoh would not make is dropped, and told once."""
+        """Take what has arrived, a bounded number; drop queries that are not rmw_zenoh's and log the first."""
         for query in self._inbox.arrived():
             payload, attachment = query.payload, query.attachment
             try:
                 sequence, _, gid = names.attached(attachment.to_bytes() if attachment else b"")
             except TransportError as error:
                 query.drop()
-                if not self._said:
-                    self._said = True
+                if not self._warned:
+                    self._warned = True
                     _log.warning("%s: dropped a request: %s", self._name, error)
             else:
                 yield memoryview(payload.to_bytes() if payload else b""), QueryOrigin(query, sequence, gid)
@@ -220,7 +220,7 @@ class ZenohServiceServer:
         return deserialise(packed, self.request_type, self._version)
 
     def reaches(self, caller: QueryOrigin) -> bool:  # noqa: ARG002 - a query knows its way back
-        """Return True: who has left is not waited for."""
+        """Return True: a query needs no discovery of its client."""
         return True
 
     def respond(self, packed: bytearray, caller: QueryOrigin) -> None:

@@ -14,7 +14,7 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros import zenoh_names as names
-from s2a_bench.ros.action import CANCEL_GOAL, FEEDBACK_QOS, STATUS_ARRAY, STATUS_QOS, AskingAction, ServedAction
+from s2a_bench.ros.action import CANCEL_GOAL, FEEDBACK_QOS, STATUS_ARRAY, STATUS_QOS, ClientAction, ServedAction
 from s2a_bench.ros.messages import DEFAULT_VERSION
 from s2a_bench.ros.router import Router
 from s2a_bench.ros.service import READER_QOS, Calling, Services
@@ -27,10 +27,13 @@ from s2a_bench.ros.zenoh_endpoints import (
 )
 from s2a_bench.ros.zenoh_node import Bell, Node, open_session
 
+WARNED_AT_MOST = 100
+"""Versions of clients that are logged."""
+
 _log = logging.getLogger(__name__)
 
 
-class ZenohActionClient(AskingAction):
+class ZenohActionClient(ClientAction):
     """Waits for whatever arrives first."""
 
     def __init__(self, node: Node, name: str, type_name: str, version: str) -> None:
@@ -48,7 +51,7 @@ class ZenohActionClient(AskingAction):
 
 
 class ZenohActionServer(ServedAction[QueryOrigin]):
-    """Looks at who else is there."""
+    """Warns of clients of another version."""
 
     send_goal: ZenohServiceServer
 
@@ -62,15 +65,19 @@ class ZenohActionServer(ServedAction[QueryOrigin]):
             node, prefix + "send_goal", type_name + "_SendGoal", version, for_goals, most_bytes=0
         )
         self._node = node
-        self._told: set[str] = set()
+        self._warned: set[str] = set()
         services, senders, bells = (goals, results, cancels), (feedback.send, status.send), (for_goals, for_others)
         super().__init__(name, type_name, result_timeout_s, version, services, senders, bells)
 
     def _look_around(self) -> None:
-        """Log once that a client of another version is there: its goals have another key, and reach nobody."""
+        """Log once that a client of another version is there: its goals have another key and never arrive."""
         for hashed in self._node.peers(names.CLIENT, self.send_goal.seen.entity):
-            if hashed not in self._told and hashed != self.send_goal.seen.entity.type_hash and len(self._told) < 100:  # noqa: PLR2004
-                self._told.add(hashed)
+            if (
+                hashed not in self._warned
+                and hashed != self.send_goal.seen.entity.type_hash
+                and len(self._warned) < WARNED_AT_MOST
+            ):
+                self._warned.add(hashed)
                 other = ros.version_of(self.send_goal.type_name, hashed) or f"of type hash {hashed[:100]}"
                 _log.warning(
                     "%s: a client waits in vain: it speaks llama_msgs %s, this server %s (--llama-msgs)",

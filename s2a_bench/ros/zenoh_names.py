@@ -1,7 +1,7 @@
 """How rmw_zenoh names things: key expressions, liveliness tokens, and the attachment of each message. No I/O.
 
 After rmw_zenoh_cpp (``docs/design.md``, ``liveliness_utils.cpp``, ``attachment_helpers.cpp``) as Jazzy has it from
-0.2.4 on, with 33 bytes of attachment; Humble's is alike, but for type hashes, which it does not know.
+0.2.4 on, with 33 bytes of attachment; Humble's is the same without type hashes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ NO_HASH: Final = "TypeHashNotSupported"
 PARTS: Final = 13
 """Of the token of an entity that is no node."""
 LONGEST: Final = 2048
-"""A longer token is nobody's."""
+"""A longer token is ignored."""
 ATTACHMENT: Final = struct.Struct("<qqB16s")
 """Sequence number, source time in ns of ROS time, 16, and the sender's gid."""
 BEST_EFFORT, TRANSIENT_LOCAL, KEEP_ALL = "2", "1", "2"
@@ -56,7 +56,7 @@ def key(domain_id: int, name: str, type_name: str, hashed: str) -> str:
 
 
 def qos_text(qos: QoS) -> str:
-    """Return a QoS as tokens have it: what is ROS's default is empty, and the depth always told."""
+    """Return a QoS as tokens have it: ROS's defaults are empty, the depth is always given."""
     history = f",{qos.depth}" if qos.depth else f"{KEEP_ALL},"
     seconds, nanoseconds = divmod(round(qos.lifespan_s * 1e9), 1_000_000_000)
     lifespan = f"{seconds},{nanoseconds}" if qos.lifespan_s else ","

@@ -1,4 +1,4 @@
-"""Our node among those of rmw_zenoh: its session, the tokens by which all are seen, and inboxes of what has arrived.
+"""Our node among those of rmw_zenoh: its session, the liveliness tokens of all nodes, and inboxes of what has arrived.
 
 rmw_zenoh's nodes meet at a router. A server of ours that finds none is one itself: its session listens on loopback, so
 nothing but the link is between it and its clients. Scouting by multicast is off, and clients listen on nothing.
@@ -33,9 +33,9 @@ PLACE: Final = re.compile(r"!?\s+at /\S+")
 MESSAGE_BYTES: Final = 128 << 20
 """A larger message is dropped as it comes in."""
 RECEIVE_BYTES: Final = 1 << 20
-"""Read at once, where Zenoh reads 64 KiB: 640x480 raw arrives in .24 ms instead of .36 (medians, two cores)."""
+"""Read at once, where Zenoh reads 64 KiB: 640x480 raw arrives in 0.24 ms instead of 0.36 (medians, two cores)."""
 BATCHES: Final = 16
-"""Of 64 KiB wait to be sent, where Zenoh has room for 2: whoever sends a picture of 640x480 goes on at once."""
+"""Of 64 KiB wait to be sent, where Zenoh has room for 2: sending a picture of 640x480 does not block."""
 OPEN_MS: Final = 5000
 """So long a router may take to say what it is."""
 SEND_US: Final = 5_000_000
@@ -62,7 +62,7 @@ def open_session(endpoint: str, *, host: bool, tuning: Tuning = "tuned") -> zeno
         "connect/exit_on_failure": True,
         "scouting/multicast/enabled": False,
         "scouting/delay": 0,  # half a second, in which a router looks for others
-        "timestamping/enabled": True,  # latched topics are told apart by it
+        "timestamping/enabled": True,  # distinguishes latched samples
         "transport/shared_memory/enabled": False,  # as rmw_zenoh: a process that is killed leaves 16 MiB behind
         "transport/link/rx/max_message_size": MESSAGE_BYTES,
         "transport/link/tx/queue/congestion_control/block/wait_before_close": SEND_US,
@@ -85,17 +85,17 @@ def open_session(endpoint: str, *, host: bool, tuning: Tuning = "tuned") -> zeno
             else "start one (ros2 run rmw_zenoh_cpp rmw_zenohd, or s2a-bench serve ros --middleware zenoh), "
             "or name it with `router`"
         )
-        raise TransportError(f"{what} ({told(error)}): {way}") from error
+        raise TransportError(f"{what} ({reason_of(error)}): {way}") from error
 
 
-def told(error: zenoh.ZError) -> str:
-    """Return what Zenoh says, less the places in its sources where it says so."""
+def reason_of(error: zenoh.ZError) -> str:
+    """Return Zenoh's message without the places in its sources."""
     return PLACE.sub("", str(error))[:200]
 
 
 @dataclass(frozen=True, slots=True)
 class AnnouncedEndpoint:
-    """An endpoint of ours as others see it; it is gone when this is no longer used."""
+    """An endpoint of ours as others see it; withdrawn when this object is deleted."""
 
     entity: names.Entity
     gid: bytes
@@ -103,7 +103,6 @@ class AnnouncedEndpoint:
     _numbers: Iterator[int] = field(default_factory=lambda: count(1))
 
     def attachment(self) -> bytes:
-        """Return what goes with the next message."""
         return names.attachment(next(self._numbers), self.gid)
 
 
@@ -155,7 +154,7 @@ class Node:
         return sum(hashed == entity.type_hash for hashed in self.peers(kind, entity))
 
     def _heard(self, sample: Any) -> None:
-        """Note an endpoint that has come or gone; on a thread of Zenoh's."""
+        """Note an endpoint that appears or leaves; called on a thread of Zenoh."""
         token = str(sample.key_expr)
         entity = names.entity_of(token)
         if entity is None:
@@ -182,7 +181,7 @@ def refusals(what: str) -> Iterator[None]:
     try:
         yield
     except zenoh.ZError as error:
-        raise TransportError(f"Zenoh: {what}: {told(error)}") from error
+        raise TransportError(f"Zenoh: {what}: {reason_of(error)}") from error
 
 
 def direct(callback: Any) -> Any:
@@ -193,7 +192,7 @@ def direct(callback: Any) -> Any:
 def give_way() -> None:
     """Let Zenoh's thread send what was just handed to it, where it waits for this very core.
 
-    Linux wakes it beside its waker. Without this the first of 32 tokens left after the last: .75 ms instead of .25.
+    Linux wakes it beside its waker. Without this the first of 32 tokens left after the last: 0.75 ms instead of 0.25.
     """
     os.sched_yield()
 
@@ -207,7 +206,7 @@ class Bell:
         self._rung = False
 
     def ring(self) -> None:
-        """Wake who waits; with the condition held."""
+        """Wake the waiting thread; call it with the condition held."""
         self._rung = True
         self.condition.notify()
 
@@ -231,25 +230,25 @@ class SampleQueue(Generic[Item]):
     """What has come in for one endpoint: the last ``depth`` items, all for 0."""
 
     def __init__(self, name: str, bell: Bell, depth: int = 0, most_bytes: int = 0) -> None:
-        """Start empty; it has room for `HELD_BYTES`, or as many as told."""
+        """Start empty; it holds ``most_bytes``, with 0 `HELD_BYTES`."""
         self._name, self._bell, self._depth = name, bell, depth
         self._most = most_bytes or HELD_BYTES
         self._items: deque[tuple[Item, int]] = deque()
-        self._bytes, self._told = 0, False
+        self._bytes, self._warned = 0, False
 
     def put(self, item: Item, size: int) -> bool:
-        """Add an item and wake who waits; False if it found no room."""
+        """Add an item and wake the waiting thread; False if the queue is full."""
         size += EACH_BYTES
         with self._bell.condition:
             if self._depth and len(self._items) >= self._depth:
                 self._pop()
             if full := self._bytes + size > self._most:
-                told, self._told = self._told, True
+                warned, self._warned = self._warned, True
             else:
                 self._items.append((item, size))
                 self._bytes += size
             self._bell.ring()
-        if full and not told:
+        if full and not warned:
             _log.warning("%s: messages are dropped: %d MiB wait to be taken", self._name, self._most >> 20)
         return not full
 

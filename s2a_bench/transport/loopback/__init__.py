@@ -8,7 +8,7 @@ from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, Server, Transp
 
 
 class Loopback(Transport[TransportOptions]):
-    """A call within the process; no picture travels, whatever the payload is."""
+    """A call within the process; no picture is sent, whatever the payload is."""
 
     name = "loopback"
     options = TransportOptions

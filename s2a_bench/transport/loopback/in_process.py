@@ -31,7 +31,6 @@ class LoopbackServer:
         _servers[self.address] = self
 
     def describe(self) -> dict[str, str | int]:
-        """Say that nothing carries anything."""
         return {"transport": "in process"}
 
     def serve(self) -> None:
@@ -39,7 +38,6 @@ class LoopbackServer:
         self._stopped.wait()
 
     def stop(self) -> None:
-        """Become unknown to clients."""
         _servers.pop(self.address, None)
         self._stopped.set()
 

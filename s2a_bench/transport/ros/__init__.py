@@ -13,7 +13,9 @@ from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Client, H
 from s2a_bench.transport.ros.options import RosOptions
 
 TOPIC, ACTION = VARIANTS = ("topic", "action")
-UNREADABLE_N = Fact("unreadable_n", "messages", "of strangers, that could not be read while the request was under way")
+UNREADABLE_N = Fact(
+    "unreadable_n", "messages", "of other nodes, that could not be read while the request was under way"
+)
 
 
 class Ros(Transport[RosOptions]):
@@ -61,7 +63,7 @@ class Ros(Transport[RosOptions]):
         return RosServer(wiring, handler)
 
     def measured(self, choice: Choice[RosOptions]) -> Sequence[str]:
-        """Return topics unless told, and of somebody else's node its action."""
+        """Return `action` for an external node, else the default."""
         return (ACTION,) if choice.options.action else super().measured(choice)
 
     def capabilities(self, choice: Choice[RosOptions]) -> Capabilities[RosOptions]:
@@ -76,7 +78,7 @@ class Ros(Transport[RosOptions]):
         return replace(can, payloads=payloads, answer_kinds=(TOKENS,), accepts_state=False)
 
     def require(self, choice: Choice[RosOptions]) -> None:
-        """Refuse what a goal cannot carry, and a stream that nobody keeps."""
+        """Raise UsageError for what a goal cannot carry, and for a stream to an external server."""
         from s2a_bench.ros.config import domain_id
         from s2a_bench.transport.ros.joining import is_routed
 
@@ -97,7 +99,6 @@ class Ros(Transport[RosOptions]):
             )
 
     def ready(self, wiring: Wiring[RosOptions]) -> str:
-        """Return the names of action and camera."""
         from s2a_bench.transport.ros.camera import CAMERA
         from s2a_bench.transport.ros.joining import AT, place_of, remapped
 

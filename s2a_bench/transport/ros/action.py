@@ -123,9 +123,9 @@ class GenerateClient(RosClient):
                     raise RequestFailed("the server rejected the goal")
                 elif isinstance(event, Result):
                     ended = True
-                    told = self._learn(goal_id.hex(), trace)  # of a goal that failed, too
+                    marked = self._learn(goal_id.hex(), trace)  # of a goal that failed, too
                     self._check(event, "".join(heard))
-                    if not told:
+                    if not marked:
                         raise RequestFailed("the server's marks did not arrive")
         finally:
             if not ended:
@@ -141,7 +141,6 @@ class GenerateClient(RosClient):
             raise MessagesLost(f"of the answer's {len(response.text)} letters {len(heard)} came as feedback")
 
     def _next(self, goal_id: bytes, bounds: Bounds) -> Any:
-        """Wait for the next event of this goal."""
         events: Iterator[ActionEvent | None] = self.taken(self._client.next_event, bounds)
         for event in events:
             if event is not None and event.goal_id == goal_id:
@@ -153,7 +152,7 @@ class GenerateClient(RosClient):
     def _learn(self, goal_id: str, trace: Trace) -> bool:
         """Take our server's marks of a goal, which were sent before its result; of another, who it is."""
         if self._marks is None:
-            if (told := self._origin.take(0)) and (origin := readable(self._origin, told, trace)) is not None:
+            if (marked := self._origin.take(0)) and (origin := readable(self._origin, marked, trace)) is not None:
                 trace.provenance = told_by(origin)
             return True
         deadline = now_ns() + int(MARKS_TIMEOUT_S * 1e9)

@@ -28,7 +28,7 @@ from s2a_bench.transport.ros.wire import TOKEN_QOS, marks_message, token_message
 from s2a_bench.types import Piece, Request, Sampling
 
 NO_SEED = 2**32 - 1
-"""SamplingConfig.seed of a client that does not care."""
+"""SamplingConfig.seed of a client without a wish."""
 BOUNDS: Final[dict[str, tuple[float, float]]] = {
     "temp": (0, 100),
     "top_k": (-1, 2**31 - 1),
@@ -44,8 +44,8 @@ BOUNDS: Final[dict[str, tuple[float, float]]] = {
     "mirostat_tau": (0.01, 100),
 }
 """Field -> what makes sense of it: the numbers that an engine may honour."""
-ELSEWHERE: Final = frozenset({"seed", "grammar", "dry_sequence_breakers"})
-"""What the goal says besides, and what ROS itself encodes in two ways."""
+NOT_LOGGED: Final = frozenset({"seed", "grammar", "dry_sequence_breakers"})
+"""Fields that a goal's request reads separately, and one that ROS encodes in two ways."""
 _log = logging.getLogger(__name__)
 
 
@@ -67,7 +67,6 @@ class ActionFront:
         self._plot = middleware.publisher(namespace + "/token", ros.TOKEN, QoS()) if options.publish_tokens else None
 
     def tune(self, options: RosOptions) -> None:
-        """Follow the options that may change while it runs."""
         self.max_tokens = min(options.max_tokens or self._wiring.max_tokens, self._wiring.limits.answer_tokens)
         self.feedback_interval_ns = int(options.feedback_interval * 1e9)
 
@@ -88,7 +87,7 @@ class ActionFront:
         packed.reject()
 
     def plot(self, goal_id: str, token: Piece) -> None:
-        """Publish a token for whoever plots, where that is wanted."""
+        """Publish a token for plotting, with `publish_tokens`."""
         if self._plot is not None:
             self._plot.send(self._plot.pack(token_message(goal_id, token, last=False)))
 
@@ -101,7 +100,6 @@ class GoalExchange(RosExchange):
     """One goal: ACCEPTED while it waits, EXECUTING when its turn comes."""
 
     def __init__(self, front: ActionFront, goal: ServerGoal, message: Any, shared: Shared, trace: Trace) -> None:
-        """Answer a goal of the front's."""
         super().__init__(shared, trace)
         self._front, self._goal, self._message = front, goal, message
         self._id = goal.id.hex()
@@ -161,7 +159,6 @@ class GoalExchange(RosExchange):
         return "".join(token.text for token in self._tokens)
 
     def finish(self, error: str) -> None:
-        """Send marks and result."""
         try:
             if self._started and not self._goal.cancel_requested:
                 self._feed()
@@ -185,15 +182,15 @@ class Wishes:
         """Know the fields that the engine honours, and a version's defaults."""
         self._honoured = honoured
         self._defaults = sampling_config(version)
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
 
     def of(self, config: Any) -> Sampling:
         """Return the wishes that the engine honours; raises RequestFailed for a number that makes no sense."""
         defaults = vars(self._defaults).items()
         wanted = [name for name, default in defaults if _differs(getattr(config, name, default), default)]
-        left_out = [name for name in wanted if name not in self._honoured and name not in self._said | ELSEWHERE]
+        left_out = [name for name in wanted if name not in self._honoured and name not in self._logged | NOT_LOGGED]
         if left_out:
-            self._said.update(left_out)
+            self._logged.update(left_out)
             _log.warning("not honoured of goals' sampling_config: %s", ", ".join(left_out))
         return tuple((name, _checked(name, getattr(config, name))) for name in wanted if name in self._honoured)
 

@@ -24,7 +24,7 @@ _UNITS = {"": 0, "K": 10, "M": 20, "G": 30}
 
 
 def dds_of(middleware: str, environ: Mapping[str, str]) -> str:
-    """Return cyclonedds, or which RMW a middleware is; "" for the one that is taken without being told."""
+    """Return cyclonedds, or which RMW a middleware is; "" stands for the default."""
     name = middleware or default_middleware(environ)
     return environ.get("RMW_IMPLEMENTATION") or DEFAULT_RMW if name == "rclpy" else name
 
@@ -44,7 +44,7 @@ def against_loss(middleware: str, environ: Mapping[str, str]) -> str:
 
 
 def cyclone_line(environ: Mapping[str, str]) -> str:
-    """Return the line that gives Cyclone DDS large buffers and fragments, and keeps what it is told already."""
+    """Return the line that gives Cyclone DDS large buffers and fragments, and keeps the user's own settings."""
     kept = '"$CYCLONEDDS_URI,"' if environ.get("CYCLONEDDS_URI") else ""
     return f"export CYCLONEDDS_URI={kept}'{FRAGMENT}'"
 
@@ -61,19 +61,19 @@ def check(machine: Machine) -> Finding | None:
     environ, code = machine.environ, "dds-buffers"
     dds = dds_of("", environ)
     if dds == CYCLONE or (dds == "cyclonedds" and environ.get("CYCLONEDDS_URI")):
-        asked = max(_asked(machine), default=0)
-        if asked >= RMEM_WANTED:
-            return Finding(code, "state", f"{dds}: CYCLONEDDS_URI asks for {asked} bytes of receive buffer")
-        told = f"{dds}: CYCLONEDDS_URI asks for no large receive buffer: pictures of 1920x1080 are lost"
-        return Finding(code, "warning", f"{told}, with best effort all of them", cyclone_line(environ))
+        size = max(_buffer_sizes(machine), default=0)
+        if size >= RMEM_WANTED:
+            return Finding(code, "state", f"{dds}: CYCLONEDDS_URI asks for {size} bytes of receive buffer")
+        finding = f"{dds}: CYCLONEDDS_URI asks for no large receive buffer: pictures of 1920x1080 are lost"
+        return Finding(code, "warning", f"{finding}, with best effort all of them", cyclone_line(environ))
     if dds == FAST:
         if "LARGE_DATA" in environ.get("FASTDDS_BUILTIN_TRANSPORTS", "") or any(map(environ.get, PROFILES)):
-            return Finding(code, "state", f"{dds} is told how to carry large pictures")
+            return Finding(code, "state", f"{dds} is configured for large pictures")
         return Finding(code, "advice", f"{dds} has its small receive buffers: pictures may be lost", fast_line(environ))
     return None
 
 
-def _asked(machine: Machine) -> Iterator[int]:
+def _buffer_sizes(machine: Machine) -> Iterator[int]:
     """Yield the sizes of receive buffers in CYCLONEDDS_URI, a list of files and pieces of XML."""
     uri = machine.environ.get("CYCLONEDDS_URI", "")
     paths = (piece.strip().removeprefix("file://") for piece in uri.split(","))

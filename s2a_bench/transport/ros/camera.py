@@ -85,7 +85,6 @@ class CameraPublisher:
         self._publisher = middleware.publisher(namespace + topic, type_name, CAMERA_QOS[qos])
 
     def stamp_ns(self, frame: Frame) -> int:
-        """Return the ROS-time stamp by which the server names the frame."""
         return frame.stamp_ns + self._offset_ns
 
     def publish(self, frame: Frame, trace: Trace) -> None:
@@ -150,8 +149,8 @@ class CameraCache:
         for thread in self._threads:
             thread.join()
 
-    def lend(self, trace: Trace) -> tuple[Frame, ...]:
-        """Return the newest frame for a request that carries none; its trace is told which it is, and how old.
+    def newest(self, trace: Trace) -> tuple[Frame, ...]:
+        """Return the newest frame for a request that carries none; note in its trace which frame it is, and its age.
 
         It is () where no frame has come and the topics have no publisher. Raises RequestFailed where they have one,
         after `FIRST_FRAME_S` at most, and for a frame that came more than ``max_frame_age`` ago.
@@ -209,7 +208,6 @@ class CameraCache:
         return f"{present}, no frame comes: look at the buffers ({buffers}) and at what is published{other}"
 
     def _publishers(self) -> dict[str, int]:
-        """Count the publishers of each topic that has some."""
         return {camera.topic: count for camera in self._cameras if (count := camera.publishers())}
 
     def seen(self) -> tuple[int, int | None]:
@@ -218,18 +216,18 @@ class CameraCache:
         return self._count, newest.received_ns if newest else None
 
     def _watch(self, camera: Subscription) -> None:
-        said = ""
+        logged = ""
         while not self._stopped:
             try:
                 packed = camera.take(POLL_S)
                 if packed is not None:
                     self._keep(camera, packed)
                     self._unused = ""
-            except Exception as error:  # noqa: BLE001 - a frame nobody can use is no reason to stop
+            except Exception as error:  # noqa: BLE001 - an unusable frame is no reason to stop
                 self._unused = str(error) or type(error).__name__
-                if self._unused != said:  # once a kind of trouble, not thirty times a second
-                    said = self._unused
-                    _log.warning("camera frame not used: %s", said)
+                if self._unused != logged:  # once a kind of trouble, not thirty times a second
+                    logged = self._unused
+                    _log.warning("camera frame not used: %s", logged)
 
     def _keep(self, camera: Subscription, packed: Any) -> None:
         """Decode a frame and keep it, unless one that came later is there already."""

@@ -14,7 +14,7 @@ from s2a_bench.ros.config import configuration, domain_id
 from s2a_bench.ros.router import ROUTER, endpoint_of
 
 STATE_AT: Final = 3
-"""The column of /proc/net/tcp that tells a socket's state."""
+"""The column of /proc/net/tcp that holds a socket's state."""
 LISTEN: Final = "0A"
 
 
@@ -32,10 +32,10 @@ def dds(machine: Machine) -> Finding:
     up = [path.split("/")[3] for path, state in machine.read_all("sys/class/net/*/operstate").items() if state == "up"]
     where = f"loopback only ({', '.join(bound)})" if bound else f"all interfaces: {', '.join(up) or 'none is up'}"
     multicast = root.findtext(".//AllowMulticast") == "true"
-    told = f"domain {domain}, {where}, {'with' if multicast else 'without'} multicast"
+    state = f"domain {domain}, {where}, {'with' if multicast else 'without'} multicast"
     if not bound and not up:
-        return Finding("dds", "warning", told, "ip link shows why; or unset ROS_AUTOMATIC_DISCOVERY_RANGE")
-    return Finding("dds", "state", told)
+        return Finding("dds", "warning", state, "ip link shows why; or unset ROS_AUTOMATIC_DISCOVERY_RANGE")
+    return Finding("dds", "state", state)
 
 
 def ros(machine: Machine) -> Finding:
@@ -53,7 +53,7 @@ def ros(machine: Machine) -> Finding:
             f"source /opt/ros/{installed[-1]}/setup.bash",
         )
     rmw = machine.environ.get("RMW_IMPLEMENTATION", "its default RMW")
-    ours = ".".join(platform.python_version_tuple()[:2])
+    python = ".".join(platform.python_version_tuple()[:2])
     built = sorted(
         {
             path.parent.parent.name.removeprefix("python")
@@ -62,19 +62,19 @@ def ros(machine: Machine) -> Finding:
             for path in (machine.root / prefix.lstrip("/")).glob(pattern)
         }
     )
-    if ours in built:
-        return Finding("ros", "state", f"{distro}, {rmw}, rclpy for Python {ours}")
-    told = (
+    if python in built:
+        return Finding("ros", "state", f"{distro}, {rmw}, rclpy for Python {python}")
+    state = (
         f"{distro} is sourced, with rclpy for Python {', '.join(built)}"
         if built
         else f"{distro} is sourced without rclpy"
     )
     fix = f"make PYTHON=python{built[-1]} VENV=.venv-ros setup" if built else f"sudo apt install ros-{distro}-rclpy"
-    return Finding("ros", "warning", f"{told}; this is Python {ours}, so Cyclone DDS from PyPI has to do", fix)
+    return Finding("ros", "warning", f"{state}; this is Python {python}, so Cyclone DDS from PyPI has to do", fix)
 
 
 def middleware(machine: Machine) -> Finding:
-    """Return which middleware a run takes unless told, and whether it is there."""
+    """Return the default middleware, and whether it is installed."""
     name = default_middleware(machine.environ)
     if machine.finds(name):
         return Finding("middleware", "state", f"{name} (--middleware takes another)")
@@ -88,5 +88,7 @@ def zenoh(machine: Machine) -> Finding | None:
     port = f":{endpoint_of(ROUTER)[2]:04X}"
     lines = [line.split() for name in ("tcp", "tcp6") for line in (machine.read(f"proc/net/{name}") or "").splitlines()]
     there = any(len(line) > STATE_AT and line[1].endswith(port) and line[STATE_AT] == LISTEN for line in lines)
-    told = "a router listens" if there else "no router listens"
-    return Finding("zenoh", "state", f"{told} at {ROUTER}{'' if there else ': serve ros --middleware zenoh starts it'}")
+    state = "a router listens" if there else "no router listens"
+    return Finding(
+        "zenoh", "state", f"{state} at {ROUTER}{'' if there else ': serve ros --middleware zenoh starts it'}"
+    )

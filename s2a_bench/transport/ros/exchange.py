@@ -1,4 +1,4 @@
-"""What the exchanges of a ROS server have in common: the newest camera frame, counts, and the order of their ends."""
+"""The exchanges of a ROS server: the newest camera frame, counts, and the order in which answers end."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _ended() -> Event:
 
 @dataclass(slots=True)
 class Shared:
-    """What the exchanges of one server share."""
+    """State shared by all exchanges of a server."""
 
     cache: CameraCache
     activity: Activity
@@ -66,14 +66,14 @@ class RosExchange(Exchange):
         """End a goal that was cancelled, and what waits when the server is stopped."""
 
     def begin(self, request: Request) -> Request | None:
-        """Lend the newest frame to a request without a picture; raises RequestFailed where none comes."""
+        """Add the newest frame to a request without a picture; raises RequestFailed where none arrives."""
         shared = self._shared
         shared.activity.requests += 1
         self._before, shared.ended = shared.ended, Event()  # in its turn, so one thread at a time
         self._ended = shared.ended
         if not self.started():
             return None
-        return request if request.images else replace(request, images=shared.cache.lend(self.trace))
+        return request if request.images else replace(request, images=shared.cache.newest(self.trace))
 
     def send(self, piece: Piece) -> bool:
         self._shared.activity.tokens += 1

@@ -31,15 +31,15 @@ SETTLE_S = 0.3
 
 
 def namespace_of(wiring: Wiring[RosOptions]) -> str:
-    """Return where our topics are; somebody else's action is not under it."""
+    """Return the namespace of our topics; an external action is not under it."""
     address = wiring.address.partition(AT)[0]
     return (not wiring.options.action and address) or wiring.options.namespace or NAMESPACE
 
 
 def domain_of(wiring: Wiring[RosOptions]) -> int:
     """Return the DDS domain; raises UsageError for a ROS_DOMAIN_ID that is none."""
-    said = wiring.options.domain_id
-    return domain_id(os.environ) if said is None else said
+    chosen = wiring.options.domain_id
+    return domain_id(os.environ) if chosen is None else chosen
 
 
 def is_routed(options: RosOptions) -> bool:
@@ -48,7 +48,7 @@ def is_routed(options: RosOptions) -> bool:
 
 
 def router_of(wiring: Wiring[RosOptions]) -> str:
-    """Return the endpoint of the router: of the server's own, else the one that is told, else rmw_zenoh's."""
+    """Return the endpoint of the router: the server's own, else the option's, else rmw_zenoh's."""
     return wiring.address.partition(AT)[2] or wiring.options.router or ROUTER
 
 
@@ -61,14 +61,14 @@ def place_of(wiring: Wiring[RosOptions]) -> str:
 def settled(wiring: Wiring[RosOptions]) -> tuple[Wiring[RosOptions], bool]:
     """Return a server's wiring, and whether it is to be the router itself, which is then in its address.
 
-    It is where none is told, so that each server of a run has its own, and where none listens on loopback as told.
+    It is without `router`, so that each server of a run has its own, and where none listens at a loopback `router`.
     """
     if not is_routed(wiring.options):
         return wiring, False
-    told = wiring.address.partition(AT)[2] or wiring.options.router
-    if told and (listens(told) or not may_host(told)):
+    endpoint = wiring.address.partition(AT)[2] or wiring.options.router
+    if endpoint and (listens(endpoint) or not may_host(endpoint)):
         return wiring, False
-    return replace(wiring, address=f"{namespace_of(wiring)}{AT}{told or free_endpoint()}"), True
+    return replace(wiring, address=f"{namespace_of(wiring)}{AT}{endpoint or free_endpoint()}"), True
 
 
 def server_name(wiring: Wiring[RosOptions]) -> str:
@@ -146,7 +146,6 @@ class RosClient:
     """What the clients of both variants have: a node, the server's camera, and messages that they wait for."""
 
     def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
-        """Join the domain."""
         self._wiring, self._alive = wiring, alive
         self._offset_ns = realtime_offset_ns()
         self.middleware = join(wiring, "client")

@@ -44,14 +44,14 @@ class Activity:
         self._waiting, self._limit, self._silent_s = waiting, limit, silent_s
         self.requests = self.tokens = self.failures = 0
         self._before = (now_ns(), 0, 0, 0, 0)
-        self._said = ""
+        self._logged = ""
 
-    def failed(self, error: str, *, told: bool = False) -> None:
-        """Count a failure, and log it unless the log was ``told`` or it is the same again, but for its numbers."""
+    def failed(self, error: str, *, logged: bool = False) -> None:
+        """Count a failure; log it unless it is ``logged`` already or differs from the last in numbers only."""
         self.failures += 1
         kind = NUMBER.sub("", error)
-        if not told and kind != self._said:
-            self._said = kind
+        if not logged and kind != self._logged:
+            self._logged = kind
             _log.warning("a request failed: %s", error)
 
     def findings(
@@ -69,17 +69,17 @@ class Activity:
         )
         self._before = now
         waiting, silent_s = self._waiting(), self._silent_s()
-        level, said = Level.OK, "answering" if silent_s else "idle"
+        level, message = Level.OK, "answering" if silent_s else "idle"
         if silent_s > STUCK_S:
-            level, said = Level.ERROR, f"the answer under way has shown no sign of life for {silent_s:.0f} s"
+            level, message = Level.ERROR, f"the answer under way has shown no sign of life for {silent_s:.0f} s"
         elif waiting and waiting >= self._limit:
-            level, said = Level.WARN, "the queue is full: goals are rejected"
+            level, message = Level.WARN, "the queue is full: goals are rejected"
         elif failures:
-            level, said = Level.WARN, f"{failures} requests failed"
+            level, message = Level.WARN, f"{failures} requests failed"
         yield PartHealth(
             "requests",
             level,
-            said,
+            message,
             {
                 "requests_per_s": requests / seconds,
                 "tokens_per_s": tokens / seconds,
@@ -95,9 +95,11 @@ class Activity:
             return
         age_s = (now[0] - frame_ns) / 1e9
         old = age_s > oldest_s
-        said = ": ".join(filter(None, (f"the newest frame is {age_s:.1f} s old", silence()))) if old else "frames come"
+        message = (
+            ": ".join(filter(None, (f"the newest frame is {age_s:.1f} s old", silence()))) if old else "frames come"
+        )
         values = {"frames_per_s": came / seconds, "frame_age_s": age_s, "frames": frames}
-        yield PartHealth("camera", Level.WARN if old else Level.OK, said, values)
+        yield PartHealth("camera", Level.WARN if old else Level.OK, message, values)
 
 
 class NodeApi:
@@ -148,7 +150,6 @@ class NodeApi:
                 _log.warning("no diagnostics this time: %s", error)
 
     def _tell(self, **lists: Sequence[Any]) -> None:
-        """Publish a ParameterEvent."""
         event = ros.default(EVENT, stamp=ros.stamp(time.time_ns()), node=self._name, **lists)
         self._events.send(self._events.pack(event))
 

@@ -1,4 +1,4 @@
-"""What the ROS transport can be told."""
+"""The options of the ROS transport."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from s2a_bench.ros.router import ROUTER, endpoint_of
 from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
 
 NAMESPACE = "/s2a_bench"
-"""Where topics are unless told; servers of a run get this and something of their own."""
+"""The default namespace; servers of a run add a random suffix."""
 
 NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 """ROS 2's rules for an absolute name."""
@@ -64,8 +64,8 @@ class RosOptions(TransportOptions):
     )
     max_frame_age: float = option(
         1.0,
-        "seconds since a camera topic's frame came: requests without a picture fail on an older one, "
-        "and where a publisher has sent none",
+        "seconds since a camera topic's frame came: a request without a picture fails if the newest "
+        "frame is older, and where a publisher has sent none",
         gt=0,
         le=86_400,
         side=SERVER,
@@ -129,13 +129,12 @@ class RosOptions(TransportOptions):
 
     @property
     def against_loss(self) -> str:
-        """Return what the middleware in use needs."""
         from s2a_bench.transport.ros.buffers import against_loss
 
         return against_loss(self.middleware, os.environ)
 
     def addresses(self) -> Iterable[str]:
-        """Yield the namespace, then it with a number; unless told, one that nobody else has."""
+        """Yield the namespace, then it with a number; a new random one without the option."""
         if not self.namespace:
             yield f"{NAMESPACE}_{token_hex(4)}"
             return

@@ -3,7 +3,7 @@
 A front is one variant's way in. Its threads take turns in waiting for a request; the one that got it answers it
 while another waits, so that no request changes threads, and one that comes meanwhile waits for the engine (stage
 `queue`), not in the network. All fronts share one queue, which a request joins as it arrives: a front's lock is held
-until it has its place and who asked knows that, so requests are accepted, answered and ended in one order.
+until it has its place and the client is informed, so requests are accepted, answered and ended in one order.
 """
 
 from __future__ import annotations
@@ -71,9 +71,9 @@ class RosServer:
         self._shared = Shared(self._cache, activity)
         self._node: NodeApi | None = None
         if wiring.options.node_api:
-            told, level = declared(wiring, queued.settings), wiring.options.log_level
+            logged, level = declared(wiring, queued.settings), wiring.options.log_level
             name = server_name(wiring)
-            self._node = NodeApi(self.middleware, name, told, self._change, self._findings, level)
+            self._node = NodeApi(self.middleware, name, logged, self._change, self._findings, level)
 
     def serve(self) -> None:
         fronts = [SharedSourceWorkers(partial(self._take, front), self._shared.stopped) for front in self._fronts]
@@ -98,7 +98,6 @@ class RosServer:
         self._cache.interrupt()
 
     def describe(self) -> dict[str, str | int]:
-        """Say what carries the messages."""
         return self.middleware.describe()
 
     def _change(self, wanted: Mapping[str, Any]) -> None:
@@ -123,7 +122,7 @@ class RosServer:
                 exchange = front.exchange(packed, self._shared, trace)
                 turn = self._core.join(exchange)
             except TransportError as error:
-                self._shared.activity.failed(str(error), told=front is self._action)
+                self._shared.activity.failed(str(error), logged=front is self._action)
                 front.refuse(packed, str(error))
                 return None
             exchange.held = held.pop_all()

@@ -113,7 +113,6 @@ class TopicFront:
         return TopicExchange(self, message, shared, trace)
 
     def size_bytes(self, packed: Any) -> int:
-        """Return the size of its CDR."""
         return len(packed)
 
     def refuse(self, packed: Any, why: str) -> None:
@@ -132,7 +131,6 @@ class TopicExchange(RosExchange):
     """One request of the topic variant."""
 
     def __init__(self, front: TopicFront, message: Any, shared: Shared, trace: Trace) -> None:
-        """Answer a message of the front's."""
         super().__init__(shared, trace)
         self._front, self._message, self._id = front, message, str(message.id)
         self._sent = 0
@@ -142,8 +140,8 @@ class TopicExchange(RosExchange):
         whole_number("max_tokens", int(message.max_tokens), 1, limits.answer_tokens, 0)
         pictures = (*message.images, *message.compressed_images)
         images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
-        said = message.max_tokens, message.grammar, message.seed
-        return Request(plain(message.id), message.prompt, images, *said, state=state_of(message.state))
+        settings = message.max_tokens, message.grammar, message.seed
+        return Request(plain(message.id), message.prompt, images, *settings, state=state_of(message.state))
 
     def piece(self, piece: Piece) -> bool:
         self._front.send(self._id, piece, [])

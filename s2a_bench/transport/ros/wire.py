@@ -27,7 +27,7 @@ TOKEN_QOS = QoS(depth=1000)
 
 
 PROVENANCE_TOPIC: Final = "/provenance"
-"""Below the namespace: who answers, for who joins late too."""
+"""Below the namespace: the server's provenance, latched for late subscribers."""
 
 
 def unguessable(request_id: str) -> str:
@@ -113,9 +113,9 @@ def marks_message(request_id: str, remote: Remote) -> Any:
     )
 
 
-def provenance_message(told: Mapping[str, str]) -> Any:
-    """Turn what a server says of who answers into s2a_msgs/Provenance."""
-    return ros.message(ros.PROVENANCE, **{**Provenance().to_dict(), **told})
+def provenance_message(facts: Mapping[str, str]) -> Any:
+    """Turn a server's provenance into s2a_msgs/Provenance."""
+    return ros.message(ros.PROVENANCE, **{**Provenance().to_dict(), **facts})
 
 
 def told_by(origin: Any) -> dict[str, str]:

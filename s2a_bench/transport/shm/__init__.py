@@ -34,7 +34,7 @@ class ShmOptions(TransportOptions):
     )
 
     def addresses(self) -> Iterable[str]:
-        """Return the socket that was asked for, and a new one."""
+        """Return the socket of the option, and a new one."""
         return self.socket, ""
 
 

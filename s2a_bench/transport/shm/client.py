@@ -19,10 +19,9 @@ from s2a_bench.transport.pictures import bgr_of, encoded
 from s2a_bench.transport.shm import ShmOptions
 from s2a_bench.transport.shm.door import connect
 from s2a_bench.transport.shm.memory import ANSWER_BYTES, PLACE, STEP_BYTES, SharedMemory, accept, in_steps, offer
-from s2a_bench.transport.shm.pieces import Said, unpacked
+from s2a_bench.transport.shm.pieces import AnswerPart, unpacked
 from s2a_bench.types import Action, Frame, Piece, Request, Token
 
-"""Memory for requests comes in steps; one holds a raw picture of 640x480."""
 NEARER_S: Final = 0.1
 """A wait that ends later than it should by no more than this is left as it is: to change it is a system call."""
 
@@ -33,7 +32,7 @@ class ShmClient:
     camera = None
 
     def __init__(self, wiring: Wiring[ShmOptions], alive: Callable[[], bool]) -> None:
-        """Connect; raises ServerDied where nobody listens."""
+        """Connect; raises ServerDied if no server listens."""
         self._wiring, self._alive, self._path = wiring, alive, wiring.address
         self._payload = wiring.options.payload
         self._link: ShmConnection | None = None
@@ -45,17 +44,17 @@ class ShmClient:
         done = False
         try:
             self._ask(link, at, length)
-            for said in self._said(link, bounds):
-                if isinstance(said, (Token, Action)):
-                    if not said.index:
+            for part in self._answer(link, bounds):
+                if isinstance(part, (Token, Action)):
+                    if not part.index:
                         trace.mark("return")
                     bounds.count_piece()
-                    yield said
+                    yield part
                     continue
                 done = True
-                if isinstance(said, str):
-                    raise RequestFailed(f"the server broke off: {said}")
-                trace.receive(said)
+                if isinstance(part, str):
+                    raise RequestFailed(f"the server broke off: {part}")
+                trace.receive(part)
                 return
         finally:
             if not done:  # what was not read belongs to this request only
@@ -120,9 +119,9 @@ class ShmClient:
         try:
             link.ask(at, length)
         except OSError as error:
-            raise self._gone(error) from error
+            raise self._disconnected(error) from error
 
-    def _said(self, link: ShmConnection, bounds: Bounds) -> Iterator[Said]:
+    def _answer(self, link: ShmConnection, bounds: Bounds) -> Iterator[AnswerPart]:
         """Yield the pieces of the answer, and its end."""
         try:
             while True:
@@ -133,12 +132,11 @@ class ShmClient:
             bounds.left_s()  # tells if it was the deadline
             raise RequestFailed(f"nothing came from {self._path} for {self._wiring.timeout_s:g} s") from error
         except (OSError, EOFError) as error:
-            raise self._gone(error) from error
+            raise self._disconnected(error) from error
         except (ValueError, KeyError, TypeError, struct.error) as error:
             raise RequestFailed(f"{self._path} sent what is no answer: {error!r}") from error
 
-    def _gone(self, error: Exception) -> RequestFailed | ServerDied:
-        """Say that the other end is not there any more."""
+    def _disconnected(self, error: Exception) -> RequestFailed | ServerDied:
         if not self._alive():
             return ServerDied(f"the server at {self._path} is gone")
         return RequestFailed(f"{self._path} broke off: {str(error) or 'it closed the link'}")
@@ -202,7 +200,7 @@ class ShmConnection:
         return self._answers.map[begin : begin + length]
 
     def _reason(self, error: BaseException) -> None:
-        """Raise what a server said that has closed a new link."""
+        """Raise the reason with which a server closed a new link."""
         if isinstance(error, BrokenPipeError | ConnectionResetError) and self._answers is None:
             with suppress(OSError, EOFError):
                 accept(self._socket, ANSWER_BYTES)

@@ -1,7 +1,8 @@
 """The Unix socket at which memory is handed over: a file that its user alone may open, cleaned up by the next start.
 
 An abstract socket would leave no file behind, but has no permissions either: any program in the machine's network
-namespace could connect, or take the name first. Both ends ask the kernel who the other is (SO_PEERCRED) all the same.
+namespace could connect, or take the name first. Both ends check
+the peer's user with the kernel (SO_PEERCRED) all the same.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def user_of(link: socket.socket) -> int:
 
 
 def _folder() -> Path:
-    """Return the folder of our sockets, which nobody else may enter."""
+    """Return the folder of our sockets, which only this user may enter."""
     folder = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / f"s2a_bench-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)
@@ -88,7 +89,6 @@ def _folder() -> Path:
 
 
 def _remove_if_dead(path: Path) -> None:
-    """Remove the socket of a server that was killed: nobody listens there."""
     with suppress(OSError):
         if stat.S_ISSOCK(path.lstat().st_mode):
             with closing(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)) as probe:

@@ -7,7 +7,7 @@ other side about as fast as an eventfd or a futex would (docs/latency.md), and u
 - Nothing has a name in /dev/shm: the memory goes when its last process does, whoever is killed and how.
 - Each side maps the other's memory for reading only, and only if its size is sealed: to read beyond the end of what the
   other side has cut off would be a SIGBUS.
-- Whoever reads copies what it checks before it checks: the other side may write meanwhile. Raw pixels are used where
+- A reader copies data before it checks it: the other side may write meanwhile. Raw pixels are used where
   they lie, for any bytes are a picture.
 """
 
@@ -30,7 +30,7 @@ HELLO: Final = struct.Struct("<8sQ")
 MAGIC: Final = b"S2A-SHM2"
 """Its last letter is the version of what follows; both sides have to be of one."""
 REFUSED: Final = b"refused:"
-"""Begins what a server says instead, with its reason."""
+"""Begins a server's refusal; the reason follows."""
 PLACE: Final = struct.Struct("<QQ")
 """All others: where something lies, and its length. A client's tells of a request's header, behind its pictures, which
 begin at 0, one after the other. A server's tells of pieces of the answer, see `pieces`."""
@@ -118,7 +118,7 @@ def _receive(link: socket.socket) -> tuple[bytes, list[int]]:
     room = socket.CMSG_SPACE(4 * _FILES)
     try:
         data, controls, _, _ = link.recvmsg(_PACKET_BYTES, room, socket.MSG_CMSG_CLOEXEC)
-    except ConnectionResetError:  # it left without reading all; what it said before is there still
+    except ConnectionResetError:  # it left without reading all; what it sent before can still be read
         data, controls, _, _ = link.recvmsg(_PACKET_BYTES, room, socket.MSG_CMSG_CLOEXEC)
     files = [
         file

@@ -17,25 +17,25 @@ HEAD: Final = struct.Struct("<B3xIIq")
 """What it is, the bytes that follow, its index, and a token's id."""
 _TOKEN, _ERROR, _END, _ACTION = 1, 2, 3, 4
 
-Said: TypeAlias = "Piece | Remote | str"
-"""A piece; or the end of an answer, with the server's marks; or why there is no more."""
+AnswerPart: TypeAlias = "Piece | Remote | str"
+"""A piece, the server's marks at the end of an answer, or the error that ended it."""
 
 
-def packed(said: Said) -> bytes:
+def packed(part: AnswerPart) -> bytes:
     """Return what is written."""
     kind, index, number = _ERROR, 0, 0
-    if isinstance(said, Token):
-        kind, index, number, body = _TOKEN, said.index, said.id, said.text.encode()
-    elif isinstance(said, Action):
-        kind, index, body = _ACTION, said.index, said.values.astype("<f4", copy=False).tobytes()
-    elif isinstance(said, Remote):
-        kind, body = _END, orjson.dumps(said)
+    if isinstance(part, Token):
+        kind, index, number, body = _TOKEN, part.index, part.id, part.text.encode()
+    elif isinstance(part, Action):
+        kind, index, body = _ACTION, part.index, part.values.astype("<f4", copy=False).tobytes()
+    elif isinstance(part, Remote):
+        kind, body = _END, orjson.dumps(part)
     else:
-        body = said.encode(errors="backslashreplace")
+        body = part.encode(errors="backslashreplace")
     return HEAD.pack(kind, len(body), index, number) + body
 
 
-def unpacked(data: bytes) -> Iterator[Said]:
+def unpacked(data: bytes) -> Iterator[AnswerPart]:
     """Read what was written; RequestFailed, ValueError, KeyError, TypeError or struct.error for what cannot be."""
     at = 0
     while at < len(data):
@@ -46,7 +46,7 @@ def unpacked(data: bytes) -> Iterator[Said]:
         yield _piece(kind, index, number, data[at - size : at])
 
 
-def _piece(kind: int, index: int, number: int, body: bytes) -> Said:
+def _piece(kind: int, index: int, number: int, body: bytes) -> AnswerPart:
     if kind == _TOKEN:
         return Token(index, body.decode(), number)
     if kind == _ACTION:

@@ -35,16 +35,16 @@ def request_at(memory: SharedMemory, at: int, length: int, limits: Limits, trace
         fields = orjson.loads(header)
     except ValueError as error:
         raise RequestFailed(f"the header is no JSON: {error}") from error
-    if not isinstance(fields, dict) or not isinstance(told := fields.get("images", []), list):
+    if not isinstance(fields, dict) or not isinstance(pictures := fields.get("images", []), list):
         raise RequestFailed("the header should be an object whose images are a list")
     trace.mark("header_parse")
     images, begin, pixels = [], 0, limits
-    for about in told:
+    for about in pictures:
         size = about.get("bytes") if isinstance(about, dict) else None
         if type(size) is not int or size <= 0 or begin + size > at:
             raise RequestFailed("a picture should lie before the header")
         images.append(_picture(memory, about, begin, trace, pixels))
-        if len(told) > 1:  # what the first ones leave to the others
+        if len(pictures) > 1:  # what the first ones leave to the others
             pixels = pixels.but(pixels=max(1, pixels.pixels - images[-1].width * images[-1].height))
         begin += size
     return Request(

@@ -93,13 +93,13 @@ class Writer:
     def __init__(self, wire: Wire, answers: SharedMemory) -> None:
         """Write into ``answers``, and tell of it over the wire."""
         self._wire, self._answers = wire, answers
-        self._told = self._end = 0
+        self._announced = self._end = 0
 
     def begin(self) -> None:
         """Begin at 0 again; the memory of a long answer is given back."""
         if self._end > STEP_BYTES:
             self._answers.map.madvise(MADV_REMOVE)
-        self._told = self._end = 0
+        self._announced = self._end = 0
 
     def send(self, piece: bytes, room: int = LAST_BYTES) -> None:
         """Write a piece and tell of it, with ``room`` left for more; raises Disconnected."""
@@ -110,7 +110,7 @@ class Writer:
             )
         self._answers.map[self._end : end] = piece
         self._end = end
-        self._tell()
+        self._announce()
 
     def end(self, piece: bytes) -> None:
         """Write the last piece, which may be marks that are too long."""
@@ -122,21 +122,21 @@ class Writer:
         ends_ns = now_ns() + round(left_s * 1e9)
         writable = select.poll()
         writable.register(self._wire.socket, select.POLLOUT)
-        while self._told < self._end:
+        while self._announced < self._end:
             if not writable.poll(max(0, ends_ns - now_ns()) / 1e6):
                 raise Disconnected("the client does not read its answer")
-            self._tell()
+            self._announce()
 
-    def _tell(self) -> None:
-        """Tell of what was written, as far as the client has read what it was told before; raises Disconnected."""
+    def _announce(self) -> None:
+        """Announce what was written, if the client has read earlier announcements; raises Disconnected."""
         try:
-            place = PLACE.pack(self._told, self._end - self._told)
+            place = PLACE.pack(self._announced, self._end - self._announced)
             self._wire.socket.send(place, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
         except BlockingIOError:
             return
         except OSError as error:
             raise Disconnected from error
-        self._told = self._end
+        self._announced = self._end
 
 
 class ShmExchange(Exchange):
@@ -173,6 +173,6 @@ class ShmExchange(Exchange):
     def fail(self, error: S2AError) -> None:
         self._last(str(error))
 
-    def _last(self, said: Remote | str) -> None:
-        self._writer.end(packed(said))
+    def _last(self, part: Remote | str) -> None:
+        self._writer.end(packed(part))
         self._writer.finish(self.left_s())

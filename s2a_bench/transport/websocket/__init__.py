@@ -1,8 +1,8 @@
 """WebSocket and MessagePack as openpi's policy servers speak it: an observation goes up, a chunk of actions comes back.
 
 ``openpi`` answers with the chunk as a whole, ``openpi-stream`` with its actions as they are ready (partial frames, then
-the final one). Our server serves both, and openpi's own clients; our client asks foreign servers too, which are told
-what a template says (`transport.observation`).
+the final one). Our server serves both, and openpi's own clients; our client also queries foreign servers, with
+observations from a template (`transport.observation`).
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ VARIANTS = ("openpi", "openpi-stream")
 OPENPI, STREAM = VARIANTS
 PACKAGES = ("msgpack", "websockets")
 """What the extra of its name brings."""
-PREV_TOTAL_MS = Fact("prev_total_ms", "ms", "what a policy server says that the connection's last request took")
+PREV_TOTAL_MS = Fact(
+    "prev_total_ms", "ms", "duration of the connection's last request, as the policy server reports it"
+)
 TIMING = {str(fact): fact for fact in (INFER_MS, PREV_TOTAL_MS)}
 """The keys of ``server_timing`` that are facts."""
 
 
 class WebsocketOptions(WebOptions, PolicyOptions):
-    """How our policy server is reached, or somebody else's is asked."""
+    """The options of our policy server, and of the client of a foreign one."""
 
     SCHEMES: ClassVar[tuple[str, ...]] = ("ws", "wss")
 
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 8000}
 
-    template: TemplateName = option(
-        DEFAULT, "what the policy is told: a template's name, or a TOML or JSON file", names=names
-    )
+    template: TemplateName = option(DEFAULT, "the observation: a template's name, or a TOML or JSON file", names=names)
 
     @property
     def template_name(self) -> str:
@@ -71,7 +71,6 @@ class Websocket(PolicyTransport[WebsocketOptions]):
         return WebsocketServer(wiring, handler)
 
     def ready(self, wiring: Wiring[WebsocketOptions]) -> str:
-        """Return where policies are asked, and by whom."""
         address = wiring.address
         whom = wiring.options.callers("have the key in {}, /healthz for all")
         return f"serving openpi's protocol at {address}, streamed at {address}{STREAM_PATH}{whom}"

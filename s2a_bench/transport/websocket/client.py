@@ -31,7 +31,7 @@ from s2a_bench.transport.websocket.link import BoundedConnection, Broken
 from s2a_bench.types import Action, Piece, Request
 
 QUOTED = 500
-"""Letters that are shown of what a server says went wrong: the end of it, as a traceback's reason comes last."""
+"""Letters shown of a server's error: its end, as a traceback's reason comes last."""
 
 
 class WebsocketClient:
@@ -41,25 +41,24 @@ class WebsocketClient:
         """Prepare to ask the server at ``wiring.address``; the first request, or `describe`, connects."""
         self.camera = None
         self._wiring, self._alive = wiring, alive
-        self._ours = not wiring.black_box
+        self._native = not wiring.black_box
         self._streams = wiring.variant == STREAM
-        self._url = wiring.address + (STREAM_PATH if self._ours and self._streams else "")
+        self._url = wiring.address + (STREAM_PATH if self._native and self._streams else "")
         self._template = template_of(wiring.options.template)
         key = read_key(wiring.options.api_key_env)
         self._headers = {"Authorization": f"{codec.SCHEME} {key}"} if key else {}
-        if self._ours:
+        if self._native:
             self._headers[codec.MARKS_HEADER] = "1"
         self._link: BoundedConnection | None = None
         self._metadata: dict[str, str] = {}
         self._provenance: dict[str, str] = {}
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        """Send the observation and yield the actions of its answer."""
         body = self._pack(request, trace)
         bounds = Bounds(self._url, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
         whole = False
         try:
-            message, packed_ns = self._asked(body, bounds, trace)
+            message, packed_ns = self._sent(body, bounds, trace)
             trace.provenance = self._provenance
             for piece in self._answer(message, packed_ns, trace):
                 bounds.count_piece()
@@ -78,14 +77,14 @@ class WebsocketClient:
         """Fill the template and write it as MessagePack, marking each stage."""
         pictures = [policy_picture(frame, self._wiring.options.payload, trace) for frame in request.images]
         observation = self._template.fill(pictures, request.state, request.prompt)
-        if self._ours:
+        if self._native:
             observation[observed.EXTENSION] = observed.extension_of(request)
         body = packb(observation)
         trace.mark("msgpack_pack")
         trace.facts[PAYLOAD_BYTES] = len(body)
         return body
 
-    def _asked(self, body: bytes, bounds: Bounds, trace: Trace) -> tuple[bytes, int]:
+    def _sent(self, body: bytes, bounds: Bounds, trace: Trace) -> tuple[bytes, int]:
         """Send, once more if the server had just closed the kept connection; return the answer's first message."""
         if self._link is not None:
             if self._link.alive(bounds):
@@ -109,7 +108,6 @@ class WebsocketClient:
         return self._message(link), packed_ns
 
     def _greeted(self, link: BoundedConnection) -> None:
-        """Read what a server says of itself when it is connected to."""
         metadata = unpackb(self._message(link))
         if not isinstance(metadata, dict):
             raise RequestFailed(f"{self._url}: its metadata is {type(metadata).__name__}, not a dictionary")
@@ -122,8 +120,8 @@ class WebsocketClient:
         """Return the next binary message; a text is an error."""
         message = link.receive()
         if isinstance(message, str):
-            said = " ".join(struck(message).split())
-            raise RequestFailed(f"{self._url}: {said[-QUOTED:] or 'an error without words'}")
+            error_text = " ".join(struck(message).split())
+            raise RequestFailed(f"{self._url}: {error_text[-QUOTED:] or 'an error without words'}")
         return message
 
     def _answer(self, message: bytes, packed_ns: int, trace: Trace) -> Generator[Action, None, None]:
@@ -133,7 +131,7 @@ class WebsocketClient:
         while True:
             answer = unpackb(message)
             if not isinstance(answer, dict) or codec.ACTIONS not in answer:
-                raise RequestFailed(f"{self._url}: an answer without {codec.ACTIONS}: {_shown(answer)}")
+                raise RequestFailed(f"{self._url}: an answer without {codec.ACTIONS}: {_keys(answer)}")
             last = not self._streams or answer.get(codec.TYPE) != codec.PARTIAL
             actions = actions_of(answer[codec.ACTIONS])
             if not last:
@@ -149,17 +147,15 @@ class WebsocketClient:
                 break
             message = self._message(self._link)
         self._learn(answer.get(codec.TIMING), trace)
-        if self._ours:
+        if self._native:
             trace.receive(observed.remote_of(unpackb(self._message(self._link))))
         self._mark(trace, packed_ns, first_ns)
 
     def _learn(self, timing: Any, trace: Trace) -> None:
-        """Keep what a server says of its times."""
         if isinstance(timing, dict):
             trace.learn({TIMING[name]: _plain(value) for name, value in timing.items() if name in TIMING})
 
     def _mark(self, trace: Trace, packed_ns: int, first_ns: int) -> None:
-        """Name the stretch from the last byte packed to the first action."""
         if trace.remote is not None and trace.remote.clock == clock_id():
             trace.marks.append(("return", first_ns))
             return
@@ -170,8 +166,8 @@ class WebsocketClient:
             trace.marks.append(("server", first_ns))
 
     def describe(self) -> dict[str, str]:
-        """Return who is asked and what it says of itself, for the manifest; a server that is not ours is asked now."""
-        if not self._ours and self._link is None:
+        """Return the server and its metadata, for the manifest; connects to a foreign server."""
+        if not self._native and self._link is None:
             try:
                 self._connected(Bounds(self._url, self._wiring.deadline_of(1), 1))
             except Broken as error:
@@ -191,6 +187,6 @@ def _plain(value: Any) -> Any:
     return float(value) if type(value) in {int, float} and isfinite(value) else value
 
 
-def _shown(answer: Any) -> str:
+def _keys(answer: Any) -> str:
     keys = ", ".join(str(key)[:40] for key in list(answer)[:8]) if isinstance(answer, dict) else type(answer).__name__
     return keys or "nothing"

@@ -1,4 +1,4 @@
-"""openpi's words, and MessagePack with NumPy's arrays as it writes them, byte for byte.
+"""openpi's keys, and MessagePack with NumPy's arrays as it writes them, byte for byte.
 
 An array is the map ``{b"__ndarray__": True, b"data": bytes, b"dtype": text, b"shape": [...]}``, one of NumPy's numbers
 ``{b"__npgeneric__": True, b"data": its value, b"dtype": text}``. Arrays are of numbers and texts: no objects (dtype
@@ -27,7 +27,7 @@ HEALTH: Final = "/healthz"
 ACTIONS, TYPE, TIMING, INDICES = "actions", "type", "server_timing", "action_indices"
 PARTIAL, FINAL = "partial", "final"
 QUIET: Final = logging.getLogger("s2a_bench.websocket")
-"""websockets' logger: what it says of clients and servers, our errors say."""
+"""websockets' logger, silenced: our errors report the same."""
 QUIET.addHandler(logging.NullHandler())
 QUIET.propagate = False
 
@@ -50,7 +50,6 @@ def packb(value: Any) -> bytes:
 
 
 def _packable(value: Any) -> Any:
-    """Return what stands for an array or one of NumPy's numbers."""
     if not isinstance(value, (np.ndarray, np.generic)):
         raise TypeError(f"{type(value).__name__} is none of its types")
     if value.dtype.kind in UNSAFE:
@@ -75,17 +74,17 @@ def _of_map(value: dict[Any, Any]) -> Any:
     return _generic(value) if GENERIC in value else value
 
 
-def _generic(told: dict[Any, Any]) -> Any:
-    dtype, data = _dtype(told), told.get(b"data")
+def _generic(fields: dict[Any, Any]) -> Any:
+    dtype, data = _dtype(fields), fields.get(b"data")
     if type(data) not in _PLAIN.get(dtype.kind, ()):
         raise ValueError(f"a number of type {dtype} that is {type(data).__name__}")
-    with np.errstate(over="ignore"):  # it is infinite, and whoever takes numbers says so
+    with np.errstate(over="ignore"):  # it is infinite, which later checks refuse
         return dtype.type(data)
 
 
-def _dtype(told: dict[Any, Any]) -> np.dtype[Any]:
+def _dtype(fields: dict[Any, Any]) -> np.dtype[Any]:
     """Read a dtype, without NumPy's whole language for them."""
-    text = told.get(b"dtype")
+    text = fields.get(b"dtype")
     if not (isinstance(text, str) and _DTYPE.fullmatch(text)):
         raise ValueError(f"an array of type {str(text)[:40]!r}, which does not travel")
     dtype = np.dtype(text)

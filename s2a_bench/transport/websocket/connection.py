@@ -42,8 +42,8 @@ END_OF_HEAD: Final = b"\r\n\r\n"
 class _Refused(Exception):
     """The connection ends with a status or a close code, and a line."""
 
-    def __init__(self, code: int, words: str) -> None:
-        super().__init__(words)
+    def __init__(self, code: int, reason: str) -> None:
+        super().__init__(reason)
         self.code = code
 
 
@@ -61,7 +61,7 @@ class PolicyConnection:
         """Greet with ``metadata``, and answer each message by an ``exchange``."""
         self.wire, self.core = wire, core
         self.native = self.streams = False
-        """Whether it is our client, which is told our marks; whether actions are sent one by one."""
+        """Whether it is our client, which receives our marks; whether actions are sent one by one."""
         self.previous_ms: float | None = None
         """What the request before took."""
         self._access, self._metadata, self._exchange = access, metadata, exchange
@@ -147,7 +147,7 @@ class PolicyConnection:
         return response
 
     def _read_all(self, data: bytes) -> None:
-        """Read messages until the connection closes; then nobody wants an answer that is under way."""
+        """Read messages until the connection closes; an answer under way is then abandoned."""
         try:
             self._take(data)
             while self._open and (data := self._received()):
@@ -160,7 +160,6 @@ class PolicyConnection:
             self.wire.hang_up()
 
     def _forget(self) -> None:
-        """Give back what a message holds that will not be answered."""
         self._message.clear()
         self._protocol.reader.discard()
         self._held.close()
@@ -203,8 +202,8 @@ class PolicyConnection:
             now_s = now_ns() / 1e9
             self._small_s = max(self._small_s, now_s) + 1 / SMALL_A_SECOND
             if self._small_s - now_s > SMALL_AT_ONCE / SMALL_A_SECOND:
-                words = f"more than {SMALL_AT_ONCE} pings, pongs or small fragments, and {SMALL_A_SECOND} a second"
-                raise _Refused(CloseCode.POLICY_VIOLATION, words)
+                reason = f"more than {SMALL_AT_ONCE} pings, pongs or small fragments, and {SMALL_A_SECOND} a second"
+                raise _Refused(CloseCode.POLICY_VIOLATION, reason)
         if frame.opcode is Opcode.TEXT:
             raise _Refused(CloseCode.UNSUPPORTED_DATA, "an observation is a binary message, not a text")
         if not data:
@@ -221,7 +220,6 @@ class PolicyConnection:
         self._count()
 
     def _count(self) -> None:
-        """Count the bytes of the next request."""
         self._held.close()
         self._came = self._held.enter_context(self.core.in_flight.counted())
         self._timed = False
@@ -253,10 +251,10 @@ class PolicyConnection:
             if self._open:
                 self.wire.flush(left_s)
 
-    def fail(self, words: str) -> None:
+    def fail(self, reason: str) -> None:
         """Say what is wrong, and that nothing follows; raises Disconnected."""
         with self._lock, suppress(OSError):
-            self._refuse(CloseCode.INTERNAL_ERROR, words)
+            self._refuse(CloseCode.INTERNAL_ERROR, reason)
             self.wire.flush(LINGER_S)
             self.wire.socket.shutdown(socket.SHUT_WR)
 
@@ -275,11 +273,11 @@ class PolicyConnection:
             self._protocol.send_binary(message)
             self._flush()
 
-    def _refuse(self, code: int, words: str) -> None:
+    def _refuse(self, code: int, reason: str) -> None:
         """Say why in a text, and close."""
         with self._lock, suppress(Disconnected):
             if self._open:
-                self._protocol.send_text(words[:ERROR_LETTERS].encode(errors="backslashreplace"))
+                self._protocol.send_text(reason[:ERROR_LETTERS].encode(errors="backslashreplace"))
                 self._protocol.send_close(code, "see the text before")
                 self._flush()
 

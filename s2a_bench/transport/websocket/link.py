@@ -35,9 +35,9 @@ class Broken(RequestFailed):
 class _Counted(ClientConnection):
     """A connection that ends where more comes than the bounds of its request allow."""
 
-    def __init__(self, bounds: Bounds, *told: Any, **more: Any) -> None:
+    def __init__(self, bounds: Bounds, *arguments: Any, **keywords: Any) -> None:
         self.bounds = bounds
-        super().__init__(*told, **more)
+        super().__init__(*arguments, **keywords)
 
     def process_event(self, event: Any) -> None:
         if isinstance(event, Frame):
@@ -123,9 +123,9 @@ class BoundedConnection:
             return RequestFailed(f"{self._url} was silent for too long, {self._timeout_s:g} s")
         if isinstance(error, InvalidStatus):
             response = error.response
-            said = " ".join(struck(bytes(response.body or b"").decode(errors="replace"))[:QUOTED].split())
+            body = " ".join(struck(bytes(response.body or b"").decode(errors="replace"))[:QUOTED].split())
             advice = "; see `api_key_env`" if response.status_code in {401, 403} else ""
-            return RequestFailed(f"{self._url} answered {response.status_code}: {said or 'nothing'}{advice}")
+            return RequestFailed(f"{self._url} answered {response.status_code}: {body or 'nothing'}{advice}")
         if isinstance(error, ConnectionClosed) or isinstance(why, (EOFError, OSError)):
             closed = error.rcvd if isinstance(error, ConnectionClosed) else None
             did = f"closed the connection: {closed}" if closed else f"broke the connection: {why or error}"

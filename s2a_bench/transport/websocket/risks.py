@@ -1,4 +1,4 @@
-"""What a foreign policy server over WebSocket does that is dangerous, as its greeting tells: nothing is asked of it."""
+"""What a foreign policy server over WebSocket does that is dangerous, from its greeting; no request is sent."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ PAGE = "https://example.org"
 
 
 def examine(parts: SplitResult) -> Iterator[Finding]:
-    """Shake hands without a key, and once more as a page in somebody's browser would."""
+    """Shake hands without a key, and once more as a web page in a browser does."""
     extras.need("websocket", *PACKAGES)
     url = urlunsplit(parts)
     try:
-        said = _greeting(url, {})
+        greeting = _greeting(url, {})
     except ServerDied as error:
         raise OSError(str(error).rpartition(": ")[2]) from error
     except S2AError as error:
@@ -29,7 +29,7 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
         return
     yield no_key(
         parts,
-        f"it greets everybody ({said}), so it answers them too",
+        f"it greets everybody ({greeting}), so it answers them too",
         "let it listen on 127.0.0.1 alone and reach it by ssh -L, or put a proxy that wants a key before it",
     )
     try:

@@ -1,4 +1,4 @@
-"""Our policy server: openpi's protocol, whose health is told and whose pings are answered whatever the engine does."""
+"""Our policy server: openpi's protocol, which reports health and answers pings whatever the engine does."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class WebsocketServer:
     def __init__(self, wiring: Wiring[WebsocketOptions], handler: Handler) -> None:
         """Bind ``host:port`` of ``wiring.address`` or what `address` was, without it 127.0.0.1 and any port.
 
-        Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
+        Raises PortInUse, and UsageError for a public address without a key or `no_auth`.
         """
         listener, key = bound_socket(wiring.address, "ws", wiring.options)
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, 1)  # none is refused before it has asked
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, 1)  # a full server answers with a status
         host, port = listener.getsockname()
         self.address = f"ws://{host}:{port}"
         self._core = Core(handler, wiring.limits)
@@ -73,8 +73,8 @@ class WebsocketExchange(Exchange):
     def request(self) -> Request:
         observation, self._message = unpackb(self._message), b""
         self.trace.mark("msgpack_parse")
-        told = observed.take_extension(observation) if self._connection.native else None
-        request = observed.request_of(observation, told, self.trace, self._connection.core.limits)
+        extension = observed.take_extension(observation) if self._connection.native else None
+        request = observed.request_of(observation, extension, self.trace, self._connection.core.limits)
         self.trace.mark("msgpack_parse")
         return request
 
@@ -124,5 +124,5 @@ def metadata_of(queued: Queued) -> Mapping[str, Any]:
     """Return what a server says of itself to everybody who connects."""
     settings = queued.settings.model_dump() if queued.settings is not None else {}
     names = {"name": "engine", "horizon": "action_horizon", "action_dim": "action_dim"}
-    told = {said: settings[name] for name, said in names.items() if isinstance(settings.get(name), (str, int))}
-    return {"server": "s2a-bench", **told, "provenance": queued.provenance}
+    extension = {key: settings[name] for name, key in names.items() if isinstance(settings.get(name), (str, int))}
+    return {"server": "s2a-bench", **extension, "provenance": queued.provenance}

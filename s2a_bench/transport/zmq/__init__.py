@@ -1,9 +1,9 @@
 """ZeroMQ and MessagePack as GR00T's policy servers speak it: an observation goes up, a chunk of actions comes back.
 
-Our server answers all layouts, N1.5 to N1.7, and GR00T's own clients; our client asks foreign servers too, which are
-told what a template says (`transport.observation`). GR00T N1 unpickled what it received, and early N1.7 servers do so
-with arrays of kind O, so that a client can run any code in them: nothing here does, and such a server belongs where no
-other client reaches it.
+Our server answers all layouts, N1.5 to N1.7, and GR00T's own clients; our client also queries foreign servers, with
+observations from a template (`transport.observation`). GR00T N1 unpickled what it received, and early N1.7 servers
+unpickle arrays of kind O, so that a client can run any code in them. Nothing here unpickles, and such a server belongs
+where no other client reaches it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PACKAGES = ("msgpack", "zmq")
 
 
 class ZmqOptions(PolicyOptions):
-    """How our policy server over ZeroMQ is reached, or somebody else's is asked."""
+    """The options of our policy server over ZeroMQ, and of the client of a foreign one."""
 
     SCHEMES: ClassVar[tuple[str, ...]] = ("tcp",)
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 5555}
@@ -38,7 +38,7 @@ class ZmqOptions(PolicyOptions):
     )
     template: TemplateName | Literal[""] = option(
         "",
-        "what the policy is told: a template's name, or a TOML or JSON file [default: that of the layout]",
+        "the observation: a template's name, or a TOML or JSON file [default: that of the layout]",
         names=names,
     )
 
@@ -83,7 +83,6 @@ class Zmq(PolicyTransport[ZmqOptions]):
         return ZmqServer(wiring, handler)
 
     def ready(self, wiring: Wiring[ZmqOptions]) -> str:
-        """Return where policies are asked, and by whom."""
         address = wiring.address
         return f"serving GR00T's protocol at {address}{wiring.options.callers('send the key in {}')}"
 

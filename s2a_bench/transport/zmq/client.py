@@ -1,7 +1,7 @@
 """The client of GR00T's protocol: fill the template, pack, send, read the chunk, and mark each step.
 
-A REQ socket takes one answer a request, so our own server is asked for its marks once the chunk is there. A foreign one
-tells none: all from the last byte that was packed to the chunk is the stage `server`. A socket whose request failed is
+A REQ socket takes one answer a request, so the client requests our server's marks once it has the chunk. A foreign one
+sends none: all from the last byte that was packed to the chunk is the stage `server`. A socket whose request failed is
 thrown away, for it would wait for that answer for ever.
 """
 
@@ -25,75 +25,73 @@ from s2a_bench.transport.listening import read_key
 from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pictures import policy_picture
 from s2a_bench.transport.zmq import ZmqOptions, layouts
-from s2a_bench.transport.zmq.npy import Room
+from s2a_bench.transport.zmq.npy import PictureFile
 from s2a_bench.transport.zmq.watch import ConnectionWatch
 from s2a_bench.transport.zmq.wire import pack, read
 from s2a_bench.types import Frame, Piece, Pixels, Request
 
 ANSWER_BYTES: Final = 16 << 20
-"""Most bytes of an answer, whatever its request asked for; libzmq does not take more."""
-LOOKS_MS: Final = 20
-"""How often one who waits looks at its connection."""
+"""Most bytes of an answer; libzmq takes no more."""
+POLL_MS: Final = 20
+"""How often a waiting request checks its connection."""
 QUOTED: Final = 500
-"""Letters that are shown of what a server says went wrong."""
+"""Letters shown of a server's error."""
 LONGEST_S: Final = 86_400
-"""No server is waited for longer, however long it asks to."""
-ROOMS: Final = 16
+"""The longest `retry_after_s` that counts."""
+KEPT_FILES: Final = 16
 """Most pictures whose memory is kept for the next request."""
-WRONG: Final = b"ERROR"
-"""What some of GR00T's servers answer where another policy serves."""
+WRONG_POLICY: Final = b"ERROR"
+"""The reply of some GR00T servers that serve another kind of policy."""
 
 
 class ZmqClient:
     """Asks one policy server."""
 
     def __init__(self, wiring: Wiring[ZmqOptions], alive: Callable[[], bool]) -> None:
-        """Prepare for the server at ``wiring.address``; a foreign one tells its layout, unless the options do."""
+        """Prepare; request the layout of a foreign server, unless the options name it."""
         self.camera = None
         self._wiring, self._alive = wiring, alive
-        self._ours = not wiring.black_box
+        self._native = not wiring.black_box
         self._template = template_of(wiring.options.template_name)
         self._key = read_key(wiring.options.api_key_env)
-        self._rooms: dict[tuple[int, int, int], Room] = {}
+        self._files: dict[tuple[int, int, int], PictureFile] = {}
         self._link: ReqSocket | None = None
         self._connected = False
         self._layout: str = wiring.options.layout
         if self._layout == layouts.AUTO:
-            self._layout = layouts.N1_6 if self._ours else self._met()
+            self._layout = layouts.N1_6 if self._native else self._server_layout()
 
-    def _met(self) -> str:
+    def _server_layout(self) -> str:
         """Return the layout of a foreign server, by the marks of its modality configurations."""
         bounds = self._bounds(1)
         with closing(ReqSocket(self._wiring.address, self._wiring.timeout_s, self._alive)) as link:
             link.greet(bounds)
-            _, marks = self._read(link.asked(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))
+            _, marks = self._read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))
         return layouts.marked(marks)
 
     def _bounds(self, max_tokens: int) -> Bounds:
-        """Start the bounds of an answer."""
         return Bounds(self._wiring.address, self._wiring.deadline_of(max_tokens), max_tokens)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        """Send the observation and yield the actions of its answer."""
         bounds = self._bounds(request.max_tokens)
         whole = False
         try:
             link = self._open(bounds, trace)
             body = self._pack(request, trace)
-            answer = self._said(link.asked(body, bounds))
+            answer = self._checked(link.exchange(body, bounds))
             actions = layouts.actions_in(answer)
             seen_ns = now_ns()
             whole = True
             for action in actions:
                 bounds.count_piece()
                 yield action
-            if self._ours:
+            if self._native:
                 whole = False
-                asked = {layouts.ENDPOINT: layouts.MARKS, observed.EXTENSION: {"id": request.id}, **self._token()}
-                trace.receive(observed.remote_of(self._said(link.asked(pack(asked), bounds))))
+                wanted = {layouts.ENDPOINT: layouts.MARKS, observed.EXTENSION: {"id": request.id}, **self._token()}
+                trace.receive(observed.remote_of(self._checked(link.exchange(pack(wanted), bounds))))
                 whole = True
-            here = trace.remote is not None and trace.remote.clock == clock_id()
-            trace.marks.append(("return" if here else "server", seen_ns))
+            same_clock = trace.remote is not None and trace.remote.clock == clock_id()
+            trace.marks.append(("return" if same_clock else "server", seen_ns))
         finally:
             if not whole:
                 self.close()
@@ -113,48 +111,50 @@ class ZmqClient:
 
     def _pack(self, request: Request, trace: Trace) -> memoryview:
         """Fill the template and write it as MessagePack, marking each stage."""
-        pictures = [self._told(frame, place, trace) for place, frame in enumerate(request.images)]
+        pictures = [self._picture(frame, place, trace) for place, frame in enumerate(request.images)]
         observation = self._template.fill(pictures, request.state, request.prompt)
         data = layouts.data_of(self._layout, observation)
         message: dict[str, Any] = {layouts.ENDPOINT: layouts.GET_ACTION, layouts.DATA: data, **self._token()}
-        if self._ours:
+        if self._native:
             message[observed.EXTENSION] = observed.extension_of(request)
-        rooms = {room.address: room for room in self._rooms.values()}
-        body = pack(message, rooms, maps=self._layout == layouts.N1_7)
+        files = {file.address: file for file in self._files.values()}
+        body = pack(message, files, maps=self._layout == layouts.N1_7)
         trace.mark("msgpack_pack")
         trace.facts[PAYLOAD_BYTES] = len(body)
         return body
 
-    def _told(self, frame: Frame, place: int, trace: Trace) -> Pixels:
+    def _picture(self, frame: Frame, place: int, trace: Trace) -> Pixels:
         """Return a picture as it travels; what a camera has as YUYV is converted to where it is packed from."""
         if self._wiring.options.payload != "raw" or frame.encoding != "yuv422_yuy2":
             return policy_picture(frame, self._wiring.options.payload, trace)
-        if len(self._rooms) > ROOMS:
-            self._rooms.clear()
+        if len(self._files) > KEPT_FILES:
+            self._files.clear()
         key = place, frame.height, frame.width
-        room = self._rooms.get(key) or self._rooms.setdefault(key, Room(frame.height, frame.width))
-        yuyv_to_rgb(frame.data, room.pixels)
+        file = self._files.get(key) or self._files.setdefault(key, PictureFile(frame.height, frame.width))
+        yuyv_to_rgb(frame.data, file.pixels)
         trace.mark("convert")
-        return room.pixels
+        return file.pixels
 
     def _token(self) -> dict[str, str]:
         return {layouts.TOKEN: self._key} if self._key else {}
 
     def _read(self, message: bytes) -> tuple[Any, set[str]]:
         """Return an answer, errors included, and its marks; raises RequestFailed for another protocol."""
-        if message == WRONG:
-            raise RequestFailed(f"{self._wiring.address} answered {WRONG.decode()}: it serves another kind of policy")
+        if message == WRONG_POLICY:
+            raise RequestFailed(
+                f"{self._wiring.address} answered {WRONG_POLICY.decode()}: it serves another kind of policy"
+            )
         return read(message)
 
-    def _said(self, message: bytes) -> Any:
+    def _checked(self, message: bytes) -> Any:
         """Return an answer; raises RequestFailed for an error."""
         url = self._wiring.address
         answer, _ = self._read(message)
         if isinstance(answer, dict) and layouts.ERROR in answer:
-            said = " ".join(struck(str(answer[layouts.ERROR])).split())[-QUOTED:] or "an error without words"
+            error_text = " ".join(struck(str(answer[layouts.ERROR])).split())[-QUOTED:] or "an error without words"
             wait_s = answer.get(layouts.RETRY)
             patient = isinstance(wait_s, (int, float)) and 0 <= wait_s <= LONGEST_S
-            raise RequestFailed(f"{url}: {said}", retry_after_s=wait_s if patient else None)
+            raise RequestFailed(f"{url}: {error_text}", retry_after_s=wait_s if patient else None)
         return answer
 
     def describe(self) -> dict[str, str]:
@@ -189,7 +189,6 @@ class ReqSocket:
             raise TransportError(f"`url`: cannot connect to {url}: {error.strerror}") from error
 
     def stands(self) -> bool:
-        """Whether the connection is still there."""
         self._watch.hear()
         return bool(self._watch.connections)
 
@@ -197,7 +196,7 @@ class ReqSocket:
         """Wait until both sides have greeted; raises ServerDied or RequestFailed."""
         ends_ns = self._patience_ns(bounds)
         while not any(connection.ready for connection in self._watch.connections.values()):
-            self._poller.poll(LOOKS_MS)
+            self._poller.poll(POLL_MS)
             self._watch.hear()
             if not self._watch.connections and self._watch.met:
                 raise self._broke("; is it a ZeroMQ peer?")
@@ -206,12 +205,12 @@ class ReqSocket:
             self._check(ends_ns, bounds)
         self._poller.register(self._socket, zmq.POLLIN)
 
-    def asked(self, body: memoryview, bounds: Bounds) -> bytes:
+    def exchange(self, body: memoryview, bounds: Bounds) -> bytes:
         """Send a request; return its answer."""
         try:
             self._socket.send(body, copy=False)
             ends_ns = self._patience_ns(bounds)
-            while self._socket not in dict(self._poller.poll(LOOKS_MS)):
+            while self._socket not in dict(self._poller.poll(POLL_MS)):
                 self._watch.hear()
                 if not self._watch.connections:
                     raise self._broke()

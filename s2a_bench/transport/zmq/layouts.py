@@ -1,4 +1,4 @@
-"""GR00T's words, and what stands where in its messages: observations of a robot, and chunks of actions.
+"""GR00T's keys, and the layouts of its messages: observations of a robot, and chunks of actions.
 
 N1.5 is flat: ``video.<camera>`` (T, H, W, 3) uint8, ``state.<part>`` (T, D), ``annotation.<...>`` [text]; its answer is
 ``action.<part>`` (H, D). N1.6 is nested: ``observation`` with ``video``, ``state`` and ``language``, all with a batch
@@ -70,14 +70,14 @@ def answer_of(observation: Mapping[Any, Any], layout: str, pieces: Sequence[Piec
 
 def actions_in(answer: Any) -> list[Action]:
     """Return the chunk of an answer of either layout, the parts of an action side by side; raises RequestFailed."""
-    parts = answer[0] if isinstance(answer, list) and answer else answer
-    if not isinstance(parts, dict):
-        raise RequestFailed(f"actions should be a map of arrays, not {type(parts).__name__}")
-    named = {name: part for name, part in parts.items() if str(name).startswith("action")} or parts
+    actions = answer[0] if isinstance(answer, list) and answer else answer
+    if not isinstance(actions, dict):
+        raise RequestFailed(f"actions should be a map of arrays, not {type(actions).__name__}")
+    named = {name: part for name, part in actions.items() if str(name).startswith("action")} or actions
     rows = [_rows(name, part) for name, part in named.items()]
     if len({len(part) for part in rows}) != 1:
-        told = ", ".join(f"{str(name)[:40]} {part.shape}" for name, part in zip(named, rows, strict=True))
-        raise RequestFailed(f"parts of actions that are of one length: there are {told or 'none'}")
+        shapes = ", ".join(f"{str(name)[:40]} {part.shape}" for name, part in zip(named, rows, strict=True))
+        raise RequestFailed(f"parts of actions that are of one length: there are {shapes or 'none'}")
     return actions_of(rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1))
 
 
@@ -90,8 +90,8 @@ def modalities(layout: str) -> dict[str, Any]:
         config: dict[str, Any] = {"delta_indices": [0], "modality_keys": [key]}
         if layout != N1_5:
             config |= dict.fromkeys(("sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"))
-        said = json.dumps(config) if layout == N1_5 else config
-        configs[modality] = {**dict.fromkeys(marks, True), "as_json": said}
+        content = json.dumps(config) if layout == N1_5 else config
+        configs[modality] = {**dict.fromkeys(marks, True), "as_json": content}
     return configs
 
 

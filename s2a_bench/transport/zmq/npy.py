@@ -1,6 +1,6 @@
 """Arrays as NumPy writes them to files (format 1.0 and later), without a copy, and bounded: nothing is ever unpickled.
 
-`Room` is a file whose pixels are still to come, so that a conversion writes them where they will be sent from.
+`PictureFile` holds a file before its pixels, so that a conversion writes them where they will be sent from.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ _HEADER = re.compile(
 """As NumPy writes it for numbers."""
 
 
-class Room:
-    """Room for the file of a picture whose pixels are still to come."""
+class PictureFile:
+    """The file of a picture, allocated before its pixels are known."""
 
     def __init__(self, height: int, width: int) -> None:
         """Make room for (H, W, 3) uint8, and for a header in front of it."""
@@ -71,7 +71,6 @@ def array_of(data: Any) -> NDArray[Any]:
 
 
 def _head_in(data: bytes) -> bytes:
-    """Return a file's header with what is before it."""
     version = data[6:8]
     prefix = PREFIX.get(version, 0) if data.startswith(npy.MAGIC_PREFIX) else 0
     if not prefix or len(data) < prefix:

@@ -1,4 +1,4 @@
-"""What a foreign policy server over ZeroMQ does that is dangerous: the answers to two harmless requests tell."""
+"""What a foreign policy server over ZeroMQ does that is dangerous: from its answers to two harmless requests."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from s2a_bench.transport.risks import PATIENCE_S, no_key, printable
 from s2a_bench.transport.zmq import PACKAGES, layouts
 
 PORT = 5555
-"""Where GR00T's servers listen unless told."""
+"""The default port of GR00T's servers."""
 N1 = b"ERROR", b"PK\x03\x04", *(bytes((0x80, protocol)) for protocol in range(2, 6))
 """How answers of GR00T N1 begin: its only error, which MessagePack is to it, an archive of torch.save, a pickle."""
 
@@ -29,7 +29,7 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
     bounds = Bounds(url, 3 * PATIENCE_S, 0)
     with closing(ReqSocket(url, PATIENCE_S, lambda: True)) as link:
         link.greet(bounds)
-        pong = link.asked(pack({layouts.ENDPOINT: layouts.PING}), bounds)
+        pong = link.exchange(pack({layouts.ENDPOINT: layouts.PING}), bounds)
         if pong.startswith(N1):
             yield _unpickles_all()
             return
@@ -38,16 +38,16 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
             raise RequestFailed(f"{url} answers a ping with {type(answer).__name__}, which GR00T's servers do not")
         if layouts.ERROR in answer:
             error = printable(str(answer[layouts.ERROR]))
-            yield Finding("server", "state", f"it answers, and tells nobody without a key anything: {error}")
+            yield Finding("server", "state", f"it answers, and refuses requests without a key: {error}")
         else:
             yield no_key(
                 parts,
                 "it answers everybody's ping; if it is GR00T's, everybody moves the robot, and ends the server by "
                 "`kill`, which is not tried here",
-                "let it listen on 127.0.0.1 alone (GR00T's listens on all unless told), reach it by ssh -L, give it an "
+                "let it listen on 127.0.0.1 alone (GR00T's default is all interfaces), reach it by ssh -L, give it an "
                 "api_token",
             )
-            _, marks = read(link.asked(pack({layouts.ENDPOINT: layouts.MODALITIES}), bounds))
+            _, marks = read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES}), bounds))
     yield _may_unpickle(marks)
 
 
@@ -63,7 +63,6 @@ def _unpickles_all() -> Finding:
 
 
 def _may_unpickle(marks: set[str]) -> Finding:
-    """Return what the layouts say that a server's configurations are marked with."""
     if layouts.N1_6 in marks:
         return Finding("pickle", "state", "its configurations are marked as N1.5's or N1.6's: they unpickle nothing")
     which = "its configurations are marked as GR00T N1.7's" if marks else "no answer tells which GR00T it is"

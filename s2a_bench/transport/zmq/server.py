@@ -31,7 +31,7 @@ from s2a_bench.transport.zmq.watch import Connection, ConnectionWatch
 from s2a_bench.transport.zmq.wire import pack, read
 from s2a_bench.types import Piece, Request
 
-LOOKS_MS: Final = 100
+POLL_MS: Final = 100
 """How often it is looked whether connections have begun or ended while nothing comes over them."""
 QUEUED: Final = 8
 """Messages of one client that libzmq keeps for us; those beyond wait at the client."""
@@ -40,9 +40,9 @@ READING: Final = 16
 ENVELOPE: Final = 4
 """Most frames before a message: the identity, those of proxies, an empty one."""
 KEPT: Final = 128
-"""Requests whose marks are kept until they are asked for, the latest; those of a long answer are half a megabyte."""
-ASKED_S: Final = 0.005
-"""How long marks wait to be found for a client that asks for them: the answer's way is not slowed meanwhile."""
+"""The latest requests whose marks are kept until requested; those of a long answer are half a megabyte."""
+WANTED_S: Final = 0.005
+"""Marks are computed when they are requested, or after this time, so that they do not delay the answer."""
 
 
 class ZmqServer:
@@ -51,11 +51,11 @@ class ZmqServer:
     def __init__(self, wiring: Wiring[ZmqOptions], handler: Handler) -> None:
         """Bind ``host:port`` of ``wiring.address`` or what `address` was, without it 127.0.0.1 and any port.
 
-        Raises PortInUse, and UsageError where others than this machine would need no key and nobody said so.
+        Raises PortInUse, and UsageError for a public address without a key or `no_auth`.
         """
-        told, port = split_address(wiring.address, "tcp")
+        name, port = split_address(wiring.address, "tcp")
         options, limits = wiring.options, wiring.limits
-        host = _resolved(told)
+        host = _resolved(name)
         self._key = key_for(host, options.api_key_env, no_auth=options.no_auth).encode()
         self._layout: str = options.layout
         self._core = Core(handler, limits)
@@ -93,7 +93,6 @@ class ZmqServer:
         self._close()
 
     def stop(self) -> None:
-        """Break off what is under way."""
         self._stopped.set()
         self._rouse()
 
@@ -101,7 +100,7 @@ class ZmqServer:
         """Wait a moment for a message; return what answers it."""
         frames = self._received()
         if not frames:
-            self._poller.poll(LOOKS_MS)
+            self._poller.poll(POLL_MS)
             with suppress(OSError):
                 self._woken.recv(4096)
             frames = self._received()
@@ -123,7 +122,7 @@ class ZmqServer:
             while frames[-1].more and len(frames) <= ENVELOPE:
                 frames.append(self._router.recv(zmq.NOBLOCK, copy=False))
             rest = frames[-1]
-            while rest.more:  # only reading it rids libzmq of a message; a million frames take .6 s
+            while rest.more:  # only reading it rids libzmq of a message; a million frames take 0.6 s
                 rest = self._router.recv(zmq.NOBLOCK, copy=False)
         return frames
 
@@ -156,18 +155,22 @@ class ZmqServer:
             self._under_way -= 1
 
     def _serve(self, client: ReplyAddress, frame: Any, trace: Trace, held: ExitStack) -> None:
-        """Read a message and answer it."""
         with held:
             try:
                 message, marks = read(frame.buffer)
                 trace.mark("msgpack_parse")
                 self._check(message)
-                endpoint, told = message.get(layouts.ENDPOINT, layouts.GET_ACTION), observed.take_extension(message)
+                endpoint, extension = (
+                    message.get(layouts.ENDPOINT, layouts.GET_ACTION),
+                    observed.take_extension(message),
+                )
                 if endpoint == layouts.GET_ACTION:
-                    promised = self._marks.promise(client.name, str(told.get("id"))) if told is not None else None
-                    self._core.answer(ActionExchange(client, message, marks, told, trace, promised, self._core))
-                elif endpoint == layouts.MARKS and told is not None:
-                    client.say(self._marks.take(client.name, str(told.get("id")), self._core.limits.answer_s))
+                    promised = (
+                        self._marks.promise(client.name, str(extension.get("id"))) if extension is not None else None
+                    )
+                    self._core.answer(ActionExchange(client, message, marks, extension, trace, promised, self._core))
+                elif endpoint == layouts.MARKS and extension is not None:
+                    client.say(self._marks.take(client.name, str(extension.get("id")), self._core.limits.answer_s))
                 else:
                     client.say(pack(self._reply(endpoint)))
             except Exception as error:  # noqa: BLE001 - the client must hear of it, whatever broke
@@ -177,13 +180,12 @@ class ZmqServer:
         """Raise RequestFailed for a message that is none, or has not the key, compared in constant time."""
         if not isinstance(message, dict):
             raise RequestFailed(f"a request is a map, not {type(message).__name__}")
-        said = message.get(layouts.TOKEN)
-        token = said.encode(errors="replace") if isinstance(said, str) else b""
+        given = message.get(layouts.TOKEN)
+        token = given.encode(errors="replace") if isinstance(given, str) else b""
         if self._key and not hmac.compare_digest(token, self._key):
             raise RequestFailed(f"Unauthorized: this server wants its key as {layouts.TOKEN}")
 
     def _reply(self, endpoint: Any) -> Any:
-        """Return the answer of an endpoint that asks for no action."""
         if endpoint == layouts.PING:
             if stuck := self._core.stuck():
                 raise RequestFailed(stuck)
@@ -241,21 +243,21 @@ class ActionExchange(Exchange):
         client: ReplyAddress,
         message: dict[Any, Any],
         marks: set[str],
-        told: dict[Any, Any] | None,
+        extension: dict[Any, Any] | None,
         trace: Trace,
         promised: Promise | None,
         core: Core,
     ) -> None:
-        """Answer ``message``; its marks are ``promised`` to a client of ours, which ``told`` more."""
+        """Answer ``message``; its marks are ``promised`` to a client of ours, which sent an ``extension``."""
         super().__init__(trace)
-        self._client, self._data, self._told, self._core = client, message.get(layouts.DATA), told, core
+        self._client, self._data, self._extension, self._core = client, message.get(layouts.DATA), extension, core
         self._promised = promised
         self._maps = layouts.marked(marks) == layouts.N1_7
         self._pieces: list[Piece] = []
 
     def request(self) -> Request:
         self._observation, self._layout = layouts.observation_in(self._data)
-        request = observed.request_of(self._observation, self._told, self.trace, self._core.limits)
+        request = observed.request_of(self._observation, self._extension, self.trace, self._core.limits)
         self.trace.mark("msgpack_parse")
         return request
 
@@ -268,7 +270,7 @@ class ActionExchange(Exchange):
         self.sent_whole()
         self._client.say(pack(layouts.answer_of(self._observation, self._layout, self._pieces), maps=self._maps))
         if self._promised is not None:
-            self._promised.asked.wait(ASKED_S)
+            self._promised.wanted.wait(WANTED_S)
             self._promised.marks.set_result(bytes(pack(observed.remote_message(self.trace.to_remote()))))
 
     def fail(self, error: S2AError) -> None:
@@ -281,30 +283,27 @@ class ActionExchange(Exchange):
 
 
 class Promise:
-    """The marks of a request, once they are found, and whether its client has asked for them."""
+    """The marks of a request, and whether its client has requested them."""
 
-    __slots__ = ("asked", "marks")
+    __slots__ = ("marks", "wanted")
 
     def __init__(self) -> None:
-        """Promise marks that are still to be found."""
-        self.asked = Event()
+        self.wanted = Event()
         self.marks: Future[bytes] = Future()
 
 
 def _unknown() -> RequestFailed:
-    return RequestFailed("marks of a request that is not known, or whose marks were asked for already")
+    return RequestFailed("unknown request, or its marks were requested before")
 
 
 class Marks:
-    """The marks of the latest requests of our clients, each of which is asked for once."""
+    """The marks of the latest requests of our clients, each requested once."""
 
     def __init__(self) -> None:
-        """Know of none."""
         self._lock = Lock()
         self._promises: OrderedDict[tuple[bytes, str], Promise] = OrderedDict()
 
     def promise(self, name: bytes, request_id: str) -> Promise:
-        """Remember that a client will ask for a request's marks."""
         promised = Promise()
         with self._lock:
             self._promises[name, request_id] = promised
@@ -318,7 +317,7 @@ class Marks:
             promised = self._promises.pop((name, request_id), None)
         if promised is None:
             raise _unknown()
-        promised.asked.set()
+        promised.wanted.set()
         try:
             return promised.marks.result(seconds)
         except NotYet:
@@ -327,8 +326,8 @@ class Marks:
 
 def _error(error: S2AError) -> memoryview:
     retry_s = error.retry_after_s if isinstance(error, RequestFailed) else None
-    told = {layouts.ERROR: str(error) or type(error).__name__}
-    return pack({**told, layouts.RETRY: retry_s} if retry_s else told)
+    reply = {layouts.ERROR: str(error) or type(error).__name__}
+    return pack({**reply, layouts.RETRY: retry_s} if retry_s else reply)
 
 
 def _resolved(host: str) -> str:

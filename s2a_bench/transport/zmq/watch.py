@@ -1,4 +1,4 @@
-"""The connections of a ZeroMQ socket, as its monitor tells of them: who has gone, and how many there are."""
+"""The connections of a ZeroMQ socket, from its monitor: which have ended, and how many there are."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any, Final
 import zmq
 
 EVENT: Final = struct.Struct("=HI")
-"""The first frame of what a monitor says."""
+"""The first frame of a monitor's event."""
 BEGUN: Final = {zmq.EVENT_ACCEPTED, zmq.EVENT_CONNECTED}
 REFUSED: Final = {zmq.EVENT_CONNECT_RETRIED, zmq.EVENT_CLOSED}
 
@@ -22,7 +22,6 @@ class Connection:
     __slots__ = ("disconnected", "ready")
 
     def __init__(self) -> None:
-        """Know of a connection that has begun."""
         self.disconnected = False
         self.ready = False
         """Whether both sides have greeted."""
@@ -32,7 +31,6 @@ class ConnectionWatch:
     """The connections of one socket; for the thread that has the socket."""
 
     def __init__(self, watched: Any) -> None:
-        """Watch a socket that neither connects nor is bound yet."""
         self.connections: dict[int, Connection] = {}
         """By libzmq's descriptor."""
         self.met = self.refused = False
@@ -41,7 +39,6 @@ class ConnectionWatch:
         self._watched = watched
 
     def hear(self) -> None:
-        """Take note of what has happened."""
         while self.monitor.getsockopt(zmq.EVENTS) & int(zmq.POLLIN):
             event, value = EVENT.unpack(self.monitor.recv_multipart()[0])
             if event in BEGUN:
@@ -59,10 +56,10 @@ class ConnectionWatch:
     def of(self, descriptor: int) -> Connection:
         """Return the connection that a message came over.
 
-        What happened before comes first: the same descriptor may have been that of another connection, which is gone.
+        What happened before comes first: the same descriptor may have been that of another connection, which has ended.
         """
         self.hear()
-        return self.connections.get(descriptor) or Connection()  # one that has gone meanwhile is not counted
+        return self.connections.get(descriptor) or Connection()  # one that has ended meanwhile is not counted
 
     def keep(self, most: int) -> None:
         """Break connections beyond so many, the latest; libzmq notices, and forgets what came."""

@@ -18,22 +18,22 @@ from numpy.typing import NDArray
 from s2a_bench.errors import RequestFailed
 from s2a_bench.transport.messagepack import array_in, unpacked
 from s2a_bench.transport.zmq.layouts import CONFIG_MARKS, N1_6, N1_7
-from s2a_bench.transport.zmq.npy import Room, array_of, file_of
+from s2a_bench.transport.zmq.npy import PictureFile, array_of, file_of
 
 ARRAY, FILE = "__ndarray_class__", "as_npy"
 ND, TYPE, KIND, SHAPE, BYTES = "nd", "type", "kind", "shape", "data"
 SMALL: Final = 1 << 16
 """Bytes that a message without large pictures takes, or fewer."""
-NO_ROOMS: Final[Mapping[int, Room]] = {}
+NO_FILES: Final[Mapping[int, PictureFile]] = {}
 
 _NUMBERS = re.compile(r"[<>|=](b1|[iu][1248]|f[248])")
 """What msgpack-numpy calls types of numbers."""
 
 
-def pack(message: Any, rooms: Mapping[int, Room] = NO_ROOMS, *, maps: bool = False) -> memoryview:
+def pack(message: Any, files: Mapping[int, PictureFile] = NO_FILES, *, maps: bool = False) -> memoryview:
     """Return a message, its arrays as files or as ``maps`` of msgpack-numpy; raises RequestFailed for other values.
 
-    An array whose pixels are in one of ``rooms``, by their address, is sent from there.
+    An array whose pixels are in one of ``files``, by their address, is sent from there.
     """
 
     def plain(value: Any) -> Any:
@@ -41,10 +41,10 @@ def pack(message: Any, rooms: Mapping[int, Room] = NO_ROOMS, *, maps: bool = Fal
             raise TypeError(f"{type(value).__name__} is none of its types")
         if maps:
             return _map_of(value)
-        room = rooms.get(value.__array_interface__["data"][0])
-        return {ARRAY: True, FILE: (room.file(value) if room else None) or file_of(value)}
+        file = files.get(value.__array_interface__["data"][0])
+        return {ARRAY: True, FILE: (file.file(value) if file else None) or file_of(value)}
 
-    size = SMALL + sum(room.pixels.size for room in rooms.values())
+    size = SMALL + sum(file.pixels.size for file in files.values())
     try:
         packer = msgpack.Packer(default=plain, autoreset=False, buf_size=size)
         packer.pack(message)
