@@ -58,7 +58,7 @@ def test_an_unfinished_run_is_told_on_standard_error(timeline: Path, tmp_path: P
         (["{run}", "--against", "rivals"], 2, "--against: 'rivals' should be paper; two runs are compared with"),
         (["{run}", "--output", "{here}"], 2, "--output: {here} is a folder; name a file"),
         (["{run}", "--output", "{here}/mine.html"], 2, "s2a-bench report did not write it; name another file"),
-        (["{run}", "--markdown", "{here}/mine.html"], 2, "--markdown: {here}/mine.html is there"),
+        (["{run}", "--markdown", "{here}/mine.html"], 2, "--markdown: {here}/mine.html exists"),
         (["{run}", "--latex", "{here}/mine.html"], 2, "--latex: {here}/mine.html is a file; name a folder"),
         (["{run}", "--output", "/proc/nowhere/page.html"], 1, "cannot write /proc/nowhere/page.html"),
         ([], 2, "Missing argument"),
