@@ -44,9 +44,7 @@ def test_an_unknown_middleware_is_named() -> None:
         open_middleware("iceoryx")
 
 
-@pytest.mark.parametrize(
-    ("name", "way_out"), [("cyclonedds", "--transport"), ("zenoh", r"pip install '.\[zenoh\]'")]
-)
+@pytest.mark.parametrize(("name", "way_out"), [("cyclonedds", "--transport"), ("zenoh", r"pip install '.\[zenoh\]'")])
 def test_a_missing_package_is_named_with_the_way_out(name: str, way_out: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(MIDDLEWARES, name, "s2a_bench.ros.no_such_module:X")
     with pytest.raises(TransportError, match=f"{name} is not installed.*{way_out}"):
