@@ -129,7 +129,7 @@ class Run:
 
 
 class Comparison:
-    """The changes between two runs. A notebook shows its table."""
+    """The changes between two runs. A notebook shows its table, `print` writes it as Markdown."""
 
     def __init__(self, compared: ComparedRuns) -> None:
         self._compared = compared
@@ -141,6 +141,12 @@ class Comparison:
         from s2a_bench.report.compare.shown import compare_csv
 
         return pd.read_csv(io.StringIO(compare_csv(self._compared)))
+
+    def __str__(self) -> str:
+        from s2a_bench.report.compare.shown import compare_table
+        from s2a_bench.writers.tables import to_markdown
+
+        return to_markdown(compare_table(self._compared))
 
     def _repr_html_(self) -> str:
         from s2a_bench.report.compare.shown import compare_table

@@ -67,6 +67,7 @@ def test_samples_leave_warm_ups_out_and_runs_are_compared(tmp_path: Path) -> Non
     assert s2a.load(one.path).samples.equals(one.samples)
     assert set(one.table("stages")["cell"]) == {"loopback"}
     compared = s2a.compare(one, other.path)
+    assert "| cell | n | A | B |" in str(compared)
     assert set(compared.table()["cell"]) == {"loopback"}
     assert "loopback" in compared._repr_html_()
 

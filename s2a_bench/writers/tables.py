@@ -236,4 +236,4 @@ def _headings(table: TextTable) -> list[str]:
 def _broken(name: str) -> str:
     if name.startswith("ratio to "):
         return name.replace("ratio to ", "ratio to\n").replace("?", "?\n")
-    return name.replace("/", "/\n") if " " not in name else name.replace(" infer", "\ninfer")
+    return re.sub(r"/(?=\w{3})", "/\n", name) if " " not in name else name.replace(" infer", "\ninfer")

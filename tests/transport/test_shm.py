@@ -366,7 +366,7 @@ def test_memory_above_the_limit_is_refused() -> None:
 
 
 def test_nobody_there_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ServerDied, match=r"nobody takes a link at .*: No such file or directory"):
+    with pytest.raises(ServerDied, match=r"no server accepts connections at .*: No such file or directory"):
         open_client(wiring_of("shm", str(tmp_path / "nobody.sock")))
 
 

@@ -61,7 +61,7 @@ class GenerateClient(RosClient):
         self._find(client)
         spoken = client.server_version() or version
         if spoken != version:
-            self.middleware.close()  # a client of the other version would go on collecting what nobody reads
+            self.middleware.close()  # a client of the other version would go on collecting messages that are never read
             self.middleware = join(self._wiring, "client")
             client = self.middleware.action_client(self._name, GENERATE_RESPONSE, spoken)
             self._find(client)

@@ -75,7 +75,7 @@ class ShmClient:
         try:
             self._link = ShmConnection(self._path, size, self._wiring.timeout_s)
         except OSError as error:
-            raise ServerDied(f"nobody takes a link at {self._path}: {error.strerror or error}") from error
+            raise ServerDied(f"no server accepts connections at {self._path}: {error.strerror or error}") from error
         return self._link
 
     def _lay_out(self, request: Request, trace: Trace) -> tuple[ShmConnection, int, int]:

@@ -4,7 +4,7 @@ A client connects to a Unix socket (SEQPACKET) and hands over a file of memory (
 the server hands over another, for its answers. From then on packets of 16 bytes say where something lies. They wake the
 other side about as fast as an eventfd or a futex would (docs/latency.md), and unlike these they end when it does.
 
-- Nothing has a name in /dev/shm: the memory goes when its last process does, whoever is killed and how.
+- Nothing has a name in /dev/shm: the memory goes when its last process ends, also by a kill.
 - Each side maps the other's memory for reading only, and only if its size is sealed: to read beyond the end of what the
   other side has cut off would be a SIGBUS.
 - A reader copies data before it checks it: the other side may write meanwhile. Raw pixels are used where

@@ -25,7 +25,7 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
     except ServerDied as error:
         raise OSError(str(error).rpartition(": ")[2]) from error
     except S2AError as error:
-        yield Finding("server", "state", f"it answers, and greets nobody without a key: {error}")
+        yield Finding("server", "state", f"it answers, and greets no client without a key: {error}")
         return
     yield no_key(
         parts,

@@ -65,7 +65,7 @@ class ConnectionWatch:
         """Break connections beyond so many, the latest; libzmq notices, and forgets what came."""
         for descriptor in list(self.connections)[most:]:
             with suppress(OSError), socket.socket(fileno=os.dup(descriptor)) as connection:
-                if connection.family in {socket.AF_INET, socket.AF_INET6}:  # or it is somebody's else by now
+                if connection.family in {socket.AF_INET, socket.AF_INET6}:  # or another socket has it by now
                     connection.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
