@@ -64,8 +64,8 @@ def test_the_advice_against_loss_is_that_of_the_dds_in_use(
         (CYCLONE | {"CYCLONEDDS_URI": "/none.xml"}, "warning", "asks for no large"),
         ({"CYCLONEDDS_URI": LOOPBACK}, "warning", "cyclonedds: CYCLONEDDS_URI asks for no large"),
         (SOURCED, "advice", "rmw_fastrtps_cpp has its small receive buffers"),
-        (SOURCED | {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA?max_msg_size=1MB"}, "state", "is told"),
-        (SOURCED | {"FASTRTPS_DEFAULT_PROFILES_FILE": "/f.xml"}, "state", "is told"),
+        (SOURCED | {"FASTDDS_BUILTIN_TRANSPORTS": "LARGE_DATA?max_msg_size=1MB"}, "state", "is configured"),
+        (SOURCED | {"FASTRTPS_DEFAULT_PROFILES_FILE": "/f.xml"}, "state", "is configured"),
         (SOURCED | {"RMW_IMPLEMENTATION": "rmw_connextdds"}, "", ""),
     ],
 )

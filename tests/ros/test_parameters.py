@@ -13,7 +13,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.parameters import AT_ONCE, PARAMETER, SERVICE, Parameters, Type, of_options, value_message
 
 
-class Told(Options):
+class NodeOptions(Options):
     """Options of every kind."""
 
     depth: int = option(5, "how deep", ge=1, le=9)
@@ -24,16 +24,16 @@ class Told(Options):
     topics: Names = option(("x", "y"), "topics")
 
 
-class Asked:
+class ParameterNode:
     """Calls the services by way of their CDR, as the wire does."""
 
     def __init__(self) -> None:
-        self.told, self.heard = Told(), list[Any]()
-        declared = of_options(self.told, Told.model_fields, live=("depth", "pace"))
+        self.options, self.heard = NodeOptions(), list[Any]()
+        declared = of_options(self.options, NodeOptions.model_fields, live=("depth", "pace"))
         self.answers = dict(Parameters(declared, self.change, self.heard.extend).services())
 
     def change(self, wanted: Mapping[str, Any]) -> None:
-        self.told = self.told.but(**{"pace" if name == "max_pace" else name: wanted[name] for name in wanted})
+        self.options = self.options.but(**{"pace" if name == "max_pace" else name: wanted[name] for name in wanted})
 
     def __call__(self, service: str, **fields: Any) -> Any:
         request = through_cdr(ros.default(f"{SERVICE}{service}_Request", **fields), f"{SERVICE}{service}_Request")
@@ -53,29 +53,29 @@ def parameters(**values: Any) -> list[Any]:
 
 
 @pytest.fixture
-def asked() -> Asked:
-    return Asked()
+def node() -> ParameterNode:
+    return ParameterNode()
 
 
 NAMES = ["depth", "max_pace", "quiet", "name", "domain", "topics"]
 
 
-def test_all_are_listed_and_names_have_levels(asked: Asked) -> None:
-    assert asked("ListParameters").result.names == NAMES
-    assert asked("ListParameters", depth=1, prefixes=["nothing"]).result.names == []
-    assert asked("ListParameters", prefixes=["depth"]).result.names == ["depth"]
+def test_all_are_listed_and_names_have_levels(node: ParameterNode) -> None:
+    assert node("ListParameters").result.names == NAMES
+    assert node("ListParameters", depth=1, prefixes=["nothing"]).result.names == []
+    assert node("ListParameters", prefixes=["depth"]).result.names == ["depth"]
 
 
-def test_values_have_their_types_and_unknown_ones_are_not_set(asked: Asked) -> None:
-    values = asked("GetParameters", names=[*NAMES, "unknown"]).values
+def test_values_have_their_types_and_unknown_ones_are_not_set(node: ParameterNode) -> None:
+    values = node("GetParameters", names=[*NAMES, "unknown"]).values
     assert [value.type for value in values] == [2, 3, 1, 4, 0, 9, 0]
     assert (values[0].integer_value, values[1].double_value, values[2].bool_value) == (5, 0.5, False)
     assert (values[3].string_value, values[5].string_array_value) == ("a", ["x", "y"])
-    assert asked("GetParameterTypes", names=[*NAMES, "unknown"]).types.tolist() == [2, 3, 1, 4, 0, 9, 0]
+    assert node("GetParameterTypes", names=[*NAMES, "unknown"]).types.tolist() == [2, 3, 1, 4, 0, 9, 0]
 
 
-def test_a_description_says_the_bounds_and_what_can_be_set(asked: Asked) -> None:
-    depth, pace, quiet, domain, unknown = asked(
+def test_a_description_says_the_bounds_and_what_can_be_set(node: ParameterNode) -> None:
+    depth, pace, quiet, domain, unknown = node(
         "DescribeParameters", names=["depth", "max_pace", "quiet", "domain", "unknown"]
     ).descriptors
     assert (depth.name, depth.type, depth.description, depth.read_only) == ("depth", 2, "how deep", False)
@@ -86,11 +86,11 @@ def test_a_description_says_the_bounds_and_what_can_be_set(asked: Asked) -> None
     assert (unknown.name, unknown.type) == ("unknown", 0)
 
 
-def test_what_is_live_is_set_and_said(asked: Asked) -> None:
-    assert asked.set(depth=7, max_pace=1.5) == [(True, ""), (True, "")]
-    assert (asked.told.depth, asked.told.pace) == (7, 1.5)
-    assert [value.integer_value for value in asked("GetParameters", names=["depth"]).values] == [7]
-    assert [(each.name, each.value.type) for each in asked.heard] == [("depth", 2), ("max_pace", 3)]
+def test_what_is_live_is_set_and_said(node: ParameterNode) -> None:
+    assert node.set(depth=7, max_pace=1.5) == [(True, ""), (True, "")]
+    assert (node.options.depth, node.options.pace) == (7, 1.5)
+    assert [value.integer_value for value in node("GetParameters", names=["depth"]).values] == [7]
+    assert [(each.name, each.value.type) for each in node.heard] == [("depth", 2), ("max_pace", 3)]
 
 
 @pytest.mark.parametrize(
@@ -104,27 +104,29 @@ def test_what_is_live_is_set_and_said(asked: Asked) -> None:
         ({"unknown": 1}, "no parameter 'unknown'"),
     ],
 )
-def test_what_cannot_be_set_stays_and_the_reason_is_told(asked: Asked, values: dict[str, Any], reason: str) -> None:
-    ((successful, said),) = asked.set(**values)
+def test_what_cannot_be_set_stays_and_the_reason_is_told(
+    node: ParameterNode, values: dict[str, Any], reason: str
+) -> None:
+    ((successful, said),) = node.set(**values)
     assert not successful
     assert reason in said
-    assert asked.told == Told()
-    assert not asked.heard
+    assert node.options == NodeOptions()
+    assert not node.heard
 
 
-def test_atomically_is_all_or_nothing(asked: Asked) -> None:
-    result = asked("SetParametersAtomically", parameters=parameters(depth=3, max_pace=3.0)).result
+def test_atomically_is_all_or_nothing(node: ParameterNode) -> None:
+    result = node("SetParametersAtomically", parameters=parameters(depth=3, max_pace=3.0)).result
     assert not result.successful
-    assert asked.told == Told()
-    assert asked("SetParametersAtomically", parameters=parameters(depth=3, max_pace=1.0)).result.successful
-    assert (asked.told.depth, asked.told.pace) == (3, 1.0)
+    assert node.options == NodeOptions()
+    assert node("SetParametersAtomically", parameters=parameters(depth=3, max_pace=1.0)).result.successful
+    assert (node.options.depth, node.options.pace) == (3, 1.0)
 
 
-def test_too_many_at_once_and_impossible_types_are_refused(asked: Asked) -> None:
+def test_too_many_at_once_and_impossible_types_are_refused(node: ParameterNode) -> None:
     with pytest.raises(TransportError, match=f"the most is {AT_ONCE}"):
-        asked("GetParameters", names=["a"] * (AT_ONCE + 1))
+        node("GetParameters", names=["a"] * (AT_ONCE + 1))
     strange = ros.default(PARAMETER, name="depth", value=ros.default("rcl_interfaces/msg/ParameterValue", type=77))
-    assert "77 is no type" in asked("SetParameters", parameters=[strange]).results[0].reason
+    assert "77 is no type" in node("SetParameters", parameters=[strange]).results[0].reason
 
 
 def test_types_are_numbered_as_in_ros() -> None:

@@ -271,13 +271,13 @@ class TestClientsOfOthers:
     def test_marks_are_for_who_said_an_id_and_once(self) -> None:
         with serving(RecordingHandler(list(CHUNK))) as server, plain(server.address) as call:
             call("get_action", flat())
-            assert "not known" in call("s2a_marks", s2a={"id": "observation-0"})["error"]
+            assert "unknown request" in call("s2a_marks", s2a={"id": "observation-0"})["error"]
             call("get_action", flat(), s2a={"id": "mine"})
             assert len(call("s2a_marks", s2a={"id": "mine"})["s2a"]["token_ns"]) == 4
-            assert "not known" in call("s2a_marks", s2a={"id": "mine"})["error"]
+            assert "unknown request" in call("s2a_marks", s2a={"id": "mine"})["error"]
             with plain(server.address) as other:
                 call("get_action", flat(), s2a={"id": "mine"})
-                assert "not known" in other("s2a_marks", s2a={"id": "mine"})["error"]
+                assert "unknown request" in other("s2a_marks", s2a={"id": "mine"})["error"]
 
 
 class TestServer:

@@ -12,7 +12,7 @@ import pytest
 
 from s2a_bench.errors import EngineError, RequestFailed
 from s2a_bench.transport.zmq.layouts import actions_in, answer_of, modalities
-from s2a_bench.transport.zmq.npy import Room, array_of, file_of
+from s2a_bench.transport.zmq.npy import PictureFile, array_of, file_of
 from s2a_bench.transport.zmq.wire import pack, read, unpack
 from s2a_bench.types import Token
 
@@ -47,7 +47,7 @@ def test_reading_copies_nothing() -> None:
 
 @pytest.mark.parametrize("outer", [(), (1,), (1, 1), (1, 1, 1)])
 def test_a_picture_is_packed_from_its_room(outer: tuple[int, ...]) -> None:
-    room = Room(48, 64)
+    room = PictureFile(48, 64)
     room.pixels[:] = np.random.default_rng(1).integers(0, 256, room.pixels.shape)
     picture = room.pixels.reshape(*outer, 48, 64, 3)
     file = room.file(picture)
@@ -57,7 +57,7 @@ def test_a_picture_is_packed_from_its_room(outer: tuple[int, ...]) -> None:
 
 
 def test_what_is_not_all_of_a_room_is_packed_as_it_is() -> None:
-    room = Room(4, 4)
+    room = PictureFile(4, 4)
     room.pixels[:] = 1
     for part in (room.pixels[:2], room.pixels[..., :1], room.pixels.transpose(2, 0, 1)):
         np.testing.assert_array_equal(unpack(pack(part, {room.address: room})), part)
@@ -96,7 +96,7 @@ def test_maps_of_msgpack_numpy_are_read_and_written(peer: Any, dtype: str, shape
 
 
 def test_a_picture_in_its_room_is_packed_as_a_map(peer: Any) -> None:
-    room = Room(4, 6)
+    room = PictureFile(4, 6)
     room.pixels[:] = 7
     got = peer.unpackb(pack({"a": room.pixels[np.newaxis]}, {room.address: room}, maps=True))
     np.testing.assert_array_equal(got["a"], np.full((1, 4, 6, 3), 7, np.uint8))
