@@ -24,7 +24,7 @@ def test_its_endpoints_are_those_of_ros(join: Join) -> None:
 
     server, client = join(), join()
     server.service(NAME, GET_TYPES, lengths, QoS(depth=1000))
-    ends = client.service_client(NAME, GET_TYPES)._asker.ends  # type: ignore[attr-defined]
+    ends = client.service_client(NAME, GET_TYPES)._client.ends  # type: ignore[attr-defined]
     for end, topic, half in zip(ends, ("rq/%sRequest", "rr/%sReply"), ("Request", "Response"), strict=True):
         topic_of = end.entity.topic
         assert topic_of.name == topic % NAME[1:]
