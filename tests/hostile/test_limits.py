@@ -1,4 +1,4 @@
-"""What is refused at the door: sizes, times, numbers and texts that a server of ours does not take."""
+"""What servers of ours refuse: sizes, times, numbers and texts beyond their limits."""
 
 from __future__ import annotations
 

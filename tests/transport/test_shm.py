@@ -30,7 +30,7 @@ from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.connections import Wire
 from s2a_bench.transport.limits import Limits
-from s2a_bench.transport.shm import door, shared_memory
+from s2a_bench.transport.shm import shared_memory, unix_socket
 from s2a_bench.transport.shm.memory import ANSWER_BYTES, HELLO, MAGIC, PLACE, STEP_BYTES, SharedMemory, accept, offer
 from s2a_bench.transport.shm.pieces import packed, unpacked
 from s2a_bench.transport.shm.reading import HEADER_BYTES, request_at, size_of
@@ -195,7 +195,7 @@ def test_servers_that_start_at_once_do_not_take_each_other_for_dead() -> None:
 
     def start() -> None:
         barrier.wait()
-        listeners.append(door.listen(""))
+        listeners.append(unix_socket.listen(""))
 
     threads = [Thread(target=start) for _ in range(number)]
     for thread in threads:
@@ -204,12 +204,12 @@ def test_servers_that_start_at_once_do_not_take_each_other_for_dead() -> None:
         thread.join()
     assert len(listeners) == number
     for listener, path in listeners:
-        door.connect(path, 5).close()
+        unix_socket.connect(path, 5).close()
         listener.close()
 
 
 def test_the_socket_is_its_users_alone(own_folder: Path) -> None:
-    listener, name = door.listen("")
+    listener, name = unix_socket.listen("")
     with listener:
         path = Path(name)
         assert path.parent == own_folder
@@ -233,7 +233,7 @@ def test_a_link_in_place_of_the_folder_is_refused(own_folder: Path, tmp_path: Pa
 def test_a_socket_of_ones_own_is_used_once_and_never_takes_the_place_of_a_file(tmp_path: Path) -> None:
     path = tmp_path / "robot.sock"
     wiring = wiring_of("shm", str(path))
-    listener, _ = door.listen(str(path))
+    listener, _ = unix_socket.listen(str(path))
     with listener, pytest.raises(PortInUse, match=r"`socket`: .*robot.sock cannot be had"):
         open_server(wiring, RecordingHandler([]))
     assert path.is_socket()  # as of a server that was killed
@@ -254,7 +254,7 @@ def test_the_name_of_a_socket_may_be_nearly_as_long_as_the_kernel_takes(tmp_path
     folder.mkdir()
     path = folder / "robot.sock"
     assert len(str(path)) == 107
-    listener, _ = door.listen(str(path))
+    listener, _ = unix_socket.listen(str(path))
     listener.close()
 
 
@@ -293,17 +293,17 @@ def test_a_client_of_another_user_hears_why_it_is_refused(connect: Connect, monk
 def test_who_may_ask_is_the_user_or_root(monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with one, other:
-        assert door.user_of(one) == os.getuid()
-        for user, may in ((os.getuid(), True), (door.ROOT, True), (NOBODY, False)):
-            monkeypatch.setattr(door, "user_of", lambda _, user=user: user)
-            assert door.may_ask(one) is may
+        assert unix_socket.user_of(one) == os.getuid()
+        for user, may in ((os.getuid(), True), (unix_socket.ROOT, True), (NOBODY, False)):
+            monkeypatch.setattr(unix_socket, "user_of", lambda _, user=user: user)
+            assert unix_socket.may_ask(one) is may
 
 
 def test_pictures_are_not_handed_to_another_users_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    listener, path = door.listen("")
+    listener, path = unix_socket.listen("")
     with listener:
-        monkeypatch.setattr(door, "user_of", lambda _: NOBODY)
-        monkeypatch.setattr(door.os, "getuid", lambda: 1000)
+        monkeypatch.setattr(unix_socket, "user_of", lambda _: NOBODY)
+        monkeypatch.setattr(unix_socket.os, "getuid", lambda: 1000)
         with pytest.raises(TransportError, match="is another user's"):
             open_client(wiring_of("shm", path))
 

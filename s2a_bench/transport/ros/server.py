@@ -1,8 +1,8 @@
-"""The ROS server: fronts receive requests, handlers answer them, the camera's newest frame is at hand.
+"""The ROS server: sources receive requests, handlers answer them, the camera's newest frame is at hand.
 
-A front is one variant's way in. Its threads take turns in waiting for a request; the one that got it answers it
+A source is one variant's way in. Its threads take turns in waiting for a request; the one that got it answers it
 while another waits, so that no request changes threads, and one that comes meanwhile waits for the engine (stage
-`queue`), not in the network. All fronts share one queue, which a request joins as it arrives: a front's lock is held
+`queue`), not in the network. All sources share one queue, which a request joins as it arrives: a source's lock is held
 until it has its place and the client is informed, so requests are accepted, answered and ended in one order.
 """
 
@@ -21,25 +21,25 @@ from s2a_bench.ros.diagnostics import PartHealth
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros import ACTION
-from s2a_bench.transport.ros.action_front import ActionFront
+from s2a_bench.transport.ros.action_source import ActionSource
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
 from s2a_bench.transport.ros.exchange import Shared
 from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company, server_name, settled
 from s2a_bench.transport.ros.node import Activity, NodeApi, declared
 from s2a_bench.transport.ros.options import RosOptions
-from s2a_bench.transport.ros.topic import TopicFront
+from s2a_bench.transport.ros.topic import TopicSource
 from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, provenance_message
 from s2a_bench.transport.serving import Core, SharedSourceWorkers
 
 _log = logging.getLogger(__name__)
 
 
-Front: TypeAlias = TopicFront | ActionFront
+RequestSource: TypeAlias = TopicSource | ActionSource
 """One variant's way in: `take` waits for the next request and returns it packed, `exchange` unpacks it."""
 
 
 class RosServer:
-    """Answers the requests of all fronts."""
+    """Answers the requests of all sources."""
 
     def __init__(self, wiring: Wiring[RosOptions], handler: Handler) -> None:
         """Join the domain and create all topics; raises TransportError where another server answers already."""
@@ -52,11 +52,11 @@ class RosServer:
             refuse_company(wiring, namespace)
         self.middleware = join(wiring, "server", host=host)
         self._cache = CameraCache(self.middleware, namespace, wiring.options, wiring.limits)
-        self._fronts: list[Front] = [TopicFront(self.middleware, namespace, wiring.limits)]
-        self._action: ActionFront | None = None
+        self._sources: list[RequestSource] = [TopicSource(self.middleware, namespace, wiring.limits)]
+        self._action: ActionSource | None = None
         try:
-            self._action = ActionFront(self.middleware, wiring, queued.honours)
-            self._fronts.append(self._action)
+            self._action = ActionSource(self.middleware, wiring, queued.honours)
+            self._sources.append(self._action)
         except MissingInterface as missing:  # of llama_msgs, which topics do not need
             if wiring.variant == ACTION:
                 self.middleware.close()
@@ -76,14 +76,14 @@ class RosServer:
             self._node = NodeApi(self.middleware, name, logged, self._change, self._findings, level)
 
     def serve(self) -> None:
-        fronts = [SharedSourceWorkers(partial(self._take, front), self._shared.stopped) for front in self._fronts]
+        sources = [SharedSourceWorkers(partial(self._take, source), self._shared.stopped) for source in self._sources]
         self._cache.start()
-        for workers in fronts:
+        for workers in sources:
             workers.start()
         if self._node:
             self._node.start(self._shared.stopped)
         self._shared.stopped.wait()
-        for workers in fronts:
+        for workers in sources:
             workers.join()
         self._cache.join()
         if self._node:
@@ -93,8 +93,8 @@ class RosServer:
     def stop(self) -> None:
         """Wake all threads."""
         self._shared.stopped.set()
-        for front in self._fronts:
-            front.interrupt()
+        for source in self._sources:
+            source.interrupt()
         self._cache.interrupt()
 
     def describe(self) -> dict[str, str | int]:
@@ -109,21 +109,21 @@ class RosServer:
     def _findings(self) -> Iterator[PartHealth]:
         return self._shared.activity.findings(*self._cache.seen(), self._cache.silence, self._options.max_frame_age)
 
-    def _take(self, front: Front) -> Callable[[], None] | None:
+    def _take(self, source: RequestSource) -> Callable[[], None] | None:
         """Wait for a request and give it its place in the queue; return what answers it."""
-        packed = front.take(POLL_S)
+        packed = source.take(POLL_S)
         if packed is None:
             return None
         trace = Trace()
         trace.mark("network")
         with ExitStack() as held:
             try:
-                held.enter_context(self._core.in_flight.counted())(front.size_bytes(packed))
-                exchange = front.exchange(packed, self._shared, trace)
+                held.enter_context(self._core.in_flight.counted())(source.size_bytes(packed))
+                exchange = source.exchange(packed, self._shared, trace)
                 turn = self._core.join(exchange)
             except TransportError as error:
-                self._shared.activity.failed(str(error), logged=front is self._action)
-                front.refuse(packed, str(error))
+                self._shared.activity.failed(str(error), logged=source is self._action)
+                source.refuse(packed, str(error))
                 return None
             exchange.held = held.pop_all()
 

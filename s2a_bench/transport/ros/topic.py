@@ -97,7 +97,7 @@ class TopicClient(RosClient):
         raise RequestFailed(f"no token for {self._wiring.timeout_s:.0f} s")
 
 
-class TopicFront:
+class TopicSource:
     """The server's side of the variant: receives requests and turns each into a job for the engine's thread."""
 
     def __init__(self, middleware: Middleware, namespace: str, limits: Limits) -> None:
@@ -130,13 +130,13 @@ class TopicFront:
 class TopicExchange(RosExchange):
     """One request of the topic variant."""
 
-    def __init__(self, front: TopicFront, message: Any, shared: Shared, trace: Trace) -> None:
+    def __init__(self, source: TopicSource, message: Any, shared: Shared, trace: Trace) -> None:
         super().__init__(shared, trace)
-        self._front, self._message, self._id = front, message, str(message.id)
+        self._source, self._message, self._id = source, message, str(message.id)
         self._sent = 0
 
     def request(self) -> Request:
-        message, limits = self._message, self._front.limits
+        message, limits = self._message, self._source.limits
         whole_number("max_tokens", int(message.max_tokens), 1, limits.answer_tokens, 0)
         pictures = (*message.images, *message.compressed_images)
         images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
@@ -144,10 +144,10 @@ class TopicExchange(RosExchange):
         return Request(plain(message.id), message.prompt, images, *settings, state=state_of(message.state))
 
     def piece(self, piece: Piece) -> bool:
-        self._front.send(self._id, piece, [])
+        self._source.send(self._id, piece, [])
         self._sent += 1
         return True
 
     def finish(self, error: str) -> None:
         marks = marks_message(self._id, self.trace.to_remote())
-        self._front.send(self._id, Token(self._sent, "", -1), [marks], error)
+        self._source.send(self._id, Token(self._sent, "", -1), [marks], error)

@@ -17,9 +17,9 @@ from s2a_bench.transport.connections import wait_at_most
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.pictures import bgr_of, encoded
 from s2a_bench.transport.shm import ShmOptions
-from s2a_bench.transport.shm.door import connect
 from s2a_bench.transport.shm.memory import ANSWER_BYTES, PLACE, STEP_BYTES, SharedMemory, accept, in_steps, offer
 from s2a_bench.transport.shm.pieces import AnswerPart, unpacked
+from s2a_bench.transport.shm.unix_socket import connect
 from s2a_bench.types import Action, Frame, Piece, Request, Token
 
 NEARER_S: Final = 0.1

@@ -18,7 +18,6 @@ from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.connections import Connections, Wire, wait_at_most
 from s2a_bench.transport.serving import Core, Disconnected, Exchange
 from s2a_bench.transport.shm import ShmOptions
-from s2a_bench.transport.shm.door import listen, may_ask
 from s2a_bench.transport.shm.memory import (
     ANSWER_BYTES,
     PLACE,
@@ -31,6 +30,7 @@ from s2a_bench.transport.shm.memory import (
 )
 from s2a_bench.transport.shm.pieces import packed
 from s2a_bench.transport.shm.reading import request_at, size_of
+from s2a_bench.transport.shm.unix_socket import listen, may_ask
 from s2a_bench.types import Piece, Request
 
 LAST_BYTES: Final = 1 << 12

@@ -49,7 +49,7 @@ NOT_LOGGED: Final = frozenset({"seed", "grammar", "dry_sequence_breakers"})
 _log = logging.getLogger(__name__)
 
 
-class ActionFront:
+class ActionSource:
     """The server's side of the variant."""
 
     def __init__(self, middleware: Middleware, wiring: Wiring[RosOptions], honoured: Collection[str] = ()) -> None:
@@ -99,9 +99,9 @@ class ActionFront:
 class GoalExchange(RosExchange):
     """One goal: ACCEPTED while it waits, EXECUTING when its turn comes."""
 
-    def __init__(self, front: ActionFront, goal: ServerGoal, message: Any, shared: Shared, trace: Trace) -> None:
+    def __init__(self, source: ActionSource, goal: ServerGoal, message: Any, shared: Shared, trace: Trace) -> None:
         super().__init__(shared, trace)
-        self._front, self._goal, self._message = front, goal, message
+        self._source, self._goal, self._message = source, goal, message
         self._id = goal.id.hex()
         self._stop = [text for text in message.stop if text]
         self._tokens: list[Piece] = []
@@ -120,11 +120,11 @@ class GoalExchange(RosExchange):
         return Request(
             id=self._id,
             prompt=message.prompt.replace(MEDIA_MARKER, ""),
-            images=tuple(picture_of(image, self.trace, self._front.limits) for image in goal_images(message)),
-            max_tokens=self._front.max_tokens,
+            images=tuple(picture_of(image, self.trace, self._source.limits) for image in goal_images(message)),
+            max_tokens=self._source.max_tokens,
             grammar=sampling.grammar,
             seed=0 if seed == NO_SEED else seed,
-            sampling=self._front.wishes.of(sampling),
+            sampling=self._source.wishes.of(sampling),
         )
 
     def cancelled(self) -> bool:
@@ -142,8 +142,8 @@ class GoalExchange(RosExchange):
             return False
         self._held.append(piece.text)
         self._tokens.append(piece)
-        self._front.plot(self._id, piece)
-        if now_ns() - self._fed_ns >= self._front.feedback_interval_ns:
+        self._source.plot(self._id, piece)
+        if now_ns() - self._fed_ns >= self._source.feedback_interval_ns:
             self._feed()
         text = self._text() if self._stop else ""
         return not any(stop in text for stop in self._stop)
@@ -151,7 +151,7 @@ class GoalExchange(RosExchange):
     def _feed(self) -> None:
         """Send what is held as one feedback: one token, or several that came faster than ROS clients' queues hold."""
         if self._held:
-            self._goal.feedback(token_feedback("".join(self._held), self._tokens[-1].id, self._front.version))
+            self._goal.feedback(token_feedback("".join(self._held), self._tokens[-1].id, self._source.version))
             self._held.clear()
             self._fed_ns = now_ns()
 
@@ -162,10 +162,10 @@ class GoalExchange(RosExchange):
         try:
             if self._started and not self._goal.cancel_requested:
                 self._feed()
-            self._front.ended(self._id, self.trace)
+            self._source.ended(self._id, self.trace)
         except S2AError as failure:
             error = error or str(failure)
-        result = text_result(error or self._text(), [token.id for token in self._tokens], self._front.version)
+        result = text_result(error or self._text(), [token.id for token in self._tokens], self._source.version)
         started = self._started or self._goal.executing()
         if self._goal.cancel_requested:
             self._goal.canceled(result)
