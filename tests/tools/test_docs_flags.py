@@ -38,7 +38,7 @@ def test_flags_have_the_headings_of_the_help_and_arguments_are_first() -> None:
         for name in ("Plans", "A model that answers")
     )
     assert "| `--n-skills` | 8 | N, skills a plan; several with commas |" in plans
-    assert "| `--warmup` | 1 | --live: answers before, which policies learn the rate from |" in live
+    assert "| `--warmup` | 1 | --live: first answers, from which policies learn the rate |" in live
 
 
 def test_the_commands_of_a_group_share_a_page() -> None:
