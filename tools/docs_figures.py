@@ -37,8 +37,8 @@ DPI = 150
 ORIN = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
 
 
-SPREAD = "lognormal:mean_ms=80,cv=.5"
-SLOW_ONES = "bimodal:mean_ms=80,cv=.2,pause_share=.05,pause_ratio=3"
+SPREAD = "lognormal:mean_ms=80,cv=0.5"
+SLOW_ONES = "bimodal:mean_ms=80,cv=0.2,pause_share=0.05,pause_ratio=3"
 
 
 class Quiet:
