@@ -34,7 +34,7 @@ class SkillParsed:
     call: Call
     line: int
     """Lines before it that are not empty, bad ones included; in a format without delimiter, codes and bad runs."""
-    chunk: int
+    piece: int
     """The call of `Parser.feed` that completed it, from 0; `Parser.close` counts as the call after the last.
 
     Fed one token at a time, this is the token whose arrival is t_i.
@@ -49,7 +49,7 @@ class BadLine:
     text: str
     why: str
     line: int
-    chunk: int
+    piece: int
 
 
 Event: TypeAlias = SkillParsed | BadLine

@@ -162,7 +162,7 @@ def test_the_text_is_numbered_skill_calls_of_six_tokens() -> None:
     assert [token.index for token in tokens if token.text.endswith("\n")] == [5, 11, 17, 23]
     parser = Parser(paper_format(load_skills("household")))
     parsed = [event for token in tokens for event in parser.feed(token.text)]
-    assert [(event.index, event.chunk) for event in parsed if isinstance(event, SkillParsed)] == [
+    assert [(event.index, event.piece) for event in parsed if isinstance(event, SkillParsed)] == [
         (0, 5),
         (1, 11),
         (2, 17),

@@ -208,7 +208,7 @@ def test_a_skill_comes_with_the_token_that_completes_it(format_: Format, tokeniz
         for token in ids:
             found += parser.feed(tokenize.piece(token))  # type: ignore[attr-defined]
     assert [event.call for event in found] == plan
-    assert [event.chunk for event in found] == [sum(map(len, lines[: at + 1])) - 1 for at in range(8)]
+    assert [event.piece for event in found] == [sum(map(len, lines[: at + 1])) - 1 for at in range(8)]
     assert [event.index for event in found] == list(range(8))
 
 
@@ -220,12 +220,12 @@ def test_a_skill_is_certain_at_its_delimiter_and_not_before() -> None:
     assert parser.feed("1. go_to(kitchen)") == []
     (event,) = parser.feed("\n2. pick")
     assert isinstance(event, SkillParsed)
-    assert (event.index, str(event.call), event.line, event.chunk) == (0, "go_to(kitchen)", 0, 1)
+    assert (event.index, str(event.call), event.line, event.piece) == (0, "go_to(kitchen)", 0, 1)
     assert event.call.skill.durations.nominal_s == 4.0
     assert parser.feed("(cup)") == []
     (last,) = parser.close()
     assert isinstance(last, SkillParsed)
-    assert (last.index, str(last.call), last.line, last.chunk) == (1, "pick(cup)", 1, 3)
+    assert (last.index, str(last.call), last.line, last.piece) == (1, "pick(cup)", 1, 3)
 
 
 def test_a_code_is_certain_at_once() -> None:
@@ -263,7 +263,7 @@ def test_a_code_is_certain_at_once() -> None:
 def test_a_bad_line_is_named_and_the_next_one_is_read(line: str, problem: str, why: str) -> None:
     bad, good = parse(PAPER, [f"{line}\n2. pick(cup)\n"])
     assert isinstance(bad, BadLine)
-    assert (bad.problem, bad.why, bad.line, bad.chunk) == (problem, why, 0, 0)
+    assert (bad.problem, bad.why, bad.line, bad.piece) == (problem, why, 0, 0)
     assert line.startswith(bad.text)
     assert isinstance(good, SkillParsed)
     assert (good.index, str(good.call), good.line) == (0, "pick(cup)", 1)
@@ -338,7 +338,7 @@ def test_one_line_that_never_ends_is_one_error_and_takes_no_memory() -> None:
     parser = Parser(PAPER)
     events = [event for _ in range(1000) for event in parser.feed("go on " * 100)]
     assert problems(events) == ["too-long"]
-    assert events[0].chunk == 0
+    assert events[0].piece == 0
     assert calls(parser.feed("\n1. pick(cup)\n")) == ["pick(cup)"]
 
 

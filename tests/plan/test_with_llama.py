@@ -46,7 +46,7 @@ def test_a_model_under_the_grammar_writes_n_skills_of_l_tokens(
             events += found
         assert parser.close() == []
         assert all(isinstance(event, SkillParsed) for event in events)
-        assert [event.chunk for event in events] == [size * at - 1 for at in range(1, 9)]
+        assert [event.piece for event in events] == [size * at - 1 for at in range(1, 9)]
 
 
 def test_a_model_under_the_grammar_writes_the_papers_form(engine: LlamaCppEngine) -> None:
