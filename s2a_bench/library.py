@@ -196,8 +196,10 @@ def compare(
 def command(name: str) -> Callable[..., Run]:
     """Return the function of an experiment, which calls `run` with its name."""
 
-    def call(**options: Any) -> Run:
-        return run(name, **options)
+    def call(
+        *, output: str | Path = "results", progress: Progress | None = None, tune: bool = True, **options: Any
+    ) -> Run:
+        return run(name, output=output, progress=progress, tune=tune, **options)
 
     call.__name__ = call.__qualname__ = name
     call.__doc__ = (

@@ -32,7 +32,7 @@ class Provenance:
 
     ``weights`` are real, dummy, or none without a model; ``tokens`` measured, emulated (their times come from a
     profile, a rate or a distribution) or paced (held back); ``link`` real, emulated, or none; ``clock`` monotonic or
-    virtual. ``profile`` names the emulated profile or latencies. "unknown": there was no report.
+    virtual. ``profile`` names the emulated profile or latencies. A field that nothing reported is "unknown".
     """
 
     engine: str = UNKNOWN

@@ -178,7 +178,7 @@ class Executor:
         self._hold(now_ns)
         if requested_ns is not None and answer < math.inf:
             return max(requested_ns + math.ceil(answer * 1e9), now_ns + 1)
-        return NEVER if self._open else self._settle(now_ns, "short", f"{started} of {self._announced} skills came")
+        return NEVER if self._open else self._settle(now_ns, "short", f"{started} of {self._announced} skills arrived")
 
     def _steer(self, now_ns: int) -> int:
         """Extend, compress or end the running skill; return when to act again, 0 for at once."""

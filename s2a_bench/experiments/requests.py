@@ -411,7 +411,7 @@ def engine_note(run: StoredRun, cells: list[RequestCell]) -> Note:
     if any(run.origins.of(name).weights == "dummy" for name in answered):
         notes.append(Note("dummy weights", DUMMY))
     if UNKNOWN in engines:
-        notes.append(Note("engine unknown, as the server does not tell", "engine unknown"))
+        notes.append(Note("engine unknown, as the server does not report it", "engine unknown"))
     return Note(", ".join(notes), *(label for note in notes for label in note.labels))
 
 

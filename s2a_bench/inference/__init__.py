@@ -64,8 +64,7 @@ class Engine(Protocol):
     @property
     def facts(self) -> dict[str, float]:
         """Return the declared facts about the last request, as llama.cpp's ``timings``."""
-        facts: dict[str, float] = getattr(self, "_facts", {})
-        return facts
+        return {}
 
     def generate(self, request: Request) -> Iterator[Piece]:
         """Yield the answer's pieces, at most ``request.max_tokens``; closing the iterator cancels the rest.

@@ -57,6 +57,10 @@ class EchoEngine(Engine):
         self._latencies_ns = _sequence_ns(config) if config.latency else None
         self._closed = False
 
+    @property
+    def facts(self) -> dict[str, float]:
+        return self._facts
+
     def generate(self, request: Request) -> Iterator[Piece]:
         if self._closed:
             raise EngineError("echo: the engine is closed; open a new one")

@@ -154,6 +154,10 @@ class LlamaCppEngine(Engine):
         self._pieces = TokenBytes(llama._model.vocab)  # noqa: SLF001
         return llama
 
+    @property
+    def facts(self) -> dict[str, float]:
+        return self._facts
+
     def generate(self, request: Request) -> Iterator[Token]:
         """Yield one `Token` per token of the model; the last token of a character carries all its bytes.
 

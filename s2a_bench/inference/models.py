@@ -89,7 +89,9 @@ def tiny_dummy() -> tuple[Path, Path]:
     """Return the tiny dummy's two files, written first if they are not in the cache; several processes may do so."""
     folder = dummy_folder("tiny")
     files = dummy_files(folder, "tiny", "f16")
-    return files if all(file.is_file() for file in files) else write_dummy(folder, "tiny", "f16")
+    if not all(file.is_file() for file in files):
+        write_dummy(folder, "tiny", "f16")
+    return files
 
 
 def resolve(config: EngineConfig) -> tuple[Path, Path]:

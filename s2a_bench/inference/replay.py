@@ -90,6 +90,10 @@ class ReplayEngine(Engine):
         self._played = 0
         self._closed = False
 
+    @property
+    def facts(self) -> dict[str, float]:
+        return self._facts
+
     def generate(self, request: Request) -> Iterator[Piece]:
         if self._closed:
             raise EngineError("replay: the engine is closed; open a new one")

@@ -20,7 +20,7 @@ class _Setting:
     cell: Annotated[str, {"pattern": "^[0-9]{4,}$"}]
     repeat: Annotated[int, {"minimum": 1}]
     virtual: Annotated[bool, {"description": "True where it is computed, not measured."}]
-    board: Annotated[str | None, {"description": "The machine that the cell asks for.", "minLength": 1}]
+    board: Annotated[str | None, {"description": "The machine that the cell needs.", "minLength": 1}]
     settings: Annotated[dict[str, Any], {"description": "By flag, without the dashes."}]
     argv: Annotated[list[str], {"minItems": 1}]
     config_hash: Annotated[str, {"pattern": "^[0-9a-f]{16}$"}]

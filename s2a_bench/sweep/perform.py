@@ -98,7 +98,7 @@ class LocalWorkers(CellWorkers):
             return self._pool(cell.virtual).submit(perform, cell, folder, self._entry)
         except BrokenProcessPool:  # an earlier cell broke it
             del self._pools[cell.virtual]
-            return self.submit(cell, folder)
+            return self._pool(cell.virtual).submit(perform, cell, folder, self._entry)
 
     def collect(self, future: Future[Outcome], folder: Path) -> Outcome:  # noqa: ARG002 - the worker has written into it
         try:

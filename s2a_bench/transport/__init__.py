@@ -4,9 +4,9 @@ To add a transport, write a package with a module like this and register its ins
 ``s2a_bench.transports``; nothing in this repository changes::
 
     from s2a_bench.options import option
-    from s2a_bench.transport import SERVER, Options, Transport
+    from s2a_bench.transport import SERVER, Transport, TransportOptions
 
-    class ToyOptions(Options):
+    class ToyOptions(TransportOptions):
         port: int = option(0, "port; 0: any free one", ge=0, le=65535, side=SERVER)
 
     class Toy(Transport[ToyOptions]):
@@ -93,7 +93,7 @@ class TransportOptions(base.Options):
     NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = ()
     """Options without a flag of `serve`, which takes them in the pipeline's name, its file or ``--ros-args``."""
 
-    payload: Payload = base.option("", f"how a picture travels: {', '.join(PAYLOADS)} [default: raw where it can]")
+    payload: Payload = base.option("", f"how pictures are sent: {', '.join(PAYLOADS)} [default: raw where it can]")
 
     @classmethod
     def of_sides(cls, *sides: str) -> list[str]:

@@ -172,13 +172,13 @@ def test_prose_after_the_whole_plan_does_no_harm() -> None:
 @pytest.mark.parametrize("name", [name for name in EVERY_POLICY if name != "s2a-clairvoyant"])
 def test_a_stream_that_ends_early_is_carried_out_and_said_to_be_short(name: str) -> None:
     record, _ = run(plan([1.0, 2.0, 3.0]), 5, by=name)
-    assert (record.outcome, record.why) == ("short", "3 of 5 skills came")
+    assert (record.outcome, record.why) == ("short", "3 of 5 skills arrived")
     assert len(record.ran) == 3
 
 
 def test_an_answer_without_a_skill_starts_nothing() -> None:
     record, _ = run(script([0.5, 0.6], []), 3)
-    assert (record.outcome, record.why, record.skills) == ("short", "0 of 3 skills came", [])
+    assert (record.outcome, record.why, record.skills) == ("short", "0 of 3 skills arrived", [])
 
 
 @pytest.mark.parametrize("name", EVERY_POLICY)

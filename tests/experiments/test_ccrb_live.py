@@ -115,7 +115,9 @@ def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
                 yield token
 
     monkeypatch.setattr(LoopbackClient, "request", cut)
-    with pytest.raises(TransportError, match=r"loopback: 1 of 3 skills came; .*tokens\.csv has what the model wrote"):
+    with pytest.raises(
+        TransportError, match=r"loopback: 1 of 3 skills arrived; .*tokens\.csv has what the model wrote"
+    ):
         drive(REPLAYED, tmp_path / "runs", fast_board)
     (folder,) = (tmp_path / "runs").iterdir()
     assert len(read_run(folder).table(TOKENS)) == 2 * L

@@ -170,7 +170,7 @@ def test_a_node_that_leaves_is_noticed(foreign: Wiring[Any], dds_domain: int) ->
     thread = Thread(target=accept_and_leave)
     thread.start()
     try:
-        with pytest.raises(ServerDied, match="/llama_ros/generate_response is gone"):
+        with pytest.raises(ServerDied, match="/llama_ros/generate_response has ended"):
             ask(client, Request("a", "plan"))
     finally:
         thread.join()

@@ -125,7 +125,7 @@ def test_a_server_that_is_killed_in_mid_answer_leaves_nothing_and_the_next_start
             os.kill(server.pid, 9)
             error = peer.hear("end")["error"]  # the link may break before the process is seen as ended
             assert error in {
-                f"ServerDied: the server at {server.address} is gone",
+                f"ServerDied: the server at {server.address} has ended",
                 f"RequestFailed: {server.address} broke off: it closed the link",
             }
             assert usage(peer.pid).descriptors < before

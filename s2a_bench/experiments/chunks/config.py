@@ -281,7 +281,9 @@ class ChunksConfig(Options):
                 f"`seconds`: {self.seconds:g} s are less than two ticks at `control_hz` {self.control_hz:g}"
             )
         if self.control_hz > FASTEST_LIVE_HZ:
-            raise UsageError(f"`control_hz`: {self.control_hz:g}: a live control loop keeps up to {FASTEST_LIVE_HZ:g}")
+            raise UsageError(
+                f"`control_hz`: {self.control_hz:g}: a live loop keeps up with at most {FASTEST_LIVE_HZ:g} Hz; lower it"
+            )
         if self.seconds * self.control_hz > MOST_LIVE_TICKS:
             raise UsageError(
                 f"`seconds`: {self.seconds:g} s at `control_hz` {self.control_hz:g} are over {MOST_LIVE_TICKS:.0e} "

@@ -71,7 +71,7 @@ METRICS: Final[Mapping[str, Metric]] = {
             "slow_down",
             "",
             "beta",
-            "The least slow-down of actions at which a share epsilon of the cycles stalls, at the greatest trigger.",
+            "The least slow-down of actions at which at most a share epsilon of the cycles stalls, at the greatest m.",
             bounds=(1, None),
         ),
         _number(

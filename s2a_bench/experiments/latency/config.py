@@ -17,7 +17,7 @@ class LatencyConfig(RequestsConfig):
 
     payload: Payloads = option(
         (),
-        f"how a picture travels: {', '.join(PAYLOADS)}; several with commas, each in cells of its own "
+        f"how pictures are sent: {', '.join(PAYLOADS)}; several with commas, each in cells of its own "
         "[default: raw,jpeg; quick, stream: raw]",
     )
 

@@ -131,7 +131,7 @@ class Modelled(Options):
     plans: int | None = option(None, "plans a cell [default: 1; with jitter 1000]", ge=1)
     jitter: str = option(
         NO_JITTER,
-        "none (even gaps, as in the paper), profile (the profile's), or a family of gaps, as lognormal:cv=0.2",
+        "none (even gaps, as in the paper), profile (its gaps), or a family of gaps, as lognormal:cv=0.2",
         first=True,
     )
     guarantee: Guarantee = option("high-confidence", GUARANTEE)
@@ -150,7 +150,7 @@ class LiveOptions(Options):
         "", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]", first=True, names=paths
     )
     skills: str = option("household", "--live: household, driving, or a TOML file", names=lambda: SKILL_SETS)
-    requests: int = option(1, "--live: requests for a plan, a cell", ge=1)
+    requests: int = option(1, "--live: plans requested per cell", ge=1)
     task: TextOrFile = option("", "--live: the robot's task, text or @FILE")
     robot: str = option(
         "timed", "--live: timed, ros, call?function=MODULE:NAME; timed only waits", names=lambda: ROBOTS

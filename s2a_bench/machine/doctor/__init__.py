@@ -33,7 +33,7 @@ COMMAND_TIMEOUT_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """The result of one check; ``fix`` is the command that changes it, which every warning and error has."""
+    """The result of one check; ``fix``, a command or what to do, is there in every warning and error."""
 
     code: str
     level: Level

@@ -67,7 +67,7 @@ class HttpOptions(WebOptions):
     )
     served_model: str = option("", "the model's name at the url [default: the first that it lists]")
     dialect: Annotated[str, one_of(lambda: ("", *DIALECTS))] = option(
-        "", f"what the url speaks: {', '.join(DIALECTS)} [default: ask]"
+        "", f"the url's dialect: {', '.join(DIALECTS)} [default: detected]"
     )
     api_docs: bool = option(False, "also serve /openapi.json, /docs and /redoc", side=SERVING)
     extra_body: TextOrFile = option("", "JSON, or @FILE, merged into every request to the url (RFC 7396)")

@@ -23,7 +23,7 @@ from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.ros.camera import POLL_S, picture_message
 from s2a_bench.transport.ros.joining import RosClient, join, namespace_of, place_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
-from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, READER_QOS, readable, remote_of, told_by
+from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, READER_QOS, provenance_of, readable, remote_of
 from s2a_bench.types import Request, Token
 
 ACTION = "/generate_response"
@@ -146,14 +146,14 @@ class GenerateClient(RosClient):
             if event is not None and event.goal_id == goal_id:
                 return event
             if event is None and not (self._alive() and self._client.server_present()):
-                raise ServerDied(f"the action server {self._name} is gone")
+                raise ServerDied(f"the action server {self._name} has ended")
         raise RequestFailed(f"no feedback for {self._wiring.timeout_s:.0f} s")
 
     def _learn(self, goal_id: str, trace: Trace) -> bool:
         """Take our server's marks of a goal, which were sent before its result; of another, who it is."""
         if self._marks is None:
             if (marked := self._origin.take(0)) and (origin := readable(self._origin, marked, trace)) is not None:
-                trace.provenance = told_by(origin)
+                trace.provenance = provenance_of(origin)
             return True
         deadline = now_ns() + int(MARKS_TIMEOUT_S * 1e9)
         while now_ns() < deadline:

@@ -93,7 +93,7 @@ class TopicClient(RosClient):
                     bounds.count_bytes(len(packed))
                     return token
             elif not self._alive():
-                raise ServerDied("the server's process is gone")
+                raise ServerDied("the server's process has ended")
         raise RequestFailed(f"no token for {self._wiring.timeout_s:.0f} s")
 
 

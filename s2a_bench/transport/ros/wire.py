@@ -118,7 +118,7 @@ def provenance_message(facts: Mapping[str, str]) -> Any:
     return ros.message(ros.PROVENANCE, **{**Provenance().to_dict(), **facts})
 
 
-def told_by(origin: Any) -> dict[str, str]:
+def provenance_of(origin: Any) -> dict[str, str]:
     """Read who answers from s2a_msgs/Provenance."""
     return {name: getattr(origin, name) for name in Provenance().to_dict()}
 
@@ -133,7 +133,7 @@ def remote_of(marks: Any) -> Remote:
             frame_stamp_ns=int(marks.frame_stamp),
             frame_marks=list(zip(marks.frame_stages, marks.frame_stamps.tolist(), strict=True)),
             facts=dict(zip(marks.fact_names, marks.fact_values.tolist(), strict=True)),
-            provenance=told_by(marks.provenance),
+            provenance=provenance_of(marks.provenance),
         ).check()
     except ValueError as error:
         raise RequestFailed(f"the server's marks are none: {error}") from error

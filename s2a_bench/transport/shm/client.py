@@ -138,7 +138,7 @@ class ShmClient:
 
     def _disconnected(self, error: Exception) -> RequestFailed | ServerDied:
         if not self._alive():
-            return ServerDied(f"the server at {self._path} is gone")
+            return ServerDied(f"the server at {self._path} has ended")
         return RequestFailed(f"{self._path} broke off: {str(error) or 'it closed the link'}")
 
 

@@ -66,7 +66,7 @@ class WebsocketClient:
             whole = True
         except Broken as error:
             if not self._alive():
-                raise ServerDied(f"the server is gone: {error}") from error
+                raise ServerDied(f"the server has ended: {error}") from error
             raise RequestFailed(str(error)) from error
         finally:
             if not whole and self._link is not None:

@@ -29,7 +29,7 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
         return
     yield no_key(
         parts,
-        f"it greets everybody ({greeting}), so it answers them too",
+        f"it greets every client ({greeting}), so it answers every client too",
         "let it listen on 127.0.0.1 alone and reach it by ssh -L, or put a proxy that wants a key before it",
     )
     try:

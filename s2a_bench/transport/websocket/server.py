@@ -121,7 +121,7 @@ class WebsocketExchange(Exchange):
 
 
 def metadata_of(queued: Queued) -> Mapping[str, Any]:
-    """Return what a server says of itself to everybody who connects."""
+    """Return the server's description of itself for every client."""
     settings = queued.settings.model_dump() if queued.settings is not None else {}
     names = {"name": "engine", "horizon": "action_horizon", "action_dim": "action_dim"}
     extension = {key: settings[name] for name, key in names.items() if isinstance(settings.get(name), (str, int))}

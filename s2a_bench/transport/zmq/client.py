@@ -230,11 +230,11 @@ class ReqSocket:
         if now_ns() > ends_ns:
             raise RequestFailed(f"{self._url} was silent for too long: {self._timeout_s:g} s")
         if not self._alive():
-            raise ServerDied(f"the server at {self._url} is gone")
+            raise ServerDied(f"the server at {self._url} has ended")
 
     def _broke(self, doubt: str = "") -> TransportError:
         if not self._alive():
-            return ServerDied(f"the server at {self._url} is gone")
+            return ServerDied(f"the server at {self._url} has ended")
         return RequestFailed(f"{self._url} broke the connection{doubt}")
 
     def _patience_ns(self, bounds: Bounds) -> int:

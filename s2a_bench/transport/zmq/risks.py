@@ -42,7 +42,7 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
         else:
             yield no_key(
                 parts,
-                "it answers everybody's ping; if it is GR00T's, everybody moves the robot, and ends the server by "
+                "it answers any client's ping; if it is GR00T's, any client can move the robot, and end the server by "
                 "`kill`, which is not tried here",
                 "let it listen on 127.0.0.1 alone (GR00T's default is all interfaces), reach it by ssh -L, give it an "
                 "api_token",

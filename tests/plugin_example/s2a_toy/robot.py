@@ -38,17 +38,17 @@ class Scribe(ActionRobot):
     def __init__(self, log: Path) -> None:
         """Open the file."""
         self._file = log.open("a", encoding="utf-8")
-        self._told = 0
+        self._count = 0
 
     def send(self, action: Vector | None, at_ns: int) -> None:
         """Write an action down."""
         del at_ns
-        self._told += 1
+        self._count += 1
         self._file.write("hold\n" if action is None else f"action {' '.join(f'{value:.3f}' for value in action)}\n")
 
     def state(self) -> tuple[float, ...]:
         """Return how often it was told something."""
-        return (float(self._told),)
+        return (float(self._count),)
 
     def start(self, call: Call, end_ns: int, report: Report) -> Running:
         """Write a skill down."""

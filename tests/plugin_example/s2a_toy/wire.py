@@ -98,7 +98,7 @@ class ToyClient:
                 yield Token(message["index"], message["text"], message["id"])
         except (OSError, EOFError, ValueError, KeyError, TypeError) as error:
             if not self._alive():
-                raise ServerDied(f"the server at {self._address} is gone") from error
+                raise ServerDied(f"the server at {self._address} has ended") from error
             raise RequestFailed(f"{self._address} broke off: {error or type(error).__name__}") from error
         finally:
             if not done:  # what was not read belongs to this request only

@@ -148,18 +148,18 @@ def jitter_notes(run: StoredRun) -> tuple[str, ...]:
 class _About:
     cell: str
     policy: str
-    profile: Annotated[str | None, about("Null for a given rate, or a model.")]
-    mode: Annotated[str, about("virtual: computed; else the clock.")]
+    profile: Annotated[str | None, about("Null if a rate was given, or a model answered.")]
+    mode: Annotated[str, about("virtual: computed; else the clock that it was executed on.")]
     emulated: Annotated[bool, about("True where no model answered.")]
     rate_tokens_per_s: Positive
     prompt_s: Annotated[
         NonNegative | None,
-        about("c: from the request to the start of decoding; absent for a model."),
+        about("c: from the request to the start of decoding; absent if a model answered."),
     ] = None
     tokens_per_skill: Annotated[Many, about("L, the delimiter included.")]
     n_skills: Many
     t_nom_s: Positive
-    plans: Annotated[Many, about("Plans of the means.")]
+    plans: Annotated[Many, about("Number of plans that the means are over.")]
     caution: Annotated[
         NonNegative | None, about("lambda; absent if the policy has none, or waits for the whole plan.")
     ] = None

@@ -91,7 +91,7 @@ _WAITING = (
 )
 _MOTION = ("speed_distortion", "fluidity", "rms_jerk", "peak_jerk", "sparc")
 _WAITING_NOTES = (
-    "queued: from a skill's arrival to its start. age: from the request, the time of the picture, to a skill's start.",
+    "queued: from a skill's arrival to its start. age: to a skill's start, as if pictured at the request.",
     "of wait: start regret over t_N - S0. over S_lo, E_lo: over the least start and end within T_min, T_max.",
 )
 _MOTION_NOTES = (
