@@ -2,7 +2,7 @@
 
 The machine is calibrated as it is without shift. Then its gaps are longer, heavier in the tail, or bursty; or its rate
 changes within each plan. Four ways to go on: *fixed* keeps prior and lambda; *tracked* follows lambda from plan to plan
-(`tracking.TrackedPolicy`); *detected* keeps lambda and detects changes of the rate within each plan (`changes`); *both*.
+(`tracking.TrackedPolicy`); *detected* keeps lambda and detects changes of the rate within a plan (`changes`); *both*.
 """
 
 from __future__ import annotations

@@ -279,7 +279,7 @@ class GgufInfo:
 def describe(path: Path, flag: str, sha256: Callable[[Path], str | None] = lambda _path: None) -> GgufInfo:
     """Read a language model's or an mmproj's header; raises ModelError, which names ``flag``, as `read_header` does."""
     header = read_header(path, flag)
-    fields, its = header.fields, f"{header.architecture}."
+    fields, own = header.fields, f"{header.architecture}."
 
     def below(prefix: str, keys: Iterable[str]) -> Scalars:
         return {key: _plain(fields[prefix + key]) for key in keys if prefix + key in fields}
@@ -297,7 +297,7 @@ def describe(path: Path, flag: str, sha256: Callable[[Path], str | None] = lambd
         parameters=sum(math.prod(tensor.shape) for tensor in header.tensors),
         types=_types(header.tensors),
         groups=_groups(header.tensors),
-        settings=below(architecture, [key.removeprefix(its) for key in fields if key.startswith(its)]),
+        settings={key.removeprefix(own): _plain(value) for key, value in fields.items() if key.startswith(own)},
         tokenizer=below("tokenizer.ggml.", ("model", "pre")),
         vocabulary=_vocabulary(header, flag),
         chat_template=str(fields[_CHAT_TEMPLATE]) if _CHAT_TEMPLATE in fields else None,

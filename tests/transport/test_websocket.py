@@ -383,7 +383,7 @@ def test_tokens_do_not_travel() -> None:
 def test_the_doctor_tells_of_a_server_without_a_key_that_refuses_pages() -> None:
     with serving(RecordingHandler(list(CHUNK))) as server:
         found = {finding.code: finding for finding in examine(server.address)}
-    assert "it greets everybody (server, provenance)" in found["no-key"].message
+    assert "it greets every client (server, provenance)" in found["no-key"].message
     assert "any-page" not in found
 
 

@@ -78,7 +78,7 @@ def _request_plan(config: CcrbConfig, ask: PlanPrompt, link: ModelLink, prior: G
     came_ns = [event.at_ns for event in events if isinstance(event, SkillArrived)][: ask.n_skills]
     if len(came_ns) < ask.n_skills:
         raise TransportError(
-            f"{link.cell.name}: {len(came_ns)} of {ask.n_skills} skills came; {link.writer.path / 'tokens.csv'} has "
+            f"{link.cell.name}: {len(came_ns)} of {ask.n_skills} skills arrived; {link.writer.path / 'tokens.csv'} has "
             "what the model wrote"
         )
     link.learn_rate(feed.token_ns)
