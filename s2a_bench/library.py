@@ -22,7 +22,7 @@ from s2a_bench.progress import NullProgress, Progress
 from s2a_bench.store import run as store
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
-from s2a_bench.writers.tables import TextTable
+from s2a_bench.writers.tables import TextTable, to_markdown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -144,7 +144,6 @@ class Comparison:
 
     def __str__(self) -> str:
         from s2a_bench.report.compare.shown import compare_table
-        from s2a_bench.writers.tables import to_markdown
 
         return to_markdown(compare_table(self._compared))
 
