@@ -171,7 +171,7 @@ GOALS: tuple[Case[Trap], ...] = (
     Case("every goal rejected", goals(lambda goal, *_: goal.reject()), "^RequestFailed: the server rejected the goal"),
     Case("accepted, then silence", goals(lambda goal, *_: goal.accept()), "^RequestFailed: no feedback for 2 s"),
     Case("one token, then silence", goals(lambda goal, *_: _starts(goal, "go")), "^RequestFailed: no feedback for 2 s"),
-    Case("one token, then gone", goals(_leaves), "^ServerDied: .*gone"),
+    Case("one token, then gone", goals(_leaves), "^ServerDied: .*has ended"),
     Case("another answer than its tokens", goals(_lies), "^MessagesLost: "),
     Case("aborted", goals(_aborts), "^RequestFailed: .*had enough"),
     Case("aborted with words that forge lines", goals(_forges), "^RequestFailed: .*all is well"),
