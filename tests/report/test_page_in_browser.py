@@ -53,6 +53,11 @@ WIDTHS, SCHEMES = (400, 1400), ("light", "dark")
 EIGHT = PLAUSIBLE | dict.fromkeys(("shm", "zmq/gr00t", "websocket/openpi"), PLAUSIBLE["http/binary"])
 LONG_POLICY = "stream-to-act?caution=1.5&detect=True"
 WAIT_S = 10
+STANDS_STILL = """
+const done = arguments[0]; let last;
+(function look() { if (scrollY === last) done(); else { last = scrollY; setTimeout(look, 100); } })()
+"""
+"""A wheel scrolls for some frames, and a click goes to where its target was."""
 READABLE = 4.5
 """The least contrast of small text in WCAG 2, level AA."""
 CONTRASTS = """
@@ -201,6 +206,7 @@ def test_lanes_are_zoomed_and_moved_by_buttons_wheel_and_pointer(opened: Callabl
     here = browser.execute_script(scrolled)
     pointer.scroll_from_origin(middle, 0, -100).perform()  # a wheel that only passes scrolls the page
     wait.until(lambda _: browser.execute_script(scrolled) != here)
+    browser.execute_async_script(STANDS_STILL)
     assert span_of(view) == (0, end)
     pointer.move_to_element(view).click().perform()
     pointer.scroll_from_origin(middle, 0, -100).perform()
