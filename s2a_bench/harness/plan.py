@@ -129,7 +129,6 @@ def resolve(config: RequestsConfig) -> RunPlan:
     facts += SPENT if config.sample_resources_hz else ()
     max_pieces = engine.horizon if config.answer == ACTIONS else config.max_tokens
     seed, nonce, size = config.seed, config.nonce or new_nonce(), "{}x{}".format(*config.size)
-    timeouts_s = config.timeout_s, config.deadline_s
     return RunPlan(
         cells=cells,
         blocks=BlocksPlan(config.requests, config.warmup, config.launches, seed),
@@ -137,7 +136,14 @@ def resolve(config: RequestsConfig) -> RunPlan:
         request=RequestPlan(
             config.sent_prompt, config.grammar, max_pieces, seed, config.state, config.mode, size, stages
         ),
-        servers=ServersPlan(engine, bool(config.grammar), config.tuned, *timeouts_s, max_pieces),
+        servers=ServersPlan(
+            engine,
+            bool(config.grammar),
+            config.tuned,
+            timeout_s=config.timeout_s,
+            deadline_s=config.deadline_s,
+            max_tokens=max_pieces,
+        ),
         finds_model=config.reads_model and engine.kind.needs_model,
         sample_resources_hz=config.sample_resources_hz,
         record=config.record,

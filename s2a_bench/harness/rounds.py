@@ -183,9 +183,9 @@ class _Run:
         pids = [server["pid"] for server in facts.values()]
         sampler = stack.enter_context(open_sampler(self.plan.sample_resources_hz, pids))
         sessions = list(self._sessions(servers, sampler, stack))
-        requests = {session.cell.name: facts for session in sessions if (facts := session.client.describe())}
+        described = {session.cell.name: facts for session in sessions if (facts := session.client.describe())}
         origins = {session.cell.name: session.origin for session in sessions}
-        writer.update(asked=requests, provenance=Origins(Provenance.of_engine(model), origins).to_manifest())
+        writer.update(asked=described, provenance=Origins(Provenance.of_engine(model), origins).to_manifest())
         hits = servers.cache_hits()
         keep = partial(self._keep, servers, sampler)
         try:

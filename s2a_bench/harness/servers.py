@@ -112,8 +112,13 @@ class ServerSet:
 
     def _wiring(self, pipeline: Pipeline, address: str) -> Wiring[Any]:
         plan = self._plan
-        timeouts_s = {"timeout_s": plan.timeout_s, "deadline_s": plan.deadline_s}
-        return pipeline.wiring(address, limits=RUN_LIMITS, **timeouts_s, max_tokens=plan.max_tokens)
+        return pipeline.wiring(
+            address,
+            limits=RUN_LIMITS,
+            timeout_s=plan.timeout_s,
+            deadline_s=plan.deadline_s,
+            max_tokens=plan.max_tokens,
+        )
 
     def cache_hits(self) -> Mapping[str, float]:
         """Return counter -> cache hits that the external servers have counted so far."""
