@@ -22,7 +22,8 @@ from s2a_bench.errors import S2AError
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.machine import tuning
 
-INTERRUPTED = 130
+INTERRUPTED: Final = 130
+AGAIN_S: Final = 0.01
 
 
 class TopCommands(Commands):
@@ -74,10 +75,19 @@ def _interrupt(*_: Any) -> None:
     raise KeyboardInterrupt
 
 
+def _interrupt_again(dropped: sys.UnraisableHookArgs) -> None:
+    """Raise a KeyboardInterrupt again in a moment if Python dropped it, in a destructor, a callback or after a fork."""
+    if issubclass(dropped.exc_type, KeyboardInterrupt):
+        signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
+    else:
+        sys.__unraisablehook__(dropped)
+
+
 def main() -> None:
     """Run the command line and exit: 0 done, 1 failed, 2 wrongly used, 130 interrupted."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM):
         signal.signal(number, _interrupt)
+    sys.unraisablehook = _interrupt_again
     try:
         check_limits()
         with tuning.allowed():

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import select
-import signal
 import socket
 import subprocess
 import sys
@@ -76,21 +75,18 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
             return False
         return True
 
-    def wait_end(self, interrupted: Callable[[], object]) -> None:
-        """Wait until the process has ended; raises KeyboardInterrupt.
+    def wait_end(self) -> None:
+        """Wait until the process has ended.
 
         Popen.wait keeps its lock if a signal arrives while it takes it, and then can never be called again. Every wait
-        has an end, as a signal just before a wait does not interrupt it. ``interrupted`` is called each time, as Python
-        drops what a signal's handler raises in a destructor, or in what runs after a fork.
+        has an end, as a signal just before a wait does not interrupt it.
         """
         ended = os.pidfd_open(self.pid)
         try:
-            while not interrupted() and not select.select([ended], [], [], POLL_S)[0]:
+            while not select.select([ended], [], [], POLL_S)[0]:
                 pass
         finally:
             os.close(ended)
-        if interrupted():
-            raise KeyboardInterrupt
         self._process.wait()
 
     def death(self) -> ServerDied:
@@ -173,26 +169,19 @@ class OwnServer(OwnProcess):
 
 
 def keep_serving(job: ServerJob, ready: Callable[[ServerProcess], None], died: Callable[[str], None]) -> None:
-    """Serve until a signal arrives, restarting the server once; raises ServerDied when it dies again.
+    """Serve until KeyboardInterrupt, restarting the server once; raises ServerDied when it dies again.
 
     ``ready`` is called after every start, ``died`` with one line after the first death. The second server keeps the
     first one's address.
     """
-    signals: list[int] = []
-
-    def interrupt(number: int, _: object) -> None:
-        signals.append(number)
-        raise KeyboardInterrupt
 
     def serve(job: ServerJob) -> tuple[str, ServerDied]:
         with OwnServer(job.wiring.transport, job) as server:
             server.wait_ready()
             ready(server)
-            server.wait_end(lambda: signals)
+            server.wait_end()
             return server.address, server.death()
 
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, interrupt)
     with suppress(KeyboardInterrupt):
         address, death = serve(job)
         died(f"{death}; it is started again, once")

@@ -7,8 +7,6 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from threading import Timer
 
@@ -57,29 +55,7 @@ def test_a_server_that_does_not_start_says_its_last_lines_and_where_its_log_is(t
     assert lines[-1] in log.read_text()
 
 
-@pytest.fixture
-def handlers() -> Iterator[None]:
-    """Give back the handlers of this process's signals."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
-def another_thread_receives_it() -> None:
-    """As a signal that comes just before the wait."""
-    Timer(0.3, lambda: signal.pthread_kill(threading.get_ident(), signal.SIGINT)).start()
-
-
-def what_it_raises_is_dropped() -> None:
-    """As in what runs after a fork."""
-    with suppress(KeyboardInterrupt):
-        signal.raise_signal(signal.SIGINT)
-
-
-@pytest.mark.usefixtures("handlers")
-@pytest.mark.parametrize("interrupt", [another_thread_receives_it, what_it_raises_is_dropped])
-def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same(interrupt: Callable[[], None]) -> None:
+def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same() -> None:
     late: list[int] = []
 
     def ready(server: ServerProcess) -> None:
@@ -89,7 +65,7 @@ def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same(interrupt: 
 
         guard.append(Timer(30, kill))
         guard[0].start()
-        interrupt()
+        Timer(0.3, lambda: signal.pthread_kill(threading.get_ident(), signal.SIGINT)).start()  # another thread gets it
 
     guard: list[Timer] = []
     died: list[str] = []
