@@ -11,7 +11,7 @@ import os
 import struct
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import partial
@@ -23,7 +23,18 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import ALL_GOALS, Accepted, ActionEvent, CancelResponse, Feedback, QoS, Rejected, Result
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.service import AT_ONCE, Caller, ClientEnd, ServiceEnd, Waits, appeared
+from s2a_bench.ros.messages import DEFAULT_VERSION
+from s2a_bench.ros.service import (
+    AT_ONCE,
+    READER_QOS,
+    Caller,
+    ClientEnd,
+    LogOnce,
+    ServiceEnd,
+    ServiceNode,
+    Waiter,
+    appeared,
+)
 
 CANCEL_GOAL = "action_msgs/srv/CancelGoal"
 STATUS_ARRAY = "action_msgs/msg/GoalStatusArray"
@@ -186,24 +197,21 @@ def _goal_info(goal_id: bytes, stamp_ns: int) -> Any:
 class ClientAction:
     """Events are taken on the consuming thread; sending and cancelling may happen on any."""
 
-    def __init__(
-        self,
-        type_name: str,
-        version: str,
-        services: tuple[ClientEnd, ClientEnd, ClientEnd],
-        feedback: Callable[[], Iterable[memoryview]],
-        topics: Iterable[Callable[[], int]],
-        waiter: Waits,
-    ) -> None:
-        """Call the services of goals, results and cancels; ``feedback`` takes what has arrived, `AT_ONCE` at most.
-
-        ``topics`` say whether the server's feedback and status are there.
-        """
+    def __init__(self, node: ServiceNode[Any, Any], name: str, type_name: str, version: str) -> None:
         self._type, self._version = type_name, version
-        self._goals, self._results, self._cancels = services
+        prefix, waiter = name + "/_action/", node.waiter()
+        # Readers are announced in order: a server that knows the reply readers below knows the feedback reader too.
+        feedback = node.subscription(prefix + "feedback", type_name + "_FeedbackMessage", READER_QOS, version, waiter)
+        status = node.subscription(prefix + "status", STATUS_ARRAY, STATUS_QOS)
+        """Not read: a goal's status comes with its result. ROS tools expect a client to subscribe."""
+        self._goals = node.client_end(prefix + "send_goal", type_name + "_SendGoal", version, waiter)
+        self._results = node.client_end(prefix + "get_result", type_name + "_GetResult", version, waiter)
+        self._cancels = node.client_end(prefix + "cancel_goal", CANCEL_GOAL, version, waiter)
         self._body_at = self._goals.body_at
-        self._present = *topics, *(service.matched for service in services)
-        self._feedback, self._waiter = feedback, waiter
+        services = self._goals, self._results, self._cancels
+        self._present = feedback.announced, status.announced, *(service.matched for service in services)
+        self._feedback, self._waiter = feedback.arrived, waiter
+        self.other_dds = self._goals.other_dds
         self._active: set[bytes] = set()
         self._ended: deque[tuple[bytes, memoryview]] = deque()
         """Results whose feedback is not all taken."""
@@ -215,9 +223,6 @@ class ClientAction:
 
     def server_present(self) -> bool:
         return all(present() for present in self._present)
-
-    def other_dds(self) -> str:
-        return ""
 
     def server_version(self) -> str | None:
         announced = self._goals.peer_type_hash()
@@ -306,6 +311,10 @@ class ClientAction:
         return self._results.unpack(packed).result
 
 
+def _version_of(service: ServiceEnd[Any], type_hash: str) -> str:
+    return ros.version_of(service.hashed_type, type_hash) or f"of type hash {type_hash[:100]}"
+
+
 class ServedGoal(Generic[Caller]):
     """One goal; its server does the work under a lock."""
 
@@ -327,10 +336,10 @@ class ServedGoal(Generic[Caller]):
     def other_version(self) -> str:
         """Compare the type hash that its client announces, where the middleware can tell which client it is."""
         service = self._server.send_goal
-        announced = self._server.announced(self._caller)
-        if announced in {"", ros.type_hash(service.request_type, self._server.version)}:
+        _, announced = service.client(self._caller)
+        if announced in {"", ros.type_hash(service.hashed_type, self._server.version)}:
             return ""
-        return ros.version_of(service.request_type, announced) or f"of type hash {announced}"
+        return _version_of(service, announced)
 
     def unpack(self) -> Any:
         return self._server.send_goal.unpack(self._packed).goal
@@ -340,24 +349,20 @@ class ServedAction(Generic[Caller]):
     """Goals are taken on the consuming thread; a service thread answers cancels and results, and expires them."""
 
     def __init__(
-        self,
-        name: str,
-        type_name: str,
-        result_timeout_s: float,
-        version: str,
-        services: tuple[ServiceEnd[Caller], ServiceEnd[Caller], ServiceEnd[Caller]],
-        senders: tuple[Callable[[bytearray], None], Callable[[bytearray], None]],
-        waiters: tuple[Waits, Waits],
+        self, node: ServiceNode[Caller, Any], name: str, type_name: str, result_timeout_s: float, version: str
     ) -> None:
-        """Serve the action ``/name`` with the services of goals, results and cancels, and start the service thread.
-
-        ``senders`` publish CDR as feedback and status; ``waiters`` wake for goals, and for the other two services.
-        """
+        """Serve the action ``/name`` and start the service thread."""
         self._name, self.version = name, version
-        self.send_goal, self._get_result, self._cancel = services
-        self._send_feedback, self._send_status = senders
-        self._goal_waiter, self._service_waiter = waiters
+        self._goal_waiter, self._service_waiter = node.waiter(), node.waiter()
         self._feedback_type = type_name + "_FeedbackMessage"
+        prefix, waiter = name + "/_action/", self._service_waiter
+        self._send_feedback = node.publisher(prefix + "feedback", self._feedback_type, FEEDBACK_QOS, version).send
+        self._send_status = node.publisher(prefix + "status", STATUS_ARRAY, STATUS_QOS).send
+        self._get_result = node.service_end(prefix + "get_result", type_name + "_GetResult", version, waiter)
+        self._cancel = node.service_end(prefix + "cancel_goal", CANCEL_GOAL, version, waiter)
+        goal_type = type_name + "_SendGoal"
+        self.send_goal = node.service_end(prefix + "send_goal", goal_type, version, self._goal_waiter, pictures=True)
+        self._once = LogOnce(_log)
         self._goals = Goals(int(result_timeout_s * 1e9))
         self._waiting: dict[bytes, list[Caller]] = {}
         """Goal -> the callers that wait for its result."""
@@ -397,18 +402,28 @@ class ServedAction(Generic[Caller]):
             self._answer(self._get_result, self._answer_result)
             with self._lock:
                 self._goals.expire(now_ns())
-            self._look_around()
+            for type_hash in self.send_goal.unreached():
+                self._once.warning(
+                    type_hash,
+                    "%s: a client waits in vain: it speaks llama_msgs %s, this server %s (--llama-msgs)",
+                    self._name,
+                    _version_of(self.send_goal, type_hash),
+                    self.version,
+                )
             self._service_waiter.wait_until(now_ns() + HOUSEKEEPING_NS)
 
-    def _understood(self, caller: Caller) -> bool:  # noqa: ARG002 - for middlewares that know
-        return True
-
-    def _look_around(self) -> None:
-        """Do what a middleware's class does twice a second."""
-
-    def announced(self, caller: Caller) -> str:  # noqa: ARG002 - for middlewares that know
-        """Return the type hash of goals that a client announces; "" where that is not known."""
-        return ""
+    def _understood(self, caller: Caller) -> bool:
+        """Log once that a client is there whose requests cannot be read, and which will hear nothing."""
+        other, _ = self.send_goal.client(caller)
+        if other:
+            self._once.warning(
+                other,
+                "%s: a client on %s waits in vain, as its services have another form on the wire: start it with "
+                "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or serve in a sourced ROS 2 of its RMW (--middleware rclpy)",
+                self._name,
+                other,
+            )
+        return not other
 
     def status(self, goal_id: bytes) -> Status:
         with self._lock:
@@ -505,3 +520,17 @@ class ServedAction(Generic[Caller]):
         self._cancel.respond(self._cancel.pack(response), caller)
         if chosen:
             self._publish_status()
+
+
+class ActionNode(ServiceNode[Caller, Waiter]):
+    """One node with services and actions."""
+
+    def action_client(self, name: str, type_name: str, version: str = DEFAULT_VERSION) -> ClientAction:
+        return ClientAction(self, name, type_name, version)
+
+    def action_server(
+        self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = ""
+    ) -> ServedAction[Caller]:
+        server = ServedAction(self, name, type_name, result_timeout_s, version or DEFAULT_VERSION)
+        self._servers.append(server)
+        return server

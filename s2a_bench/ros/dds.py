@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import ctypes as ct
 import types
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -241,13 +241,11 @@ class RawReader(_Endpoint):
 class DdsWaiter:
     """Waits for any of some readers on the calling thread, which is the fastest way that does not spin."""
 
-    def __init__(self, participant: DomainParticipant, readers: Sequence[RawReader]) -> None:
+    def __init__(self, participant: DomainParticipant) -> None:
         self._guard = GuardCondition(participant)
         self._conditions: list[ReadCondition] = []
         self._waitset = WaitSet(participant)
         self._waitset.attach(self._guard)
-        for reader in readers:
-            self.watch(reader)
         self.interrupted = False
 
     def watch(self, reader: RawReader) -> None:

@@ -19,7 +19,7 @@ from cyclonedds.domain import DomainParticipant
 
 from s2a_bench.clock import now_ns
 from s2a_bench.ros import SERVICE_QOS, QoS
-from s2a_bench.ros.dds import RawReader, RawWriter, dds_qos, other_dds, user_data
+from s2a_bench.ros.dds import DdsWaiter, RawReader, RawWriter, dds_qos, other_dds, user_data
 from s2a_bench.ros.messages import deserialise, serialise, type_hash
 from s2a_bench.ros.service import READER_QOS
 
@@ -60,12 +60,14 @@ class _End:
         name: str,
         type_name: str,
         version: str,
+        waiter: DdsWaiter,
         role: tuple[str, str],
         qos: QoS | None = None,
     ) -> None:
         """Create both endpoints of the service ``/name``; without ``qos`` they have that of an action's."""
         own, self._peer_key = role
         self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
+        self.hashed_type = self.request_type
         self._version = version
         identity = endpoint_id(participant.get_guid().bytes[:12], next(_numbers))
         request, reply = ("rq" + name + "Request", self.request_type), ("rr" + name + "Reply", self.reply_type)
@@ -77,6 +79,7 @@ class _End:
         writer_qos = qos or (SERVICE_QOS if sent is request else REPLY_QOS)
         self.writer = RawWriter(participant, *sent, dds_qos(writer_qos, announced(sent[1])))
         self.reader = RawReader(participant, *received, dds_qos(qos or READER_QOS, announced(received[1])))
+        waiter.watch(self.reader)
         self.ends = self.writer, self.reader
         self._sent_wire, self._received_wire = sent[1] + "__wire", received[1] + "__wire"
 
@@ -102,9 +105,10 @@ class _End:
 class DdsServiceClient(_End):
     """Sends requests and finds the replies that are its own."""
 
-    def __init__(self, participant: DomainParticipant, name: str, type_name: str, version: str) -> None:
-        super().__init__(participant, name, type_name, version, ("clientid", "serviceid"))
-        self.hashed_type = self.request_type
+    def __init__(
+        self, participant: DomainParticipant, name: str, type_name: str, version: str, waiter: DdsWaiter
+    ) -> None:
+        super().__init__(participant, name, type_name, version, waiter, ("clientid", "serviceid"))
         self._guid = self.writer.entity.get_instance_handle() % 2**64
         self._numbers = count(1)
         self._pending: dict[int, bytes] = {}
@@ -131,9 +135,15 @@ class DdsServiceServer(_End):
     """Takes requests and sends replies to their clients."""
 
     def __init__(
-        self, participant: DomainParticipant, name: str, type_name: str, version: str, qos: QoS | None = None
+        self,
+        participant: DomainParticipant,
+        name: str,
+        type_name: str,
+        version: str,
+        waiter: DdsWaiter,
+        qos: QoS | None = None,
     ) -> None:
-        super().__init__(participant, name, type_name, version, ("serviceid", "clientid"), qos)
+        super().__init__(participant, name, type_name, version, waiter, ("serviceid", "clientid"), qos)
         self._reachable: set[int] = set()
         self._clients: dict[int, tuple[str, str]] = {}
 
@@ -149,6 +159,9 @@ class DdsServiceServer(_End):
 
     def drop(self, caller: Caller) -> None:
         """Nothing is kept of it."""
+
+    def unreached(self) -> tuple[str, ...]:
+        return ()
 
     def client(self, caller: Caller) -> tuple[str, str]:
         """Return a client's other DDS and the type hash it announces, "" where unknown; kept, as they never change."""

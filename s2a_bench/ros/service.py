@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import time
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator
 from threading import Thread
 from typing import Any, Final, Generic, Protocol, TypeVar
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import REQUEST_BYTES, QoS
+from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, Publisher, QoS, Subscription
+from s2a_bench.ros.messages import DEFAULT_VERSION
 
 WAIT_SLICE_NS: Final = 500_000_000
 """A blocked wait returns to Python this often, so that Ctrl-C acts."""
@@ -20,6 +23,8 @@ READER_QOS: Final = QoS(depth=0)
 """Our readers keep all, whatever ROS does: history is local, and a burst overruns ROS's default of 10."""
 MATCH_POLL_S: Final = 0.01
 """rclpy's own waiting looks four times a second."""
+WARNED_AT_MOST: Final = 100
+"""Kinds of a warning that are logged."""
 
 _log = logging.getLogger(__name__)
 Caller = TypeVar("Caller")
@@ -54,6 +59,8 @@ class End(Protocol):
     """What both sides of one service have in common."""
 
     request_type: str
+    hashed_type: str
+    """The type whose hash is announced."""
     body_at: int
     """Where bodies begin in the CDR."""
 
@@ -83,12 +90,17 @@ class ServiceEnd(End, Protocol[Caller]):
         """Let go of a request, which may have been answered."""
         ...
 
+    def client(self, caller: Caller, /) -> tuple[str, str]:
+        """Return a client's DDS, if replies cannot reach it, and the type hash it announces; "" where unknown."""
+        ...
+
+    def unreached(self) -> Iterable[str]:
+        """Return the type hashes of clients of other versions, whose requests do not arrive."""
+        ...
+
 
 class ClientEnd(End, Protocol):
     """The client's side of one service."""
-
-    hashed_type: str
-    """The type whose hash a server announces."""
 
     def call(self, packed: bytearray, key: bytes, /) -> None:
         """Send a request, to which ``key`` belongs: a goal's id, where it concerns one."""
@@ -104,16 +116,45 @@ class ClientEnd(End, Protocol):
         """Return the type hash that a server announces; empty without one."""
         ...
 
+    def other_dds(self) -> str:
+        """Return the DDS of a server whose services have another form, "" without one."""
+        ...
+
+
+class Source(Subscription, Protocol):
+    """A subscription without a thread that waits for it."""
+
+    def arrived(self) -> Iterable[memoryview]:
+        """Take what has arrived, `AT_ONCE` at most."""
+        ...
+
+    def announced(self) -> int:
+        """Count the publishers, those of other versions too."""
+        ...
+
+
+class LogOnce:
+    """Logs a warning once for each kind of it."""
+
+    def __init__(self, log: logging.Logger) -> None:
+        self._log = log
+        self._kinds: set[str] = set()
+
+    def warning(self, kind: str, message: str, *values: Any) -> None:
+        """Log the first message of a ``kind``, of `WARNED_AT_MOST` kinds."""
+        if kind not in self._kinds and len(self._kinds) < WARNED_AT_MOST:
+            self._kinds.add(kind)
+            self._log.warning(message, *values)
+
 
 class Services(Generic[Caller]):
     """The services of one node, answered by one thread."""
 
     def __init__(self, waiter: Waits) -> None:
         """Start the thread; ``waiter`` wakes it for requests."""
-        self._waiter = waiter
+        self.waiter = waiter
         self._offered: dict[str, tuple[ServiceEnd[Caller], Callable[[Any], Any]]] = {}
-        self._logged: dict[str, str] = {}
-        """Service -> what was logged of it last."""
+        self._once = LogOnce(_log)
         self._thread = Thread(target=self._serve, name="services", daemon=True)
         self._thread.start()
 
@@ -122,16 +163,16 @@ class Services(Generic[Caller]):
         self._offered = {**self._offered, name: (service, answer)}  # while the thread goes through the old ones
 
     def close(self) -> None:
-        self._waiter.interrupt()
+        self.waiter.interrupt()
         self._thread.join()
 
     def _serve(self) -> None:
-        while not self._waiter.interrupted:
+        while not self.waiter.interrupted:
             for name, (service, answer) in self._offered.items():
                 for packed, caller in service.arrived():
                     self._handle(name, service, answer, packed, caller)
                     service.drop(caller)
-            self._waiter.wait_until(now_ns() + WAIT_SLICE_NS)
+            self.waiter.wait_until(now_ns() + WAIT_SLICE_NS)
 
     def _handle(
         self, name: str, service: ServiceEnd[Caller], answer: Callable[[Any], Any], packed: memoryview, caller: Caller
@@ -144,10 +185,8 @@ class Services(Generic[Caller]):
             if service.reaches(caller):
                 service.respond(response, caller)
         except Exception as error:  # noqa: BLE001 - a bad request is no reason to stop
-            kind = type(error).__name__  # not its text, which a client can vary each time
-            if kind != self._logged.get(name):
-                self._logged[name] = kind
-                _log.warning("%s: dropped a request: %s", name, str(error)[:200])
+            kind = f"{name} {type(error).__name__}"  # not its text, which a client can vary each time
+            self._once.warning(kind, "%s: dropped a request: %s", name, str(error)[:200])
 
 
 class Calling:
@@ -173,3 +212,73 @@ class Calling:
                     return self._client.unpack(packed)
             if not self._waiter.wait_until(deadline_ns):
                 raise TransportError(silent)
+
+
+Waiter = TypeVar("Waiter", bound=Waits)
+
+
+class ServiceNode(ABC, Generic[Caller, Waiter]):
+    """One node whose services are built from a middleware's endpoints; each endpoint is announced when it is made."""
+
+    def __init__(self) -> None:
+        self._services: Services[Caller] | None = None
+        self._servers: list[Any] = []
+        self._closed = False
+        atexit.register(self.close)
+
+    @abstractmethod
+    def waiter(self) -> Waiter:
+        """Return what waits for the endpoints that are made with it."""
+
+    @abstractmethod
+    def publisher(self, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION) -> Publisher: ...
+
+    @abstractmethod
+    def subscription(
+        self, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION, waiter: Waiter | None = None
+    ) -> Source: ...
+
+    @abstractmethod
+    def service_end(
+        self,
+        name: str,
+        type_name: str,
+        version: str,
+        waiter: Waiter,
+        qos: QoS | None = None,
+        *,
+        pictures: bool = False,
+    ) -> ServiceEnd[Caller]:
+        """Make the server's side of ``/name``, without ``qos`` as an action's; requests may hold ``pictures``."""
+
+    @abstractmethod
+    def client_end(self, name: str, type_name: str, version: str, waiter: Waiter) -> ClientEnd: ...
+
+    @abstractmethod
+    def leave(self) -> None:
+        """Leave the domain, which tells peers at once."""
+
+    def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
+        """Create a service; the first starts the thread that answers all."""
+        if self._services is None:
+            self._requests = self.waiter()
+            self._services = Services(self._requests)
+        self._services.offer(name, self.service_end(name, type_name, DEFAULT_VERSION, self._requests, qos), answer)
+
+    def service_client(self, name: str, type_name: str) -> Calling:
+        waiter = self.waiter()
+        return Calling(name, self.client_end(name, type_name, DEFAULT_VERSION, waiter), waiter)
+
+    def close(self) -> None:
+        if not self._closed:
+            self._closed = True
+            atexit.unregister(self.close)
+            for server in (*self._servers, self._services):
+                if server is not None:
+                    server.close()
+            self.leave()
+
+    def check_open(self) -> None:
+        """Raise TransportError if the node has left."""
+        if self._closed:
+            raise TransportError("the middleware is closed")

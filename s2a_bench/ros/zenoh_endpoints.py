@@ -20,7 +20,8 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, QoS
 from s2a_bench.ros import zenoh_names as names
-from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, serialise
+from s2a_bench.ros.messages import CDR_HEADER, deserialise, serialise
+from s2a_bench.ros.service import LogOnce
 from s2a_bench.ros.zenoh_node import Bell, Node, SampleQueue, direct, give_way, refusals
 
 CACHED_AT_MOST: Final = 1000
@@ -36,7 +37,7 @@ _log = logging.getLogger(__name__)
 class ZenohPublisher:
     """Sends messages of one type to one topic; callable from any thread."""
 
-    def __init__(self, node: Node, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION) -> None:
+    def __init__(self, node: Node, topic: str, type_name: str, qos: QoS, version: str) -> None:
         """Declare the publisher of ``/topic``, then announce it."""
         self._node, self._topic, self._type_name, self._version = node, topic, type_name, version
         key = node.key(topic, type_name, version)
@@ -76,20 +77,12 @@ class ZenohPublisher:
 class ZenohSubscription:
     """Receives messages of one type from one topic, on the consuming thread."""
 
-    def __init__(
-        self,
-        node: Node,
-        topic: str,
-        type_name: str,
-        qos: QoS,
-        version: str = DEFAULT_VERSION,
-        bell: Bell | None = None,
-    ) -> None:
+    def __init__(self, node: Node, topic: str, type_name: str, qos: QoS, version: str, bell: Bell) -> None:
         """Declare the subscriber of ``/topic``, then announce it; ``bell`` is rung by what arrives."""
         self._node, self.topic, self._type_name, self._version = node, topic, type_name, version
         self._oldest_ns = round(qos.lifespan_s * 1e9)
-        self._warned = False
-        self._bell = bell or Bell()
+        self._once = LogOnce(_log)
+        self._bell = bell
         self._inbox: SampleQueue[Any] = SampleQueue(topic, self._bell, qos.depth)
         self.interrupt = self._bell.interrupt
         self._subscriber = self._declared(node.key(topic, type_name, version), qos)
@@ -127,9 +120,7 @@ class ZenohSubscription:
         try:
             _, source_ns, _ = names.attached(sample.attachment.to_bytes() if sample.attachment else b"")
         except TransportError as error:
-            if not self._warned:
-                self._warned = True
-                _log.warning("%s: dropped a message: %s", self.topic, error)
+            self._once.warning("", "%s: dropped a message: %s", self.topic, error)
             return False
         return not self._oldest_ns or time.time_ns() - source_ns <= self._oldest_ns
 
@@ -139,9 +130,9 @@ class ZenohSubscription:
     def unpack(self, packed: memoryview) -> Any:
         return deserialise(packed, self._type_name, self._version)
 
-    def announced(self) -> bool:
-        """Return whether the type has a publisher, even one of another version, which does not reach us."""
-        return any(True for _ in self._node.peers(names.PUBLISHER, self._seen.entity))
+    def announced(self) -> int:
+        """Count the publishers of the type, those of other versions too, which do not reach us."""
+        return sum(1 for _ in self._node.peers(names.PUBLISHER, self._seen.entity))
 
     def publishers(self) -> int:
         """Count the publishers that are announced under the topic's name, those of other types too."""
@@ -172,19 +163,19 @@ class ZenohServiceServer:
         type_name: str,
         version: str,
         bell: Bell,
-        qos: QoS = SERVICE_QOS,
-        most_bytes: int = SMALL_BYTES,
+        qos: QoS,
+        most_bytes: int,
     ) -> None:
         """Declare the queryable of ``/name``, then announce it; ``bell`` is rung by what arrives.
 
         Requests of ``most_bytes`` together may wait, with 0 as many as an inbox holds.
         """
-        self.type_name = type_name
+        self.hashed_type = type_name
         self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
-        self._name, self._version = name, version
+        self._node, self._name, self._version = node, name, version
         self._key = node.key(name, type_name, version)
         self._inbox: SampleQueue[zenoh.Query] = SampleQueue(name, bell, most_bytes=most_bytes)
-        self._warned = False
+        self._once = LogOnce(_log)
         held = ref(self._inbox)
 
         def put(query: zenoh.Query) -> None:
@@ -194,7 +185,7 @@ class ZenohServiceServer:
 
         with refusals(name):
             self._queryable = node.session.declare_queryable(self._key, direct(put), complete=True)
-        self.seen = node.announce(names.SERVICE, name, type_name, version, qos)
+        self._seen = node.announce(names.SERVICE, name, type_name, version, qos)
 
     def arrived(self) -> Iterator[tuple[memoryview, QueryOrigin]]:
         """Take what has arrived, a bounded number; drop queries that are not rmw_zenoh's and log the first."""
@@ -204,9 +195,7 @@ class ZenohServiceServer:
                 sequence, _, gid = names.attached(attachment.to_bytes() if attachment else b"")
             except TransportError as error:
                 query.drop()
-                if not self._warned:
-                    self._warned = True
-                    _log.warning("%s: dropped a request: %s", self._name, error)
+                self._once.warning("", "%s: dropped a request: %s", self._name, error)
             else:
                 yield memoryview(payload.to_bytes() if payload else b""), QueryOrigin(query, sequence, gid)
 
@@ -218,6 +207,13 @@ class ZenohServiceServer:
 
     def unpack(self, packed: memoryview) -> Any:
         return deserialise(packed, self.request_type, self._version)
+
+    def client(self, caller: QueryOrigin) -> tuple[str, str]:  # noqa: ARG002 - a query does not name its client
+        return "", ""
+
+    def unreached(self) -> Iterator[str]:
+        own = self._seen.entity
+        return (hashed for hashed in self._node.peers(names.CLIENT, own) if hashed != own.type_hash)
 
     def reaches(self, caller: QueryOrigin) -> bool:  # noqa: ARG002 - a query knows its way back
         """Return True: a query needs no discovery of its client."""
@@ -294,6 +290,9 @@ class ZenohServiceClient:
             with refusals(self._name):
                 return bool(self._querier.matching_status.matching)
         return bool(hashes)
+
+    def other_dds(self) -> str:
+        return ""
 
     def peer_type_hash(self) -> str:
         """Return the type hash that a server announces, ours rather than another; empty without one."""

@@ -27,7 +27,7 @@ from s2a_bench.ros import zenoh_names as names
 from s2a_bench.ros.messages import dds_type_name
 from s2a_bench.ros.remap import check_node_name
 from s2a_bench.ros.router import endpoint_of
-from s2a_bench.ros.service import AT_ONCE, WAIT_SLICE_NS
+from s2a_bench.ros.service import AT_ONCE, WAIT_SLICE_NS, LogOnce
 
 PLACE: Final = re.compile(r"!?\s+at /\S+")
 MESSAGE_BYTES: Final = 128 << 20
@@ -234,7 +234,7 @@ class SampleQueue(Generic[Item]):
         self._name, self._bell, self._depth = name, bell, depth
         self._most = most_bytes or HELD_BYTES
         self._items: deque[tuple[Item, int]] = deque()
-        self._bytes, self._warned = 0, False
+        self._bytes, self._once = 0, LogOnce(_log)
 
     def put(self, item: Item, size: int) -> bool:
         """Add an item and wake the waiting thread; False if the queue is full."""
@@ -242,14 +242,13 @@ class SampleQueue(Generic[Item]):
         with self._bell.condition:
             if self._depth and len(self._items) >= self._depth:
                 self._pop()
-            if full := self._bytes + size > self._most:
-                warned, self._warned = self._warned, True
-            else:
+            full = self._bytes + size > self._most
+            if not full:
                 self._items.append((item, size))
                 self._bytes += size
             self._bell.ring()
-        if full and not warned:
-            _log.warning("%s: messages are dropped: %d MiB wait to be taken", self._name, self._most >> 20)
+        if full:
+            self._once.warning("", "%s: messages are dropped: %d MiB wait to be taken", self._name, self._most >> 20)
         return not full
 
     def take(self) -> Item | None:

@@ -127,7 +127,8 @@ def test_a_node_is_listed_by_name_with_its_endpoints(dds_domain: int) -> None:
         named.action_server(NAME, llama.GENERATE_RESPONSE)
         participant = listening._participant  # type: ignore[attr-defined]
         reader = RawReader(participant, DISCOVERY, PARTICIPANT_ENTITIES, dds_qos(QoS(0, latched=True), ""))
-        waiter = DdsWaiter(participant, [reader])
+        waiter = DdsWaiter(participant)
+        waiter.watch(reader)
         deadline = now_ns() + 20_000_000_000
         nodes: dict[str, Any] = {}
         while not (node := nodes.get("llama_node")) or len(node.writer_gid_seq) < 6:

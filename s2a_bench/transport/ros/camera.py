@@ -17,7 +17,7 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_STAMP_AGE_MS, STALE_FRAMES
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.service import appeared
+from s2a_bench.ros.service import LogOnce, appeared
 from s2a_bench.trace import RESIDUAL, Mark, Trace
 from s2a_bench.transport.limits import LIMITS, Limits, check_pixels
 from s2a_bench.transport.pictures import bgr_of, decoded, encoded, rgb_of
@@ -129,8 +129,9 @@ class CameraCache:
         self._count = 0
         self._unused = ""
         """Why the last frame cannot be used."""
-        self._silent = self._logged = False
-        """Whether a request has waited for the first frame in vain, and whether the log has that there is no camera."""
+        self._silent = False
+        """Whether a request has waited for the first frame in vain."""
+        self._once = LogOnce(_log)
         self._lock = Lock()
         self._stopped = False
 
@@ -187,10 +188,11 @@ class CameraCache:
         if self._newest is None and (silence := self.silence()):
             raise RequestFailed(f"no picture: {silence}")
         self._silent = False
-        if self._newest is None and not self._logged:
-            self._logged = True
+        if self._newest is None:
             topics = " or ".join(camera.topic for camera in self._cameras)
-            _log.warning("no camera: no publisher on %s; requests without a picture are answered from text", topics)
+            self._once.warning(
+                "", "no camera: no publisher on %s; requests without a picture are answered from text", topics
+            )
         return self._newest
 
     def silence(self) -> str:

@@ -17,6 +17,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.diagnostics import ARRAY, DIAGNOSTICS_QOS, Level, PartHealth, Rosout, diagnostic_array
 from s2a_bench.ros.diagnostics import TOPIC as DIAGNOSTICS
 from s2a_bench.ros.parameters import SERVICE, Parameter, Parameters, of_options
+from s2a_bench.ros.service import LogOnce
 from s2a_bench.transport import SERVER, SERVING, Wiring
 from s2a_bench.transport.limits import SET
 from s2a_bench.transport.ros.joining import domain_of, namespace_of
@@ -44,15 +45,13 @@ class Activity:
         self._waiting, self._limit, self._silent_s = waiting, limit, silent_s
         self.requests = self.tokens = self.failures = 0
         self._before = (now_ns(), 0, 0, 0, 0)
-        self._logged = ""
+        self._once = LogOnce(_log)
 
     def failed(self, error: str, *, logged: bool = False) -> None:
-        """Count a failure; log it unless it is ``logged`` already or differs from the last in numbers only."""
+        """Count a failure; log it unless it is ``logged`` already or differs from another in numbers only."""
         self.failures += 1
-        kind = NUMBER.sub("", error)
-        if not logged and kind != self._logged:
-            self._logged = kind
-            _log.warning("a request failed: %s", error)
+        if not logged:
+            self._once.warning(NUMBER.sub("", error), "a request failed: %s", error)
 
     def findings(
         self, frames: int, frame_ns: int | None, silence: Callable[[], str], oldest_s: float
