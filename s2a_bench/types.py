@@ -42,6 +42,15 @@ Sampling: TypeAlias = "tuple[tuple[str, float], ...]"
 
 
 @dataclass(frozen=True, slots=True)
+class Timing:
+    """Duration of one skill in seconds, and its limits: 0 < least <= nominal <= most (T_min, T_nom, T_max)."""
+
+    nominal_s: float
+    least_s: float
+    most_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Request:
     """One request to a model: a prompt about zero or more pictures and the robot's state.
 

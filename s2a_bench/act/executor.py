@@ -35,7 +35,7 @@ from s2a_bench.act.events import (
 from s2a_bench.act.record import Outcome, Record, RobotCommand, SkillRun, What
 from s2a_bench.clock import Clock
 from s2a_bench.plan import Gap
-from s2a_bench.policy import PlanShape, Policy, Start, Timing
+from s2a_bench.policy import PlanShape, Policy, Start
 
 SILENCE_S: Final = 60.0
 """Longest time without a token before the stream counts as broken."""
@@ -102,9 +102,7 @@ class Executor:
                 self._stepper.token(self._policy_time_s(at_ns))
             case SkillArrived(at_ns, call) if self._open and not self._whole:
                 record.arrivals.append((at_ns, call))
-                times = call.skill.durations
-                timing = Timing(times.nominal_s, times.least_s, times.most_s)
-                self._stepper.fragment(self._policy_time_s(at_ns), timing)
+                self._stepper.fragment(self._policy_time_s(at_ns), call.skill.durations)
             case SkillArrived() if self._open:
                 record.extra += 1
             case StreamEnded(at_ns):

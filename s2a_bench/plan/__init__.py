@@ -8,7 +8,7 @@ from s2a_bench.plan.formats import Cost, Format, Tokenize, paper_format, prompt
 from s2a_bench.plan.grammar import grammar
 from s2a_bench.plan.parser import BadLine, Event, Parser, Problem, SkillParsed
 from s2a_bench.plan.skill_file import SKILL_SETS, load_skills, parse_skills
-from s2a_bench.plan.skillset import Argument, Call, Durations, Gap, Skill, SkillSet, Value
+from s2a_bench.plan.skillset import Argument, Call, Gap, Skill, SkillSet, Value
 
 __all__ = [
     "GRANULARITIES",
@@ -17,7 +17,6 @@ __all__ = [
     "BadLine",
     "Call",
     "Cost",
-    "Durations",
     "Event",
     "Format",
     "Gap",

@@ -11,9 +11,10 @@ from typing import Annotated, Any, Final
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from s2a_bench.errors import UsageError
-from s2a_bench.plan.skillset import Argument, Durations, Gap, Skill, SkillSet, Value
+from s2a_bench.plan.skillset import Argument, Gap, Skill, SkillSet, Value
 from s2a_bench.text import none_of, read_text
 from s2a_bench.toml_file import Line, TomlTable, parse
+from s2a_bench.types import Timing
 
 SKILL_SETS = ("household", "driving")
 """Names of the sets that come with the package, to use or to copy: ``s2a_bench/plan/skills/NAME.toml``."""
@@ -181,7 +182,7 @@ def _skill(table: _Skill, file: _SkillFile) -> Skill:
         _refuse_twins(argument.name for argument in arguments)
     except ValueError as error:
         raise ValueError(f"skill[{table.name}].arguments: {error}") from error
-    return Skill(table.name, arguments, Durations(least, nominal, most), table.gap or file.gap)
+    return Skill(table.name, arguments, Timing(nominal, least, most), table.gap or file.gap)
 
 
 def _argument(text: str, vocabularies: Mapping[str, tuple[Value, ...]]) -> Argument:

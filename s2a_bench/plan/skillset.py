@@ -7,21 +7,14 @@ from functools import cached_property
 from itertools import product
 from typing import Literal, TypeAlias, get_args
 
+from s2a_bench.types import Timing
+
 Gap: TypeAlias = Literal["stop", "coast", "hold", "cruise"]
 """Behaviour between skills: come to rest, no effort, keep the last command, keep the initial speed."""
 
 GAPS: tuple[Gap, ...] = get_args(Gap)
 
 Value: TypeAlias = str | int | float
-
-
-@dataclass(frozen=True, slots=True)
-class Durations:
-    """Durations of a skill in seconds: 0 < least <= nominal <= most (T_min, T_nom, T_max of the paper)."""
-
-    least_s: float
-    nominal_s: float
-    most_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +35,7 @@ class Skill:
 
     name: str
     arguments: tuple[Argument, ...]
-    durations: Durations
+    durations: Timing
     gap: Gap
 
     @property

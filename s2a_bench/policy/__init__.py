@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, ClassVar, Final, Protocol, TypeAlias
 
 from s2a_bench.registry import Registry
 from s2a_bench.stats.seeds import Verbatim
+from s2a_bench.types import Timing as Timing
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,15 +23,6 @@ if TYPE_CHECKING:
     from s2a_bench.policy.estimator import GapPrior
 
 Floats: TypeAlias = "NDArray[np.float64]"
-
-
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """Duration of one skill: as planned, and the limits within which it can be time-scaled."""
-
-    nominal_s: float
-    least_s: float
-    most_s: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from s2a_bench.act.events import Event, Requested, ScriptedInbox, SkillArrived, 
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record
 from s2a_bench.clock import VirtualClock
-from s2a_bench.plan import Call, Durations, Gap, Skill
+from s2a_bench.plan import Call, Gap, Skill
 from s2a_bench.policy import POLICIES, PlanShape, Policy, Timing, policy
 
 ZERO_NS = 7_000_000_000
@@ -26,7 +26,7 @@ def ns(seconds: float) -> int:
 
 
 def call(name: str = "go", nominal_s: float = 1.0, least: float = 0.8, most: float = 1.5, gap: Gap = "hold") -> Call:
-    return Call(Skill(name, (), Durations(least * nominal_s, nominal_s, most * nominal_s), gap), ())
+    return Call(Skill(name, (), Timing(nominal_s, least * nominal_s, most * nominal_s), gap), ())
 
 
 def script(token_s: Sequence[float], arrivals: Sequence[tuple[float, Call]], end_s: float | None = None) -> list[Event]:

@@ -11,7 +11,6 @@ from s2a_bench.errors import UsageError
 from s2a_bench.plan import (
     Argument,
     Cost,
-    Durations,
     Parser,
     Skill,
     SkillParsed,
@@ -21,6 +20,7 @@ from s2a_bench.plan import (
     grammar,
     paper_format,
 )
+from s2a_bench.types import Timing
 from tests.plan.gbnf import Gbnf
 
 NAME = st.text("abcgop_ü鍋0", min_size=1, max_size=6).filter(str.isidentifier)
@@ -40,7 +40,7 @@ def skill_sets(draw: st.DrawFn) -> SkillSet:
     skills = []
     for name, keys in signatures.items():
         arguments = tuple(Argument(f"a{at}", key, vocabularies[key]) for at, key in enumerate(keys))
-        skills.append(Skill(name, arguments, Durations(1, 2, 3), "hold"))
+        skills.append(Skill(name, arguments, Timing(2, 1, 3), "hold"))
     return SkillSet("any", "planner", "hold", tuple(skills))
 
 

@@ -3,7 +3,8 @@ from pathlib import Path
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.plan import SKILL_SETS, Durations, load_skills, parse_skills
+from s2a_bench.plan import SKILL_SETS, load_skills, parse_skills
+from s2a_bench.types import Timing
 
 ARM = """
 name = "arm"
@@ -31,8 +32,8 @@ def test_a_skill_has_what_the_file_says() -> None:
     assert (skills.name, skills.role, skills.gap) == ("arm", "planner", "hold")
     assert lift.signature == "lift(thing, by: height, onto: thing)"
     assert lift.arguments[1].values == (0.1, 0.2, 0.3)
-    assert lift.durations == Durations(1.6, 2.0, 3.0)  # the defaults are .8 and 1.5 times the nominal
-    assert home.durations == Durations(1.0, 1.5, 1.5)
+    assert lift.durations == Timing(2.0, 1.6, 3.0)  # the defaults are .8 and 1.5 times the nominal
+    assert home.durations == Timing(1.5, 1.0, 1.5)
     assert (lift.gap, home.gap) == ("hold", "stop")
 
 
@@ -59,7 +60,7 @@ def test_what_is_just_allowed_is_read() -> None:
     with pytest.raises(UsageError, match="1025 calls are possible, at most 1024"):
         parse_skills(many.replace("102.3", "102.4"), "arm.toml")
     steady = ARM.replace("t_min_s = 1\n", "t_min_s = 1.5\n")
-    assert parse_skills(steady, "arm.toml").skills[1].durations == Durations(1.5, 1.5, 1.5)
+    assert parse_skills(steady, "arm.toml").skills[1].durations == Timing(1.5, 1.5, 1.5)
 
 
 def test_whole_numbers_stay_whole() -> None:

@@ -26,7 +26,7 @@ from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
 from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt, prepare_requests
 from s2a_bench.harness.timelines.policies import prepare as prepare_policies
 from s2a_bench.plan import Parser
-from s2a_bench.policy import Plans, PlanShape, Timing
+from s2a_bench.policy import Plans, PlanShape
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.scenario import Simulator, simulator
 from s2a_bench.scenario.ccrb.render import RoadSource
@@ -91,8 +91,7 @@ def _request_plan(config: CcrbConfig, ask: PlanPrompt, link: ModelLink, prior: G
         return (np.array(at_ns, dtype=np.float64)[:, np.newaxis] - requested_ns) / 1e9
 
     rows = np.ones((ask.n_skills, 1))
-    expected = Timing(times.nominal_s, times.least_s, times.most_s)
-    shape = PlanShape(ask.n_skills, ask.tokens_per_skill, expected)
+    shape = PlanShape(ask.n_skills, ask.tokens_per_skill, times)
     plans = Plans(
         column(came_ns),
         times.nominal_s * rows,

@@ -28,7 +28,6 @@ from s2a_bench.harness.timelines.config import PlanSetting, settings
 from s2a_bench.harness.timelines.policies import draw, learn
 from s2a_bench.harness.timelines.rows import skill_rows, to_ns, token_rows
 from s2a_bench.machine import environment
-from s2a_bench.plan.skillset import Durations
 from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.provenance import Origins
 from s2a_bench.scenario import Simulator, simulator
@@ -40,6 +39,7 @@ from s2a_bench.scenario.ccrb.ttc import ttc_aware
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.schema import Table
+from s2a_bench.types import Timing
 
 if TYPE_CHECKING:
     from s2a_bench.progress import Progress
@@ -80,7 +80,7 @@ def complete(
     return Prepared(setting, request_id, plans, schedules, late)
 
 
-def _with_lane_change(plans: Plans, lane: Durations) -> Plans:
+def _with_lane_change(plans: Plans, lane: Timing) -> Plans:
     changed: dict[str, Any] = {name: np.array(getattr(plans, name)) for name in ("nominal_s", "least_s", "most_s")}
     for name, value in changed.items():
         value[-1] = getattr(lane, name)

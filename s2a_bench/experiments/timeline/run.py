@@ -23,7 +23,7 @@ from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, sett
 from s2a_bench.harness.timelines.policies import Following, Knowledge, draw, finite, learn, plans_of
 from s2a_bench.harness.timelines.rows import KEPT_PLANS, skill_rows, token_rows
 from s2a_bench.machine import environment
-from s2a_bench.plan import Call, Durations, Skill
+from s2a_bench.plan import Call, Skill
 from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.progress import Progress, watching
@@ -31,6 +31,7 @@ from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SKILLS, TOKENS, TokenRow
 from s2a_bench.store.run import RunWriter, read_run
+from s2a_bench.types import Timing
 
 if TYPE_CHECKING:
     from s2a_bench.policy import Floats
@@ -234,8 +235,8 @@ def _play(token_s: Floats, plans: Plans, tokens_per_skill: int, executors: SideB
     clock = SystemClock()
     requested_ns = clock.now_ns()
     executors.send(Requested(requested_ns))
-    durations = zip(plans.least_s[:, 0], plans.nominal_s[:, 0], plans.most_s[:, 0], strict=True)
-    skills = (Durations(*map(float, each)) for each in durations)
+    durations = zip(plans.nominal_s[:, 0], plans.least_s[:, 0], plans.most_s[:, 0], strict=True)
+    skills = (Timing(*map(float, each)) for each in durations)
     calls = (Call(Skill(f"skill{number}", (), each, "hold"), ()) for number, each in enumerate(skills, start=1))
     for place, due_s in enumerate(token_s, start=1):
         clock.sleep_until_ns(requested_ns + round(float(due_s) * 1e9))

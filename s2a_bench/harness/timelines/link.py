@@ -20,7 +20,7 @@ from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, requ
 from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.inference import need_engine
 from s2a_bench.machine.tuning import limit_threads
-from s2a_bench.plan import Durations, Format, SkillSet, choose_format, grammar, paper_format, prompt
+from s2a_bench.plan import Format, SkillSet, choose_format, grammar, paper_format, prompt
 from s2a_bench.policy import PlanShape, Timing
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.progress import Progress
@@ -90,7 +90,7 @@ def skills_lasting(config: TimelineConfig, t_nom_s: float | None) -> SkillSet:
     """Return the skill set; ``t_nom_s`` replaces the duration of every skill."""
     if t_nom_s is None:
         return config.skill_set
-    times = Durations(config.t_min * t_nom_s, t_nom_s, config.t_max * t_nom_s)
+    times = Timing(t_nom_s, config.t_min * t_nom_s, config.t_max * t_nom_s)
     skills = tuple(replace(skill, durations=times) for skill in config.skill_set.skills)
     return replace(config.skill_set, skills=skills)
 

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Final
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, one_of, option
 from s2a_bench.plan import Skill, load_skills
-from s2a_bench.plan.skillset import GAPS, Durations, Gap
+from s2a_bench.plan.skillset import GAPS, Gap
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import (
     EGO_LEAST_MPS2,
@@ -20,6 +20,7 @@ from s2a_bench.scenario.ccrb.cars import (
     start_deadline,
 )
 from s2a_bench.scenario.ccrb.labels import law
+from s2a_bench.types import Timing
 
 SKILL_SET: Final = "driving"
 
@@ -53,14 +54,14 @@ class CcrbOptions(Options):
     lane_change: bool = option(False, "end the plan with a lane change; not along the lane")
 
     @cached_property
-    def durations(self) -> Durations:
+    def durations(self) -> Timing:
         """Return the durations of a set-point: the skill set's, scaled to T_nom if given."""
         durations = _skill("set_speed").durations
         factor = 1.0 if self.t_nom_s is None else self.t_nom_s / durations.nominal_s
-        return Durations(durations.least_s * factor, durations.nominal_s * factor, durations.most_s * factor)
+        return Timing(durations.nominal_s * factor, durations.least_s * factor, durations.most_s * factor)
 
     @cached_property
-    def lane_durations(self) -> Durations:
+    def lane_durations(self) -> Timing:
         return _skill("change_lane").durations
 
     @property
