@@ -71,21 +71,6 @@ class RequestPlan:
 
 
 @dataclass(frozen=True, slots=True)
-class ServersPlan:
-    """Settings of servers and clients."""
-
-    engine: EngineConfig
-    """Of all cells; a cell's name may change some of its options."""
-    grammar: bool
-    """Whether answers obey a grammar."""
-    tuned: bool
-    """Whether this process and the servers keep large blocks of memory for the next picture."""
-    timeout_s: float
-    deadline_s: float
-    max_tokens: int
-
-
-@dataclass(frozen=True, slots=True)
 class RunPlan:
     """One run of requests."""
 
@@ -93,7 +78,12 @@ class RunPlan:
     blocks: BlocksPlan
     feed: FeedPlan
     request: RequestPlan
-    servers: ServersPlan
+    engine: EngineConfig
+    """Of all cells; a cell's name may change some of its options."""
+    tuned: bool
+    """Whether this process and the servers keep large blocks of memory for the next picture."""
+    timeout_s: float
+    deadline_s: float
     finds_model: bool
     """Whether the model's files are yet to be found."""
     sample_resources_hz: float
@@ -136,14 +126,10 @@ def resolve(config: RequestsConfig) -> RunPlan:
         request=RequestPlan(
             config.sent_prompt, config.grammar, max_pieces, seed, config.state, config.mode, size, stages
         ),
-        servers=ServersPlan(
-            engine,
-            bool(config.grammar),
-            config.tuned,
-            timeout_s=config.timeout_s,
-            deadline_s=config.deadline_s,
-            max_tokens=max_pieces,
-        ),
+        engine=engine,
+        tuned=config.tuned,
+        timeout_s=config.timeout_s,
+        deadline_s=config.deadline_s,
         finds_model=config.reads_model and engine.kind.needs_model,
         sample_resources_hz=config.sample_resources_hz,
         record=config.record,

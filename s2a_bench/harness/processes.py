@@ -24,7 +24,7 @@ from s2a_bench.errors import COMPILE_AGAIN, SETUP_AGAIN, EngineError, PortInUse,
 from s2a_bench.harness import llama_wheel
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.models import ModelFiles, load_headers, sha256
+from s2a_bench.inference.models import load_headers, sha256
 from s2a_bench.machine.tuning import start_child
 from s2a_bench.transport import Program
 
@@ -158,7 +158,7 @@ class OwnProcess(ServerProcess):
             kind = getattr(errors, answer["kind"], EngineError)
             raise kind(answer["error"])
         self.address = answer.pop("address")
-        self.facts = answer
+        self.facts |= answer
 
 
 class OwnServer(OwnProcess):
@@ -219,23 +219,19 @@ class LlamaServerProcess(ServerProcess):
     _speaks_json = False
     _cure = COMPILE_AGAIN
 
-    def __init__(self, program: Program, engine: EngineConfig, log: Path, *, has_grammar: bool) -> None:
-        """Start the program on its port, or any free one for 0.
-
-        Dummy weights end at random: without a grammar they generate up to the token limit, as in the llama engine.
-        """
+    def __init__(self, program: Program, engine: EngineConfig, log: Path, *, ignore_end: bool) -> None:
+        """Start the program on its port, or any free one for 0."""
         port = _free_port(program.port)
         command = [str(program.path.absolute()), *llama_flags(engine), "--mmproj", str(engine.mmproj)]
         command += ["--host", "127.0.0.1", "--port", str(port), "--ctx-size", str(engine.context), "--parallel", "1"]
         self._on_gpu = engine.gpu_layers != 0
         if not self._on_gpu:
             command.append("--no-mmproj-offload")
-        files = load_headers(engine)
-        if files.dummy and not has_grammar:
+        if ignore_end:
             command.append("--ignore-eos")
         super().__init__("llama-server", command, log)
         self.address = f"http://127.0.0.1:{port}"
-        self.facts = {"command": command, "engine": {"engine": "llama-server", **_described(files)}}
+        self.facts = {"command": command}
 
     def wait_ready(self) -> None:
         clock = SystemClock()
@@ -260,16 +256,10 @@ class WheelServer(OwnProcess):
 
     _cure = COMPILE_AGAIN
 
-    def __init__(self, program: Program, engine: EngineConfig, log: Path, *, has_grammar: bool) -> None:
-        files = load_headers(engine)
-        job = llama_wheel.server_settings(engine, program.port, ignore_end=files.dummy and not has_grammar)
+    def __init__(self, program: Program, engine: EngineConfig, log: Path, *, ignore_end: bool) -> None:
+        job = llama_wheel.server_settings(engine, program.port, ignore_end=ignore_end)
         super().__init__("llama-server", llama_wheel.__name__, json.dumps(job), log)
-        self._files, self._job = files, job
-
-    def wait_ready(self) -> None:
-        super().wait_ready()
-        self.facts["told"] = self._job
-        self.facts["engine"] = {"engine": "llama-server", **_described(self._files)}
+        self.facts = {"told": job}
 
 
 PROGRAMS: dict[str, Callable[..., ServerProcess]] = {
@@ -279,8 +269,15 @@ PROGRAMS: dict[str, Callable[..., ServerProcess]] = {
 """Kind of a transport's `Program` -> how it is started."""
 
 
-def _described(files: ModelFiles) -> dict[str, Any]:
-    return {
+def start_program(program: Program, engine: EngineConfig, log: Path, *, has_grammar: bool) -> ServerProcess:
+    """Start another server on the model files of ``engine``.
+
+    Dummy weights end at random: without a grammar they generate up to the token limit, as in the llama engine.
+    """
+    files = load_headers(engine)
+    process = PROGRAMS[program.kind](program, engine, log, ignore_end=files.dummy and not has_grammar)
+    process.facts["engine"] = {
+        "engine": "llama-server",
         "name": str(files.model.fields.get("general.name", "")),
         "model": str(files.model.path),
         "mmproj": str(files.mmproj.path),
@@ -288,6 +285,7 @@ def _described(files: ModelFiles) -> dict[str, Any]:
         "mmproj_sha256": sha256(files.mmproj.path),
         "dummy": files.dummy,
     }
+    return process
 
 
 def _free_port(wanted: int) -> int:

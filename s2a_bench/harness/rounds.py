@@ -93,8 +93,8 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
     """
     limit_threads()
     tuning = {
-        "dds": "tuned" if plan.servers.tuned else "default",
-        "malloc_keeps_large_blocks": plan.servers.tuned and keep_large_blocks(),
+        "dds": "tuned" if plan.tuned else "default",
+        "malloc_keeps_large_blocks": plan.tuned and keep_large_blocks(),
         "process": is_allowed(),
     }
     with ExitStack() as stack:
@@ -107,8 +107,7 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
             writer.append(table, [])
         progress.opened(writer.path)
         if plan.finds_model and extras.installed("gguf"):  # without gguf no file is read
-            engine = on_files(plan.servers.engine, progress)
-            plan = replace(plan, servers=replace(plan.servers, engine=engine))
+            plan = replace(plan, engine=on_files(plan.engine, progress))
         guard = SampleGuard({cell.name: cell.options.against_loss for cell in plan.cells})
         run = _Run(task, plan, sources, writer, progress, guard)
         if plan.record is not None:
@@ -174,7 +173,7 @@ class _Run:
 
     def _launch(self, number: int, stack: ExitStack) -> None:
         writer = self.writer
-        servers = ServerSet(self.plan.cells, self.plan.servers, stack, writer.path, number)
+        servers = ServerSet(self.plan, stack, writer.path, number)
         if servers.count:
             self.progress.stage(f"starting {servers.count} server{'s' if servers.count > 1 else ''}")
         facts = servers.start()

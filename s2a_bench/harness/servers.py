@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +12,8 @@ from threading import Thread
 from typing import Any
 
 from s2a_bench.errors import ServerDied
-from s2a_bench.harness.plan import ServersPlan
-from s2a_bench.harness.processes import PROGRAMS, OwnServer, ServerProcess
+from s2a_bench.harness.plan import RunPlan
+from s2a_bench.harness.processes import OwnServer, ServerProcess, start_program
 from s2a_bench.harness.serving import ServerJob, engine_handler
 from s2a_bench.harness.session import Measured
 from s2a_bench.inference import Engine, EngineConfig, open_engine
@@ -50,11 +50,9 @@ class _Running:
 class ServerSet:
     """The servers of a run; cells whose server would get the same settings share one."""
 
-    def __init__(
-        self, cells: Sequence[Pipeline], plan: ServersPlan, stack: ExitStack, folder: Path, launch: int = 0
-    ) -> None:
+    def __init__(self, plan: RunPlan, stack: ExitStack, folder: Path, launch: int = 0) -> None:
         """Prepare; ``stack`` stops the servers. The names of servers of a later launch than 0 contain its number."""
-        self._cells = cells
+        self._cells = plan.cells
         self._plan = plan
         self._suffix = f"-launch-{launch + 1}" if launch else ""
         self._stack = stack
@@ -96,7 +94,7 @@ class ServerSet:
             return _Running(name, self._serve_in_process(self._wiring(pipeline, address), engine))
         log = self._folder / f"server-{name}.log"
         if program := pipeline.options.program:
-            process = PROGRAMS[program.kind](program, engine, log, has_grammar=plan.grammar)
+            process = start_program(program, engine, log, has_grammar=bool(plan.request.grammar))
         else:
             process = OwnServer(name, ServerJob(self._wiring(pipeline, address), engine, tuned=plan.tuned), log)
         return _Running(name, address, self._stack.enter_context(process))
@@ -117,7 +115,7 @@ class ServerSet:
             limits=RUN_LIMITS,
             timeout_s=plan.timeout_s,
             deadline_s=plan.deadline_s,
-            max_tokens=plan.max_tokens,
+            max_tokens=plan.request.max_pieces,
         )
 
     def cache_hits(self) -> Mapping[str, float]:

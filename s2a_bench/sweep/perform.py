@@ -94,11 +94,11 @@ class LocalWorkers(CellWorkers):
         self._pools: dict[bool, ProcessPoolExecutor] = {}
 
     def submit(self, cell: SweepCell, folder: Path) -> Future[Outcome]:
-        try:
-            return self._pool(cell.virtual).submit(perform, cell, folder, self._entry)
-        except BrokenProcessPool:  # an earlier cell broke it
-            del self._pools[cell.virtual]
-            return self._pool(cell.virtual).submit(perform, cell, folder, self._entry)
+        while True:
+            try:
+                return self._pool(cell.virtual).submit(perform, cell, folder, self._entry)
+            except BrokenProcessPool:  # an earlier cell broke it
+                del self._pools[cell.virtual]
 
     def collect(self, future: Future[Outcome], folder: Path) -> Outcome:  # noqa: ARG002 - the worker has written into it
         try:

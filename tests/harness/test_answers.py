@@ -39,7 +39,7 @@ def test_all_cells_answer_with_tokens_unless_told() -> None:
     assert config(engine="echo").answer == TOKENS
     assert config(engine="echo", settings={"answer": "actions"}).answer == ACTIONS
     acting = resolve(config(engine="echo", settings={"answer": "actions", "horizon": 9}))
-    assert (acting.request.max_pieces, acting.servers.max_tokens) == (9, 9)
+    assert acting.request.max_pieces == 9
     assert resolve(config(engine="echo", max_tokens=5)).request.max_pieces == 5
 
 
@@ -47,7 +47,7 @@ def test_all_cells_answer_with_tokens_unless_told() -> None:
 def test_one_that_carries_nothing_else_decides_for_all() -> None:
     chosen = config(engine="echo")
     assert chosen.answer == ACTIONS
-    assert resolve(chosen).servers.engine.answer == ACTIONS
+    assert resolve(chosen).engine.answer == ACTIONS
     assert chosen.to_manifest()["engine"]["answer"] == ACTIONS
     assert config("loopback", engine="echo").answer == TOKENS
     with pytest.raises(UsageError, match=r"^`answer`: http/as-deployed does not carry tokens; measure it in a run"):

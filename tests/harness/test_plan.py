@@ -39,7 +39,7 @@ def test_every_part_says_what_the_configuration_did() -> None:
     assert (plan.feed.size, plan.feed.seed, plan.feed.nonce, plan.feed.stream) == ((64, 48), 7, "again", False)
     assert (plan.request.max_pieces, plan.request.seed, plan.request.state) == (5, 7, 2)
     assert (plan.request.prompt, plan.request.size, plan.request.mode) == (config.prompt, "64x48", "request")
-    assert (plan.servers.timeout_s, plan.servers.max_tokens, plan.servers.grammar) == (9.0, 5, False)
+    assert (plan.timeout_s, plan.request.max_pieces, plan.request.grammar) == (9.0, 5, "")
     assert plan.finds_model
     assert (plan.record, plan.namespace) == (None, "/arm")
     assert plan.manifest["seeds"] == {"order": 7, "sampling": 7, "source": 7, "bootstrap": 7, "nonce": "again"}

@@ -56,7 +56,7 @@ class LlamaBench:
         self._program = program
         self._writer = writer
         self._depth = depth
-        engine = plan.servers.engine
+        engine = plan.engine
         self._flash_attention = engine.flash_attention
         self._command = [str(program), *llama_flags(engine), "--output", "json", "--repetitions", "1"]
         self._command += ["--n-prompt", "0", "--n-gen", str(plan.request.max_pieces)]

@@ -122,7 +122,7 @@ class ModelLink:
     def __post_init__(self) -> None:
         (self.session,) = self.launch.sessions
         self.cell, self.writer = self.session.cell, self.launch.writer
-        self.pace = self.rate = self.launch.plan.servers.engine.pace
+        self.pace = self.rate = self.launch.plan.engine.pace
         """Tokens/s: set, or of the first answer."""
         self._write_origin()
         self.writer.update(
