@@ -10,11 +10,12 @@ import re
 from collections.abc import Iterable
 from http import HTTPStatus
 from ipaddress import ip_address
-from typing import Final
+from typing import Any, Final
 
 from s2a_bench.options import option
-from s2a_bench.transport import SERVING
-from s2a_bench.transport.listening import ListeningOptions, has_key
+from s2a_bench.transport import SERVING, Handler, Wiring
+from s2a_bench.transport.listening import ListeningOptions, bound_socket, has_key
+from s2a_bench.transport.serving import Core
 
 LOCAL: Final = "localhost"
 HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]*\]|[^:\[\]]*)(?::[0-9]*)?")
@@ -62,3 +63,15 @@ class Access:
 
     def _has_key(self, value: str) -> bool:
         return has_key(value.encode(errors="replace"), self._scheme, self._key)
+
+
+class WebServer:
+    """A server that browsers can reach, on a socket that is bound before anything is promised."""
+
+    def __init__(self, wiring: Wiring[Any], handler: Handler, scheme: str, key_scheme: str) -> None:
+        """Bind ``host:port`` of ``wiring.address`` or what `address` was; `bound_socket` says what it raises."""
+        self._listener, key = bound_socket(wiring.address, scheme, wiring.options)
+        host, port = self._listener.getsockname()
+        self.address = f"{scheme}://{host}:{port}"
+        self._core = Core(handler, wiring.limits)
+        self._access = Access(wiring.options, host, key, key_scheme)

@@ -17,15 +17,13 @@ import numpy as np
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError
 from s2a_bench.transport import Handler, Wiring
-from s2a_bench.transport.access import Access
+from s2a_bench.transport.access import WebServer
 from s2a_bench.transport.connections import LINGER_S, Connections, Wire
 from s2a_bench.transport.http import native
 from s2a_bench.transport.http.chat import ChatExchange, Reads, of_json, of_picture
 from s2a_bench.transport.http.native import Refused
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.limits import Limits
-from s2a_bench.transport.listening import bound_socket
-from s2a_bench.transport.serving import Core
 from s2a_bench.types import Request
 
 PIECE: Final = 1 << 16
@@ -84,27 +82,18 @@ class Head:
         return length
 
 
-class FastServer:
-    """Answers the requests of each connection in turn; `bound_socket` says what it raises."""
+class FastServer(WebServer):
+    """Answers the requests of each connection in turn."""
 
     def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
-        listener, key = bound_socket(wiring.address, "http", wiring.options)
-        host, port = listener.getsockname()
-        self.address = f"http://{host}:{port}"
-        self._core = Core(handler, wiring.limits)
-        self._access = Access(wiring.options, host, key, native.SCHEME)
+        super().__init__(wiring, handler, "http", native.SCHEME)
         most = wiring.limits.connections
         full = Refused(HTTPStatus.SERVICE_UNAVAILABLE, f"{most} connections are open already", {"retry-after": "1"})
-        self._connections = Connections(listener, self._answer_all, most, full.answer)
+        connections = Connections(self._listener, self._answer_all, most, full.answer)
+        self.serve, self.stop = connections.serve, connections.stop
 
     def describe(self) -> dict[str, str | int]:
         return {"server": "a thread a connection", "http": "httptools", "version": httptools.__version__}
-
-    def serve(self) -> None:
-        self._connections.serve()
-
-    def stop(self) -> None:
-        self._connections.stop()
 
     def _answer_all(self, wire: Wire) -> None:
         """Answer the requests of a connection until one is refused, or the client closes it."""

@@ -21,14 +21,13 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, Field, StrictInt
 
 from s2a_bench.transport import Handler, Wiring
-from s2a_bench.transport.access import Access
+from s2a_bench.transport.access import WebServer
 from s2a_bench.transport.connections import LINGER_S
 from s2a_bench.transport.http import native
 from s2a_bench.transport.http.chat import ChatExchange, of_fields
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.http.protocol import Protocol
 from s2a_bench.transport.limits import Limits
-from s2a_bench.transport.listening import bound_socket
 from s2a_bench.transport.serving import Core, Disconnected
 from s2a_bench.types import Request
 
@@ -157,15 +156,12 @@ class _Server(uvicorn.Server):
         return nullcontext()
 
 
-class HttpServer:
-    """uvicorn on a socket that is bound first; `bound_socket` says what it raises."""
+class HttpServer(WebServer):
+    """uvicorn on a socket that is bound first."""
 
     def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
-        self._socket, key = bound_socket(wiring.address, "http", wiring.options)
-        host, port = self._socket.getsockname()
-        self.address = f"http://{host}:{port}"
-        core = Core(handler, wiring.limits)
-        app = application(core, documented=wiring.options.api_docs)
+        super().__init__(wiring, handler, "http", native.SCHEME)
+        app = application(self._core, documented=wiring.options.api_docs)
 
         async def ending(scope: Any, receive: Any, send: Any) -> None:
             with suppress(asyncio.CancelledError):  # uvicorn's, when it stops
@@ -174,7 +170,7 @@ class HttpServer:
         config = uvicorn.Config(
             ending,
             loop="uvloop",
-            http=partial(Protocol, core, Access(wiring.options, host, key, native.SCHEME)),  # type: ignore[arg-type]
+            http=partial(Protocol, self._core, self._access),  # type: ignore[arg-type]
             ws="none",
             log_level="warning",
             access_log=False,
@@ -188,7 +184,7 @@ class HttpServer:
         return {"server": "uvicorn", "version": uvicorn.__version__, "loop": "uvloop", "http": "httptools"}
 
     def serve(self) -> None:
-        self._server.run(sockets=[self._socket])
+        self._server.run(sockets=[self._listener])
 
     def stop(self) -> None:
         self._server.should_exit = True

@@ -47,13 +47,11 @@ class ShmServer:
         listener, self.address = listen(wiring.address)
         most = wiring.limits.connections
         self._connections = Connections(listener, self._answer_all, most, refusal(f"{most} links are open already"))
+        self.serve = self._connections.serve
         self._stopped = Event()
 
     def describe(self) -> dict[str, str | int]:
         return {"server": "shared memory (memfd), Unix socket"}
-
-    def serve(self) -> None:
-        self._connections.serve()
 
     def stop(self) -> None:
         """Stop listening, and end every link."""

@@ -15,44 +15,29 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import EngineError, S2AError
 from s2a_bench.facts import INFER_MS
 from s2a_bench.transport import Handler, Wiring, observed
-from s2a_bench.transport.access import Access
+from s2a_bench.transport.access import WebServer
 from s2a_bench.transport.connections import Connections, Wire
-from s2a_bench.transport.listening import bound_socket
-from s2a_bench.transport.serving import Core, Disconnected, Exchange, Queued
+from s2a_bench.transport.serving import Disconnected, Exchange, Queued
 from s2a_bench.transport.websocket import PREV_TOTAL_MS, WebsocketOptions, codec
 from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.transport.websocket.connection import PolicyConnection
 from s2a_bench.types import Action, Piece, Request
 
 
-class WebsocketServer:
-    """A server on a socket that is bound before anything is promised."""
+class WebsocketServer(WebServer):
+    """Answers the observations of each connection in turn."""
 
     def __init__(self, wiring: Wiring[WebsocketOptions], handler: Handler) -> None:
-        """Bind ``host:port`` of ``wiring.address`` or what `address` was, without it 127.0.0.1 and any port.
-
-        Raises PortInUse, and UsageError for a public address without a key or `no_auth`.
-        """
-        listener, key = bound_socket(wiring.address, "ws", wiring.options)
-        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, 1)  # a full server answers with a status
-        host, port = listener.getsockname()
-        self.address = f"ws://{host}:{port}"
-        self._core = Core(handler, wiring.limits)
-        self._access = Access(wiring.options, host, key, codec.SCHEME)
+        super().__init__(wiring, handler, "ws", codec.SCHEME)
+        self._listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, 1)  # a full server answers with a status
         self._metadata = packb(metadata_of(self._core.queued))
         most = wiring.limits.connections
         full = ServerProtocol().reject(HTTPStatus.SERVICE_UNAVAILABLE, f"{most} connections are open already\n")
-        self._connections = Connections(listener, self._handle, most, full.serialize())
+        connections = Connections(self._listener, self._handle, most, full.serialize())
+        self.serve, self.stop = connections.serve, connections.stop
 
     def describe(self) -> dict[str, str | int]:
         return {"server": "websockets", "version": websockets.version.version}
-
-    def serve(self) -> None:
-        self._connections.serve()
-
-    def stop(self) -> None:
-        """Finish the requests under way, for a second at most."""
-        self._connections.stop()
 
     def _handle(self, wire: Wire) -> None:
         PolicyConnection(wire, self._core, self._access, self._metadata, WebsocketExchange).serve()
