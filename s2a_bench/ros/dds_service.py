@@ -21,7 +21,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.ros import SERVICE_QOS, QoS
 from s2a_bench.ros.dds import DdsWaiter, RawReader, RawWriter, dds_qos, other_dds, user_data
 from s2a_bench.ros.messages import deserialise, serialise, type_hash
-from s2a_bench.ros.service import READER_QOS
+from s2a_bench.ros.service import READER_QOS, ServiceEnd
 
 HEADER = struct.Struct("<Qq")
 """guid of the client and number of its request, after the 4 bytes of CDR header."""
@@ -131,7 +131,7 @@ class DdsServiceClient(_End):
                 yield key, packed
 
 
-class DdsServiceServer(_End):
+class DdsServiceServer(_End, ServiceEnd[Caller]):
     """Takes requests and sends replies to their clients."""
 
     def __init__(
@@ -156,12 +156,6 @@ class DdsServiceServer(_End):
     def respond(self, packed: bytearray, caller: Caller) -> None:
         HEADER.pack_into(packed, HEADER_AT, *caller.header)
         self.writer.send(packed)
-
-    def drop(self, caller: Caller) -> None:
-        """Nothing is kept of it."""
-
-    def unreached(self) -> tuple[str, ...]:
-        return ()
 
     def client(self, caller: Caller) -> tuple[str, str]:
         """Return a client's other DDS and the type hash it announces, "" where unknown; kept, as they never change."""

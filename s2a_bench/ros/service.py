@@ -82,21 +82,21 @@ class ServiceEnd(End, Protocol[Caller]):
 
     def respond(self, packed: bytearray, caller: Caller, /) -> None: ...
 
-    def reaches(self, caller: Caller, /) -> bool:
+    def reaches(self, caller: Caller, /) -> bool:  # noqa: ARG002 - for ends whose replies need discovery
         """Wait, 100 ms at most, until replies reach the caller; False if it has left."""
-        ...
+        return True
 
     def drop(self, caller: Caller, /) -> None:
         """Let go of a request, which may have been answered."""
-        ...
+        return
 
-    def client(self, caller: Caller, /) -> tuple[str, str]:
+    def client(self, caller: Caller, /) -> tuple[str, str]:  # noqa: ARG002 - for ends that know
         """Return a client's DDS, if replies cannot reach it, and the type hash it announces; "" where unknown."""
-        ...
+        return "", ""
 
     def unreached(self) -> Iterable[str]:
         """Return the type hashes of clients of other versions, whose requests do not arrive."""
-        ...
+        return ()
 
 
 class ClientEnd(End, Protocol):
@@ -118,7 +118,7 @@ class ClientEnd(End, Protocol):
 
     def other_dds(self) -> str:
         """Return the DDS of a server whose services have another form, "" without one."""
-        ...
+        return ""
 
 
 class Source(Subscription, Protocol):

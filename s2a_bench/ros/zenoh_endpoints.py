@@ -21,7 +21,7 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, QoS
 from s2a_bench.ros import zenoh_names as names
 from s2a_bench.ros.messages import CDR_HEADER, deserialise, serialise
-from s2a_bench.ros.service import LogOnce
+from s2a_bench.ros.service import ClientEnd, LogOnce, ServiceEnd
 from s2a_bench.ros.zenoh_node import Bell, Node, SampleQueue, direct, give_way, refusals
 
 CACHED_AT_MOST: Final = 1000
@@ -151,7 +151,7 @@ class QueryOrigin:
     gid: bytes
 
 
-class ZenohServiceServer:
+class ZenohServiceServer(ServiceEnd[QueryOrigin]):
     """The server's side of one service."""
 
     body_at = CDR_HEADER
@@ -208,16 +208,9 @@ class ZenohServiceServer:
     def unpack(self, packed: memoryview) -> Any:
         return deserialise(packed, self.request_type, self._version)
 
-    def client(self, caller: QueryOrigin) -> tuple[str, str]:  # noqa: ARG002 - a query does not name its client
-        return "", ""
-
     def unreached(self) -> Iterator[str]:
         own = self._seen.entity
         return (hashed for hashed in self._node.peers(names.CLIENT, own) if hashed != own.type_hash)
-
-    def reaches(self, caller: QueryOrigin) -> bool:  # noqa: ARG002 - a query knows its way back
-        """Return True: a query needs no discovery of its client."""
-        return True
 
     def respond(self, packed: bytearray, caller: QueryOrigin) -> None:
         """Reply, and end the query."""
@@ -230,7 +223,7 @@ class ZenohServiceServer:
         give_way()
 
 
-class ZenohServiceClient:
+class ZenohServiceClient(ClientEnd):
     """The client's side of one service."""
 
     body_at = CDR_HEADER
@@ -290,9 +283,6 @@ class ZenohServiceClient:
             with refusals(self._name):
                 return bool(self._querier.matching_status.matching)
         return bool(hashes)
-
-    def other_dds(self) -> str:
-        return ""
 
     def peer_type_hash(self) -> str:
         """Return the type hash that a server announces, ours rather than another; empty without one."""
