@@ -36,7 +36,7 @@ def test_what_is_asked_for_is_written_and_nothing_else(timeline: Path, tmp_path:
     before = sorted(timeline.rglob("*"))
     done = called("report", timeline, "--latex", "tex", "--csv", "csv", "--markdown", "all.md", "--against", "paper")
     assert done.stdout.startswith("the paper's claims: ")
-    assert "24 undecided or not testable, 3 supported, 1 contradicted" in done.stdout
+    assert "25 undecided or not testable, 2 identity, 1 supported, 1 contradicted" in done.stdout
     assert {path.name for path in tmp_path.iterdir()} == {"tex", "csv", "all.md"}
     assert sorted(timeline.rglob("*")) == before
 

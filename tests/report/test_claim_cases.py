@@ -49,7 +49,9 @@ class Kit:
         rows = run.table(TIMELINES).copy()
         rows["mode"], rows["emulated"], rows["title"] = "live", False, "live http/as-deployed"
         origins = Origins(provenance).to_manifest()
-        manifest = {**run.manifest, "boards": [], "provenance": origins, "configuration": {}, **facts}
+        modelled = {"jitter", "t_nom_cv", "prompt_s"}
+        settings = {name: value for name, value in run.manifest["configuration"].items() if name not in modelled}
+        manifest = {**run.manifest, "boards": [], "provenance": origins, "configuration": settings, **facts}
         return replace(run, manifest=manifest, tables=run.tables | {"timelines": rows})
 
     def latency(self, *, ratio: float = 6.57, manifest: dict[str, Any] | None = None, **facts: Any) -> StoredRun:
@@ -124,12 +126,12 @@ NO_EVIDENCE: dict[str, tuple[Made, str, str]] = {
     "an Orin whose skills take 2 s": (
         lambda kit: kit.timeline(profiles=("jetson-agx-orin",), t_nom_s=(2.0,)),
         "AGX Orin:",
-        "T_nom: 2 s",
+        "settings: t_nom_s 2.0",
     ),
     "a 4080 whose skills take .1 s": (
         lambda kit: kit.timeline(profiles=("rtx-4080",), t_nom_s=(0.1,)),
         "RTX 4080:",
-        "T_nom: 0.1 s",
+        "settings: t_nom_s 0.1",
     ),
     "an Orin at one L": (
         lambda kit: kit.timeline(profiles=("jetson-agx-orin",), tokens_per_skill=(6,)),
@@ -310,7 +312,8 @@ EVIDENCE: dict[str, tuple[Made, dict[str, str]]] = {
             "AGX Orin: naive shows intermittent stalls": UNDECIDED,
             "RTX 4080: all policies run smoothly with no noticeable stalls": UNDECIDED,
             "More tokens a skill raise naive's stalls": SUPPORTED,
-            "Stream-to-act has no significant latency penalty: at the end": SUPPORTED,
+            "Stream-to-act has no significant latency penalty: at the end, S0 known": UNDECIDED,
+            "Stream-to-act has no significant latency penalty: at the end, S0 estimated": SUPPORTED,
         },
     ),
     "a jittered Orin's few plans": (
@@ -332,10 +335,6 @@ EVIDENCE: dict[str, tuple[Made, dict[str, str]]] = {
         {"AGX Orin: stream-to-act eliminates stalls": SUPPORTED},
     ),
     "table II's rate": (lambda kit: kit.rates(34.0, REAL, GPU), {"RTX 4080: 34.2 tokens/s": SUPPORTED}),
-    "another rate, maybe of another quantisation": (
-        lambda kit: kit.rates(50.0, REAL, GPU),
-        {"RTX 4080: 34.2 tokens/s": UNDECIDED},
-    ),
     "the paper's ratio": (
         lambda kit: kit.latency(),
         {
@@ -379,6 +378,51 @@ def test_evidence_decides_by_its_intervals(kit: Kit, case: str) -> None:
     make, wanted = EVIDENCE[case]
     found = verdicts(make(kit))
     assert {text: found[text].verdict for text in wanted} == wanted
+
+
+@pytest.mark.parametrize(
+    ("settings", "shown"),
+    [
+        ({"n_skills": (2,)}, "n_skills 2"),
+        ({"t_max": 20.0}, "t_max 20.0"),
+        ({"t_min": 0.5}, "t_min 0.5"),
+        ({"prompt_s": 9.0}, "prompt_s 9.0"),
+        ({"t_nom_cv": 0.5, "plans": 20}, "t_nom_cv 0.5"),
+        ({"jitter": "lognormal:cv=1.5", "t_max": 20.0, "plans": 20}, "t_max 20.0, jitter lognormal:cv=1.5"),
+    ],
+)
+def test_plans_with_other_settings_than_the_chosen_are_measured_and_not_judged(
+    kit: Kit, settings: dict[str, Any], shown: str
+) -> None:
+    found = verdicts(kit.timeline(profiles=("jetson-agx-orin",), **settings))
+    concerned = [each for text, each in found.items() if text.startswith("AGX Orin: ") or "fast and smooth" in text]
+    assert len(concerned) == 4
+    for each in concerned:
+        (finding,) = each.findings
+        assert (each.verdict, each.verdicts) == (UNDECIDED, set())
+        assert [need.text.partition(" (needs ")[0] for need in finding.needs if not need.met] == [f"settings: {shown}"]
+        assert finding.evidence.startswith("At your settings, no verdict: ")
+        assert " at L = 6" in finding.evidence or "no plan stalls" in finding.evidence
+
+
+@pytest.mark.parametrize(
+    ("quantisation", "rate", "verdict"),
+    [
+        ("Q4_K", 20.0, CONTRADICTED),
+        ("Q4_K", 50.0, UNDECIDED),
+        ("Q8_0", 20.0, UNDECIDED),
+        ("Q8_0", 50.0, UNDECIDED),
+        ("BF16", 20.0, UNDECIDED),
+        ("BF16", 50.0, CONTRADICTED),
+        ("BF16", 34.0, SUPPORTED),
+        ("mine", 20.0, UNDECIDED),
+    ],
+)
+def test_a_rate_that_no_quantisation_explains_contradicts(
+    kit: Kit, quantisation: str, rate: float, verdict: str
+) -> None:
+    run = kit.rates(rate, replace(REAL, quantisation=quantisation), GPU)
+    assert verdicts(run)["RTX 4080: 34.2 tokens/s"].verdict == verdict
 
 
 def stalling(run: StoredRun, every: int) -> StoredRun:

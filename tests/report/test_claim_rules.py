@@ -90,6 +90,20 @@ def test_values_lie_inside_each_or_together_or_one_of_them(
     assert Check("", unmeasured, 1, 2, "one").verdict(exact) == one
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "verdict"),
+    [
+        (0.56, 0.6, SUPPORTED),
+        (0.54, 0.6, UNDECIDED),
+        (0.51, 0.52, UNDECIDED),
+        (0.4, 0.46, UNDECIDED),
+        (0.4, 0.44, CONTRADICTED),
+    ],
+)
+def test_an_interval_within_the_margin_of_a_bound_decides_nothing(low: float, high: float, verdict: str) -> None:
+    assert Check("", unmeasured, 0.5, margin=0.05).verdict([Ratio(0.5, low, high)]) == verdict
+
+
 def test_more_than_a_half_is_not_a_half() -> None:
     more = Check("", unmeasured, nextafter(0.5, inf))
     assert more.verdict([Ratio(0.5, 0.5, 0.5)]) == CONTRADICTED
@@ -116,8 +130,10 @@ def test_more_than_a_half_is_not_a_half() -> None:
 def test_runs_that_can_tell_have_to_agree_and_no_other_counts(
     testable: list[str], others: list[str], verdict: str
 ) -> None:
-    findings = [ClaimFinding(verdict, str(place), (Met("board: it", True),)) for place, verdict in enumerate(testable)]
-    findings += [ClaimFinding(verdict, "", (Met("board: another (needs it)", False),)) for verdict in others]
+    findings = [
+        ClaimFinding(verdict, str(place), (Met("board: it", True),), "") for place, verdict in enumerate(testable)
+    ]
+    findings += [ClaimFinding(verdict, "", (Met("board: another (needs it)", False),), "") for verdict in others]
     for order in (findings, findings[::-1]):
         judged = Judged(CLAIMS[0], dict.fromkeys(order, ("run",)))
         assert judged.verdict == verdict

@@ -15,44 +15,67 @@ from s2a_bench.stats import Ratio
 from s2a_bench.writers.tables import TextTable
 
 if TYPE_CHECKING:
+    from s2a_bench.provenance import Provenance
     from s2a_bench.store.run import StoredRun
 
 SUPPORTED: Final = "supported"
 REPRODUCED: Final = "reproduced at the chosen point"
 """Supported where the paper names no settings: at one point, chosen so that the outcome occurs."""
+IDENTITY: Final = "identity"
+"""Supported, but by arithmetic: no run can contradict it."""
 CONTRADICTED: Final = "contradicted"
 UNDECIDED: Final = "undecided or not testable"
 
 
 @dataclass(frozen=True, slots=True)
 class RunPart:
-    """Cells of a run that are judged together, and their facts by the names of needs; ``about`` ends the evidence."""
+    """Cells of a run that are judged together, and their facts by the names of needs; ``about`` ends the evidence.
+
+    ``launches`` is 0 if nothing was launched: the part is computed.
+    """
 
     run: StoredRun
     facts: Mapping[str, Any]
+    origins: Sequence[Provenance]
+    launches: int = 0
     cells: Any = None
     about: str = ""
 
+    @property
+    def basis(self) -> str:
+        """Return the origins of the numbers, and the launches."""
+        launches = [f"{self.launches} launch{'es' * (self.launches > 1)}"] if self.launches else []
+        return "; ".join((*dict.fromkeys(origin.line for origin in self.origins), *launches))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(label for origin in self.origins for label in origin.labels))
+
 
 class Met(NamedTuple):
-    """A fact of a part beside its need, as text."""
+    """A fact of a part beside its need, as text; ``chosen`` if the need is a choice where the paper gives none."""
 
     text: str
     met: bool
+    chosen: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Need:
-    """A fact that a part must have to count: a text, and a test of its value."""
+    """A fact that a part must have to count: a text, and a test of its value.
+
+    A ``chosen`` one is a setting that the paper does not give: with another value a part is measured, and not judged.
+    """
 
     name: str
     wanted: str
     test: Callable[[Any], bool]
+    chosen: bool = field(default=False, kw_only=True)
 
     def of(self, facts: Mapping[str, Any]) -> Met:
         found = facts[self.name]
         met, shown = self.test(found), round(found, 3) if isinstance(found, float) else found
-        return Met(f"{self.name}: {shown}" + ("" if met else f" (needs {self.wanted})"), met)
+        return Met(f"{self.name}: {shown}" + ("" if met else f" (needs {self.wanted})"), met, self.chosen)
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +113,7 @@ class Check:
     """A measure, its sentence, and the bounds of its values; without bounds it is only stated.
 
     *each* value must be inside. *joint* values support or contradict only together. *one* value inside is enough.
+    Intervals nearer to a bound than ``margin`` decide nothing.
     """
 
     sentence: str
@@ -97,11 +121,15 @@ class Check:
     least: float = -inf
     most: float = inf
     of: Literal["each", "joint", "one"] = "each"
+    margin: float = 0.0
 
     def verdict(self, values: Sequence[Ratio]) -> str:
         """Judge measured values; one without an interval is undecided."""
         known = ((value.low, value.high) for value in values)
-        intervals = [(-inf, inf) if low is None or high is None else (low, high) for low, high in known]
+        intervals = [
+            (-inf, inf) if low is None or high is None else (low - self.margin, high + self.margin)
+            for low, high in known
+        ]
         verdicts = [within(low, high, self.least, self.most) for low, high in intervals]
         if self.of == "each":
             return all_of(verdicts)
@@ -137,11 +165,13 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class ClaimFinding:
-    """The verdict of one part of a run on a claim, the evidence, and the needs."""
+    """The verdict of one part of a run on a claim, the evidence with its basis and labels, and the needs."""
 
     verdict: str
     evidence: str
     needs: tuple[Met, ...]
+    basis: str
+    labels: tuple[str, ...] = ()
 
     @property
     def testable(self) -> bool:
@@ -166,11 +196,15 @@ class Judged:
         return next(iter(self.verdicts)) if len(self.verdicts) == 1 else UNDECIDED
 
     @property
-    def texts(self) -> list[tuple[str, tuple[Met, ...]]]:
-        """A text of each finding, with the names of the runs if there are several findings, and its needs."""
+    def texts(self) -> list[tuple[str, ClaimFinding]]:
+        """A text of each finding, with its verdict if there are several findings, and its basis with the runs."""
         several = len(self.findings) > 1
         return [
-            ((f"{', '.join(runs)}: {finding.verdict}. " if several else "") + finding.evidence, finding.needs)
+            (
+                (f"{finding.verdict.capitalize()}: " if several else "")
+                + f"{finding.evidence} Basis: {', '.join(runs)}; {finding.basis}.",
+                finding,
+            )
             for finding, runs in self.findings.items()
         ]
 
@@ -203,14 +237,21 @@ def judge(claim: Claim, runs: Iterable[StoredRun]) -> Judged:
 
 
 def _findings(claim: Claim, run: StoredRun) -> Iterator[ClaimFinding]:
-    """Judge the parts of a run that meet all needs; if none does, yield the needs of the nearest one."""
+    """Judge the parts of a run that meet all needs; else measure those that differ in chosen settings alone.
+
+    If there are none of these either, yield the needs of the nearest part.
+    """
     every = [(part, tuple(need.of(part.facts) for need in claim.trial.needs)) for part in claim.trial.parts(run)]
     fit = [(part, needs) for part, needs in every if all(need.met for need in needs)]
-    for part, needs in fit:
-        yield ClaimFinding(*claim.judge(part), needs)
-    if every and not fit:
-        nearest = min((needs for _, needs in every), key=lambda needs: sum(not need.met for need in needs))
-        yield ClaimFinding(UNDECIDED, "Not testable with this run.", nearest)
+    free = [(part, needs) for part, needs in every if all(need.met or need.chosen for need in needs)]
+    for part, needs in fit or free:
+        verdict, evidence = claim.judge(part)
+        if not fit:
+            verdict, evidence = UNDECIDED, f"At your settings, no verdict: {evidence}"
+        yield ClaimFinding(verdict, evidence, needs, part.basis, part.labels)
+    if every and not free:
+        part, needs = min(every, key=lambda each: sum(not need.met for need in each[1]))
+        yield ClaimFinding(UNDECIDED, "Not testable with this run.", needs, part.basis, part.labels)
 
 
 def claim_table(judged: Sequence[Judged]) -> TextTable:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
+from math import inf
 from typing import Any, Final
 
 import numpy as np
@@ -34,6 +35,9 @@ _NAMES: Final = ("engine", "model", "quantisation")
 """Fields that differ between llama-server and the engine `llama` on the same file."""
 _LAUNCHES: Final = 3
 _SMALL: Final = 50_000
+FEWEST_BITS, MOST_BITS = 4, 16
+"""Bits a weight between which the paper's quantisation is taken to lie."""
+_BITS: Final = re.compile(r"[QF](\d+)")
 
 
 def one_of(name: str, *values: str) -> Need:
@@ -134,7 +138,12 @@ def bodies(run: StoredRun) -> Iterator[RunPart]:
 
 def _pair(run: StoredRun, pair: tuple[RequestCell, RequestCell], facts: dict[str, Any], about: str) -> RunPart:
     both = {name: " and ".join(dict.fromkeys(cell.about[name] for cell in pair)) for name in ("mode", "payload")}
-    return RunPart(run, facts_of(run, [run.origins.of(cell.name) for cell in pair]) | both | facts, pair, about)
+    origins = [run.origins.of(cell.name) for cell in pair]
+    return RunPart(run, facts_of(run, origins) | both | facts, origins, _launches(*pair), pair, about)
+
+
+def _launches(*cells: RequestCell) -> int:
+    return min(int(cell.good["launch"].nunique()) for cell in cells)
 
 
 def _unlike(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
@@ -185,13 +194,20 @@ def times_as_large(part: RunPart) -> tuple[list[Ratio], str]:
     return [exact(ratio)], f"{ratio:.4f}"
 
 
-def shares(side: int, groups: Mapping[str, Sequence[str]], part: RunPart) -> tuple[list[Ratio], str]:
-    """Measure the shares of groups of stages in the time of one side without inference."""
+def shares(
+    side: int, groups: Mapping[str, tuple[Sequence[str], Sequence[str]]], part: RunPart
+) -> tuple[list[Ratio], str]:
+    """Measure the shares of groups of stages in the time of one side: name -> (stages, groups of the whole).
+
+    Without groups the whole is the time without inference.
+    """
     cell: RequestCell = part.cells[side]
     whole, seed = cell.values_ms(_METRIC), part.run.bootstrap_seed
     spent = {stage: _spent(cell, [stage]).sum() for stage, of in cell.stages.items() if of != "inference"}
-    of_groups = [_spent(cell, stages) for stages in groups.values()]
-    found = [change(each, whole, seed, paired=True).ratio if each.any() else exact(0.0) for each in of_groups]
+    found = []
+    for stages, within in groups.values():
+        each, base = _spent(cell, stages), _spent(cell, [stage for stage, of in cell.stages.items() if of in within])
+        found.append(change(each, base if within else whole, seed, paired=True).ratio if each.any() else exact(0.0))
     spread = ["" if each.low is None else f" [{each.low:.0%}, {each.high:.0%}]" for each in found]
     texts = [f"{each.value or 0:.0%}{more}{name}" for each, more, name in zip(found, spread, groups, strict=True)]
     return found, f"{', '.join(texts)} of {cell.name}; the longest stage is {max(spent, key=spent.__getitem__)}"
@@ -226,15 +242,24 @@ def speeds(run: StoredRun) -> Iterator[RunPart]:
     for speed in throughput_cells(run):
         if speed.values("tokens_per_s").size:
             source = {"T_eval": "the engine's" if speed.has_engine_time else "the client's"}
-            yield RunPart(run, facts_of(run, [run.origins.of(speed.name)]) | source, speed)
+            origins = [run.origins.of(speed.name)]
+            yield RunPart(run, facts_of(run, origins) | source, origins, _launches(speed), speed)
 
 
 KNOWN: Final = Need("quantisation", "known (the paper does not say which it used)", lambda found: found != UNKNOWN)
 
 
 def speed_over(board: PaperThroughput, part: RunPart) -> tuple[list[Ratio], str]:
-    """Measure the ratio of tokens a second to those of the paper's board."""
+    """Measure the ratio of tokens a second to those of the paper's board.
+
+    Fewer bits a weight take less time: the interval is open where the paper's quantisation may explain the difference.
+    """
     values = part.cells.values("tokens_per_s")
-    found = change(values, np.full(len(values), board.tokens_per_s), part.run.bootstrap_seed)
-    rate = summarise(values)
-    return [found.ratio], f"{part.cells.name}: {mean_sd(rate)} tokens/s (n = {rate.n})"
+    ratio = change(values, np.full(len(values), board.tokens_per_s), part.run.bootstrap_seed).ratio
+    rate, quantisation = summarise(values), part.facts["quantisation"]
+    bits = int(found[1]) if (found := _BITS.search(quantisation)) else (FEWEST_BITS + MOST_BITS) // 2
+    if ratio.high is not None and ratio.high < 1 - NEAR and bits > FEWEST_BITS:
+        ratio = Ratio(ratio.value, ratio.low, inf)
+    elif ratio.low is not None and ratio.low > 1 + NEAR and bits < MOST_BITS:
+        ratio = Ratio(ratio.value, 0, ratio.high)
+    return [ratio], f"{part.cells.name}: {mean_sd(rate)} tokens/s at {quantisation} (n = {rate.n})"
