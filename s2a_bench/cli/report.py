@@ -19,7 +19,7 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
     compared = comparison.open_comparison(*sides, unlike=config.unlike, least=config.min_effect / 100)
     wanted = comparison.metrics_of(compared, config.metrics)
     compared = comparison.compare(compared, [*wanted, *gates.concerned(compared, conditions)])
-    judgements = gates.judge(compared, conditions, strict=config.strict)
+    judgements = gates.judge(compared, conditions, strict=config.strict, one_launch=config.one_launch)
     found = comparison.warnings_of(compared)
     whole = shown.compare_json(compared, judgements, found)
     for warning in found:
@@ -35,11 +35,8 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
     for one in judgements:
         line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {shown.change_text(one.comparison)}"
         line += "" if one.comparison.p_holm is None else f", p = {one.comparison.p_holm:.2g}"
-        least = one.detectable
-        line += "; too few values for a test" if least is None else f", sees {shown.detectable_text(least)}"
-        if one.outcome == gates.UNDECIDED:
-            line += "; measure more launches (--launches), compare less (--metric), or --strict"
-        print_error(line)
+        line += "" if one.detectable is None else f", sees {shown.detectable_text(one.detectable)}"
+        print_error(f"{line}; {one.reason}" if one.reason else line)
     outcomes = {one.outcome for one in judgements}  # a tripped gate comes before an undecided one
     raise typer.Exit(TRIPPED if gates.TRIPPED in outcomes else UNDECIDED if gates.UNDECIDED in outcomes else 0)
 

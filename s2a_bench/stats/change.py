@@ -21,6 +21,9 @@ Blocks: TypeAlias = Mapping[int, Sequence[float]]
 POWER: Final = 0.8
 """Probability of finding the smallest detectable change (Cohen 1988)."""
 
+FEWEST_LAUNCHES: Final = 3
+"""Launches below which their differences are not known well enough for a verdict."""
+
 _MOST: Final = 50.0
 """Limit of the logarithm of a ratio."""
 

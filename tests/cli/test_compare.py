@@ -41,7 +41,9 @@ def timelines(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 def test_a_run_against_itself_has_no_change_and_says_what_cannot_be_known() -> None:
-    done = run(ECHO, ECHO, "--json", "--fail-if", "e2e.median>5%", "--fail-if", "e2e.median>60%", code=4)
+    done = run(
+        ECHO, ECHO, "--json", "--fail-if", "e2e.median>5%", "--fail-if", "e2e.median>60%", "--one-launch", code=4
+    )
     whole = json.loads(done.stdout)
     jsonschema.validate(whole, SCHEMA)
     assert {one["change"]["value"] for one in whole["comparisons"]} == {0.0}
@@ -56,7 +58,9 @@ def test_a_run_against_itself_has_no_change_and_says_what_cannot_be_known() -> N
 
 def test_a_gate_that_trips_is_exit_code_three_and_files_are_written_all_the_same(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    done = run(ECHO, RAW, "--unlike", "--fail-if", "http/as-*:e2e.median>5%", "--output", str(out), code=3)
+    done = run(
+        ECHO, RAW, "--unlike", "--one-launch", "--fail-if", "http/as-*:e2e.median>5%", "--output", str(out), code=3
+    )
     assert "gate http/as-*:e2e.median>5% tripped in http/as-deployed: +126 % [" in done.stderr
     assert "e2e: median, ms" in done.stdout
     assert all(len(line) <= 100 for line in done.stdout.splitlines()[:20])
@@ -66,9 +70,23 @@ def test_a_gate_that_trips_is_exit_code_three_and_files_are_written_all_the_same
 
 
 def test_a_gate_that_cannot_be_judged_is_an_error_unless_it_is_strict() -> None:
-    done = run(ECHO, ECHO, "--fail-if", "loopback:e2e.p99>5%", code=4)
-    assert "undecided in loopback: 0.0 %; too few values for a test; measure more" in done.stderr
-    run(ECHO, ECHO, "--fail-if", "loopback:e2e.p99>5%", "--strict")
+    gate = "--fail-if", "loopback:e2e.p99>5%"
+    done = run(ECHO, ECHO, *gate, "--one-launch", code=4)
+    assert "undecided in loopback: 0.0 %; too few values for a test: measure more" in done.stderr
+    run(ECHO, ECHO, *gate, "--strict")
+
+
+def test_a_gate_on_one_launch_a_side_is_undecided_and_names_the_way_out() -> None:
+    done = run(ECHO, RAW, "--unlike", "--fail-if", "http/as-*:e2e.median>5%", "--json", code=4)
+    way_out = "1 of the 3 launches that a side needs: measure both with --launches 3, or --one-launch"
+    (gate,) = json.loads(done.stdout)["gates"]
+    assert (gate["outcome"], gate["reason"]) == ("undecided", way_out)
+    assert "undecided in http/as-deployed: +126 % [" in done.stderr
+    assert f"; {way_out}\n" in done.stderr
+
+
+def test_computed_timelines_are_gated_without_launches(timelines: dict[str, str]) -> None:
+    run(timelines["even"], timelines["even"], "--fail-if", "start_s>0%")
 
 
 def test_computed_timelines_are_the_same_to_the_last_digit(timelines: dict[str, str], tmp_path: Path) -> None:
@@ -119,6 +137,7 @@ def test_throughput_is_compared_with_higher_as_better(tmp_path: Path) -> None:
             "--fail-if: no cell with e2e is called 'zmq'; there are ros/topic, http/as-",
         ),
         ([ECHO, ECHO, "--strict"], 2, "--strict: there is no gate; add --fail-if"),
+        ([ECHO, ECHO, "--one-launch"], 2, "--one-launch: there is no gate; add --fail-if"),
         ([ECHO, ECHO, "--min-effect", "-1"], 2, "--min-effect"),
         ([f"{ECHO},{ECHO}", ECHO], 2, "A: a folder is named twice"),
         ([f"{ECHO},{RAW}", ECHO], 2, "name several launches on both sides, or one on each"),

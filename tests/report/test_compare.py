@@ -301,20 +301,20 @@ def test_what_is_no_gate_is_refused_with_an_example(text: str) -> None:
         read_gate(text)
 
 
-def outcomes(found: ComparedRuns, *gates: str, strict: bool = False) -> set[str]:
-    return {one.outcome for one in judged(found, *gates, strict=strict)}
+def outcomes(found: ComparedRuns, *gates: str, **settings: bool) -> set[str]:
+    return {one.outcome for one in judged(found, *gates, **settings)}
 
 
-def judged(found: ComparedRuns, *texts: str, strict: bool = False) -> list[Judgement]:
+def judged(found: ComparedRuns, *texts: str, strict: bool = False, one_launch: bool = True) -> list[Judgement]:
     gates = [read_gate(text) for text in texts]
-    return judge(compare(found, concerned(found, gates)), gates, strict=strict)
+    return judge(compare(found, concerned(found, gates)), gates, strict=strict, one_launch=one_launch)
 
 
 def test_table_and_gate_come_from_one_correction(launch: Launch) -> None:
     found = opened(launch(1, n=40), launch(2, n=40, factor=1.08))
     gates = [read_gate("http/binary:e2e.median>5%")]
     both = compare(found, [*metrics_of(found, ["all"]), *concerned(found, gates)])
-    (one,) = judge(both, gates, strict=False)
+    (one,) = judge(both, gates)
     assert one.comparison in both.comparisons
     assert len(both.comparisons) == len({(each.pair.name, each.name) for each in both.comparisons})
     alone = judged(found, "http/binary:e2e.median>5%")[0].comparison.p_holm
@@ -371,6 +371,18 @@ def test_launches_of_one_folder_count_as_launches(launch: Launch) -> None:
     assert [len(side) for side in (both.pairs[0].baseline, both.pairs[0].other)] == [3, 3]
 
 
+@pytest.mark.parametrize(("launches", "judges"), [(1, False), (2, False), (3, True)])
+def test_a_gate_needs_three_launches_a_side_or_the_users_word(launch: Launch, launches: int, judges: bool) -> None:
+    found = opened(*(launch(each, n=150, launches=launches, factor=1 + each) for each in (0, 1)))
+    for gate, outcome in (("e2e>5%", "tripped"), ("e2e<-5%", "passed")):
+        assert outcomes(found, gate) == {outcome}
+        assert outcomes(found, gate, one_launch=False) == {outcome if judges else "undecided"}
+        assert outcomes(found, gate, one_launch=False, strict=True) == {outcome}
+    reasons = {one.reason for one in judged(found, "e2e>5%", one_launch=False)}
+    way_out = "launches that a side needs: measure both with --launches 3, or --one-launch"
+    assert reasons == {"" if judges else f"{launches} of the 3 {way_out}"}
+
+
 def test_a_gate_that_too_few_values_feed_is_undecided_not_passed(launch: Launch) -> None:
     found = opened(launch(1), launch(2, factor=2))
     assert outcomes(found, "e2e.p99>10%") == {"undecided"}
@@ -386,7 +398,7 @@ def test_a_gate_on_a_cell_that_there_is_not_is_answered_by_those_there_are(launc
 
 def test_the_json_object_is_what_its_schema_says(launch: Launch) -> None:
     found = compared(launch(1), launch(2, factor=1.2), "e2e", "e2e.p99")
-    whole = compare_json(found, judge(found, [read_gate("e2e>5%")], strict=False), warnings_of(found))
+    whole = compare_json(found, judge(found, [read_gate("e2e>5%")], one_launch=True), warnings_of(found))
     jsonschema.validate(whole, SCHEMA)
     json.dumps(whole, allow_nan=False)
     assert [one["verdict"] for one in whole["comparisons"]] == ["worse"] * 4 + ["too few"] * 4

@@ -17,7 +17,7 @@ from s2a_bench.policy import Floats
 from s2a_bench.provenance import NONE, UNKNOWN, Provenance
 from s2a_bench.report.claims import Need, RunPart
 from s2a_bench.stats import Ratio, summarise, summary_of
-from s2a_bench.stats.change import Blocks, Change, change_between, ratio_of_launches
+from s2a_bench.stats.change import FEWEST_LAUNCHES, Blocks, Change, change_between, ratio_of_launches
 from s2a_bench.store.run import StoredRun
 from s2a_bench.transport import EXTERNAL, PROGRAM, declared_transport
 from s2a_bench.writers.tables import interval, mean_sd
@@ -33,7 +33,6 @@ _METRIC: Final = "e2e_without_inference"
 _HTTP, _BINARY, _LLAMA_SERVER, _ROS = "http/as-deployed", "http/binary", "http/llama-server", "ros"
 _NAMES: Final = ("engine", "model", "quantisation")
 """Fields that differ between llama-server and the engine `llama` on the same file."""
-_LAUNCHES: Final = 3
 _SMALL: Final = 50_000
 FEWEST_BITS, MOST_BITS = 4, 16
 """Bits a weight between which the paper's quantisation is taken to lie."""
@@ -176,7 +175,7 @@ COMPARED: Final = (
     one_of("link", "real"),
     Need("both sides", "alike: engine, model, size; llama-server and llama are, on the same file", "alike".__eq__),
     one_of("servers", "started by the run"),
-    Need("launches", f"{_LAUNCHES} or more", lambda found: found >= _LAUNCHES),
+    Need("launches", f"{FEWEST_LAUNCHES} or more", lambda found: found >= FEWEST_LAUNCHES),
 )
 """The needs of a pair of HTTP/JSON and ROS."""
 LARGE: Final = Need("bytes a picture", f"{_SMALL} or more, by a larger --size", lambda found: found >= _SMALL)

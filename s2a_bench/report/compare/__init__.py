@@ -20,6 +20,9 @@ class CompareConfig(Options):
         [], "gate, e.g. e2e.median>5%, tokens_per_s<-5%, ros/topic:e2e.p99>10%; may be repeated"
     )
     strict: bool = option(False, "gates trip on any change beyond the limit, significant or not")
+    one_launch: bool = option(
+        False, "gates also judge fewer than 3 launches a side: they trip on differences between launches"
+    )
     min_effect: float = option(5.0, "the smallest relevant change, in per cent", ge=0)
     unlike: bool = option(False, "also compare runs of different machines, models or settings")
     output: Path | None = option(None, "folder for table, figure and JSON")
@@ -29,5 +32,6 @@ class CompareConfig(Options):
         return [name for text in self.metric for name in listed(text)]
 
     def check(self) -> None:
-        if self.strict and not self.fail_if:
-            raise UsageError("`strict`: there is no gate; add `fail_if`")
+        for name in ("strict", "one_launch"):
+            if getattr(self, name) and not self.fail_if:
+                raise UsageError(f"`{name}`: there is no gate; add `fail_if`")

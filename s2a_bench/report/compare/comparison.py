@@ -73,14 +73,14 @@ class ComparedRuns:
     comparisons: tuple[CellComparison, ...] = ()
 
     @property
-    def launches(self) -> bool:
-        """Return True if launches were repeated on both sides; then they are the units of the test."""
-        return len(self.pairs[0].baseline) > 1
+    def launches(self) -> int:
+        """Return the launches of the side with fewer; if they are several, they are the units of the test."""
+        return min(len(self.pairs[0].baseline), len(self.pairs[0].other))
 
-    @property
-    def one_launch(self) -> bool:
-        """Return True if the intervals lack an existing variation between launches."""
-        return not self.launches and any(pair.baseline[0].setting.get("mode") != "virtual" for pair in self.pairs)
+    def launches_below(self, fewest: int) -> bool:
+        """Return True if a side has fewer launches; False for computed runs, which do not vary between launches."""
+        measured = any(pair.baseline[0].setting.get("mode") != "virtual" for pair in self.pairs)
+        return measured and self.launches < fewest
 
     @property
     def origins(self) -> Origins:
@@ -270,7 +270,7 @@ def _of_runs(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
             yield "state", f"{run.path} is {state}, not finished", "its samples so far count; run it again"
         if codes := sorted({warning["code"] for warning in run.manifest.get("warnings", [])}):
             yield "warnings", f"{run.path} has warnings: {', '.join(codes)}", "read them in its manifest"
-    if compared.one_launch:
+    if compared.launches_below(2):
         yield (
             "one-launch",
             "one launch a side: the intervals do not include the variation between launches",

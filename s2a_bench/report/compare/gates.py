@@ -15,6 +15,7 @@ from typing import Final
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments import Metric
 from s2a_bench.report.compare.comparison import LEVEL, CellComparison, ComparedRuns, detectable, metric_of
+from s2a_bench.stats.change import FEWEST_LAUNCHES
 
 _FLAG: Final = "`fail_if`"
 _FORM: Final = re.compile(r"(?:(?P<cells>.+):)?(?P<metric>[\w.]+)\s*(?P<sign>>|<\s*-)\s*(?P<limit>\d+(?:\.\d+)?)\s*%")
@@ -46,6 +47,8 @@ class Judgement:
     gate: Gate
     comparison: CellComparison
     outcome: str
+    reason: str
+    """Why it is undecided, and the way out; else empty."""
     detectable: float | None
     """The smallest change towards the limit that the test finds, as a share."""
 
@@ -65,13 +68,22 @@ def concerned(compared: ComparedRuns, gates: Sequence[Gate]) -> list[tuple[Metri
     return [metric_of(compared, gate.metric, _FLAG) for gate in gates]
 
 
-def judge(compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool) -> list[Judgement]:
+def judge(
+    compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool = False, one_launch: bool = False
+) -> list[Judgement]:
     """Judge every gate in every cell that it selects, by the comparisons of the `concerned` metrics.
 
     A gate trips if the change is past the limit *and* its p-value, corrected for all comparisons, is below `LEVEL`. It
     passes if the test finds a change of the limit's size, or found one in the other direction; else it is undecided.
-    With ``strict`` the change alone decides. Raises UsageError for an unknown cell.
+    Below `FEWEST_LAUNCHES` a side it is undecided unless ``one_launch`` is true, as one does not show how launches
+    differ. With ``strict`` the change alone decides. Raises UsageError for an unknown cell.
     """
+    too_few = (
+        f"{compared.launches} of the {FEWEST_LAUNCHES} launches that a side needs: measure both with --launches "
+        f"{FEWEST_LAUNCHES}, or --one-launch"
+        if compared.launches_below(FEWEST_LAUNCHES) and not one_launch
+        else ""
+    )
     judged = []
     for gate, wanted in zip(gates, concerned(compared, gates), strict=True):
         every = [one for one in compared.comparisons if (one.metric, one.statistic) == wanted]
@@ -81,19 +93,24 @@ def judge(compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool) -> lis
             raise UsageError(f"{_FLAG}: no cell with {wanted[0].name} is called '{gate.cells}'; there are {names}")
         for one in found:
             least = detectable(one.change, len(compared.comparisons), falls=not gate.rises)
-            judged.append(Judgement(gate, one, _outcome(gate, one, least, strict=strict), least))
+            outcome, reason = _outcome(gate, one, least, strict=strict, too_few=too_few)
+            judged.append(Judgement(gate, one, outcome, reason, least))
     return judged
 
 
-def _outcome(gate: Gate, one: CellComparison, least: float | None, *, strict: bool) -> str:
-    """Return the outcome of a gate; ``least`` is the smallest detectable change."""
+def _outcome(gate: Gate, one: CellComparison, least: float | None, *, strict: bool, too_few: str) -> tuple[str, str]:
+    """Return outcome and reason; ``least`` is the smallest detectable change, ``too_few`` what launches lack."""
     change, p_holm = one.change, one.p_holm
     rises = change.other > change.baseline
     past = gate.beyond(change.relative, rises)
     if strict:
-        return TRIPPED if past else PASSED
+        return TRIPPED if past else PASSED, ""
+    if too_few:
+        return UNDECIDED, too_few
     significant = p_holm is not None and p_holm < LEVEL
     if past and significant:
-        return TRIPPED
-    other_way = significant and rises != gate.rises
-    return PASSED if other_way or (least is not None and least <= abs(gate.limit)) else UNDECIDED
+        return TRIPPED, ""
+    if (significant and rises != gate.rises) or (least is not None and least <= abs(gate.limit)):
+        return PASSED, ""
+    hidden = "too few values for a test" if least is None else "the noise may hide a change beyond the limit"
+    return UNDECIDED, f"{hidden}: measure more launches (--launches), compare less (--metric), or --strict"

@@ -49,8 +49,8 @@ def compare_table(compared: ComparedRuns) -> TextTable:
 
 def notes(compared: ComparedRuns) -> tuple[str, ...]:
     """Return the names of A and B, and the rules of the verdicts."""
-    of_one = ", that of one launch a side" if compared.one_launch else ""
-    unit = "launches" if compared.launches else f"{BATCHES} batches in time of each launch"
+    of_one = ", that of one launch a side" if compared.launches_below(2) else ""
+    unit = "launches" if compared.launches > 1 else f"{BATCHES} batches in time of each launch"
     return (
         title(compared),
         f"Welch's t on logarithms over {unit}; p corrected for {len(compared.comparisons)} comparisons (Holm).",
@@ -213,13 +213,14 @@ class Gated:
     p_holm: Probability
     detectable: Detectable
     outcome: Literal["passed", "tripped", "undecided"]
+    reason: Annotated[str, {"description": "Why the gate is undecided, and the way out; else empty."}]
 
     @classmethod
     def of(cls, one: Judgement) -> Gated:
         comparison, change = one.comparison, one.comparison.change
         outcome: Any = one.outcome
         values = change.relative, change.bounds, comparison.p_holm, one.detectable
-        return cls(one.gate.text, comparison.pair.name, *values, outcome)
+        return cls(one.gate.text, comparison.pair.name, *values, outcome, one.reason)
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,8 +249,8 @@ def compare_json(
     compared: ComparedRuns, judgements: Sequence[Judgement], warnings: Sequence[RunWarning]
 ) -> dict[str, Any]:
     """Return the ``--json`` object."""
-    unit: Literal["batch", "launch"] = "launch" if compared.launches else "batch"
-    batches = None if compared.launches else BATCHES
+    unit: Literal["batch", "launch"] = "launch" if compared.launches > 1 else "batch"
+    batches = None if compared.launches > 1 else BATCHES
     whole: dict[str, Any] = plain(
         CompareJson(
             schema="s2a-bench-compare/1",
