@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ Middle: TypeAlias = Literal["median", "mean"]
 
 Blocks: TypeAlias = Mapping[int, Sequence[float]]
 """The values of a cell in one launch, by block."""
+
+_Launch = TypeVar("_Launch")
 
 POWER: Final = 0.8
 """Probability of finding the smallest detectable change (Cohen 1988)."""
@@ -148,7 +150,7 @@ def change_between(
 
 
 def ratio_of_launches(
-    above: Mapping[int, Blocks], below: Mapping[int, Blocks], seed: int, statistic: Middle = "median"
+    above: Mapping[_Launch, Blocks], below: Mapping[_Launch, Blocks], seed: int, statistic: Middle = "median"
 ) -> Ratio | None:
     """Divide the medians (or means) of two cells, given by launch and block; None if no launch has values of both.
 
@@ -157,7 +159,7 @@ def ratio_of_launches(
     """
     from scipy import stats
 
-    both = [launch for launch in sorted(above) if above[launch] and below.get(launch)]
+    both = [launch for launch in above if above[launch] and below.get(launch)]
     if len(both) <= 1:
         return ratio_of_blocks(above[both[0]], below[both[0]], seed, statistic) if both else None
     middle = np.median if statistic == "median" else np.mean

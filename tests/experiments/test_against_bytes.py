@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.experiments.latency.view.against_bytes import against_bytes, crossings, shown
+from s2a_bench.experiments.latency.view.against_bytes import against_bytes, order_changes, shown
 from s2a_bench.experiments.requests import split
 from s2a_bench.store.run import StoredRun
 from s2a_bench.transport import TRANSPORTS
@@ -45,9 +45,54 @@ def test_lines_are_what_made_the_times(runs: list[StoredRun]) -> None:
         assert each.line is not None
         assert (each.line.fixed.value, each.line.slope.value) == pytest.approx((FIXED[name], A_MB[name]), rel=1e-3)
         assert (each.payload, each.wire_share) == ("raw", 2.0)
-    ((below, above, met),) = crossings([found["http/binary"], found["ros/topic"]])
-    assert (below.name, above.name) == ("ros/topic", "http/binary")
-    assert met.value == pytest.approx(0.8 / 0.6, rel=1e-2)
+
+
+LOADS = (1.0, 1.6, 0.7)
+"""What slows every cell of a launch alike: far more than the two pipelines differ."""
+WOBBLES = (0.9, 1.05, 1.1)
+
+
+def launched(
+    make_run: MakeRun, ratios: dict[int, float], *, launches: int = 3, together: bool = True
+) -> list[StoredRun]:
+    """Measure ROS against HTTP at some widths; a ratio of 1 wobbles from launch to launch."""
+    made = []
+    for width, ratio in ratios.items():
+        for load, wobble in list(zip(LOADS, WOBBLES, strict=True))[:launches]:
+            off = wobble if ratio == 1 else wobble**0.2
+            times = {"http/binary": width / 100 * load, "ros/topic": width / 100 * load * ratio * off}
+            cells = {name: {"capture": ms, "inference": 1.0, "return": 0.0} for name, ms in times.items()}
+            parts = [cells] if together else [{name: each} for name, each in cells.items()]
+            made += [make_run(part, n=5, spread=0, manifest=settings(width, 100, 1)) for part in parts]
+    return made
+
+
+def test_an_order_changes_between_the_measured_sizes_at_which_it_is_sure(make_run: MakeRun) -> None:
+    runs = split(launched(make_run, {100: 0.7, 200: 0.8, 400: 1, 800: 1.3, 1600: 1.4}))
+    (found,) = order_changes(against_bytes(runs))
+    assert (found.below.name, found.above.name) == ("ros/topic", "http/binary")
+    (small, below), (large, above) = found.smaller, found.larger
+    assert (small, large) == (200 * 300 / 1e6, 800 * 300 / 1e6)
+    assert (below.value, above.value) == pytest.approx((0.8, 1.3), rel=0.02)
+    table = shown(runs)[0]["crossings"]
+    assert table.rows[0] == (
+        *("ros/topic, raw", "http/binary, raw"),
+        *("0.060", "0.802 [0.761, 0.845]", "0.240", "1.30 [1.24, 1.37]"),
+    )
+    assert "Echo engine." in table.notes
+
+
+@pytest.mark.parametrize(
+    "unsure",
+    [{"ratios": {100: 0.8, 200: 0.7}}, {"ratios": {100: 0.8, 200: 1}}, {"launches": 2}, {"together": False}],
+    ids=["same order", "not known to differ", "two launches", "launches apart"],
+)
+def test_no_order_changes_without_two_sizes_at_which_launches_tell_it(
+    make_run: MakeRun, unsure: dict[str, Any]
+) -> None:
+    runs = split(launched(make_run, **{"ratios": {100: 0.8, 200: 1.3}} | unsure))
+    assert order_changes(against_bytes(runs)) == []
+    assert "crossings" not in shown(runs)[0]
 
 
 def test_in_process_a_cell_stands_beside_each_payload(make_run: MakeRun) -> None:
@@ -66,7 +111,7 @@ def test_scaled_pictures_count_as_scaled(make_run: MakeRun) -> None:
     sizes = [settings(640, 480, 1, resize=[224, 224]), settings(640, 480, 1)]
     made = [make_run(cells, n=5, spread=0, manifest=each, payloads={"ros": "raw"}) for each in sizes]
     ((pipeline),) = against_bytes(split(made))
-    assert [size for size, _ in pipeline.groups] == [224 * 224 * 3 / 1e6, 640 * 480 * 3 / 1e6]
+    assert [*pipeline.sizes] == [224 * 224 * 3 / 1e6, 640 * 480 * 3 / 1e6]
 
 
 def test_runs_of_one_size_show_nothing(make_run: MakeRun) -> None:
@@ -78,11 +123,10 @@ def test_runs_of_one_size_show_nothing(make_run: MakeRun) -> None:
 
 def test_tables_and_figure_say_what_answered(runs: list[StoredRun]) -> None:
     tables, figures = shown(split(runs))
-    assert set(tables) == {"bytes", "crossings"}
+    assert set(tables) == {"bytes"}  # one launch a size: no order
     assert tables["bytes"].rows[0] == (
         *("http/binary", "raw", "1.00 [1.00, 1.00]", "0.300 [0.300, 0.300]", "2.00", "0%"),
     )
-    assert tables["crossings"].rows == [("ros/topic, raw", "http/binary, raw", "1.33 [1.33, 1.33]")]
     assert all("Echo engine." in table.notes for table in tables.values())
     figure = figures["time_against_bytes"]()
     assert "Echo engine." in caption_of(figure)

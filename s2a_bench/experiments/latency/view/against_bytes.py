@@ -7,36 +7,46 @@ so that lines can cross; the share on the wire is another column. Loopback's lin
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from itertools import pairwise, permutations
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from s2a_bench.experiments.requests import RequestCell, payloads_of, stand_ins
-from s2a_bench.stats.line import Estimate, Line, crossing, fit_line
+from s2a_bench.stats import Ratio
+from s2a_bench.stats.change import FEWEST_LAUNCHES, Blocks, ratio_of_launches
+from s2a_bench.stats.line import Estimate, Line, fit_line
 from s2a_bench.transport import declared_transport
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.style import cell_styles
-from s2a_bench.writers.tables import ABSENT, TextTable, number
+from s2a_bench.writers.tables import ABSENT, TextTable, interval, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.requests import Floats, Split
+    from s2a_bench.experiments.requests import Split
     from s2a_bench.store.run import StoredRun
 
 METRIC = "e2e_without_inference"
 MB = 1e6
 FITTED = (
-    "e2e without inference = fixed + ms a MB x MB of the pictures as pixels (width x height x 3 x cameras), fitted to "
-    "the medians by relative distance; 95 % intervals of a bootstrap over launches and within each."
+    "e2e without inference = fixed + ms a MB x MB of the pictures as pixels (width x height x 3 x cameras), fitted by "
+    "relative distance to each size's geometric mean of the launches' medians. The 95 % intervals (Student's t of the "
+    "distances) include the variation between launches, and the lack of fit."
 )
 FIT = (
-    "Travels: bytes on the wire for each byte of the pixels. Off: root mean square of the medians' distances from the "
-    "line; launches differ, and a cost of calls rather than of bytes is off the line."
+    "Travels: bytes on the wire for each byte of the pixels. Off: root mean square of the distances; launches differ, "
+    "and a cost of calls rather than of bytes is off the line."
 )
+ORDER = (
+    "The measured sizes, in MB of pixels, between which the order changes. Ratio: time of the first over that of the "
+    f"second in {FEWEST_LAUNCHES} or more launches that measured both, with its 95 % interval (Student's t)."
+)
+
+Launches: TypeAlias = dict[tuple[int, int], Blocks]
+"""Times in ms by (run, launch), then by block."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,24 +56,45 @@ class FittedPipeline:
     name: str
     payload: str
     path: tuple[str, str]
-    groups: tuple[tuple[float, Floats], ...]
-    """For each run: MB of pixels a request, ms of each request."""
+    sizes: dict[float, Launches]
+    """By MB of pixels a request."""
     line: Line | None
     wire_share: float | None
     """Bytes on the wire for each byte of the pixels; None in process, or if unknown."""
+    has_ingest: bool
+    """Whether a black box prepares the pictures before inference: then the metric means something else."""
+
+    @property
+    def medians(self) -> list[tuple[float, float]]:
+        """Return (MB of pixels, median in ms) of every launch."""
+        return [
+            (size, float(np.median(np.concatenate([*blocks.values()]))))
+            for size, launches in self.sizes.items()
+            for blocks in launches.values()
+        ]
+
+
+@dataclass(frozen=True, slots=True)
+class OrderChange:
+    """Two measured sizes, with the time of ``below`` over that of ``above`` at each: below 1, then above 1."""
+
+    below: FittedPipeline
+    above: FittedPipeline
+    smaller: tuple[float, Ratio]
+    larger: tuple[float, Ratio]
 
 
 def against_bytes(runs: Split) -> list[FittedPipeline]:
     """Return the pipelines of latency runs with pictures of different sizes; empty for other runs."""
-    found: dict[tuple[str, str], list[tuple[float, RequestCell]]] = {}
-    for run, cells in runs:
+    found: dict[tuple[str, str], list[tuple[int, int, RequestCell]]] = {}
+    for place, (run, cells) in enumerate(runs):
         if run.manifest["command"] != "latency" or run.samples.empty or not (pixels := _pixels(run)):
             continue
         payloads = payloads_of(cells)
         for cell in cells:
             if cell.values_ms(METRIC).size:
                 for payload in [cell.payload] if cell.payload else payloads or [""]:  # in process: beside each payload
-                    found.setdefault((cell.label, payload), []).append((pixels, cell))
+                    found.setdefault((cell.label, payload), []).append((place, pixels, cell))
     lines = [_pipeline(name, payload, sized) for (name, payload), sized in found.items()]
     order = sorted(
         lines, key=lambda each: (each.payload != "raw", each.payload, declared_transport(each.path[0]).order, each.name)
@@ -71,13 +102,19 @@ def against_bytes(runs: Split) -> list[FittedPipeline]:
     return order if any(each.line for each in order) else []
 
 
-def _pipeline(name: str, payload: str, cells: Sequence[tuple[float, RequestCell]]) -> FittedPipeline:
-    groups = tuple((pixels / MB, cell.values_ms(METRIC)) for pixels, cell in cells)
+def _pipeline(name: str, payload: str, cells: Sequence[tuple[int, int, RequestCell]]) -> FittedPipeline:
+    sizes: dict[float, Launches] = {}
+    for run, pixels, cell in cells:
+        sizes.setdefault(pixels / MB, {}).update(
+            {(run, launch): blocks for launch, blocks in cell.by_launch(METRIC).items()}
+        )
     shares = [
-        float(sent.median()) / pixels for pixels, cell in cells if (sent := cell.good["payload_bytes"].dropna()).size
+        float(sent.median()) / pixels for _, pixels, cell in cells if (sent := cell.good["payload_bytes"].dropna()).size
     ]
     wire_share = float(np.median(shares)) if shares else None
-    return FittedPipeline(name, payload, cells[0][1].path, groups, fit_line(groups), wire_share)
+    first = cells[0][2]
+    found = FittedPipeline(name, payload, first.path, sizes, None, wire_share, first.has_ingest)
+    return replace(found, line=fit_line(found.medians))
 
 
 def _pixels(run: StoredRun) -> int:
@@ -87,18 +124,31 @@ def _pixels(run: StoredRun) -> int:
     return int(width) * int(height) * 3 * int(settings.get("cameras") or 1)
 
 
-def crossings(pipelines: Sequence[FittedPipeline]) -> list[tuple[FittedPipeline, FittedPipeline, Estimate]]:
-    """Return (faster below, faster above, where) for lines that cross between the smallest and largest picture."""
+def order_changes(pipelines: Sequence[FittedPipeline]) -> list[OrderChange]:
+    """Return where one pipeline is faster at a measured size, and slower at the next at which the two differ.
+
+    They differ where the 95 % interval of their ratio leaves out 1, over at least `FEWEST_LAUNCHES` launches that
+    measured both.
+    """
     found = []
-    for one, other in combinations([each for each in pipelines if each.line], 2):
-        if not (one.line and other.line) or (one.name != other.name and one.payload != other.payload):
+    for below, above in permutations(pipelines, 2):
+        if below.payload != above.payload or below.has_ingest != above.has_ingest:
             continue
-        sizes = [size for each in (one, other) for size, _ in each.groups]
-        met = crossing(one.line, other.line)
-        if met and min(sizes) <= met.value <= max(sizes):
-            below = (one, other) if one.line.fixed.value < other.line.fixed.value else (other, one)
-            found.append((*below, met))
-    return found
+        differ = []
+        for size in sorted(below.sizes.keys() & above.sizes.keys()):
+            pair = below.sizes[size], above.sizes[size]
+            if len(pair[0].keys() & pair[1].keys()) < FEWEST_LAUNCHES:
+                continue
+            if (ratio := ratio_of_launches(*pair, seed=0)) and (side := _side_of_one(ratio)):
+                differ.append((side, (size, ratio)))
+        found += [OrderChange(below, above, one[1], two[1]) for one, two in pairwise(differ) if one[0] < two[0]]
+    return sorted(found, key=lambda change: (change.smaller[0], change.larger[0]))
+
+
+def _side_of_one(ratio: Ratio) -> int:
+    """Return -1 or 1 for an interval below or above 1; 0 if it holds 1, or there is none."""
+    low, high = ratio.ci95 or (1, 1)
+    return (low > 1) - (high < 1)
 
 
 def line_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable:
@@ -120,21 +170,21 @@ def line_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> 
     return TextTable("Time against bytes: a line for each pipeline", header, rows, 2, notes=notes)
 
 
-def _crossing_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable | None:
-    """Return the table of the crossings of pipelines with a wire; None without any."""
+def _order_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable | None:
+    """Return the table of the changes of order of pipelines with a wire; None without any."""
     wired = [each for each in pipelines if not declared_transport(each.path[0]).in_process]
     rows: list[tuple[str, ...]] = [
-        (_label(below), _label(above), _estimate(met))
-        for below, above, met in sorted(crossings(wired), key=lambda found: found[2].value)
+        (
+            _label(change.below),
+            _label(change.above),
+            *(text for size, ratio in (change.smaller, change.larger) for text in (number(size), interval(ratio))),
+        )
+        for change in order_changes(wired)
     ]
     if not rows:
         return None
-    notes = (
-        "Where 95 % of the bootstrap's lines cross, between the smallest and the largest picture.",
-        *answered,
-    )
-    header = ("faster below", "faster above", "at MB of pixels")
-    return TextTable("Where one becomes faster than another", header, rows, 2, notes=notes)
+    header = ("faster below", "faster above", "MB below", "ratio below", "MB above", "ratio above")
+    return TextTable("Where one becomes faster than another", header, rows, 2, notes=(ORDER, *answered))
 
 
 def _label(each: FittedPipeline) -> str:
@@ -142,7 +192,8 @@ def _label(each: FittedPipeline) -> str:
 
 
 def _estimate(found: Estimate) -> str:
-    return f"{number(found.value)} [{number(found.low)}, {number(found.high)}]"
+    bounds = "" if found.ci95 is None else " [{}, {}]".format(*map(number, found.ci95))
+    return number(found.value) + bounds
 
 
 def _build_lines(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> Figure:
@@ -168,8 +219,7 @@ def _draw(axes: Axes, pipelines: Sequence[FittedPipeline], styles: Mapping[str, 
 
     for each in pipelines:
         colour, style = styles[each.name]
-        sizes = np.array([size for size, _ in each.groups])
-        medians = [float(np.median(values)) for _, values in each.groups]
+        sizes, medians = np.array(each.medians).T
         axes.scatter(sizes, medians, s=7, color=colour, linewidths=0)
         if each.line:
             along = np.geomspace(sizes.min(), sizes.max(), 60)
@@ -189,6 +239,6 @@ def shown(runs: Split) -> tuple[dict[str, TextTable], dict[str, Callable[[], Fig
         return {}, {}
     answered = stand_ins(runs)
     tables = {"bytes": line_table(pipelines, answered)}
-    if crossed := _crossing_table(pipelines, answered):
-        tables["crossings"] = crossed
+    if changes := _order_table(pipelines, answered):
+        tables["crossings"] = changes
     return tables, {"time_against_bytes": lambda: _build_lines(pipelines, answered)}
