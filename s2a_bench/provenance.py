@@ -30,9 +30,10 @@ LABELS: Final = {
 class Provenance:
     """The origin of one cell's numbers.
 
-    ``weights`` are real, dummy, or none without a model; ``tokens`` measured, emulated (their times come from a
-    profile, a rate or a distribution) or paced (held back); ``link`` real, emulated, or none; ``clock`` monotonic or
-    virtual. ``profile`` names the emulated profile or latencies. A field that nothing reported is "unknown".
+    ``weights`` are real, dummy, or none without a model; emulated tokens have none, or the dummy ones of their profile.
+    ``tokens`` are measured, emulated (their times come from a profile, a rate or a distribution) or paced (held back);
+    ``link`` real, emulated, or none; ``clock`` monotonic or virtual. ``profile`` names the emulated profile or
+    latencies. A field that nothing reported is "unknown".
     """
 
     engine: str = UNKNOWN
@@ -44,6 +45,10 @@ class Provenance:
     profile: str = ""
     link: str = "real"
     clock: str = "monotonic"
+
+    def __post_init__(self) -> None:
+        if self.emulated and self.weights == "real":
+            object.__setattr__(self, "weights", NONE)
 
     @classmethod
     def of_engine(cls, facts: Mapping[str, Any], *, link: str = "real") -> Provenance:

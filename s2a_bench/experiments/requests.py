@@ -30,7 +30,7 @@ from s2a_bench.facts import (
 )
 from s2a_bench.inference import declared_engine
 from s2a_bench.machine.resources import ENERGY_J
-from s2a_bench.provenance import UNKNOWN, Provenance
+from s2a_bench.provenance import NONE, UNKNOWN, Provenance
 from s2a_bench.stats import Ratio, Summary, summary_of
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import Count, about, with_fields
@@ -523,7 +523,7 @@ def cell_json(
         "observation": observation_of(run, [cell]),
         "answer": answer_kind(run),
         "profile": origin.profile or None,
-        "dummy": {"real": False, "dummy": True, "none": True}.get(origin.weights),
+        "dummy": {"real": False, "dummy": True, NONE: not declared_engine(origin.engine).plays}.get(origin.weights),
         **{name: getattr(cell, name) for name in ("emulated", "n", "errors", "warmups")},
     }
     return present(cls(**described, **fields, **summaries((each.key, cell.values(each)) for each in metrics)))

@@ -55,7 +55,7 @@ def test_a_replay_behind_a_url_is_emulated_in_every_place(replayed: tuple[Stored
     assert (origin.engine, origin.tokens, origin.profile) == ("replay", "emulated", "rtx-4080")
     assert "EMULATED" in output
     assert set(run.samples["engine"]) == {"replay"}
-    assert set(run.samples["provenance"]) == {"replay/real/emulated"}
+    assert set(run.samples["provenance"]) == {"replay/none/emulated"}
     for path in (run.path / "tables").iterdir():
         head, _, rest = path.read_text().partition("\n")
         rows = rest.splitlines() if path.suffix == ".csv" else [head + rest]
@@ -88,7 +88,7 @@ def test_a_replay_behind_an_action_is_emulated_too(tmp_path: Path) -> None:
             "--data-only",
         )
         run, output = measured(tmp_path, *action)
-    assert run.origins.of("ros/action").code == "replay/real/emulated"
+    assert run.origins.of("ros/action").code == "replay/none/emulated"
     assert set(run.samples["engine"]) == {"replay"}
     assert "EMULATED" in output
 
