@@ -20,6 +20,8 @@ from s2a_bench.machine import tuning
 from s2a_bench.options import Options, placed
 from s2a_bench.progress import NullProgress, Progress
 from s2a_bench.store import run as store
+from s2a_bench.store.schema import PROVENANCE
+from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import TextTable, to_markdown
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from s2a_bench.provenance import Origins
     from s2a_bench.report.compare.comparison import ComparedRuns
 
 Folder: TypeAlias = "str | Path | Run"
@@ -76,14 +79,20 @@ class Run:
         return tuple(self._shown.tables)
 
     def table(self, name: str) -> pd.DataFrame:
-        """Return one of the run's tables: with every digit if it has a CSV file, else as text."""
+        """Return one of the run's tables: with every digit if it has a CSV file, else as text.
+
+        The origin of its numbers is ``attrs["provenance"]`` and, row by row, the last column.
+        """
         import pandas as pd
 
-        shown = self._shown
+        shown, origins = self._shown, self._run.origins
         if f"{name}.csv" in shown.csvs:
-            return pd.read_csv(io.StringIO(shown.csvs[f"{name}.csv"].text(self._run.origins)))
+            return _read_csv(shown.csvs[f"{name}.csv"].text(origins), origins)
         table = self._one(shown.tables, "table", name)
-        return pd.DataFrame(table.rows, columns=list(table.header))
+        coded = CsvTable(table.header, table.rows).coded(origins, table.cells)
+        frame = pd.DataFrame(coded.rows, columns=list(coded.header))
+        frame.attrs[PROVENANCE] = table.provenance
+        return frame
 
     def plot(self, name: str) -> Figure:
         """Draw one of the run's figures, which a notebook shows with its caption."""
@@ -136,11 +145,9 @@ class Comparison:
 
     def table(self) -> pd.DataFrame:
         """Return one row a cell and metric: both values, the change with its interval, the verdict."""
-        import pandas as pd
-
         from s2a_bench.report.compare.shown import compare_csv
 
-        return pd.read_csv(io.StringIO(compare_csv(self._compared)))
+        return _read_csv(compare_csv(self._compared), self._compared.origins)
 
     def __str__(self) -> str:
         from s2a_bench.report.compare.shown import compare_table
@@ -212,6 +219,14 @@ def _opened(side: Folder | Sequence[Folder]) -> list[store.StoredRun]:
     return [store.read_run(folder.path if isinstance(folder, Run) else Path(folder)) for folder in folders]
 
 
+def _read_csv(text: str, origins: Origins) -> pd.DataFrame:
+    import pandas as pd
+
+    frame = pd.read_csv(io.StringIO(text))
+    frame.attrs[PROVENANCE] = origins.line
+    return frame
+
+
 def _png(figure: Figure) -> tuple[bytes, dict[str, int]]:
     """Return a figure as PNG, and its size in a notebook."""
     drawn = io.BytesIO()
@@ -231,6 +246,6 @@ def _figure_html(figure: Figure) -> str:
 def _html(table: TextTable) -> str:
     head = "".join(f"<th>{escape(name)}</th>" for name in table.header)
     rows = "".join(f"<tr>{''.join(f'<td>{escape(text)}</td>' for text in row)}</tr>" for row in table.rows)
-    notes = "".join(f"<p>{escape(str(note))}</p>" for note in table.notes)
+    notes = "".join(f"<p>{escape(str(note))}</p>" for note in table.footer)
     body = f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
     return f"<table><caption>{escape(table.title)}</caption>{body}</table>{notes}"

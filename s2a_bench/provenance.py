@@ -191,9 +191,14 @@ class Origins:
 
 
 def joined(origins: Iterable[Origins]) -> Origins:
-    """Return the provenance of several runs together."""
+    """Return the provenance of several runs together; a cell that has the same one wherever it is keeps it."""
+    origins = [*origins]
     every = dict.fromkeys(each for one in origins for each in one.every)
+    named: dict[str, set[Provenance]] = {}
+    for name, each in (item for one in origins for item in one.cells.items()):
+        named.setdefault(name, set()).add(each)
     cells = {str(place): each for place, each in enumerate(every)}
+    cells |= {name: found.pop() for name, found in named.items() if len(found) == 1}
     return Origins(next(iter(every), Provenance()), cells)
 
 

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import csv
 import io
+import json
+import shutil
+from collections.abc import Callable
+from functools import cache
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import s2a_bench as s2a
+from s2a_bench.boards.profile import to_toml
 from s2a_bench.experiments import EXPERIMENTS, Shown, write_shown
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.provenance import Origins, Provenance, joined
@@ -57,8 +63,11 @@ def test_what_a_peer_tells_is_bounded_and_has_the_right_types() -> None:
 
 def test_a_replay_and_an_echo_say_what_they_are() -> None:
     replay = Provenance.of_engine(open_engine(EngineConfig(name="replay", profile="rtx-4080")).describe())
-    assert (replay.emulated, replay.profile, replay.labels) == (True, "rtx-4080", ("emulated",))
+    assert (replay.emulated, replay.profile, replay.labels) == (True, "rtx-4080", ("emulated", "replay engine"))
+    assert replay.line == "replay (no model), tokens EMULATED after rtx-4080"
     echo = Provenance.of_engine(open_engine(EngineConfig(name="echo")).describe())
+    recorded_with_a_dummy = Provenance.of_engine({**LLAMA, "engine": "replay", "emulated": True})
+    assert (replay.weights, recorded_with_a_dummy.weights) == ("none", "dummy")
     assert (echo.weights, echo.tokens, echo.labels) == ("none", "measured", ("echo engine",))
 
 
@@ -102,18 +111,77 @@ def test_no_figure_is_written_without_it(tmp_path: Path) -> None:
         save(tmp_path, {"f": lambda: new_figure(1, "F")})
 
 
+TWO = {"transports": ["loopback", "shm"], "size": "64x48", "requests": 3, "warmup": 1}
 RUNS: dict[str, dict[str, Any]] = {
-    "latency": {"transports": ["loopback"], "engine": "echo", "requests": 3, "warmup": 1},
-    "timeline": {"profiles": ["rtx-4080"], "tokens_per_skill": [6]},
-    "boundary": {"profiles": ["rtx-4080"], "tokens_per_skill": [6], "rates": (1.0, 10.0)},
-    "ccrb": {},
-    "chunks": {"cycles": 100, "latency": ["40", "lognormal:mean_ms=80,cv=.5"]},
+    "latency": {**TWO, "engine": "echo"},
+    "throughput": {**TWO, "engine": "replay", "profile": "rtx-4080", "max_tokens": 40},
+    "timeline": {"profiles": ["rtx-4080", "DUMMY"], "tokens_per_skill": [6]},
+    "boundary": {"profiles": ["rtx-4080", "DUMMY"], "tokens_per_skill": [6], "points": 5},
+    "ccrb": {"random": 2},
+    "chunks": {"cycles": 100, "latency": ["40", "DUMMY"]},
 }
+"""A small run of each experiment, of two cells; DUMMY is a profile that was recorded with dummy weights."""
+ACROSS = {"stages", "facts", "positions", "ratios"}
+"""Tables with cells as columns, or pairs of them."""
 
 
-@pytest.mark.parametrize("name", ["latency", "timeline", "boundary", "ccrb", "chunks"])
-def test_every_table_csv_figure_page_and_json_of_every_experiment_has_it(name: str, tmp_path: Path) -> None:
-    run = getattr(s2a, name)(output=tmp_path, **RUNS[name])
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Return experiment -> a run of it, made once."""
+    folder = tmp_path_factory.mktemp("made")
+    dummy = folder / "dummy.toml"
+    facts = {"title": "A dummy", "origin": "measured", "tokens_per_s": 60.0, "prompt_s": 0.05}
+    dummy.write_text(to_toml({**facts, "gaps": {"family": "constant"}, "model": {"dummy": True}}))
+
+    @cache
+    def run(name: str) -> Path:
+        given = {
+            option: [str(dummy) if each == "DUMMY" else each for each in value] if isinstance(value, list) else value
+            for option, value in RUNS[name].items()
+        }
+        path: Path = getattr(s2a, name)(output=folder, **given).path
+        return path
+
+    return run
+
+
+@pytest.mark.parametrize("name", sorted(EXPERIMENTS))
+def test_every_table_of_the_library_says_it_in_a_line_and_row_by_row(
+    name: str, made: Callable[[str], Path], tmp_path: Path
+) -> None:
+    path = tmp_path / "run"
+    shutil.copytree(made(name), path)
+    if "transports" in RUNS[name]:  # as if another's server had answered in the second cell
+        manifest = json.loads((path / "manifest.json").read_text())
+        manifest["provenance"]["cells"]["shm"] = Provenance().to_dict()
+        (path / "manifest.json").write_text(json.dumps(manifest))
+    run = s2a.load(path)
+    origins = read_run(path).origins
+    codes = {each.code for each in origins.every}
+    assert len(codes) == 1 + (name != "ccrb")
+    html = run._repr_html_()
+    for table in {*run.tables, *(name.removesuffix(".csv") for name in run._shown.csvs)}:
+        frame = run.table(table)
+        assert frame.attrs[PROVENANCE] == origins.line, table
+        assert set(frame[PROVENANCE]) == ({origins.code} if table in ACROSS and "cell" not in frame else codes), table
+        assert table not in run._shown.main or html.count(escape(origins.line)) >= len(run._shown.main)
+    for frame in (run.samples, run.all_samples, run.tokens):
+        assert frame.attrs[PROVENANCE] == origins.line
+
+
+def test_rows_of_a_comparison_have_that_of_their_cell(made: Callable[[str], Path]) -> None:
+    run = s2a.load(made("timeline"))
+    found = s2a.compare(run, run).table()
+    assert [*found[PROVENANCE]] == [*map(read_run(run.path).origins.of_row, found["cell"])]
+    assert found[PROVENANCE].nunique() == 2
+    assert "DUMMY WEIGHTS" in found.attrs[PROVENANCE]
+
+
+@pytest.mark.parametrize("name", sorted(EXPERIMENTS))
+def test_every_table_csv_figure_page_and_json_of_every_experiment_has_it(
+    name: str, made: Callable[[str], Path], tmp_path: Path
+) -> None:
+    run = s2a.load(made(name))
     stored = read_run(run.path)
     assert all(each.known for each in stored.origins.every)
     experiment = EXPERIMENTS[name]

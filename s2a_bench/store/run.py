@@ -216,7 +216,8 @@ class RunWriter(AbstractContextManager["RunWriter"]):
 class StoredRun:
     """One run: the manifest, and its tables as DataFrames, each read at its first use.
 
-    Times are integers (Int64) in ns, `marks` and `facts` JSON text; a missing value is ``pd.NA``.
+    Times are integers (Int64) in ns, `marks` and `facts` JSON text; a missing value is ``pd.NA``. The origin of the
+    numbers is ``attrs["provenance"]`` and, row by row, the last column.
     """
 
     path: Path
@@ -232,6 +233,7 @@ class StoredRun:
             parquet = self.path / f"{table.name}.parquet"  # of a run that has ended
             read, path = (read_parquet, parquet) if parquet.exists() else (read_csv, parquet.with_suffix(".csv"))
             self.tables[table.name] = to_pandas(read(path, table.columns))
+            self.tables[table.name].attrs[PROVENANCE] = self.origins.line
         return self.tables[table.name]
 
     @property

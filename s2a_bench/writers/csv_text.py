@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -45,16 +45,24 @@ class CsvTable:
         whole = rows.astype(object).where(rows.notna(), None)
         return cls.of(map(str, rows.columns), whole.itertuples(index=False, name=None))
 
+    def coded(self, origins: Origins, cells: Sequence[str] = ()) -> CsvTable:
+        """Return the table with the provenance of each row as its last column: that of its cell, or of the run.
+
+        The cells of the rows are ``cells``, else the column ``cell``.
+        """
+        if PROVENANCE in self.header:  # a table of the store
+            return self
+        if not cells and "cell" in self.header:
+            cells = [str(row[self.header.index("cell")]) for row in self.rows]
+        codes = map(origins.of_row, cells) if cells else [origins.code] * len(self.rows)
+        rows = [(*row, code) for row, code in zip(self.rows, codes, strict=True)]
+        return CsvTable((*self.header, PROVENANCE), rows)
+
     def text(self, origins: Origins) -> str:
-        """Return the CSV; its last column is the provenance of a row: that of its ``cell``, or of the run."""
+        """Return the CSV of the `coded` table."""
         out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        has_provenance = PROVENANCE in self.header  # a table of the store
-        cell = self.header.index("cell") if "cell" in self.header else None
-        writer.writerow(map(_inert, self.header if has_provenance else (*self.header, PROVENANCE)))
-        for row in self.rows:
-            code = origins.code if cell is None else origins.of_row(str(row[cell]))
-            writer.writerow(map(_inert, row if has_provenance else (*row, code)))
+        table = self.coded(origins)
+        csv.writer(out, lineterminator="\n").writerows(map(_inert, row) for row in (table.header, *table.rows))
         return out.getvalue()
 
 

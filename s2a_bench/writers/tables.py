@@ -47,6 +47,7 @@ class Note(str):
 class TextTable:
     """One table: ``left`` columns of names, then columns of numbers; a line precedes each row of ``rules``.
 
+    ``cells`` are the cells of the rows, empty if every row is about all of them.
     ``notes`` are strings, or `Note` if they have labels. ``provenance`` is the origin of the numbers in one line
     (`Origins.line`); without it a table cannot be written to a file. A terminal that is too narrow shows ``brief``.
     """
@@ -59,6 +60,7 @@ class TextTable:
     notes: tuple[str, ...] = ()
     provenance: str = ""
     brief: TextTable | None = None
+    cells: tuple[str, ...] = ()
 
     @classmethod
     def grouped(
@@ -70,6 +72,7 @@ class TextTable:
         notes: Iterable[str] = (),
         *,
         once: int = 0,
+        cells: Iterable[str] = (),
     ) -> TextTable:
         """Make a table of groups with a line between them; only a group's first row has the first ``once`` names."""
         rows: list[tuple[str, ...]] = []
@@ -77,7 +80,7 @@ class TextTable:
         for group in groups:
             rules.add(len(rows))
             rows += [(*([""] * once if place else row[:once]), *row[once:]) for place, row in enumerate(group)]
-        return cls(title, tuple(header), rows, left, frozenset(rules - {0}), tuple(notes))
+        return cls(title, tuple(header), rows, left, frozenset(rules - {0}), tuple(notes), cells=tuple(cells))
 
     @property
     def footer(self) -> tuple[str, ...]:

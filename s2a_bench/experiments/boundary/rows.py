@@ -26,5 +26,10 @@ class BoundaryRow:
     stall_free: Annotated[bool, about("What the formula says of even tokens.")]
     p_stall: Annotated[Fraction, about("Share of the plans that stalled when tried.")]
 
+    @property
+    def cell(self) -> str:
+        """The cell of its provenance: a board, or the grid."""
+        return self.board
+
 
 BOUNDARY: Final[Table[BoundaryRow]] = Table("boundary", BoundaryRow)

@@ -28,7 +28,10 @@ def run_boundary(config: BoundaryConfig, output: Path, progress: Progress) -> Pa
         "seeds": {"plans": config.seed},
         "provenance": Origins(
             Provenance.computed(),
-            {board.name: Provenance.computed(board.name, board.weights) for board in config.boards},
+            {
+                "": Provenance.computed(),
+                **{board.name: Provenance.computed(board.name, board.weights) for board in config.boards},
+            },
         ).to_manifest(),
         "boards": [
             {"name": board.name, "title": board.title, "origin": board.origin, "tokens_per_s": board.tokens_per_s}

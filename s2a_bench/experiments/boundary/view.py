@@ -91,8 +91,9 @@ def board_table(run: StoredRun) -> TextTable:
             numbers = (str(one["tokens_per_skill"]), number(gap_s), number(gap_s / one["duration_s"]))
             rows.append((title, *numbers, *verdicts))
         groups.append(rows)
+    names = [board["name"] for board, group in zip(run.manifest["boards"], groups, strict=True) for _ in group]
     header = ("board", "L", "L/R (s)", "rho", "at T_nom", "at T_min")
-    return TextTable.grouped("Boards: is naive stall-free?", header, groups, 1, _notes(run), once=1)
+    return TextTable.grouped("Boards: is naive stall-free?", header, groups, 1, _notes(run), once=1, cells=names)
 
 
 def line_table(run: StoredRun) -> TextTable:
@@ -112,8 +113,8 @@ def line_table(run: StoredRun) -> TextTable:
 
 def boundary_csv(run: StoredRun) -> dict[str, CsvTable]:
     """Return file name -> CSV table."""
-    names = ("duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall")
-    return {"boundary.csv": CsvTable.of(names, run.table(BOUNDARY)[list(names)].itertuples(index=False, name=None))}
+    names = ["duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall"]
+    return {"boundary.csv": CsvTable.of_frame(run.table(BOUNDARY)[[*names, PROVENANCE]])}
 
 
 def _boundary_sentences(run: StoredRun) -> list[str]:

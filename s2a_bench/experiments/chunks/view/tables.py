@@ -116,17 +116,18 @@ def delay_table(run: StoredRun) -> TextTable:
     """Return the table of the delays of each source; in a live run, of each mode with the d that it assumes."""
     names = ["delay_ticks_mean", "delay_ticks_p99", "delay_ticks_max"]
     names += ["delay_assumed_ticks", "p_delay_above"] if live(run) else []
-    rows = []
+    rows, cells = [], []
     for place, (name, group) in enumerate(sources_of(rows_of(run)), 1):
         shared = next((row for row in group if not streams(row["mode"])), group[0])
         for one in group if live(run) else [shared]:
             latency = (number(one[column] * 1e3) for column in ("latency_s", "latency_s_p99"))
+            cells.append(one["cell"])
             left = (one["mode"],) if live(run) else (name, str(one["requests"]))
             rows.append((str(place), *left, *latency, *(_cell(one, name) for name in names)))
     names_left = ("L", "mode") if live(run) else ("L", "latency", "requests")
     header = (*names_left, "ms", "p99", *(_TITLES[name] for name in names))
     title = f"Delays, d = {run.manifest['configuration']['rounding']} of L over Delta t"
-    return TextTable(title, header, rows, 2, notes=(_convention(run),))
+    return TextTable(title, header, rows, 2, notes=(_convention(run),), cells=tuple(cells))
 
 
 def chunk_csv(run: StoredRun) -> dict[str, CsvTable]:
@@ -160,7 +161,9 @@ def _table(run: StoredRun, title: str, names: Sequence[str], notes: Iterable[str
     slower = f" / {settings['slow_down']:g}" if settings.get("slow_down", 1) > 1 else ""
     what = f"{title}{of}, H = {settings['horizon']}, {settings['control_hz']:g}{slower} Hz, d by {settings['rounding']}"
     header = (*("L",) * several, *named, *(_TITLES[name] for name in names))
-    return TextTable.grouped(what, header, groups, several + len(named), _notes(run) if notes is None else notes)
+    cells = (row["cell"] for _, group in found for row in group)
+    notes = _notes(run) if notes is None else notes
+    return TextTable.grouped(what, header, groups, several + len(named), notes, cells=cells)
 
 
 def _named(row: Row, column: str) -> str:

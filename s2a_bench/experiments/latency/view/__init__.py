@@ -166,7 +166,8 @@ def _by_cell(
     blocks: dict[str, list[tuple[str, ...]]] = {}
     for cell, row in zip(cells, rows, strict=True):
         blocks.setdefault(cell.payload, []).append((cell.payload or ABSENT, cell.label, *row))
-    return TextTable.grouped(title, ("payload", "cell", *header), blocks.values(), 2, notes, once=1)
+    names = (cell.name for payload in blocks for cell in cells if cell.payload == payload)
+    return TextTable.grouped(title, ("payload", "cell", *header), blocks.values(), 2, notes, once=1, cells=names)
 
 
 def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> TextTable:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Shown
@@ -121,9 +122,10 @@ def skill_table(cells: Sequence[Timelines]) -> TextTable:
             text = skill["text"] or str(skill["index"] + 1)
             rows.append((*name, text, *map(seconds, times), f"{skill['stretch']:.2f}"))
         groups.append(rows)
+    names = (str(cell.about("cell")) for cell in cells for _ in range(len(cell.skills)))
     header = ("board", "L", "policy", "skill", "arrives", "starts", "ends", "stall before", "queue wait", "stretch")
     plan = "the first plan, times in s" if any(cell.n > 1 for cell in cells) else "times in s"
-    return TextTable.grouped(f"Skills{_common(cells)}: {plan}", header, groups, 4, once=3)
+    return TextTable.grouped(f"Skills{_common(cells)}: {plan}", header, groups, 4, once=3, cells=names)
 
 
 def timeline_tables(run: StoredRun) -> dict[str, TextTable]:
@@ -159,13 +161,15 @@ def _table(cells: Sequence[Timelines], title: str, metrics: Sequence[str], notes
     """Return a table of means, a group of rows a board."""
     several = len({cell.setting[2:] for cell in cells}) > 1
     boards: dict[str, list[tuple[str, ...]]] = {}
+    names: dict[str, list[str]] = {}
     for (name, tokens, n_skills, t_nom_s), group in panels(cells):
         board = name + (f", N {n_skills}, T {t_nom_s:g}" if several else "")
         for place, cell in enumerate(group):
             row = (board, "" if place else str(tokens), cell.policy, *(_entry(cell, METRICS[name]) for name in metrics))
             boards.setdefault(board, []).append(row)
+            names.setdefault(board, []).append(str(cell.about("cell")))
     header = ("board", "L", "policy", *(METRICS[name].title for name in metrics))
-    return TextTable.grouped(title, header, boards.values(), 3, notes, once=1)
+    return TextTable.grouped(title, header, boards.values(), 3, notes, once=1, cells=chain(*names.values()))
 
 
 def _entry(cell: Timelines, metric: TimelineMetric) -> str:
