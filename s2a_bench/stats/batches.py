@@ -84,6 +84,13 @@ class LaunchValues:
         return self.values[low]
 
 
+def lag_one(values: Floats) -> float:
+    """Return the lag-1 autocorrelation of values in their order, r1; 0 if they are all equal."""
+    around = values - values.mean()
+    spread = float(around @ around)
+    return float(around[1:] @ around[:-1]) / spread if spread else 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class RowCorrelation:
     """Correlation of neighbours in a series of ``n`` rows, which is cut into ``k`` batches.
@@ -99,9 +106,7 @@ class RowCorrelation:
     def of(cls, levels: Floats) -> RowCorrelation:
         from scipy import stats
 
-        ranks = stats.rankdata(levels) - (len(levels) + 1) / 2
-        spread = float(ranks @ ranks)
-        r = min(0.95, max(0.0, float(ranks[1:] @ ranks[:-1]) / spread)) if spread else 0.0
+        r = min(0.95, max(0.0, lag_one(stats.rankdata(levels))))
         return cls(r, len(levels), min(BATCHES, len(levels)))
 
     @property

@@ -149,6 +149,15 @@ def change_between(
     )
 
 
+def change_of_ranks(baseline: Rows, other: Rows, *, seed: int) -> Change:
+    """Compare the ranks of two launches' values: the rank test of Wilcoxon, with the batches of `change_between`."""
+    from scipy import stats
+
+    values = np.concatenate([*baseline, *other])
+    ranks = np.split(stats.rankdata(values), np.cumsum([len(row) for row in (*baseline, *other)])[:-1])
+    return change_between([ranks[: len(baseline)]], [ranks[len(baseline) :]], "mean", seed=seed)
+
+
 def ratio_of_launches(
     above: Mapping[_Launch, Blocks], below: Mapping[_Launch, Blocks], seed: int, statistic: Middle = "median"
 ) -> Ratio | None:
