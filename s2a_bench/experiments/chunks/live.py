@@ -27,7 +27,7 @@ from s2a_bench.experiments.chunks.smooth import MOST_TICKS, smoothness
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Place, Session
-from s2a_bench.policy.chunks.cycles import NEVER, follow, gather
+from s2a_bench.policy.chunks.cycles import gather, lay
 
 if TYPE_CHECKING:
     from s2a_bench.act import ActionRobot
@@ -70,14 +70,22 @@ class LiveResult:
         delay = np.where(arrival_ns < 0, ticks, self.setting.delay_ticks(np.maximum(arrival_ns, 0)))
         return gather(acted.request_tick, acted.request_tick + delay, acted.chunk, acted.index, self.setting.horizon)
 
-    def agreement(self) -> float:
-        """Return the share of the ticks that equal those of virtual time with the same arrivals."""
-        acted = self.acted
-        arrival_ns = np.where(acted.arrival_ns < 0, NEVER, acted.arrival_ns)
-        _, computed = follow(self.cell.acting, arrival_ns, self.setting, acted.chunk.size)
-        length = min(computed.chunk.size, acted.chunk.size)
-        agreed = (acted.chunk[:length] == computed.chunk[:length]) & (acted.index[:length] == computed.index[:length])
-        return float(agreed.sum()) / acted.chunk.size
+    def agreement(self) -> float | None:
+        """Return the share of the ticks whose chunk, action and age equal those of `Mode.arrays`; None without them.
+
+        The loop runs the mode's stepper, and the arrays do not. Both have the triggers that a rule chose.
+        """
+        arrival_ns, ticks = self.acted.arrival_ns, self.acted.chunk.size
+        end_ns = ticks * self.setting.period_ns
+        arrival_ns = np.where((arrival_ns < 0) | (arrival_ns > end_ns), end_ns, arrival_ns)
+        cell = replace(self.cell, triggers=self.triggers, begin=None) if self.triggers else self.cell
+        cycles = cell.acting.arrays(arrival_ns, self.setting)
+        if cycles is None:
+            return None
+        computed, done = lay(cycles), self.counted()[1]
+        length = min(computed.chunk.size, ticks)
+        pairs = ((computed.chunk, done.chunk), (computed.index, done.index), (computed.age, done.age))
+        return float(np.all([one[:length] == other[:length] for one, other in pairs], axis=0).sum()) / ticks
 
     def smooth(self) -> dict[str, float]:
         """Return the robot's smoothness, if it reports its motion; the policy's target is unknown."""
@@ -88,7 +96,7 @@ class LiveResult:
         chunk = self.acted.chunk[first : first + MOST_TICKS]
         return smoothness(motion, actions, chunk)
 
-    def timing(self) -> dict[str, float | int]:
+    def timing(self) -> dict[str, float | None]:
         acted, period_ns = self.acted, self.setting.period_ns
         late_s, busy_s = acted.late_ns / 1e9, acted.busy_ns / 1e9
         return {

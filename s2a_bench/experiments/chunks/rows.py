@@ -92,7 +92,7 @@ METRICS: Final[Mapping[str, Metric]] = {
         _plant("boundary_jump_p99", "u", "p99", "Its 99th percentile."),
         _plant("action_step_mean", "u", "step", "From one action to the next within a chunk.", "neither"),
         _ticks("blocked_ticks", "blocked", "Ticks in which the control loop waits for an answer.", kind=COUNT),
-        _share("agreement", "alike, %", "Live: share of the ticks that equal those of virtual time.", "higher"),
+        _share("agreement", "alike, %", "Live: share of the ticks as the mode's arrays have them.", "higher"),
         _number("jitter_s_p50", "s", "jitter (ms)", "Live: delay of an action after its due time, the median."),
         _number("jitter_s_p99", "s", "p99", "Its 99th percentile."),
         _number("jitter_s_max", "s", "max", "The greatest."),

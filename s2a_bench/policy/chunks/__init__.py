@@ -161,7 +161,7 @@ class Ticks:
 
 
 class Mode(Protocol):
-    """A rule for requests and for taking over; a subclass gets `cycles` and `ticks` from its stepper."""
+    """A rule for requests and for taking over: a stepper, and where there are some the same `arrays`."""
 
     streams: ClassVar[bool] = False
     """Whether it acts on a chunk that has not arrived whole."""
@@ -239,17 +239,25 @@ class Mode(Protocol):
         """
         return None
 
+    def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles | None:  # noqa: ARG002 - for subclasses
+        """Return the cycles without the stepper, one run of ticks a chunk; None where only the stepper has them.
+
+        ``arrival_ns`` is the arrival of every action after its request's tick began: shape (R, H), in ns.
+        """
+        return None
+
     def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
         """Return the cycles of requests with latencies of shape (R,), in ns; the first leaves at tick 0."""
-        from s2a_bench.policy.chunks.cycles import step
+        from s2a_bench.policy.chunks.cycles import arrivals, step
 
-        return step(self, latency_ns, setting)[0]
+        return self.arrays(arrivals(self, latency_ns, setting), setting) or step(self, latency_ns, setting)[0]
 
     def ticks(self, latency_ns: Ints, setting: ControlSetting) -> Ticks:
         """Return the ticks of the same requests."""
-        from s2a_bench.policy.chunks.cycles import step
+        from s2a_bench.policy.chunks.cycles import arrivals, lay, step
 
-        return step(self, latency_ns, setting)[1]
+        cycles = self.arrays(arrivals(self, latency_ns, setting), setting)
+        return step(self, latency_ns, setting)[1] if cycles is None else lay(cycles)
 
 
 MODES: Final[Registry[Callable[..., Mode]]] = Registry(

@@ -15,9 +15,9 @@ import numpy as np
 from pydantic import Field
 
 from s2a_bench.policy import Floats
-from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Ticks
+from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode, Ticks
 from s2a_bench.policy.chunks.closed import Closed, stall_share
-from s2a_bench.policy.chunks.cycles import Laid, assemble, lay
+from s2a_bench.policy.chunks.cycles import assemble, lay
 
 Kind: TypeAlias = Literal["weighted_average", "latest_only", "average", "conservative"]
 WEIGHTS: Final[Mapping[Kind, float]] = {
@@ -30,7 +30,7 @@ WEIGHTS: Final[Mapping[Kind, float]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Aggregate(Laid):
+class Aggregate(Mode):
     """Request a chunk when ``trigger`` actions are left, and blend it into them where both have an action."""
 
     name: ClassVar[str] = "aggregate"
@@ -55,8 +55,9 @@ class Aggregate(Laid):
         cycle = delay + setting.horizon - np.minimum(delay, self.trigger) - self.trigger
         return Closed(stall_share(delay, self.trigger), delay, cycle)
 
-    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
+    def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles:
         # With q actions left at the request, min(d, q) of the new chunk are past when it arrives.
+        latency_ns = arrival_ns[:, -1]
         delay, horizon, most = setting.delay_ticks(latency_ns), setting.horizon, self.trigger
         known = setting.known_ticks(latency_ns)
         if 2 * most < horizon:  # on arrival more actions are left than the trigger

@@ -13,15 +13,15 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode, Ticks
+from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode
 from s2a_bench.policy.chunks.closed import Closed, appended
-from s2a_bench.policy.chunks.cycles import Laid, assemble, lay, step
+from s2a_bench.policy.chunks.cycles import assemble
 from s2a_bench.policy.chunks.trigger import Varied
 
 Execute = Annotated[int, Field(ge=0)]
 
 
-class Appending(Laid):
+class Appending(Mode):
     """A mode that executes the first ``execute`` actions of each chunk; 0: the whole chunk."""
 
     execute: int
@@ -36,8 +36,8 @@ class Appending(Laid):
         delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
         return appended(delay, known, self.trigger or 0, self.execution_horizon(setting))
 
-    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
-        delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
+    def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles | None:
+        delay, known = setting.delay_ticks(arrival_ns[:, -1]), setting.known_ticks(arrival_ns[:, -1])
         return _append(delay, known, delay, self.trigger or 0, self.execution_horizon(setting), setting.horizon)
 
 
@@ -58,8 +58,8 @@ class Queue(Appending):
 class VariedQueue(Varied):
     """`Queue` with one trigger per request."""
 
-    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
-        delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
+    def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles:
+        delay, known = setting.delay_ticks(arrival_ns[:, -1]), setting.known_ticks(arrival_ns[:, -1])
         length, last = self.mode.execution_horizon(setting), len(self.triggers) - 1
         leaves, starts, left = [0], [], 0
         for request, (ticks, known_ticks) in enumerate(zip(delay.tolist(), known.tolist(), strict=True)):
@@ -71,9 +71,6 @@ class VariedQueue(Varied):
         tick, start = np.array(leaves[:-1], np.int64), np.array(starts, np.int64)
         first, until = np.zeros_like(start), start + length
         return assemble(tick, tick + delay, start, first, until, ticks=leaves[-1], horizon=setting.horizon)
-
-    def ticks(self, latency_ns: Ints, setting: ControlSetting) -> Ticks:
-        return lay(self.cycles(latency_ns, setting))
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +113,7 @@ class Streamed(Appending):
         return -(-(self.execution_horizon(setting) - 1) * slower_ns // setting.period_ns)
 
     def waits_within(self, setting: ControlSetting) -> bool:
-        """Whether it may stall within a chunk: then arrays and closed forms do not hold."""
+        """Whether it may stall within a chunk: then closed forms do not hold."""
         return self.start == "naive" and self.gap_ns > setting.period_ns
 
     def stepper(self, setting: ControlSetting) -> ChunkStepper:
@@ -129,19 +126,15 @@ class Streamed(Appending):
         known = setting.known_ticks(latency_ns + (length - 1) * self.gap_ns)
         return appended(setting.delay_ticks(latency_ns) + self.hold_ticks(setting), known, self.trigger, length)
 
-    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
-        if self.waits_within(setting):
-            return step(self, latency_ns, setting)[0]
+    def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles | None:
         length = self.execution_horizon(setting)
-        known = setting.known_ticks(latency_ns + (length - 1) * self.gap_ns)
-        whole = setting.delay_ticks(latency_ns + (setting.horizon - 1) * self.gap_ns)
-        ready = setting.delay_ticks(latency_ns) + self.hold_ticks(setting)
-        return _append(ready, known, whole, self.trigger, length, setting.horizon)
-
-    def ticks(self, latency_ns: Ints, setting: ControlSetting) -> Ticks:
-        if self.waits_within(setting):
-            return step(self, latency_ns, setting)[1]
-        return Laid.ticks(self, latency_ns, setting)
+        usable, known = setting.delay_ticks(arrival_ns), setting.known_ticks(arrival_ns[:, length - 1])
+        ready = usable[:, 0] + self.hold_ticks(setting)
+        if (usable[:, :length] - np.arange(length) > ready[:, np.newaxis]).any():
+            return None  # an action arrives after its turn: the chunk is no single run
+        if self.trigger >= length and (ready > known).any():
+            return None  # the next request leaves while the chunk is held back
+        return _append(ready, known, usable[:, -1], self.trigger, length, setting.horizon)
 
 
 @dataclass(slots=True)

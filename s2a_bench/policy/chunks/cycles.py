@@ -19,13 +19,6 @@ NEVER: Final = 2**61
 """Arrival time of an action that never arrives, in ns."""
 
 
-class Laid(Mode):
-    """A mode whose `cycles` are arrays with one run per chunk; its ticks follow from them."""
-
-    def ticks(self, latency_ns: Ints, setting: ControlSetting) -> Ticks:
-        return lay(self.cycles(latency_ns, setting))
-
-
 def assemble(
     request_tick: Ints, usable_tick: Ints, start_tick: Ints, first_index: Ints, until: Ints, *, ticks: int, horizon: int
 ) -> Cycles:
@@ -105,10 +98,17 @@ def _stalled(chunk: Ints) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     return np.asarray(begun & (chunk < 0))
 
 
+def arrivals(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> Ints:
+    """Return the arrival of every action, shape (R, H), of chunks with latencies of shape (R,); both in ns."""
+    latency_ns = latency_ns[:, np.newaxis]
+    if not mode.gap_ns:
+        return np.broadcast_to(latency_ns, (len(latency_ns), setting.horizon))
+    return latency_ns + np.arange(setting.horizon) * mode.gap_ns
+
+
 def step(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> tuple[Cycles, Ticks]:
     """Run a mode's stepper until its first request without a latency; ``latency_ns`` has the shape (R,)."""
-    shifts = np.arange(setting.horizon) * mode.gap_ns
-    return follow(mode, latency_ns[:, np.newaxis] + shifts, setting)
+    return follow(mode, arrivals(mode, latency_ns, setting), setting)
 
 
 def follow(mode: Mode, arrival_ns: Ints, setting: ControlSetting, most: int = NEVER) -> tuple[Cycles, Ticks]:

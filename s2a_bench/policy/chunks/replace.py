@@ -12,13 +12,13 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints
+from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode
 from s2a_bench.policy.chunks.closed import Closed, replace_stall_share, slack_ticks, stall_share
-from s2a_bench.policy.chunks.cycles import Laid, assemble
+from s2a_bench.policy.chunks.cycles import assemble
 
 
 @dataclass(frozen=True, slots=True)
-class Replace(Laid):
+class Replace(Mode):
     """Request a chunk ``execute`` ticks after the last request; it takes over at index now - observation.
 
     ``under_way=one`` waits for the answer before the next request, so a cycle lasts max(s, ceil(L / Delta t)) ticks;
@@ -63,7 +63,8 @@ class Replace(Laid):
             cycle = np.full_like(delay, self.execute)
         return Closed(share, delay, cycle) if delay.max() < setting.horizon else Closed(share)
 
-    def cycles(self, latency_ns: Ints, setting: ControlSetting) -> Cycles:
+    def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles:
+        latency_ns = arrival_ns[:, -1]
         delay = setting.delay_ticks(latency_ns)
         step = np.full(delay.size, self.execute)
         if not self.several:

@@ -14,9 +14,9 @@ from s2a_bench.errors import UsageError
 from s2a_bench.policy.chunks import MODES, ControlSetting, Mode, mode
 from s2a_bench.policy.chunks.aggregate import Aggregate
 from s2a_bench.policy.chunks.append import Queue, Streamed, Sync
-from s2a_bench.policy.chunks.cycles import step
+from s2a_bench.policy.chunks.cycles import follow, step
 from s2a_bench.policy.chunks.replace import Replace
-from tests.policy.chunks.drawn import cases, latencies, plainly, settings_of_chunks
+from tests.policy.chunks.drawn import cases, latencies, modes, plainly, settings_of_chunks
 
 named = pytest.mark.parametrize("name", MODES)
 many = settings(max_examples=300)
@@ -46,6 +46,23 @@ def test_the_stepper_and_the_arrays_agree(name: str, data: st.DataObject) -> Non
     for arrays, stepped in zip(simulate(made, latency_ns, setting)[::-1], step(made, latency_ns, setting), strict=True):
         for field in fields(arrays):
             np.testing.assert_array_equal(getattr(arrays, field.name), getattr(stepped, field.name), field.name)
+
+
+@many
+@given(data=st.data(), setting=settings_of_chunks())
+def test_arrays_of_streamed_actions_are_the_stepper_s_at_any_gaps(data: st.DataObject, setting: ControlSetting) -> None:
+    made, latency_ns = data.draw(modes(setting, "streamed")), data.draw(latencies(setting))
+    most = data.draw(st.sampled_from([0, 1, setting.period_ns, 2 * setting.period_ns]))
+    gap_ns = np.random.default_rng(data.draw(st.integers(0, 99))).integers(
+        0, most + 1, (latency_ns.size, setting.horizon)
+    )
+    arrival_ns = latency_ns[:, np.newaxis] + np.cumsum(gap_ns, axis=1) - gap_ns[:, :1]
+    arrays, stepped = made.arrays(arrival_ns, setting), follow(made, arrival_ns, setting)[0]
+    length = made.execution_horizon(setting)
+    waits = (np.diff(setting.delay_ticks(arrival_ns[:, :length])) > 1).any()
+    assert arrays is not None or waits or made.trigger >= length
+    for field in fields(stepped) if arrays is not None else ():
+        np.testing.assert_array_equal(getattr(arrays, field.name), getattr(stepped, field.name), field.name)
 
 
 @named

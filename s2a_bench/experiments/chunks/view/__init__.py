@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.chunks.view.figures import chunk_figures, lanes_of
 from s2a_bench.experiments.chunks.view.tables import (
+    Row,
     chunk_csv,
     chunk_json,
     chunk_tables,
@@ -49,14 +51,24 @@ def chunk_sentences(run: StoredRun) -> list[str]:
         if stalls:
             sentences.append(f"Stalled cycles of queue @ {name}, for at most {epsilon:.2%}: {', '.join(stalls)} ticks.")
         if live(run):
-            least, worst = min(row["agreement"] for row in rows), max(row["jitter_s_p99"] for row in rows)
-            sentences.append(
-                f"Control loop @ {name}: at least {least:.2%} of the ticks equal those of virtual time; "
-                f"p99 of the jitter at most {number(worst * 1e3)} ms."
-            )
+            sentences.append(f"Control loop @ {name}: {'; '.join(_loop(rows))}.")
         slower = max((row["slow_down"] or 1 for row in rows if row["mode"].startswith("queue")), default=1)
         if slower > 1:
             sentences.append(
                 f"@ {name} no trigger of queue is enough: actions would have to be {slower:.2f} times slower."
             )
     return sentences
+
+
+def _loop(rows: list[Row]) -> Iterator[str]:
+    """Yield what the ticks of a live loop were checked against, what was not checked, and the jitter."""
+    checked = [row["agreement"] for row in rows if row["agreement"] is not None]
+    if checked:
+        rules = " and the triggers of their rules" if any(row["rule"] != "given" for row in rows) else ""
+        yield (
+            f"at least {min(checked):.2%} of the ticks have the chunk, the action and the age that the modes' arrays "
+            f"give for the measured delays{rules}"
+        )
+    if unchecked := dict.fromkeys(row["mode"] for row in rows if row["agreement"] is None):
+        yield f"not checked, as arrays do not cover its arrivals: {', '.join(unchecked)}"
+    yield f"p99 of the jitter at most {number(max(row['jitter_s_p99'] for row in rows) * 1e3)} ms"

@@ -47,8 +47,9 @@ _LOOP: Final = (
     "bytes_up_per_s",
 )
 _LOOP_NOTE: Final = (
-    "alike: share of the ticks that equal those of virtual time with the measured latencies; jitter: delay of an "
-    "action after its due time; late: by a tick or more; busy: time of a tick spent on requests and sending, p99."
+    "alike: share of the ticks with the chunk, action and age that the mode's arrays give for the measured delays, "
+    "empty where they do not cover the arrivals; jitter: delay of an action after its due time; late: by a tick or "
+    "more; busy: time of a tick spent on requests and sending, p99."
 )
 _MOTION: Final = ("jerk_rms", "boundary_jump_mean", "boundary_jump_p99", "action_step_mean")
 _FOLLOWING: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal", *_MOTION[1:])
