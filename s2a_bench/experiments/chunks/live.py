@@ -57,8 +57,8 @@ class LiveResult:
 
     @property
     def judged(self) -> ChunkCell:
-        """The cell with the measured latencies of complete answers, and the triggers."""
-        latency_ns = self.acted.arrival_ns[: self.acted.whole, 0 if self.cell.mode.streams else -1]
+        """The cell with the measured latencies of complete answers, to their first action, and the triggers."""
+        latency_ns = self.acted.arrival_ns[: self.acted.whole, 0]
         cell = replace(self.cell, drawn=replace(self.cell.drawn, judged=latency_ns))
         triggers = self.triggers[: latency_ns.size]
         return replace(cell, triggers=triggers, begin=None) if triggers else cell
@@ -66,7 +66,7 @@ class LiveResult:
     def counted(self) -> tuple[Cycles, Ticks]:
         """Return cycles and ticks of the whole run; a missing answer is usable after the last tick."""
         acted, ticks = self.acted, self.acted.chunk.size
-        arrival_ns = acted.arrival_ns[:, -1]
+        arrival_ns = acted.arrival_ns[:, 0]
         delay = np.where(arrival_ns < 0, ticks, self.setting.delay_ticks(np.maximum(arrival_ns, 0)))
         return gather(acted.request_tick, acted.request_tick + delay, acted.chunk, acted.index, self.setting.horizon)
 

@@ -112,7 +112,7 @@ class Cycles:
     request_tick: Ints
     """When it left with an observation; ticks count from 0."""
     usable_tick: Ints
-    """When the whole chunk was usable: request_tick + d."""
+    """When the chunk was usable, streamed its first action: request_tick + d."""
     start_tick: Ints
     """When its first action was executed; the end of the simulation if none was."""
     first_index: Ints

@@ -38,7 +38,7 @@ class Appending(Mode):
 
     def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles | None:
         delay, known = setting.delay_ticks(arrival_ns[:, -1]), setting.known_ticks(arrival_ns[:, -1])
-        return _append(delay, known, delay, self.trigger or 0, self.execution_horizon(setting), setting.horizon)
+        return _append(delay, delay, known, self.trigger or 0, self.execution_horizon(setting), setting.horizon)
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,13 +128,13 @@ class Streamed(Appending):
 
     def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles | None:
         length = self.execution_horizon(setting)
-        usable, known = setting.delay_ticks(arrival_ns), setting.known_ticks(arrival_ns[:, length - 1])
+        usable, known = setting.delay_ticks(arrival_ns[:, :length]), setting.known_ticks(arrival_ns[:, length - 1])
         ready = usable[:, 0] + self.hold_ticks(setting)
-        if (usable[:, :length] - np.arange(length) > ready[:, np.newaxis]).any():
+        if (usable - np.arange(length) > ready[:, np.newaxis]).any():
             return None  # an action arrives after its turn: the chunk is no single run
         if self.trigger >= length and (ready > known).any():
             return None  # the next request leaves while the chunk is held back
-        return _append(ready, known, usable[:, -1], self.trigger, length, setting.horizon)
+        return _append(usable[:, 0], ready, known, self.trigger, length, setting.horizon)
 
 
 @dataclass(slots=True)
@@ -171,7 +171,7 @@ class QueueStepper(ChunkStepper):
         return self.waiting.popleft()[0]
 
 
-def _append(ready: Ints, known: Ints, whole: Ints, trigger: int, length: int, horizon: int) -> Cycles:
+def _append(delay: Ints, ready: Ints, known: Ints, trigger: int, length: int, horizon: int) -> Cycles:
     """Append chunks that may begin ``ready`` ticks after the request, shapes (R,).
 
     With q actions left at the request at k, the chunk begins at e = k + max(q, ready). The next request leaves when
@@ -194,4 +194,4 @@ def _append(ready: Ints, known: Ints, whole: Ints, trigger: int, length: int, ho
     request = leaves[:-1]
     start = request + np.maximum(left, ready)
     first, until = np.zeros_like(start), start + length
-    return assemble(request, request + whole, start, first, until, ticks=int(leaves[-1]), horizon=horizon)
+    return assemble(request, request + delay, start, first, until, ticks=int(leaves[-1]), horizon=horizon)

@@ -142,7 +142,7 @@ def follow(mode: Mode, arrival_ns: Ints, setting: ControlSetting, most: int = NE
         index.append(-1 if acted is None else acted.index)
         tick += 1
     request_tick = np.array(leaves, np.int64)
-    usable_tick = request_tick + usable[:, -1]
+    usable_tick = request_tick + usable[:, 0]
     return gather(request_tick, usable_tick, np.array(chunk, np.int64), np.array(index, np.int64), horizon)
 
 

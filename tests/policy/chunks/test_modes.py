@@ -71,6 +71,7 @@ def test_cycles_are_what_ticks_add_up_to(name: str, data: st.DataObject) -> None
     made, latency_ns, setting = data.draw(cases(name))
     ticks, cycles = simulate(made, latency_ns, setting)
     assert len(ticks.chunk) == cycles.ticks
+    np.testing.assert_array_equal(cycles.delay_ticks, setting.delay_ticks(latency_ns))
     for request in range(latency_ns.size):
         acted = np.flatnonzero(ticks.chunk == request)
         assert cycles.executed[request] == acted.size

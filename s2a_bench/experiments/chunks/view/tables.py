@@ -119,8 +119,7 @@ def delay_table(run: StoredRun) -> TextTable:
     names += ["delay_assumed_ticks", "p_delay_above"] if live(run) else []
     rows, cells = [], []
     for place, (name, group) in enumerate(sources_of(rows_of(run)), 1):
-        shared = next((row for row in group if not streams(row["mode"])), group[0])
-        for one in group if live(run) else [shared]:
+        for one in group if live(run) else group[:1]:
             latency = (number(one[column] * 1e3) for column in ("latency_s", "latency_s_p99"))
             cells.append(one["cell"])
             left = (one["mode"],) if live(run) else (name, str(one["requests"]))
@@ -206,7 +205,7 @@ def _notes(run: StoredRun) -> Iterator[str]:
     )
     rows = rows_of(run)
     if any(streams(row["mode"]) for row in rows):
-        yield "streamed: the latency is that of the first action, d that of the last."
+        yield "streamed: latency and d are those of the first action."
     if any(row["slow_down"] is not None and row["slow_down"] > 1 for row in rows):
         yield "Where no trigger is enough, actions have to be slower by beta (chunks.csv: slow_down)."
     if any(row["rule"] != "given" for row in rows):
