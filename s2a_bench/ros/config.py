@@ -21,6 +21,12 @@ TUNED_GENERAL = "<MaxMessageSize>65500B</MaxMessageSize><FragmentSize>65000B</Fr
 TUNED_INTERNAL = '<Internal><SocketReceiveBufferSize max="16MB"/></Internal>'
 """Fragments of nearly the largest UDP datagram, and the receive buffer the kernel allows: half the time for a VGA
 image, and no lost fragments at 1920x1080."""
+CYCLONE_URI = "CYCLONEDDS_URI"
+RMW_CYCLONE = "rmw_cyclonedds_cpp"
+LARGE_PICTURES = (
+    f'<CycloneDDS><Domain id="any"><General>{TUNED_GENERAL}</General>{TUNED_INTERNAL}</Domain></CycloneDDS>'
+)
+"""Value of CYCLONEDDS_URI with which rmw_cyclonedds_cpp, too, uses these; all else remains its own choice."""
 
 PATIENT = "<InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>"
 """Cyclone 11 stops announcing itself to addresses that have not answered for 30 s; a peer that finds others by
@@ -35,13 +41,19 @@ def domain_id(environ: Mapping[str, str]) -> int:
     return int(text)
 
 
+def discovery_range(environ: Mapping[str, str], default: str) -> str:
+    """Return ROS_AUTOMATIC_DISCOVERY_RANGE; raises UsageError for an unknown one."""
+    reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", default).upper()
+    if reach not in RANGES:
+        raise UsageError(f"ROS_AUTOMATIC_DISCOVERY_RANGE: {none_of(reach, RANGES)}")
+    return reach
+
+
 def configuration(environ: Mapping[str, str], tuning: Tuning) -> str | None:
     """Return the XML for ``cyclonedds.domain.Domain``, or None to leave it to the user's CYCLONEDDS_URI."""
     if environ.get("CYCLONEDDS_URI"):
         return None
-    reach = environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST").upper()
-    if reach not in RANGES:
-        raise UsageError(f"ROS_AUTOMATIC_DISCOVERY_RANGE: {none_of(reach, RANGES)}")
+    reach = discovery_range(environ, "LOCALHOST")
     peers = [peer for peer in environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
     for peer in peers:
         if not PEER.fullmatch(peer):

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import atexit
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswer
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as package_version
 from typing import Any
@@ -21,6 +22,7 @@ import rclpy
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
+from s2a_bench.ros.config import CYCLONE_URI, LARGE_PICTURES, RMW_CYCLONE
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise
 from s2a_bench.ros.rclpy_client import RclpyActionClient
 from s2a_bench.ros.rclpy_node import ONE_SUBSCRIPTION, RclpyWaiter, SpinningNode, Unserved, qos_profile
@@ -109,7 +111,7 @@ class _RclpySubscription:
             more = True
             while not self._waiter.interrupted:
                 if (taken := self._subscription.handle.take_message(self._class, True)) is not None:
-                    return bytes(taken[0])
+                    return taken[0]  # type: ignore[no-any-return]
                 if not more:
                     break
                 more = self._waiter.wait_until(deadline_ns)
@@ -125,13 +127,32 @@ class _RclpySubscription:
     """Humble's subscriptions do not know which of them reach it."""
 
 
+@contextmanager
+def _configured(tuning: Tuning) -> Iterator[str]:
+    """Yield the value of CYCLONEDDS_URI, which makes room for large pictures where the user has set none.
+
+    rmw_cyclonedds_cpp reads it as the first node joins a domain. Cyclone DDS from PyPI reads it as well, so it is unset
+    afterwards.
+    """
+    uri = os.environ.get(CYCLONE_URI, "")
+    if uri or tuning != "tuned" or rclpy.get_rmw_implementation_identifier() != RMW_CYCLONE:
+        yield uri
+        return
+    os.environ[CYCLONE_URI] = LARGE_PICTURES
+    try:
+        yield LARGE_PICTURES
+    finally:
+        del os.environ[CYCLONE_URI]
+
+
 class RclpyMiddleware:
     """One node, through the ROS 2 installation's rclpy."""
 
-    def __init__(self, domain_id: int, _tuning: Tuning, node_name: str) -> None:
-        """Join ``domain_id`` as the node ``/namespace/name``; tuning is left to the rmw's own configuration."""
+    def __init__(self, domain_id: int, tuning: Tuning, node_name: str) -> None:
+        """Join ``domain_id`` as the node ``/namespace/name``; of the rmws, Cyclone alone is tuned."""
         self._domain_id = domain_id
-        self._node = SpinningNode(domain_id, node_name)
+        with _configured(tuning) as self._configuration:
+            self._node = SpinningNode(domain_id, node_name)
         self._close: list[Callable[[], None]] = []
         atexit.register(self.close)
 
@@ -173,8 +194,8 @@ class RclpyMiddleware:
             "distribution": distribution,
             "rmw": rclpy.get_rmw_implementation_identifier(),
             "domain_id": self._domain_id,
-            "tuning": "default",
-            "configuration": os.environ.get("CYCLONEDDS_URI", ""),
+            "tuning": "tuned" if self._configuration == LARGE_PICTURES else "default",
+            "configuration": self._configuration,
         }
 
     def close(self) -> None:

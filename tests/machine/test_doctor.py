@@ -280,6 +280,9 @@ def test_a_card_without_its_driver_is_seen_on_the_bus(make: Make) -> None:
     assert see(make(COMMON | sound), "gpu").level == "state"
 
 
+JAZZY = {"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": "/opt/ros/jazzy"}
+
+
 @pytest.mark.parametrize(
     ("environ", "level", "says"),
     [
@@ -292,9 +295,29 @@ def test_a_card_without_its_driver_is_seen_on_the_bus(make: Make) -> None:
         ({"ROS_DOMAIN_ID": "300"}, "error", "ROS_DOMAIN_ID: '300'"),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "MOON"}, "error", "'MOON' is none of"),
         ({"CYCLONEDDS_URI": "file:///x.xml"}, "state", "CYCLONEDDS_URI file:///x.xml"),
+        (JAZZY, "state", "domain 0, rclpy on rmw_fastrtps_cpp, all interfaces: eth0, with multicast"),
+        (
+            JAZZY | {"CYCLONEDDS_URI": "file:///x.xml"},
+            "state",
+            "rmw_fastrtps_cpp, all interfaces: eth0, with multicast",
+        ),
+        (
+            JAZZY | {"ROS_LOCALHOST_ONLY": "1"},
+            "state",
+            "rmw_fastrtps_cpp, loopback only (127.0.0.1), without multicast",
+        ),
+        (JAZZY | {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}, "state", "rmw_fastrtps_cpp, loopback only"),
+        (
+            JAZZY | {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp", "CYCLONEDDS_URI": "file:///x.xml"},
+            "state",
+            "domain 0, rclpy on rmw_cyclonedds_cpp, CYCLONEDDS_URI file:///x.xml",
+        ),
     ],
 )
-def test_dds_says_domain_and_interface(make: Make, environ: dict[str, str], level: str, says: str) -> None:
+def test_dds_says_domain_and_interface(
+    make: Make, monkeypatch: pytest.MonkeyPatch, environ: dict[str, str], level: str, says: str
+) -> None:
+    monkeypatch.setattr("s2a_bench.ros.find_spec", lambda name: name in {"rclpy", "cyclonedds"})
     finding = see(make(COMMON, environ=environ), "dds")
     assert finding.level == level
     assert says in finding.message

@@ -56,7 +56,7 @@ def test_the_advice_against_loss_is_that_of_the_dds_in_use(
     ("environ", "level", "says"),
     [
         ({}, "", ""),
-        (CYCLONE, "warning", "asks for no large receive buffer"),
+        (CYCLONE, "advice", "s2a-bench asks for large receive buffers itself"),
         (CYCLONE | {"CYCLONEDDS_URI": BUFFER.format('max="16MB"')}, "state", "asks for 16777216 bytes"),
         (CYCLONE | {"CYCLONEDDS_URI": BUFFER.format("min='1 MB' max='4MiB'")}, "state", "asks for 4194304 bytes"),
         (CYCLONE | {"CYCLONEDDS_URI": BUFFER.format('max="512kB"')}, "warning", "asks for no large"),

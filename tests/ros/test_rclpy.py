@@ -13,6 +13,13 @@ from tests.ros.middleware_suite import Join, MiddlewareSuite, joining
 pytest.importorskip("rclpy", reason="rclpy comes with ROS 2, not from PyPI")
 
 
+@pytest.fixture(autouse=True)
+def on_loopback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """rclpy's own default is the subnet."""
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_LOCALHOST_ONLY", "1")  # Humble's name for it
+
+
 @pytest.fixture
 def join(dds_domain: int) -> Iterator[Join]:
     with joining(lambda: open_middleware("rclpy", domain_id=dds_domain)) as join:

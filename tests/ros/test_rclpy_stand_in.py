@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import MissingInterface, TransportError
-from s2a_bench.ros import Accepted, Feedback, QoS, Result, llama, open_middleware
+from s2a_bench.ros import Accepted, Feedback, QoS, Result, Tuning, llama, open_middleware
 from s2a_bench.ros import messages as ros
+from s2a_bench.ros.config import CYCLONE_URI, LARGE_PICTURES, RMW_CYCLONE
 from s2a_bench.ros.diagnostics import LOG, ROSOUT_QOS
 from s2a_bench.ros.parameters import SERVICE, Parameter, value_of
 from s2a_bench.testing.transport import RecordingHandler, ask, connector, wiring_of, yuyv_frame
@@ -71,6 +72,33 @@ def test_a_goal_that_has_ended_goes_with_its_pictures_at_once() -> None:
         assert gone() is None
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize(
+    ("rmw", "uri", "tuning", "given"),
+    [
+        (RMW_CYCLONE, "", "tuned", LARGE_PICTURES),
+        (RMW_CYCLONE, "", "default", ""),
+        (RMW_CYCLONE, "/own.xml", "tuned", "/own.xml"),
+        ("rmw_fastrtps_cpp", "", "tuned", ""),
+    ],
+)
+def test_rmw_cyclonedds_has_room_for_large_pictures_unless_the_user_configures_it(
+    monkeypatch: pytest.MonkeyPatch, rmw: str, uri: str, tuning: Tuning, given: str
+) -> None:
+    seen: list[str] = []
+    rclpy = sys.modules["rclpy"]
+    join = rclpy.create_node
+    monkeypatch.setattr(rclpy, "get_rmw_implementation_identifier", lambda: rmw)
+    monkeypatch.setattr(
+        rclpy, "create_node", lambda *of, **how: seen.append(os.environ.get(CYCLONE_URI, "")) or join(*of, **how)
+    )
+    monkeypatch.setenv(CYCLONE_URI, uri)
+    with closing(open_middleware("rclpy", domain_id=7, tuning=tuning)) as middleware:
+        about = middleware.describe()
+    assert seen == [about["configuration"]] == [given]
+    assert about["tuning"] == ("tuned" if given == LARGE_PICTURES else "default")
+    assert os.environ.get(CYCLONE_URI, "") == uri  # Cyclone DDS from PyPI would read it in a run beside
 
 
 class TestRclpyGlue(MiddlewareSuite):

@@ -99,6 +99,7 @@ class Ros(Transport[RosOptions]):
             )
 
     def ready(self, wiring: Wiring[RosOptions]) -> str:
+        from s2a_bench.transport.ros.buffers import hint
         from s2a_bench.transport.ros.camera import CAMERA
         from s2a_bench.transport.ros.joining import AT, place_of, remapped
 
@@ -106,7 +107,8 @@ class Ros(Transport[RosOptions]):
         namespace, hosted, _ = wiring.address.partition(AT)
         action, camera = (names.get(name, name) for name in (f"{namespace}/generate_response", namespace + CAMERA))
         where = place_of(wiring) + (", which this server is" if hosted else "")
-        return f"serving action {action}, camera {camera}, in {where}"
+        room = hint(wiring.options.middleware, os.environ)
+        return f"serving action {action}, camera {camera}, in {where}{room and f'; for large pictures: {room}'}"
 
 
 ROS = Ros()

@@ -8,13 +8,11 @@ from collections.abc import Iterator, Mapping
 from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.machine.doctor.host import RMEM_WANTED
 from s2a_bench.ros import default_middleware
-from s2a_bench.ros.config import TUNED_GENERAL, TUNED_INTERNAL
+from s2a_bench.ros.config import LARGE_PICTURES, RMW_CYCLONE
 
-CYCLONE, FAST = "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp"
-DEFAULT_RMW = FAST
+FAST = DEFAULT_RMW = "rmw_fastrtps_cpp"
 """Of Humble and Jazzy, where RMW_IMPLEMENTATION says nothing."""
 KERNEL = f"sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}"
-FRAGMENT = f'<CycloneDDS><Domain id="any"><General>{TUNED_GENERAL}</General>{TUNED_INTERNAL}</Domain></CycloneDDS>'
 LARGE_DATA = "export FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA"
 PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
 
@@ -32,7 +30,7 @@ def dds_of(middleware: str, environ: Mapping[str, str]) -> str:
 def against_loss(middleware: str, environ: Mapping[str, str]) -> str:
     """Return what to do where frames are lost over a middleware."""
     dds = dds_of(middleware, environ)
-    if dds == CYCLONE or (dds == "cyclonedds" and environ.get("CYCLONEDDS_URI")):
+    if dds == RMW_CYCLONE or (dds == "cyclonedds" and environ.get("CYCLONEDDS_URI")):
         return f"--qos reliable, and on both sides: {cyclone_line(environ)}; {KERNEL}"
     if dds == "cyclonedds":
         return f"--qos reliable, --dds-tuning tuned, and {KERNEL}"
@@ -46,7 +44,7 @@ def against_loss(middleware: str, environ: Mapping[str, str]) -> str:
 def cyclone_line(environ: Mapping[str, str]) -> str:
     """Return the line that gives Cyclone DDS large buffers and fragments, and keeps the user's own settings."""
     kept = '"$CYCLONEDDS_URI,"' if environ.get("CYCLONEDDS_URI") else ""
-    return f"export CYCLONEDDS_URI={kept}'{FRAGMENT}'"
+    return f"export CYCLONEDDS_URI={kept}'{LARGE_PICTURES}'"
 
 
 def fast_line(environ: Mapping[str, str]) -> str:
@@ -56,11 +54,21 @@ def fast_line(environ: Mapping[str, str]) -> str:
     return LARGE_DATA
 
 
-def check(machine: Machine) -> Finding | None:
-    """Return whether the DDS that a run takes has room for large pictures; our own configuration has."""
+def hint(middleware: str, environ: Mapping[str, str]) -> str:
+    """Return the line that gives this process room for large pictures; "" where it has room or makes it itself."""
+    finding = check(Machine(environ=dict(environ)), middleware)
+    makes_it = dds_of(middleware, environ) == RMW_CYCLONE and not environ.get("CYCLONEDDS_URI")
+    return "" if finding is None or makes_it else finding.fix
+
+
+def check(machine: Machine, middleware: str = "") -> Finding | None:
+    """Return whether a DDS, by default the one that a run takes, has room for large pictures; our own has."""
     environ, code = machine.environ, "dds-buffers"
-    dds = dds_of("", environ)
-    if dds == CYCLONE or (dds == "cyclonedds" and environ.get("CYCLONEDDS_URI")):
+    dds = dds_of(middleware, environ)
+    if dds == RMW_CYCLONE and not environ.get("CYCLONEDDS_URI"):
+        finding = f"{dds}: s2a-bench asks for large receive buffers itself; cameras and other nodes lose large pictures"
+        return Finding(code, "advice", f"{finding}, with best effort nearly all of 1920x1080", cyclone_line(environ))
+    if environ.get("CYCLONEDDS_URI") and dds in {RMW_CYCLONE, "cyclonedds"}:
         size = max(_buffer_sizes(machine), default=0)
         if size >= RMEM_WANTED:
             return Finding(code, "state", f"{dds}: CYCLONEDDS_URI asks for {size} bytes of receive buffer")

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import platform
 from typing import Final
-from xml.etree import ElementTree as ET
 
 from s2a_bench.errors import UsageError
 from s2a_bench.extras import how_to_install
 from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.ros import WAYS_OUT, default_middleware
-from s2a_bench.ros.config import configuration, domain_id
+from s2a_bench.ros.config import CYCLONE_URI, configuration, discovery_range, domain_id
 from s2a_bench.ros.router import ROUTER, endpoint_of
+from s2a_bench.transport.ros.buffers import DEFAULT_RMW, dds_of
 
 STATE_AT: Final = 3
 """The column of /proc/net/tcp that holds a socket's state."""
@@ -19,22 +19,27 @@ LISTEN: Final = "0A"
 
 
 def dds(machine: Machine) -> Finding:
-    """Return which domain and interfaces are used."""
+    """Return which domain and interfaces the default middleware uses; rclpy's are those of the ROS installation."""
+    environ = machine.environ
+    by_rclpy = default_middleware(environ) == "rclpy"
+    default = "SUBNET" if by_rclpy and environ.get("ROS_LOCALHOST_ONLY") != "1" else "LOCALHOST"
     try:
-        domain = domain_id(machine.environ)
-        text = configuration(machine.environ, "tuned")
+        domain = f"domain {domain_id(environ)}"
+        reach = discovery_range(environ, default)
+        configuration(environ, "tuned")
     except UsageError as error:
         return Finding("dds", "error", str(error), f"unset {str(error).partition(':')[0]}")
-    if text is None:
-        return Finding("dds", "state", f"domain {domain}, CYCLONEDDS_URI {machine.environ['CYCLONEDDS_URI']}")
-    root = ET.fromstring(text)  # noqa: S314 - our own text
-    bound = [str(interface.get("address")) for interface in root.iter("NetworkInterface")]
+    if by_rclpy:
+        domain += f", rclpy on {dds_of('rclpy', environ)}"
+    if environ.get(CYCLONE_URI) and dds_of("", environ) != DEFAULT_RMW:
+        return Finding("dds", "state", f"{domain}, {CYCLONE_URI} {environ[CYCLONE_URI]}")
+    local = reach in {"OFF", "LOCALHOST"}
+    bound = local and not environ.get("ROS_STATIC_PEERS")
     up = [path.split("/")[3] for path, state in machine.read_all("sys/class/net/*/operstate").items() if state == "up"]
-    where = f"loopback only ({', '.join(bound)})" if bound else f"all interfaces: {', '.join(up) or 'none is up'}"
-    multicast = root.findtext(".//AllowMulticast") == "true"
-    state = f"domain {domain}, {where}, {'with' if multicast else 'without'} multicast"
+    where = "loopback only (127.0.0.1)" if bound else f"all interfaces: {', '.join(up) or 'none is up'}"
+    state = f"{domain}, {where}, {'without' if local else 'with'} multicast"
     if not bound and not up:
-        return Finding("dds", "warning", state, "ip link shows why; or unset ROS_AUTOMATIC_DISCOVERY_RANGE")
+        return Finding("dds", "warning", state, "ip link shows why; or export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST")
     return Finding("dds", "state", state)
 
 
