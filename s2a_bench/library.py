@@ -89,7 +89,7 @@ class Run:
         if f"{name}.csv" in shown.csvs:
             return _read_csv(shown.csvs[f"{name}.csv"].text(origins), origins)
         table = self._one(shown.tables, "table", name)
-        coded = CsvTable(table.header, table.rows).coded(origins, table.cells)
+        coded = CsvTable.of(table.header, table.rows).coded(origins, table.cells)
         frame = pd.DataFrame(coded.rows, columns=list(coded.header))
         frame.attrs[PROVENANCE] = table.provenance
         return frame

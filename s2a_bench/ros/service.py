@@ -86,7 +86,7 @@ class ServiceEnd(End, Protocol[Caller]):
         """Wait, 100 ms at most, until replies reach the caller; False if it has left."""
         return True
 
-    def drop(self, caller: Caller, /) -> None:
+    def drop(self, caller: Caller, /) -> None:  # noqa: ARG002 - for ends that keep them
         """Let go of a request, which may have been answered."""
         return
 
