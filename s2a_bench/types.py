@@ -15,7 +15,8 @@ Vector: TypeAlias = "NDArray[np.float32]"
 
 Bayer: TypeAlias = Literal["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"]
 Yuv: TypeAlias = Literal["yuv422_yuy2", "yuv422", "nv12", "nv21"]
-Encoding: TypeAlias = Literal["bgr8", "rgb8", "bgra8", "rgba8", "mono8", "mono16", Yuv, Bayer, "jpeg", "png"]
+Deep: TypeAlias = Literal["mono16", "rgb16", "bgr16"]
+Encoding: TypeAlias = Literal["bgr8", "rgb8", "bgra8", "rgba8", "mono8", Deep, Yuv, Bayer, "jpeg", "png"]
 """Pixel formats by their ROS names (``sensor_msgs/image_encodings.hpp``), and the two compressed ones."""
 
 
@@ -24,7 +25,8 @@ class Frame:
     """One picture in the format of its source.
 
     ``data`` is uint8: (height, width, 2) for ``yuv422_yuy2``, ``yuv422`` (UYVY) and ``mono16`` (in this machine's order
-    of bytes), (height, width, 3) for ``bgr8`` and ``rgb8``, (height, width, 4) for ``bgra8`` and ``rgba8``,
+    of bytes), (height, width, 6) for ``rgb16`` and ``bgr16``, (height, width, 3) for ``bgr8`` and ``rgb8``,
+    (height, width, 4) for ``bgra8`` and ``rgba8``,
     (height, width) for ``mono8`` and mosaics, (height * 3 / 2, width) for ``nv12`` and ``nv21``, (n,) for ``jpeg`` and
     ``png``. ``stamp_ns`` is the time of capture on CLOCK_MONOTONIC; ``index`` counts frames of one source from 0.
     """

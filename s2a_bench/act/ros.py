@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, fields
 from threading import Lock, Thread
 from typing import Annotated, Any, Final, Literal, TypeVar
 
+import numpy as np
 from pydantic import Field
 
 from s2a_bench.act import ActionKind, ActionRobot, Report, Running, SkillKind
@@ -129,6 +130,7 @@ class RosActions(ActionRobot):
         self._joints = joints
         seconds, nanoseconds = divmod(period_ns, 1_000_000_000)
         self._period = ros.default("builtin_interfaces/msg/Duration", sec=seconds, nanosec=nanoseconds)
+        self._publisher.pack(self._message(np.zeros(len(joints), "float32")))  # the first packing takes milliseconds
         if kind.wait_s and not appeared(lambda: self._publisher.matched() > 0, kind.wait_s):
             raise RobotError(
                 f"`robot`: ros: no subscription to {kind.topic} ({type_name}) appeared in {kind.wait_s:g} s; start the "

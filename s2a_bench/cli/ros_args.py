@@ -25,9 +25,14 @@ VALUED: Final = {
     "--param": "param",
     "--params-file": "params_file",
     "--log-level": "log_level",
+    "-e": "enclave",
+    "--enclave": "enclave",
+    "--log-config-file": "log_config_file",
 }
 QUIET: Final = re.compile("--(en|dis)able-(rosout|stdout|external-lib)-logs")
 """Ignored flags: the log goes to /rosout and, from warnings on, to stderr."""
+ENCLAVE: Final = "ROS_SECURITY_ENCLAVE_OVERRIDE"
+"""ROS 2's own variable for the flag, which rclpy's nodes follow."""
 SIM_TIME: Final = "use_sim_time"
 OF_EVERY_NODE: Final = frozenset({SIM_TIME, "start_type_description_service"})
 """Parameters that launch files set for every node."""
@@ -55,6 +60,8 @@ class Read:
 
     options: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    environ: dict[str, str] = field(default_factory=dict)
+    """For the node's process."""
 
 
 def read(text: str, known: Sequence[str], node: Mapping[str, str]) -> Read:
@@ -78,6 +85,10 @@ def read(text: str, known: Sequence[str], node: Mapping[str, str]) -> Read:
             _read_file(found, Path(value), known, name)
         elif kind == "log_level":
             found.options["log_level"] = value.rpartition(":=")[2].lower()
+        elif kind == "enclave":
+            found.environ[ENCLAVE] = value
+        elif kind == "log_config_file":
+            found.notes.append(f"--log-config-file {value} is left out: the log goes to /rosout and to stderr")
     return found
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
@@ -109,6 +110,7 @@ def _ros_args(text: str, chosen: Transport[Any], given: Mapping[str, Any]) -> So
         raise UsageError(f"`ros_args` are for ROS 2 nodes, not for serve {chosen.name}")
     node = {name: given.get(name, getattr(_as_served(chosen)(), name)) for name in ("namespace", "node_name")}
     found = read_ros_args(text, _known(chosen), node)
+    os.environ.update(found.environ)
     for note in found.notes:
         typer.echo(f"--ros-args: {note}", err=True)
     return _sorted(found.options, "`ros_args`", chosen)

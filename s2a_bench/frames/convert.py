@@ -7,12 +7,12 @@ the pixels of a row are contiguous; ``out`` must not overlap ``data``.
 
 from __future__ import annotations
 
-from typing import Final, TypeAlias, cast
+from typing import Final, TypeAlias, cast, get_args
 
 import cv2
 import numpy as np
 
-from s2a_bench.types import Frame, Pixels
+from s2a_bench.types import Deep, Frame, Pixels
 
 BytesLike: TypeAlias = "bytes | bytearray | memoryview | Pixels"
 
@@ -45,6 +45,8 @@ _CODES: Final[dict[str, tuple[int, int, int]]] = {
     "rgba8": (4, cv2.COLOR_RGBA2BGR, cv2.COLOR_RGBA2RGB),
     "mono8": (1, cv2.COLOR_GRAY2BGR, cv2.COLOR_GRAY2RGB),
     "mono16": (1, cv2.COLOR_GRAY2BGR, cv2.COLOR_GRAY2RGB),
+    "rgb16": (3, cv2.COLOR_RGB2BGR, AS_IT_IS),
+    "bgr16": (3, AS_IT_IS, cv2.COLOR_BGR2RGB),
     "yuv422_yuy2": (2, cv2.COLOR_YUV2BGR_YUY2, cv2.COLOR_YUV2RGB_YUY2),
     "yuv422": (2, cv2.COLOR_YUV2BGR_UYVY, cv2.COLOR_YUV2RGB_UYVY),
     "nv12": (1, cv2.COLOR_YUV2BGR_NV12, cv2.COLOR_YUV2RGB_NV12),
@@ -84,10 +86,11 @@ def to_rgb(frame: Frame) -> Pixels:
 
 
 def _eight_bits(frame: Frame) -> Pixels:
-    """Return the frame's data, of ``mono16`` scaled as cv_bridge does: 65535 is 255."""
-    if frame.encoding != "mono16":
+    """Return the frame's data, 16 bits scaled as cv_bridge does: 65535 is 255."""
+    if frame.encoding not in get_args(Deep):
         return frame.data
-    values = np.ascontiguousarray(frame.data).view(np.uint16)[..., 0]
+    values = np.ascontiguousarray(frame.data).view(np.uint16)
+    values = values[..., 0] if frame.encoding == "mono16" else values
     return cast("Pixels", cv2.convertScaleAbs(values, alpha=255 / 65535))
 
 

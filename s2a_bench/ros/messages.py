@@ -17,7 +17,7 @@ import sys
 from collections.abc import Iterable, Iterator
 from functools import cache, partial
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, get_args
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -26,7 +26,7 @@ from rosbags.typesys.msg import MSGParser, make_typesdict
 
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.text import none_of
-from s2a_bench.types import Frame, Pixels
+from s2a_bench.types import Deep, Frame, Pixels
 
 if TYPE_CHECKING:
     if sys.version_info >= (3, 11):
@@ -62,12 +62,13 @@ COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CHANNELS: dict[str, int] = {
     **dict.fromkeys(("bgr8", "rgb8"), 3),
     **dict.fromkeys(("bgra8", "rgba8"), 4),
+    **dict.fromkeys(("bgr16", "rgb16"), 6),
     **dict.fromkeys(("yuv422_yuy2", "yuv422", "mono16"), 2),
     **dict.fromkeys(("mono8", "nv12", "nv21", "bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"), 1),
 }
 """Bytes per pixel of the raw encodings (``sensor_msgs/image_encodings.hpp``); of NV12 and NV21 those of brightness."""
-ALSO = {"yuyv": "yuv422_yuy2", "uyvy": "yuv422"}
-"""Second names since ROS 2 Iron."""
+ALSO = {"yuyv": "yuv422_yuy2", "uyvy": "yuv422", "8UC3": "bgr8", "8UC1": "mono8"}
+"""Second names since ROS 2 Iron, and OpenCV's types, whose order of colours is blue first."""
 CHROMA_BELOW = frozenset({"nv12", "nv21"})
 """Encodings with half as many rows of colour below those of brightness."""
 DEPTH = frozenset({"16UC1", "32FC1"})
@@ -311,8 +312,8 @@ def frame_of_image(image: Any, index: int = -1) -> Frame:
         raise TransportError(f"image of {image.width}x{image.height} {image.encoding} has {image.data.size} bytes")
     rows = image.data[: image.step * height].reshape(height, image.step)[:, : image.width * channels]
     pixels = rows.reshape((height, image.width) if channels == 1 else (height, image.width, channels))
-    if encoding == "mono16" and bool(image.is_bigendian) != (sys.byteorder == "big"):
-        pixels = pixels[..., ::-1]
+    if encoding in get_args(Deep) and bool(image.is_bigendian) != (sys.byteorder == "big"):
+        pixels = pixels.reshape(*pixels.shape[:2], -1, 2)[..., ::-1].reshape(pixels.shape)
     return Frame(index, stamp_of(image.header), image.width, image.height, encoding, pixels)
 
 

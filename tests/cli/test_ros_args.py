@@ -57,15 +57,20 @@ def test_each_says_an_option(arguments: list[str], options: dict[str, Any]) -> N
     assert parsed(*arguments) == Read(options)
 
 
+def test_an_enclave_reaches_rclpy_by_its_variable() -> None:
+    assert parsed("--enclave", "/robot/brain").environ == {"ROS_SECURITY_ENCLAVE_OVERRIDE": "/robot/brain"}
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["-e"], "-e needs a value"),
         (["-r", "a=b"], "-r a=b should look like from:=to"),
         (["-p", "max_tokens"], "-p max_tokens should look like name:=value"),
         (["-p", "max_toks:=7"], "-p: 'max_toks' is none of engine, max_tokens"),
         (["-p", "engine:=[a"], "-p engine:=.* is no YAML"),
         (["-p"], "-p needs a value"),
-        (["--enclave", "x"], "--enclave is none of -r, --remap"),
+        (["--enclav", "x"], "--enclav is none of -r, --remap"),
         (["--params-file", "/nowhere/x.yaml"], "cannot read --params-file /nowhere/x.yaml"),
     ],
 )

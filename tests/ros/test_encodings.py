@@ -85,6 +85,22 @@ def test_grey_of_16_bits_is_scaled_to_8_as_cv_bridge_does(big: bool) -> None:
         np.testing.assert_array_equal(got, expected[..., None].repeat(3, axis=2))
 
 
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("encoding", ["rgb16", "bgr16"])
+def test_colours_of_16_bits_are_scaled_to_8_too(encoding: str, big: bool) -> None:
+    values = np.arange(HEIGHT * WIDTH * 3, dtype=np.uint16).reshape(HEIGHT, WIDTH, 3) * 50
+    data = np.ascontiguousarray(values.astype(">u2" if big else "<u2")).view(np.uint8)
+    expected = np.rint(values * (255 / 65535)).astype(np.uint8)
+    got = rgb(encoding, data, 3, is_bigendian=int(big))
+    np.testing.assert_array_equal(got, expected if encoding == "rgb16" else expected[..., ::-1])
+
+
+@pytest.mark.parametrize(("opencv", "named"), [("8UC3", "bgr8"), ("8UC1", "mono8")])
+def test_a_picture_under_the_name_of_its_opencv_type_is_in_opencvs_order(opencv: str, named: str) -> None:
+    data = pixels(named)
+    np.testing.assert_array_equal(rgb(opencv, data), rgb(named, data))
+
+
 @pytest.mark.parametrize("encoding", BAYER)
 def test_a_mosaic_of_one_colour_is_that_colour(encoding: str) -> None:
     colour = {"r": 200, "g": 120, "b": 40}

@@ -74,6 +74,16 @@ def test_a_goal_that_has_ended_goes_with_its_pictures_at_once() -> None:
         gc.enable()
 
 
+def test_llama_msgs_is_needed_where_its_version_is_an_option(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    without_llama_msgs(monkeypatch)
+    wiring = wiring_of("ros/topic", "/s2a", middleware="rclpy", domain_id=7, llama_msgs="4.4")
+    with pytest.raises(MissingInterface, match="colcon build --packages-select llama_msgs"):
+        open_server(wiring, RecordingHandler([]))
+    assert GRAPH == []
+
+
 @pytest.mark.parametrize(
     ("rmw", "uri", "tuning", "given"),
     [

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from s2a_bench.errors import UsageError
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros.remap import Remapped, table
+from s2a_bench.testing.transport import wiring_of
+from s2a_bench.transport.ros.joining import remapped
 from s2a_bench.transport.ros.options import RosOptions
 from tests.ros.action_suite import NAME, ActionSuite
 from tests.ros.middleware_suite import STRING, Join, MiddlewareSuite, joining, text, wait_matched
@@ -34,6 +37,19 @@ def test_names_are_relative_private_or_absolute(rule: str, source: str, target: 
 
 def test_the_first_rule_for_a_name_holds() -> None:
     assert table(["a:=b", "/n/a:=c"], "/n/x") == {"/n/a": "/n/b"}
+
+
+@pytest.mark.parametrize(
+    ("options", "compressed"),
+    [
+        ({"remap": ("camera/image_raw:=/front/image",)}, "/front/image/compressed"),
+        ({"camera_topic": "/front/image"}, "/front/image/compressed"),
+        ({"remap": ("camera/image_raw:=/front/image", "camera/image_raw/compressed:=/jpeg")}, "/jpeg"),
+    ],
+)
+def test_what_is_compressed_follows_its_topic(options: dict[str, Any], compressed: str) -> None:
+    names = remapped(wiring_of("ros/topic", "/llama", **options))
+    assert names == {"/llama/camera/image_raw": "/front/image", "/llama/camera/image_raw/compressed": compressed}
 
 
 @pytest.mark.parametrize("rule", ["a", "a:=", ":=b", "a b:=c", "a:=b:=c", "rostopic://a:=b", "a//b:=c", "1:=b", "a:=/"])

@@ -94,10 +94,12 @@ def join(wiring: Wiring[RosOptions], role: str, *, host: bool = False) -> Middle
 def remapped(wiring: Wiring[RosOptions]) -> dict[str, str]:
     """Return absolute name -> what stands for it."""
     rules, camera = wiring.options.remap, wiring.options.camera_topic
-    if camera:
+    names = table((*rules, f"{CAMERA[1:]}:={camera}") if camera else rules, server_name(wiring))
+    raw = namespace_of(wiring) + CAMERA
+    if raw in names:  # image_transport keeps what is compressed below it
         below = COMPRESSED_CAMERA.removeprefix(CAMERA)
-        rules = (*rules, f"{CAMERA[1:]}:={camera}", f"{COMPRESSED_CAMERA[1:]}:={camera}{below}")
-    return table(rules, server_name(wiring))
+        names.setdefault(raw + below, names[raw] + below)
+    return names
 
 
 def wait_until(arrived: Callable[[], bool], alive: Callable[[], bool], what: str) -> None:

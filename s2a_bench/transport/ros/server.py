@@ -58,7 +58,7 @@ class RosServer:
             self._action = ActionSource(self.middleware, wiring, queued.honours)
             self._sources.append(self._action)
         except MissingInterface as missing:  # of llama_msgs, which topics do not need
-            if wiring.variant == ACTION:
+            if wiring.variant == ACTION or wiring.options.llama_msgs:  # wanted by name
                 self.middleware.close()
                 raise
             _log.warning("the action is not served: %s", missing)
