@@ -16,6 +16,8 @@ from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.report.claims import CONTRADICTED, REPRODUCED, SUPPORTED, UNDECIDED, Judged
+from s2a_bench.report.claims.plans import after, timelines
+from s2a_bench.report.claims.requests import change
 from s2a_bench.report.claims.table import judge_claims
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
@@ -461,3 +463,16 @@ def test_cells_of_one_run_are_judged_each(kit: Kit) -> None:
     assert verdicts(both)["HTTP/JSON takes longer end to end than ROS 2-native"].verdict == SUPPORTED
     turned = replace(run, tables=run.tables | {"samples": pd.concat([other, rows], ignore_index=True)})
     assert verdicts(turned)["HTTP/JSON takes longer end to end than ROS 2-native"].verdict == SUPPORTED
+
+
+def test_policies_are_compared_plan_by_plan(kit: Kit) -> None:
+    """All run the same plans: the spread between plans cancels."""
+    (part,) = timelines(
+        kit.timeline(profiles=(), rates=(4.8,), tokens_per_skill=(6,), jitter="lognormal:cv=0.5", plans=60)
+    )
+    ends_s = (part.cells[6][policy].values("end_s") for policy in ("wait-then-act", "naive"))
+    apart = change(*ends_s, part.run.bootstrap_seed).ratio.ci95
+    (ratio,), _ = after("wait-then-act", "naive", "end_s").measure(part)
+    assert apart is not None
+    assert ratio.ci95 is not None
+    assert ratio.ci95[1] - ratio.ci95[0] < (apart[1] - apart[0]) / 2
