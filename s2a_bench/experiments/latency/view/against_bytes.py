@@ -7,7 +7,7 @@ so that lines can cross; the share on the wire is another column. Loopback's lin
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise, permutations
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -47,6 +47,8 @@ ORDER = (
 
 Launches: TypeAlias = dict[tuple[int, int], Blocks]
 """Times in ms by (run, launch), then by block."""
+At: TypeAlias = tuple[float, Ratio]
+"""MB of pixels, and the time of one pipeline over that of another there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,30 +60,13 @@ class FittedPipeline:
     path: tuple[str, str]
     sizes: dict[float, Launches]
     """By MB of pixels a request."""
+    medians: list[tuple[float, float]]
+    """(MB, median in ms) of each launch."""
     line: Line | None
     wire_share: float | None
     """Bytes on the wire for each byte of the pixels; None in process, or if unknown."""
     has_ingest: bool
     """Whether a black box prepares the pictures before inference: then the metric means something else."""
-
-    @property
-    def medians(self) -> list[tuple[float, float]]:
-        """Return (MB of pixels, median in ms) of every launch."""
-        return [
-            (size, float(np.median(np.concatenate([*blocks.values()]))))
-            for size, launches in self.sizes.items()
-            for blocks in launches.values()
-        ]
-
-
-@dataclass(frozen=True, slots=True)
-class OrderChange:
-    """Two measured sizes, with the time of ``below`` over that of ``above`` at each: below 1, then above 1."""
-
-    below: FittedPipeline
-    above: FittedPipeline
-    smaller: tuple[float, Ratio]
-    larger: tuple[float, Ratio]
 
 
 def against_bytes(runs: Split) -> list[FittedPipeline]:
@@ -104,17 +89,17 @@ def against_bytes(runs: Split) -> list[FittedPipeline]:
 
 def _pipeline(name: str, payload: str, cells: Sequence[tuple[int, int, RequestCell]]) -> FittedPipeline:
     sizes: dict[float, Launches] = {}
+    medians = []
     for run, pixels, cell in cells:
-        sizes.setdefault(pixels / MB, {}).update(
-            {(run, launch): blocks for launch, blocks in cell.by_launch(METRIC).items()}
-        )
+        for launch, blocks in cell.by_launch(METRIC).items():
+            sizes.setdefault(pixels / MB, {})[run, launch] = blocks
+            medians.append((pixels / MB, float(np.median(np.concatenate([*blocks.values()])))))
     shares = [
         float(sent.median()) / pixels for _, pixels, cell in cells if (sent := cell.good["payload_bytes"].dropna()).size
     ]
     wire_share = float(np.median(shares)) if shares else None
     first = cells[0][2]
-    found = FittedPipeline(name, payload, first.path, sizes, None, wire_share, first.has_ingest)
-    return replace(found, line=fit_line(found.medians))
+    return FittedPipeline(name, payload, first.path, sizes, medians, fit_line(medians), wire_share, first.has_ingest)
 
 
 def _pixels(run: StoredRun) -> int:
@@ -124,31 +109,24 @@ def _pixels(run: StoredRun) -> int:
     return int(width) * int(height) * 3 * int(settings.get("cameras") or 1)
 
 
-def order_changes(pipelines: Sequence[FittedPipeline]) -> list[OrderChange]:
-    """Return where one pipeline is faster at a measured size, and slower at the next at which the two differ.
+def order_changes(pipelines: Sequence[FittedPipeline]) -> list[tuple[FittedPipeline, FittedPipeline, At, At]]:
+    """Return (faster below, faster above, the larger size below, the smaller size above), with the ratio at each.
 
-    They differ where the 95 % interval of their ratio leaves out 1, over at least `FEWEST_LAUNCHES` launches that
-    measured both.
+    At these measured sizes the 95 % interval of the ratio leaves out 1, over at least `FEWEST_LAUNCHES` launches that
+    measured both; at none between.
     """
     found = []
-    for below, above in permutations(pipelines, 2):
-        if below.payload != above.payload or below.has_ingest != above.has_ingest:
-            continue
-        differ = []
-        for size in sorted(below.sizes.keys() & above.sizes.keys()):
-            pair = below.sizes[size], above.sizes[size]
-            if len(pair[0].keys() & pair[1].keys()) < FEWEST_LAUNCHES:
+    for one, other in permutations(pipelines, 2):
+        differ: list[tuple[bool, At]] = []
+        for size in sorted(one.sizes.keys() & other.sizes.keys()):
+            pair = one.sizes[size], other.sizes[size]
+            if len(pair[0].keys() & pair[1].keys()) < FEWEST_LAUNCHES or one.has_ingest != other.has_ingest:
                 continue
-            if (ratio := ratio_of_launches(*pair, seed=0)) and (side := _side_of_one(ratio)):
-                differ.append((side, (size, ratio)))
-        found += [OrderChange(below, above, one[1], two[1]) for one, two in pairwise(differ) if one[0] < two[0]]
-    return sorted(found, key=lambda change: (change.smaller[0], change.larger[0]))
-
-
-def _side_of_one(ratio: Ratio) -> int:
-    """Return -1 or 1 for an interval below or above 1; 0 if it holds 1, or there is none."""
-    low, high = ratio.ci95 or (1, 1)
-    return (low > 1) - (high < 1)
+            ratio = ratio_of_launches(*pair, seed=0)
+            if ratio and ratio.ci95 and not ratio.ci95[0] <= 1 <= ratio.ci95[1]:
+                differ.append((ratio.ci95[0] > 1, (size, ratio)))
+        found += [(one, other, first[1], then[1]) for first, then in pairwise(differ) if first[0] < then[0]]
+    return sorted(found, key=lambda change: (change[2][0], change[3][0]))
 
 
 def line_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable:
@@ -175,20 +153,15 @@ def _order_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -
     wired = [each for each in pipelines if not declared_transport(each.path[0]).in_process]
     rows: list[tuple[str, ...]] = [
         (
-            _label(change.below),
-            _label(change.above),
-            *(text for size, ratio in (change.smaller, change.larger) for text in (number(size), interval(ratio))),
+            *(f"{each.name}, {each.payload}" for each in (one, other)),
+            *(text for size, ratio in (below, above) for text in (number(size), interval(ratio))),
         )
-        for change in order_changes(wired)
+        for one, other, below, above in order_changes(wired)
     ]
     if not rows:
         return None
     header = ("faster below", "faster above", "MB below", "ratio below", "MB above", "ratio above")
     return TextTable("Where one becomes faster than another", header, rows, 2, notes=(ORDER, *answered))
-
-
-def _label(each: FittedPipeline) -> str:
-    return f"{each.name}, {each.payload}"
 
 
 def _estimate(found: Estimate) -> str:
