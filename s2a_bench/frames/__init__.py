@@ -20,11 +20,9 @@ class FrameSource(Protocol):
 
     def read(self) -> Frame:
         """Return the next frame, blocking until there is one; raises SourceError."""
-        ...
 
     def close(self) -> None:
         """Release the device or file; may be called twice."""
-        ...
 
 
 class SourceKind(Protocol):
@@ -35,7 +33,6 @@ class SourceKind(Protocol):
 
     def __call__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> FrameSource:
         """Open ``where``; raises UsageError for an impossible size, SourceError if it cannot deliver."""
-        ...
 
 
 SOURCES: Final[Registry[SourceKind]] = Registry(

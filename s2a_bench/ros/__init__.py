@@ -39,15 +39,12 @@ class Publisher(Protocol):
 
     def pack(self, message: Any) -> Any:
         """Serialise a message into what `send` takes."""
-        ...
 
     def send(self, packed: Any) -> None:
         """Hand a packed message to the middleware; raises TransportError."""
-        ...
 
     def matched(self) -> int:
         """Count the subscriptions this publisher reaches."""
-        ...
 
 
 class Subscription(Protocol):
@@ -58,23 +55,18 @@ class Subscription(Protocol):
 
     def take(self, timeout_s: float) -> Any | None:
         """Wait for the next message and return it packed; None on timeout or after `interrupt`."""
-        ...
 
     def unpack(self, packed: Any) -> Any:
         """Deserialise; arrays may be read-only views of the received buffer. Raises TransportError."""
-        ...
 
     def interrupt(self) -> None:
         """Make a blocked `take`, and every later one, return None; callable from any thread."""
-        ...
 
     def matched(self) -> int:
         """Count the publishers that reach this subscription."""
-        ...
 
     def publishers(self) -> int:
         """Count the publishers of the topic, those too whose QoS does not fit; callable from any thread."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,57 +119,45 @@ class ActionClient(Protocol):
 
     def wait_for_server(self, timeout_s: float) -> bool:
         """Wait until a whole server is matched; False on timeout."""
-        ...
 
     def server_present(self) -> bool:
         """Return whether a whole server is matched now."""
-        ...
 
     def other_dds(self) -> str:
         """Return the DDS of a server that is there and cannot be spoken to, "" if there is none."""
-        ...
 
     def server_version(self) -> str | None:
         """Return the interface version whose type hash the server announces; None if it announces none.
 
         Raises TransportError when the hash is that of no known version.
         """
-        ...
 
     def pack(self, goal: Any) -> Any:
         """Serialise a goal into what `send` takes."""
-        ...
 
     def send(self, packed: Any, goal_id: bytes | None = None) -> bytes:
         """Send a goal under a new id, or under ``goal_id`` (16 bytes), and return the id."""
-        ...
 
     def next_event(self, timeout_s: float) -> ActionEvent | None:
         """Wait for the next event of any goal of this client; None on timeout or after `interrupt`.
 
         A goal's events come in the order Accepted, Feedback ..., Result.
         """
-        ...
 
     def unpack_feedback(self, packed: Any) -> Any:
         """Deserialise `Feedback.packed` into the action's feedback; raises TransportError."""
-        ...
 
     def unpack_result(self, packed: Any) -> Any:
         """Deserialise `Result.packed` into the action's result; raises TransportError."""
-        ...
 
     def cancel(self, goal_id: bytes, stamp_ns: int = 0) -> None:
         """Ask to cancel a goal, `ALL_GOALS`, or with a stamp (ROS time) also all accepted until then."""
-        ...
 
     def get_result(self, goal_id: bytes) -> None:
         """Ask for a result (again); after acceptance this happens by itself."""
-        ...
 
     def interrupt(self) -> None:
         """Make a blocked `next_event`, and every later one, return None; callable from any thread."""
-        ...
 
 
 class ServerGoal(Protocol):
@@ -189,32 +169,25 @@ class ServerGoal(Protocol):
     @property
     def size_bytes(self) -> int:
         """How large its request is: the CDR, or where the middleware keeps none its texts and pixels."""
-        ...
 
     @property
     def cancel_requested(self) -> bool:
         """Return True once a client has requested a cancel."""
-        ...
 
     def other_version(self) -> str:
         """Return the version of llama_msgs that its client announces, where that is known and not the server's."""
-        ...
 
     def unpack(self) -> Any:
         """Deserialise the goal; arrays may be views of the received buffer. Raises TransportError."""
-        ...
 
     def accept(self) -> None:
         """Accept the goal: reply to the client, then publish the status."""
-        ...
 
     def reject(self) -> None:
         """Reject the goal: reply to the client and keep nothing."""
-        ...
 
     def executing(self) -> bool:
         """Start; False if a cancel came first (then end it with `canceled`)."""
-        ...
 
     def feedback(self, message: Any) -> None: ...
 
@@ -224,7 +197,6 @@ class ServerGoal(Protocol):
 
     def canceled(self, result: Any) -> None:
         """End the goal as CANCELED; only after a cancel was requested."""
-        ...
 
 
 class ActionServer(Protocol):
@@ -235,11 +207,9 @@ class ActionServer(Protocol):
 
     def next_goal(self, timeout_s: float) -> ServerGoal | None:
         """Wait for the next goal, to accept or reject; None on timeout or after `interrupt`. One thread at a time."""
-        ...
 
     def interrupt(self) -> None:
         """Make a blocked `next_goal`, and every later one, return None; callable from any thread."""
-        ...
 
 
 class ServiceClient(Protocol):
@@ -247,7 +217,6 @@ class ServiceClient(Protocol):
 
     def call(self, request: Any, timeout_s: float) -> Any:
         """Wait for the server, send a request and return the response; raises TransportError where none comes."""
-        ...
 
 
 SERVICE_QOS = QoS(depth=10)
@@ -261,11 +230,9 @@ class Middleware(Protocol):
 
     def publisher(self, topic: str, type_name: str, qos: QoS) -> Publisher:
         """Publish messages of ROS type ``pkg/msg/Name`` on the absolute ROS topic name ``/x``."""
-        ...
 
     def subscription(self, topic: str, type_name: str, qos: QoS) -> Subscription:
         """Subscribe to the absolute ROS topic name ``/x``."""
-        ...
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         """Offer the service ``/x`` of ROS type ``pkg/srv/Name``; ``answer`` turns a request into its response.
@@ -273,13 +240,11 @@ class Middleware(Protocol):
         All services of a node are answered by one thread of the middleware. A request that cannot be read, or for
         which ``answer`` raises, is dropped and logged; so is one of more than `REQUEST_BYTES`, where its size is known.
         """
-        ...
 
     def service_client(self, name: str, type_name: str) -> ServiceClient: ...
 
     def action_client(self, name: str, type_name: str, version: str = "6.0") -> ActionClient:
         """Call the action ``/x`` of ROS type ``pkg/action/Name``; ``version`` as in `messages.VERSIONS`."""
-        ...
 
     def action_server(
         self, name: str, type_name: str, result_timeout_s: float = 60.0, version: str = ""
@@ -288,15 +253,12 @@ class Middleware(Protocol):
 
         Without a ``version`` it is the one that the workspace has built, 6.0 where there is no workspace.
         """
-        ...
 
     def describe(self) -> dict[str, str | int]:
         """Return what carries the messages: implementation, version, domain, configuration."""
-        ...
 
     def close(self) -> None:
         """Leave the domain at once, so that peers need not wait for the lease; may be called twice."""
-        ...
 
 
 MIDDLEWARES: dict[str, str] = {

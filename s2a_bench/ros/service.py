@@ -38,11 +38,9 @@ class Waits(Protocol):
 
     def wait_until(self, deadline_ns: int, /) -> bool:
         """Return after data, a time slice or an interrupt; False once the deadline or an interrupt has come."""
-        ...
 
     def interrupt(self) -> None:
         """End a wait under way and every later one; callable from any thread."""
-        ...
 
 
 def appeared(present: Callable[[], bool], timeout_s: float, given_up: Callable[[], bool] = lambda: False) -> bool:
@@ -68,7 +66,6 @@ class End(Protocol):
 
     def unpack(self, packed: memoryview, /) -> Any:
         """Deserialise what the other side sent; raises TransportError."""
-        ...
 
 
 class ServiceEnd(End, Protocol[Caller]):
@@ -78,7 +75,6 @@ class ServiceEnd(End, Protocol[Caller]):
 
     def arrived(self) -> Iterator[tuple[memoryview, Caller]]:
         """Take the requests that have arrived, a bounded number: CDR and caller."""
-        ...
 
     def respond(self, packed: bytearray, caller: Caller, /) -> None: ...
 
@@ -104,17 +100,14 @@ class ClientEnd(End, Protocol):
 
     def call(self, packed: bytearray, key: bytes, /) -> None:
         """Send a request, to which ``key`` belongs: a goal's id, where it concerns one."""
-        ...
 
     def replies(self) -> Iterator[tuple[bytes, memoryview | None]]:
         """Take the replies that have arrived, a bounded number: key, and CDR, None where the request was dropped."""
-        ...
 
     def matched(self) -> bool: ...
 
     def peer_type_hash(self) -> str:
         """Return the type hash that a server announces; empty without one."""
-        ...
 
     def other_dds(self) -> str:
         """Return the DDS of a server whose services have another form, "" without one."""
@@ -126,11 +119,9 @@ class Source(Subscription, Protocol):
 
     def arrived(self) -> Iterable[memoryview]:
         """Take what has arrived, `AT_ONCE` at most."""
-        ...
 
     def announced(self) -> int:
         """Count the publishers, those of other versions too."""
-        ...
 
 
 class LogOnce:

@@ -79,11 +79,9 @@ class CellWorkers(AbstractContextManager["CellWorkers"], Protocol):
 
     def submit(self, cell: SweepCell, folder: Path) -> Future[Any]:
         """Start or queue a cell; ``folder`` must not exist yet."""
-        ...
 
     def collect(self, future: Future[Any], folder: Path) -> Outcome:
         """Return the outcome of a finished future; the run folder of its cell is then below ``folder``."""
-        ...
 
 
 WORKERS: dict[str, str] = {

@@ -148,11 +148,9 @@ class CameraSink(Protocol):
 
     def stamp_ns(self, frame: Frame) -> int:
         """Return the ROS-time stamp that will name this frame in the server's marks."""
-        ...
 
     def publish(self, frame: Frame, trace: Trace) -> None:
         """Convert, pack and send one frame, marking each stage."""
-        ...
 
 
 class Client(Protocol):
@@ -161,7 +159,6 @@ class Client(Protocol):
     @property
     def camera(self) -> CameraSink | None:
         """None where the newest frame goes with the prompt instead. The first use may wait for the server."""
-        ...
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Send a request with its frames as captured, yield pieces as they arrive, mark every stage.
@@ -169,15 +166,12 @@ class Client(Protocol):
         After the last piece ``trace.remote`` holds the server's marks. Raises RequestFailed when the server
         refuses, breaks off or exceeds the bounds of `transport.limits`, ServerDied when it has ended.
         """
-        ...
 
     def describe(self) -> dict[str, str]:
         """Return what the manifest records of the client beside its wiring."""
-        ...
 
     def close(self) -> None:
         """Close connections; may be called twice."""
-        ...
 
 
 class Server(Protocol):
@@ -188,15 +182,12 @@ class Server(Protocol):
 
     def describe(self) -> dict[str, str | int]:
         """Return what the manifest records of the server."""
-        ...
 
     def serve(self) -> None:
         """Serve until `stop` is called from another thread or a signal handler."""
-        ...
 
     def stop(self) -> None:
         """Make `serve` return soon; may be called twice, from any thread."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,11 +81,9 @@ class Reader(Protocol):
 
     def read(self) -> Mapping[str, float]:
         """Return columns of `ResourceRow` by name; an unreadable one is absent."""
-        ...
 
     def close(self) -> None:
         """Close the source; may be called twice."""
-        ...
 
 
 READERS: dict[str, str] = {

@@ -14,11 +14,9 @@ class Framing(Protocol):
 
     def feed(self, data: bytes) -> Iterator[str | bytes]:
         """Yield the messages that these bytes complete; raises ValueError for one that is too large."""
-        ...
 
     def end(self) -> Iterator[str | bytes]:
         """Yield the last message after the end of the body."""
-        ...
 
 
 class Lines:
