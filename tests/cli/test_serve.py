@@ -282,20 +282,6 @@ def test_a_server_whose_latencies_are_known_says_so_and_is_recognised_from_afar(
     assert process.wait(30) in {0, -signal.SIGTERM}
 
 
-def test_zmq_says_where_a_policy_is_asked_and_ends_with_a_signal(start: Start) -> None:
-    process, line = start("zmq", "--engine", "echo", "--port", "0", "--horizon", "5", "--action-dim", "2")
-    found = re.search(r"serving GR00T's protocol at (tcp://127\.0\.0\.1:\d+)", line)
-    assert found
-    client = open_client(wiring_of("zmq", found[1]))
-    try:
-        actions, _ = ask(client, Request("a", "pick it up", max_tokens=20))
-    finally:
-        client.close()
-    assert len(actions) == 5
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(30) == 0
-
-
 def test_shm_says_where_memory_is_handed_over_and_leaves_no_socket(start: Start, tmp_path: Path) -> None:
     path = tmp_path / "robot.sock"
     process, line = start("shm", "--engine", "echo", "--socket", str(path))
@@ -309,11 +295,18 @@ def test_shm_says_where_memory_is_handed_over_and_leaves_no_socket(start: Start,
     assert not path.exists()
 
 
-def test_a_policy_server_says_where_it_is_and_answers_with_chunks(start: Start) -> None:
-    process, line = start("websocket/openpi", "--engine", "echo", "--port", "0", "--horizon", "5", "--action-dim", "3")
-    address = re.search(r"at (ws://\S+), streamed at \1/stream; ", line)
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("websocket/openpi", r"at (ws://\S+), streamed at \1/stream; "),
+        ("zmq", r"serving GR00T's protocol at (tcp://127\.0\.0\.1:\d+)"),
+    ],
+)
+def test_a_policy_server_says_where_it_is_and_answers_with_chunks(start: Start, name: str, said: str) -> None:
+    process, line = start(name, "--engine", "echo", "--port", "0", "--horizon", "5", "--action-dim", "3")
+    address = re.search(said, line)
     assert address
-    client = open_client(wiring_of("websocket", address[1]))
+    client = open_client(wiring_of(name.partition("/")[0], address[1]))
     actions, _ = ask(client, Request("a", "hello robot", (yuyv_frame(),), max_tokens=50))
     client.close()
     assert [action.values.shape for action in actions if isinstance(action, Action)] == [(3,)] * 5

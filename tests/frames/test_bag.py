@@ -159,11 +159,6 @@ def test_an_image_topic_without_messages_is_no_endless_loop(tmp_path: Path, open
         opened(tmp_path / "bag")
 
 
-def test_a_missing_recording_is_named(tmp_path: Path, opened: Open) -> None:
-    with pytest.raises(SourceError, match=r"^`source`: no recording at .*none\.mcap$"):
-        opened(tmp_path / "none.mcap")
-
-
 @pytest.mark.parametrize("name", ["x.mcap", "x.db3", "x.txt"])
 @pytest.mark.parametrize("content", [b"", b"no recording", b"\x89MCAP0\r\n" + bytes(100)])
 def test_a_file_that_is_none_is_named(tmp_path: Path, name: str, content: bytes, opened: Open) -> None:

@@ -50,11 +50,6 @@ def test_a_folder_without_pictures_says_what_it_takes(tmp_path: Path) -> None:
         ImageFolder(str(tmp_path), 64, 48)
 
 
-def test_a_missing_folder_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"^`source`: no folder at .*nowhere"):
-        ImageFolder(str(tmp_path / "nowhere"), 64, 48)
-
-
 def test_an_unreadable_picture_is_named_at_once(folder: Path) -> None:
     (folder / "d.jpg").write_bytes(b"no picture")
     with pytest.raises(SourceError, match=r"^`source`: cannot read .*d\.jpg: the 10 bytes are no picture"):

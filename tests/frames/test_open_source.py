@@ -40,13 +40,14 @@ def test_a_path_for_the_synthetic_camera_is_refused() -> None:
         open_source("synthetic:x", 64, 48)
 
 
-@pytest.mark.parametrize("scheme", ["video", "images", "v4l2", "bag"])
-def test_a_path_that_is_missing_is_named(scheme: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("scheme", "what"),
+    [("video", "no video file at"), ("images", "no folder at"), ("v4l2", ""), ("bag", "no recording at")],
+)
+def test_a_path_that_is_missing_is_named(scheme: str, what: str, tmp_path: Path) -> None:
     path = tmp_path / "with:colon"
-    with pytest.raises(SourceError) as caught:
+    with pytest.raises(SourceError, match=f"^`source`: {what}.*{path}"):
         open_source(f"{scheme}:{path}", 64, 48)
-    assert str(caught.value).startswith("`source`: ")
-    assert str(path) in str(caught.value)
 
 
 def test_importing_the_package_does_not_load_opencv() -> None:

@@ -40,11 +40,6 @@ def test_frames_come_in_order_and_start_over(clip: str, size: tuple[int, int]) -
     np.testing.assert_allclose(seen, [*GREYS, *GREYS, GREYS[0]], atol=3)
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
-    with pytest.raises(SourceError, match=r"^`source`: no video file at .*none\.mp4"):
-        VideoFile(str(tmp_path / "none.mp4"), 64, 48)
-
-
 def test_a_file_that_is_no_video_is_named(tmp_path: Path) -> None:
     path = tmp_path / "text.mp4"
     path.write_text("no video")

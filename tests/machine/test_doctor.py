@@ -360,11 +360,16 @@ def test_ros_is_looked_up(
     assert fix in finding.fix
 
 
-def test_a_missing_middleware_is_an_error_that_names_rclpy(make: Make) -> None:
-    finding = see(make(JETSON, finds=lambda _package: False), "middleware")
-    assert finding.level == "error"
-    assert "rclpy" in finding.fix
-    assert "/opt/ros/" in finding.fix
+@pytest.mark.parametrize(
+    ("code", "level", "fix"),
+    [
+        ("middleware", "error", "or the rclpy of a ROS 2 (source /opt/ros/"),
+        ("zenoh", "state", "pip install '.[zenoh]' in the clone of s2a-bench"),
+    ],
+)
+def test_a_missing_package_is_told_with_the_way_to_it(make: Make, code: str, level: str, fix: str) -> None:
+    finding = see(make(JETSON, finds=lambda _package: False), code)
+    assert (finding.level, "not installed" in finding.message, fix in finding.fix) == (level, True, True)
 
 
 @pytest.mark.parametrize(
@@ -380,12 +385,6 @@ def test_zenohs_router_is_looked_for(make: Make, tree: dict[str, str], says: str
     finding = see(make(tree, finds=lambda _package: True), "zenoh")
     assert finding.level == "state"
     assert finding.message.startswith(says)
-
-
-def test_how_to_get_zenoh_is_told(make: Make) -> None:
-    finding = see(make({}, finds=lambda _package: False), "zenoh")
-    assert (finding.level, finding.message) == ("state", "not installed")
-    assert finding.fix.startswith("pip install '.[zenoh]' in the clone of s2a-bench")
 
 
 def test_cameras_are_listed_with_their_formats(make: Make) -> None:
@@ -444,13 +443,6 @@ def test_a_build_without_the_cpus_instructions_is_a_warning(make: Make, monkeypa
     assert see(make(RTX), "llama-build").level == "state"
 
 
-def test_a_gpu_build_says_so(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
-    fake_llama(monkeypatch, b"CUDA : ARCHS = 1200 | USE_GRAPHS = 1 | CPU : AVX2 = 1 | ", offload=True)
-    finding = see(make(RTX), "llama-build")
-    assert finding.level == "state"
-    assert finding.message.endswith("with GPU; USE_GRAPHS AVX2; no AMX in this CPU")
-
-
 XEON = RTX | {"proc/cpuinfo": "model name : Intel Xeon\nflags : avx2 amx_bf16 amx_tile amx_int8\n"}
 NO_AMX = {f"{sys.prefix}/s2a-bench-llama".lstrip("/"): "cpu no-amx"}
 
@@ -458,6 +450,12 @@ NO_AMX = {f"{sys.prefix}/s2a-bench-llama".lstrip("/"): "cpu no-amx"}
 @pytest.mark.parametrize(
     ("tree", "info", "level", "says"),
     [
+        (
+            RTX,
+            b"CUDA : ARCHS = 1 | USE_GRAPHS = 1 | CPU : AVX2 = 1 | ",
+            "state",
+            "with GPU; USE_GRAPHS AVX2; no AMX in this CPU",
+        ),
         (XEON, b"CPU : AVX2 = 1 | AMX_INT8 = 1 | ", "state", "AMX used"),
         (XEON | NO_AMX, b"CPU : AVX2 = 1 | ", "advice", "AMX off, as the compiler's code for it does not work"),
         (XEON, b"CPU : AVX2 = 1 | ", "advice", "AMX off, left out of this build"),

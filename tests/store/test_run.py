@@ -416,19 +416,6 @@ def test_a_failure_before_the_first_row_keeps_a_folder_that_holds_runs(tmp_path:
     assert read_run(run.path).manifest["state"] == "failed"
 
 
-def test_a_run_that_goes_on_is_read_with_its_new_rows_before_it_finishes(tmp_path: Path) -> None:
-    samples = samples_table(STAGES)
-    run = kept(tmp_path, sample("r1"))
-    again = RunWriter.reopen(run.path, [samples, TOKENS])
-    again.sample(sample("r2"))
-    read = read_run(run.path)
-    assert (read.manifest["state"], read.manifest["finished"]) == ("running", None)
-    assert read.samples["request_id"].tolist() == ["r1", "r2"]
-    assert read.row_counts() == {"samples": 2}
-    again.finish("finished")
-    assert read_run(run.path).samples["request_id"].tolist() == ["r1", "r2"]
-
-
 def test_intervals_are_drawn_from_the_seed_that_the_manifest_tells(tmp_path: Path) -> None:
     with RunWriter.create(tmp_path, "latency", {"seeds": {"order": 3, "bootstrap": 7}}) as seeded:
         pass
@@ -507,16 +494,19 @@ def test_a_damaged_parquet_file_is_one_line_with_the_way_out(tmp_path: Path, dam
     assert read_run(run.path).tokens["text"].tolist() == ["a"]
 
 
-@pytest.mark.parametrize("torn", ["r1,torn", ""])
-def test_a_run_that_was_killed_goes_on_after_its_last_whole_record(tmp_path: Path, torn: str) -> None:
-    samples = samples_table(STAGES)
+@pytest.mark.parametrize("torn", ["", "r1,torn", None])
+def test_a_run_that_goes_on_does_so_after_its_last_whole_record(tmp_path: Path, torn: str | None) -> None:
     run = kept(tmp_path, sample("r1"))
     path = run.path / "samples.csv"
-    path.write_text(path.read_text() + torn if torn else "")  # without torn: not even the header came
-    again = RunWriter.reopen(run.path, [samples])
+    path.write_text("" if torn is None else path.read_text() + torn)  # None: not even the header came
+    ids = ["r2"] if torn is None else ["r1", "r2"]
+    again = RunWriter.reopen(run.path, [samples_table(STAGES), TOKENS])
     again.sample(sample("r2"))
-    assert read_run(run.path).samples["request_id"].tolist() == (["r1", "r2"] if torn else ["r2"])
+    read = read_run(run.path)
+    assert (read.manifest["state"], read.manifest["finished"]) == ("running", None)
+    assert (read.samples["request_id"].tolist(), read.row_counts()) == (ids, {"samples": len(ids)})
     again.finish("finished")
+    assert read_run(run.path).samples["request_id"].tolist() == ids
 
 
 def test_the_manifest_holds_only_strict_json(tmp_path: Path) -> None:
