@@ -452,9 +452,9 @@ NO_AMX = {f"{sys.prefix}/s2a-bench-llama".lstrip("/"): "cpu no-amx"}
     [
         (
             RTX,
-            b"CUDA : ARCHS = 1 | USE_GRAPHS = 1 | CPU : AVX2 = 1 | ",
+            b"CUDA : ARCHS = 1200 | USE_GRAPHS = 1 | CPU : AVX2 = 1 | ",
             "state",
-            "with GPU; USE_GRAPHS AVX2; no AMX in this CPU",
+            "USE_GRAPHS AVX2; no AMX in this CPU",
         ),
         (XEON, b"CPU : AVX2 = 1 | AMX_INT8 = 1 | ", "state", "AMX used"),
         (XEON | NO_AMX, b"CPU : AVX2 = 1 | ", "advice", "AMX off, as the compiler's code for it does not work"),

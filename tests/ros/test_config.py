@@ -16,15 +16,43 @@ def parse(environ: dict[str, str], tuning: str = "tuned") -> ET.Element:
     return ET.fromstring(xml)  # noqa: S314 - our own text
 
 
-def peers(root: ET.Element) -> list[str | None]:
-    return [peer.get("address") for peer in root.iter("Peer")]
+@pytest.mark.parametrize(
+    ("environ", "interfaces", "multicast", "found"),
+    [
+        ({}, ["127.0.0.1"], "false", ["127.0.0.1"]),
+        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "subnet"}, [], "true", []),
+        (
+            {"ROS_STATIC_PEERS": "192.168.0.7;robot-1.lan"},
+            *([], "false", ["127.0.0.1", "192.168.0.7", "robot-1.lan"]),
+        ),
+    ],
+    ids=["loopback", "subnet", "static peers"],
+)
+def test_dds_stays_on_loopback_unless_asked(
+    environ: dict[str, str], interfaces: list[str], multicast: str, found: list[str]
+) -> None:
+    root = parse(environ)
+    assert [interface.get("address") for interface in root.iter("NetworkInterface")] == interfaces
+    assert root.findtext(".//AllowMulticast") == multicast
+    assert [peer.get("address") for peer in root.iter("Peer")] == found
 
 
-def test_dds_stays_on_loopback_unless_asked() -> None:
-    root = parse({})
-    assert [interface.get("address") for interface in root.iter("NetworkInterface")] == ["127.0.0.1"]
-    assert root.findtext(".//AllowMulticast") == "false"
-    assert peers(root) == ["127.0.0.1"]
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("ROS_STATIC_PEERS", "not a host", "'not a host'"),
+        ("ROS_AUTOMATIC_DISCOVERY_RANGE", "moon", "'MOON' is none of OFF"),
+        *(("ROS_DOMAIN_ID", text, "") for text in ("-1", "233", "x", "1.5")),
+    ],
+)
+def test_a_variable_that_makes_no_sense_is_named(name: str, text: str, message: str) -> None:
+    with pytest.raises(UsageError, match=f"{name}: {message}"):
+        _ = domain_id({name: text}), configuration({name: text}, "tuned")
+
+
+@pytest.mark.parametrize(("text", "expected"), [("", 0), ("0", 0), ("42", 42), ("232", 232)])
+def test_the_domain_is_ros_domain_id(text: str, expected: int) -> None:
+    assert domain_id({"ROS_DOMAIN_ID": text}) == expected
 
 
 def test_tuning_is_there_or_not() -> None:
@@ -38,40 +66,6 @@ def test_tuning_is_there_or_not() -> None:
 
 def test_the_users_own_configuration_wins() -> None:
     assert configuration({"CYCLONEDDS_URI": "file:///x.xml"}, "tuned") is None
-
-
-def test_a_subnet_is_used_when_asked_for() -> None:
-    root = parse({"ROS_AUTOMATIC_DISCOVERY_RANGE": "subnet"})
-    assert root.find(".//NetworkInterface") is None
-    assert root.findtext(".//AllowMulticast") == "true"
-
-
-def test_static_peers_open_the_network_but_not_multicast() -> None:
-    root = parse({"ROS_STATIC_PEERS": "192.168.0.7;robot-1.lan"})
-    assert root.find(".//NetworkInterface") is None
-    assert root.findtext(".//AllowMulticast") == "false"
-    assert peers(root) == ["127.0.0.1", "192.168.0.7", "robot-1.lan"]
-
-
-def test_a_peer_that_is_none_is_named() -> None:
-    with pytest.raises(UsageError, match="ROS_STATIC_PEERS: 'not a host'"):
-        configuration({"ROS_STATIC_PEERS": "not a host"}, "tuned")
-
-
-def test_an_unknown_range_is_named() -> None:
-    with pytest.raises(UsageError, match="ROS_AUTOMATIC_DISCOVERY_RANGE: 'MOON' is none of OFF"):
-        configuration({"ROS_AUTOMATIC_DISCOVERY_RANGE": "moon"}, "tuned")
-
-
-@pytest.mark.parametrize(("text", "expected"), [("", 0), ("0", 0), ("42", 42), ("232", 232)])
-def test_the_domain_is_ros_domain_id(text: str, expected: int) -> None:
-    assert domain_id({"ROS_DOMAIN_ID": text}) == expected
-
-
-@pytest.mark.parametrize("text", ["-1", "233", "x", "1.5"])
-def test_a_domain_that_is_none_is_named(text: str) -> None:
-    with pytest.raises(UsageError, match="ROS_DOMAIN_ID"):
-        domain_id({"ROS_DOMAIN_ID": text})
 
 
 def test_addresses_where_nobody_answers_yet_are_not_given_up() -> None:
