@@ -169,30 +169,6 @@ def test_repeats_have_draws_of_their_own_and_policies_share_them(whole: Sweep) -
     assert first["naive"] != orin[orin["seed"] == 4].groupby("policy")["last_arrival_ns"].apply(list)["naive"]
 
 
-def test_the_settings_are_columns_beside_the_state(whole: Sweep) -> None:
-    assert set(whole.cells["profile"]) == {"rtx-4080", "jetson-agx-orin"}
-    assert set(whole.cells["tokens-per-skill"]) == {6, 1}
-    counts = whole.cells.groupby("profile").size()
-    assert dict(counts) == {"rtx-4080": 4, "jetson-agx-orin": 12}
-    argv = json.loads(whole.cells["argv"][0])
-    assert argv[0] == "timeline"
-    assert "--plans=200" in argv
-
-
-def test_a_changed_file_and_another_machine_are_refused_with_one_line(whole: Sweep, tmp_path: Path) -> None:
-    changed = tmp_path / "changed.toml"
-    changed.write_text(MANY.replace("plans = 200", "plans = 201"))
-    line = refused("sweep", changed, "--resume", whole.path)
-    assert "was another one" in line
-    manifest = json.loads((whole.path / "manifest.json").read_text())
-    (tmp_path / "sweep.toml").write_text(MANY)
-    manifest["environment"] |= {"cpu": "Z80", "host": "elsewhere"}
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    line = refused("sweep", "--resume", tmp_path)
-    assert "was elsewhere" in line
-    assert "was Z80" in line
-
-
 @pytest.mark.slow
 def test_a_failed_cell_keeps_its_error_and_is_retried_when_told(tmp_path: Path) -> None:
     file, output = tmp_path / "f.toml", tmp_path / "results"

@@ -117,10 +117,6 @@ def test_of_two_urls_both_are_asked_or_refused() -> None:
         LatencyConfig(transports="websocket?url=ws://127.0.0.1:1", url="http://127.0.0.1:2")
 
 
-def test_a_llama_server_is_started_afresh_for_every_launch() -> None:
-    assert RequestsConfig(launches=3, options={"http": {"llama_server": PROGRAM}}).launches == 3
-
-
 MODEL = ({"model": Path("m.gguf")}, {"mmproj": Path("p.gguf")}, {"gpu_layers": -1})
 
 
@@ -210,10 +206,6 @@ def test_a_foreign_action_is_the_only_ros_cell() -> None:
     (cell,) = config.pipelines
     assert (cell.name, cell.black_box) == ("ros/action", True)
     assert cell.options.external_address == "/llama/generate_response"
-
-
-def test_both_ros_variants_are_measured_in_one_run() -> None:
-    assert names(RequestsConfig(transports="ros/topic,ros/action")) == ["ros/topic", "ros/action"]
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -185,14 +186,16 @@ def test_the_order_of_two_pictures_matters(shared: LlamaCppEngine) -> None:
     assert text(shared, images=(one, two), max_tokens=24) != text(shared, images=(two, one), max_tokens=24)
 
 
-def test_pictures_of_another_encoding_are_refused(shared: LlamaCppEngine) -> None:
-    with pytest.raises(BadRequest, match="bgr8 picture; engines take rgb8"):
-        ask(shared, images=(replace(rgb_frame(), encoding="bgr8"),))
-
-
-def test_pictures_smaller_than_they_say_are_refused(shared: LlamaCppEngine) -> None:
-    with pytest.raises(BadRequest, match=r"640x480 whose data are uint8 of shape \(48, 64, 3\)"):
-        ask(shared, images=(replace(rgb_frame(), width=640, height=480),))
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"encoding": "bgr8"}, "bgr8 picture; engines take rgb8"),
+        ({"width": 640, "height": 480}, r"640x480 whose data are uint8 of shape \(48, 64, 3\)"),
+    ],
+)
+def test_pictures_that_are_no_rgb8_are_refused(shared: LlamaCppEngine, fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadRequest, match=message):
+        ask(shared, images=(replace(rgb_frame(), **fields),))
 
 
 def test_a_request_longer_than_the_context_says_so(tiny: EngineConfig) -> None:
