@@ -10,7 +10,7 @@ from itertools import product
 
 from s2a_bench.errors import UsageError
 from s2a_bench.plan.formats import Format, Tokenize, spelled
-from s2a_bench.plan.labels import Calls, Codes, Letters, Words
+from s2a_bench.plan.labels import CallLabels, Codes, Letters, Words
 from s2a_bench.plan.skillset import SkillSet
 
 GRANULARITIES = (6, 4, 2, 1)
@@ -67,7 +67,7 @@ def _stream(skills: SkillSet, tokenize: Tokenize) -> Format:
 
 
 def _plain_formats(skills: SkillSet, tokenize: Tokenize) -> Iterator[Format]:
-    labels: list[Calls] = [Calls(), Words()]
+    labels: list[CallLabels] = [CallLabels(), Words()]
     with suppress(ValueError):  # too many names for one letter each
         labels.append(Letters(skills))
     for each in labels:

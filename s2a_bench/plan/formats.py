@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
-from s2a_bench.plan.labels import Calls, normalise
+from s2a_bench.plan.labels import CallLabels, normalise
 from s2a_bench.plan.skillset import Call, SkillSet
 
 Tokenize: TypeAlias = Callable[[str], list[int]]
@@ -32,7 +32,7 @@ class Format:
 
     name: str
     skills: SkillSet
-    labels: Calls
+    labels: CallLabels
     texts: tuple[str, ...]
     numbered: bool = False
     delimiter: str = "\n"
@@ -71,7 +71,7 @@ class Format:
         return [len(tokenize(line)) for number in numbers for line in self.lines(number)]
 
 
-def spelled(skills: SkillSet, labels: Calls, *, numbered: bool) -> Format:
+def spelled(skills: SkillSet, labels: CallLabels, *, numbered: bool) -> Format:
     """Return a format with these labels, without fillers."""
     name = f"numbered {labels.name}" if numbered else labels.name
     return Format(name, skills, labels, tuple(map(labels.spell, skills.calls)), numbered)
@@ -79,7 +79,7 @@ def spelled(skills: SkillSet, labels: Calls, *, numbered: bool) -> Format:
 
 def paper_format(skills: SkillSet) -> Format:
     """Return the paper's format (section IV-E): numbered calls, one per line, of any cost."""
-    return spelled(skills, Calls(), numbered=True)
+    return spelled(skills, CallLabels(), numbered=True)
 
 
 def prompt(format_: Format, n_skills: int, task: str = "") -> str:

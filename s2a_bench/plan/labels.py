@@ -19,7 +19,7 @@ def normalise(line: str) -> str:
     return _BLANKS_AT_MARKS.sub(r"\1", " ".join(line.split()))
 
 
-class Calls:
+class CallLabels:
     """Labels as in the paper, ``place(cup, table)``; subclasses have others."""
 
     name = "calls"
@@ -48,7 +48,7 @@ class Calls:
         return [match[1], *(match[2].split(",") if match[2] else [])]
 
 
-class Words(Calls):
+class Words(CallLabels):
     """The same words without brackets: ``place cup table``."""
 
     name = "words"
@@ -60,7 +60,7 @@ class Words(Calls):
         return line.split()
 
 
-class Letters(Calls):
+class Letters(CallLabels):
     """One letter for the skill and one for each value, unique within its vocabulary: ``pct``."""
 
     name = "letters"
@@ -89,7 +89,7 @@ class Letters(Calls):
         return list(line)
 
 
-class Codes(Calls):
+class Codes(CallLabels):
     """One code per call with all its arguments: ``A``."""
 
     name = "codes"

@@ -140,11 +140,11 @@ class Goals:
             raise TransportError(f"goal {goal_id.hex()} is {present.name} and cannot become {status.name}")
         self._live[goal_id].status = status
 
-    def end(self, goal_id: bytes, status: Status, result: Any, now_ns: int) -> None:
+    def end(self, goal_id: bytes, status: Status, result: Any, at_ns: int) -> None:
         """End a goal with its result, which is kept; raises TransportError like `move`."""
         self.move(goal_id, status)
         goal = self._live.pop(goal_id)
-        goal.result, goal.ended_ns = result, now_ns
+        goal.result, goal.ended_ns = result, at_ns
         self._ended[goal_id] = goal
 
     def cancel(self, goal_id: bytes, stamp_ns: int) -> tuple[CancelCode, list[Goal]]:
@@ -168,11 +168,11 @@ class Goals:
             goal.status = Status.CANCELING
         return CancelCode.NONE, chosen
 
-    def expire(self, now_ns: int) -> None:
+    def expire(self, at_ns: int) -> None:
         """Forget goals that ended ``result_timeout_ns`` ago."""
         while self._ended:
             goal = next(iter(self._ended.values()))
-            if goal.ended_ns + self._timeout_ns > now_ns:
+            if goal.ended_ns + self._timeout_ns > at_ns:
                 return
             del self._ended[goal.id]
 

@@ -98,7 +98,7 @@ def _raw_type(type_name: str) -> type:
     return dataclass(types.new_class(name, (IdlStruct,), {"typename": dds_type_name(type_name)}))
 
 
-def dds_qos(qos: QoS, user_data: str) -> Qos:
+def dds_qos(qos: QoS, announced: str) -> Qos:
     """Translate to DDS as rmw_cyclonedds does."""
     reliability = Policy.Reliability.Reliable(FOREVER_NS) if qos.reliable else Policy.Reliability.BestEffort
     history = Policy.History.KeepLast(qos.depth) if qos.depth else Policy.History.KeepAll
@@ -112,7 +112,7 @@ def dds_qos(qos: QoS, user_data: str) -> Qos:
         *mortal,
         Policy.WriterDataLifecycle(autodispose=False),
         Policy.DataRepresentation(use_cdrv0_representation=True),
-        Policy.Userdata(user_data.encode()),
+        Policy.Userdata(announced.encode()),
     )
 
 

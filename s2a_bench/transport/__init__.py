@@ -98,8 +98,7 @@ class TransportOptions(base.Options):
     @classmethod
     def of_sides(cls, *sides: str) -> list[str]:
         """Return the options with one of these sides; "" is the client's."""
-        fields = cls.model_fields.items()
-        return [name for name, field in fields if str(base.extra_of(field).get("side", "")) in sides]
+        return [name for name, field in cls.model_fields.items() if str(base.extra_of(field).get("side", "")) in sides]
 
     @property
     def external(self) -> str:

@@ -255,14 +255,14 @@ class TimelineConfig(LiveOptions, Modelled, ComparedOptions):
             yield "robot", risk, self.robot
 
     def to_manifest(self) -> dict[str, Any]:
-        fields = self.model_dump(include=set(ComparedOptions.model_fields) - {"profiles", "real_time", "live"})
-        fields |= {"tokens_per_skill": self.lengths, "plans": self.plans_a_cell}
+        shared = self.model_dump(include=set(ComparedOptions.model_fields) - {"profiles", "real_time", "live"})
+        shared |= {"tokens_per_skill": self.lengths, "plans": self.plans_a_cell}
         if self.live:
             plan = {"skills": self.skills, "task": self.task, "robot": self.robot, "constrained": not self.no_grammar}
-            return {**requests_of(self).to_manifest(), **fields, **plan, "time": "live"}
-        fields |= self.model_dump(include=set(Modelled.model_fields))
-        fields |= {"profiles": self._profiles, "t_nom_s": self.t_nom_s or (1.0,)}
-        return fields | ({"time": "real-time"} if self.real_time else {})
+            return {**requests_of(self).to_manifest(), **shared, **plan, "time": "live"}
+        shared |= self.model_dump(include=set(Modelled.model_fields))
+        shared |= {"profiles": self._profiles, "t_nom_s": self.t_nom_s or (1.0,)}
+        return shared | ({"time": "real-time"} if self.real_time else {})
 
 
 def check_tracking(config: TimelineConfig) -> None:

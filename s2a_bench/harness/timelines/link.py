@@ -143,13 +143,13 @@ class ModelLink:
             provenance=Origins(self.origin).to_manifest(), live=live if dummy is None else {**live, "dummy": dummy}
         )
 
-    def warm_up(self, prompt: PlanPrompt) -> GapPrior | None:
+    def warm_up(self, of: PlanPrompt) -> GapPrior | None:
         """Make the warm-up requests and return the prior that policies learn from them."""
         warmups, progress = self.launch.plan.blocks.warmup, self.launch.progress
         arrivals_ns = []
         for _ in range(warmups):
             progress.stage("warming up")
-            measured = self.request(prompt, 0, None)
+            measured = self.request(of, 0, None)
             arrivals_ns.append([token.client_ns for token in measured.tokens])
             progress.advance()
         prior = prior_of(arrivals_ns, self.rate)
@@ -159,12 +159,10 @@ class ModelLink:
             self.writer.update(prior={**values, "warmups": warmups})
         return prior
 
-    def request(self, prompt: PlanPrompt, plan: int, feed: PlanFeed | None) -> Measured:
+    def request(self, of: PlanPrompt, plan: int, feed: PlanFeed | None) -> Measured:
         """Make one request and write its rows; raises an error that ends the run."""
         run = self.session.request
-        request = replace(
-            run, prompt=prompt.prompt, grammar=prompt.grammar, max_pieces=prompt.max_tokens, seed=run.seed + plan
-        )
+        request = replace(run, prompt=of.prompt, grammar=of.grammar, max_pieces=of.max_tokens, seed=run.seed + plan)
         place = Place(next(self.blocks), 0, warmup=feed is None)
         measured = self.session.measure(place, RequestContext(plan=feed, request=request))
         if self.session.origin != self.origin:
@@ -178,15 +176,15 @@ class ModelLink:
             raise UsageError(f"{error} (`no_grammar` leaves it out)") from error
         return measured
 
-    def setting(self, prompt: PlanPrompt) -> PlanSetting:
+    def setting(self, of: PlanPrompt) -> PlanSetting:
         return PlanSetting(
             board="",
             title=f"live {self.cell.name}",
             tokens_per_s=float(f"{self.rate or 0.0:.4g}"),
             prompt_s=None,
-            tokens_per_skill=prompt.tokens_per_skill,
-            n_skills=prompt.n_skills,
-            t_nom_s=prompt.t_nom_s,
+            tokens_per_skill=of.tokens_per_skill,
+            n_skills=of.n_skills,
+            t_nom_s=of.t_nom_s,
             mode=MODE,
             emulated=self.origin.emulated,
         )
