@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import count, groupby, product
+from itertools import count, groupby
 from pathlib import Path
 from random import Random
 from typing import TYPE_CHECKING, Any, Final
@@ -22,18 +22,20 @@ from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.chunks.build_rows import stall_metrics, stalls_of, write_cell
 from s2a_bench.experiments.chunks.cells import ChunkCell, LatencyDraw, cells
 from s2a_bench.experiments.chunks.latencies import Source, delay_rows, measured, write_delays
-from s2a_bench.experiments.chunks.requester import ChunkRequester, Job, warm_up
+from s2a_bench.experiments.chunks.requester import ChunkRequester, Job
 from s2a_bench.experiments.chunks.smooth import MOST_TICKS, smoothness
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
-from s2a_bench.harness.session import Place, Session
+from s2a_bench.harness.session import Session
+from s2a_bench.policy.chunks import ControlSetting
+from s2a_bench.policy.chunks.append import Sync
 from s2a_bench.policy.chunks.cycles import gather, lay
 
 if TYPE_CHECKING:
     from s2a_bench.act import ActionRobot
     from s2a_bench.act.control import Acted
     from s2a_bench.experiments.chunks.config import ChunksConfig
-    from s2a_bench.policy.chunks import ControlSetting, Cycles, Ints, Ticks
+    from s2a_bench.policy.chunks import Cycles, Ints, Mode, Ticks
     from s2a_bench.progress import Progress
     from s2a_bench.store.run import RunWriter
     from s2a_bench.types import Vector
@@ -41,6 +43,10 @@ CLIENTS: Final = 4
 """Of a cell, for modes with several concurrent requests."""
 KEEP_S: Final = 0.05
 """Period in which measurements are written while the loop runs."""
+WARM_UP_TICK_NS: Final = 20_000_000
+"""The longest tick of the loop that warms up."""
+ENDLESS: Final = 2**62
+"""Ticks of a loop that is stopped."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,41 +163,54 @@ def _drive(config: ChunksConfig, launch: RunningLaunch) -> None:
     launch.progress.expect(len(tried))
     for cell, sessions, dims in Random(config.seed).sample(tried, len(tried)):  # noqa: S311 - an order, not a secret
         launch.progress.stage(f"acting for {config.seconds:g} s: {cell.cell}")
-        period_ns = config.setting.slowed(cell.slower).period_ns
-        robot = open_robot(config.robot, dims, period_ns) if config.robot else None
+        setting = config.setting.slowed(cell.slower)
+        ticks, streams = max(2, round(config.seconds * 1e9 / setting.period_ns)), cell.mode.streams
+        robot = open_robot(config.robot, dims, setting.period_ns) if config.robot else None
         with nullcontext() if robot is None else closing(robot):
             launch.writer.update(robot={} if robot is None else robot.describe())
-            write(config, launch.writer, _act(config, cell, sessions, launch, blocks, robot))
+            loop, requester = _run(
+                config, cell.acting, setting, sessions, launch, blocks, ticks=ticks, streams=streams, robot=robot
+            )
+            triggers = tuple(loop.stepper.triggers)
+            live = LiveResult(cell, setting, sessions[0], loop.acted(), requester, robot, triggers)
+            write(config, launch.writer, live)
         launch.progress.advance()
 
 
 def _warm_up(
     config: ChunksConfig, launch: RunningLaunch, sessions: Sequence[Session], blocks: Iterator[int]
 ) -> tuple[Ints, int]:
-    """Return the latencies of warm-up requests in ns, and the size of an action."""
-    latency_ns: list[int] = []
-    dims, error = 0, ""
-    for session, _ in product(sessions, range(launch.plan.blocks.warmup)):
-        warm, numbers = warm_up(session, Place(next(blocks), 0, warmup=True), config.horizon)
-        launch.keep(session, warm)
-        dims = dims or numbers
-        if not warm.sample.error and warm.sample.last_token_ns is not None:
-            latency_ns.append(warm.sample.last_token_ns - warm.sample.marks[0][1])
-        error = warm.sample.error
+    """Return the latencies of warm-up requests in ns, and the size of an action.
+
+    A loop requests them: their latencies include the hand-over between threads, as those of the run do.
+    """
+    setting = ControlSetting(min(config.setting.period_ns, WARM_UP_TICK_NS), config.horizon)
+    latency_ns, dims = [np.empty(0, np.int64)], 0
+    for session in sessions:
+        mode, warmup = Sync(1), launch.plan.blocks.warmup
+        loop, requester = _run(config, mode, setting, [session], launch, blocks, warmup=warmup)
+        arrival_ns, dims = loop.acted().arrival_ns[:, 0], dims or requester.dims
+        latency_ns.append(arrival_ns[arrival_ns >= 0])
+        error = requester.error
     if not dims:
         raise TransportError(f"no request of {sessions[0].cell.name} succeeded while warming up, at last with {error}")
-    return np.array(latency_ns, np.int64), dims
+    return np.concatenate(latency_ns), dims
 
 
-def _act(
+def _run(
     config: ChunksConfig,
-    cell: ChunkCell,
+    mode: Mode,
+    setting: ControlSetting,
     sessions: Sequence[Session],
     launch: RunningLaunch,
     blocks: Iterator[int],
-    robot: ActionRobot | None,
-) -> LiveResult:
-    setting = config.setting.slowed(cell.slower)
+    *,
+    ticks: int = ENDLESS,
+    streams: bool = False,
+    robot: ActionRobot | None = None,
+    warmup: int = 0,
+) -> tuple[ControlLoop, ChunkRequester]:
+    """Act for ``ticks``, or until ``warmup`` requests have been made; write the requests."""
     sends_state = robot is not None and _accepts_state(config, sessions[0], robot)
 
     def on_actions(request: int, actions: Sequence[Any], at_ns: int) -> None:
@@ -201,25 +220,24 @@ def _act(
         if robot is not None:
             robot.send(action, at_ns)
 
-    requester = ChunkRequester(sessions, config.horizon, config.seed, cell.mode.streams, on_actions, blocks)
+    requester = ChunkRequester(sessions, config.horizon, config.seed, streams, on_actions, blocks, warmup)
 
     def request_chunk(request: int, tick: int) -> None:
         requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else ()))
 
-    loop = ControlLoop(
-        cell.acting, setting, send, request_chunk, max(2, round(config.seconds * 1e9 / setting.period_ns))
-    )
+    loop = ControlLoop(mode, setting, send, request_chunk, ticks)
     with requester.running():
         try:
             loop.start()
-            while not loop.join(KEEP_S):
+            while not loop.join(KEEP_S) and not requester.over.is_set():
                 _keep(requester, launch)
             if any(session.busy for session in sessions):
                 launch.progress.stage("waiting for the last answer")
         finally:
             loop.stop()
     _keep(requester, launch)
-    return LiveResult(cell, setting, sessions[0], loop.acted(), requester, robot, tuple(loop.stepper.triggers))
+    loop.join()
+    return loop, requester
 
 
 def _accepts_state(config: ChunksConfig, session: Session, robot: ActionRobot) -> bool:

@@ -52,10 +52,17 @@ class ChunkRequester:
     on_actions: OnActions
     blocks: Iterator[int]
     """The next place in the run."""
+    warmup: int = 0
+    """Attempts, marked as warm-ups, after which it is over; 0: no warm-ups, and no limit."""
     jobs: SimpleQueue[Job | None] = field(default_factory=SimpleQueue)
     done: SimpleQueue[tuple[Session, Measured]] = field(default_factory=SimpleQueue)
     names: dict[int, str] = field(default_factory=dict)
     """Request -> the id of its sample."""
+    attempts: int = 0
+    error: str = ""
+    """Of the last attempt."""
+    dims: int = 0
+    """Numbers of an action; 0 before the first."""
     sent_bytes: int = 0
     failure: BaseException | None = None
     over: Event = field(default_factory=Event)
@@ -97,36 +104,27 @@ class ChunkRequester:
             def on_piece(piece: Piece, at_ns: int, actions: list[Vector] = actions) -> None:
                 if isinstance(piece, Action):
                     actions.append(piece.values)
+                    self.dims = piece.values.size
                 if len(actions) > len(chunk) and (self.streams or len(actions) == self.horizon):
                     chunk.extend(actions[len(chunk) :])
                     self.on_actions(job.request, chunk, at_ns)
 
-            place = Place(next(self.blocks), attempt, warmup=False)
+            place = Place(next(self.blocks), attempt, warmup=self.warmup > 0)
             request = replace(session.request, seed=(self.seed + job.tick) % SEEDS)
             measured = session.measure(place, RequestContext(job.state or None, on_piece, request=request))
             self.names[job.request] = measured.sample.request_id
             self.sent_bytes += measured.sample.payload_bytes or 0
+            self.error = measured.sample.error
             self.done.put((session, measured))
+            self.attempts += 1
+            if self.attempts == self.warmup:
+                self.over.set()
             if not measured.sample.error:
                 check(session, len(actions), self.horizon)
             if not measured.sample.error or len(chunk) == self.horizon:
                 return
             if measured.fatal is not None or self.over.wait(min(measured.retry_after_s, MOST_WAIT_S)):
                 return
-
-
-def warm_up(session: Session, place: Place, horizon: int) -> tuple[Measured, int]:
-    """Measure a request before the loop starts; return it and the size of an action; raises as `check` does."""
-    actions: list[Vector] = []
-
-    def on_piece(piece: Piece, _at_ns: int) -> None:
-        if isinstance(piece, Action):
-            actions.append(piece.values)
-
-    measured = session.measure(place, RequestContext(on_piece=on_piece))
-    if not measured.sample.error:
-        check(session, len(actions), horizon)
-    return measured, actions[0].size if actions else 0
 
 
 def check(session: Session, actions: int, horizon: int) -> None:

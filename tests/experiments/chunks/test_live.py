@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
+from time import sleep
 
 import pandas as pd
 import pytest
@@ -14,6 +15,7 @@ from s2a_bench.errors import EngineError, RequestFailed, RobotError, S2AError, U
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
 from s2a_bench.experiments.chunks.view import show
+from s2a_bench.harness.session import PLAIN, Measured, Place, RequestContext, Session
 from s2a_bench.inference import EngineConfig, chunk
 from s2a_bench.library import Run
 from s2a_bench.policy.chunks.append import QueueStepper, Sync
@@ -129,6 +131,22 @@ def test_rules_choose_triggers_as_they_go(tmp_path: Path) -> None:
         ("sync", "given"),
         ("queue", "calibrated"),
     ]
+
+
+def test_a_calibrated_trigger_covers_the_way_from_the_tick_to_the_capture(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    measure = Session.measure
+
+    def starts_late(session: Session, place: Place, context: RequestContext = PLAIN) -> Measured:
+        sleep(0.03)
+        return measure(session, place, context)
+
+    monkeypatch.setattr(Session, "measure", starts_late)
+    requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
+    rows = act(tmp_path, modes="queue", rules="calibrated", epsilon=0.05, latency="10", requests=requests)
+    assert rows.set_index("rule").loc["calibrated", "trigger"] >= 2  # of 40 ms at 50 Hz
+    assert read_run(folder_of(tmp_path)).samples["warmup"].sum() == 19
 
 
 def test_a_slow_server_slows_actions_down(tmp_path: Path) -> None:
