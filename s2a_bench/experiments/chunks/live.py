@@ -27,8 +27,7 @@ from s2a_bench.experiments.chunks.smooth import MOST_TICKS, smoothness
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Session
-from s2a_bench.policy.chunks import ControlSetting
-from s2a_bench.policy.chunks.append import Sync
+from s2a_bench.policy.chunks import ONE_BY_ONE, ControlSetting, mode
 from s2a_bench.policy.chunks.cycles import gather, lay
 
 if TYPE_CHECKING:
@@ -90,8 +89,8 @@ class LiveResult:
             return None
         computed, done = lay(cycles), self.counted()[1]
         length = min(computed.chunk.size, ticks)
-        pairs = ((computed.chunk, done.chunk), (computed.index, done.index), (computed.age, done.age))
-        return float(np.all([one[:length] == other[:length] for one, other in pairs], axis=0).sum()) / ticks
+        equal = [getattr(computed, each)[:length] == getattr(done, each)[:length] for each in ("chunk", "index", "age")]
+        return float(np.all(equal, axis=0).sum()) / ticks
 
     def smooth(self) -> dict[str, float]:
         """Return the robot's smoothness, if it reports its motion; the policy's target is unknown."""
@@ -187,8 +186,8 @@ def _warm_up(
     setting = ControlSetting(min(config.setting.period_ns, WARM_UP_TICK_NS), config.horizon)
     latency_ns, dims = [np.empty(0, np.int64)], 0
     for session in sessions:
-        mode, warmup = Sync(1), launch.plan.blocks.warmup
-        loop, requester = _run(config, mode, setting, [session], launch, blocks, warmup=warmup)
+        warmup = launch.plan.blocks.warmup
+        loop, requester = _run(config, mode(ONE_BY_ONE), setting, [session], launch, blocks, warmup=warmup)
         arrival_ns, dims = loop.acted().arrival_ns[:, 0], dims or requester.dims
         latency_ns.append(arrival_ns[arrival_ns >= 0])
         error = requester.error
@@ -199,7 +198,7 @@ def _warm_up(
 
 def _run(
     config: ChunksConfig,
-    mode: Mode,
+    acting: Mode,
     setting: ControlSetting,
     sessions: Sequence[Session],
     launch: RunningLaunch,
@@ -225,7 +224,7 @@ def _run(
     def request_chunk(request: int, tick: int) -> None:
         requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else ()))
 
-    loop = ControlLoop(mode, setting, send, request_chunk, ticks)
+    loop = ControlLoop(acting, setting, send, request_chunk, ticks)
     with requester.running():
         try:
             loop.start()

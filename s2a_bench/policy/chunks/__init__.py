@@ -27,7 +27,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, Protocol, TypeAlias
 
-from s2a_bench.errors import UsageError
 from s2a_bench.registry import Registry
 
 if TYPE_CHECKING:
@@ -276,17 +275,12 @@ MODES: Final[Registry[Callable[..., Mode]]] = Registry(
 COMPARED: Final = ("sync", "queue?trigger=6", "replace?execute=8", "aggregate?trigger=6")
 """Modes that commands compare by default."""
 
+ONE_BY_ONE: Final = "sync?execute=1"
+"""The mode that requests most often with one request pending: it warms loops up."""
+
 
 def mode(written: str) -> Mode:
     """Build the mode ``name[?parameter=value&...]``; raises UsageError for an unknown name, parameter or value."""
     from s2a_bench.policy.parameters import build
 
     return build(MODES[written.partition("?")[0]], written, MODES.field)
-
-
-def streams(written: str) -> bool:
-    """Return `Mode.streams`; False for a mode whose package is not installed."""
-    try:
-        return mode(written).streams
-    except UsageError:
-        return False

@@ -38,7 +38,7 @@ class Appending(Mode):
 
     def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles | None:
         delay, known = setting.delay_ticks(arrival_ns[:, -1]), setting.known_ticks(arrival_ns[:, -1])
-        return _append(delay, delay, known, self.trigger or 0, self.execution_horizon(setting), setting.horizon)
+        return _append(delay, delay, known, (self.trigger or 0,), self.execution_horizon(setting), setting.horizon)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,17 +60,7 @@ class VariedQueue(Varied):
 
     def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles:
         delay, known = setting.delay_ticks(arrival_ns[:, -1]), setting.known_ticks(arrival_ns[:, -1])
-        length, last = self.mode.execution_horizon(setting), len(self.triggers) - 1
-        leaves, starts, left = [0], [], 0
-        for request, (ticks, known_ticks) in enumerate(zip(delay.tolist(), known.tolist(), strict=True)):
-            now = leaves[-1]
-            starts.append(now + max(left, ticks))
-            end = starts[-1] + length
-            leaves.append(max(end - self.triggers[min(request + 1, last)], now + max(known_ticks, 1)))
-            left = max(0, end - leaves[-1])
-        tick, start = np.array(leaves[:-1], np.int64), np.array(starts, np.int64)
-        first, until = np.zeros_like(start), start + length
-        return assemble(tick, tick + delay, start, first, until, ticks=leaves[-1], horizon=setting.horizon)
+        return _append(delay, delay, known, self.triggers, self.mode.execution_horizon(setting), setting.horizon)
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +124,7 @@ class Streamed(Appending):
             return None  # an action arrives after its turn: the chunk is no single run
         if self.trigger >= length and (ready > known).any():
             return None  # the next request leaves while the chunk is held back
-        return _append(usable[:, 0], ready, known, self.trigger, length, setting.horizon)
+        return _append(usable[:, 0], ready, known, (self.trigger,), length, setting.horizon)
 
 
 @dataclass(slots=True)
@@ -171,27 +161,29 @@ class QueueStepper(ChunkStepper):
         return self.waiting.popleft()[0]
 
 
-def _append(delay: Ints, ready: Ints, known: Ints, trigger: int, length: int, horizon: int) -> Cycles:
+def _append(delay: Ints, ready: Ints, known: Ints, triggers: tuple[int, ...], length: int, horizon: int) -> Cycles:
     """Append chunks that may begin ``ready`` ticks after the request, shapes (R,).
 
     With q actions left at the request at k, the chunk begins at e = k + max(q, ready). The next request leaves when
-    ``trigger`` actions are left and all have arrived, at max(e + length - trigger, k + known). If that is always the
-    former, q is always the trigger, and cycles do not depend on each other.
+    as many actions are left as its trigger, the last for all later ones, and all have arrived: at max(e + length -
+    trigger, k + known). If that is always the former with one trigger, q is always the trigger, and cycles do not
+    depend on each other.
     """
+    trigger = triggers[-1]
     left = np.full(ready.size, trigger)
     left[:1] = 0
     step = np.maximum(left, ready) + length - trigger
-    if (step >= np.maximum(known, 1)).all():
+    if len(triggers) == 1 and (step >= np.maximum(known, 1)).all():
         leaves = np.concatenate(([0], np.cumsum(step)))
     else:
         leaves_at, left_then = [0], [0]
-        for ready_ticks, known_ticks in zip(ready.tolist(), known.tolist(), strict=True):
+        for request, (ready_ticks, known_ticks) in enumerate(zip(ready.tolist(), known.tolist(), strict=True), 1):
             now = leaves_at[-1]
-            begin = now + max(left_then[-1], ready_ticks)
-            leaves_at.append(max(begin + length - trigger, now + known_ticks, now + 1))
-            left_then.append(begin + length - leaves_at[-1])
+            end = now + max(left_then[-1], ready_ticks) + length
+            leaves_at.append(max(end - triggers[min(request, len(triggers) - 1)], now + known_ticks, now + 1))
+            left_then.append(end - leaves_at[-1])
         leaves, left = np.array(leaves_at), np.array(left_then[:-1], np.int64)
-    request = leaves[:-1]
-    start = request + np.maximum(left, ready)
+    request_tick = leaves[:-1]
+    start = request_tick + np.maximum(left, ready)
     first, until = np.zeros_like(start), start + length
-    return assemble(request, request + delay, start, first, until, ticks=int(leaves[-1]), horizon=horizon)
+    return assemble(request_tick, request_tick + delay, start, first, until, ticks=int(leaves[-1]), horizon=horizon)

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.experiments import SHARE
 from s2a_bench.experiments.chunks.rows import CHUNKS, METRICS, ChunkRow
-from s2a_bench.policy.chunks import streams
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import PROVENANCE, about
 from s2a_bench.writers.csv_text import CsvTable
@@ -127,7 +126,8 @@ def delay_table(run: StoredRun) -> TextTable:
     names_left = ("L", "mode") if live(run) else ("L", "latency", "requests")
     header = (*names_left, "ms", "p99", *(_TITLES[name] for name in names))
     title = f"Delays, d = {run.manifest['configuration']['rounding']} of L over Delta t"
-    return TextTable(title, header, rows, 2, notes=(_convention(run),), cells=tuple(cells))
+    notes = (_convention(run), "L and d of streamed: to the first action.")
+    return TextTable(title, header, rows, 2, notes=notes, cells=tuple(cells))
 
 
 def chunk_csv(run: StoredRun) -> dict[str, CsvTable]:
@@ -204,8 +204,6 @@ def _notes(run: StoredRun) -> Iterator[str]:
         "margin: ticks that all latencies may be longer without a stall. Ages and stalls are in control ticks."
     )
     rows = rows_of(run)
-    if any(streams(row["mode"]) for row in rows):
-        yield "streamed: latency and d are those of the first action."
     if any(row["slow_down"] is not None and row["slow_down"] > 1 for row in rows):
         yield "Where no trigger is enough, actions have to be slower by beta (chunks.csv: slow_down)."
     if any(row["rule"] != "given" for row in rows):
