@@ -1,4 +1,4 @@
-"""Estimate of the gap between tokens: a prior from the hardware profile, updated by every token of the plan.
+"""Estimate of the gap between tokens: a prior, updated by every token of the plan.
 
 The gaps of one plan have an unknown mean mu ~ N(mu0, tau0^2) and vary around it with variance sigma^2. After g gaps
 that took ``elapsed`` together, mu is N(mu_g, v_g) with (conjugate update, e.g. Gelman et al., Bayesian Data Analysis,
@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
-from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Floats
 
@@ -23,7 +22,7 @@ Number = TypeVar("Number", float, "Floats")
 """One plan's value, or an array of many plans' values."""
 
 PLAN_CV = 0.10
-"""Coefficient of variation of the mean gap from plan to plan, if the profile has none."""
+"""Coefficient of variation of the mean gap from plan to plan, if nothing is known of it."""
 
 LEAST_CV = 1e-6
 """Lower limit of estimates: with a variance of zero nothing could be learned."""
@@ -43,15 +42,6 @@ class GapPrior:
         for name in ("mean_s", "plan_cv", "token_cv"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise UsageError(f"prior: {name} = {getattr(self, name):g} should be above 0 and finite")
-
-    @staticmethod
-    def of_profile(profile: Profile, *, seed: int = 0) -> GapPrior:
-        """Take rate and spreads from a hardware profile; the spread of sums is drawn (2,000 sums of 64 gaps)."""
-        import numpy as np
-
-        sums = profile.gaps.sample(np.random.default_rng(seed), 64, 2000).sum(axis=0)
-        cv = float(sums.std() / sums.mean()) * 64**0.5
-        return GapPrior(1 / profile.tokens_per_s, profile.rate_cv or PLAN_CV, max(cv, LEAST_CV))
 
     @staticmethod
     def fit(token_s: Floats) -> GapPrior:

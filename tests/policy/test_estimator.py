@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from s2a_bench.boards.gaps import Constant, Lognormal, Markov
-from s2a_bench.boards.profile import Profile
+from s2a_bench.boards.gaps import Lognormal, Markov
 from s2a_bench.errors import UsageError
 from s2a_bench.policy.estimator import VAGUE, GapPrior
 
@@ -88,20 +87,6 @@ def test_gaps_without_any_spread_still_let_plans_teach_something() -> None:
     assert 0 < prior.token_cv < 1e-3
     mean, _ = prior.learned(5.0, 10.0)
     assert 1.0 < mean <= 2.0
-
-
-def test_a_profile_tells_rate_and_spreads() -> None:
-    profile = Profile("x", "X", "paper", 4.8, 0.5, 0.15, Lognormal(1 / 4.8, 0.2))
-    prior = GapPrior.of_profile(profile)
-    assert prior.mean_s == 1 / 4.8
-    assert prior.plan_cv == 0.1
-    assert prior.token_cv == pytest.approx(0.2, rel=0.05)
-
-
-def test_a_profile_s_own_spread_of_rates_is_taken_and_steady_gaps_still_let_plans_teach() -> None:
-    prior = GapPrior.of_profile(Profile("x", "X", "measured", 5.0, 0.5, 0.15, Constant(0.2), rate_cv=0.03))
-    assert prior.plan_cv == 0.03
-    assert 0 < prior.token_cv <= 1e-6
 
 
 def test_the_least_that_can_be_fitted_by_hand() -> None:
