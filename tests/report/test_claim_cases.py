@@ -89,9 +89,16 @@ class Kit:
             server_prompt_ms=130 - without_model_ms,
         )
 
-    def rates(self, rate: float, provenance: Provenance | None, model: dict[str, Any], **facts: Any) -> StoredRun:
+    def rates(
+        self,
+        rate: float,
+        provenance: Provenance | None,
+        model: dict[str, Any],
+        cells: dict[str, Provenance] | None = None,
+        **facts: Any,
+    ) -> StoredRun:
         """Make a throughput run on a host with an RTX 4080."""
-        origins = {} if provenance is None else {"provenance": Origins(provenance).to_manifest()}
+        origins = {} if provenance is None else {"provenance": Origins(provenance, cells or {}).to_manifest()}
         return self.spoken(rate, environment=RTX, model=model, **origins, **facts)
 
     def ccrb(self, **settings: Any) -> StoredRun:
@@ -149,6 +156,11 @@ NO_EVIDENCE: dict[str, tuple[Made, str, str]] = {
     "dummy weights at the 4080's rate": (lambda kit: kit.rates(34.2, DUMMY, GPU), "RTX 4080: 34.2", "weights: dummy"),
     "a paced server": (
         lambda kit: kit.rates(34.2, replace(REAL, tokens="paced"), GPU),
+        "RTX 4080: 34.2",
+        "tokens: paced",
+    ),
+    "a paced cell of a run that is measured": (
+        lambda kit: kit.rates(34.2, REAL, GPU, cells={"in-process": replace(REAL, tokens="paced")}),
         "RTX 4080: 34.2",
         "tokens: paced",
     ),

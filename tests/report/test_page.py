@@ -15,6 +15,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -36,6 +37,7 @@ from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.latex import PREAMBLE, document, escape, to_siunitx
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import ABSENT, TextTable
+from tests.report.conftest import REAL
 
 MakeRun = Callable[..., StoredRun]
 MakeRow = Callable[..., SampleRow]
@@ -367,6 +369,32 @@ def test_files_lie_in_a_folder_a_run(tmp_path: Path, computed: Path, make_run: M
     markdown = (tmp_path / "all.md").read_text()
     assert "| Jetson AGX Orin | 6 | naive | 1.75 | 11.50 | 7 |" in markdown
     assert "## The paper's claims" in markdown
+
+
+def test_the_provenance_of_every_cell_is_on_the_page_in_the_claims_and_in_csv(
+    tmp_path: Path, computed: Path, beside: MakeRun
+) -> None:
+    replayed = replace(REAL, engine="replay", weights="none", tokens="emulated", profile="rtx-4080")
+    cells = {"http/as-deployed": replayed, "ros/topic": replace(REAL, weights="dummy")}
+    stages = {"convert": 10.0, "inference": 5.0, "return": 0.0}
+    run = beside(dict.fromkeys(cells, stages), origins=cells).path
+    report = make_report(read_chapters([run, computed], against_paper=True), against_paper=True)
+    page = tmp_path / "page.html"
+    write_report(report, ReportConfig(runs=[run], output=page, csv=tmp_path / "csv"))
+
+    codes = {name: each.code for name, each in cells.items()}
+    claims = pd.read_csv(tmp_path / "csv" / "claims.csv")
+    assert {*codes.values(), *read_run(computed).origins.code.split()} == set(claims["provenance"][0].split())
+    rows = pd.read_csv(tmp_path / "csv" / run.name / "summary.csv")
+    assert {name: set(rows.loc[rows["cell"] == name, "provenance"]) for name in codes} == {
+        name: {code} for name, code in codes.items()
+    }
+    (basis,) = claims.loc[claims["claim"].str.startswith("HTTP/JSON"), "evidence"]
+    assert f"Basis: {run.name}; {'; '.join(each.line for each in cells.values())}; 3 launches." in basis
+    article = page.read_text().partition("HTTP/JSON takes longer")[2].partition("</article>")[0]
+    assert re.findall('class="label">(.*?)<', article) == ["emulated", "replay engine", "dummy weights"]
+    heading = page.read_text().partition(f'<section id="run-{run.name}">')[2].partition("</h2>")[0]
+    assert set(re.findall('class="label">(.*?)<', heading)) >= {"emulated", "replay engine", "dummy weights"}
 
 
 def test_a_figures_caption_stands_below_it_on_the_page_and_in_latex(tmp_path: Path, computed: Path) -> None:
