@@ -277,9 +277,9 @@ class LlamaCppEngine(Engine):
             facts["model_bytes"] = int(llama_cpp.llama_model_size(handle))
             description = ctypes.create_string_buffer(256)
             llama_cpp.llama_model_desc(handle, description, len(description))
-            model_type = description.value.decode()  # for instance "qwen2 7B Q4_0"
+            model_type = description.value.decode()
             facts["model_type"] = model_type
-            facts["quantisation"] = model_type.rpartition(" ")[2]
+            facts["quantisation"] = model_type.split(maxsplit=2)[-1]  # of "qwen2 7B Q4_K - Medium"
         return facts
 
     def close(self) -> None:

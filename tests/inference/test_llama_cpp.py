@@ -1,3 +1,4 @@
+import ctypes
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -234,6 +235,14 @@ def test_it_describes_model_and_build(shared: LlamaCppEngine, tiny: EngineConfig
     assert facts["parameters"] == 3_294_233
     assert facts["quantisation"] == "F16"
     assert isinstance(facts["gpu_offload_supported"], bool)
+
+
+def test_a_quantisation_of_several_words_is_whole(shared: LlamaCppEngine, monkeypatch: pytest.MonkeyPatch) -> None:
+    def describe(_: object, buffer: ctypes.Array[ctypes.c_char], __: int) -> None:
+        buffer.value = b"qwen2 7B Q4_K - Medium"
+
+    monkeypatch.setattr(llama_cpp, "llama_model_desc", describe)
+    assert shared.describe()["quantisation"] == "Q4_K - Medium"
 
 
 @pytest.mark.parametrize("quant", ["q8_0", "q4_0"])
