@@ -14,7 +14,7 @@ from scipy import stats
 from scipy.signal import lfilter
 
 from s2a_bench.stats.batches import LaunchValues, RowCorrelation, Rows
-from s2a_bench.stats.change import Noise, change_between, holm
+from s2a_bench.stats.change import Noise, change_between, change_of_ranks, holm
 
 Floats: TypeAlias = NDArray[np.float64]
 LEVEL = 0.05
@@ -305,3 +305,14 @@ def test_holm_by_hand() -> None:
     assert holm([0.01, 0.015, 0.02]) == [pytest.approx(0.03)] * 3
     assert holm([0.6, 0.7]) == [1.0, 1.0]
     assert holm([]) == []
+
+
+@pytest.mark.parametrize(("factor", "least", "most"), [(1.0, 0.0, 0.06), (1.5, 0.9, 1.0)])
+def test_ranks_tell_a_change_from_none_whatever_the_scale(factor: float, least: float, most: float) -> None:
+    rng, found = np.random.default_rng(8), []
+    for _ in range(REPEATS):
+        before, after = (rng.lognormal(0, 0.4, n) for n in (200, 80))
+        change = change_of_ranks(rows_of(before), rows_of(after * factor), seed=0)
+        assert change == change_of_ranks(rows_of(before**3), rows_of((after * factor) ** 3), seed=0)
+        found.append(change.p is not None and change.p < 0.01)
+    assert least <= np.mean(found) <= most
