@@ -149,6 +149,7 @@ class _Chunks(_Run, _ChunksLatencyThroughput, _ChunksLatencyThroughputTimeline, 
     eps: float
     epsilon: float
     export_delays: str | Path | None
+    guarantee: Literal["high-confidence", "expected"]
     horizon: int
     latency: _Several[str | float]
     live: bool

@@ -26,7 +26,7 @@ class StudyConfig(Options):
     plans: int | None = option(None, "plans a cell [default: the study's own number]", ge=1)
     calibration_plans: int = option(400, "plans that prior and lambda come from")
     epsilon: float = option(0.01, "share of plans that may stall")
-    guarantee: Guarantee = option("high-confidence", GUARANTEE)
+    guarantee: Guarantee = GUARANTEE
     profile: str = option("", "profile whose recorded gaps the frontier adds as a family")
     seed: int = option(0, "seed; every cell has its own from it", ge=0)
     seeds: int = option(1, "run the whole study for as many seeds, this and the following ones", ge=1, le=1000)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -14,12 +14,16 @@ from s2a_bench.facts import FRAMES_LOST, HEADERS_OFF_MS, STALE_FRAMES, USAGE_ZER
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Machine, examine, warnings_of
 from s2a_bench.machine.doctor.host import RMEM_WANTED
-from s2a_bench.stats.batches import RowCorrelation
+from s2a_bench.policy.conformal import no_promise
+from s2a_bench.stats.batches import FEWEST_ROWS, RowCorrelation, Rows
+from s2a_bench.stats.change import change_of_ranks
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import RESIDUAL_LIMIT, budget
 
 CLOCK_STEP_NS = 50_000_000
+LEVEL: Final = 0.01
+"""Of the test for changed delays."""
 SURELY_OFF_MS, SURELY_OFF_SHARE = 20.0, 0.25
 """Beyond both, a llama-server's headers did not leave when its slot started."""
 
@@ -27,6 +31,30 @@ SURELY_OFF_MS, SURELY_OFF_SHARE = 20.0, 0.25
 def before_run(checks: Mapping[str, str] | None = None, machine: Machine | None = None) -> list[RunWarning]:
     """Return the doctor's warnings that concern any run, and those of a plan's ``checks``."""
     return warnings_of(examine(machine or Machine(), {code: CHECKS[code] for code in BEFORE_RUN} | dict(checks or {})))
+
+
+def exchange_warnings(calibrations: Mapping[str, Mapping[str, Any]], advice: str) -> list[RunWarning]:
+    """Return where a calibration, as plain data by name, promises nothing."""
+    broken = no_promise(calibrations)
+    return [RunWarning("not-exchangeable", broken.removesuffix("."), advice)] if broken else []
+
+
+def change_warnings(name: str, learned: Rows, seen: Rows, unit: str, advice: str) -> list[RunWarning]:
+    """Return whether later delays differ from those that a rule learned from, by a rank test on the 1 % level.
+
+    Rows are in order of measurement; fewer than `FEWEST_ROWS` of either are not compared.
+    """
+    if min(len(learned), len(seen)) < FEWEST_ROWS:
+        return []
+    change = change_of_ranks(learned, seen, seed=0)
+    if change.p is None or change.p >= LEVEL:
+        return []
+    before, now = (float(np.median(np.concatenate(rows))) for rows in (learned, seen))
+    what = (
+        f"{name}: delays changed since the calibration, in the median from {before:.4g} to {now:.4g} {unit} "
+        f"(P(a later one is longer) = {change.superiority.value:.2f})"
+    )
+    return [RunWarning("delays-changed", what, advice)]
 
 
 class Counters(NamedTuple):

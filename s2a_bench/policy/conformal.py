@@ -9,6 +9,10 @@ control requires. With n exchangeable plans, choosing the least lambda at which 
 - that share, for the lambda at hand rather than on average over calibrations, at most x with confidence
   1 - P(Bin(n, x) <= r): a risk-controlling prediction set (Bates et al., J. ACM 2021, arXiv 2101.02703).
 
+Exchangeable: every order of the scores is equally likely, as of independent ones. Scores that follow one another's
+level are not, nor are those of a machine that has changed: the lag-1 correlation r1 of the calibration's scores, in the
+order of measurement, shows the first (`Calibration.exchangeable`), a comparison with later ones the second.
+
 `calibrate` takes the greatest r that keeps the `Guarantee`. *expected* keeps the first at epsilon or less, on average
 over calibrations. *high-confidence*, the default, also keeps the second at 2 epsilon with 99.9 % confidence, because a
 robot calibrated once keeps that one lambda. With epsilon = 1 %, 400 plans give r = 3 and r = 0, a rule that stalls in
@@ -26,6 +30,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, get_args
 
 from s2a_bench.errors import UsageError
+from s2a_bench.options import option
 from s2a_bench.policy import Floats, Plans, Policy
 
 if TYPE_CHECKING:
@@ -47,10 +52,13 @@ GRID: Final = (*(i / 4 for i in range(17)), 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0,
 Guarantee: TypeAlias = Literal["high-confidence", "expected"]
 """What epsilon bounds; see the module docstring."""
 GUARANTEES: Final[tuple[Guarantee, ...]] = get_args(Guarantee)
-GUARANTEE: Final = (
-    "what epsilon bounds: expected (the mean over calibrations), high-confidence (also 2 epsilon for this one, 99.9 %)"
+GUARANTEE: Final[Any] = option(
+    "high-confidence",
+    "what epsilon bounds: expected (the mean over calibrations), high-confidence (also 2 epsilon for this one, 99.9 %)",
 )
-"""Help text of the choice."""
+"""The option of whatever calibrates."""
+CHANCE: Final = 2.58
+"""Greatest |r1| by chance, over 1 / sqrt(n): 1 % of independent scores correlate more."""
 ROUNDING: Final = 1e-9
 """A product this close below a whole number counts as whole."""
 
@@ -71,6 +79,52 @@ class Calibration:
     """Bound on P(any stall) at this caution, with ``confidence``."""
     confidence: float
     guarantee: Guarantee = "high-confidence"
+    correlation: float | None = None
+    """r1, the lag-1 correlation of the scores in their order; None in a record that lacks it."""
+    changed: bool = False
+    """Whether later delays differed from those of the calibration."""
+
+    @property
+    def chance(self) -> float:
+        return CHANCE / math.sqrt(self.plans)
+
+    @property
+    def exchangeable(self) -> bool:
+        """Return False if the bounds do not hold: neighbouring scores correlate beyond chance, or delays changed."""
+        return not self.changed and abs(self.correlation or 0.0) <= self.chance
+
+    @property
+    def lag_one(self) -> str:
+        return f"lag-1 correlation {self.correlation:.3f}, by chance up to {self.chance:.3f}"
+
+
+def promise(calibrations: Mapping[str, Mapping[str, Any]], what: str, unit: str) -> str:
+    """Return the share of further ``unit`` (plural) that ``what`` lets stall, the greatest of named calibrations.
+
+    Calibrations are plain data; one whose scores are not exchangeable promises nothing, and the sentence says so.
+    """
+    kept = [each for each in (Calibration(**found) for found in calibrations.values()) if each.exchangeable]
+    if not kept:
+        return no_promise(calibrations)
+    worst = max(kept, key=lambda each: each.expected_risk)
+    closest = max(kept, key=lambda each: abs(each.correlation or 0.0))
+    measured = "" if closest.correlation is None else f" ({closest.lag_one})"
+    sentence = (
+        f"--guarantee {worst.guarantee}: {what} lets at most {worst.expected_risk:.2%} of the {unit} stall on average, "
+        f"{worst.risk:.2%} with {worst.confidence:.1%} confidence (epsilon {worst.epsilon:g}), if they are "
+        f"exchangeable with those of the calibration{measured}."
+    )
+    return " ".join(filter(None, (sentence, no_promise(calibrations))))
+
+
+def no_promise(calibrations: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return which calibrations promise nothing, as their scores are not exchangeable; empty for none."""
+    broken = ", ".join(
+        f"{name} ({'changed since the calibration' if each.changed else each.lag_one})"
+        for name, each in ((name, Calibration(**found)) for name, found in calibrations.items())
+        if not each.exchangeable
+    )
+    return f"No promise about stalls, because the delays are not exchangeable: {broken}." if broken else ""
 
 
 def scores(policy: Policy, plans: Plans) -> Floats:
@@ -130,8 +184,10 @@ def may_stall(plans: int, epsilon: float, guarantee: Guarantee) -> int:
 
 
 def choose(score: Floats, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence") -> Calibration:
-    """Find lambda from scores, shape (plans,); raises UsageError for too few scores."""
+    """Find lambda from scores, shape (plans,), in order of measurement; raises UsageError for too few scores."""
     import numpy as np
+
+    from s2a_bench.stats.batches import lag_one
 
     count = score.size
     check(count, epsilon)
@@ -146,6 +202,7 @@ def choose(score: Floats, epsilon: float = EPSILON, guarantee: Guarantee = "high
         risk=upper_bound(above, count, CONFIDENCE),
         confidence=CONFIDENCE,
         guarantee=guarantee,
+        correlation=lag_one(np.where(np.isinf(score), 2 * GRID[-1], score)),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -363,6 +364,27 @@ def test_skills_keep_their_own_durations_unless_they_are_given(config: TimelineC
     assert (bool(given.grammar), given.max_tokens) == (True, 48)
     (free,) = plan_prompts(config.but(no_grammar=True), None)
     assert free.grammar == ""
+
+
+@pytest.mark.parametrize("slower", [1, 2])
+def test_tokens_that_come_slower_than_in_the_warm_ups_are_named(
+    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slower: int
+) -> None:
+    generate = ReplayEngine.generate
+    answers = iter(range(10))
+
+    def paced(self: ReplayEngine, request: Request) -> Iterator[Token]:
+        late = slower > 1 and next(answers) >= 5
+        for token in generate(self, request):
+            if late:
+                time.sleep(0.01)
+            yield token
+
+    monkeypatch.setattr(ReplayEngine, "generate", paced)
+    run, _ = live(config.but(policies=("naive",), n_skills=(2,), warmup=5, requests=5), tmp_path)
+    found = [each["message"] for each in run.manifest["warnings"] if each["code"] == "delays-changed"]
+    assert len(found) == slower - 1
+    assert all(text.startswith("loopback: delays changed since the calibration") for text in found)
 
 
 @pytest.fixture

@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
+from scipy import signal, stats
 
 from s2a_bench.boards.gaps import Markov
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Plans
-from s2a_bench.policy.conformal import GRID, Tracker, calibrate, choose, coarse, scores, stalled, take, upper_bound
+from s2a_bench.policy.conformal import (
+    GRID,
+    Tracker,
+    calibrate,
+    choose,
+    coarse,
+    no_promise,
+    promise,
+    scores,
+    stalled,
+    take,
+    upper_bound,
+)
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.naive import Naive
 from s2a_bench.policy.stream_to_act import StreamToAct
@@ -95,6 +107,54 @@ def test_the_promises_hold_for_scores_of_any_distribution() -> None:
     expected = np.array([1 - choose(rng.random(400), 0.01, "expected").caution for _ in range(4000)])
     assert expected.mean() == pytest.approx(4 / 401, abs=4 * expected.std() / 4000**0.5)
     assert (expected > 0.02).mean() > 0.02  # one calibration in 24 is worse than the other guarantee allows
+
+
+def autoregressive(phi: float, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draw lognormal scores whose logarithms follow one another."""
+    noise = rng.normal(size=count + 1000) * (1 - phi**2) ** 0.5
+    return np.exp(signal.lfilter([1], [1, -phi], noise)[1000:])
+
+
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [(0.3, 300), (0.9, 100), (0.99, 400), (-0.5, 400), ("step", 400), ("pauses", 400), ("infinite", 400)],
+)
+def test_a_calibration_whose_scores_follow_one_another_promises_nothing(kind: float | str, count: int) -> None:
+    rng = np.random.default_rng(9)
+    if isinstance(kind, float):
+        score = autoregressive(kind, count, rng)
+    elif kind == "step":
+        score = rng.lognormal(0, 0.4, count) * np.where(np.arange(count) < count // 2, 1, 1.5)
+    else:
+        score = Markov(1.0, 0.2, pause_share=0.05, pause_ratio=4.0, pause_tokens=3.0).sample(rng, count, 1)[:, 0]
+        score[score > 2] = math.inf if kind == "infinite" else 4.0
+    known = choose(score, 0.05)
+    assert not known.exchangeable
+    said = promise({"a": asdict(known)}, "lambda", "plans")
+    assert said == no_promise({"a": asdict(known)})
+    assert said.startswith("No promise about stalls")
+    assert f"a (lag-1 correlation {known.correlation:.3f}, by chance up to {2.58 / count**0.5:.3f})" in said
+    assert "%" not in said
+
+
+def test_independent_scores_are_exchangeable_but_for_one_in_a_hundred() -> None:
+    rng = np.random.default_rng(10)
+    found = [choose(rng.lognormal(size=400)) for _ in range(2000)]
+    assert 0.003 < np.mean([not each.exchangeable for each in found]) < 0.015
+    assert choose(np.ones(99)).correlation == 0
+    assert choose(np.arange(99.0), 0.01).correlation == pytest.approx(1, abs=0.05)
+
+
+def test_a_promise_names_its_assumption_and_leaves_out_what_does_not_meet_it() -> None:
+    rng = np.random.default_rng(11)
+    good, bad = choose(rng.random(400)), choose(np.arange(400.0))
+    known = {"good": asdict(good), "bad": asdict(bad), "later": asdict(replace(good, changed=True))}
+    said = promise(known, "lambda", "plans")
+    assert "lets at most 0.25% of the plans stall on average, 1.71% with 99.9% confidence (epsilon 0.01), if" in said
+    assert f"exchangeable with those of the calibration (lag-1 correlation {good.correlation:.3f}, by chance" in said
+    assert said.endswith("bad (lag-1 correlation 0.993, by chance up to 0.129), later (changed since the calibration).")
+    older = {name: value for name, value in asdict(good).items() if name not in {"correlation", "changed"}}
+    assert promise({"older": older}, "lambda", "plans").endswith("exchangeable with those of the calibration.")
 
 
 @pytest.mark.parametrize("gaps", [None, BURSTS], ids=["lognormal", "bursts"])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from s2a_bench.harness.warnings import change_warnings
 from s2a_bench.policy.chunks.trigger import (
     Learning,
     Maximum,
@@ -24,10 +25,13 @@ if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.config import ChunksConfig
     from s2a_bench.experiments.chunks.latencies import Source
     from s2a_bench.policy.chunks import Ints, Mode
+    from s2a_bench.policy.conformal import Calibration
+    from s2a_bench.store.manifest import RunWarning
 
 FIXED: Final = ("calibrated", "oracle")
 """Rules that choose one trigger for all requests, and may slow actions down."""
 GIVEN: Final = "given"
+FOLLOW: Final = "take --rules tracked, whose trigger follows the delays"
 _ORACLE_DRAWS: Final = 1_000_000
 
 
@@ -54,6 +58,8 @@ class ChunkCell:
     """By how many times slower its actions are executed (time-scaling)."""
     begin: Callable[[], TriggerRule] | None = None
     """Creates the rule that chooses triggers in a live run."""
+    calibration: Calibration | None = None
+    """What the rule `calibrated` learned."""
 
     @property
     def acting(self) -> Mode:
@@ -90,17 +96,21 @@ def cells(config: ChunksConfig, drawn: LatencyDraw) -> Iterator[ChunkCell]:
     for rule in config.rules_tried:
         most = max(1, mode.execution_horizon(config.setting) - 1)
         if rule in FIXED:
-            ready_ns = (
-                calibrate(drawn.learnt, config.epsilon).caution if rule == "calibrated" else _oracle_ns(config, drawn)
-            )
-            chosen = trigger(ready_ns, config.setting, most)
-            triggers = (chosen.ticks,)
-            yield ChunkCell(mode, name, rule, drawn, triggers, min(chosen.beta, config.slowest))
+            known = calibrate(drawn.learnt, config.epsilon, config.guarantee) if rule == "calibrated" else None
+            chosen = trigger(known.caution if known else _oracle_ns(config, drawn), config.setting, most)
+            slower = min(chosen.beta, config.slowest)
+            yield ChunkCell(mode, name, rule, drawn, (chosen.ticks,), slower, calibration=known)
         elif config.live:
             yield ChunkCell(mode, name, rule, drawn, begin=partial(_learner, config, rule, drawn))
         else:
             triggers = tuple(follow(_learner(config, rule, drawn), drawn.judged, config.setting, most).tolist())
             yield ChunkCell(mode, name, rule, drawn, triggers)
+
+
+def changes(config: ChunksConfig, name: str, learnt: Ints, judged: Ints) -> list[RunWarning]:
+    """Return whether the delays of ``judged`` latencies, in ticks, differ from those that a rule learned from."""
+    learned, seen = (list(config.setting.delay_ticks(each).astype(float)[:, None]) for each in (learnt, judged))
+    return change_warnings(name, learned, seen, "control ticks", f"calibrate anew, or {FOLLOW}")
 
 
 def without_trigger(mode: Mode) -> str:

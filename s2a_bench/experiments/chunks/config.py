@@ -20,6 +20,7 @@ from s2a_bench.harness.config import FirstVariants
 from s2a_bench.inference import STAND_IN, EngineConfig
 from s2a_bench.options import Names, Options, group, one_of, option
 from s2a_bench.policy.chunks import COMPARED, MODES, Rounding
+from s2a_bench.policy.conformal import GUARANTEE, Guarantee
 from s2a_bench.text import none_of
 from s2a_bench.transport import TRANSPORTS
 from s2a_bench.transport.defaults import ACTING
@@ -104,6 +105,7 @@ class ChunksConfig(Options):
         first=True,
     )
     epsilon: float = option(0.01, "share of cycles that may stall, for the rules", flag="eps", gt=0, lt=1)
+    guarantee: Guarantee = GUARANTEE
     cycles: int | None = option(
         None, f"requests of each row [default: {CYCLES}; replayed: as many as there are]", ge=2, le=1_000_000
     )

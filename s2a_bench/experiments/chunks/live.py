@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import count, groupby
 from pathlib import Path
@@ -20,13 +20,15 @@ from s2a_bench.act import open_robot
 from s2a_bench.act.control import ControlLoop
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.chunks.build_rows import stall_metrics, stalls_of, write_cell
-from s2a_bench.experiments.chunks.cells import ChunkCell, LatencyDraw, cells
+from s2a_bench.experiments.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes
+from s2a_bench.experiments.chunks.config import PROMISING
 from s2a_bench.experiments.chunks.latencies import Source, delay_rows, measured, write_delays
 from s2a_bench.experiments.chunks.requester import ChunkRequester, Job
 from s2a_bench.experiments.chunks.smooth import MOST_TICKS, smoothness
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Session
+from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.policy.chunks import ONE_BY_ONE, ControlSetting, mode
 from s2a_bench.policy.chunks.cycles import gather, lay
 
@@ -159,6 +161,9 @@ def _drive(config: ChunksConfig, launch: RunningLaunch) -> None:
         learnt, dims = _warm_up(config, launch, sessions, blocks)
         source = Source(config.named(sessions[0].cell.name))
         tried += [(cell, sessions, dims) for cell in cells(config, LatencyDraw(source, learnt[:0], learnt))]
+    found = {cell.drawn.source.name: asdict(cell.calibration) for cell, *_ in tried if cell.calibration}
+    launch.writer.update(calibrations=found)
+    launch.warnings.extend(exchange_warnings(found, FOLLOW))
     launch.progress.expect(len(tried))
     for cell, sessions, dims in Random(config.seed).sample(tried, len(tried)):  # noqa: S311 - an order, not a secret
         launch.progress.stage(f"acting for {config.seconds:g} s: {cell.cell}")
@@ -173,6 +178,11 @@ def _drive(config: ChunksConfig, launch: RunningLaunch) -> None:
             triggers = tuple(loop.stepper.triggers)
             live = LiveResult(cell, setting, sessions[0], loop.acted(), requester, robot, triggers)
             write(config, launch.writer, live)
+            seen_ns = live.judged.drawn.judged
+            if cell.rule in PROMISING and (changed := changes(config, cell.cell, cell.drawn.learnt, seen_ns)):
+                launch.warnings.extend(changed)
+                if cell.calibration:
+                    launch.writer.update(calibrations={cell.drawn.source.name: {"changed": True}})
         launch.progress.advance()
 
 

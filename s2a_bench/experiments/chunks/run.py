@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -10,11 +11,20 @@ import numpy as np
 
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.chunks.build_rows import stalls_of, write_cell
-from s2a_bench.experiments.chunks.cells import ChunkCell, LatencyDraw, cells, draw, without_trigger
-from s2a_bench.experiments.chunks.config import ChunksConfig
+from s2a_bench.experiments.chunks.cells import (
+    FOLLOW,
+    ChunkCell,
+    LatencyDraw,
+    cells,
+    changes,
+    draw,
+    without_trigger,
+)
+from s2a_bench.experiments.chunks.config import PROMISING, ChunksConfig
 from s2a_bench.experiments.chunks.latencies import delay_rows, write_delays
 from s2a_bench.experiments.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS, MeanRow, TriggerRow
 from s2a_bench.experiments.chunks.smooth import TrackingPlant, follower
+from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
 from s2a_bench.policy.chunks.closed import closed
 from s2a_bench.policy.chunks.metrics import measure
@@ -98,11 +108,18 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
     for each in drawn:
         _check(config, each)
     tried = [cell for each in drawn for cell in cells(config, each)]
+    found = {cell.drawn.source.name: asdict(cell.calibration) for cell in tried if cell.calibration}
+    warnings = [*_warnings(config), *exchange_warnings(found, FOLLOW)]
+    for name, each in {cell.drawn.source.name: cell.drawn for cell in tried if cell.rule in PROMISING}.items():
+        if each.source.recorded_ns is not None and (changed := changes(config, name, each.learnt, each.judged)):
+            warnings += changed
+            found.get(name, {})["changed"] = True
     manifest = {
         "configuration": config.to_manifest(),
         "environment": environment.collect(),
         "seeds": {"latencies": config.seed},
-        "warnings": [warning.to_manifest() for warning in _warnings(config)],
+        "calibrations": found,
+        "warnings": [warning.to_manifest() for warning in warnings],
         "provenance": Origins(
             Provenance.computed(), {cell.cell: cell.drawn.source.provenance for cell in tried}
         ).to_manifest(),

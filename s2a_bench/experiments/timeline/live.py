@@ -62,6 +62,7 @@ def _drive(
                 _execute(link, ask, plan, following, robots, records)
                 progress.advance()
         link.require_answers()
+        link.compare()
     finally:
         launch.writer.update(start_jitter=jitter_facts(records))
 

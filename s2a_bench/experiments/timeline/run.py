@@ -22,6 +22,7 @@ from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, settings
 from s2a_bench.harness.timelines.policies import Following, Knowledge, draw, finite, learn, plans_of
 from s2a_bench.harness.timelines.rows import KEPT_PLANS, skill_rows, token_rows
+from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
 from s2a_bench.plan import Call, Skill
 from s2a_bench.policy import Plans, Policy, Schedule
@@ -123,15 +124,12 @@ def _facts(board: Board) -> dict[str, Any]:
 def calibration_warnings(calibrations: dict[str, Any]) -> list[RunWarning]:
     """Return where stream-to-act could not be calibrated well."""
     waits = [name for name, found in calibrations.items() if found["caution"] is None]
-    if not waits:
-        return []
-    return [
-        RunWarning(
-            "calibration-waits",
-            f"stream-to-act waits for the whole plan in {', '.join(waits)}: no smaller lambda kept stalls rare enough",
-            "allow more stalls with --epsilon, or calibrate on more plans with --calibration-plans",
-        )
-    ]
+    waiting = RunWarning(
+        "calibration-waits",
+        f"stream-to-act waits for the whole plan in {', '.join(waits)}: no smaller lambda kept stalls rare enough",
+        "allow more stalls with --epsilon, or calibrate on more plans with --calibration-plans",
+    )
+    return [*([waiting] if waits else []), *exchange_warnings(calibrations, "follow lambda with --track")]
 
 
 def recordings(folder: Path) -> list[Floats]:

@@ -134,7 +134,7 @@ class Modelled(Options):
         "none (even gaps, as in the paper), profile (its gaps), or a family of gaps, as lognormal:cv=0.2",
         first=True,
     )
-    guarantee: Guarantee = option("high-confidence", GUARANTEE)
+    guarantee: Guarantee = GUARANTEE
     calibration_plans: int = option(400, "other plans that prior and lambda are learned from")
     calibrate: Path | None = option(
         None, "run folder of latency or throughput: learn prior and lambda from its answers instead"

@@ -18,10 +18,11 @@ from s2a_bench.harness.servers import on_files
 from s2a_bench.harness.session import Measured, Place, RequestContext
 from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, requests_of
 from s2a_bench.harness.timelines.policies import prior_of
+from s2a_bench.harness.warnings import change_warnings
 from s2a_bench.inference import need_engine
 from s2a_bench.machine.tuning import limit_threads
 from s2a_bench.plan import Format, SkillSet, choose_format, grammar, paper_format, prompt
-from s2a_bench.policy import PlanShape, Timing
+from s2a_bench.policy import Floats, PlanShape, Timing
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins
@@ -118,6 +119,10 @@ class ModelLink:
     blocks: Iterator[int] = field(default_factory=count)
     answers: int = 0
     """Plans without an error."""
+    learned_ms: list[Floats] = field(default_factory=list)
+    """Gaps between tokens of each warm-up, from which policies learn."""
+    seen_ms: list[Floats] = field(default_factory=list)
+    """Those of each plan."""
 
     def __post_init__(self) -> None:
         (self.session,) = self.launch.sessions
@@ -152,6 +157,7 @@ class ModelLink:
             measured = self.request(of, 0, None)
             arrivals_ns.append([token.client_ns for token in measured.tokens])
             progress.advance()
+        self.learned_ms += filter(np.size, (np.diff(times) / 1e6 for times in arrivals_ns))
         prior = prior_of(arrivals_ns, self.rate)
         if prior is not None:
             self.rate = self.rate or 1 / prior.mean_s
@@ -195,10 +201,18 @@ class ModelLink:
             return
         rate = (len(token_ns) - 1) / (token_ns[-1] - token_ns[0]) * 1e9
         self.rate = self.rate or rate
+        self.seen_ms.append(np.diff(token_ns) / 1e6)
         if self.pace and rate * LATE < self.pace:
             what = f"the model sent {rate:.3g} tokens/s, not the {self.pace:g} of --pace: it is slower"
             advice = "stop other programs, try --threads 1, or a lower --pace"
             self.launch.warnings.append(RunWarning("pace-missed", what, advice))
+
+    def compare(self) -> None:
+        """Warn if the plans' tokens came at other gaps than those of the warm-ups."""
+        advice = "policies learned from the warm-ups: take more, --warmup, or follow the change, --track"
+        self.launch.warnings.extend(
+            change_warnings(self.cell.name, self.learned_ms, self.seen_ms, "ms a token", advice)
+        )
 
     def require_answers(self) -> None:
         if not self.answers:

@@ -149,6 +149,23 @@ def test_a_calibrated_trigger_covers_the_way_from_the_tick_to_the_capture(
     assert read_run(folder_of(tmp_path)).samples["warmup"].sum() == 19
 
 
+@pytest.mark.parametrize("longer_ms", [0, 40])
+def test_delays_that_changed_since_the_warm_up_are_named(tmp_path: Path, longer_ms: int) -> None:
+    file = tmp_path / "delays.csv"
+    later = "".join(f"{each + longer_ms}\n" for each in (30, 50, 30, 30))
+    file.write_text("latency_ms\n" + "30\n50\n30\n30\n" * 5 + later * 100)
+    requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 20}
+    options = {"rules": "calibrated,tracked", "epsilon": 0.05, "latency": str(file), "horizon": 5}
+    act(tmp_path, modes="queue?trigger=1", requests=requests, seconds=2, **options)
+    run = read_run(folder_of(tmp_path))
+    changed = [each["message"] for each in run.manifest["warnings"] if each["code"] == "delays-changed"]
+    assert len(changed) == (2 if longer_ms else 0)
+    assert all("from 1 to 3 control ticks (P(a later one is longer) = 1.00)" in message for message in changed)
+    notes = " ".join(show(run).tables["chunks"].notes)
+    assert ("lets at most" in notes) == (not longer_ms)
+    assert ("No promise about stalls" in notes) == bool(longer_ms)
+
+
 def test_a_slow_server_slows_actions_down(tmp_path: Path) -> None:
     requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
     options = {"rules": "calibrated", "epsilon": 0.05, "latency": "150", "slowest": 4.0, "horizon": 4}

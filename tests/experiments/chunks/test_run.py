@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -14,6 +16,8 @@ from s2a_bench.experiments.chunks.cells import cells, draw
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.rows import CHUNKS, METRICS, REQUESTS, TICKS
 from s2a_bench.experiments.chunks.run import run_chunks
+from s2a_bench.experiments.chunks.view import chunk_sentences
+from s2a_bench.experiments.chunks.view.tables import chunk_tables
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 
@@ -141,6 +145,44 @@ def test_a_recording_is_played_in_order_and_its_first_half_is_what_rules_learn_f
     assert {cell.rule for cell in cells(config, drawn)} == {"given", *config.rules}
     without = ChunksConfig(latency=str(file), rules="", cycles=150)
     assert draw(without, without.sources[0]).judged.size == 150
+
+
+@pytest.mark.parametrize(
+    ("of_place", "code", "why"),
+    [
+        (lambda _, noise: 60 + 20 * noise, None, None),
+        (lambda place, noise: 60 + 20 * (place // 9 % 2) + noise, "not-exchangeable", "(lag-1 correlation 0."),
+        (lambda place, noise: (1.5 if place >= 600 else 1) * (60 + 20 * noise), "delays-changed", "(changed since"),
+    ],
+    ids=["independent", "in stretches", "a step after the calibration"],
+)
+def test_what_is_promised_of_a_recording_depends_on_its_order(
+    of_place: Callable[[int, float], float], code: str | None, why: str | None, tmp_path: Path
+) -> None:
+    file = tmp_path / "delays.csv"
+    noise = np.random.default_rng(3).random(1200).tolist()
+    file.write_text("latency_ms\n" + "".join(f"{of_place(*each)}\n" for each in enumerate(noise)))
+    found = ran(tmp_path, latency=str(file), rules="calibrated")
+    assert [each["code"] for each in found.manifest["warnings"]] == ([code] if code else [])
+    (known,) = found.manifest["calibrations"].values()
+    assert known["plans"] == 600
+    notes = " ".join(chunk_tables(found)["chunks"].notes)
+    assert ("lets at most" in notes) == (why is None)
+    assert "<=" not in notes + " ".join(chunk_sentences(found))
+    assert f"No promise about stalls, because the delays are not exchangeable: {file} {why}" in notes or why is None
+
+
+def test_a_guarantee_chooses_how_many_cycles_of_the_calibration_may_stall(tmp_path: Path) -> None:
+    latency = "lognormal:mean_ms=80,cv=.5"
+    options = {"latency": latency, "rules": "calibrated", "calibration_cycles": 400, "cycles": 300}
+    careful, expected = (ran(tmp_path, guarantee=each, **options) for each in ("high-confidence", "expected"))
+    stalled = [next(iter(each.manifest["calibrations"].values()))["stalled"] for each in (careful, expected)]
+    assert stalled == [0, 3]
+    careful_m, expected_m = (row(each, "queue", latency, "calibrated")["trigger"] for each in (careful, expected))
+    assert careful_m > expected_m
+    assert "--guarantee expected: the calibrated trigger lets at most 1.00% of the cycles" in " ".join(
+        chunk_tables(expected)["chunks"].notes
+    )
 
 
 def test_a_short_recording_has_no_rule_that_promises(tmp_path: Path) -> None:

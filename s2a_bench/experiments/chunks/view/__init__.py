@@ -49,7 +49,7 @@ def chunk_sentences(run: StoredRun) -> list[str]:
             if rule != "given"
         ]
         if stalls:
-            sentences.append(f"Stalled cycles of queue @ {name}, for at most {epsilon:.2%}: {', '.join(stalls)} ticks.")
+            sentences.append(f"Stalled cycles of queue @ {name}, epsilon {epsilon:g}: {', '.join(stalls)} ticks.")
         if live(run):
             sentences.append(f"Control loop @ {name}: {'; '.join(_loop(rows))}.")
         slower = max((row["slow_down"] or 1 for row in rows if row["mode"].startswith("queue")), default=1)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.experiments import SHARE
 from s2a_bench.experiments.chunks.rows import CHUNKS, METRICS, ChunkRow
+from s2a_bench.policy.conformal import promise
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import PROVENANCE, about
 from s2a_bench.writers.csv_text import CsvTable
@@ -210,9 +211,11 @@ def _notes(run: StoredRun) -> Iterator[str]:
         settings = run.manifest["configuration"]
         others = "an oracle that knows the distribution. All others learnt from the same cycles."
         yield (
-            f"Rules choose m of queue: calibrated for P(stall) <= {settings['epsilon']:.2%}, tracked from there, "
+            f"Rules choose m of queue: calibrated for epsilon = {settings['epsilon']:g}, tracked from there, "
             f"lerobot's maximum, the mean, {'each after the same warm-up.' if live(run) else others}"
         )
+        if found := run.manifest.get("calibrations"):
+            yield promise(found, "the calibrated trigger", "cycles")
     if live(run):
         sources = [name for name, _ in sources_of(rows)]
         if len(sources) > 1:

@@ -184,8 +184,8 @@ def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> Text
         matching = [next((base for base in each if cell.is_compared_with(base)), None) for each in bases.values()]
         over = [ratio_between(cell, base, metric, run.bootstrap_seed) if base else None for base in matching]
         found += filter(None, over)
-        cells_ = ("1" if cell in each else interval(ratio) for each, ratio in zip(bases.values(), over, strict=True))
-        rows.append((str(cell.n), str(cell.errors), *entries(cell.values_ms(metric), *figures), *shown))
+        ratios = ("1" if cell in each else interval(ratio) for each, ratio in zip(bases.values(), over, strict=True))
+        rows.append((str(cell.n), str(cell.errors), *entries(cell.values_ms(metric), *figures), *ratios))
     header = ("n", "errors", *figures, *(f"ratio to {base}" for base in bases))
     title = f"{metric_phrase(metric)} in ms; ratios of medians [95 % interval]"
     return _by_cell(title, header, cells, rows, (*_notes(run, cells), *launches_note(found)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any
@@ -20,6 +20,7 @@ from s2a_bench.experiments.timeline.view.cells import (
 from s2a_bench.experiments.timeline.view.chrome_trace import TRACE, write_trace
 from s2a_bench.experiments.timeline.view.figures import timeline_figures
 from s2a_bench.policy import ONLINE
+from s2a_bench.policy.conformal import promise
 from s2a_bench.stats import summary_of
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable
 from s2a_bench.writers.tables import ABSENT, TextTable, number
@@ -192,16 +193,6 @@ def _common(cells: Sequence[Timelines]) -> str:
     return "" if len(shapes) != 1 else ", N = {}, T_nom = {:g} s".format(*next(iter(shapes)))
 
 
-def _promise(calibrations: Iterable[Mapping[str, Any]]) -> str:
-    """Return the share of further plans that calibration lets stall: epsilon, or less with few plans."""
-    worst = max(calibrations, key=lambda each: float(each["expected_risk"]))
-    return (
-        f"--guarantee {worst.get('guarantee', 'high-confidence')}: lambda lets at most {worst['expected_risk']:.2%} of "
-        f"the plans stall on average, {worst['risk']:.2%} with {worst['confidence']:.1%} confidence "
-        f"(--epsilon {worst['epsilon']:g})."
-    )
-
-
 ONLINE_LIVE = (ONLINE, "live")
 
 
@@ -218,7 +209,7 @@ def _plan_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
         plans_each = next(iter(calibrations.values()))["plans"]
         kind = "recorded" if run.manifest["configuration"].get("calibrate") else "other"
         notes.append(f"stream-to-act: lambda {span}, calibrated on {plans_each} {kind} plans a setting.")
-        notes.append(_promise(calibrations.values()))
+        notes.append(promise(calibrations, "lambda", "plans"))
     elif live_cautions := {cell.about("caution") for cell in cells if (cell.policy, cell.about("mode")) == ONLINE_LIVE}:
         span = ", ".join(f"{caution:g}" for caution in sorted(live_cautions))
         notes.append(f"stream-to-act: lambda {span}, not calibrated; its prior is from the warm-ups, or the pace.")
