@@ -27,16 +27,31 @@ ANY: Final = "127.0.0.1:0"
 VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
-class ListeningOptions(TransportOptions):
-    """Options of a server with an address, ours or an external one."""
+class UrlOptions(TransportOptions):
+    """Options of the client of an external server."""
 
     SCHEMES: ClassVar[tuple[str, ...]] = ()
+    ENDS_WITH_PORT: ClassVar[bool] = False
+    """Whether a URL has to name a port, and has nothing after it."""
+
+    url: str = option("", "a server that runs already (a black box)", side=EXTERNAL, risk="url")
+
+    @field_validator("url")
+    @classmethod
+    def _names_a_server(cls, url: str) -> str:
+        checked_url(url, cls.SCHEMES)
+        if cls.ENDS_WITH_PORT and url and (not urlsplit(url).port or url.partition("//")[2] != urlsplit(url).netloc):
+            raise ValueError(f"'{url.partition('?')[0]}' should look like {cls.SCHEMES[0]}://HOST:PORT")
+        return url
+
+
+class ListeningOptions(UrlOptions):
+    """Options of a server with an address, ours or an external one."""
 
     host: str = option(
         "127.0.0.1", "address that our server binds; others than this machine need a key", side=SERVING, first=True
     )
     port: int = option(0, "port of the server; 0: any free one", ge=0, le=65535, side=SERVER, first=True)
-    url: str = option("", "a server that runs already (a black box)", side=EXTERNAL, risk="url")
     api_key_env: str = option(
         "",
         "NAME of the environment variable with the API key: of the url, or that our server wants",
@@ -45,11 +60,6 @@ class ListeningOptions(TransportOptions):
         first=True,
     )
     no_auth: bool = option(False, "serve every client that reaches the host, without a key", side=SERVING)
-
-    @field_validator("url")
-    @classmethod
-    def _names_a_server(cls, url: str) -> str:
-        return checked_url(url, cls.SCHEMES)
 
     def check(self) -> None:
         if self.no_auth and self.api_key_env:

@@ -10,9 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Literal
-from urllib.parse import urlsplit
-
-from pydantic import field_validator
 
 from s2a_bench import extras
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
@@ -29,6 +26,7 @@ class ZmqOptions(PolicyOptions):
     """The options of our policy server over ZeroMQ, and of the client of a foreign one."""
 
     SCHEMES: ClassVar[tuple[str, ...]] = ("tcp",)
+    ENDS_WITH_PORT: ClassVar[bool] = True
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 5555}
 
     layout: Literal["auto", "n1.7", "n1.6", "n1.5"] = option(
@@ -41,13 +39,6 @@ class ZmqOptions(PolicyOptions):
         "the observation: a template's name, or a TOML or JSON file [default: that of the layout]",
         names=names,
     )
-
-    @field_validator("url")
-    @classmethod
-    def _names_a_port(cls, url: str) -> str:
-        if url and (not urlsplit(url).port or url.partition("//")[2] != urlsplit(url).netloc):
-            raise ValueError(f"'{url.partition('?')[0]}' should look like tcp://HOST:PORT")
-        return url
 
     @property
     def template_name(self) -> str:
