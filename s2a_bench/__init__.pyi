@@ -25,12 +25,14 @@ class _Run(TypedDict, total=False):
 
 class _ChunksLatencyThroughput(TypedDict, total=False):
     action: str
+    actions_per_chunk: int
     api_key_env: str
     cameras: int
     connection: Literal["keep-alive", "per-request", "client-per-request"]
     dds_tuning: Literal["tuned", "default"]
     deadline: float
     deadline_s: float
+    device: str
     domain_id: int | None
     extra_body: str
     gaps: str
@@ -40,7 +42,9 @@ class _ChunksLatencyThroughput(TypedDict, total=False):
     middleware: str
     namespace: str
     payload: _Several[str]
+    policy_type: str
     port: int
+    pretrained: str
     prompt: str
     qos: Literal["reliable", "sensor_data"]
     resize: str | tuple[int, int] | None

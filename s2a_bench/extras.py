@@ -23,6 +23,7 @@ EXTRAS: Final = {
     "nvidia": "load, memory and power of NVIDIA GPUs",
     "openvla": "the openvla dialect",
     "ray": "sweeps on a Ray cluster",
+    "lerobot": "policies over gRPC, as lerobot serves them",
     "websocket": "policies over WebSocket, as openpi serves them",
     "zmq": "policies over ZeroMQ, as GR00T serves them",
     "carla": "the carla simulator",

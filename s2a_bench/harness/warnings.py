@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from s2a_bench.clock import realtime_offset_ns
-from s2a_bench.facts import FRAMES_LOST, HEADERS_OFF_MS, STALE_FRAMES, USAGE_ZERO
+from s2a_bench.facts import FRAMES_LOST, HEADERS_OFF_MS, PADDED, STALE_FRAMES, USAGE_ZERO
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Machine, examine, warnings_of
 from s2a_bench.machine.doctor.host import RMEM_WANTED
@@ -152,6 +152,11 @@ UNCOUNTED = Doubt(
     "answers came with a usage of zero tokens: it is left out, and the cached share is unknown",
     "a gateway may drop the counts: measure the server behind it",
 )
+ASLEEP = Doubt(
+    "padded-answers",
+    "answers came when the server had slept: 33 ms after the request, however fast its policy is",
+    "start lerobot's server with --inference_latency=0",
+)
 OVERTAKEN = Doubt(
     "lost-frames", "camera frames did not reach the server, or were overtaken there by the next (over the whole run)"
 )
@@ -163,7 +168,7 @@ STALE = Doubt(
 LOST = Doubt("lost-messages", "requests lost messages on the way")
 FAILED = Doubt("failed-samples", "requests failed", "see the column error of samples.csv")
 DOUBTS: Final = (
-    *(REPEATED, CACHED, HITS, RESIDUAL, HEADERS_EARLY, HEADERS_LATE, UNCOUNTED, OVERTAKEN, STALE, LOST, FAILED),
+    *(REPEATED, CACHED, HITS, RESIDUAL, HEADERS_EARLY, HEADERS_LATE, UNCOUNTED, ASLEEP, OVERTAKEN, STALE, LOST, FAILED),
 )
 """In the order of the warnings."""
 
@@ -209,6 +214,7 @@ class SampleGuard:
             return
         self.succeeded[cell] += 1
         self._launches.add(row.launch)
+        counts[ASLEEP][cell] += PADDED in row.facts
         off_ms = row.facts.get(HEADERS_OFF_MS, 0.0)
         if abs(off_ms) > max(SURELY_OFF_MS, SURELY_OFF_SHARE * (row.server_prompt_ms or 0.0)):
             counts[HEADERS_EARLY if off_ms > 0 else HEADERS_LATE][cell] += 1

@@ -300,8 +300,8 @@ class Transport(Generic[O]):
     def client(self, wiring: Wiring[O], alive: Callable[[], bool]) -> Client:
         raise NotImplementedError
 
-    def server(self, wiring: Wiring[O], handler: Handler) -> Server:
-        raise NotImplementedError
+    def server(self, wiring: Wiring[O], handler: Handler) -> Server:  # noqa: ARG002 - for those that have one
+        raise UsageError(f"`transport`: {self.name} is a client alone; name a server that runs already with `url`")
 
     def measured(self, choice: Choice[O]) -> Sequence[str]:  # noqa: ARG002 - for those whose variants depend on it
         return self.variants[:1] or ("",)
@@ -327,6 +327,7 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "shm": "s2a_bench.transport.shm:SHM",
         "websocket": "s2a_bench.transport.websocket:WEBSOCKET",
         "zmq": "s2a_bench.transport.zmq:ZMQ",
+        "grpc": "s2a_bench.transport.grpc:GRPC",
     },
 )
 

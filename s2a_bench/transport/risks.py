@@ -1,7 +1,6 @@
 """`doctor --url`: security risks of an external server, found without a request to its model.
 
-Each transport with URLs has its own examination (`Urls.examine`). This module has the findings that all share, and
-those about gRPC, which lerobot's policy server speaks and no transport does.
+Each transport with URLs has its own examination (`Urls.examine`). This module has the findings that all share.
 """
 
 from __future__ import annotations
@@ -22,12 +21,6 @@ Examine: TypeAlias = Callable[[SplitResult], Iterator[Finding]]
 """Yields findings about the server at a URL with a host; raises OSError or TransportError if none answers."""
 
 PATIENCE_S: Final = 5.0
-GRPC: Final = "grpc"
-GRPC_PORT: Final = 8080
-PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
-"""The connection preface of HTTP/2 and an empty SETTINGS frame (RFC 9113, 3.4 and 6.5)."""
-FRAME_HEADER: Final = 9
-SETTINGS: Final = 4
 ENCRYPTED: Final = frozenset({"https", "wss"})
 
 
@@ -44,13 +37,13 @@ def examine(url: str) -> list[Finding]:
         host, _ = address.hostname, address.port
     except ValueError as error:
         raise UsageError(f"`url`: that is no URL: {error}") from error
-    if not host or address.scheme not in {*known, GRPC}:
-        schemes = ", ".join(f"{scheme}://" for scheme in (*known, GRPC))
+    if not host or address.scheme not in known:
+        schemes = ", ".join(f"{scheme}://" for scheme in known)
         without_key = f"{address.scheme}://{host or ''}" if address.scheme else url.rpartition("@")[2]
         raise UsageError(
             f"`url`: '{without_key}' should look like http://192.168.0.5:8000: one of {schemes}, a host, and its port"
         )
-    examine_it: Examine = grpc if address.scheme == GRPC else resolve_name(known[address.scheme])
+    examine_it: Examine = resolve_name(known[address.scheme])
     findings = [plain_text(address)]
     try:
         findings += examine_it(address)
@@ -92,22 +85,3 @@ def no_key(address: SplitResult, what: str, cure: str) -> Finding:
     """Return the finding that a server asks for no key: a choice on this machine, a risk on any other."""
     local = is_local(address.hostname or "")
     return Finding("no-key", "advice" if local else "warning", f"it wants no key: {what}", cure)
-
-
-def grpc(address: SplitResult) -> Iterator[Finding]:
-    """Find out whether the server speaks HTTP/2, as lerobot's does; no method is called, because `Ready` resets it."""
-    with socket.create_connection((address.hostname or "", address.port or GRPC_PORT), PATIENCE_S) as connection:
-        connection.sendall(PREFACE)
-        head = b""
-        while len(head) < FRAME_HEADER and (received := connection.recv(FRAME_HEADER - len(head))):
-            head += received
-    if len(head) < FRAME_HEADER or head[3] != SETTINGS:
-        yield Finding("server", "error", "the server does not speak gRPC", "name another scheme, or another port")
-        return
-    yield Finding(
-        "pickle",
-        "warning",
-        "it speaks gRPC; if it is lerobot's policy server, it unpickles what any client sends: a client that reaches "
-        "the port can run code there (CVE-2026-25874), and a malicious server can do the same to its clients",
-        "let it listen on 127.0.0.1 alone, and reach it by ssh -L; s2a-bench does not speak to it",
-    )

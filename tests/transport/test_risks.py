@@ -13,7 +13,8 @@ from s2a_bench.errors import UsageError
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.testing.transport import RecordingHandler, served, wiring_of
 from s2a_bench.transport import risks
-from s2a_bench.transport.risks import PREFACE, examine, printable
+from s2a_bench.transport.grpc.risks import PREFACE
+from s2a_bench.transport.risks import examine, printable
 
 SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 

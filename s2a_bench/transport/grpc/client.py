@@ -1,0 +1,217 @@
+"""The client of lerobot's policy server: fill the template, pickle, send, wait for the chunk, and mark each step.
+
+As lerobot's own client it waits in `GetActions` while it sends, because the server sleeps until a thirtieth of a second
+after that call began (`--inference_latency`). Each observation has `must_go`, or the server would drop those like the
+last one. The server holds one policy, which its last client named, and one observation.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+
+from s2a_bench.clock import now_ns
+from s2a_bench.errors import RequestFailed, ServerDied, TransportError, UsageError
+from s2a_bench.facts import PADDED, PAYLOAD_BYTES, RECONNECTS
+from s2a_bench.trace import Trace
+from s2a_bench.transport import Wiring
+from s2a_bench.transport.chunks import actions_of
+from s2a_bench.transport.grpc import PAYLOAD_DOWN_BYTES, GrpcOptions
+from s2a_bench.transport.grpc.pickles import chunk_in, pickled
+from s2a_bench.transport.limits import MIB, Bounds
+from s2a_bench.transport.observation import template_of
+from s2a_bench.transport.observed import COLOURS
+from s2a_bench.transport.pictures import policy_picture
+from s2a_bench.types import Piece, Request
+
+os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # our errors say the same
+import grpc
+
+AXES: Final = ["height", "width", "channels"]
+SERVICE, LOAD = "/transport.AsyncInference/", "SendPolicyInstructions"
+PIECE_BYTES: Final = 2 * MIB
+BEGIN, MIDDLE, END = 1, 2, 3
+"""lerobot's TransferState of a piece of an observation."""
+MORE: Final = 0x80
+"""Set in each byte of protobuf's varint but the last."""
+SLEEP_NS, WINDOW_NS = 10**9 // 30, 2_000_000
+"""How long after `GetActions` the server answers by default; how much later its client sees it."""
+NO_CHUNK: Final = (
+    "answered without a chunk: its policy raised an error, which only its log has, or no observation reached it within "
+    "its --obs_queue_timeout (2 s), as another client took it"
+)
+_LOADED: Final[dict[str, dict[str, Any]]] = {}
+"""URL -> the policy that a client of this process named last; cells of one run may name different ones."""
+
+
+class GrpcClient:
+    """Asks one policy server."""
+
+    def __init__(self, wiring: Wiring[GrpcOptions]) -> None:
+        """Prepare to ask the server at ``wiring.address``; the first request connects and has it load the policy."""
+        self.camera = None
+        self._wiring, self._url = wiring, wiring.address
+        self._template = template_of(wiring.options.template)
+        self._channel: grpc.Channel | None = None
+        self._connected = False
+        self._timestep = 0
+        self._fastest_ns = SLEEP_NS + WINDOW_NS
+
+    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
+        bounds = Bounds(self._url, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
+        pictures = [policy_picture(frame, "raw", trace) for frame in request.images]
+        filled = self._template.fill(pictures, request.state, request.prompt)
+        observation, features = observation_of(filled, self._template.name)
+        try:
+            channel = self._open(features, bounds, trace)
+            stamp, body = self._pack(observation, trace)
+            answer = self._exchanged(channel, body, bounds, trace)
+        except grpc.RpcError as error:
+            raise self._failed(error) from error
+        bounds.count_bytes(len(answer))
+        trace.facts[PAYLOAD_DOWN_BYTES] = len(answer)
+        if not answer:
+            raise RequestFailed(f"{self._url} {NO_CHUNK}")
+        first_stamp, chunk = chunk_in(bytes_in(answer))
+        if first_stamp != stamp:
+            raise RequestFailed(f"{self._url} answered about the observation of another client; stop that client")
+        actions = actions_of(chunk)
+        trace.mark("pickle_parse")
+        for action in actions:
+            bounds.count_piece()
+            yield action
+
+    def _open(self, features: dict[str, Any], bounds: Bounds, trace: Trace) -> grpc.Channel:
+        """Return the channel over which the server holds our policy, marking `connect` if it was not there."""
+        options = self._wiring.options
+        policy = {
+            "policy_type": options.policy_type,
+            "pretrained_name_or_path": options.pretrained,
+            "lerobot_features": features,
+            "actions_per_chunk": options.actions_per_chunk,
+            "device": options.device,
+            "rename_map": {},
+        }
+        if self._channel is None:
+            self._channel = grpc.insecure_channel(self._url.partition("://")[2], [("grpc.enable_http_proxy", 0)])
+            if self._connected:
+                trace.facts[RECONNECTS] = 1.0
+        elif _LOADED.get(self._url) == policy:
+            return self._channel
+        _LOADED.pop(self._url, None)
+        for method, message in (("Ready", b""), (LOAD, message_of(pickled("RemotePolicyConfig", policy)))):
+            self._channel.unary_unary(SERVICE + method)(message, self._patience_s(bounds))
+        _LOADED[self._url] = policy
+        self._connected = True
+        trace.mark("connect")
+        return self._channel
+
+    def _pack(self, observation: dict[str, Any], trace: Trace) -> tuple[float, list[bytes]]:
+        """Return the observation's time stamp, which the chunk repeats, and its messages."""
+        stamp, self._timestep = time.time(), self._timestep + 1
+        fields = {"timestamp": stamp, "timestep": self._timestep, "observation": observation, "must_go": True}
+        body = memoryview(pickled("TimedObservation", fields))
+        starts = range(0, len(body), PIECE_BYTES)
+        states = [BEGIN, *[MIDDLE] * (len(starts) - 2), END][-len(starts) :]
+        pieces = [
+            bytes((8, state)) + message_of(body[start : start + PIECE_BYTES], 2)
+            for state, start in zip(states, starts, strict=True)
+        ]
+        trace.mark("pickle_pack")
+        trace.facts[PAYLOAD_BYTES] = sum(map(len, pieces))
+        return stamp, pieces
+
+    def _exchanged(self, channel: grpc.Channel, pieces: list[bytes], bounds: Bounds, trace: Trace) -> bytes:
+        """Wait for the chunk while the observation is sent, and recognise the server's sleep.
+
+        An answer came at its end if it came so long after the call, and none came earlier.
+        """
+        patience_s, started_ns = self._patience_s(bounds), now_ns()
+        answer = channel.unary_unary(SERVICE + "GetActions").future(b"", patience_s)
+        try:
+            channel.stream_unary(SERVICE + "SendObservations")(iter(pieces), patience_s)
+            trace.mark("send")
+            message: bytes = answer.result()
+            trace.mark("server")
+        finally:
+            answer.cancel()
+        took_ns = trace.marks[-1][1] - started_ns
+        self._fastest_ns = min(self._fastest_ns, took_ns)
+        if self._fastest_ns >= SLEEP_NS and took_ns < SLEEP_NS + WINDOW_NS:
+            trace.facts[PADDED] = 1.0
+        return message
+
+    def _patience_s(self, bounds: Bounds) -> float:
+        return min(self._wiring.timeout_s, bounds.left_s())
+
+    def _failed(self, error: Any) -> TransportError:
+        """Return the error that says what gRPC's status means; a connection that broke is made again."""
+        code, why = error.code(), " ".join(str(error.details()).split())[:500]
+        if code is grpc.StatusCode.UNAVAILABLE:
+            self.close()
+            if not self._connected:
+                return ServerDied(f"no gRPC server answers at {self._url}: {why}")
+            return RequestFailed(f"{self._url} broke the connection: {why}")
+        meaning = {
+            grpc.StatusCode.DEADLINE_EXCEEDED: f"was silent for too long: {self._wiring.timeout_s:g} s",
+            grpc.StatusCode.UNIMPLEMENTED: f"is no policy server of lerobot's: {why}",
+            grpc.StatusCode.RESOURCE_EXHAUSTED: f"answered with more than 4 MiB (see `actions_per_chunk`): {why}",
+        }.get(code, f"refused ({code.name}): {why}")
+        return RequestFailed(f"{self._url} {meaning}")
+
+    def describe(self) -> dict[str, str]:
+        """Return where the server is, and the template, for the manifest."""
+        return {"url": self._url, "template": self._template.name}
+
+    def close(self) -> None:
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = None
+
+
+def observation_of(filled: dict[str, Any], template: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return a template's observation as lerobot has it, flat, and the features that describe it.
+
+    Each number of the state is a motor, with a name of its own. Raises UsageError for a value that it does not carry.
+    """
+    observation: dict[str, Any] = {}
+    features: dict[str, Any] = {}
+    motors: dict[str, float] = {}
+    for key, value in filled.items():
+        array: Any = value if isinstance(value, np.ndarray) else np.empty(())
+        if array.dtype == np.uint8 and array.ndim == len(AXES) and array.shape[-1] == COLOURS:
+            features[f"observation.images.{key}"] = {"dtype": "image", "shape": value.shape, "names": AXES}
+            observation[key] = value
+        elif array.dtype.kind == "f" and array.ndim == 1:
+            motors |= {f"{key}.{index}": number for index, number in enumerate(array.tolist())}
+        elif isinstance(value, str):
+            observation[key] = value
+        else:
+            raise UsageError(
+                f"`template` {template}: {key} is no picture (H, W, 3), no state (D,) and no text, which lerobot takes"
+            )
+    features["observation.state"] = {"dtype": "float32", "shape": (len(motors),), "names": [*motors]}
+    return observation | motors, features
+
+
+def message_of(data: bytes | memoryview, field: int = 1) -> bytes:
+    """Return a protobuf message whose one field is these bytes."""
+    size, length = bytearray(), len(data)
+    while length >= MORE:
+        size.append(length % MORE | MORE)
+        length //= MORE
+    size.append(length)
+    return b"".join((bytes((field << 3 | 2,)), size, data))
+
+
+def bytes_in(message: bytes) -> bytes:
+    """Return the bytes of a message that `message_of` could have written; raises RequestFailed."""
+    start = next((at + 1 for at, byte in enumerate(message[1:7], 1) if byte < MORE), 0)
+    data = message[start:]
+    if message_of(data) != message:
+        raise RequestFailed(f"{len(message)} bytes that are no message of lerobot's")
+    return data
