@@ -47,6 +47,7 @@ def without(modules: set[str], folder: Path, *arguments: str) -> subprocess.Comp
 
 
 BLACK_BOX = ("latency", "--transport", "http", "--url", "http://127.0.0.1:9")
+LEROBOT = ("--transport", "grpc", "--policy-type", "act", "--pretrained", "x")
 
 
 @pytest.mark.parametrize(
@@ -65,6 +66,7 @@ BLACK_BOX = ("latency", "--transport", "http", "--url", "http://127.0.0.1:9")
         ("carla", "carla", ("ccrb", "--simulator", "carla")),
         ("json_numpy", "openvla", (*BLACK_BOX, "--dialect", "openvla", "--payload", "raw")),
         ("ray", "ray", ("sweep", "paper", "--ray", "local")),
+        ("grpc", "lerobot", ("latency", "--url", "grpc://a:1", *LEROBOT)),
     ],
 )
 def test_a_missing_library_is_one_line_with_the_command_and_leaves_nothing(

@@ -51,6 +51,7 @@ def test_good_samples_raise_no_warning(second: SampleRow, fingerprint: int) -> N
         (row("b"), 1, "duplicate-frames"),
         (row("b", cache_n=7), 2, "prompt-cache"),
         (row("b", facts={"usage_zero": 1.0}), 2, "usage-zero"),
+        (row("b", facts={"padded": 1.0}), 2, "padded-answers"),
         (row("b", marks=LOOSE), 2, "residual"),
         (row("b", facts={"frames_lost": 2.0}), 2, "lost-frames"),
         (row("b", facts={"headers_off_ms": -97.0}, server_prompt_ms=97.5), 2, "ingest-unsure"),
