@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-import re
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
-import httpx
 import jsonschema
 import pytest
 
@@ -101,24 +98,6 @@ def test_where_nothing_can_be_written_nothing_is_measured(home: Path) -> None:
     (home / "file").write_text("")
     error = refused("profile", "capture", "here", "--output", "file/profiles", code=1)
     assert error == "error: --output: cannot write file/profiles/here.toml: Not a directory"
-
-
-def test_a_server_that_replays_says_so() -> None:
-    process = subprocess.Popen(
-        [sys.executable, "-m", "s2a_bench", "serve", "http", "--engine", "replay", "--profile", "fast", "--port", "0"],
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert process.stdout is not None
-        line = process.stdout.readline()
-        assert "engine replay of fast (EMULATED); Ctrl-C ends it" in line
-        body = {"messages": [{"role": "user", "content": "plan"}], "max_tokens": 12}
-        answer = httpx.post(line.split()[2].rstrip(";"), json=body).json()
-        assert re.fullmatch(r"1\. \w+\(\w+\)\n2\. \w+\(\w+\)\n?", answer["choices"][0]["message"]["content"])
-    finally:
-        process.terminate()
-        process.communicate(timeout=30)
 
 
 def test_a_replayed_run_is_labelled_emulated_wherever_it_shows(home: Path) -> None:

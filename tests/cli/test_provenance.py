@@ -45,6 +45,7 @@ def measured(output: Path, *arguments: str) -> tuple[StoredRun, str]:
 @pytest.fixture(scope="module")
 def replayed(tmp_path_factory: pytest.TempPathFactory) -> tuple[StoredRun, str]:
     with serving("http", "--engine", "replay", "--profile", "rtx-4080", "--port", "0") as line:
+        assert "engine replay of rtx-4080 (EMULATED); Ctrl-C ends it" in line
         url = line.split()[2].rstrip(";").split("/v1")[0]
         return measured(tmp_path_factory.mktemp("replayed"), "--transport", "http/as-deployed", "--url", url)
 

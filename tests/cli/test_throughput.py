@@ -102,14 +102,6 @@ def test_both_ways_of_flash_attention_are_cells_of_one_run(tmp_path: Path) -> No
     assert "flash_attention" not in manifest["model"]  # it has no one value
 
 
-@pytest.mark.slow
-def test_a_replayed_profile_is_labelled_emulated(tmp_path: Path) -> None:
-    done = run(*SMALL, "--max-tokens", "3", "--engine", "replay", "--profile", "rtx-4080", "--json", output=tmp_path)
-    (cell,) = valid(done.stdout)["cells"]
-    assert cell["emulated"] is True
-    assert cell["profile"] == "rtx-4080"
-
-
 def test_a_reference_that_fails_ends_the_run_with_one_line_and_keeps_the_samples(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 from itertools import islice
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -73,13 +72,6 @@ def test_a_whole_answer_is_there_after_the_latency_of_its_request(written: str, 
     assert [times_ns(engine, clock) for _ in range(20)] == [[each] * 3 for each in known(written, 20)]
 
 
-def test_latencies_of_a_file_are_played_in_its_order_and_start_over(tmp_path: Path) -> None:
-    file = tmp_path / "delays.csv"
-    file.write_text("latency_ms\n3\n1\n2\n")
-    engine, clock = echo(str(file))
-    assert [times_ns(engine, clock)[0] // MS for _ in range(5)] == [3, 1, 2, 3, 1]
-
-
 def test_every_request_that_is_begun_takes_its_latency_also_where_the_rest_is_not_wanted() -> None:
     engine, clock = echo(DRAWN)
     engine.generate(Request("never begun", "go"))
@@ -112,9 +104,6 @@ def test_an_echo_that_answers_at_once_tells_and_emulates_nothing() -> None:
         ({"name": "replay", "latency": "80"}, "`latency` needs `engine` echo"),
         ({"name": "echo", "latency": "80", "pace": 5}, "`pace`: with `latency` the whole answer arrives at once"),
         ({"name": "echo", "latency": "fast"}, "`latency`: 'fast' should be a number of ms, a family, or a .csv file"),
-        ({"name": "echo", "latency": "-1"}, "`latency`: -1 should be between 0"),
-        ({"name": "echo", "latency": "normal:mean_ms=80"}, "`latency`: 'normal' is none of the families"),
-        ({"name": "echo", "latency": "none.csv"}, "`latency`: cannot read none.csv"),
     ],
 )
 def test_a_latency_that_makes_no_sense_is_one_line(options: dict[str, Any], message: str) -> None:

@@ -13,7 +13,7 @@ import pytest
 from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.boards.profile import load_profile, to_toml
 from s2a_bench.clock import VirtualClock
-from s2a_bench.errors import EngineError, UsageError
+from s2a_bench.errors import UsageError
 from s2a_bench.inference import Engine, EngineConfig, check_engine, open_engine
 from s2a_bench.inference.replay import GAPS, ReplayEngine
 from s2a_bench.plan import Parser, SkillParsed, load_skills, paper_format
@@ -218,10 +218,3 @@ def test_facts_tell_prompt_and_decoding_time() -> None:
 def test_settings_that_do_not_go_together_are_refused(config: EngineConfig, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         check_engine(config)
-
-
-def test_a_closed_engine_refuses() -> None:
-    engine, _ = replay("rtx-4080")
-    engine.close()
-    with pytest.raises(EngineError, match="replay: the engine is closed"):
-        ask(engine)
