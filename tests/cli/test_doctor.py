@@ -17,7 +17,7 @@ from s2a_bench.cli.doctor import all_checks
 from s2a_bench.machine.doctor import Finding, Level
 from s2a_bench.machine.resources import RESOURCES
 from s2a_bench.store.run import StoredRun, read_run
-from tests.cli.program import program, refused
+from tests.cli.program import program
 
 ROOT = Path(__file__).parent.parent.parent
 SCHEMA = json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text())
@@ -104,10 +104,6 @@ def test_sampling_can_be_left_out(tmp_path: Path) -> None:
     assert run.manifest["resources"] == {}
     assert not list(run.path.glob("resources*"))
     assert not any("cpu" in facts for facts in run.samples["facts"])
-
-
-def test_a_negative_rate_is_refused() -> None:
-    assert "--sample-resources: -1.0 should be" in refused(*ECHO, "--sample-resources", "-1")
 
 
 def test_without_cyclonedds_one_line_names_rclpy() -> None:

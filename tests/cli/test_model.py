@@ -3,9 +3,7 @@
 import os
 from pathlib import Path
 
-import pytest
-
-from tests.cli.program import program, refused
+from tests.cli.program import program
 
 
 def test_no_network_is_one_line_and_code_one(tmp_path: Path) -> None:
@@ -14,14 +12,3 @@ def test_no_network_is_one_line_and_code_one(tmp_path: Path) -> None:
     assert done.stdout == ""
     assert "cannot be fetched from http://127.0.0.1:1" in done.stderr
     assert "set HF_ENDPOINT" in done.stderr
-
-
-@pytest.mark.parametrize(
-    ("content", "message"), [(b"PK\x03\x04", "not a GGUF file"), (b"GGUF\x03\x00\x00\x00", "damaged or cut short")]
-)
-def test_a_file_that_is_no_model_is_one_line_and_code_one(tmp_path: Path, content: bytes, message: str) -> None:
-    path = tmp_path / "x.gguf"
-    path.write_bytes(content)
-    line = refused("model", "info", path, code=1)
-    assert f"model info {path}: " in line
-    assert message in line

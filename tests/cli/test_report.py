@@ -69,8 +69,3 @@ def test_wrong_use_is_one_line(timeline: Path, tmp_path: Path, arguments: list[s
     filled = [each.format(here=tmp_path, run=timeline) for each in arguments]
     assert message.format(here=tmp_path) in refused("report", *filled, code=code)
     assert (tmp_path / "mine.html").read_text() == "mine"
-
-
-def test_a_damaged_manifest_is_one_line(timeline: Path, tmp_path: Path) -> None:
-    (tmp_path / "manifest.json").write_text((timeline / "manifest.json").read_text()[:100])
-    assert "manifest.json is damaged" in refused("report", tmp_path, code=1)

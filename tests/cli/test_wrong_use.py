@@ -51,6 +51,7 @@ WRONG = {
     ],
     "latency": [
         ("--requests many", "'--requests'"),
+        ("--sample-resources -1", "--sample-resources: -1.0 should be"),
         ("--trnsport ros", "No such option: --trnsport; did you mean --transport?"),
         ("--requessts 9", "did you mean --requests?"),
         ("--runss 9", "No such option: --runss; did you mean --requests?"),
@@ -81,19 +82,9 @@ WRONG = {
         ("--url foo", "--url: 'foo' should look like http://192.168.0.5:8000: one of http://"),
         ("--url me:key@host", "--url: 'me://' should look like http"),
     ],
-    "compare": [
-        ("/no/such", "Missing argument 'B'"),
-        ("/no/such /no/such", "/no/such is no run folder", 1),
-        ("/no/such,/no/such B", "A: a folder is named twice; every launch counts once"),
-        ("A B --strict", "--strict: there is no gate; add --fail-if"),
-        ("A B --fail-if e2e", "--fail-if: 'e2e' should look like e2e.median>5%"),
-    ],
-    "report": [
-        ("", "Missing argument 'RUNS...'"),
-        ("/no/such", "/no/such is no run folder", 1),
-        ("/no/such --against us", "--against: 'us' should be paper"),
-    ],
     "model": [
+        ("dummy --size huge", "--size: 'huge' should be 'tiny' or 'full'"),
+        ("dummy --output /dev/null/x", "--output /dev/null/x: cannot write the dummy model", 1),
         ("info /no/such", "model info /no/such: no such file; check the path", 1),
         ("fetch gpt", "model fetch: 'gpt' is neither minicpm-v-2.6 nor ORG/REPO:FILE"),
         ("fetch a/b:c.gguf --quant Q8_0", "--quant Q8_0: goes with minicpm-v-2.6"),

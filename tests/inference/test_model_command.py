@@ -4,7 +4,6 @@ import pytest
 from typer.testing import CliRunner
 
 from s2a_bench.cli.model import app
-from s2a_bench.errors import ModelError, UsageError
 
 
 def test_it_prints_the_two_paths_and_writes_once_unless_forced(tmp_path: Path) -> None:
@@ -26,14 +25,3 @@ def test_the_default_folder_is_the_cache(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path))
     out = CliRunner().invoke(app, ["dummy", "--quant", "q4_0"]).stdout
     assert Path(out.splitlines()[0]).parent == tmp_path / "models" / "dummy-tiny"
-
-
-def test_an_unknown_size_is_wrong_usage() -> None:
-    result = CliRunner().invoke(app, ["dummy", "--size", "huge"])
-    assert isinstance(result.exception, UsageError)
-
-
-def test_a_folder_that_cannot_be_written_is_raised_as_a_typed_error(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    result = CliRunner().invoke(app, ["dummy", "--output", str(tmp_path / "file" / "x")])
-    assert isinstance(result.exception, ModelError)

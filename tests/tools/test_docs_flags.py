@@ -30,25 +30,6 @@ def test_a_page_of_flags_and_the_page_of_its_command_link_to_each_other(name: st
     assert f"](../{about.name})" in PAGES[DOCS / "flags" / f"{name}.md"]
 
 
-def test_flags_have_the_headings_of_the_help_and_arguments_are_first() -> None:
-    assert re.findall("^## (.*)$", PAGES[DOCS / "flags" / "compare.md"], re.MULTILINE) == ["Arguments", "Options"]
-    assert re.findall("^## (.*)$", PAGES[DOCS / "flags" / "boundary.md"], re.MULTILINE)[-1] == "Options"
-    plans, live = (
-        PAGES[DOCS / "flags" / "timeline.md"].split(f"\n## {name}\n")[1].split("\n## ")[0].splitlines()
-        for name in ("Plans", "A model that answers")
-    )
-    assert "| `--n-skills` | 8 | N, skills a plan; several with commas |" in plans
-    assert "| `--warmup` | 1 | --live: first answers, from which policies learn the rate |" in live
-
-
-def test_the_commands_of_a_group_share_a_page() -> None:
-    page = PAGES[DOCS / "flags" / "profile.md"]
-    assert re.findall("^## (.*)$", page, re.MULTILINE) == [
-        f"profile {name}" for name in ("capture", "list", "match", "show")
-    ]
-    assert "| `NAME` |  | name of the profile; its file is NAME.toml |" in page
-
-
 def test_no_table_of_flags_is_by_hand() -> None:
     for page in sorted(DOCS.glob("*.md")):
         assert not re.search(r"^\| (flag|option) +\|", page.read_text(encoding="utf-8"), re.MULTILINE), page.name
