@@ -191,4 +191,5 @@ class CycloneMiddleware(ActionNode[Caller, DdsWaiter]):
 
     def leave(self) -> None:
         participant = self._participant
+        del self._participant  # with it goes what nothing else refers to
         participant._delete(participant._ref)  # noqa: SLF001 - __del__ may come seconds later
