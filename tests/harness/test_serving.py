@@ -102,7 +102,10 @@ def test_a_failure_frees_the_engine() -> None:
 
 @pytest.mark.parametrize(
     "engine",
-    [EngineConfig(name="echo"), EngineConfig(name="llama", model=Path("/m.gguf"), mmproj=Path("/p.gguf"), threads=2)],
+    [
+        EngineConfig(name="echo", pace=4.8),
+        EngineConfig(name="llama", model=Path("/m.gguf"), mmproj=Path("/p.gguf"), threads=2),
+    ],
 )
 def test_a_job_survives_its_line(engine: EngineConfig) -> None:
     job = ServerJob(wiring_of("http/binary", "127.0.0.1:0", payload="raw"), engine, tuned=False)

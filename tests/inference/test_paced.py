@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -11,7 +10,6 @@ from s2a_bench.clock import VirtualClock
 from s2a_bench.inference import Engine, EngineConfig, PacedEngine, open_engine
 from s2a_bench.inference.echo import EchoEngine
 from s2a_bench.testing.engine import EngineSuite
-from s2a_bench.testing.transport import wiring_of
 from s2a_bench.types import Request, Token
 
 SECOND = 10**9
@@ -82,10 +80,3 @@ def test_it_says_what_the_rate_is_and_else_what_the_engine_says() -> None:
     plain = open_engine(EngineConfig(name="echo"))
     assert engine.describe() == {**plain.describe(), "paced_tokens_per_s": 4.8}
     assert PacedEngine(Slow(VirtualClock(), []), 1.0).facts == {"predicted_n": 3.0}
-
-
-def test_a_server_process_is_told_the_pace() -> None:
-    from s2a_bench.harness.serving import ServerJob
-
-    job = ServerJob(wiring_of("http"), EngineConfig(model=Path("m.gguf"), pace=4.8))
-    assert ServerJob.from_json(job.to_json()) == job

@@ -48,25 +48,21 @@ def test_the_world_runs_in_step_and_gets_its_settings_back(monkeypatch: pytest.M
     assert (world.settings.synchronous_mode, world.actors) == (False, [])
 
 
-def test_a_map_without_a_straight_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World()
-    world.straight_m = 200.0
-    with pytest.raises(SimulatorError, match="no straight lane of 250 m"):
-        connect(monkeypatch, world).place(START, np.zeros((3, 1)))
-
-
-def test_no_room_to_spawn_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World()
-    world.full = True
-    with pytest.raises(SimulatorError, match="no space to spawn the ego car"):
-        connect(monkeypatch, world).place(START, np.zeros((3, 1)))
-
-
-def test_a_server_that_goes_away_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("fault", "told"),
+    [
+        ({"straight_m": 200.0}, "no straight lane of 250 m"),
+        ({"full": True}, "no space to spawn the ego car"),
+        ({"gone": True}, "the server has disconnected"),
+    ],
+)
+def test_a_world_that_cannot_be_driven_in_is_told(
+    fault: dict[str, float], told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     world = World()
     adapter = connect(monkeypatch, world)
-    world.gone = True
-    with pytest.raises(SimulatorError, match="the server has disconnected"):
+    vars(world).update(fault)
+    with pytest.raises(SimulatorError, match=told):
         adapter.place(START, np.zeros((3, 1)))
 
 
