@@ -13,6 +13,7 @@ from s2a_bench.options import Options, extra_of, group_of, placed
 from s2a_bench.store.run import read_run
 from s2a_bench.writers.style import paper_column
 from studies.config import StudyConfig
+from studies.delays import DelaysConfig, run_delays, show_delays
 from studies.output import Lines
 from studies.run import STUDIES, run_study, show_study
 from studies.validity import ValidityConfig, run_validity, show_validity
@@ -46,6 +47,7 @@ def parser() -> argparse.ArgumentParser:
     commands = whole.add_subparsers(dest="name", required=True, metavar="NAME")
     for name, study in STUDIES.items():
         _command(commands, name, study.about, StudyConfig)
+    _command(commands, "delays", "triggers where delays are not exchangeable", DelaysConfig)
     _command(commands, "validity", "valid skills in a model's plans, with a grammar and without", ValidityConfig)
     drawn = commands.add_parser("figures", help="draw the figures of README.md and docs/shift.md anew; minutes")
     drawn.add_argument("figures", nargs="*", metavar="FIGURE", help=f"[default: {' '.join(FIGURES)}]")
@@ -77,6 +79,9 @@ def main(arguments: list[str]) -> int:
     try:
         if name == "figures":
             draw(given["figures"], output)
+        elif name == "delays":
+            delays = DelaysConfig(**placed(DelaysConfig, given))
+            show_delays(read_run(run_delays(delays, output, Lines())))
         elif name == "validity":
             validity = ValidityConfig(**placed(ValidityConfig, given))
             show_validity(read_run(run_validity(validity, output, Lines())))
