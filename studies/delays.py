@@ -54,7 +54,8 @@ def _autoregressive(rng: np.random.Generator, count: int, *, phi: float) -> Floa
         level = phi * level + each
         found[place] = level
     variance = np.log1p(CV**2)
-    return MEAN_S * np.exp(variance**0.5 * found - variance / 2)
+    latency_s: Floats = MEAN_S * np.exp(variance**0.5 * found - variance / 2)
+    return latency_s
 
 
 def _two_states(rng: np.random.Generator, count: int) -> Floats:

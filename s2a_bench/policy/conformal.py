@@ -10,7 +10,7 @@ control requires. With n exchangeable plans, choosing the least lambda at which 
   1 - P(Bin(n, x) <= r): a risk-controlling prediction set (Bates et al., J. ACM 2021, arXiv 2101.02703).
 
 Exchangeable: every order of the scores is equally likely, as of independent ones. Scores that follow one another's
-level are not, nor are those of a machine that has changed: the lag-1 correlation r1 of the calibration's scores, in the
+level are not, nor are those of a machine that has changed: the lag-1 correlation r1 of the calibration's delays, in the
 order of measurement, shows the first (`Calibration.exchangeable`), a comparison with later ones the second.
 
 `calibrate` takes the greatest r that keeps the `Guarantee`. *expected* keeps the first at epsilon or less, on average
@@ -58,7 +58,7 @@ GUARANTEE: Final[Any] = option(
 )
 """The option of whatever calibrates."""
 CHANCE: Final = 2.58
-"""Greatest |r1| by chance, over 1 / sqrt(n): 1 % of independent scores correlate more."""
+"""Greatest |r1| by chance, over 1 / sqrt(n): 1 % of independent delays correlate more."""
 ROUNDING: Final = 1e-9
 """A product this close below a whole number counts as whole."""
 
@@ -80,7 +80,7 @@ class Calibration:
     confidence: float
     guarantee: Guarantee = "high-confidence"
     correlation: float | None = None
-    """r1, the lag-1 correlation of the scores in their order; None in a record that lacks it."""
+    """r1, the lag-1 correlation of the delays in the order of measurement; None if unknown."""
     changed: bool = False
     """Whether later delays differed from those of the calibration."""
 
@@ -90,7 +90,7 @@ class Calibration:
 
     @property
     def exchangeable(self) -> bool:
-        """Return False if the bounds do not hold: neighbouring scores correlate beyond chance, or delays changed."""
+        """Return False if the bounds do not hold: neighbouring delays correlate beyond chance, or delays changed."""
         return not self.changed and abs(self.correlation or 0.0) <= self.chance
 
     @property
@@ -169,7 +169,7 @@ def calibrate(
     policy: Policy, plans: Plans, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence"
 ) -> Calibration:
     """Find lambda for P(any stall) <= ``epsilon`` from recorded plans; raises UsageError for too few plans."""
-    return choose(scores(policy, plans), epsilon, guarantee)
+    return choose(scores(policy, plans), epsilon, guarantee, plans.arrival_s[-1])
 
 
 def may_stall(plans: int, epsilon: float, guarantee: Guarantee) -> int:
@@ -183,8 +183,13 @@ def may_stall(plans: int, epsilon: float, guarantee: Guarantee) -> int:
     return most
 
 
-def choose(score: Floats, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence") -> Calibration:
-    """Find lambda from scores, shape (plans,), in order of measurement; raises UsageError for too few scores."""
+def choose(
+    score: Floats, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence", delay: Floats | None = None
+) -> Calibration:
+    """Find lambda from scores, shape (plans,); raises UsageError for too few scores.
+
+    ``delay`` has the delay behind each score, such as a plan's last arrival, in order of measurement.
+    """
     import numpy as np
 
     from s2a_bench.stats.batches import lag_one
@@ -202,7 +207,7 @@ def choose(score: Floats, epsilon: float = EPSILON, guarantee: Guarantee = "high
         risk=upper_bound(above, count, CONFIDENCE),
         confidence=CONFIDENCE,
         guarantee=guarantee,
-        correlation=lag_one(np.where(np.isinf(score), 2 * GRID[-1], score)),
+        correlation=None if delay is None else lag_one(delay),
     )
 
 

@@ -199,8 +199,11 @@ def test_a_configuration_that_makes_no_sense_is_refused(fields: dict[str, Any], 
         TimelineConfig(**fields)
 
 
-def recorded_run(output: Path, answers: int, tokens: int) -> Path:
-    """Make a run folder of answers at 5 tokens/s, the first token 1 s after the request, and one warm-up."""
+def recorded_run(output: Path, answers: int, tokens: int, slower: int = 0) -> Path:
+    """Make a run folder of answers at 5 tokens/s, the first token 1 s after the request, and one warm-up.
+
+    Each answer's gaps are ``slower`` ns longer than those of the one before.
+    """
     with RunWriter.create(output, "throughput", {}) as writer:
         for place in range(answers + 1):
             at = place * 10**12
@@ -210,7 +213,8 @@ def recorded_run(output: Path, answers: int, tokens: int) -> Path:
                 row_of("loopback", times, place, request_id=name, marks=marks_of(times, at), warmup=not place)
             )
             writer.tokens(
-                TokenRow(name, "loopback", i, 0, "x", None, at + 10**6 + 10**9 + i * 200_000_000) for i in range(tokens)
+                TokenRow(name, "loopback", i, 0, "x", None, at + 10**6 + 10**9 + i * (200_000_000 + place * slower))
+                for i in range(tokens)
             )
         return writer.path
 
@@ -222,13 +226,18 @@ def test_answers_of_a_run_are_read_from_the_request(tmp_path: Path) -> None:
         assert token_s == pytest.approx([1.0, 1.2, 1.4, 1.6])
 
 
-def test_recorded_answers_calibrate(tmp_path: Path) -> None:
-    folder = recorded_run(tmp_path / "recorded", 120, 12)
+@pytest.mark.parametrize("slower", [0, 100_000])
+def test_recorded_answers_calibrate(tmp_path: Path, slower: int) -> None:
+    folder = recorded_run(tmp_path / "recorded", 120, 12, slower)
     config = TimelineConfig(profiles=(), rates=(5.0,), tokens_per_skill=(3,), n_skills=(4,), calibrate=folder)
     run = ran(config, tmp_path / "run")
     (found,) = run.manifest["calibrations"].values()
     assert found["plans"] == 120
     assert run.manifest["configuration"]["calibrate"] == str(folder)
+    codes = [each["code"] for each in run.manifest["warnings"]]
+    notes = " ".join(timeline_tables(run)["timelines"].notes)
+    assert ("not-exchangeable" in codes) == ("No promise about stalls" in notes) == bool(slower)
+    assert ("of the plans stall on average" in notes) == (not slower)
 
 
 def test_too_few_or_too_short_answers_are_refused_before_there_is_a_folder(tmp_path: Path) -> None:

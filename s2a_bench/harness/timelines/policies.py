@@ -52,7 +52,8 @@ class Knowledge:
             return CAUTION
         if policy not in self.calibrations:
             self.scores[policy] = scores(policy.informed(self.prior), self.plans)
-            self.calibrations[policy] = choose(self.scores[policy], self.epsilon, self.guarantee)
+            last_s = self.plans.arrival_s[-1]
+            self.calibrations[policy] = choose(self.scores[policy], self.epsilon, self.guarantee, last_s)
         return self.calibrations[policy].caution
 
     def facts(self, setting: PlanSetting) -> dict[str, Any]:

@@ -57,7 +57,7 @@ def trigger(latency_ns: float, setting: ControlSetting, most: int) -> Trigger:
 
 def calibrate(latency_ns: Ints, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence") -> Calibration:
     """Find the latency limit, ``caution`` in ns, from latencies of shape (n,); raises UsageError for too few."""
-    return choose(latency_ns.astype(float), epsilon, guarantee)
+    return choose(latency_ns.astype(float), epsilon, guarantee, latency_ns.astype(float))
 
 
 @dataclass(slots=True)
