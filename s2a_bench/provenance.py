@@ -21,6 +21,7 @@ LABELS: Final = {
     ("tokens", "emulated"): "emulated",
     ("tokens", "paced"): "paced",
     ("link", "emulated"): "emulated link",
+    ("link", UNKNOWN): "link unknown",
     ("engine", UNKNOWN): "engine unknown",
 }
 """Field and value -> the label that marks a run wherever runs are listed."""
@@ -32,8 +33,8 @@ class Provenance:
 
     ``weights`` are real, dummy, or none without a model; emulated tokens have none, or the dummy ones of their profile.
     ``tokens`` are measured, emulated (their times come from a profile, a rate or a distribution) or paced (held back);
-    ``link`` real, emulated, or none; ``clock`` monotonic or virtual. ``profile`` names the emulated profile or
-    latencies. A field that nothing reported is "unknown".
+    ``link`` real (within this machine), emulated, or none; ``clock`` monotonic or virtual. ``profile`` names the
+    emulated profile or latencies. A field that nothing reported is "unknown", as the link to another machine is.
     """
 
     engine: str = UNKNOWN
@@ -43,7 +44,7 @@ class Provenance:
     weights: str = UNKNOWN
     tokens: str = UNKNOWN
     profile: str = ""
-    link: str = "real"
+    link: str = UNKNOWN
     clock: str = "monotonic"
 
     def __post_init__(self) -> None:
@@ -51,7 +52,7 @@ class Provenance:
             object.__setattr__(self, "weights", NONE)
 
     @classmethod
-    def of_engine(cls, facts: Mapping[str, Any], *, link: str = "real") -> Provenance:
+    def of_engine(cls, facts: Mapping[str, Any], *, link: str = UNKNOWN) -> Provenance:
         """Read an engine's description (`Engine.describe`); an absent fact is unknown."""
         weights = {True: "dummy", False: "real"}.get(facts.get("dummy", ""), UNKNOWN)
         if not facts.get("engine"):
@@ -99,21 +100,21 @@ class Provenance:
 
     @property
     def code(self) -> str:
-        """Return the text of a column: engine/weights/tokens, with an emulated link and a virtual clock."""
+        """Return the text of a column: engine/weights/tokens, with an emulated or unknown link and a virtual clock."""
         more = [f"{name}-{value}" for name, value in (("link", self.link), ("clock", self.clock)) if value in _UNPLAIN]
         return "/".join((self.engine, self.weights, self.tokens, *more))
 
     @property
     def line(self) -> str:
         """Return a sentence: "llama (tiny-f16.gguf, DUMMY WEIGHTS), tokens measured"."""
+        link = [f"link {self.link.upper()}"] if self.link in _UNPLAIN else []
         if not self.known:
-            return "engine UNKNOWN (the server does not report it)"
+            return ", ".join(("engine UNKNOWN (the server does not report it)", *link))
         model = ", ".join(filter(None, (self.model, self.quantisation, _WEIGHTS.get(self.weights, ""))))
         engine = "no engine" if self.engine == NONE else self.engine + (f" ({model})" if model else "")
         tokens = f"tokens {self.tokens.upper() if self.tokens in _LOUD else self.tokens}"
         tokens += f" after {self.profile}" if self.profile else ""
         tokens += " with DUMMY WEIGHTS" if self.engine == NONE and self.weights == "dummy" else ""
-        link = ["link EMULATED"] if self.link == "emulated" else []
         clock = ["virtual time"] if self.clock == "virtual" else []
         return ", ".join((engine, tokens, *link, *clock))
 
@@ -121,7 +122,7 @@ class Provenance:
 _FIELDS: Final = tuple(item.name for item in fields(Provenance))
 _WEIGHTS: Final = {"dummy": "DUMMY WEIGHTS", NONE: "no model", UNKNOWN: "weights unknown"}
 _LOUD: Final = {"emulated", "paced", UNKNOWN}
-_UNPLAIN: Final = {"emulated", "virtual"}
+_UNPLAIN: Final = {"emulated", "virtual", UNKNOWN}
 _LONGEST: Final = 200
 """Limit on a peer's text."""
 

@@ -47,7 +47,7 @@ STAGES = {
 
 def known(manifest: Mapping[str, Any]) -> dict[str, Any]:
     """Return a manifest with the stages and the provenance that a run writes, where it has none."""
-    origins = Origins(Provenance.of_engine(manifest.get("model") or {}))
+    origins = Origins(Provenance.of_engine(manifest.get("model") or {}, link="real"))
     return {"stages": STAGES, "provenance": origins.to_manifest(), **manifest}
 
 

@@ -50,7 +50,7 @@ LLAMA = {"engine": "llama", "model": "/m/tiny.gguf", "name": "tiny", "dummy": Tr
 def test_what_an_engine_tells_is_said_in_words_and_in_one(
     facts: dict[str, Any], line: str, code: str, labels: tuple[str, ...]
 ) -> None:
-    found = Provenance.of_engine(facts)
+    found = Provenance.of_engine(facts, link="real")
     assert (found.line, found.code, found.labels) == (line, code, labels)
     assert Provenance.from_dict(found.to_dict()) == found
 
@@ -62,10 +62,10 @@ def test_what_a_peer_tells_is_bounded_and_has_the_right_types() -> None:
 
 
 def test_a_replay_and_an_echo_say_what_they_are() -> None:
-    replay = Provenance.of_engine(open_engine(EngineConfig(name="replay", profile="rtx-4080")).describe())
+    replay = Provenance.of_engine(open_engine(EngineConfig(name="replay", profile="rtx-4080")).describe(), link="real")
     assert (replay.emulated, replay.profile, replay.labels) == (True, "rtx-4080", ("emulated", "replay engine"))
     assert replay.line == "replay (no model), tokens EMULATED after rtx-4080"
-    echo = Provenance.of_engine(open_engine(EngineConfig(name="echo")).describe())
+    echo = Provenance.of_engine(open_engine(EngineConfig(name="echo")).describe(), link="real")
     recorded_with_a_dummy = Provenance.of_engine({**LLAMA, "engine": "replay", "emulated": True})
     assert (replay.weights, recorded_with_a_dummy.weights) == ("none", "dummy")
     assert (echo.weights, echo.tokens, echo.labels) == ("none", "measured", ("echo engine",))
@@ -76,7 +76,7 @@ def test_a_replay_and_an_echo_say_what_they_are() -> None:
     [("80", "latencies 80 ms"), ("lognormal:mean_ms=80,cv=5", "latencies lognormal:mean_ms=80,cv=5")],
 )
 def test_an_echo_whose_latencies_are_given_is_emulated(written: str, profile: str) -> None:
-    echo = Provenance.of_engine(open_engine(EngineConfig(name="echo", latency=written)).describe())
+    echo = Provenance.of_engine(open_engine(EngineConfig(name="echo", latency=written)).describe(), link="real")
     assert (echo.emulated, echo.profile, echo.labels) == (True, profile, ("emulated", "echo engine"))
     assert echo.line == f"echo (no model), tokens EMULATED after {profile}"
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from threading import Thread
 from typing import Any
+from urllib.parse import urlsplit
 
 from s2a_bench.errors import ServerDied
 from s2a_bench.harness.plan import RunPlan
@@ -19,10 +20,11 @@ from s2a_bench.harness.session import Measured
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.models import resolve
 from s2a_bench.progress import Progress
-from s2a_bench.provenance import NONE, Provenance
+from s2a_bench.provenance import NONE, UNKNOWN, Provenance
 from s2a_bench.transport import Client, Wiring, open_client, open_server
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import Pipeline
+from s2a_bench.transport.risks import is_local
 
 LAST_MOMENT_S = 0.5
 """A killed process breaks its connections before the kernel reports its end: on a busy machine, long before."""
@@ -136,10 +138,12 @@ class ServerSet:
 
     def origin(self, pipeline: Pipeline) -> Provenance:
         """Return the provenance of a cell's answers, as its engine reports it; unknown for an external server."""
-        process = self._servers[pipeline.server].process
+        server = self._servers[pipeline.server]
         if pipeline.transport.in_process:
             return Provenance.of_engine(self._local_facts, link=NONE)
-        return Provenance.of_engine(process.facts.get("engine", {}) if process else {})
+        if server.process:
+            return Provenance.of_engine(server.process.facts.get("engine", {}), link="real")
+        return Provenance(link="real" if is_local(urlsplit(server.address).hostname or "") else UNKNOWN)
 
     def client(self, pipeline: Pipeline) -> Client:
         server = self._servers[pipeline.server]

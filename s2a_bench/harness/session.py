@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 
 from s2a_bench.act.events import PlanFeed
-from s2a_bench.clock import now_ns
+from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import EngineError, RequestFailed, S2AError, ServerDied, SourceError, UsageError
 from s2a_bench.facts import (
     CACHE_N,
@@ -25,7 +25,7 @@ from s2a_bench.harness.plan import RequestPlan
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.inference import swing
 from s2a_bench.machine.resources.sampler import ResourceSampler
-from s2a_bench.provenance import Provenance
+from s2a_bench.provenance import UNKNOWN, Provenance
 from s2a_bench.secrets import struck_pieces
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import STAGES, Mark, Trace
@@ -190,6 +190,8 @@ class Session:
     ) -> Measured:
         facts = trace.facts
         origin = Provenance.from_dict(trace.provenance or (trace.remote.provenance if trace.remote else {}))
+        if trace.remote and self.origin.link in {"real", UNKNOWN}:  # behind a tunnel, loopback is another machine
+            self.origin = replace(self.origin, link="real" if trace.remote.clock == clock_id() else UNKNOWN)
         if origin.known:
             self.origin = replace(origin, link=self.origin.link)
         streamed = self._streamed(trace, request_id)

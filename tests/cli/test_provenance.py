@@ -89,7 +89,7 @@ def test_a_replay_behind_an_action_is_emulated_too(tmp_path: Path) -> None:
             "--data-only",
         )
         run, output = measured(tmp_path, *action)
-    assert run.origins.of("ros/action").code == "replay/none/emulated"
+    assert run.origins.of("ros/action").code == "replay/none/emulated/link-unknown"
     assert set(run.samples["engine"]) == {"replay"}
     assert "EMULATED" in output
 
@@ -100,5 +100,5 @@ def test_a_server_that_does_not_tell_is_unknown_never_the_default(tmp_path: Path
             tmp_path, "--transport", "http/as-deployed", "--url", url, "--dialect", "openai", "--data-only"
         )
     assert set(run.samples["engine"]) == {"unknown"}
-    assert not any(origin.known for origin in run.origins.cells.values())
+    assert [(origin.known, origin.link) for origin in run.origins.cells.values()] == [(False, "real")]
     assert "engine UNKNOWN" in output

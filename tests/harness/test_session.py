@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
 import pytest
 
-from s2a_bench.clock import VirtualClock
+from s2a_bench.clock import VirtualClock, clock_id
 from s2a_bench.frames import open_source
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import back_off
+from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Place, Session, inference_start_ns
-from s2a_bench.trace import Trace
+from s2a_bench.provenance import Provenance
+from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import open_client
 from s2a_bench.transport.pipeline import one_pipeline
+from s2a_bench.types import Request, Token
 from tests.servers.sockets import head, serving
 from tests.servers.speakers import Cloud
 
@@ -54,3 +61,51 @@ def test_inference_starts_where_the_engine_gets_the_request(inside: list[str]) -
     trace = Trace()
     trace.marks = [(stage, 10 * place) for place, stage in enumerate(["", "capture", "queue", *inside, "return"])]
     assert inference_start_ns(trace) == 20
+
+
+@pytest.mark.parametrize(
+    ("transport", "address", "link"),
+    [
+        ("http/as-deployed", {"url": "http://127.0.0.1:1"}, "real"),
+        ("websocket", {"url": "ws://localhost:1"}, "real"),
+        ("http/as-deployed", {"url": "http://192.0.2.1:1"}, "unknown"),
+        ("zmq", {"url": "tcp://192.0.2.1:1"}, "unknown"),
+        ("ros/action", {"action": "/robot/answer"}, "unknown"),
+    ],
+)
+def test_the_link_to_a_server_of_another_machine_is_unknown(
+    transport: str, address: dict[str, str], link: str, tmp_path: Path
+) -> None:
+    cell = one_pipeline(transport, **address)
+    with ExitStack() as stack:
+        servers = ServerSet([cell], resolve(RequestsConfig()).servers, stack, tmp_path)
+        servers.start()
+        assert servers.origin(cell).link == link
+
+
+HERE, ELSEWHERE = clock_id(), "another machine"
+
+
+@pytest.mark.parametrize(
+    ("before", "clock", "after"),
+    [
+        ("unknown", HERE, "real"),
+        ("unknown", ELSEWHERE, "unknown"),
+        ("real", HERE, "real"),
+        ("real", ELSEWHERE, "unknown"),  # the end of a tunnel
+        ("none", ELSEWHERE, "none"),
+        ("emulated", HERE, "emulated"),
+    ],
+)
+def test_the_clock_of_an_answer_tells_whether_the_link_leaves_this_machine(before: str, clock: str, after: str) -> None:
+    class Answering:
+        def request(self, _: Request, trace: Trace) -> Iterator[Token]:
+            yield Token(0, "x")
+            trace.receive(Remote(clock, provenance=Provenance("echo", link="real").to_dict()))
+
+    source = open_source("synthetic", 64, 48, fps=30.0, seed=0)
+    feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request
+    session = Session(one_pipeline("loopback"), Answering(), feed, plan, origin=Provenance(link=before))
+    session.measure(Place(0, 0, warmup=False))
+    source.close()
+    assert (session.origin.engine, session.origin.link) == ("echo", after)

@@ -14,7 +14,7 @@ from s2a_bench.store.run import StoredRun
 from tests.made_runs import spoken_run
 
 MakeRun = Callable[..., StoredRun]
-REAL = Provenance("llama", "MiniCPM-V 2.6", "ab", "Q4_K_M", "real", "measured")
+REAL = Provenance("llama", "MiniCPM-V 2.6", "ab", "Q4_K_M", "real", "measured", link="real")
 
 
 @pytest.fixture

@@ -82,7 +82,7 @@ def test_a_request_is_of_the_first_launch_and_has_no_token_unless_it_says_so() -
 
 
 def test_a_row_says_itself_where_it_comes_from_else_its_cell_or_the_run(tmp_path: Path) -> None:
-    values = Origins(Provenance(), {name: Provenance(name) for name in ("echo", "llama")}).to_manifest()
+    values = Origins(Provenance(), {name: Provenance(name, link="real") for name in ("echo", "llama")}).to_manifest()
     cells = Table("cells", CellRow)
     with RunWriter.create(tmp_path, "latency", {"provenance": values}) as run:
         run.append(cells, [CellRow("echo"), CellRow("llama"), CellRow("echo", "its own")])

@@ -36,8 +36,8 @@ def computed(name: str, config: Any, root: Path, _: Any) -> StoredRun:
 
 def measured(name: str, _: Path, make_run: Any) -> StoredRun:
     llama = {"engine": "llama", "model": "tiny.gguf", "dummy": True}
-    paced = Provenance.of_engine({**llama, "paced_tokens_per_s": 4.8})
-    origins = Origins(Provenance.of_engine(llama), {"loopback": paced})
+    paced = Provenance.of_engine({**llama, "paced_tokens_per_s": 4.8}, link="real")
+    origins = Origins(Provenance.of_engine(llama, link="real"), {"loopback": paced})
     cells = {"loopback": {"capture": 0.2, "inference": 100, "return": 0.2}}
     run: StoredRun = make_run(cells, n=3, engine="llama", manifest={"provenance": origins.to_manifest()})
     return StoredRun(run.path, {**run.manifest, "command": name}, run.tables)
@@ -86,4 +86,4 @@ def test_the_line_stays_one_line_and_fits_whatever_answered(make_run: Any) -> No
 
 
 def test_what_a_manifest_does_not_say_is_left_out() -> None:
-    assert source_line([StoredRun(Path(), {})]) == "engine UNKNOWN (the server does not report it)"
+    assert source_line([StoredRun(Path(), {})]) == "engine UNKNOWN (the server does not report it), link UNKNOWN"
