@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from s2a_bench.clock import realtime_offset_ns
-from s2a_bench.facts import FRAMES_LOST, HEADERS_OFF_MS, PADDED, STALE_FRAMES, USAGE_ZERO
+from s2a_bench.facts import FRAMES_LOST, HEADERS_OFF_MS, PADDED, RECONNECTS, STALE_FRAMES, USAGE_ZERO
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Machine, examine, warnings_of
 from s2a_bench.machine.doctor.host import RMEM_WANTED
@@ -111,6 +111,8 @@ class Doubt(NamedTuple):
     what: str
     advice: str = ""
     """Empty: the transports of the cells advise."""
+    share: float = 0.0
+    """Share of the samples of a cell that count, from which on it is raised."""
 
 
 REPEATED = Doubt(
@@ -157,6 +159,12 @@ ASLEEP = Doubt(
     "answers came when the server had slept: 33 ms after the request, however fast its policy is",
     "start lerobot's server with --inference_latency=0",
 )
+RECONNECTED = Doubt(
+    "reconnects",
+    "requests found the kept connection closed by the server: connecting again is in their times",
+    "let the server, or a proxy before it, keep connections; over HTTP --connection per-request makes it a stage",
+    share=0.5,
+)
 OVERTAKEN = Doubt(
     "lost-frames", "camera frames did not reach the server, or were overtaken there by the next (over the whole run)"
 )
@@ -168,7 +176,21 @@ STALE = Doubt(
 LOST = Doubt("lost-messages", "requests lost messages on the way")
 FAILED = Doubt("failed-samples", "requests failed", "see the column error of samples.csv")
 DOUBTS: Final = (
-    *(REPEATED, CACHED, HITS, RESIDUAL, HEADERS_EARLY, HEADERS_LATE, UNCOUNTED, ASLEEP, OVERTAKEN, STALE, LOST, FAILED),
+    *(
+        REPEATED,
+        CACHED,
+        HITS,
+        RESIDUAL,
+        HEADERS_EARLY,
+        HEADERS_LATE,
+        UNCOUNTED,
+        ASLEEP,
+        RECONNECTED,
+        OVERTAKEN,
+        STALE,
+        LOST,
+        FAILED,
+    ),
 )
 """In the order of the warnings."""
 
@@ -215,6 +237,7 @@ class SampleGuard:
         self.succeeded[cell] += 1
         self._launches.add(row.launch)
         counts[ASLEEP][cell] += PADDED in row.facts
+        counts[RECONNECTED][cell] += RECONNECTS in row.facts
         off_ms = row.facts.get(HEADERS_OFF_MS, 0.0)
         if abs(off_ms) > max(SURELY_OFF_MS, SURELY_OFF_SHARE * (row.server_prompt_ms or 0.0)):
             counts[HEADERS_EARLY if off_ms > 0 else HEADERS_LATE][cell] += 1
@@ -232,7 +255,7 @@ class SampleGuard:
         for doubt, counts in self._counts.items():
             if doubt is FAILED:
                 found += self._odd_facts()
-            if cells := {cell: count for cell, count in counts.items() if count > 0}:
+            if cells := {cell: count for cell, count in counts.items() if count > doubt.share * self.succeeded[cell]}:
                 where = ", ".join(f"{cell}: {count}" for cell, count in cells.items())
                 what = doubt.what.format(cached_share=self._cached_share)
                 found.append(RunWarning(doubt.code, f"{what} ({where})", doubt.advice or self.advice(cells)))

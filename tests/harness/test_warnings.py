@@ -158,3 +158,10 @@ def test_what_cannot_be_read_and_packets_lost_by_others_are_no_warning_about_a_r
     assert now.warnings_since(now) == []
     assert now.receive_buffer_errors is not None
     assert Counters.read(watches_udp=False).receive_buffer_errors is None
+
+
+@pytest.mark.parametrize(("closed", "expected"), [(12, ["reconnects"]), (7, ["reconnects"]), (6, []), (0, [])])
+def test_a_server_that_closes_most_kept_connections_is_warned_of(closed: int, expected: list[str]) -> None:
+    seen = [row(f"{n}", facts={"reconnects": 1.0} if n < closed else {}) for n in range(13)]
+    warm_ups = [row(f"warm-up {n}", warmup=True, facts={"reconnects": 1.0}) for n in range(9)]
+    assert codes(*((sample, n) for n, sample in enumerate([*seen, *warm_ups]))) == expected
