@@ -51,7 +51,7 @@ METRICS: Final[Mapping[str, Metric]] = {
         _ticks("age_ticks_blended", "blended", "Its mean with blended actions: ages weighted as the actions are."),
         _number("reaction_s_mean", "s", "react (ms)", "From an event to the start of the first tick that knows of it."),
         _number("reaction_s_p99", "s", "p99", "Its 99th percentile."),
-        _number("reaction_s_closed", "s", "form", "Its mean by the closed form, in ticks, where that holds."),
+        _number("reaction_s_closed", "s", "form", "Its mean by the closed form of the same delays, where it holds."),
         _number("first_action_s", "s", "first action", "From the first observation until an action leaves."),
         _number("control_rate_hz", "Hz", "Hz", "Executed actions a second, from the first on.", "higher"),
         _ticks("delay_ticks_mean", "d", "Realised d, by the row's convention.", better="neither"),

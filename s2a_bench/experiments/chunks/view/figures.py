@@ -222,7 +222,9 @@ def build_triggers(run: StoredRun) -> Figure:
     rows = run.table(TRIGGERS)
     epsilon = float(run.manifest["configuration"]["epsilon"])
     groups = sources_of(rows_of(run))[:_MOST_PANELS]
-    more = "Line: closed form; dots: simulated, with 95 % intervals; 0 lies at the bottom."
+    more = (
+        "Line: closed form of the same sample of latencies; dots: simulated, with 95 % intervals; 0 lies at the bottom."
+    )
     figure = new_figure(2.5 + 0.16 * len(groups), _caption(run, "P(stall) against the trigger of queue", more))
     axes = figure.subplots()
     sources: list[Any] = []
@@ -294,7 +296,7 @@ def build_reactions(run: StoredRun) -> Figure:
         panels[-1].plot([], [], color=LINE_COLOURS[place % len(LINE_COLOURS)], label=name)[0]
         for place, name in enumerate(names)
     ]
-    handles += panels[-1].plot([], [], ":", color="black", label="closed form")
+    handles += panels[-1].plot([], [], ":", color="black", label="closed form of the same sample")
     figure.legend(handles=handles, loc="outside lower center", ncols=2, columnspacing=1.0)
     return figure
 

@@ -201,8 +201,9 @@ def _convention(run: StoredRun) -> str:
 def _notes(run: StoredRun) -> Iterator[str]:
     yield _convention(run)
     yield (
-        "P(stall): share of the cycles, with its 95 % interval; form: the closed form, where it holds; "
-        "margin: ticks that all latencies may be longer without a stall. Ages and stalls are in control ticks."
+        "P(stall): share of the cycles, with its 95 % interval; form: the closed form of the same sample of latencies, "
+        "where it holds; margin: ticks that all latencies may be longer without a stall. Ages and stalls are in "
+        "control ticks."
     )
     rows = rows_of(run)
     if any(row["slow_down"] is not None and row["slow_down"] > 1 for row in rows):
