@@ -112,7 +112,7 @@ class Doubt(NamedTuple):
     advice: str = ""
     """Empty: the transports of the cells advise."""
     share: float = 0.0
-    """Share of the samples of a cell that count, from which on it is raised."""
+    """It is raised above this share of a cell's samples."""
 
 
 REPEATED = Doubt(
@@ -176,21 +176,8 @@ STALE = Doubt(
 LOST = Doubt("lost-messages", "requests lost messages on the way")
 FAILED = Doubt("failed-samples", "requests failed", "see the column error of samples.csv")
 DOUBTS: Final = (
-    *(
-        REPEATED,
-        CACHED,
-        HITS,
-        RESIDUAL,
-        HEADERS_EARLY,
-        HEADERS_LATE,
-        UNCOUNTED,
-        ASLEEP,
-        RECONNECTED,
-        OVERTAKEN,
-        STALE,
-        LOST,
-        FAILED,
-    ),
+    *(REPEATED, CACHED, HITS, RESIDUAL, HEADERS_EARLY, HEADERS_LATE),
+    *(UNCOUNTED, ASLEEP, RECONNECTED, OVERTAKEN, STALE, LOST, FAILED),
 )
 """In the order of the warnings."""
 

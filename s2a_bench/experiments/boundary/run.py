@@ -22,17 +22,13 @@ if TYPE_CHECKING:
 
 def run_boundary(config: BoundaryConfig, output: Path, progress: Progress) -> Path:
     """Compute the plane and return the run folder; raises S2AError."""
+    grid = Provenance.computed()
+    boards = {board.name: Provenance.computed(board.name, board.weights) for board in config.boards}
     manifest = {
         "configuration": config.to_manifest(),
         "environment": environment.collect(),
         "seeds": {"plans": config.seed},
-        "provenance": Origins(
-            Provenance.computed(),
-            {
-                "": Provenance.computed(),
-                **{board.name: Provenance.computed(board.name, board.weights) for board in config.boards},
-            },
-        ).to_manifest(),
+        "provenance": Origins(grid, {"": grid} | boards).to_manifest(),
         "boards": [
             {"name": board.name, "title": board.title, "origin": board.origin, "tokens_per_s": board.tokens_per_s}
             for board in config.boards
