@@ -33,7 +33,7 @@ from s2a_bench.report.claims import (
     claim_table,
     judge,
 )
-from s2a_bench.report.claims.plans import CHOSEN, PLANS
+from s2a_bench.report.claims.plans import CHOSEN, PLANE, PLANS
 from s2a_bench.report.claims.table import CLAIMS, judge_claims
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import StoredRun, read_run
@@ -361,12 +361,18 @@ def test_the_boundary_has_a_safe_side_and_one_that_is_not_always_unsafe(tmp_path
     assert claim_of("Below R", read_run(run_boundary(jitter, tmp_path, NullProgress()))).verdict == UNDECIDED
 
 
-def test_where_skills_cannot_end_early_the_papers_line_is_not_tried(tmp_path: Path) -> None:
-    run = read_run(run_boundary(BoundaryConfig(t_min=1.0), tmp_path, NullProgress()))
+@pytest.mark.parametrize("t_min", [0.99, 1.0])
+def test_at_another_t_min_than_the_chosen_the_papers_line_is_tried_without_a_verdict(
+    tmp_path: Path, t_min: float
+) -> None:
+    run = read_run(run_boundary(BoundaryConfig(t_min=t_min), tmp_path, NullProgress()))
     assert claim_of("suffices", run).verdict == IDENTITY
-    assert not claim_of("Below R", run).verdicts
-    older = replace(run, manifest=run.manifest | {"configuration": {}})  # an older folder: T_min was T_nom
-    assert not claim_of("Below R", older).verdicts
+    older = replace(run, manifest=run.manifest | {"configuration": {}})
+    for each, missing in ((run, f"t_min {t_min}"), (older, "t_min unknown")):
+        below = claim_of("Below R", each)
+        assert not below.verdicts
+        assert below.evidence[0].startswith("At your settings, no verdict: Naive stalls at 95 of 95 points below")
+        assert missing in below.required
 
 
 def test_the_operating_point_is_reproduced_and_the_diagram_does_not_bear_all_of_it_out(ccrb: StoredRun) -> None:
@@ -386,12 +392,11 @@ def test_the_chosen_point_is_the_default_of_the_command() -> None:
     assert {name: settings[name] for name in CHOSEN} == CHOSEN
 
 
-def test_the_chosen_settings_of_plans_are_the_defaults_of_the_command() -> None:
-    settings = json.loads(json.dumps(TimelineConfig().to_manifest()))
-    several = {"n_skills", "t_nom_s"}
-    assert {name: settings[name] for name in PLANS} == {
-        name: [value] if name in several else value for name, value in PLANS.items()
-    }
+def test_the_chosen_settings_of_plans_and_plane_are_the_defaults_of_the_commands() -> None:
+    plans, plane = (json.loads(json.dumps(kind().to_manifest())) for kind in (TimelineConfig, BoundaryConfig))
+    several = {"n_skills": [PLANS["n_skills"]], "t_nom_s": [PLANS["t_nom_s"]]}
+    assert {name: plans[name] for name in PLANS} == PLANS | several
+    assert {name: plane[name] for name in PLANE} == PLANE
 
 
 @pytest.mark.parametrize(

@@ -126,7 +126,7 @@ CLAIMS: Final[tuple[Claim, ...]] = (
         "IV-F, figure 2",
         "Below R = L/T_min stalls occur",
         "The same below the line: one point without a stall contradicts.",
-        Trial("s2a-bench boundary", of.plane, (of.EVENLY, of.SHORTER)),
+        Trial("s2a-bench boundary", of.plane, (of.EVENLY, of.OF_THE_PLANE)),
         (Check("Naive stalls at {}.", partial(of.stalls_at, "below"), 1, 1),),
         {CONTRADICTED: (CONTRADICTED, "Elsewhere skills run for T_nom, and do not stall: the line is R = L/T_nom.")},
     ),
