@@ -130,10 +130,8 @@ def test_more_than_a_half_is_not_a_half() -> None:
 def test_runs_that_can_tell_have_to_agree_and_no_other_counts(
     testable: list[str], others: list[str], verdict: str
 ) -> None:
-    findings = [
-        ClaimFinding(verdict, str(place), (Met("board: it", True),), "") for place, verdict in enumerate(testable)
-    ]
-    findings += [ClaimFinding(verdict, "", (Met("board: another (needs it)", False),), "") for verdict in others]
+    findings = [ClaimFinding(verdict, str(place), (Met("board: it", True),)) for place, verdict in enumerate(testable)]
+    findings += [ClaimFinding(verdict, "", (Met("board: another (needs it)", False),)) for verdict in others]
     for order in (findings, findings[::-1]):
         judged = Judged(CLAIMS[0], dict.fromkeys(order, ("run",)))
         assert judged.verdict == verdict

@@ -390,7 +390,7 @@ def test_the_provenance_of_every_cell_is_on_the_page_in_the_claims_and_in_csv(
         name: {code} for name, code in codes.items()
     }
     (basis,) = claims.loc[claims["claim"].str.startswith("HTTP/JSON"), "evidence"]
-    assert f"Basis: {run.name}; {'; '.join(each.line for each in cells.values())}; 3 launches." in basis
+    assert f"Basis: {run.name}, 3 launches. Provenance: {'; '.join(each.line for each in cells.values())}." in basis
     article = page.read_text().partition("HTTP/JSON takes longer")[2].partition("</article>")[0]
     assert re.findall('class="label">(.*?)<', article) == ["emulated", "replay engine", "dummy weights"]
     heading = page.read_text().partition(f'<section id="run-{run.name}">')[2].partition("</h2>")[0]

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
+from s2a_bench.provenance import Origins, Provenance, joined
 from s2a_bench.stats import Ratio
 from s2a_bench.writers.tables import TextTable
 
 if TYPE_CHECKING:
-    from s2a_bench.provenance import Provenance
     from s2a_bench.store.run import StoredRun
 
 SUPPORTED: Final = "supported"
@@ -40,16 +40,6 @@ class RunPart:
     launches: int = 0
     cells: Any = None
     about: str = ""
-
-    @property
-    def basis(self) -> str:
-        """Return the origins of the numbers, and the launches."""
-        launches = [f"{self.launches} launch{'es' * (self.launches > 1)}"] if self.launches else []
-        return "; ".join((*dict.fromkeys(origin.line for origin in self.origins), *launches))
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(label for origin in self.origins for label in origin.labels))
 
 
 class Met(NamedTuple):
@@ -165,13 +155,22 @@ class Claim:
 
 @dataclass(frozen=True, slots=True)
 class ClaimFinding:
-    """The verdict of one part of a run on a claim, the evidence with its basis and labels, and the needs."""
+    """The verdict of one part of a run on a claim, the evidence, the needs, and the basis: origins and launches."""
 
     verdict: str
     evidence: str
     needs: tuple[Met, ...]
-    basis: str
-    labels: tuple[str, ...] = ()
+    origins: tuple[Provenance, ...] = ()
+    launches: int = 0
+
+    @property
+    def origin(self) -> Origins:
+        return joined(map(Origins, self.origins))
+
+    def basis(self, runs: Iterable[str]) -> str:
+        """Return the runs, the launches, and the origin of the numbers."""
+        launches = [f"{self.launches} launch{'es' * (self.launches > 1)}"] if self.launches else []
+        return f"Basis: {', '.join((*runs, *launches))}. {self.origin.line}"
 
     @property
     def testable(self) -> bool:
@@ -200,12 +199,8 @@ class Judged:
         """A text of each finding, with its verdict if there are several findings, and its basis with the runs."""
         several = len(self.findings) > 1
         return [
-            (
-                (f"{finding.verdict.capitalize()}: " if several else "")
-                + f"{finding.evidence} Basis: {', '.join(runs)}; {finding.basis}.",
-                finding,
-            )
-            for finding, runs in self.findings.items()
+            ((f"{each.verdict.capitalize()}: " if several else "") + f"{each.evidence} {each.basis(runs)}", each)
+            for each, runs in self.findings.items()
         ]
 
     @property
@@ -248,10 +243,10 @@ def _findings(claim: Claim, run: StoredRun) -> Iterator[ClaimFinding]:
         verdict, evidence = claim.judge(part)
         if not fit:
             verdict, evidence = UNDECIDED, f"At your settings, no verdict: {evidence}"
-        yield ClaimFinding(verdict, evidence, needs, part.basis, part.labels)
+        yield ClaimFinding(verdict, evidence, needs, tuple(part.origins), part.launches)
     if every and not free:
         part, needs = min(every, key=lambda each: sum(not need.met for need in each[1]))
-        yield ClaimFinding(UNDECIDED, "Not testable with this run.", needs, part.basis, part.labels)
+        yield ClaimFinding(UNDECIDED, "Not testable with this run.", needs, tuple(part.origins), part.launches)
 
 
 def claim_table(judged: Sequence[Judged]) -> TextTable:
