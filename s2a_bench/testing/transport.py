@@ -8,7 +8,7 @@ A package tests its transport like this, once for each of its variants and paylo
         name = "toy"
 
     class TestToyJpeg(TransportSuite):
-        name, lossless = "toy?payload=jpeg", False
+        name = "toy?payload=jpeg"
 """
 
 from __future__ import annotations
@@ -17,18 +17,19 @@ import json
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from threading import Thread
-from typing import Any, ClassVar
+from threading import Event, Thread
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import pytest
 
 from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import EngineError, RequestFailed
-from s2a_bench.facts import PROMPT_N
+from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, PROMPT_N
 from s2a_bench.trace import GROUPS, RESIDUAL, STAGES, Trace, budget, path_of
 from s2a_bench.transport import (
     ACTIONS,
+    LOSSLESS,
     TOKENS,
     TRANSPORTS,
     Client,
@@ -39,10 +40,18 @@ from s2a_bench.transport import (
     open_client,
     open_server,
 )
+from s2a_bench.transport.pictures import encoded
 from s2a_bench.transport.pipeline import one_pipeline, pipelines
+from s2a_bench.transport.serving import Queued
 from s2a_bench.types import Action, Frame, Piece, Request, Token
 
 Connect = Callable[[Handler], Client]
+"""Opens a client of the server that has this handler."""
+
+CODED: Final = frozenset({"image_encode", "image_decode"})
+PICTURE_STAGES: Final = {"yuyv": frozenset({"yuv_decode"}), "jpeg": CODED, "png": CODED}
+"""Payload -> the stages of a camera's YUYV frame; of all others `convert`."""
+PATIENCE_S: Final = 20.0
 
 
 class RecordingHandler:
@@ -109,10 +118,13 @@ def served(wiring: Wiring[Any], handler: Handler) -> Iterator[tuple[Server, Thre
 
 
 def connector(wiring: Wiring[Any]) -> Iterator[Connect]:
+    servers: dict[int, tuple[Server, Thread]] = {}
     with ExitStack() as stack:
 
         def connect(handler: Handler) -> Client:
-            server, thread = stack.enter_context(served(wiring, handler))
+            if id(handler) not in servers:
+                servers[id(handler)] = stack.enter_context(served(wiring, handler))
+            server, thread = servers[id(handler)]
             client = open_client(replace(wiring, address=server.address), thread.is_alive)
             stack.callback(client.close)
             return client
@@ -125,13 +137,13 @@ class TransportSuite:
 
     name: ClassVar[str]
     """As in ``--transport``: the transport, perhaps a variant, perhaps options."""
-    lossless = True
-    """Whether the engine gets the camera's exact pixels."""
     carries_id_and_limit = True
     carries: ClassVar[frozenset[str]] = frozenset({"grammar", "seed"})
     """The further fields of a request that reach the handler."""
     whole = False
     """Whether an answer is sent as a whole: then none of it arrives before an error."""
+    lacks: ClassVar[frozenset[str]] = frozenset()
+    """Declared stages that only other variants have."""
 
     @pytest.fixture
     def wiring(self) -> Wiring[Any]:
@@ -232,7 +244,7 @@ class TransportSuite:
         expected = cv2.cvtColor(frame.data, cv2.COLOR_YUV2RGB_YUY2)
         assert (image.encoding, image.width, image.height) == ("rgb8", 64, 48)
         assert image.data.shape == expected.shape
-        if self.lossless:
+        if wiring.options.payload in LOSSLESS:
             np.testing.assert_array_equal(image.data, expected)
 
     def test_stages_and_residual_sum_to_the_whole(
@@ -250,6 +262,73 @@ class TransportSuite:
         assert set(spent.stages_ns) <= set(path_of([transport.stages]))
         assert all(duration >= 0 for duration in spent.stages_ns.values())
         assert {"inference", "return"} <= set(spent.stages_ns)
+
+    def test_every_stage_takes_time(self, connect: Connect, transport: Transport[Any], wiring: Wiring[Any]) -> None:
+        _, trace = ask(connect(self.handler(wiring, ["x"])), Request("a", "plan", (yuyv_frame(),)))
+        spent = budget(trace.chain()).stages_ns
+        stages = {"inference", "return", *transport.stages} - self.lacks
+        stages |= PICTURE_STAGES.get(wiring.options.payload, {"convert"})
+        if not transport.in_process:
+            stages.add("network")
+        if wiring.black_box:  # the rest of its way is not seen
+            stages = {stage for stage in stages if path_of([transport.stages])[stage] in {"encode", "pack"}}
+        assert {stage for stage in stages if spent.get(stage, 0) <= 0} == set()
+
+    def test_the_payload_weighs_as_much_as_its_pictures(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        if PAYLOAD_BYTES not in wiring.capabilities.facts:
+            pytest.skip(f"{wiring.transport}/{wiring.variant} reports no bytes")
+        client, payload = connect(self.handler(wiring, ["x"])), wiring.options.payload
+        frames = [yuyv_frame(seed=seed) for seed in range(3 if wiring.capabilities.accepts_state else 1)]
+        without, sent = (
+            ask(client, Request("a", "plan", tuple(images)))[1].facts[PAYLOAD_BYTES] for images in ([], frames)
+        )
+        files = [frame.data if payload == "yuyv" else encoded(frame, payload, Trace())[1] for frame in frames]
+        pictures = sum(file.size for file in files)
+        assert pictures <= sent - without <= 4 / 3 * pictures + 400 * len(frames)  # Base64 and fields at most
+
+    def test_marks_are_computed_once_the_answer_has_arrived(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        if wiring.black_box:
+            pytest.skip("a black box sends no marks")
+        arrived, recording = Event(), self.handler(wiring, ["x", "y"])
+
+        def handler(request: Request, trace: Trace) -> Generator[Piece, None, None]:
+            trace.later["had_arrived"] = lambda: float(arrived.wait(PATIENCE_S / 4))
+            yield from recording(request, trace)
+
+        trace = Trace()
+        for piece in connect(handler).request(Request("a", "plan"), trace):
+            if piece.index == 1:
+                arrived.set()
+        assert trace.facts["had_arrived"] == 1
+
+    def test_inference_begins_when_the_engine_is_free(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        """Not in the queue or before, by the marks and by what a policy server reports."""
+        if wiring.black_box:
+            pytest.skip("a black box sends no marks")
+        recording, busy = self.handler(wiring, ["x", "y"]), Event()
+        called_ns: list[int] = []
+
+        def answering(request: Request, trace: Trace) -> Generator[Piece, None, None]:
+            if not busy.is_set():
+                busy.set()
+                gives_up_ns = now_ns() + PATIENCE_S * 1e9
+                while not queued.turns.waiting and now_ns() < gives_up_ns:
+                    Event().wait(0.002)
+            called_ns.append(now_ns())
+            yield from recording(request, trace)
+
+        queued = Queued.around(answering)
+        first, second = connect(queued), connect(queued)
+        asking = Thread(target=ask, args=(first, Request("a", "plan")))
+        asking.start()
+        assert busy.wait(PATIENCE_S)
+        _, trace = ask(second, Request("b", "plan"))
+        asking.join()
+        chain, (busy_ns, handed_ns) = trace.chain(), called_ns
+        begins_ns = chain[[stage for stage, _ in chain].index("inference") - 1][1]
+        assert busy_ns < begins_ns <= handed_ns
+        assert trace.remote is not None
+        assert trace.facts.get(INFER_MS, 0) * 1e6 < trace.remote.token_ns[-1] - busy_ns
 
     def test_the_servers_marks_come_back(self, connect: Connect, wiring: Wiring[Any]) -> None:
         _, trace = ask(connect(self.handler(wiring, ["x", "y", "z"])), Request("a", "plan"))

@@ -66,7 +66,6 @@ class TestContract(TransportSuite):
     """The transports' contract, as far as a foreign server carries it: no ids, no marks, no raw pixels."""
 
     name = "http/as-deployed"
-    lossless = False
 
     @pytest.fixture
     def wiring(self, speaker: Speaker) -> Wiring[Any]:

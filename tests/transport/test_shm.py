@@ -25,7 +25,7 @@ from s2a_bench.errors import PortInUse, RequestFailed, ServerDied, TransportErro
 from s2a_bench.frames.convert import to_bgr, to_rgb
 from s2a_bench.machine.doctor import Machine
 from s2a_bench.testing.hostile.client import usage
-from s2a_bench.testing.transport import Connect, RecordingHandler, TransportSuite, ask, connector, wiring_of, yuyv_frame
+from s2a_bench.testing.transport import Connect, RecordingHandler, ask, connector, wiring_of, yuyv_frame
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.connections import Wire
@@ -39,22 +39,6 @@ from s2a_bench.types import Action, Frame, Request, Token
 from tests.waiting import until
 
 NOBODY = 65534
-
-
-class TestShm(TransportSuite):
-    name = "shm"
-
-
-class TestShmYuyv(TransportSuite):
-    name = "shm?payload=yuyv"
-
-
-class TestShmJpeg(TransportSuite):
-    name, lossless = "shm?payload=jpeg", False
-
-
-class TestShmPng(TransportSuite):
-    name = "shm?payload=png"
 
 
 @pytest.fixture(autouse=True)
