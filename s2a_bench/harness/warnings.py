@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from s2a_bench.clock import realtime_offset_ns
-from s2a_bench.facts import FRAMES_LOST, HEADERS_OFF_MS, PADDED, RECONNECTS, STALE_FRAMES, USAGE_ZERO
+from s2a_bench.facts import FRAMES_LOST, GET_ACTIONS_MS, HEADERS_OFF_MS, RECONNECTS, STALE_FRAMES, USAGE_ZERO
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Machine, examine, warnings_of
 from s2a_bench.machine.doctor.host import RMEM_WANTED
@@ -26,6 +26,9 @@ LEVEL: Final = 0.01
 """Of the test for changed delays."""
 SURELY_OFF_MS, SURELY_OFF_SHARE = 20.0, 0.25
 """Beyond both, a llama-server's headers did not leave when its slot started."""
+
+SLEEP_MS, AWAKE_MS, EARLY = 1e3 / 30, 2.0, 0.05
+"""How long lerobot's server sleeps by default, how much later its client sees it, the share of answers that tells."""
 
 
 def before_run(checks: Mapping[str, str] | None = None, machine: Machine | None = None) -> list[RunWarning]:
@@ -156,7 +159,7 @@ UNCOUNTED = Doubt(
 )
 ASLEEP = Doubt(
     "padded-answers",
-    "answers came when the server had slept: 33 ms after the request, however fast its policy is",
+    "no answers came earlier than 33 ms after the request, and these just then: the server slept until then",
     "start lerobot's server with --inference_latency=0",
 )
 RECONNECTED = Doubt(
@@ -198,6 +201,7 @@ class SampleGuard:
         self._cached_share = 0.0
         self._odd: dict[str, set[str]] = defaultdict(set)
         self._times_ns: dict[str, list[int]] = defaultdict(list)
+        self._waits_ms: dict[str, list[float]] = defaultdict(list)
         self._launches: set[int] = set()
 
     def see(self, row: SampleRow, fingerprint: int, odd: Iterable[str] = ()) -> None:
@@ -223,8 +227,8 @@ class SampleGuard:
             return
         self.succeeded[cell] += 1
         self._launches.add(row.launch)
-        counts[ASLEEP][cell] += PADDED in row.facts
         counts[RECONNECTED][cell] += RECONNECTS in row.facts
+        self._waits_ms[cell].append(row.facts.get(GET_ACTIONS_MS, 0.0))
         off_ms = row.facts.get(HEADERS_OFF_MS, 0.0)
         if abs(off_ms) > max(SURELY_OFF_MS, SURELY_OFF_SHARE * (row.server_prompt_ms or 0.0)):
             counts[HEADERS_EARLY if off_ms > 0 else HEADERS_LATE][cell] += 1
@@ -239,6 +243,9 @@ class SampleGuard:
 
     def warnings(self) -> list[RunWarning]:
         found = []
+        for cell, waits_ms in self._waits_ms.items():
+            if min(waits_ms) >= SLEEP_MS and np.quantile(waits_ms, EARLY) < SLEEP_MS + AWAKE_MS:
+                self._counts[ASLEEP][cell] = sum(wait_ms < SLEEP_MS + AWAKE_MS for wait_ms in waits_ms)
         for doubt, counts in self._counts.items():
             if doubt is FAILED:
                 found += self._odd_facts()

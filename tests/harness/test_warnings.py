@@ -51,7 +51,6 @@ def test_good_samples_raise_no_warning(second: SampleRow, fingerprint: int) -> N
         (row("b"), 1, "duplicate-frames"),
         (row("b", cache_n=7), 2, "prompt-cache"),
         (row("b", facts={"usage_zero": 1.0}), 2, "usage-zero"),
-        (row("b", facts={"padded": 1.0}), 2, "padded-answers"),
         (row("b", marks=LOOSE), 2, "residual"),
         (row("b", facts={"frames_lost": 2.0}), 2, "lost-frames"),
         (row("b", facts={"headers_off_ms": -97.0}, server_prompt_ms=97.5), 2, "ingest-unsure"),
@@ -72,6 +71,20 @@ def test_headers_at_another_moment_are_told_with_the_half_that_is_too_long(off_m
     guard.see(row("a", facts={"headers_off_ms": off_ms}, server_prompt_ms=97.5), 1)
     (warning,) = guard.warnings()
     assert says in warning.message
+
+
+@pytest.mark.parametrize(
+    ("waits_ms", "slept"),
+    [
+        ([33.5, 33.9, 34.1, 60.0], True),
+        ([33.5] * 9 + [33.1] * 3, False),  # some came while it would have slept
+        ([20.0, *[33.5] * 60], False),
+        ([90.0, 33.5] + [80.0] * 60, False),
+    ],
+)
+def test_a_server_that_sleeps_is_known_by_its_earliest_answers(waits_ms: list[float], slept: bool) -> None:
+    seen = [(row(str(at), facts={"get_actions_ms": wait_ms}), at) for at, wait_ms in enumerate(waits_ms)]
+    assert codes(*seen) == ["padded-answers"] * slept
 
 
 def test_hits_that_servers_count_during_the_run_are_a_warning() -> None:

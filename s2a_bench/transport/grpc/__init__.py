@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
-from s2a_bench.facts import PADDED, PAYLOAD_BYTES, RECONNECTS, Fact
+from s2a_bench.facts import GET_ACTIONS_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import option
 from s2a_bench.transport import ACTIONS, Capabilities, Choice, Client, Transport, Urls, Wiring
 from s2a_bench.transport.listening import UrlOptions
@@ -47,7 +47,7 @@ class Grpc(Transport[GrpcOptions]):
     stages: ClassVar[dict[str, str]] = {"pickle_pack": "pack", "send": "network", "pickle_parse": "parse"}
     urls = Urls(GrpcOptions.SCHEMES, examine="s2a_bench.transport.grpc.risks:examine")
     compared_with = ("ros", "loopback")
-    facts = (PAYLOAD_BYTES, PAYLOAD_DOWN_BYTES, RECONNECTS, PADDED)
+    facts = (PAYLOAD_BYTES, PAYLOAD_DOWN_BYTES, RECONNECTS, GET_ACTIONS_MS)
     order = 24
     style = {LEROBOT: ("#01665E", "-")}
     packages = ("grpcio",)

@@ -16,7 +16,7 @@ import numpy as np
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError, UsageError
-from s2a_bench.facts import PADDED, PAYLOAD_BYTES, RECONNECTS
+from s2a_bench.facts import GET_ACTIONS_MS, PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.chunks import actions_of
@@ -38,8 +38,6 @@ BEGIN, MIDDLE, END = 1, 2, 3
 """lerobot's TransferState of a piece of an observation."""
 MORE: Final = 0x80
 """Set in each byte of protobuf's varint but the last."""
-SLEEP_NS, WINDOW_NS = 10**9 // 30, 2_000_000
-"""How long after `GetActions` the server answers by default; how much later its client sees it."""
 NO_CHUNK: Final = (
     "answered without a chunk: its policy raised an error, which only its log has, or no observation reached it within "
     "its --obs_queue_timeout (2 s), as another client took it"
@@ -59,7 +57,6 @@ class GrpcClient:
         self._channel: grpc.Channel | None = None
         self._connected = False
         self._timestep = 0
-        self._fastest_ns = SLEEP_NS + WINDOW_NS
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         bounds = Bounds(self._url, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
@@ -126,10 +123,7 @@ class GrpcClient:
         return stamp, pieces
 
     def _exchanged(self, channel: grpc.Channel, pieces: list[bytes], bounds: Bounds, trace: Trace) -> bytes:
-        """Wait for the chunk while the observation is sent, and recognise the server's sleep.
-
-        An answer came at its end if it came so long after the call, and none came earlier.
-        """
+        """Wait for the chunk while the observation is sent."""
         patience_s, started_ns = self._patience_s(bounds), now_ns()
         answer = channel.unary_unary(SERVICE + "GetActions").future(b"", patience_s)
         try:
@@ -139,10 +133,7 @@ class GrpcClient:
             trace.mark("server")
         finally:
             answer.cancel()
-        took_ns = trace.marks[-1][1] - started_ns
-        self._fastest_ns = min(self._fastest_ns, took_ns)
-        if self._fastest_ns >= SLEEP_NS and took_ns < SLEEP_NS + WINDOW_NS:
-            trace.facts[PADDED] = 1.0
+        trace.facts[GET_ACTIONS_MS] = (trace.marks[-1][1] - started_ns) / 1e6
         return message
 
     def _patience_s(self, bounds: Bounds) -> float:
