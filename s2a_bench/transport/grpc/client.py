@@ -7,11 +7,11 @@ last one. The server holds one policy, which its last client named, and one obse
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from typing import Any, Final
 
+import grpc
 import numpy as np
 
 from s2a_bench.clock import now_ns
@@ -27,9 +27,6 @@ from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.observed import COLOURS
 from s2a_bench.transport.pictures import policy_picture
 from s2a_bench.types import Piece, Request
-
-os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # our errors say the same
-import grpc
 
 AXES: Final = ["height", "width", "channels"]
 SERVICE, LOAD = "/transport.AsyncInference/", "SendPolicyInstructions"
