@@ -30,6 +30,7 @@ CHANCE: Final = 2.0
 """Greatest correlation by chance, in standard deviations of about 1 / sqrt(n) of independent neighbours."""
 
 _RESAMPLES: Final = 1000
+_ROUNDING: Final = 1e-9
 
 
 @final
@@ -85,10 +86,11 @@ class LaunchValues:
 
 
 def lag_one(values: Floats) -> float:
-    """Return the lag-1 autocorrelation of values in their order, r1; 0 if they are all equal."""
+    """Return the lag-1 autocorrelation of values in their order, r1; 0 if they are equal but for rounding."""
     around = values - values.mean()
-    spread = float(around @ around)
-    return float(around[1:] @ around[:-1]) / spread if spread else 0.0
+    if np.ptp(around) <= _ROUNDING * np.abs(values).max():
+        return 0.0
+    return float(around[1:] @ around[:-1]) / float(around @ around)
 
 
 @dataclass(frozen=True, slots=True)

@@ -63,7 +63,7 @@ def test_tables_number_the_sources_and_name_the_convention(run: StoredRun) -> No
 
 def test_sentences_say_what_each_rule_costs(run: StoredRun) -> None:
     constant, random = chunk_sentences(run)
-    assert constant.startswith("Stalled cycles of queue @ 60, for at most 1.00%: calibrated 0.00% at age 10.5")
+    assert constant.startswith("Stalled cycles of queue @ 60, epsilon 0.01: calibrated 0.00% at age 10.5")
     assert "mean 3" in random
 
 
