@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from math import inf
 from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
 
@@ -29,25 +30,21 @@ UNDECIDED: Final = "undecided or not testable"
 
 @dataclass(frozen=True, slots=True)
 class RunPart:
-    """Cells of a run that are judged together, and their facts by the names of needs; ``about`` ends the evidence.
-
-    ``launches`` is 0 if nothing was launched: the part is computed.
-    """
+    """Cells of a run that are judged together, and their facts by the names of needs; ``about`` ends the evidence."""
 
     run: StoredRun
     facts: Mapping[str, Any]
     origins: Sequence[Provenance]
-    launches: int = 0
+    launches: int = 0  # none if all is computed
     cells: Any = None
     about: str = ""
 
 
 class Met(NamedTuple):
-    """A fact of a part beside its need, as text; ``chosen`` if the need is a choice where the paper gives none."""
+    """A fact of a part beside its need, as text."""
 
     text: str
     met: bool
-    chosen: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +62,7 @@ class Need:
     def of(self, facts: Mapping[str, Any]) -> Met:
         found = facts[self.name]
         met, shown = self.test(found), round(found, 3) if isinstance(found, float) else found
-        return Met(f"{self.name}: {shown}" + ("" if met else f" (needs {self.wanted})"), met, self.chosen)
+        return Met(f"{self.name}: {shown}" + ("" if met else f" (needs {self.wanted})"), met)
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,13 +229,11 @@ def judge(claim: Claim, runs: Iterable[StoredRun]) -> Judged:
 
 
 def _findings(claim: Claim, run: StoredRun) -> Iterator[ClaimFinding]:
-    """Judge the parts of a run that meet all needs; else measure those that differ in chosen settings alone.
-
-    If there are none of these either, yield the needs of the nearest part.
-    """
+    """Judge the parts that meet all needs; else measure those of other settings; else yield the nearest's needs."""
     every = [(part, tuple(need.of(part.facts) for need in claim.trial.needs)) for part in claim.trial.parts(run)]
     fit = [(part, needs) for part, needs in every if all(need.met for need in needs)]
-    free = [(part, needs) for part, needs in every if all(need.met or need.chosen for need in needs)]
+    fixed = [not need.chosen for need in claim.trial.needs]
+    free = [(part, needs) for part, needs in every if all(need.met for need in compress(needs, fixed))]
     for part, needs in fit or free:
         verdict, evidence = claim.judge(part)
         if not fit:

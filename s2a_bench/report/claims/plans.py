@@ -43,14 +43,7 @@ _PROMISED: Final = 0.01
 AS_CHOSEN: Final = "as chosen"
 EXACT, VARYING = "exact", "random, or measured"
 NAMED_JITTER: Final = "lognormal:cv=0.2"
-PLANS: Final[dict[str, Any]] = {
-    "n_skills": 8,
-    "t_nom_s": 1.0,
-    "t_min": 0.8,
-    "t_max": 1.5,
-    "t_nom_cv": 0.0,
-    "prompt_s": None,
-}
+PLANS: Final = {"n_skills": 8, "t_nom_s": 1.0, "t_min": 0.8, "t_max": 1.5, "t_nom_cv": 0.0, "prompt_s": None}
 """The defaults of `s2a-bench timeline` that decide its claims; a test compares them. The paper gives none of them."""
 _UNMODELLED: Final = {"t_nom_cv": 0.0, "prompt_s": None, "jitter": "none"}
 """The settings that a live run does not have."""
@@ -253,14 +246,7 @@ def _compared(part: RunPart, above: Timelines, below: Timelines, metric: str) ->
     return change(one, other, part.run.bootstrap_seed, paired=same, exact=part.facts["times"] == EXACT)
 
 
-PLANE: Final[dict[str, Any]] = {
-    "n_skills": 8,
-    "t_nom_s": 1.0,
-    "t_min": 0.8,
-    "most_tokens": 8,
-    "rates": [0.3, 60.0],
-    "points": 25,
-}
+PLANE: Final = {"n_skills": 8, "t_nom_s": 1.0, "t_min": 0.8, "most_tokens": 8, "rates": [0.3, 60.0], "points": 25}
 """The defaults of `s2a-bench boundary` that decide its claims; a test compares them. The paper gives none of them."""
 
 
