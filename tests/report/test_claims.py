@@ -299,6 +299,16 @@ def test_an_end_within_one_per_cent_of_naives_is_no_penalty(timelines: StoredRun
     assert claim_of("at the end, S0 known", changed(timelines, timelines=rows)).verdict == verdict
 
 
+@pytest.mark.parametrize(("factor", "verdict"), [(1.0, SUPPORTED), (1.05, CONTRADICTED)])
+def test_a_later_end_contradicts_where_s0_is_estimated(tmp_path: Path, factor: float, verdict: str) -> None:
+    config = TimelineConfig(profiles=("jetson-agx-orin",), jitter="lognormal:cv=0.2", plans=200)
+    run = read_run(run_timeline(config, tmp_path, NullProgress()))
+    rows = run.table(TIMELINES).copy()
+    ours = rows["policy"] == "stream-to-act"
+    rows.loc[ours, "end_ns"] = (rows.loc[ours, "end_ns"].astype("float64") * factor).round().astype("Int64")
+    assert claim_of("at the end, S0 estimated", changed(run, timelines=rows)).verdict == verdict
+
+
 def test_an_increase_that_may_be_none_decides_nothing(tmp_path: Path) -> None:
     config = TimelineConfig(
         profiles=("jetson-agx-orin",), policies=("naive",), tokens_per_skill=(4, 6), jitter="lognormal:cv=0.2", plans=40

@@ -152,10 +152,7 @@ def _latex(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> Iterator
 
 def _csv(report: Report) -> Iterator[tuple[str, str]]:
     if report.judged:
-        rows = [
-            (each.verdict, each.claim.where, each.claim.text, each.claim.rule, each.required, " ".join(each.evidence))
-            for each in report.judged
-        ]
+        rows = [(row[3], *row[:3], *row[4:]) for row in _claims(report).rows]
         header = ("verdict", "where", "claim", "rule", "required", "evidence")
         yield "claims.csv", CsvTable.of(header, rows).text(report.origins)
     for chapter in report.chapters:
