@@ -32,7 +32,7 @@ class GrpcOptions(UrlOptions):
     policy_type: str = option("", "the policy that the server loads: act, smolvla, diffusion, pi0, pi05, groot, ...")
     pretrained: str = option("", "its checkpoint: a path on the server's machine, or a name on its hub")
     device: str = option("cpu", "the server's device for the policy: cpu, cuda, mps")
-    actions_per_chunk: int = option(50, "most actions of a chunk that the server returns", ge=1, le=4096)
+    actions_per_chunk: int = option(50, "most actions of a chunk that the server returns", ge=1, le=500)
     template: TemplateName = option(LEROBOT, "the observation: a template's name, or a TOML or JSON file", names=names)
 
 

@@ -40,7 +40,7 @@ NO_CHUNK: Final = (
     "its --obs_queue_timeout (2 s), as another client took it"
 )
 _LOADED: Final[dict[str, dict[str, Any]]] = {}
-"""URL -> the policy that a client of this process named last; cells of one run may name different ones."""
+"""URL -> the policy that a client of this process, which is open, named last: cells of a run may name others."""
 
 
 class GrpcClient:
@@ -69,6 +69,7 @@ class GrpcClient:
         bounds.count_bytes(len(answer))
         trace.facts[PAYLOAD_DOWN_BYTES] = len(answer)
         if not answer:
+            self.close()  # a server that was started again has no policy
             raise RequestFailed(f"{self._url} {NO_CHUNK}")
         first_stamp, chunk = chunk_in(bytes_in(answer))
         if first_stamp != stamp:
@@ -80,7 +81,7 @@ class GrpcClient:
             yield action
 
     def _open(self, features: dict[str, Any], bounds: Bounds, trace: Trace) -> grpc.Channel:
-        """Return the channel over which the server holds our policy, marking `connect` if it was not there."""
+        """Return the channel to the server, which holds our policy; marks `connect` if it had to load it."""
         options = self._wiring.options
         policy = {
             "policy_type": options.policy_type,
@@ -94,7 +95,7 @@ class GrpcClient:
             self._channel = grpc.insecure_channel(self._url.partition("://")[2], [("grpc.enable_http_proxy", 0)])
             if self._connected:
                 trace.facts[RECONNECTS] = 1.0
-        elif _LOADED.get(self._url) == policy:
+        if _LOADED.get(self._url) == policy:
             return self._channel
         _LOADED.pop(self._url, None)
         for method, message in (("Ready", b""), (LOAD, message_of(pickled("RemotePolicyConfig", policy)))):
@@ -157,6 +158,7 @@ class GrpcClient:
 
     def close(self) -> None:
         if self._channel is not None:
+            _LOADED.pop(self._url, None)
             self._channel.close()
             self._channel = None
 
