@@ -268,6 +268,21 @@ class TestClientsOfOthers:
         with serving(RecordingHandler(["go"])) as server, plain(server.address) as call:
             assert "choose `answer` actions" in call("get_action", flat())["error"]
 
+    def test_marks_are_computed_when_they_are_requested(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("s2a_bench.transport.zmq.server.WANTED_S", 20)
+        arrived, recording = Event(), RecordingHandler(list(CHUNK))
+
+        def handler(request: Request, trace: Trace) -> Generator[Piece, None, None]:
+            trace.later["had_arrived"] = lambda: float(arrived.is_set())
+            yield from recording(request, trace)
+
+        with serving(handler) as server, robot(server.address) as client:
+            trace = Trace()
+            for piece in client.request(Request("a", "plan"), trace):
+                if piece.index == len(CHUNK) - 1:
+                    arrived.set()
+        assert trace.facts["had_arrived"] == 1
+
     def test_marks_are_for_who_said_an_id_and_once(self) -> None:
         with serving(RecordingHandler(list(CHUNK))) as server, plain(server.address) as call:
             call("get_action", flat())
