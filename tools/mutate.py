@@ -47,7 +47,7 @@ TESTS = {
     "act": ["tests/act"],
     "store": ["tests/store", "tests/sweep/test_sweep.py"],
     "library.py": ["tests/test_library.py"],
-    "transport": ["tests/transport", "tests/harness/test_serving.py"],
+    "transport": ["tests/transport", "tests/harness/test_serving.py", "tests/machine/test_doctor.py"],
     "report/claims": [f"tests/report/test_claim{part}.py" for part in ("_rules", "_texts", "s", "_cases")],
 }
 """Package -> the tests that belong to it."""

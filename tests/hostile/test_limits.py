@@ -94,6 +94,10 @@ def test_half_a_pair_in_a_picture_s_address_is_refused(urls: Urls) -> None:
     assert post(urls["as-deployed"], "as-deployed", "", prompt=part).status_code == 400
 
 
+NO_FRAMES = (0xBF, 0xC4, 0xC8, 0xCC, 0xD9, 0xE0)
+"""Markers of JPEG segments beside those of frame headers."""
+
+
 def jpeg(width: int, height: int, before: bytes = b"") -> bytes:
     """The first bytes of a JPEG that says that it has this size."""
     frame = struct.pack(">BHHB", 8, height, width, 3) + bytes(9)
@@ -109,6 +113,7 @@ class TestPictures:
             jpeg(65_535, 65_535, b"\xff\xe1\x00\x13\xff\xc0\x00\x11\x08\x00\x01\x00\x01" + bytes(8)),  # a thumbnail
             jpeg(65_535, 65_535, b"junk\xff\xff\xff\x00\xff\x01"),
             jpeg(0, 10),
+            *(jpeg(65_535, 65_535, bytes([255, other, 0, 10, 8, 0, 1, 0, 1, 0, 0, 0])) for other in NO_FRAMES),
             b"GIF89a" + bytes(100),
             b"",
             b"\xff\xd8" + b"\xff" * 100,

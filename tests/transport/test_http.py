@@ -243,6 +243,15 @@ def test_a_page_in_a_browser_is_not_answered(
     assert ("message" in answer.json().get("error", {})) == (status == 403)
 
 
+@pytest.mark.parametrize(("options", "status"), [({}, 404), ({"api_docs": True}, 200)])
+def test_the_pages_of_fastapi_are_served_on_request_only(
+    handler: RecordingHandler, options: dict[str, bool], status: int
+) -> None:
+    with served(wiring_of("http", **options), handler) as (server, _):
+        for page in ("/openapi.json", "/docs", "/redoc"):
+            assert httpx.get(server.address + page).status_code == status
+
+
 def test_best_effort_and_binary_share_a_server_and_as_deployed_has_its_own() -> None:
     deployed, best_effort, binary = (one_pipeline(f"http/{name}").server for name in native.PATHS)
     assert deployed != best_effort == binary

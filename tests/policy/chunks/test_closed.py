@@ -16,6 +16,7 @@ from s2a_bench.policy.chunks.aggregate import Aggregate
 from s2a_bench.policy.chunks.append import Queue, Streamed, Sync
 from s2a_bench.policy.chunks.closed import (
     Closed,
+    appended,
     mean_reaction_s,
     replace_stall_share,
     slack_ticks,
@@ -401,3 +402,9 @@ def test_a_fixed_estimate_makes_the_robot_jump_by_its_error(
 )
 def test_where_no_closed_form_holds_none_is_told(name: str, latency: int) -> None:
     assert mode(name).closed_form(constant(latency * PERIOD), ControlSetting(PERIOD, 16)) == Closed()
+
+
+def test_appended_chunks_have_a_closed_form_while_answers_come_within_a_cycle() -> None:
+    ready = np.array([2, 3])
+    assert appended(ready, ready + 4, 0, 4) != Closed()
+    assert appended(ready, ready + 5, 0, 4) == Closed()
