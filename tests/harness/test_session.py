@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -78,7 +79,7 @@ def test_the_link_to_a_server_of_another_machine_is_unknown(
 ) -> None:
     cell = one_pipeline(transport, **address)
     with ExitStack() as stack:
-        servers = ServerSet([cell], resolve(RequestsConfig()).servers, stack, tmp_path)
+        servers = ServerSet(replace(resolve(RequestsConfig()), cells=(cell,)), stack, tmp_path)
         servers.start()
         assert servers.origin(cell).link == link
 
