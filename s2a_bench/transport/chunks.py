@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -11,15 +12,28 @@ from s2a_bench.types import Action, Vector
 
 NUMBERS: Final = 1 << 20
 """More than any chunk has."""
+BATCHED: Final = 3
+"""Axes of a batch of chunks, of which one chunk is taken."""
 
 
 def actions_of(values: Any, first: int = 0) -> list[Action]:
-    """Return the actions of an array (H, D), or the one of (D,), counted from tick ``first``.
+    """Return the actions of an array (H, D) or (1, H, D), or the one of (D,), counted from tick ``first``.
 
-    Raises RequestFailed unless the values are finite numbers of that shape: they may move a robot.
+    A map of arrays has the parts of each action, which are put side by side in the map's order; those whose names
+    begin with ``action`` if there are any. Raises RequestFailed unless the values are finite numbers of that shape:
+    they may move a robot.
     """
-    rows = _numbers("actions", values, (1, 2))
+    rows = _side_by_side(values) if isinstance(values, Mapping) else _numbers("actions", values, (1, 2))
     return [Action(first + tick, row) for tick, row in enumerate(np.atleast_2d(rows))]
+
+
+def _side_by_side(parts: Mapping[Any, Any]) -> Vector:
+    named = {name: part for name, part in parts.items() if str(name).startswith("action")} or parts
+    rows = [_numbers(f"action '{str(name)[:40]}'", part, (1, 2)) for name, part in named.items()]
+    if len({len(part) for part in rows}) != 1:
+        shapes = ", ".join(f"{str(name)[:40]} {part.shape}" for name, part in zip(named, rows, strict=True))
+        raise RequestFailed(f"parts of actions that are of one length: there are {shapes or 'none'}")
+    return np.concatenate([part.reshape(len(part), -1) for part in rows], axis=1)
 
 
 def state_of(values: Any) -> tuple[float, ...]:
@@ -37,6 +51,8 @@ def _numbers(what: str, values: Any, dimensions: tuple[int, ...]) -> Vector:
         array = np.asarray(values)
     except (ValueError, TypeError, OverflowError) as error:
         raise RequestFailed(f"{what}: no array of numbers: {error}") from error
+    if array.ndim == BATCHED and len(array) == 1:
+        array = array[0]
     if array.ndim not in dimensions or not array.size or array.dtype.kind not in "fiu":
         shape = "(H, D)" if max(dimensions) > 1 else "(D,)"
         raise RequestFailed(f"{what}: shape {array.shape} and type {array.dtype}, not numbers of shape {shape}")

@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from s2a_bench.errors import EngineError, RequestFailed
 from s2a_bench.transport.chunks import actions_of
@@ -73,12 +72,7 @@ def actions_in(answer: Any) -> list[Action]:
     actions = answer[0] if isinstance(answer, list) and answer else answer
     if not isinstance(actions, dict):
         raise RequestFailed(f"actions should be a map of arrays, not {type(actions).__name__}")
-    named = {name: part for name, part in actions.items() if str(name).startswith("action")} or actions
-    rows = [_rows(name, part) for name, part in named.items()]
-    if len({len(part) for part in rows}) != 1:
-        shapes = ", ".join(f"{str(name)[:40]} {part.shape}" for name, part in zip(named, rows, strict=True))
-        raise RequestFailed(f"parts of actions that are of one length: there are {shapes or 'none'}")
-    return actions_of(rows[0] if len(rows) == 1 else np.concatenate(rows, axis=1))
+    return actions_of(actions)
 
 
 def modalities(layout: str) -> dict[str, Any]:
@@ -100,16 +94,3 @@ def _batched(flat: Mapping[Any, Any]) -> bool:
     arrays = {str(key): value.ndim for key, value in flat.items() if isinstance(value, np.ndarray)}
     states = [axes for key, axes in arrays.items() if "state" in key]
     return min(states) > STATE_AXES if states else any(axes > PICTURE_AXES for axes in arrays.values())
-
-
-def _rows(name: Any, part: Any) -> NDArray[Any]:
-    """Return one part of the actions as (H, D)."""
-    try:
-        array = np.asarray(part)
-    except (ValueError, TypeError, OverflowError) as error:
-        raise RequestFailed(f"action '{name}' is no array: {error}") from error
-    if array.ndim == 3 and len(array) == 1:  # noqa: PLR2004 - a batch of one
-        array = array[0]
-    if array.dtype.kind not in "fiu" or array.ndim not in {1, 2} or not array.size:
-        raise RequestFailed(f"action '{name}' of shape {array.shape} and type {array.dtype}, not numbers (H, D)")
-    return array.reshape(len(array), -1)
