@@ -72,7 +72,11 @@ def loads(text: str, where: str, parse_float: Callable[[str], Any] = float) -> d
 
 def parse(table: type[T], text: str, where: str, parse_float: Callable[[str], Any] = float) -> T:
     """Read TOML text as a table; ``where`` begins every error. Raises UsageError naming the key that is wrong."""
-    content = loads(text, where, parse_float)
+    return checked(table, loads(text, where, parse_float), where)
+
+
+def checked(table: type[T], content: Any, where: str) -> T:
+    """Return what was read of TOML or JSON as a table; raises UsageError as `parse` does."""
     try:
         return table.model_validate(content)
     except ValidationError as error:

@@ -5,12 +5,15 @@ It holds the nested dictionary that the policy expects. These texts in it are pl
 - ``"{image}"``, ``"{image:1}"``: the first, the second picture, uint8 (H, W, 3) RGB. ``"{image:0|CHW}"`` is
   (3, H, W), ``"{image:0|bytes}"`` the bytes of its file, if pictures are sent as JPEG or PNG.
 - ``"{state}"``, ``"{state:0:7}"``, ``"{state:7:}"``: the robot's state, float32 (D,), or a slice of it.
-- ``{prompt}``, also within a text: ``"Task: {prompt}"``. Any other brace is written twice.
+- ``"{images}"``: all pictures of the request, as a list.
+- ``{prompt}``, also within a text: ``"Task: {prompt}"``; ``{session}``, an identifier that every client draws once. Any
+  other brace is written twice.
 
 A list of arrays becomes one array with one more axis in front: ``[["{image}"]]`` is (1, 1, H, W, 3) and
 ``["{image:0}", "{image:1}"]`` is (2, H, W, 3), while ``[["{prompt}"]]`` stays a list of lists of text. A key that ends
 with ``?`` is optional: it is left out if the request lacks the picture or the numbers of its value. All other values
-are constants. The files in ``templates`` beside this module are known by name.
+are constants. The table `EXTENSION` is no part of the observation: it describes the server, as `ExternalServer`
+reads it. The files in ``templates`` beside this module are known by name.
 
 `PolicyTransport` is the base of transports whose observations are made from a template.
 """
@@ -23,15 +26,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, NoReturn, TypeAlias, TypeVar
+from uuid import uuid4
 
 import numpy as np
-from pydantic import AfterValidator
+from pydantic import AfterValidator, Field
 
 from s2a_bench import extras, toml_file
 from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.text import none_of, read_text
 from s2a_bench.transport import ACTIONS, Capabilities, Choice, Transport
 from s2a_bench.transport.listening import ListeningOptions, read_key
+from s2a_bench.transport.observed import EXTENSION
 from s2a_bench.types import Pixels, Vector
 
 TEMPLATES: Final = Path(__file__).with_name("templates")
@@ -43,10 +48,10 @@ STATE: Final = 10**6
 WHOLE: Final = range(-(1 << 63), 1 << 64)
 
 _PLACE = re.compile(
-    r"\{(?:(?P<picture>image)(?::(?P<image>\d{1,3}))?(?:\|(?P<form>\w+))?"
+    r"\{(?:(?P<all>images)|(?P<picture>image)(?::(?P<image>\d{1,3}))?(?:\|(?P<form>\w+))?"
     r"|state(?::(?P<start>\d{0,6}):(?P<stop>\d{0,6}))?)\}"
 )
-_IN_TEXT = re.compile(r"\{\{|\}\}|\{prompt\}|[{}]")
+_IN_TEXT = re.compile(r"\{\{|\}\}|\{prompt\}|\{session\}|[{}]")
 _BRACES = {"{{": "{", "}}": "}"}
 _FORMS = (None, "CHW", "bytes")
 
@@ -65,11 +70,25 @@ class _Values:
 _Make: TypeAlias = Callable[[_Values], Any]
 
 
+class ExternalServer(toml_file.TomlTable):
+    """How a policy server differs from openpi's, the table `EXTENSION` of a template."""
+
+    path: Annotated[str, Field(max_length=200, pattern=r"^(/[\w.~/-]*)?$")] = ""
+    """Path of its address, where `url` has none."""
+    answer: Annotated[str, Field(max_length=200)] = "actions"
+    """Keys that lead to the actions of an answer, joined by dots; empty if the answer is the actions."""
+    reset: dict[str, Any] | None = None
+    """Message that begins a session: sent on each connection before the first observation, and answered by one."""
+    idle_s: Annotated[float, Field(ge=1, le=3600)] | None = None
+    """Silence after which it closes a connection, in seconds; it skips an empty message, which ends a silence."""
+
+
 class Template:
     """The template of one policy's observations."""
 
     def __init__(self, content: Any, name: str) -> None:
         self.name = name
+        self._session = uuid4().hex
         self.pictures = 0
         """Number of pictures that it has placeholders for."""
         self.accepts_state = False
@@ -78,7 +97,9 @@ class Template:
         self._values = 0
         if not isinstance(content, Mapping):
             raise UsageError(f"`template` {name} should be a table of keys, not {type(content).__name__}")
-        self._make = self._table(content, "", 0)
+        server = content.get(EXTENSION, {})
+        self.server = toml_file.checked(ExternalServer, server, f"`template` {name}: {EXTENSION}")
+        self._make = self._table({key: value for key, value in content.items() if key != EXTENSION}, "", 0)
 
     def fill(self, pictures: Sequence[Pixels], state: Sequence[float], prompt: str) -> dict[str, Any]:
         """Return the observation, if possible without copies of ``pictures``, uint8 (H, W, 3) or (n,).
@@ -104,6 +125,11 @@ class Template:
         if why:
             other = f"use `cameras` {self.pictures}, or another template" if self.pictures else "use another template"
             raise UsageError(f"`cameras`: {cameras} a request, and `template` {self.name} {why}; {other}")
+
+    def check_server(self, transport: str) -> None:
+        """Refuse a description of the server, which ``transport`` does not read."""
+        if self.server != ExternalServer():
+            raise UsageError(f"`template` {self.name}: {transport} does not read its table {EXTENSION}; leave it out")
 
     def _refuse(self, path: str, why: str) -> NoReturn:
         raise UsageError(f"`template` {self.name}: {path or 'it'} {why}")
@@ -163,14 +189,27 @@ class Template:
         if not _is_text(text):
             self._refuse(path, "is no Unicode text")
         if place := _PLACE.fullmatch(text):
+            if place["all"]:
+                return self._pictures(path)
             if place["picture"]:
                 return self._picture(path, int(place["image"] or 0), place["form"])
             return self._state(path, place["start"] or "", place["stop"] or "")
         for brace in _IN_TEXT.finditer(text):
             if brace[0] in {"{", "}"}:
-                places = "{image}, {image:1}, {image:0|CHW}, {state}, {state:0:7}, {prompt}"
+                places = "{image}, {image:1}, {image:0|CHW}, {images}, {state}, {state:0:7}, {prompt}, {session}"
                 self._refuse(path, f"has a brace that is no place: {text!r}; there are {places}, and {{{{ for a brace")
-        return lambda values: _IN_TEXT.sub(lambda brace: _BRACES.get(brace[0], values.prompt), text)
+        known = {**_BRACES, "{session}": self._session}
+        return lambda values: _IN_TEXT.sub(lambda brace: known.get(brace[0], values.prompt), text)
+
+    def _pictures(self, path: str) -> _Make:
+        self.pictures = CAMERAS
+
+        def make(values: _Values) -> list[Pixels]:
+            if not values.pictures:
+                raise _Missing(f"{path} wants pictures, and the request has none")
+            return list(values.pictures)
+
+        return make
 
     def _picture(self, path: str, index: int, form: str | None) -> _Make:
         if index >= CAMERAS or form not in _FORMS:
@@ -270,6 +309,8 @@ class PolicyTransport(Transport[P]):
     payloads: ClassVar[tuple[str, ...]] = ("raw", "jpeg", "jpeg-preencoded", "png")
     answer_kinds = (ACTIONS,)
     stages: ClassVar[Mapping[str, str]] = {"msgpack_pack": "pack", "msgpack_parse": "parse"}
+    reads_server: ClassVar[bool] = False
+    """Whether a template may describe the server."""
     modules: ClassVar[tuple[str, ...]]
     """Modules that the extra of its name installs."""
 
@@ -282,5 +323,8 @@ class PolicyTransport(Transport[P]):
     def require(self, choice: Choice[P]) -> None:
         """Refuse a missing key, and a template for other pictures; raises MissingExtra too."""
         extras.need(self.name, *self.modules)
-        template_of(choice.options.template_name).check_pictures(choice.cameras)
+        template = template_of(choice.options.template_name)
+        template.check_pictures(choice.cameras)
+        if not self.reads_server:
+            template.check_server(self.name)
         read_key(choice.options.api_key_env)

@@ -53,6 +53,16 @@ def test_other_lists_and_values_stay_what_they_are() -> None:
     assert filled(content, ()) == {**content, "language": [["go"]]}
 
 
+def test_all_pictures_are_a_list_and_a_session_is_of_one_client() -> None:
+    content = {"views?": "{images}", "id": "{session}"}
+    assert filled(content)["views"] == [FIRST, SECOND]
+    assert set(filled(content, ())) == {"id"}
+    template = Template(content, "mine")
+    assert template.fill((), (), "")["id"] == template.fill((), (), "go")["id"]
+    assert len(template.fill((), (), "")["id"]) == 32
+    assert template.fill((), (), "") != Template(content, "mine").fill((), (), "")
+
+
 def test_a_prompt_stands_within_a_text_and_is_not_read_again() -> None:
     assert filled({"p": "Task: {prompt}; {{json}}"}, (), prompt="{image}")["p"] == "Task: {image}; {json}"
 
@@ -113,6 +123,10 @@ def deep() -> Any:
         ({"a": "\ud800"}, "a is no Unicode text"),
         ({"a": [0] * 2000}, "exceeds the limits of a template"),
         (deep(), "exceeds the limits of a template"),
+        ({"s2a": {"anser": "x"}}, "s2a: anser: there is no such key; did you mean answer"),
+        ({"s2a": {"path": "no/slash"}}, "s2a: path: 'no/slash' should match pattern"),
+        ({"s2a": {"idle_s": 0}}, "s2a: idle_s: 0 should be greater than or equal to 1"),
+        ({"s2a": {"reset": "x"}}, "s2a: reset: 'x' should be a table"),
     ],
 )
 def test_a_template_that_makes_no_sense_is_refused_with_the_key(content: Any, says: str) -> None:

@@ -75,7 +75,9 @@ class Grpc(Transport[GrpcOptions]):
                 "`pretrained`: lerobot's server loads what its client names; give `policy_type` and `pretrained`"
             )
         extras.need(LEROBOT, *PACKAGES)
-        template_of(options.template).check_pictures(choice.cameras)
+        template = template_of(options.template)
+        template.check_pictures(choice.cameras)
+        template.check_server(self.name)
 
 
 GRPC = Grpc()

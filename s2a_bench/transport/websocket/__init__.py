@@ -50,6 +50,7 @@ class Websocket(PolicyTransport[WebsocketOptions]):
     variants = VARIANTS
     urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.transport.websocket.risks:examine")
     modules = PACKAGES
+    reads_server = True
     compared_with = ("ros", "loopback")
     facts = (PAYLOAD_BYTES, RECONNECTS, INFER_MS, PREV_TOTAL_MS)
     order = 20

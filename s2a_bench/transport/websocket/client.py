@@ -10,6 +10,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
 from math import isfinite
 from typing import Any
+from urllib.parse import urlsplit, urlunsplit
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from s2a_bench.transport import Wiring, observed
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.observation import template_of
+from s2a_bench.transport.observation import ExternalServer, template_of
 from s2a_bench.transport.pictures import policy_picture
 from s2a_bench.transport.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
 from s2a_bench.transport.websocket.codec import packb, unpackb
@@ -43,8 +44,11 @@ class WebsocketClient:
         self._wiring, self._alive = wiring, alive
         self._native = not wiring.black_box
         self._streams = wiring.variant == STREAM
-        self._url = wiring.address + (STREAM_PATH if self._native and self._streams else "")
         self._template = template_of(wiring.options.template)
+        self._server = ExternalServer() if self._native else self._template.server
+        self._url = _with_path(wiring.address, self._server.path)
+        if self._native and self._streams:
+            self._url += STREAM_PATH
         key = read_key(wiring.options.api_key_env)
         self._headers = {"Authorization": f"{codec.SCHEME} {key}"} if key else {}
         if self._native:
@@ -98,9 +102,17 @@ class WebsocketClient:
 
     def _connected(self, bounds: Bounds) -> BoundedConnection:
         self._link = None
-        self._link = BoundedConnection(self._url, self._headers, bounds, self._wiring.timeout_s)
-        self._greeted(self._link)
-        return self._link
+        link = BoundedConnection(self._url, self._headers, bounds, self._wiring.timeout_s, self._server.idle_s)
+        try:
+            self._greeted(link)
+            if self._server.reset is not None:
+                link.send(packb(self._server.reset))
+                self._check(unpackb(self._message(link)))
+        except BaseException:
+            link.close()
+            raise
+        self._link = link
+        return link
 
     def _exchanged(self, link: BoundedConnection, body: bytes, trace: Trace) -> tuple[bytes, int]:
         packed_ns = trace.marks[-1][1]
@@ -120,9 +132,30 @@ class WebsocketClient:
         """Return the next binary message; a text is an error."""
         message = link.receive()
         if isinstance(message, str):
-            error_text = " ".join(struck(message).split())
-            raise RequestFailed(f"{self._url}: {error_text[-QUOTED:] or 'an error without words'}")
+            raise self._failed(message)
         return message
+
+    def _failed(self, text: str) -> RequestFailed:
+        return RequestFailed(f"{self._url}: {' '.join(struck(text).split())[-QUOTED:] or 'an error without words'}")
+
+    def _check(self, answer: Any) -> None:
+        """Raise the error that an answer is, in the server's words."""
+        reason = answer.get(codec.ERROR) if isinstance(answer, dict) else None
+        if _kind(answer) == codec.ERROR or (isinstance(reason, (str, dict)) and reason):
+            while isinstance(answer, dict):
+                answer = next((answer[key] for key in codec.ERROR_KEYS if key in answer), "")
+            if isinstance(answer, str):
+                raise self._failed(answer)
+
+    def _actions_in(self, answer: Any) -> list[Action]:
+        """Return the actions of a message, from where the server puts them."""
+        self._check(answer)
+        found = answer
+        for key in filter(None, self._server.answer.split(".")):
+            if not isinstance(found, dict) or key not in found:
+                raise RequestFailed(f"{self._url}: an answer without {self._server.answer}: {_keys(found)}")
+            found = found[key]
+        return actions_of(found)
 
     def _answer(self, message: bytes, packed_ns: int, trace: Trace) -> Generator[Action, None, None]:
         """Yield the actions of an answer; after the last, complete the trace."""
@@ -130,10 +163,8 @@ class WebsocketClient:
         count, first_ns = 0, 0
         while True:
             answer = unpackb(message)
-            if not isinstance(answer, dict) or codec.ACTIONS not in answer:
-                raise RequestFailed(f"{self._url}: an answer without {codec.ACTIONS}: {_keys(answer)}")
-            last = not self._streams or answer.get(codec.TYPE) != codec.PARTIAL
-            actions = actions_of(answer[codec.ACTIONS])
+            actions = self._actions_in(answer)
+            last = not self._streams or _kind(answer) != codec.PARTIAL
             if not last:
                 actions = [Action(count + index, action.values) for index, action in enumerate(actions)]
             elif count > len(actions):
@@ -146,7 +177,7 @@ class WebsocketClient:
             if last:
                 break
             message = self._message(self._link)
-        self._learn(answer.get(codec.TIMING), trace)
+        self._learn(answer.get(codec.TIMING) if isinstance(answer, dict) else None, trace)
         if self._native:
             trace.receive(observed.remote_of(unpackb(self._message(self._link))))
         self._mark(trace, packed_ns, first_ns)
@@ -178,6 +209,18 @@ class WebsocketClient:
         if self._link is not None:
             self._link.close(orderly=True)
             self._link = None
+
+
+def _with_path(url: str, path: str) -> str:
+    """Return a URL that has no path with ``path``, any other as it is."""
+    parts = urlsplit(url)
+    return url if parts.path.strip("/") or not path else urlunsplit(parts._replace(path=path))
+
+
+def _kind(answer: Any) -> str:
+    """Return the type that a message states, if any."""
+    kind = answer.get(codec.TYPE) if isinstance(answer, dict) else None
+    return kind if isinstance(kind, str) else ""
 
 
 def _plain(value: Any) -> Any:

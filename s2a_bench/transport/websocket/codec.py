@@ -26,6 +26,9 @@ SCHEME: Final = "Api-Key"
 HEALTH: Final = "/healthz"
 ACTIONS, TYPE, TIMING, INDICES = "actions", "type", "server_timing", "action_indices"
 PARTIAL, FINAL = "partial", "final"
+ERROR = "error"
+ERROR_KEYS: Final = ("message", ERROR, "payload")
+"""Keys under which servers describe an error in a binary message, some of them nested."""
 QUIET: Final = logging.getLogger("s2a_bench.websocket")
 """websockets' logger, silenced: our errors report the same."""
 QUIET.addHandler(logging.NullHandler())

@@ -6,6 +6,8 @@ import socket
 import ssl
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
+from threading import Event, Thread
+from time import monotonic
 from typing import Any, Final
 
 from websockets.client import ClientProtocol
@@ -48,9 +50,15 @@ class _Counted(ClientConnection):
 class BoundedConnection:
     """One connection to one server."""
 
-    def __init__(self, url: str, headers: Mapping[str, str], bounds: Bounds, timeout_s: float) -> None:
-        """Connect and shake hands; raises ServerDied, RequestFailed, TransportError."""
+    def __init__(
+        self, url: str, headers: Mapping[str, str], bounds: Bounds, timeout_s: float, idle_s: float | None = None
+    ) -> None:
+        """Connect and shake hands; raises ServerDied, RequestFailed, TransportError.
+
+        Empty messages keep the connection open if the server closes it after ``idle_s`` without a message.
+        """
         self._url, self._timeout_s = url, timeout_s
+        self._sent_s, self._closed = monotonic(), Event()
         try:
             uri = parse_uri(url)
         except (InvalidURI, ValueError) as error:
@@ -65,6 +73,15 @@ class BoundedConnection:
         except BaseException:
             self.close()
             raise
+        if idle_s:
+            Thread(target=self._keep_open, args=(idle_s / 3,), daemon=True).start()
+
+    def _keep_open(self, third_s: float) -> None:
+        """Send an empty message after each ``third_s`` without a message of ours."""
+        with suppress(OSError, ConnectionClosed):
+            while not self._closed.wait(third_s):
+                if monotonic() - self._sent_s >= third_s:
+                    self._connection.send(b"")
 
     def _connected(self, bounds: Bounds, host: str, port: int, *, secure: bool) -> socket.socket:
         timeout_s = min(self._timeout_s, bounds.left_s())
@@ -96,6 +113,7 @@ class BoundedConnection:
         with self._in_time() as seconds:
             self._connection.socket.settimeout(seconds)
             self._connection.send(message)
+            self._sent_s = monotonic()
 
     def receive(self) -> bytes | str:
         """Wait for one message, a text or bytes; raises Broken, RequestFailed."""
@@ -134,6 +152,7 @@ class BoundedConnection:
 
     def close(self, *, orderly: bool = False) -> None:
         """Close, where it is ``orderly`` with a word, for which the server has a second; may be called twice."""
+        self._closed.set()
         if orderly:
             self._connection.close()
         self._connection.close_socket()
