@@ -75,6 +75,10 @@ class ExternalServer(toml_file.TomlTable):
 
     path: Annotated[str, Field(max_length=200, pattern=r"^(/[\w.~/-]*)?$")] = ""
     """Path of its address, where `url` has none."""
+    greets: bool = True
+    """Whether the first message of a connection is its description."""
+    text_keys: bool = False
+    """Whether the keys of an array's map are texts, not bytes."""
     answer: Annotated[str, Field(max_length=200)] = "actions"
     """Keys that lead to the actions of an answer, joined by dots; empty if the answer is the actions."""
     reset: dict[str, Any] | None = None

@@ -25,7 +25,7 @@ REQUEST = Request("a", "go", (yuyv_frame(64, 48, 1), yuyv_frame(64, 48, 2)), sta
 
 
 @contextmanager
-def relative(answer: Callable[[Any], Any]) -> Iterator[tuple[str, list[Any]]]:
+def relative(answer: Callable[[Any], Any], *, greets: bool = True, **packing: bool) -> Iterator[tuple[str, list[Any]]]:
     """A server that answers each message by a function: its address, and the paths and messages that came.
 
     An empty message has no answer.
@@ -34,11 +34,12 @@ def relative(answer: Callable[[Any], Any]) -> Iterator[tuple[str, list[Any]]]:
 
     def handle(socket: Any) -> None:
         heard.append(socket.request.path)
-        socket.send(packb({"model": "pi0"}))
+        if greets:
+            socket.send(packb({"model": "pi0"}))
         for message in socket:
             heard.append(unpackb(message) if message else b"")
             if message:
-                socket.send(packb(answer(heard[-1])))
+                socket.send(packb(answer(heard[-1]), **packing))
 
     with serve(handle, "127.0.0.1", 0, compression=None, max_size=None) as server:
         thread = Thread(target=server.serve_forever)
@@ -109,6 +110,18 @@ def test_starvla_has_an_envelope_in_both_directions() -> None:
     assert (example["lang"], example["state"].tolist()) == ("go", [0.5, 1.0])
 
 
+def test_vla_eval_is_greeted_and_has_texts_as_the_keys_of_an_array() -> None:
+    def answer(message: Any) -> Any:
+        return {**message, "payload": {"actions": CHUNK[0]} if message["type"] == "observation" else {}}
+
+    with relative(answer, greets=False, text_keys=True) as (address, heard):
+        np.testing.assert_array_equal(asked(address, "vla-eval"), CHUNK[:1])
+    _, hello, observation = heard
+    assert (hello["type"], hello["payload"]) == ("hello", {"protocol_version": 1})
+    assert observation["payload"]["images"]["wrist"].shape == (48, 64, 3)
+    assert observation["payload"]["task_description"] == "go"
+
+
 @pytest.mark.parametrize(
     ("template", "answer", "says"),
     [
@@ -149,7 +162,7 @@ def test_a_connection_whose_reset_fails_is_not_used() -> None:
     assert [each for each in heard if isinstance(each, dict)] == [{"endpoint": "reset"}] * 2
 
 
-@pytest.mark.parametrize("template", ["vllm-omni", "sglang", "starvla"])
+@pytest.mark.parametrize("template", ["vllm-omni", "sglang", "starvla", "vla-eval"])
 def test_our_own_server_is_asked_as_always(template: str) -> None:
     handler = RecordingHandler(list(CHUNK))
     wiring = wiring_of("websocket", template=template, payload="raw")

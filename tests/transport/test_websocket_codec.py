@@ -89,6 +89,16 @@ def test_bytes_that_are_no_message_are_refused_in_a_line(name: str) -> None:
     assert len(str(failed.value)) < 300
 
 
+def test_the_keys_of_an_array_may_be_texts() -> None:
+    array = np.arange(6, dtype=np.int16).reshape(2, 3)
+    packed = packb({"a": array}, text_keys=True)
+    plain = msgpack.unpackb(packed)["a"]
+    assert plain == {"__ndarray__": True, "data": array.tobytes(), "dtype": "<i2", "shape": [2, 3]}
+    np.testing.assert_array_equal(unpackb(packed)["a"], array)
+    with pytest.raises(RequestFailed, match="does not travel"):
+        unpackb(msgpack.packb({**plain, "dtype": "|O"}))
+
+
 def test_a_number_beyond_its_type_is_infinite() -> None:
     assert np.isinf(unpackb(generic(1e300, "<f4")))
 

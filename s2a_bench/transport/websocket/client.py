@@ -83,7 +83,7 @@ class WebsocketClient:
         observation = self._template.fill(pictures, request.state, request.prompt)
         if self._native:
             observation[observed.EXTENSION] = observed.extension_of(request)
-        body = packb(observation)
+        body = packb(observation, text_keys=self._server.text_keys)
         trace.mark("msgpack_pack")
         trace.facts[PAYLOAD_BYTES] = len(body)
         return body
@@ -104,7 +104,8 @@ class WebsocketClient:
         self._link = None
         link = BoundedConnection(self._url, self._headers, bounds, self._wiring.timeout_s, self._server.idle_s)
         try:
-            self._greeted(link)
+            if self._server.greets:
+                self._greeted(link)
             if self._server.reset is not None:
                 link.send(packb(self._server.reset))
                 self._check(unpackb(self._message(link)))

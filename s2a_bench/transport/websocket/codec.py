@@ -1,8 +1,9 @@
 """openpi's keys, and MessagePack with NumPy's arrays as it writes them, byte for byte.
 
 An array is the map ``{b"__ndarray__": True, b"data": bytes, b"dtype": text, b"shape": [...]}``, one of NumPy's numbers
-``{b"__npgeneric__": True, b"data": its value, b"dtype": text}``. Arrays are of numbers and texts: no objects (dtype
-kind O), no records (V), no complex numbers (c), which openpi refuses too.
+``{b"__npgeneric__": True, b"data": its value, b"dtype": text}``. The keys of an array may be texts, as vla-eval has
+them. Arrays are of numbers and texts: no objects (dtype kind O), no records (V), no complex numbers (c), which openpi
+refuses too.
 
 Our client says who it is in a header of its handshake, `MARKS_HEADER`. Then its observations have what
 `transport.observed` adds, and each answer is followed by one more frame with the server's marks.
@@ -43,10 +44,13 @@ _PLAIN: Final = {"b": (bool,), "i": (int,), "u": (int,), "f": (float, int), "S":
 """Kind of a dtype -> the types of one value of it."""
 
 
-def packb(value: Any) -> bytes:
-    """Write a message; raises RequestFailed for an array that no policy server takes, or a value that is none."""
+def packb(value: Any, *, text_keys: bool = False) -> bytes:
+    """Write a message, the keys of its arrays as bytes or as texts.
+
+    Raises RequestFailed for an array that no policy server takes, or a value that is none.
+    """
     try:
-        packed: bytes = msgpack.packb(value, default=_packable)
+        packed: bytes = msgpack.packb(value, default=_text_keyed if text_keys else _packable)
     except (TypeError, ValueError, OverflowError) as error:
         raise RequestFailed(f"a message that MessagePack cannot carry: {error}") from error
     return packed
@@ -66,12 +70,18 @@ def _packable(value: Any) -> Any:
     return {ARRAY: True, b"data": data, b"dtype": value.dtype.str, b"shape": value.shape}
 
 
+def _text_keyed(value: Any) -> Any:
+    return {key if isinstance(key, str) else key.decode(): each for key, each in _packable(value).items()}
+
+
 def unpackb(data: bytes | bytearray | memoryview) -> Any:
     """Read a message, whose arrays are read-only views of their bytes; raises RequestFailed for any other bytes."""
     return unpacked(data, _of_map)
 
 
 def _of_map(value: dict[Any, Any]) -> Any:
+    if ARRAY.decode() in value:
+        value = {key.encode() if isinstance(key, str) else key: each for key, each in value.items()}
     if ARRAY in value:
         return array_in(value.get(b"data"), value.get(b"shape"), _dtype(value))
     return _generic(value) if GENERIC in value else value
