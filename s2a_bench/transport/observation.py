@@ -36,11 +36,12 @@ from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.text import none_of, read_text
 from s2a_bench.transport import ACTIONS, Capabilities, Choice, Transport
 from s2a_bench.transport.listening import ListeningOptions, read_key
-from s2a_bench.transport.observed import EXTENSION
 from s2a_bench.types import Pixels, Vector
 
 TEMPLATES: Final = Path(__file__).with_name("templates")
 DEFAULT: Final = "openpi"
+EXTENSION: Final = "s2a"
+"""Key that no observation has."""
 FILE_LETTERS, VALUES, DEPTH, CAMERAS = 1 << 16, 1024, 16, 64
 """The most of a template: bytes, values, nested dictionaries and lists, pictures."""
 STATE: Final = 10**6
@@ -79,12 +80,23 @@ class ExternalServer(toml_file.TomlTable):
     """Whether the first message of a connection is its description."""
     text_keys: bool = False
     """Whether the keys of an array's map are texts, not bytes."""
+    arrays_as_text: bool = False
+    """Whether each array is a text that is JSON, within the JSON of the observation."""
     answer: Annotated[str, Field(max_length=200)] = "actions"
     """Keys that lead to the actions of an answer, joined by dots; empty if the answer is the actions."""
     reset: dict[str, Any] | None = None
     """Message that begins a session: sent on each connection before the first observation, and answered by one."""
     idle_s: Annotated[float, Field(ge=1, le=3600)] | None = None
     """Silence after which it closes a connection, in seconds; it skips an empty message, which ends a silence."""
+
+    def actions_in(self, answer: Any) -> Any:
+        """Return the actions of an answer, as the server has them; raises RequestFailed for an answer without."""
+        found = answer
+        for key in filter(None, self.answer.split(".")):
+            if not isinstance(found, dict) or key not in found:
+                raise RequestFailed(f"an answer without {self.answer}: {_keys(found)}")
+            found = found[key]
+        return found
 
 
 class Template:
@@ -130,10 +142,10 @@ class Template:
             other = f"use `cameras` {self.pictures}, or another template" if self.pictures else "use another template"
             raise UsageError(f"`cameras`: {cameras} a request, and `template` {self.name} {why}; {other}")
 
-    def check_server(self, transport: str) -> None:
-        """Refuse a description of the server, which ``transport`` does not read."""
-        if self.server != ExternalServer():
-            raise UsageError(f"`template` {self.name}: {transport} does not read its table {EXTENSION}; leave it out")
+    def check_server(self, transport: str, reads: Sequence[str]) -> None:
+        """Refuse a description of the server of which ``transport`` does not read all, only the keys ``reads``."""
+        if unread := [f"{EXTENSION}.{key}" for key in self.server.model_fields_set if key not in reads]:
+            raise UsageError(f"`template` {self.name}: {transport} does not read {min(unread)}; leave it out")
 
     def _refuse(self, path: str, why: str) -> NoReturn:
         raise UsageError(f"`template` {self.name}: {path or 'it'} {why}")
@@ -280,20 +292,25 @@ def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return table
 
 
+def _keys(answer: Any) -> str:
+    keys = ", ".join(str(key)[:40] for key in list(answer)[:8]) if isinstance(answer, dict) else type(answer).__name__
+    return keys or "nothing"
+
+
 def _is_text(text: str) -> bool:
     return not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def _readable(name: str) -> str:
     try:
-        template_of(name)
+        template_of(name or DEFAULT)
     except UsageError as error:
         raise ValueError(str(error).removeprefix("`template`").lstrip(": ")) from None
     return name
 
 
 TemplateName = Annotated[str, AfterValidator(_readable)]
-"""Name or path of a readable template."""
+"""Name or path of a readable template, empty for the transport's own."""
 
 
 class PolicyOptions(ListeningOptions):
@@ -313,8 +330,8 @@ class PolicyTransport(Transport[P]):
     payloads: ClassVar[tuple[str, ...]] = ("raw", "jpeg", "jpeg-preencoded", "png")
     answer_kinds = (ACTIONS,)
     stages: ClassVar[Mapping[str, str]] = {"msgpack_pack": "pack", "msgpack_parse": "parse"}
-    reads_server: ClassVar[bool] = False
-    """Whether a template may describe the server."""
+    reads_server: ClassVar[Sequence[str]] = ()
+    """The keys of `ExternalServer` by which a template may describe the server."""
     modules: ClassVar[tuple[str, ...]]
     """Modules that the extra of its name installs."""
 
@@ -329,6 +346,5 @@ class PolicyTransport(Transport[P]):
         extras.need(self.name, *self.modules)
         template = template_of(choice.options.template_name)
         template.check_pictures(choice.cameras)
-        if not self.reads_server:
-            template.check_server(self.name)
+        template.check_server(self.name, self.reads_server)
         read_key(choice.options.api_key_env)

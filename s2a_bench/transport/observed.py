@@ -21,12 +21,12 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport.chunks import state_of
 from s2a_bench.transport.limits import SEEDS, Limits, check_pixels, text, whole_number
+from s2a_bench.transport.observation import EXTENSION
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.types import Frame, Request
 
 PICTURES, NUMBERS = 64, 4096
 """The most pictures, and numbers of the state, in one request."""
-EXTENSION: Final = "s2a"
 PROMPT: Final = "prompt"
 DEPTH: Final = 32
 COLOURS: Final = 3

@@ -11,8 +11,8 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.convert import encode_png
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport.limits import LIMITS, Limits
+from s2a_bench.transport.observation import EXTENSION
 from s2a_bench.transport.observed import (
-    EXTENSION,
     extension_of,
     read_observation,
     remote_message,

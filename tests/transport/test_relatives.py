@@ -176,5 +176,5 @@ def test_our_own_server_is_asked_as_always(template: str) -> None:
 
 def test_a_description_of_the_server_is_for_websocket_alone() -> None:
     transport = TRANSPORTS["zmq"]
-    with pytest.raises(UsageError, match="`template` starvla: zmq does not read its table s2a; leave it out"):
+    with pytest.raises(UsageError, match=r"`template` starvla: zmq does not read s2a\.answer; leave it out"):
         transport.require(Choice(transport.options(template="starvla"), cameras=2))

@@ -77,7 +77,7 @@ class Grpc(Transport[GrpcOptions]):
         extras.need(LEROBOT, *PACKAGES)
         template = template_of(options.template)
         template.check_pictures(choice.cameras)
-        template.check_server(self.name)
+        template.check_server(self.name, ())
 
 
 GRPC = Grpc()

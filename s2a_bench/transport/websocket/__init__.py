@@ -39,7 +39,7 @@ class WebsocketOptions(WebOptions, PolicyOptions):
 
     @property
     def template_name(self) -> str:
-        return self.template
+        return self.template or DEFAULT
 
 
 class Websocket(PolicyTransport[WebsocketOptions]):
@@ -50,7 +50,7 @@ class Websocket(PolicyTransport[WebsocketOptions]):
     variants = VARIANTS
     urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.transport.websocket.risks:examine")
     modules = PACKAGES
-    reads_server = True
+    reads_server = ("path", "greets", "text_keys", "answer", "reset", "idle_s")
     compared_with = ("ros", "loopback")
     facts = (PAYLOAD_BYTES, RECONNECTS, INFER_MS, PREV_TOTAL_MS)
     order = 20

@@ -24,7 +24,7 @@ from s2a_bench.transport import Wiring, observed
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.observation import ExternalServer, template_of
+from s2a_bench.transport.observation import EXTENSION, ExternalServer, template_of
 from s2a_bench.transport.pictures import policy_picture
 from s2a_bench.transport.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
 from s2a_bench.transport.websocket.codec import packb, unpackb
@@ -44,7 +44,7 @@ class WebsocketClient:
         self._wiring, self._alive = wiring, alive
         self._native = not wiring.black_box
         self._streams = wiring.variant == STREAM
-        self._template = template_of(wiring.options.template)
+        self._template = template_of(wiring.options.template_name)
         self._server = ExternalServer() if self._native else self._template.server
         self._url = _with_path(wiring.address, self._server.path)
         if self._native and self._streams:
@@ -82,7 +82,7 @@ class WebsocketClient:
         pictures = [policy_picture(frame, self._wiring.options.payload, trace) for frame in request.images]
         observation = self._template.fill(pictures, request.state, request.prompt)
         if self._native:
-            observation[observed.EXTENSION] = observed.extension_of(request)
+            observation[EXTENSION] = observed.extension_of(request)
         body = packb(observation, text_keys=self._server.text_keys)
         trace.mark("msgpack_pack")
         trace.facts[PAYLOAD_BYTES] = len(body)
@@ -151,12 +151,7 @@ class WebsocketClient:
     def _actions_in(self, answer: Any) -> list[Action]:
         """Return the actions of a message, from where the server puts them."""
         self._check(answer)
-        found = answer
-        for key in filter(None, self._server.answer.split(".")):
-            if not isinstance(found, dict) or key not in found:
-                raise RequestFailed(f"{self._url}: an answer without {self._server.answer}: {_keys(found)}")
-            found = found[key]
-        return actions_of(found)
+        return actions_of(self._server.actions_in(answer))
 
     def _answer(self, message: bytes, packed_ns: int, trace: Trace) -> Generator[Action, None, None]:
         """Yield the actions of an answer; after the last, complete the trace."""
@@ -229,8 +224,3 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.generic):
         value = value.item()
     return float(value) if type(value) in {int, float} and isfinite(value) else value
-
-
-def _keys(answer: Any) -> str:
-    keys = ", ".join(str(key)[:40] for key in list(answer)[:8]) if isinstance(answer, dict) else type(answer).__name__
-    return keys or "nothing"

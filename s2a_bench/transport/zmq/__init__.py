@@ -34,7 +34,7 @@ class ZmqOptions(PolicyOptions):
         "GR00T's form of observations and arrays: n1.7, n1.6, n1.5; auto: by the marks of the server's configurations",
         side=SERVER,
     )
-    template: TemplateName | Literal[""] = option(
+    template: TemplateName = option(
         "",
         "the observation: a template's name, or a TOML or JSON file [default: that of the layout]",
         names=names,

@@ -22,7 +22,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring, observed
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.observation import template_of
+from s2a_bench.transport.observation import EXTENSION, template_of
 from s2a_bench.transport.pictures import policy_picture
 from s2a_bench.transport.zmq import ZmqOptions, layouts
 from s2a_bench.transport.zmq.npy import PictureFile
@@ -87,7 +87,7 @@ class ZmqClient:
                 yield action
             if self._native:
                 whole = False
-                wanted = {layouts.ENDPOINT: layouts.MARKS, observed.EXTENSION: {"id": request.id}, **self._token()}
+                wanted = {layouts.ENDPOINT: layouts.MARKS, EXTENSION: {"id": request.id}, **self._token()}
                 trace.receive(observed.remote_of(self._checked(link.exchange(pack(wanted), bounds))))
                 whole = True
             same_clock = trace.remote is not None and trace.remote.clock == clock_id()
@@ -116,7 +116,7 @@ class ZmqClient:
         data = layouts.data_of(self._layout, observation)
         message: dict[str, Any] = {layouts.ENDPOINT: layouts.GET_ACTION, layouts.DATA: data, **self._token()}
         if self._native:
-            message[observed.EXTENSION] = observed.extension_of(request)
+            message[EXTENSION] = observed.extension_of(request)
         files = {file.address: file for file in self._files.values()}
         body = pack(message, files, maps=self._layout == layouts.N1_7)
         trace.mark("msgpack_pack")
