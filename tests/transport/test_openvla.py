@@ -1,22 +1,26 @@
-"""OpenVLA's action server: pixels in, an action out, nothing streamed."""
+"""OpenVLA's action server and its relatives: observations in, actions out, nothing streamed."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import json_numpy
 import numpy as np
 import pytest
 
-from s2a_bench.errors import RequestFailed
-from s2a_bench.frames.convert import yuyv_to_rgb
+from s2a_bench.errors import RequestFailed, UsageError
+from s2a_bench.experiments.latency.config import LatencyConfig
+from s2a_bench.frames.convert import decode_image, yuyv_to_rgb
 from s2a_bench.testing.transport import ask, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import open_client
 from s2a_bench.types import Frame, Request, Token
 from tests.servers.sockets import Received, Reply, head, serving
 
+STATE = (0.5, -0.25, 1.0)
 ACTION = np.array([0.5, -0.25, 0.0, 1e-3, 0.0, 0.0, 1.0])
 
 
@@ -76,6 +80,7 @@ def test_without_a_key_of_statistics_none_is_sent() -> None:
         lambda action: json.dumps(json_numpy.dumps(action)),  # a server that got `encoded`
         lambda action: json.dumps(action.tolist()),
         lambda action: json_numpy.dumps(np.stack([action, action])),
+        lambda action: json_numpy.dumps([action, action]),
     ],
 )
 def test_an_action_in_any_of_its_forms_is_read(encode: Callable[[np.ndarray], str]) -> None:
@@ -108,3 +113,110 @@ def test_what_is_no_action_is_a_failure(body: str, message: str) -> None:
 def test_a_body_of_another_type_is_a_failure() -> None:
     with pytest.raises(RequestFailed, match="answered 500: Internal Server Error"):
         act(lambda _: [head("500 Internal Server Error", "text/plain") + b"Internal Server Error"])
+
+
+OFT = [np.array([0.5, -0.25, float(tick)]) for tick in range(4)]
+CHUNK = [[0.5, -0.25, 0.0], [0.5, -0.25, 1.0]]
+PICTURES = (yuyv_frame(seed=1), yuyv_frame(seed=2), yuyv_frame(seed=3))
+
+
+def chunk(reply: Reply, template: str, cameras: int, state: tuple[float, ...] = (), **more: str) -> tuple[Any, Trace]:
+    with serving(reply) as url:
+        more = {"payload": "raw", "dialect": "openvla", "template": template, **more}
+        client = open_client(wiring_of("http", url=url, **more))
+        try:
+            return ask(client, Request("a", "pick up the cup", PICTURES[:cameras], state=state))
+        finally:
+            client.close()
+
+
+def test_openvla_oft_is_sent_its_observation_and_answers_a_list_of_arrays() -> None:
+    seen: list[Received] = []
+
+    def deploy(received: Received) -> list[bytes]:
+        """``JSONResponse(action)`` of ``get_vla_action``'s list, after ``json_numpy.patch()``."""
+        seen.append(received)
+        return [json_head(json_numpy.dumps(OFT).encode())]
+
+    actions, trace = chunk(deploy, "openvla-oft", 3, STATE, served_model="libero")
+    payload = json_numpy.loads(seen[0].body)
+    assert (seen[0].path, payload.pop("instruction"), payload.pop("unnorm_key")) == (
+        "/act",
+        "pick up the cup",
+        "libero",
+    )
+    np.testing.assert_array_equal(payload.pop("state"), np.array(STATE, np.float32))
+    assert list(payload) == ["full_image", "left_wrist_image", "right_wrist_image"]
+    for picture, frame in zip(payload.values(), PICTURES, strict=True):
+        np.testing.assert_array_equal(picture, yuyv_to_rgb(frame.data))
+    np.testing.assert_array_equal([action.values for action in actions], OFT)
+    assert [action.index for action in actions] == [0, 1, 2, 3]
+    assert trace.facts["action_n"] == 12
+    assert set(budget(trace.chain()).stages_ns) == {"convert", "base64_encode", "json_pack", "server"}
+
+
+def test_x_vla_is_sent_arrays_as_texts_and_answers_an_object() -> None:
+    seen: list[Received] = []
+
+    def act_of(received: Received) -> list[bytes]:
+        seen.append(received)
+        return [json_head(json.dumps({"action": CHUNK}).encode())]
+
+    actions, _ = chunk(act_of, "x-vla", 2, STATE, extra_body='{"domain_id": 3}')
+    payload = seen[0].json
+    assert (payload["language_instruction"], payload["domain_id"], payload["steps"]) == ("pick up the cup", 3, 10)
+    assert "image2" not in payload
+    np.testing.assert_array_equal(json_numpy.loads(payload["image1"]), yuyv_to_rgb(PICTURES[1].data))
+    np.testing.assert_array_equal(json_numpy.loads(payload["proprio"]), np.array(STATE, np.float32))
+    np.testing.assert_array_equal([action.values for action in actions], CHUNK)
+
+
+def test_the_file_of_a_picture_is_an_array_of_its_bytes(tmp_path: Path) -> None:
+    seen: list[Received] = []
+    mine = tmp_path / "mine.toml"
+    mine.write_text('images = ["{image:0|bytes}", "{prompt}"]\ns2a = {answer = "", path = "/v1/act"}\n')
+
+    def answers(received: Received) -> list[bytes]:
+        seen.append(received)
+        return [json_head(b"[1, 2]")]
+
+    chunk(answers, str(mine), 1, payload="jpeg")
+    picture, prompt = json_numpy.loads(seen[0].body)["images"]
+    assert decode_image(picture.tobytes()).shape == (48, 64, 3)
+    assert (prompt, seen[0].path) == ("pick up the cup", "/v1/act")
+
+
+@pytest.mark.parametrize(
+    ("template", "body", "message"),
+    [
+        ("x-vla", '{"actions": [[1]]}', "an answer without action: actions"),
+        ("x-vla", '{"action": [[NaN]]}', "actions: not finite numbers"),
+        ("x-vla", '{"action": null}', "not numbers of shape"),
+        ("x-vla", '{"error": "Request failed"}', "broke off: Request failed"),
+        ("openvla-oft", '"error"', "the server answered 'error'; the reason is in the server's output"),
+        ("openvla-oft", '[{"__numpy__": "AAAA", "dtype": "O", "shape": [1]}]', "an action of type O"),
+        ("openvla-oft", "[[1], [1, 2]]", "no array of numbers"),
+    ],
+)
+def test_an_answer_that_is_no_chunk_is_a_failure(template: str, body: str, message: str) -> None:
+    with pytest.raises(RequestFailed, match=message):
+        chunk(says(body), template, 1, STATE)
+
+
+@pytest.mark.parametrize(
+    ("options", "cameras", "message"),
+    [
+        (
+            {"dialect": "openvla", "template": "openvla-oft"},
+            4,
+            "4 a request, and `template` openvla-oft has places for 3",
+        ),
+        ({"dialect": "openvla", "template": "vllm-omni"}, 1, "vllm-omni: openvla does not read s2a.idle_s"),
+        ({"dialect": "vllm", "template": "x-vla"}, 1, "the dialect 'vllm' takes none"),
+        ({"template": "x-vla"}, 1, "the dialect 'openai' takes none; .*`dialect` openvla"),
+    ],
+)
+def test_a_template_that_does_not_fit_is_refused_in_a_line(options: dict[str, str], cameras: int, message: str) -> None:
+    url = "http://127.0.0.1:1"
+    with pytest.raises(UsageError, match=message):
+        LatencyConfig(transports="http", url=url, cameras=cameras, options={"http": options})

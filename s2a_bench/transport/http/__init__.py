@@ -115,17 +115,21 @@ class Http(Transport[HttpOptions]):
         from s2a_bench.transport.http.dialects import open_dialect
 
         possible = (options.spoken,) if options.spoken else ("openai", *OWNERS.values())
-        dialects = [open_dialect(name) for name in possible]
+        dialects = [open_dialect(name, options.observation) for name in possible]
         return replace(
             can,
             payloads=jpeg if choice.variant == LLAMA_SERVER else dialects[0].payloads,
-            answer_kinds=(TOKENS,),
-            accepts_state=False,
+            answer_kinds=dialects[0].answer_kinds,
+            accepts_state=dialects[0].accepts_state,
             facts=(*self.facts, *(fact for dialect in dialects for fact in dialect.facts)),
         )
 
     def require(self, choice: Choice[HttpOptions]) -> None:
         variant, options = choice.variant, choice.options
+        if options.observation:
+            from s2a_bench.transport.http.dialects import open_dialect
+
+            open_dialect(options.dialect, options.observation).check(choice.cameras)
         if options.url and variant in {BINARY, LLAMA_SERVER}:
             raise UsageError(f"`transport` {self.name}/{variant} needs our own server; leave it out with `url`")
         if variant == LLAMA_SERVER:

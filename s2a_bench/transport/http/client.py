@@ -25,7 +25,7 @@ from s2a_bench.transport import Wiring
 from s2a_bench.transport.http import HEADERS_MS, THINKING_MS, THINKING_PIECES, blocks, native
 from s2a_bench.transport.http.clients import BoundedClient, HttpResponse, LeanClient
 from s2a_bench.transport.http.detect import body_of, met
-from s2a_bench.transport.http.dialects import NATIVE, EncodedPicture, Event, open_dialect
+from s2a_bench.transport.http.dialects import NATIVE, Event, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_MODEL
 from s2a_bench.transport.http.dialects.decoder import Decoder, error_in
 from s2a_bench.transport.http.options import HttpOptions, merged, read_patch
@@ -55,7 +55,7 @@ class HttpClient:
         options, key = wiring.options, read_key(wiring.options.api_key_env)
         self._codec = native.CODECS[wiring.variant]
         if wiring.black_box:
-            self._dialect, self._url, self._model = met(wiring.address, key, options.spoken, options.served_model)
+            self._dialect, self._url, self._model = met(wiring.address, key, options)
         else:
             self._dialect, self._model = open_dialect(NATIVE), options.served_model or NO_MODEL
             self._url = wiring.address.rstrip("/") + native.PATHS[wiring.variant]
@@ -140,14 +140,9 @@ class HttpClient:
         if self._wiring.variant == native.BINARY:
             body, headers = self._pack_binary(request, trace)
         else:
-            pictures = []
-            for frame in request.images:
-                media_type, data = self._dialect.encode(frame, self._options.payload, trace)
-                text = self._codec.to_base64(data.reshape(-1))
-                trace.mark("base64_encode")
-                pictures.append(EncodedPicture(media_type, text, data.shape))
-            fields = merged(self._dialect.body(request, pictures, self._model), self._extra)
-            body, headers = self._codec.dumps(fields), self._headers
+            to_base64, payload = self._codec.to_base64, self._options.payload
+            fields = self._dialect.fields(request, payload, self._model, to_base64, trace)
+            body, headers = self._codec.dumps(merged(fields, self._extra)), self._headers
         trace.mark("json_pack")
         trace.facts[PAYLOAD_BYTES] = sum(map(len, body)) if isinstance(body, list) else len(body)
         return body, headers

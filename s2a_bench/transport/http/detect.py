@@ -31,16 +31,17 @@ PATIENCE_S = 5.0
 LIMIT = 1 << 20
 
 
-def met(base: str, key: str, spoken: str, model: str) -> tuple[Dialect, str, str]:
+def met(base: str, key: str, options: HttpOptions) -> tuple[Dialect, str, str]:
     """Return the dialect, the URL to post to and the model of a black box: as given, else as its list of models says.
 
     A server with an invalid list counts as plain OpenAI. Raises ServerDied if nothing answers.
     """
+    spoken, model = options.spoken, options.served_model
     with probe(base) as client:
         if not spoken:
             owner, first = first_model(base, getter(client, open_dialect("openai").authorization(key) if key else {}))
             spoken, model = OWNERS.get(owner, "openai"), model or first or NO_MODEL
-        dialect = open_dialect(spoken)
+        dialect = open_dialect(spoken, options.observation)
         base, model = dialect.met(base, model, getter(client, dialect.authorization(key) if key else {}))
     return dialect, dialect.url(base, model), model
 

@@ -15,6 +15,7 @@ from s2a_bench.secrets import LONG, keep, secrets_in
 from s2a_bench.transport import PROGRAM, SERVING, Program
 from s2a_bench.transport.access import WebOptions
 from s2a_bench.transport.http.dialects import DIALECTS
+from s2a_bench.transport.observation import TemplateName, names
 
 WHEEL = Path("xllamacpp")
 """Stands for llama.cpp's server in the wheel of that name."""
@@ -69,6 +70,11 @@ class HttpOptions(WebOptions):
     dialect: Annotated[str, one_of(lambda: ("", *DIALECTS))] = option(
         "", f"the url's dialect: {', '.join(DIALECTS)} [default: detected]"
     )
+    template: TemplateName = option(
+        "",
+        "the observation: a template's name, or a TOML or JSON file [default: that of the transport or dialect]",
+        names=names,
+    )
     api_docs: bool = option(False, "also serve /openapi.json, /docs and /redoc", side=SERVING)
     extra_body: TextOrFile = option("", "JSON, or @FILE, merged into every request to the url (RFC 7396)")
     llama_server: Path | None = option(
@@ -95,6 +101,11 @@ class HttpOptions(WebOptions):
     @property
     def spoken(self) -> str:
         return "llama-server" if self.llama_server else self.dialect
+
+    @property
+    def observation(self) -> str:
+        """The template of requests to the url; our own server reads no observations."""
+        return self.template if self.url else ""
 
     @property
     def program(self) -> Program | None:

@@ -67,6 +67,12 @@ DIALECTS: Final[Registry[Callable[[], Dialect]]] = Registry(
 )
 
 
-def open_dialect(name: str) -> Dialect:
-    """Return a new adapter; raises UsageError for an unknown name."""
-    return DIALECTS[name]()
+def open_dialect(name: str, template: str = "") -> Dialect:
+    """Return a new adapter, with the template of its requests; raises UsageError for a name or template unknown to it.
+
+    A template is that of `transport.observation`, by its name.
+    """
+    dialect = DIALECTS[name]()
+    if template:
+        dialect.describe(template)
+    return dialect

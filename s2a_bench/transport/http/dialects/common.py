@@ -10,6 +10,7 @@ from urllib.parse import urlsplit, urlunsplit
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CACHE_N, PROMPT_N, USAGE_ZERO, Fact
 from s2a_bench.trace import FACT_LIMIT, Trace
+from s2a_bench.transport import TOKENS
 from s2a_bench.transport.http.dialects import EncodedPicture, Event
 from s2a_bench.transport.http.dialects.framing import Framing, ServerSentEvents
 from s2a_bench.transport.pictures import encoded
@@ -43,6 +44,15 @@ class Dialect:
     payloads: tuple[str, ...] = ("jpeg", "jpeg-preencoded", "png")
     framing: Callable[[], Framing] = ServerSentEvents
     facts: Sequence[Fact] = ()
+    answer_kinds: tuple[str, ...] = (TOKENS,)
+    accepts_state = False
+
+    def describe(self, template: str) -> None:  # noqa: ARG002 - that of a policy server
+        """Make requests from a template, by its name; raises UsageError if the dialect takes none."""
+        raise UsageError(f"`template`: the dialect '{self.name}' takes none; leave it out, or choose `dialect` openvla")
+
+    def check(self, cameras: int) -> None:
+        """Raise UsageError if a request cannot have so many pictures."""
 
     def met(self, base: str, model: str, get: Get) -> tuple[str, str]:
         """Return the URL and the model of requests: as given, else the first model that the server lists."""
@@ -59,6 +69,18 @@ class Dialect:
 
     def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
         return encoded(frame, payload, trace)
+
+    def fields(
+        self, request: Request, payload: str, model: str, to_base64: Callable[[Pixels], str], trace: Trace
+    ) -> dict[str, Any]:
+        """Encode the pictures and return the request's body, marking each step."""
+        pictures = []
+        for frame in request.images:
+            media_type, data = self.encode(frame, payload, trace)
+            text = to_base64(data.reshape(-1))
+            trace.mark("base64_encode")
+            pictures.append(EncodedPicture(media_type, text, data.shape))
+        return self.body(request, pictures, model)
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
         """Return the request's body; raises UsageError for what the dialect cannot express."""

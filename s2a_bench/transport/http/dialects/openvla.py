@@ -1,12 +1,14 @@
 """OpenVLA's ``/act``: an array of pixels in, an array of actions out, by json_numpy; nothing is streamed.
 
-The whole action is one token, so its time to first token is that of the answer.
+The whole action is one token, so its time to first token is that of the answer. With a template (OpenVLA-OFT, X-VLA)
+the request is its observation, and the answer a chunk of actions.
 """
 
 from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,9 +17,13 @@ from s2a_bench import extras
 from s2a_bench.facts import Fact
 from s2a_bench.frames.convert import to_rgb
 from s2a_bench.trace import Trace
+from s2a_bench.transport import ACTIONS
+from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http.dialects import EncodedPicture, Event
 from s2a_bench.transport.http.dialects.common import Dialect
 from s2a_bench.transport.http.dialects.framing import WholeBody
+from s2a_bench.transport.observation import PolicyTransport, Template, template_of
+from s2a_bench.transport.pictures import policy_picture
 from s2a_bench.types import Frame, Pixels, Request
 
 json_numpy = extras.require("json_numpy", "openvla")
@@ -26,6 +32,9 @@ FAILED = "error"
 """The body of a failure, with status 200 (``vla-scripts/deploy.py``)."""
 
 ACTION_N = Fact("action_n", "", "numbers of the action")
+
+ARRAY = "__numpy__"
+"""The key of an array's bytes, in Base64."""
 
 NUMBERS = re.compile(r"[<>|=]?[fiu][0-9]+")
 
@@ -37,9 +46,23 @@ class OpenVla(Dialect):
     path = "/act"
     lists_models = False
     media_type = "application/json"
-    payloads = ("raw",)
+    payloads: tuple[str, ...] = ("raw",)
     framing = WholeBody
     facts = (ACTION_N,)
+
+    def __init__(self) -> None:
+        self._template: Template | None = None
+
+    def describe(self, template: str) -> None:
+        self._template = made = template_of(template)
+        made.check_server(self.name, ("path", "answer", "arrays_as_text"))
+        self.path = made.server.path or self.path
+        self.answer_kinds, self.accepts_state = (ACTIONS,), made.accepts_state
+        self.payloads = PolicyTransport.payloads[1:] if made.encoded else self.payloads
+
+    def check(self, cameras: int) -> None:
+        if self._template is not None:
+            self._template.check_pictures(cameras)
 
     def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:  # noqa: ARG002 - always pixels
         """Return the pixels as RGB, height x width x 3, marking `convert`."""
@@ -49,26 +72,68 @@ class OpenVla(Dialect):
         trace.mark("convert")
         return "", pixels
 
+    def fields(
+        self, request: Request, payload: str, model: str, to_base64: Callable[[Pixels], str], trace: Trace
+    ) -> dict[str, Any]:
+        """Return the observation of the template, else `body`."""
+        if self._template is None:
+            return super().fields(request, payload, model, to_base64, trace)
+        as_text = self._template.server.arrays_as_text
+        pictures = [policy_picture(frame, payload, trace) for frame in request.images]
+
+        def sendable(value: Any) -> Any:
+            if isinstance(value, dict):
+                return {key: sendable(each) for key, each in value.items()}
+            if isinstance(value, list):
+                return [sendable(each) for each in value]
+            if isinstance(value, bytes):
+                value = np.frombuffer(value, np.uint8)
+            if not isinstance(value, np.ndarray):
+                return value
+            data = np.ascontiguousarray(value).reshape(-1).view(np.uint8)
+            array = {ARRAY: to_base64(data), "dtype": value.dtype.str, "shape": value.shape}
+            return json.dumps(array) if as_text else array
+
+        observation: dict[str, Any] = sendable(self._template.fill(pictures, request.state, request.prompt))
+        trace.mark("base64_encode")
+        return {**observation, "unnorm_key": model} if model else observation
+
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
         """Return the array in the form of ``json_numpy.dumps``, and the instruction."""
         fields: dict[str, Any] = {"instruction": request.prompt}
         if model:
             fields["unnorm_key"] = model
         for picture in pictures[:1]:
-            fields["image"] = {"__numpy__": picture.base64, "dtype": "|u1", "shape": picture.shape}
+            fields["image"] = {ARRAY: picture.base64, "dtype": "|u1", "shape": picture.shape}
         return fields
 
     def event(self, message: Any) -> Event:
-        """Read the action: an array, an array in a JSON text (a server that was sent ``encoded``), or a list."""
+        """Read the action: an array, an array in a JSON text (a server that was sent ``encoded``), or a list of them.
+
+        With a template read the actions from where it says they are.
+        """
         if message == FAILED:
             return Event(error="the server answered 'error'; the reason is in the server's output")
         if isinstance(message, str):
             message = json.loads(message)
-        if isinstance(message, dict):
-            if not NUMBERS.fullmatch(message["dtype"]):
-                raise ValueError(f"an action of type {message['dtype']}")
-            message = json_numpy.object_hook(message)
-        action = np.asarray(message, np.float64)
+        if self._template is not None:
+            actions = actions_of(_arrays_in(self._template.server.actions_in(message)))
+            count = float(sum(action.values.size for action in actions))
+            return Event(finish="stop", facts={ACTION_N: count}, actions=actions)
+        action = np.asarray(_arrays_in(message), np.float64)
         if not (action.size and np.isfinite(action).all()):
             raise ValueError("an action that is no finite numbers")
         return Event(json.dumps(action.tolist()), finish="stop", facts={ACTION_N: float(action.size)})
+
+
+def _arrays_in(value: Any) -> Any:
+    """Return a value with NumPy's arrays in place of json_numpy's, also of those in lists and objects."""
+    if isinstance(value, list) and any(isinstance(each, dict) for each in value):
+        return [_arrays_in(each) for each in value]
+    if not isinstance(value, dict):
+        return value
+    if ARRAY not in value:
+        return {key: _arrays_in(each) for key, each in value.items()}
+    if not NUMBERS.fullmatch(value["dtype"]):
+        raise ValueError(f"an action of type {value['dtype']}")
+    return json_numpy.object_hook(value)
