@@ -85,3 +85,11 @@ def no_key(address: SplitResult, what: str, cure: str) -> Finding:
     """Return the finding that a server asks for no key: a choice on this machine, a risk on any other."""
     local = is_local(address.hostname or "")
     return Finding("no-key", "advice" if local else "warning", f"it wants no key: {what}", cure)
+
+
+def idle_cut(seconds: float, cure: str) -> Finding:
+    """Return the finding that a server closes connections on which nothing comes."""
+    message = (
+        f"it closes a connection after {seconds:g} s of silence: a request after a longer pause connects again first"
+    )
+    return Finding("idle", "advice", message, cure)

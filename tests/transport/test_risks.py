@@ -46,6 +46,7 @@ def test_grpc_is_told_of_without_calling_a_method() -> None:
         findings = found(f"grpc://{place}")
     assert findings["pickle"].level == "warning"
     assert "unpickles what any client sends" in findings["pickle"].message
+    assert {"sleep", "filter", "no-key"} <= set(findings)
     assert heard == [PREFACE]
 
 
@@ -71,6 +72,12 @@ def test_off_this_machine_both_are_warnings(monkeypatch: pytest.MonkeyPatch) -> 
     assert [findings[code].level for code in ("plain-text", "no-key")] == ["warning", "warning"]
     assert findings["plain-text"].fix.startswith("ssh -L ")
     assert findings["no-key"].message.isprintable()
+
+
+def test_an_http_server_that_closes_idle_connections_is_told_of() -> None:
+    head = b"HTTP/1.1 200 OK\r\nkeep-alive: timeout=5, max=100\r\ncontent-length: 2\r\n\r\n{}"
+    with answering(head) as (place, _):
+        assert "after 5 s of silence" in found(f"http://{place}")["idle"].message
 
 
 def test_nobody_there_is_one_line() -> None:

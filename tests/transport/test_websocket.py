@@ -384,13 +384,21 @@ def test_the_doctor_tells_of_a_server_without_a_key_that_refuses_pages() -> None
     with serving(RecordingHandler(list(CHUNK))) as server:
         found = {finding.code: finding for finding in examine(server.address)}
     assert "it greets every client (server, provenance)" in found["no-key"].message
-    assert "any-page" not in found
+    assert {"plain-text", "no-key"} == set(found)
 
 
 def test_the_doctor_tells_of_a_server_that_any_page_may_ask() -> None:
     with told_by(lambda _: b"") as address:
         found = {finding.code: finding for finding in examine(address)}
-    assert {"plain-text", "no-key", "any-page"} == set(found)
+    assert {"plain-text", "no-key", "any-page", "keepalive"} == set(found)
+
+
+def test_the_doctor_tells_of_compression_with_its_time_and_of_a_path_that_is_cut_when_idle() -> None:
+    with handled_by(lambda _: None, compression="deflate") as address:
+        found = {finding.code: finding for finding in examine(address + "/v1/realtime/robot/openpi/")}
+    assert float(found["compression"].message.rpartition("takes ")[2].split()[0]) > 0
+    assert "after 30 s of silence" in found["idle"].message
+    assert "vllm-omni" in found["idle"].fix
 
 
 def test_the_doctor_tells_of_a_server_with_a_key(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -462,14 +470,14 @@ def test_a_foreign_server_takes_pixels_unless_its_template_says_otherwise(tmp_pa
 
 
 @contextmanager
-def handled_by(handle: Callable[[Any], None], metadata: Any = None) -> Iterator[str]:
+def handled_by(handle: Callable[[Any], None], metadata: Any = None, compression: str | None = None) -> Iterator[str]:
     """A server that greets each connection, and then handles it by a function."""
 
     def greeted(socket: Any) -> None:
         socket.send(packb(metadata or {}))
         handle(socket)
 
-    with plain_serve(greeted, "127.0.0.1", 0, compression=None, max_size=None) as server:
+    with plain_serve(greeted, "127.0.0.1", 0, compression=compression, max_size=None) as server:
         thread = Thread(target=server.serve_forever)
         thread.start()
         try:

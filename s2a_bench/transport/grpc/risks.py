@@ -8,7 +8,7 @@ from typing import Final
 from urllib.parse import SplitResult
 
 from s2a_bench.machine.doctor import Finding
-from s2a_bench.transport.risks import PATIENCE_S
+from s2a_bench.transport.risks import PATIENCE_S, no_key
 
 PORT: Final = 8080
 PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
@@ -39,4 +39,16 @@ def examine(address: SplitResult) -> Iterator[Finding]:
         "advice",
         "lerobot's policy server answers no sooner than 33 ms after it was asked, unless it was started otherwise",
         "start it with --inference_latency=0; `latency` and `chunks --live` recognise the sleep (padded-answers)",
+    )
+    yield Finding(
+        "filter",
+        "advice",
+        "lerobot's policy server drops, silently, an observation without must_go whose state is within 1.0 of the last "
+        "one: a client that waits for the chunk gets an empty answer after 2 s",
+        "set must_go on each observation, as s2a-bench does, or measure with a state that changes",
+    )
+    yield no_key(
+        address,
+        "any client of lerobot's policy server names the policy that it loads, and takes the observation of another",
+        "let it listen on 127.0.0.1 alone, and one client at a time",
     )

@@ -1,8 +1,9 @@
-"""Security risks of an external HTTP server, as far as its list of models shows them."""
+"""Security risks of an external HTTP server, and when it closes idle connections, as its list of models shows them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from re import findall
 from urllib.parse import SplitResult, urlunsplit
 
 import httpx
@@ -11,20 +12,26 @@ from s2a_bench.errors import S2AError, ServerDied
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.transport.http.detect import getter, probe
 from s2a_bench.transport.http.dialects.common import NO_LIST, first_model
-from s2a_bench.transport.risks import no_key, printable
+from s2a_bench.transport.risks import idle_cut, no_key, printable
 
 
 def examine(address: SplitResult) -> Iterator[Finding]:
     """Request the list of models without a key."""
     url = urlunsplit(address)
+    idle: set[str] = set()
     try:
         with probe(url) as client:
+            client.event_hooks["response"] = [
+                lambda reply: idle.update(findall(r"timeout=(\d{1,6})", reply.headers.get("keep-alive", "")))
+            ]
             owner, model = first_model(url, getter(client, {}))
     except ServerDied as error:
         raise OSError(str(error).rpartition(": ")[2]) from error
     except (*NO_LIST, S2AError, httpx.HTTPError, httpx.InvalidURL) as error:
         yield Finding("server", "state", f"it answers, and shows no list of models without a key: {error}")
         return
+    for seconds in sorted(idle)[:1]:
+        yield idle_cut(int(seconds), "send requests more often, or start the server with a longer keep-alive")
     if model:
         shown = f"{printable(model)} of {printable(owner)}" if owner else printable(model)
         yield no_key(

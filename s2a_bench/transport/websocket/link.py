@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 import ssl
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from threading import Event, Thread
 from time import monotonic
@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from websockets.client import ClientProtocol
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
+from websockets.extensions import ClientExtensionFactory
 from websockets.frames import Frame
 from websockets.protocol import State
 from websockets.sync.client import ClientConnection
@@ -51,7 +52,13 @@ class BoundedConnection:
     """One connection to one server."""
 
     def __init__(
-        self, url: str, headers: Mapping[str, str], bounds: Bounds, timeout_s: float, idle_s: float | None = None
+        self,
+        url: str,
+        headers: Mapping[str, str],
+        bounds: Bounds,
+        timeout_s: float,
+        idle_s: float | None = None,
+        extensions: Sequence[ClientExtensionFactory] = (),
     ) -> None:
         """Connect and shake hands; raises ServerDied, RequestFailed, TransportError.
 
@@ -64,7 +71,7 @@ class BoundedConnection:
         except (InvalidURI, ValueError) as error:
             raise TransportError(f"`url`: '{url}' is no URL of a WebSocket: {error}") from error
         plain = self._connected(bounds, uri.host, uri.port, secure=uri.secure)
-        protocol = ClientProtocol(uri, max_size=MESSAGE_BYTES, logger=codec.QUIET)
+        protocol = ClientProtocol(uri, extensions=extensions, max_size=MESSAGE_BYTES, logger=codec.QUIET)
         self._connection = _Counted(bounds, plain, protocol, ping_interval=None, close_timeout=CLOSING_S)
         self._connection.__enter__()
         try:
@@ -149,6 +156,10 @@ class BoundedConnection:
             did = f"closed the connection: {closed}" if closed else f"broke the connection: {why or error}"
             return Broken(f"{self._url} {did[:QUOTED]}")
         return RequestFailed(f"{self._url} is no WebSocket: {str(why or error)[:QUOTED]}")
+
+    def headers(self) -> Mapping[str, str]:
+        """Return the headers of the server's handshake."""
+        return self._connection.response.headers if self._connection.response else {}
 
     def close(self, *, orderly: bool = False) -> None:
         """Close, where it is ``orderly`` with a word, for which the server has a second; may be called twice."""

@@ -1,19 +1,25 @@
-"""What a foreign policy server over WebSocket does that is dangerous, from its greeting; no request is sent."""
+"""What a policy server over WebSocket does that is dangerous or slow, from its handshake; no request is sent."""
 
 from __future__ import annotations
 
+import os
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import closing
 from urllib.parse import SplitResult, urlunsplit
 
 from s2a_bench import extras
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError, ServerDied
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.transport.limits import Bounds
-from s2a_bench.transport.risks import PATIENCE_S, no_key, printable
+from s2a_bench.transport.observation import names, template_of
+from s2a_bench.transport.risks import PATIENCE_S, idle_cut, no_key, printable
 from s2a_bench.transport.websocket import PACKAGES
 
 PAGE = "https://example.org"
+PINGING = "websockets/", "uvicorn"
+"""Names, in the header Server, of servers whose handler may block the loop that answers pings."""
 
 
 def examine(parts: SplitResult) -> Iterator[Finding]:
@@ -21,12 +27,13 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
     extras.need("websocket", *PACKAGES)
     url = urlunsplit(parts)
     try:
-        greeting = _greeting(url, {})
+        greeting, headers = _greeting(url, {})
     except ServerDied as error:
         raise OSError(str(error).rpartition(": ")[2]) from error
     except S2AError as error:
         yield Finding("server", "state", f"it answers, and greets no client without a key: {error}")
         return
+    yield from _slow(parts, headers)
     yield no_key(
         parts,
         f"it greets every client ({greeting}), so it answers every client too",
@@ -44,16 +51,49 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
     )
 
 
-def _greeting(url: str, headers: Mapping[str, str]) -> str:
-    """Return what a server says of itself, in a few words."""
+def _slow(parts: SplitResult, headers: Mapping[str, str]) -> Iterator[Finding]:
+    """Yield what the headers of the handshake tell about time."""
+    if "permessage-deflate" in headers.get("Sec-WebSocket-Extensions", ""):
+        yield Finding(
+            "compression",
+            "advice",
+            "it compresses with clients that offer it, as libraries do by default: deflating two 224x224 pictures of "
+            f"noise takes {_deflate_ms():.1f} ms here, for each observation",
+            "connect with compression=None, as the clients of openpi and s2a-bench do, or turn it off in the server",
+        )
+    if any(name in headers.get("Server", "") for name in PINGING):
+        yield Finding(
+            "keepalive",
+            "advice",
+            "a policy that blocks its event loop, as openpi's does, leaves pings unanswered: a client that waits 20 s "
+            "for each, the libraries' default, disconnects, and an answer that takes longer is lost",
+            "connect with ping_interval=None; s2a-bench sends no pings",
+        )
+    for name in names():
+        server = template_of(name).server
+        if server.idle_s and server.path == parts.path.rstrip("/"):
+            yield idle_cut(server.idle_s, f"--template {name}, of servers with this path: it keeps the connection open")
+
+
+def _deflate_ms() -> float:
+    """Return how long websockets' compression takes for two pictures that do not shrink."""
+    noise, deflate = os.urandom(2 * 224 * 224 * 3), zlib.compressobj(wbits=-12, memLevel=5)
+    started_ns = now_ns()
+    deflate.compress(noise)
+    return (now_ns() - started_ns) / 1e6
+
+
+def _greeting(url: str, headers: Mapping[str, str]) -> tuple[str, Mapping[str, str]]:
+    """Return what a server says of itself, in a few words, and the headers of its handshake."""
+    from websockets.extensions.permessage_deflate import ClientPerMessageDeflateFactory
+
     from s2a_bench.transport.websocket.codec import unpackb
     from s2a_bench.transport.websocket.link import BoundedConnection
 
-    with closing(BoundedConnection(url, headers, Bounds(url, PATIENCE_S, 0), PATIENCE_S)) as link:
+    bounds, offered = Bounds(url, PATIENCE_S, 0), [ClientPerMessageDeflateFactory()]
+    with closing(BoundedConnection(url, headers, bounds, PATIENCE_S, extensions=offered)) as link:
         message = link.receive()
-    if isinstance(message, str):
-        return printable(message)
-    metadata = unpackb(message)
-    return (
-        printable(", ".join(map(str, metadata)) if isinstance(metadata, dict) else type(metadata).__name__) or "nothing"
-    )
+    if not isinstance(message, str):
+        metadata = unpackb(message)
+        message = ", ".join(map(str, metadata)) if isinstance(metadata, dict) else type(metadata).__name__
+    return printable(message) or "nothing", link.headers()
