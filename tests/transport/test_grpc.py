@@ -130,13 +130,14 @@ class TestClient:
     def test_a_server_that_comes_again_loads_the_policy_again(self) -> None:
         with ExitStack() as stack:
             with policy() as (_, url):
-                opened = stack.enter_context(robot(url))
-                ask(opened, request())
-            with pytest.raises(RequestFailed, match="broke the connection"):
-                ask(opened, request())
+                clients = [stack.enter_context(robot(url)) for _ in range(2)]
+                for opened in clients:  # the first has the policy loaded for both
+                    ask(opened, request())
+            for opened in clients:
+                with pytest.raises(RequestFailed, match="broke the connection"):
+                    ask(opened, request())
             server, _ = stack.enter_context(policy(port=int(url.rpartition(":")[2])))
-            _, trace = ask(opened, request())
-            assert trace.facts[RECONNECTS] == 1
+            assert [ask(opened, request())[1].facts[RECONNECTS] for opened in clients] == [1, 1]
             assert len(server.policies) == 1
 
 

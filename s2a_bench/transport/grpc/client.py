@@ -95,14 +95,13 @@ class GrpcClient:
             self._channel = grpc.insecure_channel(self._url.partition("://")[2], [("grpc.enable_http_proxy", 0)])
             if self._connected:
                 trace.facts[RECONNECTS] = 1.0
-        if _LOADED.get(self._url) == policy:
-            return self._channel
-        _LOADED.pop(self._url, None)
-        for method, message in (("Ready", b""), (LOAD, message_of(pickled("RemotePolicyConfig", policy)))):
-            self._channel.unary_unary(SERVICE + method)(message, self._patience_s(bounds))
-        _LOADED[self._url] = policy
+        if _LOADED.get(self._url) != policy:
+            _LOADED.pop(self._url, None)
+            for method, message in (("Ready", b""), (LOAD, message_of(pickled("RemotePolicyConfig", policy)))):
+                self._channel.unary_unary(SERVICE + method)(message, self._patience_s(bounds))
+            _LOADED[self._url] = policy
+            trace.mark("connect")
         self._connected = True
-        trace.mark("connect")
         return self._channel
 
     def _pack(self, observation: dict[str, Any], trace: Trace) -> tuple[float, list[bytes]]:
