@@ -251,6 +251,7 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         """Create a service; the first starts the thread that answers all."""
+        self.check_open()
         if self._services is None:
             self._requests = self.waiter()
             self._services = Services(self._requests)

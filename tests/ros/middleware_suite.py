@@ -188,9 +188,12 @@ class MiddlewareSuite:
     def test_once_closed_it_says_so_and_closing_twice_does_no_harm(self, join: Join) -> None:
         middleware = join()
         publisher = middleware.publisher("/test/closed", STRING, QoS())
+        middleware.service("/test/types", GET_TYPES, lambda _: ros.default(GET_TYPES + "_Response"))
         middleware.close()
         middleware.close()
         with pytest.raises(TransportError):
             publisher.send(publisher.pack(text("x")))
         with pytest.raises(TransportError, match="closed"):
             middleware.subscription("/test/closed", STRING, QoS())
+        with pytest.raises(TransportError, match="closed"):
+            middleware.service("/test/list", LIST, lambda _: ros.default(LIST + "_Response"))
