@@ -16,6 +16,8 @@ from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import budget
 from s2a_bench.transport import TRANSPORTS, Choice, Client, open_client
+from s2a_bench.transport.risks import examine
+from s2a_bench.transport.websocket import risks
 from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.types import Request
 from tests.waiting import until
@@ -178,3 +180,11 @@ def test_a_description_of_the_server_is_for_websocket_alone() -> None:
     transport = TRANSPORTS["zmq"]
     with pytest.raises(UsageError, match=r"`template` starvla: zmq does not read s2a\.answer; leave it out"):
         transport.require(Choice(transport.options(template="starvla"), cameras=2))
+
+
+def test_the_doctor_tells_of_a_server_that_waits_for_its_clients_first_message(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(risks, "PATIENCE_S", 0.3)
+    with relative(lambda _: None, greets=False) as (address, _):
+        found = {finding.code: finding for finding in examine(address)}
+    assert "every client in (and greets with: nothing)" in found["no-key"].message
+    assert {"plain-text", "no-key", "any-page", "keepalive"} == set(found)

@@ -383,7 +383,7 @@ def test_tokens_do_not_travel() -> None:
 def test_the_doctor_tells_of_a_server_without_a_key_that_refuses_pages() -> None:
     with serving(RecordingHandler(list(CHUNK))) as server:
         found = {finding.code: finding for finding in examine(server.address)}
-    assert "it greets every client (server, provenance)" in found["no-key"].message
+    assert "every client in (and greets with: server, provenance)" in found["no-key"].message
     assert {"plain-text", "no-key"} == set(found)
 
 
@@ -405,7 +405,7 @@ def test_the_doctor_tells_of_a_server_with_a_key(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("ROBOT_KEY", "open sesame")
     with serving(RecordingHandler(list(CHUNK)), api_key_env="ROBOT_KEY") as server:
         found = {finding.code: finding for finding in examine(server.address)}
-    assert "greets no client without a key" in found["server"].message
+    assert "lets no client in without a key" in found["server"].message
     assert {finding.level for finding in examine("ws://127.0.0.1:9")} == {"state", "error"}
 
 

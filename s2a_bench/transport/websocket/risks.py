@@ -10,7 +10,7 @@ from urllib.parse import SplitResult, urlunsplit
 
 from s2a_bench import extras
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import S2AError, ServerDied
+from s2a_bench.errors import RequestFailed, S2AError, ServerDied
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.observation import names, template_of
@@ -31,12 +31,12 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
     except ServerDied as error:
         raise OSError(str(error).rpartition(": ")[2]) from error
     except S2AError as error:
-        yield Finding("server", "state", f"it answers, and greets no client without a key: {error}")
+        yield Finding("server", "state", f"it answers, and lets no client in without a key: {error}")
         return
     yield from _slow(parts, headers)
     yield no_key(
         parts,
-        f"it greets every client ({greeting}), so it answers every client too",
+        f"it lets every client in (and greets with: {greeting}), so it answers every client too",
         "let it listen on 127.0.0.1 alone and reach it by ssh -L, or put a proxy that wants a key before it",
     )
     try:
@@ -92,7 +92,10 @@ def _greeting(url: str, headers: Mapping[str, str]) -> tuple[str, Mapping[str, s
 
     bounds, offered = Bounds(url, PATIENCE_S, 0), [ClientPerMessageDeflateFactory()]
     with closing(BoundedConnection(url, headers, bounds, PATIENCE_S, extensions=offered)) as link:
-        message = link.receive()
+        try:
+            message = link.receive()
+        except RequestFailed:  # as of servers that wait for their client's first message
+            message = ""
     if not isinstance(message, str):
         metadata = unpackb(message)
         message = ", ".join(map(str, metadata)) if isinstance(metadata, dict) else type(metadata).__name__
