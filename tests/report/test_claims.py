@@ -367,6 +367,7 @@ def test_the_boundary_has_a_safe_side_and_one_that_is_not_always_unsafe(tmp_path
     below = claim_of("Below R", run)
     assert below.verdict == CONTRADICTED
     assert "the line is R = L/T_nom" in below.evidence[0]
+    assert "Provenance: no engine, tokens EMULATED, virtual time." in below.evidence[0]  # of the grid, without boards
     jitter = BoundaryConfig(jitter="lognormal:cv=0.2", plans=50, points=10)
     assert claim_of("Below R", read_run(run_boundary(jitter, tmp_path, NullProgress()))).verdict == UNDECIDED
 

@@ -255,7 +255,7 @@ def plane(run: StoredRun) -> Iterator[RunPart]:
     if not run.table(BOUNDARY).empty:
         settings = _unlike(run.manifest.get("configuration", {}), PLANE)
         facts = {"tokens": "with jitter" if is_random(run) else "evenly", "settings": settings}
-        yield RunPart(run, facts, run.origins.every)
+        yield RunPart(run, facts, [run.origins.run])  # the grid, not the boards
 
 
 EVENLY: Final = Need("tokens", "evenly: with jitter no line separates the regions", lambda found: found == "evenly")
