@@ -69,7 +69,7 @@ class GrpcClient:
         bounds.count_bytes(len(answer))
         trace.facts[PAYLOAD_DOWN_BYTES] = len(answer)
         if not answer:
-            self.close()  # a server that was started again has no policy
+            _LOADED.pop(self._url, None)  # a server that was started again has no policy
             raise RequestFailed(f"{self._url} {NO_CHUNK}")
         first_stamp, chunk = chunk_in(bytes_in(answer))
         if first_stamp != stamp:
