@@ -86,9 +86,10 @@ def dds_domain() -> Iterator[int]:
 
 @pytest.fixture(scope="session", autouse=True)
 def interrupts_reach_the_processes_of_tests() -> None:
-    """Undo what a shell does to background jobs: a process that inherits an ignored SIGINT cannot be interrupted."""
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    """Undo what a shell and nohup do to background jobs: an inherited signal that is ignored ends no process."""
+    for number, handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -83,11 +83,16 @@ def _interrupt_again(dropped: sys.UnraisableHookArgs) -> None:
         sys.__unraisablehook__(dropped)
 
 
+def _interrupt_on_signals() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
+            signal.signal(number, _interrupt)
+    sys.unraisablehook = _interrupt_again
+
+
 def main() -> None:
     """Run the command line and exit: 0 done, 1 failed, 2 wrongly used, 130 interrupted."""
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM):
-        signal.signal(number, _interrupt)
-    sys.unraisablehook = _interrupt_again
+    _interrupt_on_signals()
     try:
         check_limits()
         with tuning.allowed():

@@ -22,6 +22,16 @@ def command():
 cli.check_limits = command
 cli.main()
 """
+IGNORED = """
+import signal
+from s2a_bench import cli
+
+signal.signal(signal.SIGHUP, signal.SIG_IGN)
+cli.check_limits = lambda: signal.raise_signal(signal.SIGHUP)
+cli.app = lambda **_: 7
+cli.app.info = cli.typer.models.TyperInfo()
+cli.main()
+"""
 
 
 @pytest.mark.parametrize("signal", ["SIGINT", "SIGTERM"])
@@ -30,3 +40,8 @@ def test_a_signal_that_arrives_in_a_destructor_ends_the_command_all_the_same(sig
     program = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=50, check=False)
     assert program.returncode == 130
     assert program.stderr == "interrupted\n"
+
+
+def test_a_command_under_nohup_outlives_its_terminal() -> None:
+    program = subprocess.run([sys.executable, "-c", IGNORED], timeout=50, check=False)
+    assert program.returncode == 7
