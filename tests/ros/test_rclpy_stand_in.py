@@ -24,6 +24,7 @@ from s2a_bench.ros.diagnostics import LOG, ROSOUT_QOS
 from s2a_bench.ros.parameters import SERVICE, Parameter, value_of
 from s2a_bench.testing.transport import RecordingHandler, ask, connector, wiring_of, yuyv_frame
 from s2a_bench.transport import open_client, open_server
+from s2a_bench.transport.ros import ROS
 from s2a_bench.transport.ros.node import NodeApi
 from s2a_bench.types import Frame, Request
 from tests.ros.action_suite import NAME, ActionSuite
@@ -188,6 +189,7 @@ def test_topics_are_served_without_llama_msgs_and_the_log_says_what_is_not(
     assert [token.text for token in tokens] == ["a ", "b"]
     assert "the action is not served: llama_msgs/action/GenerateResponse is not in this ROS 2 workspace" in caplog.text
     assert "colcon build --packages-select llama_msgs" in caplog.text
+    assert ROS.ready(wiring).startswith("serving topics below /s2a, camera")
     assert GRAPH == []
 
 

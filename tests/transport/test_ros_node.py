@@ -74,10 +74,10 @@ def received(subscription: Subscription, wanted: Callable[[Any], bool]) -> Any:
 def test_the_options_are_parameters(peer: Middleware) -> None:
     names = call(peer, "ListParameters").result.names
     assert len(names) == len(set(names))
-    asked = ["namespace", "max_tokens", "engine", "model", "max_waiting", "use_sim_time"]
+    asked = ["namespace", "max_tokens", "engine", "model", "max_waiting", "use_sim_time", "llama_msgs"]
     assert set(asked) < set(names)
     values = [value_of(value) for value in call(peer, "GetParameters", names=asked).values]
-    assert values == ["/behaves", 9, "echo", None, 64, False]
+    assert values == ["/behaves", 9, "echo", None, 64, False, "6.0"]
 
 
 def test_a_limit_can_be_set_while_it_runs_and_everybody_hears(peer: Middleware, server: RosServer) -> None:

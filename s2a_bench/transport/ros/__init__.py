@@ -101,14 +101,15 @@ class Ros(Transport[RosOptions]):
     def ready(self, wiring: Wiring[RosOptions]) -> str:
         from s2a_bench.transport.ros.buffers import hint
         from s2a_bench.transport.ros.camera import CAMERA
-        from s2a_bench.transport.ros.joining import AT, place_of, remapped
+        from s2a_bench.transport.ros.joining import AT, action_is_built, place_of, remapped
 
         names = remapped(wiring)
         namespace, hosted, _ = wiring.address.partition(AT)
         action, camera = (names.get(name, name) for name in (f"{namespace}/generate_response", namespace + CAMERA))
+        served = f"action {action}" if action_is_built(wiring.options) else f"topics below {namespace}"
         where = place_of(wiring) + (", which this server is" if hosted else "")
         room = hint(wiring.options.middleware, os.environ)
-        return f"serving action {action}, camera {camera}, in {where}{room and f'; for large pictures: {room}'}"
+        return f"serving {served}, camera {camera}, in {where}{room and f'; for large pictures: {room}'}"
 
 
 ROS = Ros()

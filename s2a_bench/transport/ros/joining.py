@@ -136,6 +136,18 @@ def refuse_company(wiring: Wiring[RosOptions], namespace: str) -> None:
         probe.close()
 
 
+def action_is_built(options: RosOptions) -> bool:
+    """Return whether a server has the action: rclpy's needs llama_msgs in its workspace."""
+    if (options.middleware or default_middleware(os.environ)) != "rclpy":
+        return True
+    from s2a_bench.ros.rclpy_types import installed_version, interface_class
+
+    try:
+        return bool(installed_version(interface_class(GENERATE_RESPONSE), GENERATE_RESPONSE))
+    except MissingInterface:
+        return False
+
+
 def _action_offered(probe: Middleware, name: str) -> Callable[[], bool]:
     """Return the question whether an action is offered; a workspace without llama_msgs cannot tell, and offers none."""
     try:

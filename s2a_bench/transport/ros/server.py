@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -71,7 +72,8 @@ class RosServer:
         self._shared = Shared(self._cache, activity)
         self._node: NodeApi | None = None
         if wiring.options.node_api:
-            logged, level = declared(wiring, queued.settings), wiring.options.log_level
+            spoken = wiring.options.but(llama_msgs=self._action.version if self._action else "")
+            logged, level = declared(replace(wiring, options=spoken), queued.settings), wiring.options.log_level
             name = server_name(wiring)
             self._node = NodeApi(self.middleware, name, logged, self._change, self._findings, level)
 
