@@ -217,7 +217,7 @@ def test_its_robot_gets_the_actions_of_its_engine_in_its_mode(command: Command, 
     done = command(*args, "--robot", "toy-robot?log=actions.txt", "--json")
     rows = {cell["rule"]: cell for cell in json.loads(done.stdout)["cells"]}
     assert set(rows) == {"given", "maximum"}
-    assert min(cell["agreement"] for cell in rows.values()) > 0.5
+    assert not any("agreement" in cell for cell in rows.values())  # the mode has no arrays to check it by
     lines = (tmp_path / "actions.txt").read_text().splitlines()
     assert sum(line.startswith("action ") for line in lines) > 50
     assert json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())["robot"] == {"robot": "toy-robot"}

@@ -58,7 +58,7 @@ class BoundedConnection:
         bounds: Bounds,
         timeout_s: float,
         idle_s: float | None = None,
-        extensions: Sequence[ClientExtensionFactory] = (),
+        extensions: Sequence[ClientExtensionFactory] | None = None,
     ) -> None:
         """Connect and shake hands; raises ServerDied, RequestFailed, TransportError.
 
