@@ -41,8 +41,9 @@ class TopicClient(RosClient):
         """Join the domain and wait for the server; raises ServerDied if it does not appear."""
         super().__init__(wiring, alive)
         namespace = namespace_of(wiring)
-        self._publisher = self.middleware.publisher(namespace + "/request", ros.REQUEST, REQUEST_QOS)
+        # announced first: a server that knows the requests' writer should know the tokens' reader as well
         self._subscription = self.middleware.subscription(namespace + "/token", ros.TOKEN, READER_QOS)
+        self._publisher = self.middleware.publisher(namespace + "/request", ros.REQUEST, REQUEST_QOS)
         ends = (self._publisher, self._subscription)  # volatile: what is sent before they match is lost
         absent = f"no server appeared under {namespace} in {place_of(wiring)}"
         try:
