@@ -49,15 +49,21 @@ def discovery_range(environ: Mapping[str, str], default: str) -> str:
     return reach
 
 
+def static_peers(environ: Mapping[str, str]) -> list[str]:
+    """Return the addresses of ROS_STATIC_PEERS; raises UsageError for what is none."""
+    peers = [peer for peer in environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
+    for peer in peers:
+        if not PEER.fullmatch(peer):
+            raise UsageError(f"ROS_STATIC_PEERS: '{peer}' is no host name or address; separate several with ';'")
+    return peers
+
+
 def configuration(environ: Mapping[str, str], tuning: Tuning) -> str | None:
     """Return the XML for ``cyclonedds.domain.Domain``, or None to leave it to the user's CYCLONEDDS_URI."""
     if environ.get("CYCLONEDDS_URI"):
         return None
     reach = discovery_range(environ, "LOCALHOST")
-    peers = [peer for peer in environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
-    for peer in peers:
-        if not PEER.fullmatch(peer):
-            raise UsageError(f"ROS_STATIC_PEERS: '{peer}' is no host name or address; separate several with ';'")
+    peers = static_peers(environ)
     local = reach in {"OFF", "LOCALHOST"} and not peers
     if local or reach == "LOCALHOST":
         peers.insert(0, "127.0.0.1")

@@ -295,6 +295,11 @@ JAZZY = {"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": "/opt/ros/jazzy"}
         ({"ROS_DOMAIN_ID": "300"}, "error", "ROS_DOMAIN_ID: '300'"),
         ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "MOON"}, "error", "'MOON' is none of"),
         ({"CYCLONEDDS_URI": "file:///x.xml"}, "state", "CYCLONEDDS_URI file:///x.xml"),
+        (
+            {"CYCLONEDDS_URI": "file:///x.xml", "ROS_AUTOMATIC_DISCOVERY_RANGE": "MOON"},
+            "state",
+            "CYCLONEDDS_URI file:///x.xml",
+        ),
         (JAZZY, "state", "domain 0, rclpy on rmw_fastrtps_cpp, all interfaces: eth0, with multicast"),
         (
             JAZZY | {"CYCLONEDDS_URI": "file:///x.xml"},

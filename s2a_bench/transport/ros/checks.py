@@ -9,7 +9,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.extras import how_to_install
 from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.ros import WAYS_OUT, default_middleware
-from s2a_bench.ros.config import CYCLONE_URI, configuration, discovery_range, domain_id
+from s2a_bench.ros.config import CYCLONE_URI, discovery_range, domain_id, static_peers
 from s2a_bench.ros.router import ROUTER, endpoint_of
 from s2a_bench.transport.ros.buffers import DEFAULT_RMW, dds_of
 
@@ -25,16 +25,14 @@ def dds(machine: Machine) -> Finding:
     default = "SUBNET" if by_rclpy and environ.get("ROS_LOCALHOST_ONLY") != "1" else "LOCALHOST"
     try:
         domain = f"domain {domain_id(environ)}"
-        reach = discovery_range(environ, default)
-        configuration(environ, "tuned")
+        if by_rclpy:
+            domain += f", rclpy on {dds_of('rclpy', environ)}"
+        if environ.get(CYCLONE_URI) and dds_of("", environ) != DEFAULT_RMW:  # it replaces what follows
+            return Finding("dds", "state", f"{domain}, {CYCLONE_URI} {environ[CYCLONE_URI]}")
+        local = discovery_range(environ, default) in {"OFF", "LOCALHOST"}
+        bound = local and not static_peers(environ)
     except UsageError as error:
         return Finding("dds", "error", str(error), f"unset {str(error).partition(':')[0]}")
-    if by_rclpy:
-        domain += f", rclpy on {dds_of('rclpy', environ)}"
-    if environ.get(CYCLONE_URI) and dds_of("", environ) != DEFAULT_RMW:
-        return Finding("dds", "state", f"{domain}, {CYCLONE_URI} {environ[CYCLONE_URI]}")
-    local = reach in {"OFF", "LOCALHOST"}
-    bound = local and not environ.get("ROS_STATIC_PEERS")
     up = [path.split("/")[3] for path, state in machine.read_all("sys/class/net/*/operstate").items() if state == "up"]
     where = "loopback only (127.0.0.1)" if bound else f"all interfaces: {', '.join(up) or 'none is up'}"
     state = f"{domain}, {where}, {'without' if local else 'with'} multicast"
