@@ -105,7 +105,7 @@ class GrpcClient:
         return self._channel
 
     def _pack(self, observation: dict[str, Any], trace: Trace) -> tuple[float, list[bytes]]:
-        """Return the observation's time stamp, which the chunk repeats, and its messages."""
+        """Return the time stamp (Unix time, as lerobot has it), which the chunk repeats, and the messages."""
         stamp, self._timestep = time.time(), self._timestep + 1
         fields = {"timestamp": stamp, "timestep": self._timestep, "observation": observation, "must_go": True}
         body = memoryview(pickled("TimedObservation", fields))

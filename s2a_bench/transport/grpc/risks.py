@@ -37,7 +37,7 @@ def examine(address: SplitResult) -> Iterator[Finding]:
     yield Finding(
         "sleep",
         "advice",
-        "lerobot's policy server answers no sooner than 33 ms after it was asked, unless it was started otherwise",
+        "lerobot's policy server answers no sooner than 33 ms after a request, unless it was started otherwise",
         "start it with --inference_latency=0; `latency` and `chunks --live` recognise the sleep (padded-answers)",
     )
     yield Finding(

@@ -7,7 +7,6 @@ import ssl
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from threading import Event, Thread
-from time import monotonic
 from typing import Any, Final
 
 from websockets.client import ClientProtocol
@@ -18,6 +17,7 @@ from websockets.protocol import State
 from websockets.sync.client import ClientConnection
 from websockets.uri import parse_uri
 
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, S2AError, ServerDied, TransportError
 from s2a_bench.secrets import struck
 from s2a_bench.transport.limits import Bounds
@@ -65,7 +65,7 @@ class BoundedConnection:
         Empty messages keep the connection open if the server closes it after ``idle_s`` without a message.
         """
         self._url, self._timeout_s = url, timeout_s
-        self._sent_s, self._closed = monotonic(), Event()
+        self._sent_ns, self._closed = now_ns(), Event()
         try:
             uri = parse_uri(url)
         except (InvalidURI, ValueError) as error:
@@ -87,7 +87,7 @@ class BoundedConnection:
         """Send an empty message after each ``third_s`` without a message of ours."""
         with suppress(OSError, ConnectionClosed):
             while not self._closed.wait(third_s):
-                if monotonic() - self._sent_s >= third_s:
+                if now_ns() - self._sent_ns >= third_s * 1e9:
                     self._connection.send(b"")
 
     def _connected(self, bounds: Bounds, host: str, port: int, *, secure: bool) -> socket.socket:
@@ -120,7 +120,7 @@ class BoundedConnection:
         with self._in_time() as seconds:
             self._connection.socket.settimeout(seconds)
             self._connection.send(message)
-            self._sent_s = monotonic()
+            self._sent_ns = now_ns()
 
     def receive(self) -> bytes | str:
         """Wait for one message, a text or bytes; raises Broken, RequestFailed."""
