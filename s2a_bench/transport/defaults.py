@@ -16,3 +16,5 @@ LOOPBACK: Final = "loopback"
 """An engine in this process."""
 LLAMA_SERVER: Final = "http/llama-server"
 """llama.cpp's server, which a run starts."""
+BESIDE: Final = ("ros", LOOPBACK)
+"""Transports that servers of other protocols are compared with."""

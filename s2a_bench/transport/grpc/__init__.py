@@ -14,6 +14,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.facts import GET_ACTIONS_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import option
 from s2a_bench.transport import ACTIONS, Capabilities, Choice, Client, Transport, Urls, Wiring
+from s2a_bench.transport.defaults import BESIDE
 from s2a_bench.transport.listening import UrlOptions
 from s2a_bench.transport.observation import TemplateName, names, template_of
 
@@ -46,7 +47,7 @@ class Grpc(Transport[GrpcOptions]):
     answer_kinds = (ACTIONS,)
     stages: ClassVar[dict[str, str]] = {"pickle_pack": "pack", "send": "network", "pickle_parse": "parse"}
     urls = Urls(GrpcOptions.SCHEMES, examine="s2a_bench.transport.grpc.risks:examine")
-    compared_with = ("ros", "loopback")
+    compared_with = BESIDE
     facts = (PAYLOAD_BYTES, PAYLOAD_DOWN_BYTES, RECONNECTS, GET_ACTIONS_MS)
     order = 24
     style = {LEROBOT: ("#01665E", "-")}

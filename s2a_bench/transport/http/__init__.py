@@ -23,6 +23,7 @@ from s2a_bench.transport import (
     Urls,
     Wiring,
 )
+from s2a_bench.transport.defaults import BESIDE
 from s2a_bench.transport.http.options import WHEEL, HttpOptions
 from s2a_bench.transport.listening import read_key
 
@@ -66,7 +67,7 @@ class Http(Transport[HttpOptions]):
         "binary": ("#CC79A7", "-."),
         "llama-server": ("#8C510A", ":"),
     }
-    compared_with = ("ros", "loopback")
+    compared_with = BESIDE
     packages = (
         *("fastapi", "httptools", "httpx", "json-numpy", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"),
     )

@@ -15,6 +15,7 @@ from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import option
 from s2a_bench.transport import Client, Handler, Server, Urls, Wiring
 from s2a_bench.transport.access import WebOptions
+from s2a_bench.transport.defaults import BESIDE
 from s2a_bench.transport.observation import DEFAULT, PolicyOptions, PolicyTransport, TemplateName, names
 
 VARIANTS = ("openpi", "openpi-stream")
@@ -51,7 +52,7 @@ class Websocket(PolicyTransport[WebsocketOptions]):
     urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.transport.websocket.risks:examine")
     modules = PACKAGES
     reads_server = ("path", "greets", "text_keys", "answer", "reset", "idle_s")
-    compared_with = ("ros", "loopback")
+    compared_with = BESIDE
     facts = (PAYLOAD_BYTES, RECONNECTS, INFER_MS, PREV_TOTAL_MS)
     order = 20
     style = {OPENPI: ("#000000", "-"), STREAM: ("#000000", "--")}

@@ -15,6 +15,7 @@ from s2a_bench import extras
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.options import option
 from s2a_bench.transport import SERVER, Client, Handler, Server, Urls, Wiring
+from s2a_bench.transport.defaults import BESIDE
 from s2a_bench.transport.observation import PolicyOptions, PolicyTransport, TemplateName, names
 
 GR00T = "gr00t"
@@ -53,7 +54,7 @@ class Zmq(PolicyTransport[ZmqOptions]):
     variants = (GR00T,)
     urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.transport.zmq.risks:examine")
     modules = PACKAGES
-    compared_with = ("ros", "loopback")
+    compared_with = BESIDE
     facts = (PAYLOAD_BYTES, RECONNECTS)
     order = 22
     style = {GR00T: ("#8C510A", "-")}
