@@ -59,6 +59,15 @@ class Subscription(Protocol):
     def unpack(self, packed: Any) -> Any:
         """Deserialise; arrays may be read-only views of the received buffer. Raises TransportError."""
 
+    def sender(self) -> Any:
+        """Return a hashable name of the publisher of what `take` returned last; for the thread that takes."""
+
+    def sender_hears(self, sender: Any, publisher: Any) -> bool:
+        """Return whether ``publisher``, of the same node as this, reaches a subscription beside ``sender``.
+
+        True where that cannot be known, and once the sender has left; callable from any thread.
+        """
+
     def interrupt(self) -> None:
         """Make a blocked `take`, and every later one, return None; callable from any thread."""
 

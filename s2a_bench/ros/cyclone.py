@@ -95,7 +95,7 @@ class _CycloneSubscription:
         waiter.watch(self.reader)
         self.interrupt, self.arrived = waiter.interrupt, self.reader.arrived
         self.matched = self.announced = self.reader.matched
-        self.publishers = self.reader.publishers
+        self.publishers, self.sender = self.reader.publishers, self.reader.sender
 
     def take(self, timeout_s: float) -> memoryview | None:
         deadline_ns = now_ns() + int(timeout_s * 1e9)
@@ -104,6 +104,10 @@ class _CycloneSubscription:
             if packed is not None or not self._waiter.wait_until(deadline_ns):
                 return packed
         return None
+
+    def sender_hears(self, sender: int, publisher: RawWriter) -> bool:
+        client = self.reader.endpoint(sender)
+        return client is None or any(each.participant_key == client.participant_key for each in publisher.endpoints())
 
     def unpack(self, packed: memoryview) -> Any:
         return deserialise(packed, self._type_name, self._version)

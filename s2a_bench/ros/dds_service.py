@@ -21,7 +21,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.ros import SERVICE_QOS, QoS
 from s2a_bench.ros.dds import DdsWaiter, RawReader, RawWriter, dds_qos, other_dds, user_data
 from s2a_bench.ros.messages import deserialise, serialise, type_hash
-from s2a_bench.ros.service import READER_QOS, ServiceEnd
+from s2a_bench.ros.service import MATCH_POLL_S, REACH_S, READER_QOS, REMEMBERED_CLIENTS, ServiceEnd
 
 HEADER = struct.Struct("<Qq")
 """guid of the client and number of its request, after the 4 bytes of CDR header."""
@@ -29,10 +29,6 @@ HEADER_AT = 4
 
 REPLY_QOS = QoS(depth=1000)
 """Deeper than ROS's 10: all clients' replies share one writer, and one that was lost on the way can be sent again."""
-
-REPLY_READER_TIMEOUT_NS = 100_000_000
-REPLY_READER_POLL_S = 0.01
-REMEMBERED_CLIENTS = 64
 
 _numbers = count(8)
 
@@ -177,7 +173,7 @@ class DdsServiceServer(_End, ServiceEnd[Caller]):
         """
         if caller.sender in self._reachable:
             return True
-        deadline_ns = now_ns() + REPLY_READER_TIMEOUT_NS
+        deadline_ns = now_ns() + round(REACH_S * 1e9)
         while (endpoint := self.reader.endpoint(caller.sender)) is not None:
             client = user_data(endpoint).get("clientid")
             if client is None or any(user_data(each).get("clientid") == client for each in self.writer.endpoints()):
@@ -187,5 +183,5 @@ class DdsServiceServer(_End, ServiceEnd[Caller]):
                 return True
             if now_ns() > deadline_ns:
                 return True  # as rmw_cyclonedds: send all the same
-            time.sleep(REPLY_READER_POLL_S)
+            time.sleep(MATCH_POLL_S)
         return False

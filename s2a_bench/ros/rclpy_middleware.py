@@ -123,8 +123,12 @@ class _RclpySubscription:
     def publishers(self) -> int:
         return 0 if self._node.closed else int(self._node.node.count_publishers(self.topic))
 
-    matched = publishers
-    """Humble's subscriptions do not know which of them reach it."""
+    matched = sender = publishers
+    """Humble's subscriptions do not know which of them reach it; Jazzy's do not know whose a message is."""
+
+    def sender_hears(self, sender: int, publisher: _RclpyPublisher) -> bool:
+        """Return whether as many clients hear us as there were when one of them sent."""
+        return publisher.matched() >= sender
 
 
 @contextmanager

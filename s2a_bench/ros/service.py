@@ -23,6 +23,9 @@ READER_QOS: Final = QoS(depth=0)
 """Our readers keep all, whatever ROS does: history is local, and a burst overruns ROS's default of 10."""
 MATCH_POLL_S: Final = 0.01
 """rclpy's own waiting looks four times a second."""
+REACH_S: Final = 0.1
+"""A server waits so long for the reader of a client that it does not reach yet, as rmw_cyclonedds does."""
+REMEMBERED_CLIENTS: Final = 64
 WARNED_AT_MOST: Final = 100
 """Kinds of a warning that are logged."""
 

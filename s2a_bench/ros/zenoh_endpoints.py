@@ -56,6 +56,7 @@ class ZenohPublisher:
                 self._publisher = node.session.declare_publisher(key, **how)
         self._latched = qos.latched
         self._seen = node.announce(names.PUBLISHER, topic, type_name, version, qos)
+        self.entity = self._seen.entity
 
     def pack(self, message: Any) -> bytearray:
         return serialise(message, self._type_name, self._version, padded=False)
@@ -84,6 +85,7 @@ class ZenohSubscription:
         self._once = LogOnce(_log)
         self._bell = bell
         self._inbox: SampleQueue[Any] = SampleQueue(topic, self._bell, qos.depth)
+        self._sender = b""
         self.interrupt = self._bell.interrupt
         self._subscriber = self._declared(node.key(topic, type_name, version), qos)
         self._seen = node.announce(names.SUBSCRIPTION, topic, type_name, version, qos)
@@ -118,11 +120,18 @@ class ZenohSubscription:
     def _wanted(self, sample: Any) -> bool:
         """Return True for a ROS message within its lifespan; log the first that is no ROS message."""
         try:
-            _, source_ns, _ = names.attached(sample.attachment.to_bytes() if sample.attachment else b"")
+            _, source_ns, self._sender = names.attached(sample.attachment.to_bytes() if sample.attachment else b"")
         except TransportError as error:
             self._once.warning("", "%s: dropped a message: %s", self.topic, error)
             return False
         return not self._oldest_ns or time.time_ns() - source_ns <= self._oldest_ns
+
+    def sender(self) -> bytes:
+        return self._sender
+
+    def sender_hears(self, sender: bytes, publisher: ZenohPublisher) -> bool:
+        sessions = self._node.sessions(names.PUBLISHER, self._seen.entity, sender)
+        return not sessions or bool(sessions & self._node.sessions(names.SUBSCRIPTION, publisher.entity))
 
     def arrived(self) -> Any:
         return (memoryview(sample.payload.to_bytes()) for sample in self._inbox.arrived() if self._wanted(sample))

@@ -89,6 +89,11 @@ def entity_of(token: str) -> Entity | None:
     return Entity(kind, name, type_name, hashed) if name.startswith("%") else None
 
 
+def session_of(token: str) -> str:
+    """Return the session that declared a token, as `entity_of` reads it."""
+    return token.split("/")[2]
+
+
 def gid_of(token: str) -> bytes:
     """Return an endpoint's gid: XXH3-128 of its token, the low half first."""
     return int.to_bytes(xxhash.xxh3_128_intdigest(token.encode()), 16, "little")

@@ -144,6 +144,13 @@ class Node:
             known = [*self._known.get((kind, entity.name), {}).values()]
         return (each.type_hash for each in known if each.type_name == entity.type_name)
 
+    def sessions(self, kind: str, entity: names.Entity, gid: bytes = b"") -> set[str]:
+        """Return the sessions of the endpoints of a kind that match ``entity``, or of the one with a ``gid``."""
+        with self._lock:
+            known = [*self._known.get((kind, entity.name), {}).items()]
+        matching = (token for token, each in known if each.type_hash == entity.type_hash)
+        return {names.session_of(token) for token in matching if not gid or names.gid_of(token) == gid}
+
     def named(self, kind: str, entity: names.Entity) -> int:
         """Count the endpoints of a kind that have the name of ``entity``."""
         with self._lock:

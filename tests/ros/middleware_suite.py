@@ -147,6 +147,21 @@ class MiddlewareSuite:
         _kept = join().publisher("/test/other_type", "std_msgs/msg/Header", QoS())
         wait_publishers(subscription, 1)
 
+    def test_a_sender_hears_a_publisher_once_it_subscribes(self, join: Join) -> None:
+        server, client = join(), join()
+        requests, answers = (
+            server.subscription("/test/request", STRING, QoS()),
+            server.publisher("/test/answer", STRING, QoS()),
+        )
+        publisher = client.publisher("/test/request", STRING, QoS())
+        wait_matched(publisher, requests)
+        publisher.send(publisher.pack(text("x")))
+        assert requests.take(WAIT_S) is not None
+        sender = requests.sender()
+        assert not requests.sender_hears(sender, answers)
+        _kept = client.subscription("/test/answer", STRING, QoS())
+        until(lambda: requests.sender_hears(sender, answers))
+
     def test_services_answer_who_asked(self, join: Join) -> None:
         def types(request: Any) -> Any:
             return ros.default(GET_TYPES + "_Response", types=[len(name) for name in request.names])

@@ -7,6 +7,7 @@ from collections.abc import Generator
 from contextlib import ExitStack
 from dataclasses import replace
 from threading import Event, Thread
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,11 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import Client, Handler, Wiring, open_client, open_server
+from s2a_bench.transport.limits import LIMITS
+from s2a_bench.transport.ros import topic
 from s2a_bench.transport.ros.camera import CAMERA
+from s2a_bench.transport.ros.joining import join
+from s2a_bench.transport.ros.wire import READER_QOS, REQUEST_QOS, request_message
 from s2a_bench.transport.serving import Queued
 from s2a_bench.types import Frame, Request, Token
 from tests.waiting import until
@@ -187,3 +192,36 @@ def test_a_second_server_of_a_namespace_is_refused(stack: ExitStack, wiring: Wir
     serve(stack, wiring, RecordingHandler(["x"]))
     with pytest.raises(TransportError, match="another server answers under /test_ros"):
         open_server(wiring, RecordingHandler(["y"]))
+
+
+def test_the_first_token_waits_for_the_reader_of_a_client_that_appears_late(
+    stack: ExitStack, from_pypi: str, dds_domain: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(topic, "REACH_S", 20.0)
+    wiring = wiring_of("ros/topic", "/test_late", domain_id=dds_domain, middleware=from_pypi)
+    wiring = replace(wiring, address=serve(stack, wiring, RecordingHandler(["x"])).address)
+    late, other = (join(wiring, name) for name in ("late", "other"))
+    for middleware in (late, other):
+        stack.callback(middleware.close)
+    requests = late.publisher("/test_late/request", ros.REQUEST, REQUEST_QOS)
+    bystander = other.subscription("/test_late/token", ros.TOKEN, READER_QOS)
+    until(lambda: requests.matched() and bystander.matched())
+    requests.send(requests.pack(request_message(Request("a", "plan", max_tokens=1))))
+    assert bystander.take(0.5) is None
+    tokens = late.subscription("/test_late/token", ros.TOKEN, READER_QOS)
+    packed = tokens.take(20)
+    assert packed is not None
+    assert tokens.unpack(packed).text == "x"
+
+
+def test_a_client_without_a_reader_is_waited_for_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    waited, sent = list[str](), list[Any]()
+    monkeypatch.setattr(topic, "appeared", lambda *_: waited.append("once"))
+    requests = SimpleNamespace(take=None, interrupt=None, sender=None)
+    tokens = SimpleNamespace(pack=lambda message: message, send=sent.append)
+    middleware: Any = SimpleNamespace(subscription=lambda *_: requests, publisher=lambda *_: tokens)
+    source = topic.TopicSource(middleware, "/test", LIMITS)
+    for index in range(2):
+        source.send("a", "sender", Token(index, "x"), [])
+    assert waited == ["once"]
+    assert [token.index for token in sent] == [0, 1]

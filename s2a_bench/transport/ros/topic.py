@@ -10,6 +10,7 @@ from s2a_bench.errors import MessagesLost, RequestFailed, ServerDied, TransportE
 from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.ros import Middleware
 from s2a_bench.ros import messages as ros
+from s2a_bench.ros.service import REACH_S, REMEMBERED_CLIENTS, appeared
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.chunks import state_of
@@ -105,7 +106,8 @@ class TopicSource:
         self.limits = limits
         self._requests = middleware.subscription(namespace + "/request", ros.REQUEST, READER_QOS)
         self._tokens = middleware.publisher(namespace + "/token", ros.TOKEN, TOKEN_QOS)
-        self.take, self.interrupt = self._requests.take, self._requests.interrupt
+        self._reached: set[Any] = set()
+        self.take, self.sender, self.interrupt = self._requests.take, self._requests.sender, self._requests.interrupt
 
     def exchange(self, packed: Any, shared: Shared, trace: Trace) -> TopicExchange:
         """Unpack a request; raises TransportError for bytes that are none."""
@@ -119,10 +121,19 @@ class TopicSource:
     def refuse(self, packed: Any, why: str) -> None:
         """Answer a request with an error only; raises TransportError for bytes that are no request."""
         request_id = self._requests.unpack(packed).id
-        self.send(request_id, Token(0, "", -1), [marks_message(request_id, Trace().to_remote())], why)
+        marks = [marks_message(request_id, Trace().to_remote())]
+        self.send(request_id, self.sender(), Token(0, "", -1), marks, why)
 
-    def send(self, request_id: str, token: Piece, marks: list[Any], error: str = "") -> None:
-        """Publish one token, or with marks the end of the answer."""
+    def send(self, request_id: str, sender: Any, token: Piece, marks: list[Any], error: str = "") -> None:
+        """Publish one token, or with marks the end of the answer; the first to a client waits for its reader.
+
+        Tokens are volatile: one that is sent before the reader is matched is lost.
+        """
+        if sender not in self._reached:
+            appeared(lambda: self._requests.sender_hears(sender, self._tokens), REACH_S)
+            if len(self._reached) >= REMEMBERED_CLIENTS:
+                self._reached.clear()
+            self._reached.add(sender)
         self._tokens.send(
             self._tokens.pack(token_message(request_id, token, last=bool(marks), error=error, marks=marks))
         )
@@ -133,7 +144,8 @@ class TopicExchange(RosExchange):
 
     def __init__(self, source: TopicSource, message: Any, shared: Shared, trace: Trace) -> None:
         super().__init__(shared, trace)
-        self._source, self._message, self._id = source, message, str(message.id)
+        self._source, self._message = source, message
+        self._client = str(message.id), source.sender()
         self._sent = 0
 
     def request(self) -> Request:
@@ -145,10 +157,10 @@ class TopicExchange(RosExchange):
         return Request(plain(message.id), message.prompt, images, *settings, state=state_of(message.state))
 
     def piece(self, piece: Piece) -> bool:
-        self._source.send(self._id, piece, [])
+        self._source.send(*self._client, piece, [])
         self._sent += 1
         return True
 
     def finish(self, error: str) -> None:
-        marks = marks_message(self._id, self.trace.to_remote())
-        self._source.send(self._id, Token(self._sent, "", -1), [marks], error)
+        marks = marks_message(self._client[0], self.trace.to_remote())
+        self._source.send(*self._client, Token(self._sent, "", -1), [marks], error)
