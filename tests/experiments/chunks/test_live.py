@@ -149,21 +149,19 @@ def test_a_calibrated_trigger_covers_the_way_from_the_tick_to_the_capture(
     assert read_run(folder_of(tmp_path)).samples["warmup"].sum() == 19
 
 
-@pytest.mark.parametrize("longer_ms", [0, 40])
-def test_delays_that_changed_since_the_warm_up_are_named(tmp_path: Path, longer_ms: int) -> None:
+def test_delays_that_changed_since_the_warm_up_are_named(tmp_path: Path) -> None:
     file = tmp_path / "delays.csv"
-    later = "".join(f"{each + longer_ms}\n" for each in (30, 50, 30, 30))
-    file.write_text("latency_ms\n" + "30\n50\n30\n30\n" * 5 + later * 100)
+    file.write_text("latency_ms\n" + "30\n50\n30\n30\n" * 5 + "90\n110\n90\n90\n" * 100)
     requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 20}
     options = {"rules": "calibrated,tracked", "epsilon": 0.05, "latency": str(file), "horizon": 5}
     act(tmp_path, modes="queue?trigger=1", requests=requests, seconds=2, **options)
     run = read_run(folder_of(tmp_path))
     changed = [each["message"] for each in run.manifest["warnings"] if each["code"] == "delays-changed"]
-    assert len(changed) == (2 if longer_ms else 0)
-    assert all("from 1 to 3 control ticks (P(a later one is longer) = 1.00)" in message for message in changed)
+    assert len(changed) == 2
+    assert all("delays changed since the calibration" in message for message in changed)
     notes = " ".join(show(run).tables["chunks"].notes)
-    assert ("lets at most" in notes) == (not longer_ms)
-    assert ("No promise about stalls" in notes) == bool(longer_ms)
+    assert "lets at most" not in notes
+    assert "No promise about stalls" in notes
 
 
 def test_a_slow_server_slows_actions_down(tmp_path: Path) -> None:
@@ -245,11 +243,11 @@ def recording(tmp_path: Path, *latency_ms: float) -> str:
 
 
 def test_an_answer_that_has_not_come_by_the_end_counts_as_a_stall_to_the_end(tmp_path: Path) -> None:
-    latency = recording(tmp_path, 10, 10, 10, 2500)  # the first is the warm-up's
+    latency = recording(tmp_path, 10, 10, 10, 3500)  # the first is the warm-up's
     (tmp_path / "runs").mkdir()
-    row = act(tmp_path / "runs", modes="queue", latency=latency, seconds=1.5).iloc[0]
+    row = act(tmp_path / "runs", modes="queue", latency=latency, seconds=2.5).iloc[0]
     first_tick = round(row["first_action_s"] * 50) - 1
-    assert row["ticks"] == 75 - first_tick
+    assert row["ticks"] == 125 - first_tick
     assert row["stall_ticks"] > 30
     assert row["boundaries"] == 2
     assert row["stalled_cycles"] >= 1  # a busy machine may be late for the first boundary as well
@@ -265,7 +263,7 @@ def test_the_last_answer_of_a_mode_is_waited_for_and_is_none_of_the_next(tmp_pat
     samples = read_run(folder_of(tmp_path / "runs")).samples
     assert (samples["error"] == "").all()
     assert len(samples) - 1 == rows["requests"].sum()
-    assert sorted(rows["latency_s_p99"] > 0.5) == [False, True]
+    assert sorted(rows["latency_s_p99"] > 1.9) == [False, True]
 
 
 def test_where_no_warm_up_succeeds_it_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
