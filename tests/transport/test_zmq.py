@@ -447,17 +447,18 @@ class TestBlackBox:
 
     def test_the_same_client_connects_anew_after_a_failure(self) -> None:
         calls: list[int] = []
+        given_up = Event()
 
         def answers(_: Any) -> Any:
             calls.append(len(calls))
             if len(calls) == 1:
-                Event().wait(1.0)
+                given_up.wait(20)
             return [{"robot": (CHUNK + calls[-1])[np.newaxis]}, {}]
 
-        with policy(answers) as url, robot("", url=url, layout="n1.6", timeout_s=0.7) as client:
+        with policy(answers) as url, robot("", url=url, layout="n1.6", timeout_s=2) as client:
             with pytest.raises(RequestFailed, match="silent"):
                 ask(client, Request("a", "go"))
-            Event().wait(0.5)
+            given_up.set()
             actions, trace = ask(client, Request("b", "go"))
         np.testing.assert_array_equal(actions[0].values, CHUNK[0] + 1)  # type: ignore[union-attr]
         assert trace.facts["reconnects"] == 1.0
@@ -556,15 +557,15 @@ class TestLayoutOfAServer:
 
     def test_a_silent_server_and_one_of_another_kind_are_told(self) -> None:
         begun = Event()
-        for answers, why in (
-            (lambda _: begun.wait(1) or {}, r"silent for too long: 0\.5 s"),
-            (lambda _: b"ERROR", "another kind of policy"),
-            (lambda _: b"PK\x03\x04", "no message"),
+        for answers, timeout_s, why in (
+            (lambda _: begun.wait(1) or {}, 0.5, r"silent for too long: 0\.5 s"),
+            (lambda _: b"ERROR", 20, "another kind of policy"),
+            (lambda _: b"PK\x03\x04", 20, "no message"),
         ):
             with (
                 policy(answers) as url,
                 pytest.raises(RequestFailed, match=why),
-                robot("", url=url, timeout_s=0.5),
+                robot("", url=url, timeout_s=timeout_s),
             ):
                 pass
 
