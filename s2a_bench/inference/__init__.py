@@ -340,13 +340,6 @@ class FetchConfig(Options):
     mmproj: str | None = option(None, "the repository's vision tower to fetch too [default: the known one, or none]")
 
 
-class InfoConfig(Options):
-    """The options of `model info`."""
-
-    what: str = option(..., "a GGUF file, or minicpm-v-2.6 once it is fetched", flag="file", argument=True)
-    hash: bool = option(False, "compute the SHA-256; without it, a known one is shown")
-
-
 class DummyConfig(Options):
     """The options of `model dummy`."""
 

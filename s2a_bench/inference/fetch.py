@@ -21,14 +21,14 @@ from typing import Annotated, Any, TypeAlias
 
 from s2a_bench import extras
 from s2a_bench.errors import ModelError, UsageError
-from s2a_bench.inference.gguf_file import Sha256
 from s2a_bench.inference.models import HUB_MODELS, digest, remember_sha256, sha256
-from s2a_bench.store.schema import Count, about
+from s2a_bench.store.schema import Count, Facts, about
 
 Progress: TypeAlias = Callable[[str, int, int], None]
 """(file, bytes present, total bytes) -> None."""
 
 _SHA256 = re.compile(r"[0-9a-f]{64}")
+Sha256 = Annotated[str, Facts(pattern="^[0-9a-f]{64}$")]
 _SPARE_BYTES = 100 << 20
 """Left free on the disk."""
 _REFUSED = (401, 403, 404)

@@ -39,10 +39,10 @@ HUB_MODELS: dict[str, HubModel] = {
         "openbmb/MiniCPM-V-2_6-gguf", "ggml-model-{quant}.gguf", "mmproj-model-f16.gguf", "Q4_K_M"
     ),
 }
-"""Name for `model fetch`, `model info` and ``--model`` -> its files."""
+"""Name for `model fetch` and ``--model`` -> its files."""
 
 
-def fetched(name: str, flag: str) -> tuple[Path, Path]:
+def fetched(name: str) -> tuple[Path, Path]:
     """Return the paths of a known model's fetched language model and mmproj, in the hub's cache.
 
     Raises ModelError if it is not fetched yet, or if several quantisations are.
@@ -53,11 +53,11 @@ def fetched(name: str, flag: str) -> tuple[Path, Path]:
     folder = Path(mmproj).parent if isinstance(mmproj, str) else None
     models = [path for path in sorted(folder.glob(known.model_file("*"))) if path.is_file()] if folder else []
     if not models or not isinstance(mmproj, str):
-        raise ModelError(f"{flag} {name}: not fetched yet; run: s2a-bench model fetch {name}")
+        raise ModelError(f"`model` {name}: not fetched yet; run: s2a-bench model fetch {name}")
     if len(models) > 1:
         before, after = known.model_file("*").split("*")
         quants = ", ".join(path.name.removeprefix(before).removesuffix(after) for path in models)
-        raise ModelError(f"{flag} {name}: several were fetched ({quants}); give a path, as {models[0]}")
+        raise ModelError(f"`model` {name}: several were fetched ({quants}); give a path, as {models[0]}")
     return models[0], Path(mmproj)
 
 
@@ -112,7 +112,7 @@ def load_headers(config: EngineConfig) -> ModelFiles:
             raise ModelError(f"`mmproj` {mmproj_path}: needs the language model too; give `model`, or leave out both")
         model_path, mmproj_path = tiny_dummy()
     elif str(model_path) in HUB_MODELS and not model_path.is_file():
-        model_path, fetched_mmproj = fetched(str(model_path), "`model`")
+        model_path, fetched_mmproj = fetched(str(model_path))
         mmproj_path = mmproj_path or fetched_mmproj
     model = read_header(model_path, "`model`")
     if model.is_mmproj:
@@ -140,11 +140,12 @@ def _mmproj_beside(model: Path) -> Path:
 
 def sha256(path: Path) -> str:
     """Return a file's SHA-256, cached by path, size and time of change, as models are large."""
-    value = remembered_sha256(path)
-    if value is None:
+    try:
+        return str(json.loads(_note(path).read_text())["sha256"])
+    except (OSError, ValueError, KeyError, TypeError):  # absent or damaged
         value = digest(path)
         remember_sha256(path, value)
-    return value
+        return value
 
 
 def digest(path: Path) -> str:
@@ -154,14 +155,6 @@ def digest(path: Path) -> str:
         while block := file.read(1 << 22):
             computed.update(block)
     return computed.hexdigest()
-
-
-def remembered_sha256(path: Path) -> str | None:
-    """Return a file's cached SHA-256, None if there is none or the file has changed since."""
-    try:
-        return str(json.loads(_note(path).read_text())["sha256"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None  # absent or damaged: to be computed
 
 
 def remember_sha256(path: Path, value: str) -> None:

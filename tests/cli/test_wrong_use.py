@@ -85,7 +85,6 @@ WRONG = {
     "model": [
         ("dummy --size huge", "--size: 'huge' should be 'tiny' or 'full'"),
         ("dummy --output /dev/null/x", "--output /dev/null/x: cannot write the dummy model", 1),
-        ("info /no/such", "model info /no/such: no such file; check the path", 1),
         ("fetch gpt", "model fetch: 'gpt' is neither minicpm-v-2.6 nor ORG/REPO:FILE"),
         ("fetch a/b:c.gguf --quant Q8_0", "--quant Q8_0: goes with minicpm-v-2.6"),
     ],

@@ -17,7 +17,6 @@ from typing import Any
 from unittest.mock import Mock
 
 import cv2
-import jsonschema
 import numpy as np
 from starlette.testclient import TestClient
 
@@ -35,7 +34,6 @@ from s2a_bench.report.page.chapters import read_chapters
 from s2a_bench.report.page.files import make_report
 from s2a_bench.ros import messages as ros
 from s2a_bench.store.files import count_rows, read_csv, read_parquet
-from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import TOKENS, TokenRow, samples_table
 from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.sweep.file import read_sweep_file
@@ -64,7 +62,6 @@ from tests.plan.test_parser import FORMATS
 from tests.servers.speakers import SPEAKERS
 
 ROOT = Path(__file__).parents[2]
-MODELS = json.loads((ROOT / "docs/schema/s2a-bench-model-1.json").read_text())["$defs"]
 
 
 @dataclass(frozen=True)
@@ -184,13 +181,9 @@ def gguf_files() -> list[bytes]:
 
 
 def read_gguf(data: bytes) -> None:
-    from s2a_bench.cli.model import info_sections
-    from s2a_bench.inference.gguf_file import describe
+    from s2a_bench.inference.gguf_file import read_header
 
-    info = describe(as_file("a.gguf", data), "model info")
-    assert info.bytes == len(data)
-    jsonschema.validate(json.loads(json.dumps(present(info))), MODELS["info"] | {"$defs": MODELS})
-    info_sections(info)
+    assert isinstance(read_header(as_file("a.gguf", data), "`model`").architecture, str)
 
 
 def tomls(*patterns: str) -> Callable[[], list[bytes]]:

@@ -212,7 +212,7 @@ def test_a_later_fetch_goes_on_where_an_earlier_one_ended(hub: Hub, tmp_path: Pa
     (part,) = blobs(tmp_path)
     assert part == f"{hub.digest(MODEL)}.s2a-bench.part"
     with pytest.raises(ModelError, match="not fetched yet"):
-        fetched(NAME, "`model`")
+        fetched(NAME)
     before = len(hub.gets(MODEL))
     done = fetch(wanted(NAME, None, None))
     assert done.files[0].resumed_at > 2_000_000
