@@ -1,15 +1,10 @@
-"""Real cameras through Linux' V4L2: a camera as a source of its driver's YUYV, and the list of cameras."""
+"""Real cameras through Linux' V4L2, as sources of their driver's YUYV."""
 
 from __future__ import annotations
 
-import errno
 import fcntl
 import os
-import re
 import struct
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import ClassVar, cast
 
 import cv2
@@ -20,27 +15,14 @@ from s2a_bench.frames import NumberedSource
 from s2a_bench.types import Encoding, Pixels
 
 VIDIOC_QUERYCAP = 0x80685600
-VIDIOC_ENUM_FMT = 0xC0405602
-VIDIOC_ENUM_FRAMESIZES = 0xC02C564A
-"""``linux/videodev2.h``: fill a struct v4l2_capability, v4l2_fmtdesc, v4l2_frmsizeenum."""
+"""``linux/videodev2.h``: fill a struct v4l2_capability."""
 CAPABILITY = struct.Struct("16s32s32sIII12x")
 """struct v4l2_capability: driver, card, bus, version, capabilities, device_caps, reserved."""
-FORMAT = struct.Struct("III32sI16x")
-"""struct v4l2_fmtdesc: index, type, flags, description, pixelformat, mbus_code and reserved."""
-FRAME_SIZE = struct.Struct("III6I8x")
-"""struct v4l2_frmsizeenum: index, pixel_format, type, then width and height, or both as minimum, maximum, step."""
-CAN_CAPTURE, CAN_CAPTURE_PLANES, HAS_DEVICE_CAPS = 0x00000001, 0x00001000, 0x80000000
-CAPTURE, CAPTURE_PLANES = 1, 9
-DISCRETE = 1
-MOST = 64
-"""The most entries of a list that are read: a driver might never end it."""
-
+CAN_CAPTURE, HAS_DEVICE_CAPS = 0x00000001, 0x80000000
 QUEUE = 10
 """The most buffers that OpenCV has a driver fill; its default is 4."""
 AT_ONCE_NS = 1_000_000
 """A frame delivered faster than this was waiting in the queue."""
-
-Ioctl = Callable[[int, int, bytes], bytes]
 
 
 class V4L2Camera(NumberedSource):
@@ -130,91 +112,14 @@ def _check_device(path: str) -> None:
     except OSError as error:
         raise SourceError(f"`source`: cannot open {path}: {error.strerror}") from error
     try:
-        _, caps = _card_and_caps(device, fcntl.ioctl)
+        answer = fcntl.ioctl(device, VIDIOC_QUERYCAP, bytes(CAPABILITY.size))
     except OSError:
         raise SourceError(f"`source`: {path} is no camera; `ls /dev/video*` shows those there are") from None
     finally:
         os.close(device)
-    if not caps & CAN_CAPTURE:
+    *_, all_caps, device_caps = CAPABILITY.unpack(answer)
+    if not (device_caps if all_caps & HAS_DEVICE_CAPS else all_caps) & CAN_CAPTURE:
         raise SourceError(
             f"`source`: {path} captures no pictures, though its camera may under another number; "
             "`v4l2-ctl --list-devices` shows them"
         )
-
-
-@dataclass(frozen=True, slots=True)
-class CameraInfo:
-    """One capture device; ``problem`` is the reason if it cannot be examined."""
-
-    path: str
-    card: str = ""
-    formats: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
-    """Four-letter code -> sizes; the smallest and the largest if they are a range."""
-    problem: str = ""
-
-    def summary(self) -> str:
-        return ", ".join(
-            f"{code} up to {max(sizes)[0]}x{max(sizes)[1]}" if sizes else code for code, sizes in self.formats.items()
-        )
-
-
-def list_cameras(folder: Path = Path("/dev"), ioctl: Ioctl = fcntl.ioctl) -> list[CameraInfo]:
-    """Examine every ``video`` device; those that capture nothing (metadata, encoders) are left out."""
-    paths = sorted(folder.glob("video[0-9]*"), key=lambda path: int(re.sub(r"\D", "", path.name)))
-    return [camera for path in paths if (camera := _examine(path, ioctl)) is not None]
-
-
-def _examine(path: Path, ioctl: Ioctl) -> CameraInfo | None:
-    try:
-        device = os.open(path, os.O_RDWR | os.O_NONBLOCK)
-    except PermissionError:
-        return CameraInfo(str(path), problem="no permission to open it")
-    except OSError as error:
-        return CameraInfo(str(path), problem=error.strerror or str(error))
-    try:
-        card, caps = _card_and_caps(device, ioctl)
-        if not caps & (CAN_CAPTURE | CAN_CAPTURE_PLANES):
-            return None
-        kind = CAPTURE if caps & CAN_CAPTURE else CAPTURE_PLANES
-        return CameraInfo(str(path), card, _formats(device, kind, ioctl))
-    except OSError:
-        return None
-    finally:
-        os.close(device)
-
-
-def _card_and_caps(device: int, ioctl: Ioctl) -> tuple[str, int]:
-    _, card, _, _, all_caps, device_caps = CAPABILITY.unpack(ioctl(device, VIDIOC_QUERYCAP, bytes(CAPABILITY.size)))
-    return _text(card), device_caps if all_caps & HAS_DEVICE_CAPS else all_caps
-
-
-def _formats(device: int, kind: int, ioctl: Ioctl) -> dict[str, list[tuple[int, int]]]:
-    formats = {}
-    for index in range(MOST):
-        try:
-            answer = ioctl(device, VIDIOC_ENUM_FMT, FORMAT.pack(index, kind, 0, b"", 0))
-        except OSError as error:
-            if error.errno != errno.EINVAL:  # EINVAL: the end of the list
-                raise
-            break
-        code: int = FORMAT.unpack(answer)[4]
-        formats[_text(code.to_bytes(4, "little"))] = _sizes(device, code, ioctl)
-    return formats
-
-
-def _sizes(device: int, code: int, ioctl: Ioctl) -> list[tuple[int, int]]:
-    sizes: list[tuple[int, int]] = []
-    for index in range(MOST):
-        try:
-            answer = ioctl(device, VIDIOC_ENUM_FRAMESIZES, FRAME_SIZE.pack(index, code, 0, *[0] * 6))
-        except OSError:
-            break
-        _, _, kind, *numbers = FRAME_SIZE.unpack(answer)
-        if kind != DISCRETE:
-            return [(numbers[0], numbers[3]), (numbers[1], numbers[4])]
-        sizes.append((numbers[0], numbers[1]))
-    return sizes
-
-
-def _text(raw: bytes) -> str:
-    return raw.partition(b"\0")[0].decode("ascii", "replace").strip()

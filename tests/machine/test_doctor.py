@@ -15,7 +15,6 @@ from typing import Any
 import pytest
 
 from s2a_bench.cli.doctor import all_checks
-from s2a_bench.frames.v4l2 import CameraInfo
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.warnings import before_run
@@ -87,7 +86,7 @@ def make(tmp_path: Path) -> Make:
         for path, text in tree.items():
             (root / path).parent.mkdir(parents=True, exist_ok=True)
             (root / path).write_text(text)
-        silent: dict[str, Any] = {"run": lambda _command: None, "which": lambda _name: None, "cameras": list}
+        silent: dict[str, Any] = {"run": lambda _command: None, "which": lambda _name: None}
         known: dict[str, Any] = {"environ": {}, "cpus": frozenset(range(4)), "finds": lambda _package: True}
         return Machine(root, **(known | silent | {"output": tmp_path} | fields))
 
@@ -392,17 +391,12 @@ def test_zenohs_router_is_looked_for(make: Make, tree: dict[str, str], says: str
     assert finding.message.startswith(says)
 
 
-def test_cameras_are_listed_with_their_formats(make: Make) -> None:
-    webcam = CameraInfo("/dev/video0", "C920", {"YUYV": [(640, 480), (1920, 1080)], "MJPG": []})
-    bayer = CameraInfo("/dev/video1", "imx219", {"RG10": [(3280, 2464)]})
-    closed = CameraInfo("/dev/video2", problem="no permission to open it")
-    assert see(make({}, cameras=lambda: [webcam, bayer]), "cameras") == Finding(
-        "cameras",
-        "state",
-        "/dev/video0 C920: YUYV up to 1920x1080, MJPG; /dev/video1 imx219: RG10 up to 3280x2464",
-    )
-    assert see(make({}, cameras=lambda: [bayer]), "cameras").level == "advice"
-    assert "usermod" in see(make({}, cameras=lambda: [webcam, closed]), "cameras").fix
+def test_cameras_are_listed_and_closed_ones_warned_of(make: Make) -> None:
+    webcam = {"sys/class/video4linux/video0/name": "C920\n"}
+    found = see(make(webcam | {"dev/video0": ""}), "cameras")
+    assert found.level == "state"
+    assert found.message.startswith("/dev/video0 C920 (v4l2-ctl")
+    assert "usermod" in see(make(webcam), "cameras").fix
 
 
 def test_the_disk_of_a_folder_that_is_not_there_yet_is_its_parents(make: Make, tmp_path: Path) -> None:

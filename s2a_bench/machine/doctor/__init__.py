@@ -14,14 +14,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 from s2a_bench import extras
 from s2a_bench.options import Options, option
 from s2a_bench.store.manifest import RunWarning
-
-if TYPE_CHECKING:
-    from s2a_bench.frames.v4l2 import CameraInfo
 
 Level: TypeAlias = Literal["state", "advice", "warning", "error"]
 LEVELS: tuple[Level, ...] = ("state", "advice", "warning", "error")
@@ -52,12 +49,6 @@ def _run(command: Sequence[str]) -> str | None:
     return done.stdout if done.returncode == 0 else None
 
 
-def _cameras() -> list[CameraInfo]:
-    from s2a_bench.frames.v4l2 import list_cameras  # it imports OpenCV, which the checks of a run do not need
-
-    return list_cameras()
-
-
 @dataclass(frozen=True, slots=True)
 class Machine:
     """The inputs of checks; the defaults are this machine and this process."""
@@ -69,7 +60,6 @@ class Machine:
     run: Callable[[Sequence[str]], str | None] = _run
     which: Callable[[str], str | None] = shutil.which
     finds: Callable[[str], bool] = extras.installed
-    cameras: Callable[[], list[CameraInfo]] = _cameras
 
     def read(self, path: str) -> str | None:
         """Return a file's text without surrounding blanks and NULs; None if it cannot be read."""
