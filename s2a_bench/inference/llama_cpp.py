@@ -37,10 +37,8 @@ from s2a_bench.inference import (
 )
 from s2a_bench.inference.llama_decode import (
     GrammarSampler,
-    GreedySampler,
     TokenBatch,
     TokenBytes,
-    TokenSampler,
     beyond_limits,
     grammar_error,
 )
@@ -76,14 +74,12 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
     def context_params(self, params: Any) -> None:
         self._context_params = params
 
-    def sampler(self, name: str, grammar: str, settings: Mapping[str, float]) -> TokenSampler:
+    def sampler(self, name: str, grammar: str, settings: Mapping[str, float]) -> Any:
         """Build the sampling ``name``, with some ``settings`` replaced, as a chain of samplers under a grammar."""
-        if name == "greedy" and not grammar and not settings:
-            return GreedySampler(self._n_vocab)
         last_n = int(settings.get(PENALTY_LAST_N, LAST_N))
         self.last_n_tokens_size = self.n_ctx() if last_n < 0 else last_n
         arguments = {SAMPLER_ARGUMENTS[key]: value for key, value in settings.items() if key in SAMPLER_ARGUMENTS}
-        chain: TokenSampler = self._init_sampler(**SAMPLINGS[name] | arguments)
+        chain = self._init_sampler(**SAMPLINGS[name] | arguments)
         return GrammarSampler(chain, self._model.vocab, grammar, self._candidates) if grammar else chain
 
     def eval(self, tokens: list[int]) -> None:

@@ -13,20 +13,15 @@ import re
 import tempfile
 import weakref
 from collections.abc import Iterator
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from s2a_bench import extras
 from s2a_bench.inference import llama_log
 
 llama_cpp = extras.require("llama_cpp", "llama")
 bindings = llama_cpp.llama_cpp
-
-_logits_address = bindings._lib["llama_get_logits_ith"]  # noqa: SLF001 a separate function object: a plain address
-_logits_address.argtypes = [ctypes.c_void_p, ctypes.c_int32]
-_logits_address.restype = ctypes.c_void_p
 
 _PIECE_BYTES = 1024
 _STDERR = 2
@@ -59,35 +54,6 @@ class TokenBytes(dict[int, bytes]):
         return found
 
 
-class TokenSampler(Protocol):
-    """Chooses a token; llama-cpp-python's ``LlamaSampler`` is one."""
-
-    def sample(self, ctx: Any, idx: int = -1) -> int:
-        """Return the token that follows output ``idx`` of the library's context."""
-
-
-class GreedySampler:
-    """Takes the likeliest token, the first of equals, from llama.cpp's buffer of logits.
-
-    llama.cpp's greedy sampler returns the same after copying the vocabulary to a list of candidates: 160 us against
-    10 with Qwen2's 151666 tokens on the development machine.
-    """
-
-    def __init__(self, n_vocab: int) -> None:
-        self._n_vocab = n_vocab
-        self._address = 0
-        self._logits: NDArray[np.float32] = np.zeros(0, np.float32)
-
-    def sample(self, ctx: Any, idx: int = -1) -> int:
-        address = _logits_address(ctx.ctx, idx)  # waits for the device
-        if address != self._address:  # llama.cpp moves its buffer only when it needs a larger one
-            if not address:
-                raise RuntimeError("there are no logits")
-            self._logits = np.ctypeslib.as_array((ctypes.c_float * self._n_vocab).from_address(address))
-            self._address = address
-        return int(self._logits.argmax())
-
-
 class TokenBatch:
     """A batch of one token of sequence 0, allocated once."""
 
@@ -98,8 +64,8 @@ class TokenBatch:
         self._batch.seq_id[0][0] = 0
         self._batch.logits[0] = 1
 
-    def answer(self, ctx: Any, sampler: TokenSampler, position: int) -> Iterator[int]:
-        """Yield tokens without end, the first from the present logits; ``position`` is the prompt's length.
+    def answer(self, ctx: Any, sampler: Any, position: int) -> Iterator[int]:
+        """Yield tokens of the library's (or our) ``sampler`` without end; ``position`` is the prompt's length.
 
         Raises RuntimeError if llama.cpp cannot decode.
         """

@@ -11,7 +11,7 @@ import pytest
 from s2a_bench.errors import EngineError
 from s2a_bench.inference import SAMPLINGS, EngineConfig
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
-from s2a_bench.inference.llama_decode import GreedySampler, bindings
+from s2a_bench.inference.llama_decode import bindings
 from s2a_bench.testing.engine import ask, rgb_frame
 from s2a_bench.types import Frame, Request
 
@@ -41,20 +41,6 @@ def test_it_writes_the_tokens_that_the_library_writes(
     ours = [token.id for token in engine.generate(request)]
     assert ours == by_the_library(engine, request)
     assert len(ours) == 70
-
-
-def test_the_greedy_sampler_is_llama_cpps(engine: LlamaCppEngine) -> None:
-    llama = engine._llama
-    assert llama is not None
-    engine._evaluate(llama, Request("r", "go"))
-    theirs = llama_cpp.llama_sampler_init_greedy()
-    sampler = GreedySampler(llama._n_vocab)
-    for position in range(len(llama.prompt), len(llama.prompt) + 40):
-        token = sampler.sample(llama._ctx)
-        assert token == llama_cpp.llama_sampler_sample(theirs, llama.ctx, -1)
-        llama.n_tokens = position
-        llama.eval([token])
-    llama_cpp.llama_sampler_free(theirs)
 
 
 def test_greedy_does_not_depend_on_the_seed(tiny: EngineConfig) -> None:
