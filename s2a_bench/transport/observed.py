@@ -19,8 +19,8 @@ import numpy as np
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.trace import Remote, Trace
-from s2a_bench.transport.chunks import state_of
-from s2a_bench.transport.limits import SEEDS, Limits, check_pixels, text, whole_number
+from s2a_bench.transport import chunks
+from s2a_bench.transport.limits import Limits, check_pixels, text
 from s2a_bench.transport.observation import EXTENSION
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.types import Frame, Request
@@ -55,7 +55,7 @@ def read_observation(
             numbers.append(row)
         if len(frames) > PICTURES:
             raise RequestFailed(f"more than {PICTURES} pictures")
-    state = state_of(np.concatenate(numbers)) if count else ()
+    state = chunks.state_of(np.concatenate(numbers)) if count else ()
     return tuple(frames), state, text(PROMPT, prompt if prompt is not None else first)
 
 
@@ -114,15 +114,8 @@ def request_of(observation: Any, extension: dict[Any, Any] | None, trace: Trace,
     """Read an observation and our client's fields, decode its pictures; raises RequestFailed."""
     fields = extension or {}
     images, state, prompt = read_observation(observation, trace, limits)
-    return Request(
-        id=text("id", fields.get("id")) or "observation-0",
-        prompt=prompt,
-        images=images,
-        max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, limits.answer_tokens, limits.answer_tokens),
-        grammar=text("grammar", fields.get("grammar")),
-        seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
-        state=state,
-    )
+    name = text("id", fields.get("id")) or "observation-0"
+    return chunks.request_of(fields, limits, name, prompt, images, state, limits.answer_tokens)
 
 
 def remote_message(remote: Remote) -> dict[str, Any]:

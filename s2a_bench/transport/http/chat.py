@@ -8,9 +8,9 @@ from typing import Any
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.facts import PROMPT_N
 from s2a_bench.trace import Trace
-from s2a_bench.transport.chunks import state_of
+from s2a_bench.transport.chunks import request_of, state_of
 from s2a_bench.transport.http import blocks, native
-from s2a_bench.transport.limits import SEEDS, Limits, check_values, text, whole_number
+from s2a_bench.transport.limits import Limits, check_values, text
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.serving import Disconnected, Exchange
 from s2a_bench.types import Action, Frame, Piece, Request
@@ -90,15 +90,8 @@ def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) ->
 
 
 def _request(fields: dict[str, Any], prompt: str, images: tuple[Frame, ...], limits: Limits) -> tuple[Request, bool]:
-    request = Request(
-        id=text("request_id", fields.get("request_id")) or "chatcmpl-0",
-        prompt=text("the prompt", prompt),
-        images=images,
-        max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, limits.answer_tokens, 32),
-        grammar=text("grammar", fields.get("grammar")),
-        seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
-        state=state_of(fields.get("state") or ()),
-    )
+    name = text("request_id", fields.get("request_id")) or "chatcmpl-0"
+    request = request_of(fields, limits, name, text("the prompt", prompt), images, state_of(fields.get("state") or ()))
     return request, bool(fields.get("stream"))
 
 

@@ -8,8 +8,8 @@ import orjson
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.trace import Trace
-from s2a_bench.transport.chunks import state_of
-from s2a_bench.transport.limits import SEEDS, Limits, check_pixels, check_values, text, whole_number
+from s2a_bench.transport.chunks import request_of, state_of
+from s2a_bench.transport.limits import Limits, check_pixels, check_values, text, whole_number
 from s2a_bench.transport.pictures import decoded, rgb_of
 from s2a_bench.transport.shm.memory import SharedMemory
 from s2a_bench.types import Frame, Request
@@ -47,15 +47,8 @@ def request_at(memory: SharedMemory, at: int, length: int, limits: Limits, trace
         if len(pictures) > 1:  # what the first ones leave to the others
             pixels = pixels.but(pixels=max(1, pixels.pixels - images[-1].width * images[-1].height))
         begin += size
-    return Request(
-        id=text("id", fields.get("id")),
-        prompt=text("prompt", fields.get("prompt")),
-        images=tuple(images),
-        max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, limits.answer_tokens, 32),
-        grammar=text("grammar", fields.get("grammar")),
-        seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
-        state=state_of(fields.get("state") or ()),
-    )
+    name, prompt = (text(key, fields.get(key)) for key in ("id", "prompt"))
+    return request_of(fields, limits, name, prompt, tuple(images), state_of(fields.get("state") or ()))
 
 
 def _picture(memory: SharedMemory, about: dict[str, Any], begin: int, trace: Trace, limits: Limits) -> Frame:
