@@ -220,7 +220,6 @@ class Wiring(Generic[O]):
         return TRANSPORTS[self.transport].capabilities(Choice(self.options, self.variant))
 
     def deadline_of(self, max_tokens: int) -> float:
-        """Return the seconds that an answer of so many tokens may take."""
         return self.deadline_s or self.timeout_s + TOKEN_S * max_tokens
 
     @staticmethod
@@ -231,8 +230,6 @@ class Wiring(Generic[O]):
 
 @dataclass(frozen=True, slots=True)
 class Choice(Generic[O]):
-    """The choice of a pipeline's name and a run's settings."""
-
     options: O
     variant: str = ""
     mode: str = ""

@@ -22,8 +22,6 @@ HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]*\]|[^:\[\]]*)(?::[0-9]*)?")
 
 
 class WebOptions(ListeningOptions):
-    """Options of a server that browsers can reach."""
-
     allow_host: str = option(
         "", "on loopback, more names that clients may send as Host, comma separated: a proxy's", side=SERVING
     )

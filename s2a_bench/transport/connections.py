@@ -63,7 +63,6 @@ class Connections:
             wire.hang_up()
 
     def stop(self) -> None:
-        """Make `serve` return soon; may be called twice, from any thread."""
         self._stopped = True
         with suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)

@@ -28,8 +28,6 @@ VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 class UrlOptions(TransportOptions):
-    """Options of the client of an external server."""
-
     SCHEMES: ClassVar[tuple[str, ...]] = ()
     ENDS_WITH_PORT: ClassVar[bool] = False
     """Whether a URL has to name a port, and has nothing after it."""
@@ -46,8 +44,6 @@ class UrlOptions(TransportOptions):
 
 
 class ListeningOptions(UrlOptions):
-    """Options of a server with an address, ours or an external one."""
-
     host: str = option(
         "127.0.0.1", "address that our server binds; others than this machine need a key", side=SERVING, first=True
     )

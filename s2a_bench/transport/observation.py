@@ -100,8 +100,6 @@ class ExternalServer(toml_file.TomlTable):
 
 
 class Template:
-    """The template of one policy's observations."""
-
     def __init__(self, content: Any, name: str) -> None:
         self.name = name
         self._session = uuid4().hex
@@ -259,7 +257,6 @@ class Template:
 
 
 def names() -> list[str]:
-    """Return the templates that are known by name."""
     return sorted(path.stem for path in TEMPLATES.glob("*.toml"))
 
 
@@ -314,8 +311,6 @@ TemplateName = Annotated[str, AfterValidator(_readable)]
 
 
 class PolicyOptions(ListeningOptions):
-    """Options of a policy server, with the template of its observations."""
-
     @property
     def template_name(self) -> str:
         raise NotImplementedError

@@ -119,7 +119,6 @@ def request_of(observation: Any, extension: dict[Any, Any] | None, trace: Trace,
 
 
 def remote_message(remote: Remote) -> dict[str, Any]:
-    """Return the message with a server's marks."""
     return {EXTENSION: remote.to_json()}
 
 

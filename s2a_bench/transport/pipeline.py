@@ -36,8 +36,6 @@ O = TypeVar("O", bound=TransportOptions)  # noqa: E741 - the one type variable h
 
 @dataclass(frozen=True, slots=True)
 class Pipeline:
-    """One pipeline with its settings: the subject of a comparison."""
-
     name: str
     """The name of its cell: canonical, unless a command chooses another."""
     transport: Transport[Any]
@@ -225,7 +223,6 @@ def require_payload(pipeline: Pipeline) -> None:
 
 
 def without(name: str, option: str) -> str:
-    """Return a cell's name without one of its options."""
     path, _, query = name.partition("?")
     kept = "&".join(each for each in query.split("&") if each.partition("=")[0] != option)
     return f"{path}?{kept}" if kept else path

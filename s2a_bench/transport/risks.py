@@ -60,7 +60,6 @@ def printable(text: str, most: int = 120) -> str:
 
 
 def is_local(host: str) -> bool:
-    """Return True if a name means this machine alone."""
     with suppress(OSError, ValueError):
         return all(ip_address(each[4][0]).is_loopback for each in socket.getaddrinfo(host, None))
     return False
@@ -88,7 +87,6 @@ def no_key(address: SplitResult, what: str, cure: str) -> Finding:
 
 
 def idle_cut(seconds: float, cure: str) -> Finding:
-    """Return the finding that a server closes connections on which nothing comes."""
     message = (
         f"it closes a connection after {seconds:g} s of silence: a request after a longer pause connects again first"
     )

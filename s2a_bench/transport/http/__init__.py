@@ -44,8 +44,6 @@ def found_llama_server() -> Path | None:
 
 
 class Http(Transport[HttpOptions]):
-    """Base64 and JSON as usually deployed, at their best, the binary control, and llama.cpp's server."""
-
     name = "http"
     options = HttpOptions
     variants = VARIANTS

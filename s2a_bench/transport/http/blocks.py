@@ -23,13 +23,11 @@ ACTION, JSON = b"A", b"J"
 
 
 def of_action(action: Action) -> bytes:
-    """Return the block of an action."""
     block = ACTION + LENGTH.pack(action.index) + action.values.astype("<f4").tobytes()
     return LENGTH.pack(len(block)) + block
 
 
 def json_block(message: Any) -> bytes:
-    """Return the block of any other message."""
     block = JSON + orjson.dumps(message)
     return LENGTH.pack(len(block)) + block
 

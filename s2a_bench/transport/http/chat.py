@@ -28,7 +28,6 @@ def of_json(_headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> tu
 
 
 def of_picture(headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> tuple[Request, bool]:
-    """Read a body that consists of the pictures."""
     values = dict(headers)
     fields = _parsed(values.get(native.PARAMETERS_HEADER, "").encode(), f"header {native.PARAMETERS_HEADER}", trace)
     if not (isinstance(fields, dict) and isinstance(prompt := fields.get("prompt", ""), str)):
@@ -68,7 +67,6 @@ def _cut(pictures: Any, media_type: str, body: Buffer) -> list[tuple[str, Buffer
 
 
 def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) -> tuple[Request, bool]:
-    """Read OpenAI's fields and decode the pictures of the messages."""
     images: list[Frame] = []
     texts: list[str] = []
     try:

@@ -46,8 +46,6 @@ QUOTED = 200
 
 
 class HttpClient:
-    """One variant of the HTTP pipeline."""
-
     def __init__(self, wiring: Wiring[HttpOptions], alive: Callable[[], bool]) -> None:
         """Prepare requests to ``wiring.address``; a black box of unknown dialect is asked for its list of models."""
         self.camera = None
@@ -67,7 +65,6 @@ class HttpClient:
         self._client = self._new_client() if options.connection != "client-per-request" else None
 
     def describe(self) -> dict[str, str]:
-        """Return the URL, the dialect and, if the server named it, the model."""
         named = {"model": self._model} if self._model not in {self._wiring.options.served_model, NO_MODEL} else {}
         return {"url": self._url, "dialect": self._dialect.name, **named}
 
@@ -261,7 +258,6 @@ def refusal(url: str, response: HttpResponse, body: str, options: HttpOptions, e
 
 
 def advice_for(status: int, message: str, options: HttpOptions, *, moved: str = "") -> str:
-    """Return the way out for a status or a known message, or nothing."""
     if httpx.codes.is_redirect(status):
         return f"it moved: give {moved or 'its new place'} to `url`"
     if UNKNOWN_MODEL.search(message):

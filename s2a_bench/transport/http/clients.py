@@ -36,8 +36,6 @@ def _in_time(bounds: Bounds, timeout_s: float | None) -> Iterator[float]:
 
 
 class BoundedClient(httpx.Client):
-    """An httpx client within the bounds of the running request."""
-
     def __init__(self, bounds: Bounds, **options: Any) -> None:
         # compression would delay tokens, and a few bytes could become gigabytes
         super().__init__(headers={"accept-encoding": "identity"}, **options)
@@ -67,8 +65,6 @@ class _Network(httpcore.NetworkBackend):
 
 
 class _BoundedStream(httpcore.NetworkStream):
-    """A connection whose reads and writes end with the bounds."""
-
     def __init__(self, stream: httpcore.NetworkStream, client: BoundedClient) -> None:
         self._stream, self._client = stream, client
 
@@ -96,8 +92,6 @@ class _BoundedStream(httpcore.NetworkStream):
 
 
 class LeanResponse:
-    """An answer whose headers have arrived."""
-
     def __init__(self, response: HTTPResponse) -> None:
         self._response = response
         self.status_code, self.headers = response.status, response.headers

@@ -70,8 +70,6 @@ def cache_hits(wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
 
 
 def getter(client: BoundedClient, headers: dict[str, str]) -> Get:
-    """Return a function that gets JSON from a URL, bounded in size and time."""
-
     def get(url: str) -> Any:
         try:
             return json.loads(_text(url, client, headers))

@@ -83,8 +83,6 @@ class Head:
 
 
 class FastServer(WebServer):
-    """Answers the requests of each connection in turn."""
-
     def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
         super().__init__(wiring, handler, "http", native.SCHEME)
         most = wiring.limits.connections
@@ -96,7 +94,6 @@ class FastServer(WebServer):
         return {"server": "a thread a connection", "http": "httptools", "version": httptools.__version__}
 
     def _answer_all(self, wire: Wire) -> None:
-        """Answer the requests of a connection until one is refused, or the client closes it."""
         wire.socket.setsockopt(IPPROTO_TCP, TCP_NODELAY, 1)
         early: bytes | None = b""
         try:

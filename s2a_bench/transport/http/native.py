@@ -47,8 +47,6 @@ PARAMETERS_HEADER = "s2a-request"
 
 @dataclass(frozen=True, slots=True)
 class Codec:
-    """The JSON and Base64 functions of a variant."""
-
     dumps: Callable[[Any], bytes]
     loads: Callable[[Any], Any]
     to_base64: Callable[[Any], str]
@@ -87,19 +85,16 @@ def refusal_of(error: S2AError) -> tuple[int, str, dict[str, str]]:
 
 
 def error_json(status: int, message: str) -> dict[str, Any]:
-    """Return an error in OpenAI's form."""
     shown = message.encode(errors="backslashreplace").decode()
     return {"error": {"message": shown, "type": "invalid_request_error", "code": status}}
 
 
 def head_of(status: int, headers: Mapping[str, str], *, keep: bool) -> bytes:
-    """Return the head of an answer."""
     lines = [f"HTTP/1.1 {status} {HTTPStatus(status).phrase}", *(f"{name}: {value}" for name, value in headers.items())]
     return "\r\n".join([*lines, *([] if keep else ["connection: close"]), "", ""]).encode()
 
 
 def json_answer(status: int, value: Any, headers: Mapping[str, str] | None = None, *, keep: bool) -> bytes:
-    """Return an answer of JSON."""
     body = FAST.dumps(value)
     headers = {"content-type": "application/json", **(headers or {}), "content-length": str(len(body))}
     return head_of(status, headers, keep=keep) + body
@@ -121,13 +116,11 @@ def admit(access: Access, path: str, headers: Iterable[tuple[str, str]]) -> None
 
 
 def health(core: Core) -> tuple[int, dict[str, str]]:
-    """Return the status and the JSON of the health page."""
     stuck = core.stuck()
     return (503, {"status": "stuck", "reason": stuck}) if stuck else (200, {"status": "ok"})
 
 
 def models(queued: Queued) -> dict[str, Any]:
-    """Return OpenAI's list of models."""
     model = {"id": "s2a", "object": "model", "owned_by": "s2a-bench", "s2a_provenance": queued.provenance}
     return {"object": "list", "data": [model]}
 

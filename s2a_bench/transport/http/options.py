@@ -57,8 +57,6 @@ def merged(target: Any, patch: Any) -> Any:
 
 
 class HttpOptions(WebOptions):
-    """Options of an HTTP server, ours or an external one."""
-
     SCHEMES: ClassVar[tuple[str, ...]] = ("http", "https")
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 8080}
     NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = ("api_docs",)

@@ -33,22 +33,16 @@ from s2a_bench.types import Request
 
 
 class ImageUrl(BaseModel):
-    """A picture as a data URI."""
-
     url: str
 
 
 class MessagePart(BaseModel):
-    """An item of a message: text or a picture."""
-
     type: Literal["text", "image_url"]
     text: str = ""
     image_url: ImageUrl | None = None
 
 
 class Message(BaseModel):
-    """One message of the conversation."""
-
     role: str
     content: str | Annotated[list[MessagePart], Field(fail_fast=True)]
 
@@ -120,7 +114,6 @@ class ExchangeResponse(Response):
 
 
 def application(core: Core, *, documented: bool = False) -> FastAPI:
-    """Build the application: chat completions as deployed, and the pages that tools expect."""
     app = FastAPI(title="s2a-bench", openapi_url="/openapi.json" if documented else None)  # /docs and /redoc follow it
     threads = ThreadPoolExecutor(core.limits.waiting + 2, "http")  # one is answered, one refused, the others wait
 
@@ -157,8 +150,6 @@ class _Server(uvicorn.Server):
 
 
 class HttpServer(WebServer):
-    """uvicorn on a socket that is bound first."""
-
     def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
         super().__init__(wiring, handler, "http", native.SCHEME)
         app = application(self._core, documented=wiring.options.api_docs)

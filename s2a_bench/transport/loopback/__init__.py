@@ -21,13 +21,11 @@ class Loopback(Transport[TransportOptions]):
     in_process = True
 
     def client(self, wiring: Wiring[TransportOptions], alive: Callable[[], bool]) -> Client:
-        """Find the handler that is registered under ``wiring.address``."""
         from s2a_bench.transport.loopback.in_process import LoopbackClient
 
         return LoopbackClient(wiring, alive)
 
     def server(self, wiring: Wiring[TransportOptions], handler: Handler) -> Server:
-        """Register the handler under ``wiring.address``, or a new name without one."""
         from s2a_bench.transport.loopback.in_process import LoopbackServer
 
         return LoopbackServer(wiring, handler)

@@ -24,7 +24,6 @@ class LoopbackServer:
     """A handler that clients of this process find by its address."""
 
     def __init__(self, wiring: Wiring[TransportOptions], handler: Handler) -> None:
-        """Register under ``wiring.address``, or a new name without one."""
         self.address = wiring.address or f"loopback-{next(_numbers)}"
         self.handler = handler
         self._stopped = Event()
@@ -43,16 +42,12 @@ class LoopbackServer:
 
 
 class LoopbackClient:
-    """Calls the handler directly."""
-
     def __init__(self, wiring: Wiring[TransportOptions], alive: Callable[[], bool]) -> None:
-        """Remember the address; the server is looked up for each request."""
         del alive  # a server in this process lives as long as it is registered
         self.camera = None
         self._address = wiring.address
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        """Convert, swap channels and hand over, all on the calling thread."""
         server = _servers.get(self._address)
         if server is None:
             raise ServerDied(f"no loopback server '{self._address}' in this process")
@@ -71,7 +66,6 @@ class LoopbackClient:
         trace.receive(served.to_remote())
 
     def describe(self) -> dict[str, str]:
-        """Add nothing: the wiring tells all."""
         return {}
 
     def close(self) -> None:

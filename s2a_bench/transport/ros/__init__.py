@@ -47,7 +47,6 @@ class Ros(Transport[RosOptions]):
     udp_checks = ("rmem-max",)
 
     def client(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> Client:
-        """Join the domain and wait for the server under the namespace ``wiring.address``."""
         if wiring.variant == ACTION:
             from s2a_bench.transport.ros.action import GenerateClient
 
@@ -57,7 +56,6 @@ class Ros(Transport[RosOptions]):
         return TopicClient(wiring, alive)
 
     def server(self, wiring: Wiring[RosOptions], handler: Handler) -> Server:
-        """Join the domain alone under the namespace; one server answers both variants."""
         from s2a_bench.transport.ros.server import RosServer
 
         return RosServer(wiring, handler)

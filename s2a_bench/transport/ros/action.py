@@ -34,8 +34,6 @@ MARKS_TIMEOUT_S = 2.0
 
 
 class GenerateClient(RosClient):
-    """Sends goals and collects the feedback, from our own server or a llama_ros node."""
-
     def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
         """Join the domain and wait for the action; raises ServerDied if it does not appear."""
         super().__init__(wiring, alive)

@@ -50,8 +50,6 @@ _log = logging.getLogger(__name__)
 
 
 class ActionSource:
-    """The server's side of the variant."""
-
     def __init__(self, middleware: Middleware, wiring: Wiring[RosOptions], honoured: Collection[str] = ()) -> None:
         """Offer the action and create the topics; ``honoured`` are the engine's names in `Request.sampling`."""
         namespace, options = namespace_of(wiring), wiring.options
@@ -87,7 +85,6 @@ class ActionSource:
         packed.reject()
 
     def plot(self, goal_id: str, token: Piece) -> None:
-        """Publish a token for plotting, with `publish_tokens`."""
         if self._plot is not None:
             self._plot.send(self._plot.pack(token_message(goal_id, token, last=False)))
 
@@ -131,7 +128,6 @@ class GoalExchange(RosExchange):
         return self._goal.cancel_requested
 
     def started(self) -> bool:
-        """Let the goal be EXECUTING, unless a cancel came first."""
         self._started = self._goal.executing()
         self.trace.mark("accept")
         return self._started
@@ -176,10 +172,7 @@ class GoalExchange(RosExchange):
 
 
 class Wishes:
-    """Reads what goals want, and logs once what the engine does not honour."""
-
     def __init__(self, honoured: Collection[str], version: str) -> None:
-        """Know the fields that the engine honours, and a version's defaults."""
         self._honoured = honoured
         self._defaults = sampling_config(version)
         self._logged: set[str] = set()

@@ -28,7 +28,6 @@ def dds_of(middleware: str, environ: Mapping[str, str]) -> str:
 
 
 def against_loss(middleware: str, environ: Mapping[str, str]) -> str:
-    """Return what to do where frames are lost over a middleware."""
     dds = dds_of(middleware, environ)
     if dds == RMW_CYCLONE or (dds == "cyclonedds" and environ.get("CYCLONEDDS_URI")):
         return f"--qos reliable, and on both sides: {cyclone_line(environ)}; {KERNEL}"

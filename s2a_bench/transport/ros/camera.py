@@ -75,10 +75,7 @@ def _decompressed(message: Any, trace: Trace, limits: Limits) -> Frame:
 
 
 class CameraPublisher:
-    """Publishes frames as a ROS 2 camera does."""
-
     def __init__(self, middleware: Middleware, namespace: str, payload: str, qos: str) -> None:
-        """Create the one topic that ``payload`` needs."""
         self._payload = payload
         self._offset_ns = realtime_offset_ns()
         topic, type_name = (CAMERA, ros.IMAGE) if payload in PIXELS else (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE)
@@ -88,7 +85,6 @@ class CameraPublisher:
         return frame.stamp_ns + self._offset_ns
 
     def publish(self, frame: Frame, trace: Trace) -> None:
-        """Convert, pack and send one frame."""
         _, message = picture_message(frame, self._payload, self._offset_ns, trace)
         packed = self._publisher.pack(message)
         trace.mark("cdr_pack")
@@ -117,7 +113,6 @@ class CameraCache:
     """Keeps the newest frame of both camera topics, already as RGB, each topic on a thread of its own."""
 
     def __init__(self, middleware: Middleware, namespace: str, options: RosOptions, limits: Limits = LIMITS) -> None:
-        """Subscribe; `start` starts the threads."""
         self.limits = limits
         self._options = options
         topics = ((CAMERA, ros.IMAGE), (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE))
@@ -140,13 +135,11 @@ class CameraCache:
             thread.start()
 
     def interrupt(self) -> None:
-        """Make the threads end; callable from any thread."""
         self._stopped = True
         for camera in self._cameras:
             camera.interrupt()
 
     def join(self) -> None:
-        """Wait for the threads' end."""
         for thread in self._threads:
             thread.join()
 

@@ -77,7 +77,6 @@ def ros(machine: Machine) -> Finding:
 
 
 def middleware(machine: Machine) -> Finding:
-    """Return the default middleware, and whether it is installed."""
     name = default_middleware(machine.environ)
     if machine.finds(name):
         return Finding("middleware", "state", f"{name} (--middleware takes another)")

@@ -25,8 +25,6 @@ def _ended() -> Event:
 
 @dataclass(slots=True)
 class Shared:
-    """State shared by all exchanges of a server."""
-
     cache: CameraCache
     activity: Activity
     stopped: Event = field(default_factory=Event)
@@ -38,7 +36,6 @@ class RosExchange(Exchange):
     """One request of a front; subclasses read it, send its pieces and finish it."""
 
     def __init__(self, shared: Shared, trace: Trace) -> None:
-        """Answer a request that was received as ``trace`` says."""
         super().__init__(trace)
         self._shared = shared
         self._before = self._ended = _ended()

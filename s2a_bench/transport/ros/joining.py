@@ -43,7 +43,6 @@ def domain_of(wiring: Wiring[RosOptions]) -> int:
 
 
 def is_routed(options: RosOptions) -> bool:
-    """Return whether the nodes meet at a router."""
     return (options.middleware or default_middleware(os.environ)) in ROUTED
 
 
@@ -72,7 +71,6 @@ def settled(wiring: Wiring[RosOptions]) -> tuple[Wiring[RosOptions], bool]:
 
 
 def server_name(wiring: Wiring[RosOptions]) -> str:
-    """Return the server's node, its namespace included."""
     return f"{namespace_of(wiring)}/{wiring.options.node_name}"
 
 
@@ -176,7 +174,6 @@ class RosClient:
             yield take(min(POLL_S, bounds.left_s()))
 
     def describe(self) -> dict[str, str]:
-        """Add nothing: the wiring tells all."""
         return {}
 
     def close(self) -> None:

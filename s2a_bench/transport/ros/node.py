@@ -38,8 +38,6 @@ _log = logging.getLogger(__name__)
 
 
 class Activity:
-    """Counts what a server does, and turns the counts of a while into findings."""
-
     def __init__(self, waiting: Callable[[], int], limit: int, silent_s: Callable[[], float]) -> None:
         """Start at nothing; ``waiting`` requests of at most ``limit`` are queued, ``silent_s`` is `Turns.silent_s`."""
         self._waiting, self._limit, self._silent_s = waiting, limit, silent_s
@@ -102,8 +100,6 @@ class Activity:
 
 
 class NodeApi:
-    """The parameters, log and diagnostics of one node."""
-
     def __init__(
         self,
         middleware: Middleware,
@@ -113,7 +109,6 @@ class NodeApi:
         findings: Callable[[], Iterator[PartHealth]],
         log_level: str,
     ) -> None:
-        """Create services and topics of the node ``/namespace/name``; ``change`` as for `Parameters`."""
         self._name, self._findings = name, findings
         self._events = middleware.publisher(EVENTS, EVENT, PARAMETERS_QOS)
         held = Parameters(parameters, change, lambda changed: self._tell(changed_parameters=changed))
@@ -130,12 +125,10 @@ class NodeApi:
             self._logger.addHandler(handler)
 
     def start(self, stopped: Event) -> None:
-        """Publish diagnostics until ``stopped``."""
         self._thread = Thread(target=self._publish, args=(stopped,), name="diagnostics", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Wait for the thread's end, and log no more."""
         self._thread.join()
         for handler in self._handlers:
             self._logger.removeHandler(handler)
@@ -165,5 +158,4 @@ def declared(wiring: Wiring[RosOptions], settings: Options | None) -> list[Param
 
 
 def snake(name: str) -> str:
-    """Return a CamelCase name as words_with_underscores."""
     return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name).lstrip("_")

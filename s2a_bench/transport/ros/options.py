@@ -26,8 +26,6 @@ BASE_NAME = r"^[A-Za-z_][A-Za-z0-9_]*$"
 
 
 class RosOptions(TransportOptions):
-    """Where topics and actions are, and what carries them."""
-
     PANEL: ClassVar[str] = "ROS 2"
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {
         "namespace": "/llama",

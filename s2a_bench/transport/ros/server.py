@@ -40,8 +40,6 @@ RequestSource: TypeAlias = TopicSource | ActionSource
 
 
 class RosServer:
-    """Answers the requests of all sources."""
-
     def __init__(self, wiring: Wiring[RosOptions], handler: Handler) -> None:
         """Join the domain and create all topics; raises TransportError where another server answers already."""
         wiring, host = settled(wiring)
@@ -93,7 +91,6 @@ class RosServer:
         self.middleware.close()
 
     def stop(self) -> None:
-        """Wake all threads."""
         self._shared.stopped.set()
         for source in self._sources:
             source.interrupt()

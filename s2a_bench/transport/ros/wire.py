@@ -50,7 +50,6 @@ def readable(subscription: Subscription, packed: Any, trace: Trace) -> Any | Non
 
 
 def request_message(request: Request, images: Sequence[Any] = (), compressed_images: Sequence[Any] = ()) -> Any:
-    """Turn a request into s2a_msgs/Request, with pictures as messages."""
     return ros.message(
         ros.REQUEST,
         id=request.id,
@@ -96,7 +95,6 @@ def pieces_of(message: Any) -> list[Piece]:
 
 
 def marks_message(request_id: str, remote: Remote) -> Any:
-    """Turn a server's marks into s2a_msgs/Marks."""
     return ros.message(
         ros.MARKS,
         id=request_id,
@@ -114,12 +112,10 @@ def marks_message(request_id: str, remote: Remote) -> Any:
 
 
 def provenance_message(facts: Mapping[str, str]) -> Any:
-    """Turn a server's provenance into s2a_msgs/Provenance."""
     return ros.message(ros.PROVENANCE, **{**Provenance().to_dict(), **facts})
 
 
 def provenance_of(origin: Any) -> dict[str, str]:
-    """Read who answers from s2a_msgs/Provenance."""
     return {name: getattr(origin, name) for name in Provenance().to_dict()}
 
 

@@ -27,14 +27,11 @@ from s2a_bench.transport import (
 
 
 class ShmOptions(TransportOptions):
-    """The options of `shm`."""
-
     socket: str = option(
         "", "path of the Unix socket where shared memory is handed over [default: a new one of this user]", side=SERVER
     )
 
     def addresses(self) -> Iterable[str]:
-        """Return the socket of the option, and a new one."""
         return self.socket, ""
 
 
@@ -53,7 +50,6 @@ class Shm(Transport[ShmOptions]):
     checks: ClassVar[Mapping[str, str]] = {"shared-memory": "s2a_bench.transport.shm:shared_memory"}
 
     def client(self, wiring: Wiring[ShmOptions], alive: Callable[[], bool]) -> Client:
-        """Connect to the server at ``wiring.address``."""
         _check_system()
         from s2a_bench.transport.shm.client import ShmClient
 
@@ -66,12 +62,10 @@ class Shm(Transport[ShmOptions]):
         return ShmServer(wiring, handler)
 
     def require(self, choice: Choice[ShmOptions]) -> None:
-        """Refuse systems without such memory."""
         super().require(choice)
         _check_system()
 
     def ready(self, wiring: Wiring[ShmOptions]) -> str:
-        """Return where memory is handed over, and to whom."""
         return f"serving shared memory at {wiring.address} for this user alone"
 
 

@@ -61,7 +61,6 @@ class ShmClient:
                 self.close()
 
     def describe(self) -> dict[str, str]:
-        """Add nothing: the wiring tells all."""
         return {}
 
     def close(self) -> None:
@@ -122,7 +121,6 @@ class ShmClient:
             raise self._disconnected(error) from error
 
     def _answer(self, link: ShmConnection, bounds: Bounds) -> Iterator[AnswerPart]:
-        """Yield the pieces of the answer, and its end."""
         try:
             while True:
                 data = link.next(min(self._wiring.timeout_s, bounds.left_s()))

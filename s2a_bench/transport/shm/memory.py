@@ -57,7 +57,6 @@ class SharedMemory:
 
 
 def in_steps(size: int) -> int:
-    """Return how much memory is offered for so many bytes."""
     return -(-size // STEP_BYTES) * STEP_BYTES
 
 
@@ -109,12 +108,10 @@ def accept(link: socket.socket, most: int) -> SharedMemory:
 
 
 def refusal(why: str) -> bytes:
-    """Return the packet that says why there will be no link."""
     return (REFUSED + why.encode())[:_PACKET_BYTES]
 
 
 def _receive(link: socket.socket) -> tuple[bytes, list[int]]:
-    """Return the next packet, and the files that came with it."""
     room = socket.CMSG_SPACE(4 * _FILES)
     try:
         data, controls, _, _ = link.recvmsg(_PACKET_BYTES, room, socket.MSG_CMSG_CLOEXEC)

@@ -22,7 +22,6 @@ AnswerPart: TypeAlias = "Piece | Remote | str"
 
 
 def packed(part: AnswerPart) -> bytes:
-    """Return what is written."""
     kind, index, number = _ERROR, 0, 0
     if isinstance(part, Token):
         kind, index, number, body = _TOKEN, part.index, part.id, part.text.encode()

@@ -39,8 +39,6 @@ _log = logging.getLogger(__name__)
 
 
 class ShmServer:
-    """Answers the clients of one user on one machine."""
-
     def __init__(self, wiring: Wiring[ShmOptions], handler: Handler) -> None:
         """Bind; raises PortInUse, TransportError."""
         self._core = Core(handler, wiring.limits)
@@ -54,7 +52,6 @@ class ShmServer:
         return {"server": "shared memory (memfd), Unix socket"}
 
     def stop(self) -> None:
-        """Stop listening, and end every link."""
         if not self._stopped.is_set():
             with suppress(OSError):
                 Path(self.address).unlink()  # while it is ours
@@ -62,7 +59,6 @@ class ShmServer:
         self._connections.stop()
 
     def _answer_all(self, wire: Wire) -> None:
-        """Welcome a client, and answer one request after the other."""
         link, limits = wire.socket, self._core.limits
         try:
             wait_at_most(link, limits.head_s)
@@ -89,7 +85,6 @@ class Writer:
     """An answer in memory: it lies there whole, so that a client which is slow to read never holds the engine."""
 
     def __init__(self, wire: Wire, answers: SharedMemory) -> None:
-        """Write into ``answers``, and tell of it over the wire."""
         self._wire, self._answers = wire, answers
         self._announced = self._end = 0
 
@@ -138,8 +133,6 @@ class Writer:
 
 
 class ShmExchange(Exchange):
-    """One request in a client's memory, and its answer in ours."""
-
     def __init__(
         self,
         wire: Wire,
@@ -148,7 +141,6 @@ class ShmExchange(Exchange):
         place: tuple[int, int],
         core: Core,
     ) -> None:
-        """Answer what lies at a ``place`` in ``requests``."""
         super().__init__()
         self.disconnected = wire.disconnected  # type: ignore[method-assign]
         self._requests, self._writer, self._place, self._core = requests, writer, place, core

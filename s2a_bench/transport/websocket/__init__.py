@@ -30,8 +30,6 @@ TIMING = {str(fact): fact for fact in (INFER_MS, PREV_TOTAL_MS)}
 
 
 class WebsocketOptions(WebOptions, PolicyOptions):
-    """The options of our policy server, and of the client of a foreign one."""
-
     SCHEMES: ClassVar[tuple[str, ...]] = ("ws", "wss")
 
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 8000}
@@ -44,8 +42,6 @@ class WebsocketOptions(WebOptions, PolicyOptions):
 
 
 class Websocket(PolicyTransport[WebsocketOptions]):
-    """Policies over WebSocket, whole or streamed."""
-
     name = "websocket"
     options = WebsocketOptions
     variants = VARIANTS
@@ -59,14 +55,12 @@ class Websocket(PolicyTransport[WebsocketOptions]):
     packages = PACKAGES
 
     def client(self, wiring: Wiring[WebsocketOptions], alive: Callable[[], bool]) -> Client:
-        """Prepare to ask the server at ``wiring.address``, a URL."""
         extras.need(self.name, *PACKAGES)
         from s2a_bench.transport.websocket.client import WebsocketClient
 
         return WebsocketClient(wiring, alive)
 
     def server(self, wiring: Wiring[WebsocketOptions], handler: Handler) -> Server:
-        """Bind ``host:port``; raises PortInUse."""
         extras.need(self.name, *PACKAGES)
         from s2a_bench.transport.websocket.server import WebsocketServer
 

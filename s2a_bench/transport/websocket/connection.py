@@ -58,7 +58,6 @@ class PolicyConnection:
         metadata: bytes,
         exchange: Callable[[PolicyConnection, bytes], Exchange],
     ) -> None:
-        """Greet with ``metadata``, and answer each message by an ``exchange``."""
         self.wire, self.core = wire, core
         self.native = self.streams = False
         """Whether it is our client, which receives our marks; whether actions are sent one by one."""
@@ -274,7 +273,6 @@ class PolicyConnection:
             self._flush()
 
     def _refuse(self, code: int, reason: str) -> None:
-        """Say why in a text, and close."""
         with self._lock, suppress(Disconnected):
             if self._open:
                 self._protocol.send_text(reason[:ERROR_LETTERS].encode(errors="backslashreplace"))

@@ -49,8 +49,6 @@ class _Counted(ClientConnection):
 
 
 class BoundedConnection:
-    """One connection to one server."""
-
     def __init__(
         self,
         url: str,
@@ -158,7 +156,6 @@ class BoundedConnection:
         return RequestFailed(f"{self._url} is no WebSocket: {str(why or error)[:QUOTED]}")
 
     def headers(self) -> Mapping[str, str]:
-        """Return the headers of the server's handshake."""
         return self._connection.response.headers if self._connection.response else {}
 
     def close(self, *, orderly: bool = False) -> None:

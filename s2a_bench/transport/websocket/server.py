@@ -25,8 +25,6 @@ from s2a_bench.types import Action, Piece, Request
 
 
 class WebsocketServer(WebServer):
-    """Answers the observations of each connection in turn."""
-
     def __init__(self, wiring: Wiring[WebsocketOptions], handler: Handler) -> None:
         super().__init__(wiring, handler, "ws", codec.SCHEME)
         self._listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_DEFER_ACCEPT, 1)  # a full server answers with a status
@@ -44,10 +42,7 @@ class WebsocketServer(WebServer):
 
 
 class WebsocketExchange(Exchange):
-    """One observation, and the chunk of actions that answers it."""
-
     def __init__(self, connection: PolicyConnection, message: bytes) -> None:
-        """Answer a ``message`` that is whole."""
         super().__init__()
         self.trace.mark("network")
         self.disconnected = connection.wire.disconnected  # type: ignore[method-assign]
@@ -68,7 +63,6 @@ class WebsocketExchange(Exchange):
         return request
 
     def send(self, piece: Piece) -> bool:
-        """Keep an action, and send it where the chunk is streamed."""
         if self.disconnected():
             raise Disconnected
         if not isinstance(piece, Action):
@@ -106,7 +100,6 @@ class WebsocketExchange(Exchange):
 
 
 def metadata_of(queued: Queued) -> Mapping[str, Any]:
-    """Return the server's description of itself for every client."""
     settings = queued.settings.model_dump() if queued.settings is not None else {}
     names = {"name": "engine", "horizon": "action_horizon", "action_dim": "action_dim"}
     extension = {key: settings[name] for name, key in names.items() if isinstance(settings.get(name), (str, int))}

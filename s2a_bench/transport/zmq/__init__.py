@@ -24,8 +24,6 @@ PACKAGES = ("msgpack", "zmq")
 
 
 class ZmqOptions(PolicyOptions):
-    """The options of our policy server over ZeroMQ, and of the client of a foreign one."""
-
     SCHEMES: ClassVar[tuple[str, ...]] = ("tcp",)
     ENDS_WITH_PORT: ClassVar[bool] = True
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 5555}
@@ -47,8 +45,6 @@ class ZmqOptions(PolicyOptions):
 
 
 class Zmq(PolicyTransport[ZmqOptions]):
-    """Policies over ZeroMQ."""
-
     name = "zmq"
     options = ZmqOptions
     variants = (GR00T,)
@@ -61,14 +57,12 @@ class Zmq(PolicyTransport[ZmqOptions]):
     packages = ("msgpack", "pyzmq")
 
     def client(self, wiring: Wiring[ZmqOptions], alive: Callable[[], bool]) -> Client:
-        """Prepare to ask the server at ``wiring.address``, a URL."""
         extras.need(self.name, *PACKAGES)
         from s2a_bench.transport.zmq.client import ZmqClient
 
         return ZmqClient(wiring, alive)
 
     def server(self, wiring: Wiring[ZmqOptions], handler: Handler) -> Server:
-        """Bind ``host:port``; raises PortInUse."""
         extras.need(self.name, *PACKAGES)
         from s2a_bench.transport.zmq.server import ZmqServer
 

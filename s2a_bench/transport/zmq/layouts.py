@@ -45,12 +45,10 @@ def marked(marks: set[str]) -> str:
 
 
 def data_of(layout: str, observation: dict[str, Any]) -> dict[str, Any]:
-    """Return the ``data`` of a request for actions."""
     return observation if layout == N1_5 else {OBSERVATION: observation, "options": None}
 
 
 def observation_in(data: Any) -> tuple[Any, str]:
-    """Return the observation in the ``data`` of a request, and its layout."""
     nested = data.get(OBSERVATION) if isinstance(data, dict) else None
     return (nested, N1_6) if isinstance(nested, dict) else (data, N1_5)
 

@@ -54,7 +54,6 @@ class PictureFile:
 
 
 def file_of(array: NDArray[Any]) -> bytes:
-    """Return the file of an array."""
     solid = np.ascontiguousarray(array)
     return b"".join((_head(array.shape, solid.dtype.str), solid.reshape(-1).view(np.uint8).data))
 

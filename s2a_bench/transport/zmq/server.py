@@ -97,7 +97,6 @@ class ZmqServer:
         self._rouse()
 
     def _next(self) -> Callable[[], None] | None:
-        """Wait a moment for a message; return what answers it."""
         frames = self._received()
         if not frames:
             self._poller.poll(POLL_MS)
@@ -200,7 +199,6 @@ class ZmqServer:
         raise RequestFailed(f"Unknown endpoint: {str(endpoint)[:80]!r} is none of {known}")
 
     def _send(self, frames: list[Any]) -> None:
-        """Send an answer, from any thread."""
         with self._lock:
             if self._router.closed:
                 return
@@ -223,8 +221,6 @@ class ZmqServer:
 
 
 class ReplyAddress:
-    """Where an answer goes."""
-
     def __init__(self, envelope: list[bytes], connection: Connection, send: Callable[[list[Any]], None]) -> None:
         """Answer to the frames before a message, as long as the connection is there."""
         self.name = envelope[0]

@@ -37,7 +37,6 @@ class Dialect:
     root, path = "", ""
     """The path below a server's URL: the root of the API, and the rest."""
     lists_models = True
-    """Whether the server lists its models."""
     takes_grammar = False
     media_type = "text/event-stream"
     """The beginning of a good answer's content-type."""
@@ -117,7 +116,6 @@ def first_model(base: str, get: Get) -> tuple[str, str]:
 
 
 def sampled(request: Request, max_tokens: str = "max_tokens", top_p: str = "top_p") -> dict[str, Any]:
-    """Return the sampling of an answer, under a dialect's names."""
     return {max_tokens: request.max_tokens, "temperature": TEMPERATURE, top_p: TOP_P, "seed": request.seed}
 
 

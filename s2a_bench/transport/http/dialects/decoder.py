@@ -27,8 +27,6 @@ ODD = (ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowErro
 
 
 class Decoder:
-    """One answer's decoder, by default with the dialect's framing."""
-
     def __init__(
         self, dialect: Dialect, loads: Callable[[Any], Any] = json.loads, framing: Callable[[], Framing] | None = None
     ) -> None:

@@ -62,8 +62,6 @@ class JsonLines(Lines):
 
 
 class WholeBody(Lines):
-    """A body that is one message."""
-
     unit = "body"
 
     def feed(self, data: bytes) -> Iterator[str]:

@@ -34,8 +34,6 @@ COMPLETE = frozenset({"STOP", "MAX_TOKENS"})
 
 
 class Gemini(Dialect):
-    """Google's API, by key."""
-
     name = "gemini"
     facts = (*USAGE.values(), USAGE_ZERO)
 
@@ -70,7 +68,6 @@ class Gemini(Dialect):
         }
 
     def event(self, message: Any) -> Event:
-        """Read one message, whose parts may be thoughts."""
         text, thinking, finish = "", "", ""
         for candidate in message.get("candidates") or ():
             finish = text_of(candidate.get("finishReason") or "")

@@ -61,8 +61,6 @@ WITH_FACTS = frozenset({"usage", "metrics", "timings"})
 
 
 class OpenAI(Dialect):
-    """Any server of the dialect."""
-
     name = "openai"
     root, path = "/v1", "/chat/completions"
     facts = (*TIMINGS.values(), *METRICS.values(), THINKING_N, PREDICTED_STEPS, USAGE_ZERO)
@@ -76,7 +74,6 @@ class OpenAI(Dialect):
         return {}
 
     def event(self, message: Any) -> Event:
-        """Read one message; reasoning has two names."""
         text, thinking, finish = None, "", ""
         for choice in message.get("choices") or ():
             delta = choice.get("delta") or {}
@@ -89,7 +86,6 @@ class OpenAI(Dialect):
 
     @staticmethod
     def _facts(message: dict[str, Any]) -> dict[str, float]:
-        """Return the numbers of the usage, then those of llama-server and vLLM."""
         if not (message.keys() & WITH_FACTS):
             return {}
         usage = message.get("usage") or {}
@@ -110,8 +106,6 @@ class OpenAI(Dialect):
 
 
 class LlamaServer(OpenAI):
-    """llama.cpp's own server."""
-
     name = "llama-server"
     takes_grammar = True
 
@@ -158,7 +152,6 @@ class Native(OpenAI):
         return native.native_parameters(request)
 
     def event(self, message: Any) -> Event:
-        """Read one message, the last of which has the marks."""
         text, token, finish = None, -1, ""
         actions: Sequence[Action] = ()
         for choice in message.get("choices") or ():

@@ -75,7 +75,6 @@ class OpenVla(Dialect):
     def fields(
         self, request: Request, payload: str, model: str, to_base64: Callable[[Pixels], str], trace: Trace
     ) -> dict[str, Any]:
-        """Return the observation of the template, else `body`."""
         if self._template is None:
             return super().fields(request, payload, model, to_base64, trace)
         as_text = self._template.server.arrays_as_text

@@ -21,7 +21,6 @@ class Tgi(Dialect):
     facts = tuple(DETAILS.values())
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:  # noqa: ARG002
-        """Return the prompt with its pictures in Markdown, and request details."""
         marked = [f"![](data:{picture.media_type};base64,{picture.base64})" for picture in pictures]
         parameters = {**sampled(request, "max_new_tokens"), "details": True}
         return {"inputs": "".join([*marked, request.prompt]), "parameters": parameters}
