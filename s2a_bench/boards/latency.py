@@ -81,7 +81,6 @@ def sequence_ns(latencies: Latencies) -> Iterator[int]:
 
 
 def whole_ns(latency_s: NDArray[np.float64]) -> Ints:
-    """Return latencies in s as whole ns."""
     import numpy as np
 
     return np.rint(latency_s * 1e9).astype(np.int64)

@@ -28,8 +28,6 @@ PROMPT_TIME: Final[Any] = option(
 
 @dataclass(frozen=True, slots=True)
 class Board:
-    """A source of tokens."""
-
     name: str
     """The profile's; empty for a rate."""
     title: str

@@ -22,7 +22,6 @@ BLACK, WHITE, GREY = 16, 235, 128
 
 
 def new_nonce() -> str:
-    """Return a new nonce, which no other run has."""
     return token_hex(8)
 
 

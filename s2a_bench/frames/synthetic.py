@@ -123,7 +123,6 @@ def _texture(width: int, height: int, rng: np.random.Generator) -> Plane:
 
 
 def _luma(yuv: Pixels, texture: Plane, rng: np.random.Generator) -> Plane:
-    """Light, texture and blur the painted luma, and add the sensor's noise."""
     height, width = texture.shape
     light = 1 + LIGHT * _noise(width, height, max(2, height // 2), rng)
     luma = _blur(yuv[..., 0] * light + TEXTURE * texture, LENS_BLUR_PX)

@@ -142,8 +142,6 @@ def _written(value: Any) -> Any:
 
 
 class EngineConfig(Options):
-    """Which engine, on which files, with which settings."""
-
     PANEL: ClassVar[str] = "Model"
 
     name: Annotated[str, one_of(lambda: ENGINES)] = option(
@@ -260,7 +258,6 @@ def need_engine(config: EngineConfig) -> None:
 
 
 def cancel(tokens: object) -> None:
-    """Close an engine's iterator if it can be closed."""
     if close := getattr(tokens, "close", None):
         close()
 
@@ -333,16 +330,12 @@ Quant: TypeAlias = Literal["f16", "q8_0", "q4_0"]
 
 
 class FetchConfig(Options):
-    """The options of `model fetch`."""
-
     what: str = option(..., "minicpm-v-2.6, or ORG/REPO:FILE", flag="name", argument=True)
     quant: str | None = option(None, "quantisation of the language model, as Q8_0 [default: Q4_K_M]")
     mmproj: str | None = option(None, "the repository's vision tower to fetch too [default: the known one, or none]")
 
 
 class DummyConfig(Options):
-    """The options of `model dummy`."""
-
     size: Size = option("tiny", "tiny: 13 MB, for tests; full: the shapes of MiniCPM-V 2.6")
     quant: Quant | None = option(
         None, "type of the language model's weights: f16, q8_0, q4_0 [default: f16 (tiny), q4_0 (full)]"

@@ -230,8 +230,6 @@ _FILE_TYPES = {"f16": 1, "q4_0": 2, "q8_0": 7}  # llama_ftype
 
 @dataclass(frozen=True, slots=True)
 class Shape:
-    """The dimensions of a MiniCPM-V of one size."""
-
     layers: int
     width: int
     ffn: int
@@ -252,14 +250,11 @@ SHAPES: dict[Size, Shape] = {
 
 
 class DummyFiles(NamedTuple):
-    """The paths of a model's two files."""
-
     model: Path
     mmproj: Path
 
 
 def dummy_files(folder: Path, size: Size, quant: Quant, seed: int = 0) -> DummyFiles:
-    """Name the files that `write_dummy` writes into ``folder``."""
     stem = f"MiniCPM-V-2_6-dummy-{size}-r{REVISION}-s{seed}"
     return DummyFiles(folder / f"{stem}-{quant}.gguf", folder / f"mmproj-{stem}-f16.gguf")
 

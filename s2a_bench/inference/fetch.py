@@ -69,8 +69,6 @@ class FetchedFile:
 
 @dataclass(frozen=True, slots=True)
 class Fetched:
-    """The fetched files, with the hub and the commit."""
-
     endpoint: str
     repository: str
     commit: str

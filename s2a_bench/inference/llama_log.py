@@ -29,7 +29,6 @@ _callback = llama_cpp.llama_log_callback(_keep)  # must outlive the library's us
 
 
 def verbose() -> bool:
-    """Return True if the user wants llama.cpp's log."""
     return os.environ.get(VARIABLE) == "1"
 
 

@@ -81,7 +81,6 @@ def cache_folder() -> Path:
 
 
 def dummy_folder(size: Size) -> Path:
-    """Return the default folder of dummy models of a size."""
     return cache_folder() / "models" / f"dummy-{size}"
 
 
@@ -149,7 +148,6 @@ def sha256(path: Path) -> str:
 
 
 def digest(path: Path) -> str:
-    """Compute a file's SHA-256 in hex."""
     computed = hashlib.sha256()
     with path.open("rb") as file:
         while block := file.read(1 << 22):

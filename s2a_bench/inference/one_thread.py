@@ -42,7 +42,6 @@ class _Answer:
             self._tokens.put(None)
 
     def _wait_for_place(self) -> bool:
-        """Return True if a token is still wanted after the wait."""
         self._places.get()
         return self.wanted
 
@@ -112,8 +111,6 @@ class OneThreadEngine(Engine):
 
 
 class Llama(OneThreadEngine):
-    """The llama engine, on a separate thread or on that of another one."""
-
     needs = ("llama", "llama_cpp", "gguf")
     declared_facts = LLAMA
     honours = (*SAMPLER_ARGUMENTS, PENALTY_LAST_N)

@@ -55,7 +55,6 @@ def allowed(yes: bool = True) -> Iterator[None]:
 
 
 def is_allowed() -> bool:
-    """Return True if this process may be tuned."""
     return _undo is not None
 
 

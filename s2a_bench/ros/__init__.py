@@ -35,8 +35,6 @@ class QoS:
 
 
 class Publisher(Protocol):
-    """Sends messages of one type to one topic."""
-
     def pack(self, message: Any) -> Any:
         """Serialise a message into what `send` takes."""
 

@@ -169,7 +169,6 @@ class Goals:
         return CancelCode.NONE, chosen
 
     def expire(self, at_ns: int) -> None:
-        """Forget goals that ended ``result_timeout_ns`` ago."""
         while self._ended:
             goal = next(iter(self._ended.values()))
             if goal.ended_ns + self._timeout_ns > at_ns:
@@ -351,7 +350,6 @@ class ServedAction(Generic[Caller]):
     def __init__(
         self, node: ServiceNode[Caller, Any], name: str, type_name: str, result_timeout_s: float, version: str
     ) -> None:
-        """Serve the action ``/name`` and start the service thread."""
         self._name, self.version = name, version
         self._goal_waiter, self._service_waiter = node.waiter(), node.waiter()
         self._feedback_type = type_name + "_FeedbackMessage"
@@ -440,7 +438,6 @@ class ServedAction(Generic[Caller]):
         return None
 
     def decide(self, goal_id: bytes, caller: Caller, *, accepted: bool) -> None:
-        """Accept or reject a goal: store it, tell the client, publish the status."""
         stamp_ns = time.time_ns()  # ROS time, as rclpy stamps
         with self._lock:
             if accepted:
@@ -472,7 +469,6 @@ class ServedAction(Generic[Caller]):
         self._send_feedback(ros.serialise(message, self._feedback_type, self.version))
 
     def end(self, goal_id: bytes, status: Status, result: Any) -> None:
-        """End a goal: publish the status, then send the result to waiting callers."""
         packed = self._pack_result(status, result)
         with self._lock:
             self._goals.end(goal_id, status, packed, now_ns())
@@ -523,8 +519,6 @@ class ServedAction(Generic[Caller]):
 
 
 class ActionNode(ServiceNode[Caller, Waiter]):
-    """One node with services and actions."""
-
     def action_client(self, name: str, type_name: str, version: str = DEFAULT_VERSION) -> ClientAction:
         return ClientAction(self, name, type_name, version)
 

@@ -79,8 +79,6 @@ class _CyclonePublisher(RawWriter):
 
 
 class _CycloneSubscription:
-    """Receives messages from a ROS topic, on the consuming thread."""
-
     def __init__(
         self,
         participant: DomainParticipant,
@@ -128,8 +126,6 @@ def _configure(domain_id: int, xml: str) -> None:
 
 
 class CycloneMiddleware(ActionNode[Caller, DdsWaiter]):
-    """One participant of a ROS 2 domain, from PyPI packages alone."""
-
     def __init__(self, domain_id: int, tuning: Tuning, node_name: str) -> None:
         """Join ``domain_id`` as the node ``/namespace/name``; raises TransportError when Cyclone refuses."""
         self._domain_id = domain_id

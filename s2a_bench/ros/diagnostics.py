@@ -36,8 +36,6 @@ class Level(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class PartHealth:
-    """How one part of a node is."""
-
     part: str
     level: Level
     message: str
@@ -67,8 +65,6 @@ def diagnostic_array(node_name: str, findings: Iterable[PartHealth], stamp_ns: i
 
 
 class Rosout(logging.Handler):
-    """Publishes what is logged, under the node's name."""
-
     def __init__(self, middleware: Middleware, node_name: str) -> None:
         """Create the topic; a node ``/namespace/name`` logs as ``namespace.name``."""
         super().__init__()

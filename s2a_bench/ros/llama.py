@@ -56,12 +56,10 @@ def goal_images(goal: Any) -> list[Any]:
 
 
 def token_feedback(text: str, token: int, version: str = DEFAULT_VERSION) -> Any:
-    """Build the feedback for one token."""
     partial = default("llama_msgs/msg/PartialResponse", version, text=text, token=token)
     return default(GENERATE_RESPONSE + "_Feedback", version, partial_response=partial)
 
 
 def text_result(text: str, tokens: Sequence[int] = (), version: str = DEFAULT_VERSION) -> Any:
-    """Build the result: the whole text and its tokens."""
     response = default("llama_msgs/msg/Response", version, text=text, tokens=tokens)
     return default(GENERATE_RESPONSE + "_Result", version, response=response)

@@ -263,18 +263,15 @@ float32_array = partial(np.fromiter, dtype=np.float32)
 
 
 def uuid(goal_id: bytes) -> Any:
-    """Build a unique_identifier_msgs/UUID."""
     return message("unique_identifier_msgs/msg/UUID", uuid=np.frombuffer(goal_id, np.uint8))
 
 
 def stamp(stamp_ns: int) -> Any:
-    """Build a builtin_interfaces/Time of ROS time."""
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     return message("builtin_interfaces/msg/Time", sec=seconds, nanosec=nanoseconds)
 
 
 def header(stamp_ns: int, frame_id: str = "") -> Any:
-    """Build a std_msgs/Header."""
     return message("std_msgs/msg/Header", stamp=stamp(stamp_ns), frame_id=frame_id)
 
 
@@ -318,7 +315,6 @@ def frame_of_image(image: Any, index: int = -1) -> Frame:
 
 
 def refuse_depth(encoding: str) -> None:
-    """Raise TransportError for distances."""
     if encoding in DEPTH:
         raise TransportError(
             f"image encoding '{encoding}' is depth, which a model cannot look at: give it the camera's colour topic"

@@ -54,8 +54,6 @@ RANGES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter as it is declared."""
-
     name: str
     value: Any
     about: str = ""
@@ -89,14 +87,12 @@ def _bound(metadata: Iterable[Any], *names: str) -> float | None:
 
 
 def type_of(value: Any) -> Type:
-    """Return the ROS type of a value."""
     if value is None:
         return Type.NOT_SET
     return Type.STRING_ARRAY if isinstance(value, list) else TYPES[type(value)]
 
 
 def value_message(value: Any) -> Any:
-    """Build a ParameterValue."""
     kind = type_of(value)
     return ros.default(VALUE, type=int(kind), **({FIELDS[kind]: value} if kind else {}))
 

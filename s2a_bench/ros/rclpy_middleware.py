@@ -43,8 +43,6 @@ def offer(node: SpinningNode, name: str, type_name: str, answer: Callable[[Any],
 
 
 class RclpyServiceClient:
-    """Calls one service and waits for the answer."""
-
     def __init__(self, node: SpinningNode, name: str, type_name: str) -> None:
         self._node, self._name, self._type_name = node, name, type_name
         self._class = interface_class(type_name)
@@ -150,8 +148,6 @@ def _configured(tuning: Tuning) -> Iterator[str]:
 
 
 class RclpyMiddleware:
-    """One node, through the ROS 2 installation's rclpy."""
-
     def __init__(self, domain_id: int, tuning: Tuning, node_name: str) -> None:
         """Join ``domain_id`` as the node ``/namespace/name``; of the rmws, Cyclone alone is tuned."""
         self._domain_id = domain_id

@@ -32,7 +32,6 @@ _log = logging.getLogger(__name__)
 
 
 def qos_profile(qos: QoS) -> Any:
-    """Return rclpy's QoS profile."""
     settings: dict[str, Any] = {
         "reliability": ReliabilityPolicy.RELIABLE if qos.reliable else ReliabilityPolicy.BEST_EFFORT,
         "durability": DurabilityPolicy.TRANSIENT_LOCAL if qos.latched else DurabilityPolicy.VOLATILE,
@@ -175,7 +174,6 @@ class RclpyWaiter:
 
 
 def for_waitable(node: Any, waitable: Any) -> RclpyWaiter:
-    """Return what waits for a waitable of rclpy, such as an action's client or server."""
     of = waitable.get_num_entities()
     names = ("subscriptions", "guard_conditions", "timers", "clients", "services", "events")
     counts = [getattr(of, f"num_{name}") for name in names]

@@ -37,7 +37,6 @@ def interface_class(type_name: str) -> Any:
 
 
 def to_ros(message: Any, cls: Any, type_name: str, version: str) -> Any:
-    """Turn a rosbags message into one of the generated class."""
     with _without_pixels(message, NO_PIXELS) as pixels:
         made = deserialize_message(bytes(ros.serialise(message, type_name, version)), cls)
     for image, its in zip(images_of(made), pixels, strict=True):

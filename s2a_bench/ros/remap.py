@@ -19,7 +19,6 @@ NODE_NAME: Final = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
 
 
 def check_node_name(name: str) -> None:
-    """Raise UsageError for what is no name of a node."""
     if not NODE_NAME.fullmatch(name):
         raise UsageError(f"node name '{name}': write it as /name or /namespace/name, letters, digits and _")
 
@@ -41,11 +40,7 @@ def table(rules: Iterable[str], node_name: str) -> dict[str, str]:
 
 
 class Remapped:
-    """A middleware in which names of ours stand for others."""
-
     def __init__(self, middleware: Middleware, names: Mapping[str, str]) -> None:
-        """Replace the keys of ``names`` by their values."""
-
         def renamed(make: Callable[..., T]) -> Callable[..., T]:
             return lambda name, *how, **more: make(names.get(name, name), *how, **more)
 

@@ -55,7 +55,6 @@ def may_host(endpoint: str) -> bool:
 
 
 def free_endpoint() -> str:
-    """Return a free endpoint on loopback."""
     with closing(socket.socket()) as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -35,8 +35,6 @@ Caller = TypeVar("Caller")
 
 
 class Waits(Protocol):
-    """Waits for anything to arrive."""
-
     interrupted: bool
 
     def wait_until(self, deadline_ns: int, /) -> bool:
@@ -57,8 +55,6 @@ def appeared(present: Callable[[], bool], timeout_s: float, given_up: Callable[[
 
 
 class End(Protocol):
-    """What both sides of one service have in common."""
-
     request_type: str
     hashed_type: str
     """The type whose hash is announced."""
@@ -72,8 +68,6 @@ class End(Protocol):
 
 
 class ServiceEnd(End, Protocol[Caller]):
-    """The server's side of one service."""
-
     reply_type: str
 
     def arrived(self) -> Iterator[tuple[memoryview, Caller]]:
@@ -99,8 +93,6 @@ class ServiceEnd(End, Protocol[Caller]):
 
 
 class ClientEnd(End, Protocol):
-    """The client's side of one service."""
-
     def call(self, packed: bytearray, key: bytes, /) -> None:
         """Send a request, to which ``key`` belongs: a goal's id, where it concerns one."""
 
@@ -128,8 +120,6 @@ class Source(Subscription, Protocol):
 
 
 class LogOnce:
-    """Logs a warning once for each kind of it."""
-
     def __init__(self, log: logging.Logger) -> None:
         self._log = log
         self._kinds: set[str] = set()
@@ -153,7 +143,6 @@ class Services(Generic[Caller]):
         self._thread.start()
 
     def offer(self, name: str, service: ServiceEnd[Caller], answer: Callable[[Any], Any]) -> None:
-        """Answer the service ``/name`` from now on."""
         self._offered = {**self._offered, name: (service, answer)}  # while the thread goes through the old ones
 
     def close(self) -> None:
@@ -184,8 +173,6 @@ class Services(Generic[Caller]):
 
 
 class Calling:
-    """Calls one service and waits for the answer."""
-
     def __init__(self, name: str, client: ClientEnd, waiter: Waits) -> None:
         self._name, self._client, self._waiter = name, client, waiter
         self._calls = 0
@@ -274,6 +261,5 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
             self.leave()
 
     def check_open(self) -> None:
-        """Raise TransportError if the node has left."""
         if self._closed:
             raise TransportError("the middleware is closed")

@@ -35,10 +35,7 @@ _log = logging.getLogger(__name__)
 
 
 class ZenohPublisher:
-    """Sends messages of one type to one topic; callable from any thread."""
-
     def __init__(self, node: Node, topic: str, type_name: str, qos: QoS, version: str) -> None:
-        """Declare the publisher of ``/topic``, then announce it."""
         self._node, self._topic, self._type_name, self._version = node, topic, type_name, version
         key = node.key(topic, type_name, version)
         how: dict[str, Any] = {
@@ -76,10 +73,7 @@ class ZenohPublisher:
 
 
 class ZenohSubscription:
-    """Receives messages of one type from one topic, on the consuming thread."""
-
     def __init__(self, node: Node, topic: str, type_name: str, qos: QoS, version: str, bell: Bell) -> None:
-        """Declare the subscriber of ``/topic``, then announce it; ``bell`` is rung by what arrives."""
         self._node, self.topic, self._type_name, self._version = node, topic, type_name, version
         self._oldest_ns = round(qos.lifespan_s * 1e9)
         self._once = LogOnce(_log)
@@ -161,8 +155,6 @@ class QueryOrigin:
 
 
 class ZenohServiceServer(ServiceEnd[QueryOrigin]):
-    """The server's side of one service."""
-
     body_at = CDR_HEADER
 
     def __init__(
@@ -222,7 +214,6 @@ class ZenohServiceServer(ServiceEnd[QueryOrigin]):
         return (hashed for hashed in self._node.peers(names.CLIENT, own) if hashed != own.type_hash)
 
     def respond(self, packed: bytearray, caller: QueryOrigin) -> None:
-        """Reply, and end the query."""
         attachment = names.attachment(caller.sequence, caller.gid)
         with refusals(self._name):
             try:
@@ -233,12 +224,9 @@ class ZenohServiceServer(ServiceEnd[QueryOrigin]):
 
 
 class ZenohServiceClient(ClientEnd):
-    """The client's side of one service."""
-
     body_at = CDR_HEADER
 
     def __init__(self, node: Node, name: str, type_name: str, version: str, bell: Bell) -> None:
-        """Declare the querier of ``/name``, then announce it; ``bell`` is rung by what arrives."""
         self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
         self.hashed_type = type_name
         self._node, self._name, self._version = node, name, version

@@ -20,8 +20,6 @@ from s2a_bench.ros.zenoh_node import Bell, Node, open_session
 
 
 class ZenohMiddleware(ActionNode[QueryOrigin, Bell]):
-    """One node of a ROS 2 domain, from PyPI packages alone."""
-
     def __init__(self, domain_id: int, tuning: Tuning, node_name: str, router: Router) -> None:
         """Join ``domain_id`` as the node ``/namespace/name``; raises TransportError where no router answers."""
         self._domain_id, self._tuning, self._router = domain_id, tuning, router
@@ -38,7 +36,6 @@ class ZenohMiddleware(ActionNode[QueryOrigin, Bell]):
         return Bell()
 
     def publisher(self, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION) -> ZenohPublisher:
-        """Create a publisher; a latched one keeps what late subscriptions ask for."""
         self.check_open()
         return ZenohPublisher(self._node, topic, type_name, qos, version)
 

@@ -65,12 +65,10 @@ def qos_text(qos: QoS) -> str:
 
 
 def node_token(domain_id: int, session: str, node_name: str) -> str:
-    """Return the token of the one node ``/namespace/name`` of a session."""
     return _token(domain_id, session, 0, NODE, node_name)
 
 
 def endpoint_token(domain_id: int, session: str, number: int, node_name: str, entity: Entity, qos: QoS) -> str:
-    """Return the token of a node's endpoint."""
     head = _token(domain_id, session, number, entity.kind, node_name)
     return f"{head}/{entity.name}/{entity.type_name}/{entity.type_hash}/{qos_text(qos)}"
 

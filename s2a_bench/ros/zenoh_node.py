@@ -131,7 +131,6 @@ class Node:
         return names.key(self.domain_id, name, type_name, names.wire_hash(type_name, version))
 
     def announce(self, kind: str, name: str, type_name: str, version: str, qos: QoS) -> AnnouncedEndpoint:
-        """Let others see an endpoint ``/name`` of ROS type ``pkg/kind/Name``, which is ready."""
         hashed = names.wire_hash(type_name, version)
         entity = names.Entity(kind, name.replace("/", "%"), dds_type_name(type_name), hashed)
         token = names.endpoint_token(self.domain_id, self._id, next(self._numbers), self._name, entity, qos)
@@ -152,7 +151,6 @@ class Node:
         return {names.session_of(token) for token in matching if not gid or names.gid_of(token) == gid}
 
     def named(self, kind: str, entity: names.Entity) -> int:
-        """Count the endpoints of a kind that have the name of ``entity``."""
         with self._lock:
             return len(self._known.get((kind, entity.name), {}))
 
@@ -184,7 +182,6 @@ class Node:
 
 @contextmanager
 def refusals(what: str) -> Iterator[None]:
-    """Turn what Zenoh refuses into TransportError."""
     try:
         yield
     except zenoh.ZError as error:

@@ -27,8 +27,6 @@ one."""
 
 @dataclass(frozen=True, slots=True)
 class SweepCommand:
-    """The command that a sweep repeats."""
-
     name: str
     flags: Mapping[str, Flag]
     check: Callable[[Sequence[str]], bool]
@@ -38,8 +36,6 @@ class SweepCommand:
 
 @dataclass(frozen=True, slots=True)
 class SweepCell:
-    """One repeat of one setting."""
-
     number: int
     repeat: int
     settings: dict[str, Any]
@@ -92,8 +88,6 @@ COPY: Final = "sweep.toml"
 
 
 class SweepConfig(Options):
-    """A sweep to start or to resume."""
-
     file: str = option(
         "",
         "sweep file (TOML), or the name of one: paper, quick, transports; not needed with --resume",

@@ -47,7 +47,6 @@ class SweptCell(_Setting):
 
 
 def plan_json(cells: Sequence[SweepCell], expected: Expected, environment: dict[str, Any]) -> dict[str, Any]:
-    """Return the ``--json`` object of a dry run."""
     planned = [
         PlannedCell(
             cell=cell.name,
@@ -70,7 +69,6 @@ def plan_json(cells: Sequence[SweepCell], expected: Expected, environment: dict[
 
 
 def sweep_json(sweep: Sweep) -> dict[str, Any]:
-    """Return the ``--json`` object of a sweep."""
     return frame(sweep, [plain(_cell(sweep, row)) for row in sweep.cells.to_dict("records")], [])
 
 

@@ -107,7 +107,6 @@ def _check(plan: SweepPlan, resources: Mapping[str, float]) -> None:
 
 
 def resource(board: str) -> str:
-    """Return the name of a board's custom resource."""
     return f"board:{board}"
 
 

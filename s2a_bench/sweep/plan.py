@@ -22,8 +22,6 @@ HASHED_WHOLE = 1 << 20
 
 @dataclass(frozen=True, slots=True)
 class SweepPlan:
-    """The cells of a sweep, in order."""
-
     command: str
     cells: tuple[SweepCell, ...]
     rest_s: float

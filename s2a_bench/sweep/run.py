@@ -91,8 +91,6 @@ def pending(plan: SweepPlan, rows: Iterable[Mapping[Any, Any]], *, retry_failed:
 
 
 class SweepRun:
-    """One session of a sweep."""
-
     def __init__(self, writer: RunWriter, plan: SweepPlan, progress: Progress, clock: Clock | None = None) -> None:
         """Read the rows of earlier sessions; the folder must be held by `only_one`."""
         self._writer = writer

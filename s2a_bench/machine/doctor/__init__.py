@@ -116,18 +116,14 @@ def examine(machine: Machine, checks: Mapping[str, str] = CHECKS) -> list[Findin
 
 
 def worst(findings: Iterable[Finding]) -> Level:
-    """Return the most severe level."""
     return max((finding.level for finding in findings), key=LEVELS.index, default="state")
 
 
 def warnings_of(findings: Iterable[Finding]) -> list[RunWarning]:
-    """Return the warnings and errors as runs store them."""
     return [RunWarning(each.code, each.message, each.fix) for each in findings if each.level in {"warning", "error"}]
 
 
 class DoctorConfig(Options):
-    """Options of `doctor`."""
-
     output: Path = option(Path("results"), "folder for run folders, whose disk is checked")
     url: str = option("", "check a server of another operator for risks, instead of this machine")
     strict: bool = option(False, "exit with 1 on warnings too")

@@ -62,12 +62,10 @@ def is_jetson(machine: Machine) -> bool:
 
 
 def has_nvidia(machine: Machine) -> bool:
-    """Return True if an NVIDIA driver is loaded."""
     return machine.read("proc/driver/nvidia/version") is not None or is_jetson(machine)
 
 
 def board(machine: Machine) -> Finding | None:
-    """Report a single-board computer and its system software."""
     model = machine.read("proc/device-tree/model")
     if not model:
         return None
@@ -111,7 +109,6 @@ def _cards(lib: Any, gpus: list[Any]) -> Finding:
 
 
 def gpu_throttling(machine: Machine) -> Finding | None:  # noqa: ARG001 - NVML knows one machine
-    """Check that no GPU is slowed down at this moment."""
     with nvml() as (lib, gpus):
         bits: list[int] = []
         for card in gpus:

@@ -48,7 +48,6 @@ def cgroup_quota(machine: Machine) -> float | None:
 
 
 def governor(machine: Machine) -> Finding | None:
-    """Check that every CPU keeps its clock high."""
     found = machine.read_all(f"{CPU}/cpu[0-9]*/cpufreq/scaling_governor")
     if not found:
         return None
@@ -74,7 +73,6 @@ def turbo(machine: Machine) -> Finding | None:
 
 
 def load(machine: Machine) -> Finding | None:
-    """Check that other programs leave the CPUs free."""
     text = machine.read("proc/loadavg")
     if not text:
         return None
@@ -99,7 +97,6 @@ def throttling(machine: Machine) -> Finding | None:
 
 
 def temperature(machine: Machine) -> Finding | None:
-    """Compare each thermal zone with its lowest throttling temperature."""
     hottest: tuple[float, str] | None = None
     for path, kind in machine.read_all("sys/class/thermal/thermal_zone[0-9]*/type").items():
         zone = path.rpartition("/")[0]
@@ -160,7 +157,6 @@ def memory(machine: Machine) -> Finding | None:
 
 
 def disk(machine: Machine) -> Finding | None:
-    """Check that run folders can be made, and the free space for them."""
     folder = machine.output.absolute()
     while not folder.exists():
         folder = folder.parent
@@ -178,7 +174,6 @@ def disk(machine: Machine) -> Finding | None:
 
 
 def rmem_max(machine: Machine) -> Finding | None:
-    """Check the limit on a socket's receive buffer; DDS uses all of it."""
     rmem = machine.number("proc/sys/net/core/rmem_max")
     if rmem is None:
         return None
@@ -190,7 +185,6 @@ def rmem_max(machine: Machine) -> Finding | None:
 
 
 def cameras(machine: Machine) -> Finding:
-    """Report the video devices, and whether they may be opened."""
     names = machine.read_all("sys/class/video4linux/video*/name")
     devices = {machine.root / "dev" / path.split("/")[3]: name for path, name in names.items()}
     if not devices:

@@ -13,7 +13,6 @@ from s2a_bench.machine.doctor import Finding, Machine
 
 
 def python(machine: Machine) -> Finding:
-    """Report the interpreter and the platform."""
     release = re.search(r'^PRETTY_NAME="?([^"\n]+)', machine.read("etc/os-release") or "", re.MULTILINE)
     system = f"{release[1]}, " if release else ""
     message = f"s2a-bench {__version__}, Python {platform.python_version()} on {platform.machine()}"
@@ -63,7 +62,6 @@ def _problem(requirement: Requirement) -> str:
 
 
 def compiler(machine: Machine) -> Finding:
-    """Report the compilers that llama-cpp-python is built with."""
     name = next((name for name in ("c++", "g++", "clang++") if machine.which(name)), None)
     if name is None:
         message = "no C++ compiler: fine while llama-cpp-python stays as it is installed"

@@ -35,8 +35,6 @@ COVERED = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """The values of one reader at one moment."""
-
     at_ns: int
     values: Mapping[str, float]
 
