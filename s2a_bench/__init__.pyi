@@ -103,7 +103,6 @@ class _Ccrb(_Run, total=False):
     front_gap_m: float
     gap: Literal["stop", "coast", "hold", "cruise"]
     gap_behaviour: Literal["stop", "coast", "hold", "cruise"]
-    host: str
     lane_change: bool
     lead_decel: float
     lead_decel_mps2: float

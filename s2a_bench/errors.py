@@ -3,7 +3,7 @@
 A field of a configuration is in backquotes, as `requests`: the command line shows it as its flag, --requests.
 
 S2AError
-├── UsageError, MissingExtra, SourceError, SimulatorError, RobotError, StoreError, UnlikeRuns
+├── UsageError, MissingExtra, SourceError, RobotError, StoreError, UnlikeRuns
 ├── EngineError: ModelError, BadRequest, Overdue
 └── TransportError: MissingInterface, PortInUse, ServerDied
     └── RequestFailed: Busy, TooLarge, MessagesLost
@@ -100,10 +100,6 @@ class PortInUse(TransportError):
 
 class ServerDied(TransportError):
     """The server's process has ended."""
-
-
-class SimulatorError(S2AError):
-    """A simulator cannot start, or ends."""
 
 
 class RobotError(S2AError):

@@ -26,7 +26,6 @@ EXTRAS: Final = {
     "lerobot": "policies over gRPC, as lerobot serves them",
     "websocket": "policies over WebSocket, as openpi serves them",
     "zmq": "policies over ZeroMQ, as GR00T serves them",
-    "carla": "the carla simulator",
     "zenoh": "ROS 2 over Zenoh, as rmw_zenoh speaks it",
 }
 """Extra -> its purpose."""

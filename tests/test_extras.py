@@ -63,7 +63,6 @@ LEROBOT = ("--transport", "grpc", "--policy-type", "act", "--pretrained", "x")
         ("huggingface_hub", "model", ("model", "fetch", "minicpm-v-2.6")),
         ("highway_env", "ccrb", ("ccrb", "--simulator", "embedded")),
         ("highway_env", "ccrb", ("ccrb", "--animation")),
-        ("carla", "carla", ("ccrb", "--simulator", "carla")),
         ("json_numpy", "openvla", (*BLACK_BOX, "--dialect", "openvla", "--payload", "raw")),
         ("ray", "ray", ("sweep", "paper", "--ray", "local")),
         ("grpc", "lerobot", ("latency", "--url", "grpc://a:1", *LEROBOT)),
@@ -182,7 +181,7 @@ def test_every_extra_is_described_and_in_all() -> None:
     (everything,) = (Requirement(text).extras for text in offered["all"])
     assert everything | {"model"} == set(extras.EXTRAS)
     (made,) = (Requirement(text).extras for text in offered["dev"] if text.startswith("s2a-bench"))
-    assert made == everything - {"ray", "carla"}
+    assert made == everything - {"ray"}
 
 
 @pytest.mark.parametrize(

@@ -281,7 +281,7 @@ def install_core() -> None:
 
 
 def install() -> None:
-    """Make the environment, compile llama-cpp-python, install the rest (`dev` has all but Ray and CARLA)."""
+    """Make the environment, compile llama-cpp-python, install the rest (`dev` has all but Ray)."""
     check_compilers()
     make_environment()
     if built_for() != wanted_build():

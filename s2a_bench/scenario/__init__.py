@@ -66,21 +66,17 @@ class Simulator(Protocol):
     def step(self, command: DriveCommand) -> State:
         """Simulate one step; cars brake to a stop, never backwards."""
 
-    def close(self) -> None:
-        """Release the world; may be called twice."""
-
 
 SIMULATORS: dict[str, str] = {
     "longitudinal": "s2a_bench.scenario.longitudinal:Longitudinal",
     "embedded": "s2a_bench.scenario.embedded:Embedded",
-    "carla": "s2a_bench.scenario.carla:Carla",
 }
 """Value of ``--simulator`` -> constructor."""
 
 
-def simulator(name: str, **settings: object) -> Simulator:
+def simulator(name: str) -> Simulator:
     """Build a simulator; raises UsageError for an unknown name."""
     if name not in SIMULATORS:
         raise UsageError(f"`simulator`: {none_of(name, SIMULATORS)}")
     build: Callable[..., Simulator] = resolve_name(SIMULATORS[name])
-    return build(**settings)
+    return build()

@@ -60,9 +60,6 @@ class Embedded:
             vehicle.speed = max(vehicle.speed, 0.0)
         return self._state()
 
-    def close(self) -> None:
-        self._cars = {}
-
     def _state(self) -> State:
         position = [[vehicle.position[0] - LENGTHS[car] * vehicle.LENGTH] for car, vehicle in self._cars.items()]
         speed = [[vehicle.speed] for vehicle in self._cars.values()]

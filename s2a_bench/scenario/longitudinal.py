@@ -52,5 +52,3 @@ class Longitudinal(LockStep):
 
     def keep(self, columns: NDArray[np.int64]) -> None:
         self._state = self._state.keep(columns)
-
-    def close(self) -> None: ...

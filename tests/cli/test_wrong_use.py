@@ -11,9 +11,8 @@ from tests.cli.program import refused
 
 WRONG = {
     "ccrb": [
-        ("--simulator gazebo", "--simulator: 'gazebo' is none of longitudinal, embedded, carla"),
+        ("--simulator gazebo", "--simulator: 'gazebo' is none of longitudinal, embedded"),
         ("--lane-change", "--lane-change: the longitudinal simulator knows one lane"),
-        ("--simulator carla --host localhost:1", "carla", 1),
         ("--pace 4.8", "--pace is about a model that answers; it needs --live"),
         ("--live --rate 9", "--rate is about tokens that are modelled; leave it out with --live"),
         ("--live --transport pigeon", "--transport: 'pigeon' is none of http, ros, loopback"),

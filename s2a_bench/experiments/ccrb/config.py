@@ -71,9 +71,8 @@ class CcrbConfig(Options):
     tokens_per_skill: int = option(6, "L, the delimiter included", ge=1, le=1000)
     scenario: CcrbOptions = Field(default_factory=CcrbOptions)
     simulator: Annotated[str, one_of(lambda: SIMULATORS)] = option(
-        "longitudinal", "longitudinal (along the lane), embedded (highway-env), carla", first=True
+        "longitudinal", "longitudinal (along the lane), embedded (highway-env)", first=True
     )
-    host: str = option("localhost:2000", "carla: where the server is, HOST or HOST:PORT")
     ttc: bool = option(False, "add s2a-ttc: stream-to-act that starts by the lead's deadline")
     phase: bool = option(False, "also the phase diagram over rate and rear gap, for every gap behaviour", first=True)
     phase_rates: Numbers = option((2.0, 12.0), "tokens/s of the phase diagram: from, to")
@@ -89,11 +88,7 @@ class CcrbConfig(Options):
 
     @property
     def virtual(self) -> bool:
-        return not self.plan_request.live and self.simulator != "carla"
-
-    @property
-    def world(self) -> dict[str, Any]:
-        return {"host": self.host} if self.simulator == "carla" else {}
+        return not self.plan_request.live
 
     @cached_property
     def timeline(self) -> TimelineConfig:

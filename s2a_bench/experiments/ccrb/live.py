@@ -6,7 +6,6 @@ arrival times of its skills; the ego drives the scenario's set-points.
 
 from __future__ import annotations
 
-from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -43,17 +42,17 @@ def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
     def road(feed: FeedPlan) -> FrameSource:
         return Stamped(RoadSource(config.scenario.cars, *feed.size, fps=feed.fps), feed.nonce)
 
-    with closing(simulator(config.simulator, **config.world)) as world:
-        plan, (ask,) = prepare_requests(config.request, progress)
-        live = {**config.request.to_manifest(), "source": RoadSource.name}
-        plan = plan.with_manifest(
-            configuration={**config.to_manifest(), "live": live},
-            follower_law=config.scenario.follower_law,
-            seeds={"sampling": plan.request.seed, "nonce": plan.feed.nonce},
-        )
-        tables = (ROLLOUTS, TRAJECTORIES, SKILLS)
-        task = Task("ccrb", drive=partial(_drive, config, ask, world), tables=tables, source=road)
-        return run_requests(task, plan, output, progress)
+    world = simulator(config.simulator)
+    plan, (ask,) = prepare_requests(config.request, progress)
+    live = {**config.request.to_manifest(), "source": RoadSource.name}
+    plan = plan.with_manifest(
+        configuration={**config.to_manifest(), "live": live},
+        follower_law=config.scenario.follower_law,
+        seeds={"sampling": plan.request.seed, "nonce": plan.feed.nonce},
+    )
+    tables = (ROLLOUTS, TRAJECTORIES, SKILLS)
+    task = Task("ccrb", drive=partial(_drive, config, ask, world), tables=tables, source=road)
+    return run_requests(task, plan, output, progress)
 
 
 def _drive(config: CcrbConfig, ask: PlanPrompt, world: Simulator, launch: RunningLaunch) -> None:

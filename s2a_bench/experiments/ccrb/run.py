@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
@@ -130,25 +129,24 @@ def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
         from s2a_bench.experiments.ccrb.live import run_ccrb_live
 
         return run_ccrb_live(config, output, progress)
-    with closing(simulator(config.simulator, **config.world)) as world:
-        board, ready = config.timeline.boards[0], prepare(config)
-        manifest = {
-            "configuration": config.to_manifest(),
-            "environment": environment.collect(),
-            "seeds": {"plans": config.seed},
-            "follower_law": config.scenario.follower_law,
-            "boards": [{name: getattr(board, name) for name in _BOARD}],
-            "provenance": Origins(board.provenance).to_manifest(),
-        }
-        with RunWriter.create(output, "ccrb", manifest, (ROLLOUTS, TRAJECTORIES, SKILLS, TOKENS)) as writer:
-            progress.opened(writer.path)
-            progress.stage("driving the operating point")
-            tokens_s = ready.plans.token_s
-            assert tokens_s is not None  # noqa: S101 - drawn plans have tokens
-            writer.append(TOKENS, token_rows(ready.setting.name, tokens_s, [ready.request_id]))
-            drive_point(config, ready, world, writer)
-            _drive_studies(config, writer, progress)
-            return writer.path
+    world, board, ready = simulator(config.simulator), config.timeline.boards[0], prepare(config)
+    manifest = {
+        "configuration": config.to_manifest(),
+        "environment": environment.collect(),
+        "seeds": {"plans": config.seed},
+        "follower_law": config.scenario.follower_law,
+        "boards": [{name: getattr(board, name) for name in _BOARD}],
+        "provenance": Origins(board.provenance).to_manifest(),
+    }
+    with RunWriter.create(output, "ccrb", manifest, (ROLLOUTS, TRAJECTORIES, SKILLS, TOKENS)) as writer:
+        progress.opened(writer.path)
+        progress.stage("driving the operating point")
+        tokens_s = ready.plans.token_s
+        assert tokens_s is not None  # noqa: S101 - drawn plans have tokens
+        writer.append(TOKENS, token_rows(ready.setting.name, tokens_s, [ready.request_id]))
+        drive_point(config, ready, world, writer)
+        _drive_studies(config, writer, progress)
+        return writer.path
 
 
 def _drive_studies(config: CcrbConfig, writer: RunWriter, progress: Progress) -> None:
