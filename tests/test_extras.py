@@ -62,7 +62,6 @@ LEROBOT = ("--transport", "grpc", "--policy-type", "act", "--pretrained", "x")
         ("gguf", "model", ("model", "dummy")),
         ("huggingface_hub", "model", ("model", "fetch", "minicpm-v-2.6")),
         ("highway_env", "ccrb", ("ccrb", "--simulator", "embedded")),
-        ("highway_env", "ccrb", ("ccrb", "--animation")),
         ("json_numpy", "openvla", (*BLACK_BOX, "--dialect", "openvla", "--payload", "raw")),
         ("ray", "ray", ("sweep", "paper", "--ray", "local")),
         ("grpc", "lerobot", ("latency", "--url", "grpc://a:1", *LEROBOT)),

@@ -34,24 +34,6 @@ def test_tables_name_the_law_and_what_is_emulated(tmp_path: Path) -> None:
         assert text in done.stdout
 
 
-def test_the_animation_has_frames_of_the_right_size(tmp_path: Path) -> None:
-    import cv2
-    from PIL import Image
-
-    done = called("ccrb", "--animation", "--json", "--output", tmp_path)
-    figures = Path(json.loads(done.stdout)["run"]) / "figures"
-    with Image.open(figures / "scenario.gif") as gif:
-        assert gif.n_frames > 50  # type: ignore[attr-defined]
-        gif.seek(gif.n_frames - 1)  # type: ignore[attr-defined]
-        colours = gif.convert("RGB").getcolors(1 << 20) or []
-        size = gif.size
-    near_red = sum(count for count, (red, green, blue) in colours if red > 190 and green < 120 and blue < 60)
-    assert near_red > 1000  # two pairs of cars have crashed
-    film = cv2.VideoCapture(str(figures / "scenario.mp4"))
-    assert (film.get(cv2.CAP_PROP_FRAME_WIDTH), film.get(cv2.CAP_PROP_FRAME_HEIGHT)) == size
-    assert film.get(cv2.CAP_PROP_FRAME_COUNT) > 100
-
-
 @pytest.mark.slow
 def test_a_live_run_prints_one_object_and_leaves_a_whole_folder(tmp_path: Path) -> None:
     flags = ("--live", "--transport", "loopback", "--pace", "40", "--threads", "1", "--skills", "3", "--ttc")

@@ -199,8 +199,6 @@ def test_the_metrics_are_keys_of_the_cells_and_columns_of_the_tables(made: Calla
 def test_the_run_shows_what_its_options_ask_for(made: Callable[..., StoredRun]) -> None:
     assert set(show(made()).tables) == {"margins", "outcomes"}
     assert set(show(made(**GRID)).figures) == {"scenario", "phase"}
-    assert set(show(made(), animation=True).files) == {"figures/scenario.gif", "figures/scenario.mp4"}
-    assert not show(made()).files
 
 
 @pytest.mark.parametrize(

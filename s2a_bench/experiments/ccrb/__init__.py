@@ -10,6 +10,5 @@ EXPERIMENT = Experiment(
     run="s2a_bench.experiments.ccrb.run:run_ccrb",
     view="s2a_bench.experiments.ccrb.view.tables:show",
     cell="s2a_bench.experiments.ccrb.view.tables:CcrbCell",
-    view_options="s2a_bench.experiments.ccrb.config:CcrbView",
     unit="parts",
 )

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 from pydantic import Field
 
-from s2a_bench import extras
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.boards.tokens import PROMPT_TIME
 from s2a_bench.errors import UsageError
@@ -175,14 +174,3 @@ class CcrbConfig(Options):
                 f"`rate`, `pace` or `profile`: the whole plan takes {whole_s:.0f} s to arrive, "
                 f"which is no driving; at most {LONG_S:.0f} s"
             )
-
-
-class CcrbView(Options):
-    """What is drawn besides tables and figures."""
-
-    animation: bool = option(False, "write the animation (GIF, MP4): half a minute", flag="animation/--no-animation")
-
-    def check(self) -> None:
-        """Raise MissingExtra before anything is driven if the animation's packages are missing."""
-        if self.animation:
-            extras.need("ccrb", "highway_env")

@@ -18,7 +18,6 @@ from s2a_bench.scenario.embedded import LANE_WIDTH_M, MIDDLE_M, build_road, cent
 from s2a_bench.types import Encoding, Frame
 
 COLOURS: Final = {LEAD: (230, 159, 0), EGO: (0, 158, 115), REAR: (0, 114, 178)}
-CRASHED: Final = (213, 94, 0)
 PIXELS_A_M: Final = 8.0
 AHEAD_M: Final = 15.0
 """From the ego to the middle of the picture."""
@@ -49,14 +48,10 @@ class TopView:
             self._cars[car] = vehicle
             self._road.vehicles.append(vehicle)
 
-    def picture(
-        self, position_m: Floats, lateral_m: Floats, heading: Floats, crashed: frozenset[int] = frozenset()
-    ) -> NDArray[np.uint8]:
-        """Return RGB pixels, shape (height, width, 3), for arrays of shape (3,); headings in rad, to the left."""
+    def picture(self, position_m: Floats) -> NDArray[np.uint8]:
+        """Return RGB pixels, shape (height, width, 3), for positions of shape (3,)."""
         for car, vehicle in self._cars.items():
-            vehicle.position = centre(car, float(position_m[car]), float(lateral_m[car]), vehicle.LENGTH)
-            vehicle.heading = -float(heading[car])
-            vehicle.color = CRASHED if car in crashed else COLOURS[car]
+            vehicle.position = centre(car, float(position_m[car]), 0.0, vehicle.LENGTH)
         middle = np.array([float(position_m[EGO]) + AHEAD_M, MIDDLE_M - LANE_WIDTH_M / 2])
         self._surface.move_display_window_to(middle)
         self._draw.display(self._road, self._surface)
@@ -65,7 +60,7 @@ class TopView:
 
 
 class RoadSource:
-    """A FrameSource of one scenario: the ego and its surroundings from above, as in the animation.
+    """A FrameSource of one scenario: the ego and its surroundings from above.
 
     All cars drive at v0 with their gaps at t = 0; every frame is one period later. `read` renders and never waits.
     Raises UsageError for a tiny size.
@@ -93,5 +88,4 @@ class RoadSource:
     def close(self) -> None: ...
 
     def _picture(self, index: int) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-        flat = np.zeros(3)
-        return self._view.picture(self._gaps_m + self._ahead_m * (index % LOOP_FRAMES), flat, flat)
+        return self._view.picture(self._gaps_m + self._ahead_m * (index % LOOP_FRAMES))

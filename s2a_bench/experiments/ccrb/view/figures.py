@@ -115,27 +115,18 @@ def ccrb_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
     return builders
 
 
-def path_of(run: StoredRun, cell: str) -> pd.DataFrame:
-    """Return the trajectory of a recorded roll-out with times in s, speeds in km/h, and gaps."""
+def _path(run: StoredRun, row: dict[Any, Any]) -> pd.DataFrame:
+    """Return a trajectory until the cars rest, the car behind until its impact: times in s, speeds in km/h, gaps."""
     rows = run.table(TRAJECTORIES)
-    path: pd.DataFrame = rows[rows["cell"] == cell].reset_index(drop=True)
+    path: pd.DataFrame = rows[rows["cell"] == row["cell"]].reset_index(drop=True)
     path["time_s"] = path["at_ns"] / 1e9
     for car in CAR_STYLES:
         path[f"{car}_speed_kmh"] = path[f"{car}_speed_mps"] * 3.6
     path["front_gap_m"] = path["lead_position_m"] - path["ego_position_m"]
     path["rear_gap_m"] = path["ego_position_m"] - path["rear_position_m"]
-    return path
-
-
-def rest_of(path: pd.DataFrame) -> int:
-    """Return the last row in which a car moves."""
     moving = path[[f"{car}_speed_mps" for car in CAR_STYLES]].max(axis=1) > _REST_MPS
-    return int(moving[moving].index[-1]) if moving.any() else 0
-
-
-def _path(run: StoredRun, row: dict[Any, Any]) -> pd.DataFrame:
-    path = path_of(run, row["cell"])
-    shown = path["time_s"] <= float(path["time_s"].iloc[rest_of(path)]) + _AFTER_S
+    rest_s = float(path["time_s"][moving].max()) if moving.any() else 0.0
+    shown = path["time_s"] <= rest_s + _AFTER_S
     path = path.loc[shown].copy()
     touched: Any = path.index[path["rear_gap_m"] <= 0] if row["outcome"] in {"rear", "both"} else []
     if len(touched):

@@ -18,7 +18,6 @@ from s2a_bench.experiments.ccrb.rows import (
     RolloutRow,
     SensitivityRow,
 )
-from s2a_bench.experiments.ccrb.view.animation import animation_files
 from s2a_bench.experiments.ccrb.view.figures import ccrb_figures
 from s2a_bench.experiments.ccrb.view.outcomes import (
     VARIED_TITLES,
@@ -63,7 +62,7 @@ if TYPE_CHECKING:
     from s2a_bench.store.schema import Table
 
 
-def show(run: StoredRun, *, animation: bool = False, **_: Any) -> Shown:
+def show(run: StoredRun, **_: Any) -> Shown:
     """Return what a CCRB run shows."""
     tables = ccrb_tables(run)
     return Shown(
@@ -72,7 +71,6 @@ def show(run: StoredRun, *, animation: bool = False, **_: Any) -> Shown:
         main=[name for name in ("outcomes", "phase", "random", "followers", "follower-shares") if name in tables],
         csvs=_ccrb_csv(run),
         figures=ccrb_figures(run),
-        files=animation_files(run) if animation else {},
         json=lambda: ccrb_json(run),
     )
 
