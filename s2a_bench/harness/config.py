@@ -280,9 +280,8 @@ class RequestsConfig(Options):
             raise UsageError(f"`resize`: {pipeline.payload} is what the camera gave; use `payload` raw, jpeg or png")
         if self.state and not pipeline.capabilities.accepts_state:
             raise UsageError(f"`state`: a request of {pipeline.name} has no place for it; leave one of them out")
-        options, engine = pipeline.options, self.engine.name
-        choice = Choice(options, pipeline.variant, mode=self.mode, engine=engine, cameras=self.cameras)
-        pipeline.transport.require(choice)
+        chosen = Choice(pipeline.options, pipeline.variant, self.mode, self.engine.name, self.cameras, self.state)
+        pipeline.transport.require(chosen)
         require_payload(pipeline)
         self.served_engine.but(**dict(pipeline.engine))  # raises UsageError for a value in its name
         if pipeline.engine and pipeline.options.external_address:

@@ -235,6 +235,7 @@ class Choice(Generic[O]):
     mode: str = ""
     engine: str = ""
     cameras: int = 1
+    state: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,6 @@ A list of arrays becomes one array with one more axis in front: ``[["{image}"]]`
 with ``?`` is optional: it is left out if the request lacks the picture or the numbers of its value. All other values
 are constants. The table `EXTENSION` is no part of the observation: it describes the server, as `ExternalServer`
 reads it. The files in ``templates`` beside this module are known by name.
-
-`PolicyTransport` is the base of transports whose observations are made from a template.
 """
 
 from __future__ import annotations
@@ -25,17 +23,15 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, NoReturn, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, NoReturn, TypeAlias
 from uuid import uuid4
 
 import numpy as np
 from pydantic import AfterValidator, Field
 
-from s2a_bench import extras, toml_file
+from s2a_bench import toml_file
 from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.text import none_of, read_text
-from s2a_bench.transport import ACTIONS, Capabilities, Choice, Transport
-from s2a_bench.transport.listening import ListeningOptions, read_key
 from s2a_bench.types import Pixels, Vector
 
 TEMPLATES: Final = Path(__file__).with_name("templates")
@@ -130,15 +126,21 @@ class Template:
             raise RequestFailed(f"`template` {self.name}: {missing}") from None
         return filled
 
-    def check_pictures(self, cameras: int) -> None:
+    def check_request(self, cameras: int, state: int) -> dict[str, Any]:
+        """Return the observation of a request with so many pictures, and numbers of the state; raises UsageError."""
         why = f"has places for {self.pictures}" if cameras > self.pictures else ""
+        pictures = [np.zeros((1, 1, 3), np.uint8)] * cameras
         try:
-            self._make(_Values([np.zeros((1, 1, 3), np.uint8)] * cameras, np.zeros(STATE, np.float32), ""))
+            self._make(_Values(pictures, np.zeros(STATE, np.float32), ""))
         except _Missing:
             why = f"wants {self.pictures}"
         if why:
             other = f"use `cameras` {self.pictures}, or another template" if self.pictures else "use another template"
             raise UsageError(f"`cameras`: {cameras} a request, and `template` {self.name} {why}; {other}")
+        try:
+            return self._make(_Values(pictures, np.zeros(state, np.float32), ""))  # type: ignore[no-any-return]
+        except _Missing as missing:
+            raise UsageError(f"`state`: `template` {self.name}: {missing}") from None
 
     def check_server(self, transport: str, reads: Sequence[str]) -> None:
         """Refuse a description of the server of which ``transport`` does not read all, only the keys ``reads``."""
@@ -308,38 +310,3 @@ def _readable(name: str) -> str:
 
 TemplateName = Annotated[str, AfterValidator(_readable)]
 """Name or path of a readable template, empty for the transport's own."""
-
-
-class PolicyOptions(ListeningOptions):
-    @property
-    def template_name(self) -> str:
-        raise NotImplementedError
-
-
-P = TypeVar("P", bound=PolicyOptions)
-
-
-class PolicyTransport(Transport[P]):
-    """Sends observations as MessagePack and receives chunks of actions."""
-
-    payloads: ClassVar[tuple[str, ...]] = ("raw", "jpeg", "jpeg-preencoded", "png")
-    answer_kinds = (ACTIONS,)
-    stages: ClassVar[Mapping[str, str]] = {"msgpack_pack": "pack", "msgpack_parse": "parse"}
-    reads_server: ClassVar[Sequence[str]] = ()
-    """The keys of `ExternalServer` by which a template may describe the server."""
-    modules: ClassVar[tuple[str, ...]]
-    """Modules that the extra of its name installs."""
-
-    def capabilities(self, choice: Choice[P]) -> Capabilities[P]:
-        options, template = choice.options, template_of(choice.options.template_name)
-        pixels = self.payloads[:1] if options.url else self.payloads
-        payloads = self.payloads[1:] if template.encoded else pixels
-        return Capabilities(options, payloads, self.answer_kinds, template.accepts_state, self.facts)
-
-    def require(self, choice: Choice[P]) -> None:
-        """Refuse a missing key, and a template for other pictures; raises MissingExtra too."""
-        extras.need(self.name, *self.modules)
-        template = template_of(choice.options.template_name)
-        template.check_pictures(choice.cameras)
-        template.check_server(self.name, self.reads_server)
-        read_key(choice.options.api_key_env)

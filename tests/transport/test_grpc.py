@@ -206,6 +206,7 @@ MISUSES = {
     "no policy": ({"url": "grpc://a:1", "policy_type": "act"}, 1, "give `policy_type` and `pretrained`"),
     "no type": ({"url": "grpc://a:1", "pretrained": "x"}, 1, "give `policy_type` and `pretrained`"),
     "cameras": ({"url": "grpc://a:1", "pretrained": "x", "policy_type": "act"}, 5, "has places for 4"),
+    "state": ({"url": "grpc://a:1", "pretrained": "x", "policy_type": "act"}, 1, "`state`: .*and the request has 0"),
 }
 
 
@@ -229,8 +230,9 @@ def test_it_serves_nobody() -> None:
 def test_a_template_with_what_lerobot_does_not_take_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "chw.toml"
     path.write_text('front = "{image:0|CHW}"\nstate = "{state}"')
-    with policy() as (_, url), robot(url, template=str(path)) as opened, pytest.raises(UsageError, match="front is no"):
-        ask(opened, request(yuyv_frame()))
+    options = GrpcOptions(url="grpc://a:1", pretrained="x", policy_type="act", template=str(path))
+    with pytest.raises(UsageError, match="front is no"):
+        GRPC.require(Choice(options, state=2))
 
 
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.pkl")), ids=lambda path: path.stem)

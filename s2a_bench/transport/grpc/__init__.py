@@ -6,25 +6,21 @@ read without unpickling (`pickles`).
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import ClassVar
 
-from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import GET_ACTIONS_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import option
-from s2a_bench.transport import ACTIONS, Capabilities, Choice, Client, Transport, Urls, Wiring
-from s2a_bench.transport.defaults import BESIDE
-from s2a_bench.transport.listening import UrlOptions
+from s2a_bench.transport import Choice, Urls
+from s2a_bench.transport.grpc.pickles import observation_of
 from s2a_bench.transport.observation import TemplateName, names, template_of
+from s2a_bench.transport.policies import PolicyOptions, PolicyTransport
 
 LEROBOT = "lerobot"
-PACKAGES = ("grpc",)
-"""What the extra brings, by the name under which it is imported."""
 PAYLOAD_DOWN_BYTES = Fact("payload_down_bytes", "bytes", "what the chunk weighs on the wire")
 
 
-class GrpcOptions(UrlOptions):
+class GrpcOptions(PolicyOptions):
     """The options of the client of lerobot's policy server."""
 
     SCHEMES: ClassVar[tuple[str, ...]] = ("grpc",)
@@ -37,35 +33,25 @@ class GrpcOptions(UrlOptions):
     template: TemplateName = option(LEROBOT, "the observation: a template's name, or a TOML or JSON file", names=names)
 
 
-class Grpc(Transport[GrpcOptions]):
+class Grpc(PolicyTransport[GrpcOptions]):
     """lerobot's policies over gRPC."""
 
     name = "grpc"
     options = GrpcOptions
     variants = (LEROBOT,)
     payloads = ("raw",)
-    answer_kinds = (ACTIONS,)
     stages: ClassVar[dict[str, str]] = {"pickle_pack": "pack", "send": "network", "pickle_parse": "parse"}
     urls = Urls(GrpcOptions.SCHEMES, examine="s2a_bench.transport.grpc.risks:examine")
-    compared_with = BESIDE
+    extra = LEROBOT
+    modules = ("grpc",)
+    client_class = "s2a_bench.transport.grpc.client:GrpcClient"
     facts = (PAYLOAD_BYTES, PAYLOAD_DOWN_BYTES, RECONNECTS, GET_ACTIONS_MS)
     order = 24
     style = {LEROBOT: ("#01665E", "-")}
     packages = ("grpcio",)
 
-    def client(self, wiring: Wiring[GrpcOptions], alive: Callable[[], bool]) -> Client:  # noqa: ARG002
-        """Prepare to ask the server at ``wiring.address``, a URL."""
-        extras.need(LEROBOT, *PACKAGES)
-        from s2a_bench.transport.grpc.client import GrpcClient
-
-        return GrpcClient(wiring)
-
-    def capabilities(self, choice: Choice[GrpcOptions]) -> Capabilities[GrpcOptions]:
-        accepts_state = template_of(choice.options.template).accepts_state
-        return Capabilities(choice.options, self.payloads, self.answer_kinds, accepts_state, self.facts)
-
     def require(self, choice: Choice[GrpcOptions]) -> None:
-        """Refuse a choice without a server or a policy, and a template for other pictures; raises MissingExtra too."""
+        """Refuse a choice without a server or a policy, and an observation that lerobot does not take."""
         options = choice.options
         if not options.url:
             raise UsageError(
@@ -75,10 +61,9 @@ class Grpc(Transport[GrpcOptions]):
             raise UsageError(
                 "`pretrained`: lerobot's server loads what its client names; give `policy_type` and `pretrained`"
             )
-        extras.need(LEROBOT, *PACKAGES)
-        template = template_of(options.template)
-        template.check_pictures(choice.cameras)
-        template.check_server(self.name, ())
+        super().require(choice)
+        template = template_of(options.template_name)
+        observation_of(template.check_request(choice.cameras, choice.state), template.name)
 
 
 GRPC = Grpc()

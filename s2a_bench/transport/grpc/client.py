@@ -8,27 +8,23 @@ last one. The server holds one policy, which its last client named, and one obse
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 import grpc
-import numpy as np
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, ServerDied, TransportError, UsageError
+from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.facts import GET_ACTIONS_MS, PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.grpc import PAYLOAD_DOWN_BYTES, GrpcOptions
-from s2a_bench.transport.grpc.pickles import chunk_in, pickled
+from s2a_bench.transport.grpc.pickles import chunk_in, observation_of, pickled
 from s2a_bench.transport.limits import MIB, Bounds
-from s2a_bench.transport.observation import template_of
-from s2a_bench.transport.observed import COLOURS
-from s2a_bench.transport.pictures import policy_picture
+from s2a_bench.transport.policy_client import PolicyClient
 from s2a_bench.types import Piece, Request
 
-AXES: Final = ["height", "width", "channels"]
 SERVICE, LOAD = "/transport.AsyncInference/", "SendPolicyInstructions"
 PIECE_BYTES: Final = 2 * MIB
 BEGIN, MIDDLE, END = 1, 2, 3
@@ -43,29 +39,24 @@ _LOADED: Final[dict[str, dict[str, Any]]] = {}
 """URL -> the policy that a client of this process, which is open, named last: cells of a run may name others."""
 
 
-class GrpcClient:
+class GrpcClient(PolicyClient[GrpcOptions]):
     """Asks one policy server."""
 
-    def __init__(self, wiring: Wiring[GrpcOptions]) -> None:
+    def __init__(self, wiring: Wiring[GrpcOptions], alive: Callable[[], bool]) -> None:
         """Prepare to ask the server at ``wiring.address``; the first request connects and has it load the policy."""
-        self.camera = None
-        self._wiring, self._url = wiring, wiring.address
-        self._template = template_of(wiring.options.template)
+        super().__init__(wiring, alive)
         self._channel: grpc.Channel | None = None
         self._connected = False
         self._timestep = 0
 
-    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        bounds = Bounds(self._url, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
-        pictures = [policy_picture(frame, "raw", trace) for frame in request.images]
-        filled = self._template.fill(pictures, request.state, request.prompt)
-        observation, features = observation_of(filled, self._template.name)
+    def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:
+        observation, features = observation_of(self._observation(request, trace), self._template.name)
         try:
             channel = self._open(features, bounds, trace)
             stamp, body = self._pack(observation, trace)
             answer = self._exchanged(channel, body, bounds, trace)
         except grpc.RpcError as error:
-            raise self._failed(error) from error
+            raise self._reason(error) from error
         bounds.count_bytes(len(answer))
         trace.facts[PAYLOAD_DOWN_BYTES] = len(answer)
         if not answer:
@@ -76,21 +67,16 @@ class GrpcClient:
             raise RequestFailed(f"{self._url} answered about the observation of another client; stop that client")
         actions = actions_of(chunk)
         trace.mark("pickle_parse")
-        for action in actions:
-            bounds.count_piece()
-            yield action
+        yield from actions
+
+    def _abandon(self) -> None:
+        """Keep the channel, on which each call is a stream of its own."""
 
     def _open(self, features: dict[str, Any], bounds: Bounds, trace: Trace) -> grpc.Channel:
         """Return the channel to the server, which holds our policy; marks `connect` if it had to load it."""
-        options = self._wiring.options
-        policy = {
-            "policy_type": options.policy_type,
-            "pretrained_name_or_path": options.pretrained,
-            "lerobot_features": features,
-            "actions_per_chunk": options.actions_per_chunk,
-            "device": options.device,
-            "rename_map": {},
-        }
+        policy = self._wiring.options.model_dump(include={"policy_type", "actions_per_chunk", "device"})
+        policy |= {"pretrained_name_or_path": self._wiring.options.pretrained, "rename_map": {}}
+        policy["lerobot_features"] = features
         if self._channel is None:
             self._channel = grpc.insecure_channel(self._url.partition("://")[2], [("grpc.enable_http_proxy", 0)])
             if self._connected:
@@ -136,7 +122,7 @@ class GrpcClient:
     def _patience_s(self, bounds: Bounds) -> float:
         return min(self._wiring.timeout_s, bounds.left_s())
 
-    def _failed(self, error: Any) -> TransportError:
+    def _reason(self, error: Any) -> TransportError:
         """Return the error that says what gRPC's status means; a connection that broke is made again."""
         code, why = error.code(), " ".join(str(error.details()).split())[:500]
         if code is grpc.StatusCode.UNAVAILABLE:
@@ -151,40 +137,11 @@ class GrpcClient:
         }.get(code, f"refused ({code.name}): {why}")
         return RequestFailed(f"{self._url} {meaning}")
 
-    def describe(self) -> dict[str, str]:
-        """Return where the server is, and the template, for the manifest."""
-        return {"url": self._url, "template": self._template.name}
-
     def close(self) -> None:
         if self._channel is not None:
             _LOADED.pop(self._url, None)
             self._channel.close()
             self._channel = None
-
-
-def observation_of(filled: dict[str, Any], template: str) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return a template's observation as lerobot has it, flat, and the features that describe it.
-
-    Each number of the state is a motor, with a name of its own. Raises UsageError for a value that it does not carry.
-    """
-    observation: dict[str, Any] = {}
-    features: dict[str, Any] = {}
-    motors: dict[str, float] = {}
-    for key, value in filled.items():
-        array: Any = value if isinstance(value, np.ndarray) else np.empty(())
-        if array.dtype == np.uint8 and array.ndim == len(AXES) and array.shape[-1] == COLOURS:
-            features[f"observation.images.{key}"] = {"dtype": "image", "shape": value.shape, "names": AXES}
-            observation[key] = value
-        elif array.dtype.kind == "f" and array.ndim == 1:
-            motors |= {f"{key}.{index}": number for index, number in enumerate(array.tolist())}
-        elif isinstance(value, str):
-            observation[key] = value
-        else:
-            raise UsageError(
-                f"`template` {template}: {key} is no picture (H, W, 3), no state (D,) and no text, which lerobot takes"
-            )
-    features["observation.state"] = {"dtype": "float32", "shape": (len(motors),), "names": [*motors]}
-    return observation | motors, features
 
 
 def message_of(data: bytes | memoryview, field: int = 1) -> bytes:

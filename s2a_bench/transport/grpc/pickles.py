@@ -19,7 +19,7 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from s2a_bench.errors import RequestFailed
+from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.transport.chunks import NUMBERS
 
 Numbers: TypeAlias = NDArray[Any]
@@ -71,6 +71,32 @@ def chunk_in(data: bytes) -> tuple[float, Numbers]:
     except Exception as error:
         why = str(error)[:SHOWN] or type(error).__name__
         raise RequestFailed(f"{len(data)} bytes that are no chunk of lerobot's: {why}") from error
+
+
+def observation_of(filled: dict[str, Any], template: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return a template's observation as lerobot has it, flat, and the features that describe it.
+
+    Each number of the state is a motor, with a name of its own. Raises UsageError for a value that it does not carry.
+    """
+    observation: dict[str, Any] = {}
+    features: dict[str, Any] = {}
+    motors: dict[str, float] = {}
+    for key, value in filled.items():
+        array: Any = value if isinstance(value, np.ndarray) else np.empty(())
+        if array.dtype == np.uint8 and array.shape[2:] == (3,):
+            axes = ["height", "width", "channels"]
+            features[f"observation.images.{key}"] = {"dtype": "image", "shape": value.shape, "names": axes}
+            observation[key] = value
+        elif array.dtype.kind == "f" and array.ndim == 1:
+            motors |= {f"{key}.{index}": number for index, number in enumerate(array.tolist())}
+        elif isinstance(value, str):
+            observation[key] = value
+        else:
+            raise UsageError(
+                f"`template` {template}: {key} is no picture (H, W, 3), no state (D,) and no text, which lerobot takes"
+            )
+    features["observation.state"] = {"dtype": "float32", "shape": (len(motors),), "names": [*motors]}
+    return observation | motors, features
 
 
 def _names() -> Names:

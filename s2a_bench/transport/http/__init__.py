@@ -128,7 +128,7 @@ class Http(Transport[HttpOptions]):
         if options.observation:
             from s2a_bench.transport.http.dialects import open_dialect
 
-            open_dialect(options.dialect, options.observation).check(choice.cameras)
+            open_dialect(options.dialect, options.observation).check(choice.cameras, choice.state)
         if options.url and variant in {BINARY, LLAMA_SERVER}:
             raise UsageError(f"`transport` {self.name}/{variant} needs our own server; leave it out with `url`")
         if variant == LLAMA_SERVER:

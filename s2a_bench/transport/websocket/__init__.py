@@ -7,16 +7,13 @@ observations from a template (`transport.observation`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
-from s2a_bench import extras
 from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS, Fact
-from s2a_bench.options import option
-from s2a_bench.transport import Client, Handler, Server, Urls, Wiring
+from s2a_bench.transport import Urls, Wiring
 from s2a_bench.transport.access import WebOptions
-from s2a_bench.transport.defaults import BESIDE
-from s2a_bench.transport.observation import DEFAULT, PolicyOptions, PolicyTransport, TemplateName, names
+from s2a_bench.transport.policies import PolicyOptions, PolicyTransport
 
 VARIANTS = ("openpi", "openpi-stream")
 OPENPI, STREAM = VARIANTS
@@ -34,37 +31,21 @@ class WebsocketOptions(WebOptions, PolicyOptions):
 
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 8000}
 
-    template: TemplateName = option(DEFAULT, "the observation: a template's name, or a TOML or JSON file", names=names)
-
-    @property
-    def template_name(self) -> str:
-        return self.template or DEFAULT
-
 
 class Websocket(PolicyTransport[WebsocketOptions]):
     name = "websocket"
     options = WebsocketOptions
     variants = VARIANTS
     urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.transport.websocket.risks:examine")
+    extra = "websocket"
     modules = PACKAGES
+    client_class = "s2a_bench.transport.websocket.client:WebsocketClient"
+    server_class = "s2a_bench.transport.websocket.server:WebsocketServer"
     reads_server = ("path", "greets", "text_keys", "answer", "reset", "idle_s")
-    compared_with = BESIDE
     facts = (PAYLOAD_BYTES, RECONNECTS, INFER_MS, PREV_TOTAL_MS)
     order = 20
     style = {OPENPI: ("#000000", "-"), STREAM: ("#000000", "--")}
     packages = PACKAGES
-
-    def client(self, wiring: Wiring[WebsocketOptions], alive: Callable[[], bool]) -> Client:
-        extras.need(self.name, *PACKAGES)
-        from s2a_bench.transport.websocket.client import WebsocketClient
-
-        return WebsocketClient(wiring, alive)
-
-    def server(self, wiring: Wiring[WebsocketOptions], handler: Handler) -> Server:
-        extras.need(self.name, *PACKAGES)
-        from s2a_bench.transport.websocket.server import WebsocketServer
-
-        return WebsocketServer(wiring, handler)
 
     def ready(self, wiring: Wiring[WebsocketOptions]) -> str:
         address = wiring.address

@@ -6,7 +6,7 @@ was packed to the answer is the stage `server`, and where it tells ``infer_ms`` 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from math import isfinite
 from typing import Any
@@ -24,27 +24,21 @@ from s2a_bench.transport import Wiring, observed
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.observation import EXTENSION, ExternalServer, template_of
-from s2a_bench.transport.pictures import policy_picture
+from s2a_bench.transport.observation import EXTENSION, ExternalServer
+from s2a_bench.transport.policy_client import PolicyClient
 from s2a_bench.transport.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
 from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.transport.websocket.link import BoundedConnection, Broken
 from s2a_bench.types import Action, Piece, Request
 
-QUOTED = 500
-"""Letters shown of a server's error: its end, as a traceback's reason comes last."""
 
-
-class WebsocketClient:
+class WebsocketClient(PolicyClient[WebsocketOptions]):
     """One variant of openpi's protocol."""
 
     def __init__(self, wiring: Wiring[WebsocketOptions], alive: Callable[[], bool]) -> None:
         """Prepare to ask the server at ``wiring.address``; the first request, or `describe`, connects."""
-        self.camera = None
-        self._wiring, self._alive = wiring, alive
-        self._native = not wiring.black_box
+        super().__init__(wiring, alive)
         self._streams = wiring.variant == STREAM
-        self._template = template_of(wiring.options.template_name)
         self._server = ExternalServer() if self._native else self._template.server
         self._url = _with_path(wiring.address, self._server.path)
         if self._native and self._streams:
@@ -57,30 +51,25 @@ class WebsocketClient:
         self._metadata: dict[str, str] = {}
         self._provenance: dict[str, str] = {}
 
-    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
+    def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:
         body = self._pack(request, trace)
-        bounds = Bounds(self._url, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
-        whole = False
         try:
             message, packed_ns = self._sent(body, bounds, trace)
             trace.provenance = self._provenance
-            for piece in self._answer(message, packed_ns, trace):
-                bounds.count_piece()
-                yield piece
-            whole = True
+            yield from self._actions(message, packed_ns, trace)
         except Broken as error:
             if not self._alive():
                 raise ServerDied(f"the server has ended: {error}") from error
             raise RequestFailed(str(error)) from error
-        finally:
-            if not whole and self._link is not None:
-                self._link.close()
-                self._link = None
+
+    def _abandon(self) -> None:
+        if self._link is not None:
+            self._link.close()
+            self._link = None
 
     def _pack(self, request: Request, trace: Trace) -> bytes:
         """Fill the template and write it as MessagePack, marking each stage."""
-        pictures = [policy_picture(frame, self._wiring.options.payload, trace) for frame in request.images]
-        observation = self._template.fill(pictures, request.state, request.prompt)
+        observation = self._observation(request, trace)
         if self._native:
             observation[EXTENSION] = observed.extension_of(request)
         body = packb(observation, text_keys=self._server.text_keys)
@@ -136,9 +125,6 @@ class WebsocketClient:
             raise self._failed(message)
         return message
 
-    def _failed(self, text: str) -> RequestFailed:
-        return RequestFailed(f"{self._url}: {' '.join(struck(text).split())[-QUOTED:] or 'an error without words'}")
-
     def _check(self, answer: Any) -> None:
         """Raise the error that an answer is, in the server's words."""
         reason = answer.get(codec.ERROR) if isinstance(answer, dict) else None
@@ -153,7 +139,7 @@ class WebsocketClient:
         self._check(answer)
         return actions_of(self._server.actions_in(answer))
 
-    def _answer(self, message: bytes, packed_ns: int, trace: Trace) -> Generator[Action, None, None]:
+    def _actions(self, message: bytes, packed_ns: int, trace: Trace) -> Iterator[Action]:
         """Yield the actions of an answer; after the last, complete the trace."""
         assert self._link  # noqa: S101 - for mypy
         count, first_ns = 0, 0
@@ -196,10 +182,10 @@ class WebsocketClient:
         """Return the server and its metadata, for the manifest; connects to a foreign server."""
         if not self._native and self._link is None:
             try:
-                self._connected(Bounds(self._url, self._wiring.deadline_of(1), 1))
+                self._connected(self._bounds(1))
             except Broken as error:
                 raise RequestFailed(str(error)) from error
-        return {"url": self._url, "template": self._template.name, **self._metadata}
+        return {**super().describe(), **self._metadata}
 
     def close(self) -> None:
         if self._link is not None:

@@ -8,22 +8,22 @@ where no other client reaches it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
-from s2a_bench import extras
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.options import option
-from s2a_bench.transport import SERVER, Client, Handler, Server, Urls, Wiring
-from s2a_bench.transport.defaults import BESIDE
-from s2a_bench.transport.observation import PolicyOptions, PolicyTransport, TemplateName, names
+from s2a_bench.transport import SERVER, Urls, Wiring
+from s2a_bench.transport.listening import ListeningOptions
+from s2a_bench.transport.observation import TemplateName, names
+from s2a_bench.transport.policies import PolicyOptions, PolicyTransport
 
 GR00T = "gr00t"
 PACKAGES = ("msgpack", "zmq")
 """What the extra of its name brings, by the names under which they are imported."""
 
 
-class ZmqOptions(PolicyOptions):
+class ZmqOptions(ListeningOptions, PolicyOptions):
     SCHEMES: ClassVar[tuple[str, ...]] = ("tcp",)
     ENDS_WITH_PORT: ClassVar[bool] = True
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 5555}
@@ -49,24 +49,14 @@ class Zmq(PolicyTransport[ZmqOptions]):
     options = ZmqOptions
     variants = (GR00T,)
     urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.transport.zmq.risks:examine")
+    extra = "zmq"
     modules = PACKAGES
-    compared_with = BESIDE
+    client_class = "s2a_bench.transport.zmq.client:ZmqClient"
+    server_class = "s2a_bench.transport.zmq.server:ZmqServer"
     facts = (PAYLOAD_BYTES, RECONNECTS)
     order = 22
     style = {GR00T: ("#8C510A", "-")}
     packages = ("msgpack", "pyzmq")
-
-    def client(self, wiring: Wiring[ZmqOptions], alive: Callable[[], bool]) -> Client:
-        extras.need(self.name, *PACKAGES)
-        from s2a_bench.transport.zmq.client import ZmqClient
-
-        return ZmqClient(wiring, alive)
-
-    def server(self, wiring: Wiring[ZmqOptions], handler: Handler) -> Server:
-        extras.need(self.name, *PACKAGES)
-        from s2a_bench.transport.zmq.server import ZmqServer
-
-        return ZmqServer(wiring, handler)
 
     def ready(self, wiring: Wiring[ZmqOptions]) -> str:
         address = wiring.address

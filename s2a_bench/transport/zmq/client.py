@@ -17,13 +17,12 @@ from s2a_bench.clock import clock_id, now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
-from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring, observed
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.observation import EXTENSION, template_of
-from s2a_bench.transport.pictures import policy_picture
+from s2a_bench.transport.observation import EXTENSION
+from s2a_bench.transport.policy_client import PolicyClient
 from s2a_bench.transport.zmq import ZmqOptions, layouts
 from s2a_bench.transport.zmq.npy import PictureFile
 from s2a_bench.transport.zmq.watch import ConnectionWatch
@@ -34,8 +33,6 @@ ANSWER_BYTES: Final = 16 << 20
 """Most bytes of an answer; libzmq takes no more."""
 POLL_MS: Final = 20
 """How often a waiting request checks its connection."""
-QUOTED: Final = 500
-"""Letters shown of a server's error."""
 LONGEST_S: Final = 86_400
 """The longest `retry_after_s` that counts."""
 KEPT_FILES: Final = 16
@@ -44,15 +41,12 @@ WRONG_POLICY: Final = b"ERROR"
 """The reply of some GR00T servers that serve another kind of policy."""
 
 
-class ZmqClient:
+class ZmqClient(PolicyClient[ZmqOptions]):
     """Asks one policy server."""
 
     def __init__(self, wiring: Wiring[ZmqOptions], alive: Callable[[], bool]) -> None:
         """Prepare; request the layout of a foreign server, unless the options name it."""
-        self.camera = None
-        self._wiring, self._alive = wiring, alive
-        self._native = not wiring.black_box
-        self._template = template_of(wiring.options.template_name)
+        super().__init__(wiring, alive)
         self._key = read_key(wiring.options.api_key_env)
         self._files: dict[tuple[int, int, int], PictureFile] = {}
         self._link: ReqSocket | None = None
@@ -64,37 +58,21 @@ class ZmqClient:
     def _server_layout(self) -> str:
         """Return the layout of a foreign server, by the marks of its modality configurations."""
         bounds = self._bounds(1)
-        with closing(ReqSocket(self._wiring.address, self._wiring.timeout_s, self._alive)) as link:
+        with closing(ReqSocket(self._url, self._wiring.timeout_s, self._alive)) as link:
             link.greet(bounds)
             _, marks = self._read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))
         return layouts.marked(marks)
 
-    def _bounds(self, max_tokens: int) -> Bounds:
-        return Bounds(self._wiring.address, self._wiring.deadline_of(max_tokens), max_tokens)
-
-    def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        bounds = self._bounds(request.max_tokens)
-        whole = False
-        try:
-            link = self._open(bounds, trace)
-            body = self._pack(request, trace)
-            answer = self._checked(link.exchange(body, bounds))
-            actions = layouts.actions_in(answer)
-            seen_ns = now_ns()
-            whole = True
-            for action in actions:
-                bounds.count_piece()
-                yield action
-            if self._native:
-                whole = False
-                wanted = {layouts.ENDPOINT: layouts.MARKS, EXTENSION: {"id": request.id}, **self._token()}
-                trace.receive(observed.remote_of(self._checked(link.exchange(pack(wanted), bounds))))
-                whole = True
-            same_clock = trace.remote is not None and trace.remote.clock == clock_id()
-            trace.marks.append(("return" if same_clock else "server", seen_ns))
-        finally:
-            if not whole:
-                self.close()
+    def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:
+        link = self._open(bounds, trace)
+        actions = layouts.actions_in(self._checked(link.exchange(self._pack(request, trace), bounds)))
+        seen_ns = now_ns()
+        yield from actions
+        if self._native:
+            wanted = {layouts.ENDPOINT: layouts.MARKS, EXTENSION: {"id": request.id}, **self._token()}
+            trace.receive(observed.remote_of(self._checked(link.exchange(pack(wanted), bounds))))
+        same_clock = trace.remote is not None and trace.remote.clock == clock_id()
+        trace.marks.append(("return" if same_clock else "server", seen_ns))
 
     def _open(self, bounds: Bounds, trace: Trace) -> ReqSocket:
         """Return the kept connection, or a new one that both sides have greeted over, marking `connect`."""
@@ -103,7 +81,7 @@ class ZmqClient:
         if self._link is None:
             if self._connected:
                 trace.facts[RECONNECTS] = 1.0
-            self._link = ReqSocket(self._wiring.address, self._wiring.timeout_s, self._alive)
+            self._link = ReqSocket(self._url, self._wiring.timeout_s, self._alive)
             self._link.greet(bounds)
             self._connected = True
             trace.mark("connect")
@@ -111,9 +89,7 @@ class ZmqClient:
 
     def _pack(self, request: Request, trace: Trace) -> memoryview:
         """Fill the template and write it as MessagePack, marking each stage."""
-        pictures = [self._picture(frame, place, trace) for place, frame in enumerate(request.images)]
-        observation = self._template.fill(pictures, request.state, request.prompt)
-        data = layouts.data_of(self._layout, observation)
+        data = layouts.data_of(self._layout, self._observation(request, trace))
         message: dict[str, Any] = {layouts.ENDPOINT: layouts.GET_ACTION, layouts.DATA: data, **self._token()}
         if self._native:
             message[EXTENSION] = observed.extension_of(request)
@@ -126,7 +102,7 @@ class ZmqClient:
     def _picture(self, frame: Frame, place: int, trace: Trace) -> Pixels:
         """Return a picture as it travels; what a camera has as YUYV is converted to where it is packed from."""
         if self._wiring.options.payload != "raw" or frame.encoding != "yuv422_yuy2":
-            return policy_picture(frame, self._wiring.options.payload, trace)
+            return super()._picture(frame, place, trace)
         if len(self._files) > KEPT_FILES:
             self._files.clear()
         key = place, frame.height, frame.width
@@ -141,25 +117,21 @@ class ZmqClient:
     def _read(self, message: bytes) -> tuple[Any, set[str]]:
         """Return an answer, errors included, and its marks; raises RequestFailed for another protocol."""
         if message == WRONG_POLICY:
-            raise RequestFailed(
-                f"{self._wiring.address} answered {WRONG_POLICY.decode()}: it serves another kind of policy"
-            )
+            raise RequestFailed(f"{self._url} answered {WRONG_POLICY.decode()}: it serves another kind of policy")
         return read(message)
 
     def _checked(self, message: bytes) -> Any:
         """Return an answer; raises RequestFailed for an error."""
-        url = self._wiring.address
         answer, _ = self._read(message)
         if isinstance(answer, dict) and layouts.ERROR in answer:
-            error_text = " ".join(struck(str(answer[layouts.ERROR])).split())[-QUOTED:] or "an error without words"
             wait_s = answer.get(layouts.RETRY)
             patient = isinstance(wait_s, (int, float)) and 0 <= wait_s <= LONGEST_S
-            raise RequestFailed(f"{url}: {error_text}", retry_after_s=wait_s if patient else None)
+            raise self._failed(str(answer[layouts.ERROR]), wait_s if patient else None)
         return answer
 
     def describe(self) -> dict[str, str]:
         """Return where the server is, and how requests for it are packed, for the manifest."""
-        return {"url": self._wiring.address, "template": self._template.name, "layout": self._layout}
+        return {**super().describe(), "layout": self._layout}
 
     def close(self) -> None:
         if self._link is not None:

@@ -50,8 +50,8 @@ class Dialect:
         """Make requests from a template, by its name; raises UsageError if the dialect takes none."""
         raise UsageError(f"`template`: the dialect '{self.name}' takes none; leave it out, or choose `dialect` openvla")
 
-    def check(self, cameras: int) -> None:
-        """Raise UsageError if a request cannot have so many pictures."""
+    def check(self, cameras: int, state: int) -> None:
+        """Raise UsageError if a request cannot have so many pictures, or numbers of the state."""
 
     def met(self, base: str, model: str, get: Get) -> tuple[str, str]:
         """Return the URL and the model of requests: as given, else the first model that the server lists."""

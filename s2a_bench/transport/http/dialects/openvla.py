@@ -22,8 +22,9 @@ from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http.dialects import EncodedPicture, Event
 from s2a_bench.transport.http.dialects.common import Dialect
 from s2a_bench.transport.http.dialects.framing import WholeBody
-from s2a_bench.transport.observation import PolicyTransport, Template, template_of
+from s2a_bench.transport.observation import Template, template_of
 from s2a_bench.transport.pictures import policy_picture
+from s2a_bench.transport.policies import PolicyTransport
 from s2a_bench.types import Frame, Pixels, Request
 
 json_numpy = extras.require("json_numpy", "openvla")
@@ -60,9 +61,9 @@ class OpenVla(Dialect):
         self.answer_kinds, self.accepts_state = (ACTIONS,), made.accepts_state
         self.payloads = PolicyTransport.payloads[1:] if made.encoded else self.payloads
 
-    def check(self, cameras: int) -> None:
+    def check(self, cameras: int, state: int) -> None:
         if self._template is not None:
-            self._template.check_pictures(cameras)
+            self._template.check_request(cameras, state)
 
     def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:  # noqa: ARG002 - always pixels
         """Return the pixels as RGB, height x width x 3, marking `convert`."""

@@ -1,0 +1,72 @@
+"""What transports of policy servers share: an observation from a template goes up, a chunk of actions comes back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pkgutil import resolve_name
+from typing import ClassVar, TypeVar
+
+from s2a_bench import extras
+from s2a_bench.options import option
+from s2a_bench.transport import ACTIONS, Capabilities, Choice, Client, Handler, Server, Transport, Wiring
+from s2a_bench.transport.defaults import BESIDE
+from s2a_bench.transport.listening import UrlOptions, read_key
+from s2a_bench.transport.observation import DEFAULT, TemplateName, names, template_of
+
+
+class PolicyOptions(UrlOptions):
+    """Options of a policy server's client, with the template of its observations."""
+
+    template: TemplateName = option(DEFAULT, "the observation: a template's name, or a TOML or JSON file", names=names)
+
+    @property
+    def template_name(self) -> str:
+        return self.template or str(type(self).model_fields["template"].default)
+
+
+P = TypeVar("P", bound=PolicyOptions)
+
+
+class PolicyTransport(Transport[P]):
+    """Sends observations and receives chunks of actions, both as MessagePack."""
+
+    payloads: ClassVar[tuple[str, ...]] = ("raw", "jpeg", "jpeg-preencoded", "png")
+    answer_kinds = (ACTIONS,)
+    stages: ClassVar[Mapping[str, str]] = {"msgpack_pack": "pack", "msgpack_parse": "parse"}
+    compared_with = BESIDE
+    reads_server: ClassVar[Sequence[str]] = ()
+    """The keys of `ExternalServer` by which a template may describe the server."""
+    extra: ClassVar[str]
+    modules: ClassVar[tuple[str, ...]]
+    """Modules that the extra installs."""
+    client_class: ClassVar[str]
+    """``module:class`` of its `PolicyClient`."""
+    server_class: ClassVar[str] = ""
+
+    def client(self, wiring: Wiring[P], alive: Callable[[], bool]) -> Client:
+        """Prepare to ask the server at ``wiring.address``, a URL."""
+        extras.need(self.extra, *self.modules)
+        opened: Client = resolve_name(self.client_class)(wiring, alive)
+        return opened
+
+    def server(self, wiring: Wiring[P], handler: Handler) -> Server:
+        """Bind ``host:port``; raises PortInUse."""
+        if not self.server_class:
+            return super().server(wiring, handler)
+        extras.need(self.extra, *self.modules)
+        bound: Server = resolve_name(self.server_class)(wiring, handler)
+        return bound
+
+    def capabilities(self, choice: Choice[P]) -> Capabilities[P]:
+        options, template = choice.options, template_of(choice.options.template_name)
+        pixels = self.payloads[:1] if options.url else self.payloads
+        payloads = self.payloads[1:] if template.encoded else pixels
+        return Capabilities(options, payloads, self.answer_kinds, template.accepts_state, self.facts)
+
+    def require(self, choice: Choice[P]) -> None:
+        """Refuse a template that does not fit the requests or the server; raises MissingExtra too."""
+        extras.need(self.extra, *self.modules)
+        template = template_of(choice.options.template_name)
+        template.check_request(choice.cameras, choice.state)
+        template.check_server(self.name, self.reads_server)
+        read_key(getattr(choice.options, "api_key_env", ""))
