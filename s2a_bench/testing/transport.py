@@ -144,6 +144,10 @@ class TransportSuite:
     """Whether an answer is sent as a whole: then none of it arrives before an error."""
     lacks: ClassVar[frozenset[str]] = frozenset()
     """Declared stages that only other variants have."""
+    burst = 1000
+    """Tokens or actions of a long answer."""
+    failure = "the engine has had enough"
+    """What a client says of an engine that fails with these words."""
 
     @pytest.fixture
     def wiring(self) -> Wiring[Any]:
@@ -205,9 +209,10 @@ class TransportSuite:
         got = np.stack([action.values for action in actions if isinstance(action, Action)])
         assert got.dtype == np.float32
         assert got.tobytes() == chunk.tobytes()
-        assert trace.remote is not None
-        assert len(trace.remote.token_ns) == 16
-        assert trace.chain()[-1][0] == "return"
+        if not wiring.black_box:
+            assert trace.remote is not None
+            assert len(trace.remote.token_ns) == 16
+            assert trace.chain()[-1][0] == "return"
 
     def test_several_pictures_and_the_state_reach_the_handler(self, connect: Connect, wiring: Wiring[Any]) -> None:
         if not wiring.capabilities.accepts_state:
@@ -258,10 +263,10 @@ class TransportSuite:
         spent = budget(chain)
         assert sum(spent.stages_ns.values()) + spent.residual_ns == spent.e2e_ns == chain[-1][1] - chain[0][1]
         assert begin <= chain[0][1] <= chain[-1][1] <= end
-        assert chain[-1][0] == "return"
+        assert (chain[-1][0] == "return") != wiring.black_box
         assert set(spent.stages_ns) <= set(path_of([transport.stages]))
         assert all(duration >= 0 for duration in spent.stages_ns.values())
-        assert {"inference", "return"} <= set(spent.stages_ns)
+        assert ({"inference", "return"} <= set(spent.stages_ns)) != wiring.black_box
 
     def test_every_stage_takes_time(self, connect: Connect, transport: Transport[Any], wiring: Wiring[Any]) -> None:
         _, trace = ask(connect(self.handler(wiring, ["x"])), Request("a", "plan", (yuyv_frame(),)))
@@ -332,6 +337,9 @@ class TransportSuite:
 
     def test_the_servers_marks_come_back(self, connect: Connect, wiring: Wiring[Any]) -> None:
         _, trace = ask(connect(self.handler(wiring, ["x", "y", "z"])), Request("a", "plan"))
+        if wiring.black_box:
+            assert trace.remote is None  # nothing is made up
+            return
         assert trace.remote is not None
         assert trace.remote.clock == clock_id()
         assert len(trace.remote.token_ns) == 3
@@ -347,7 +355,7 @@ class TransportSuite:
         handler = self.handler(wiring, ["x"])
         client = connect(handler)
         handler.fail_at = 0
-        with pytest.raises(RequestFailed, match="the engine has had enough"):
+        with pytest.raises(RequestFailed, match=self.failure):
             ask(client, Request("a", "plan"))
         handler.fail_at = None
         tokens, _ = ask(client, Request("b", "plan"))
@@ -358,7 +366,7 @@ class TransportSuite:
         handler = self.handler(wiring, ["a", "b", "c"])
         handler.fail_at = fail_at
         indices: list[int] = []
-        with pytest.raises(RequestFailed, match="the engine has had enough"):
+        with pytest.raises(RequestFailed, match=self.failure):
             indices.extend(token.index for token in connect(handler).request(Request("a", "plan"), Trace()))
         # extend keeps the items before an exception
         assert indices == ([] if self.whole else [0, 1, 2][:fail_at])
@@ -368,9 +376,9 @@ class TransportSuite:
         tokens, _ = ask(connect(RecordingHandler([])), Request("a", "plan"))
         assert tokens == []
 
-    def test_a_burst_of_a_thousand_tokens_is_complete(self, connect: Connect, wiring: Wiring[Any]) -> None:
-        handler = self.handler(wiring, [f"t{number} " for number in range(1000)])
-        tokens, _ = ask(connect(handler), Request("a", "plan", max_tokens=1000))
+    def test_a_burst_of_many_tokens_is_complete(self, connect: Connect, wiring: Wiring[Any]) -> None:
+        handler = self.handler(wiring, [f"t{number} " for number in range(self.burst)])
+        tokens, _ = ask(connect(handler), Request("a", "plan", max_tokens=self.burst))
         acts = not isinstance(handler.answer[0], str)
         expected = [Action(0, np.float32(each)).text for each in handler.answer] if acts else handler.answer  # type: ignore[arg-type]
         assert [token.text for token in tokens] == expected

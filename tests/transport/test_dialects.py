@@ -98,18 +98,6 @@ class TestContract(TransportSuite):
         (image,) = handler.requests[0].images
         np.testing.assert_array_equal(image.data, decode_image(encode_png(to_bgr(frame))))
 
-    def test_stages_and_residual_sum_to_the_whole(self, connect: Connect) -> None:
-        _, trace = ask(connect(RecordingHandler(["x", "y"])), Request("a", "plan", (yuyv_frame(),)))
-        spent = budget(trace.chain())
-        assert sum(spent.stages_ns.values()) + spent.residual_ns == spent.e2e_ns
-        assert all(duration >= 0 for duration in spent.stages_ns.values())
-        assert not {"network", "json_parse", "return"} & set(spent.stages_ns)
-
-    def test_the_servers_marks_come_back(self, connect: Connect) -> None:
-        """It has none; nothing is made up."""
-        _, trace = ask(connect(RecordingHandler(["x"])), Request("a", "plan"))
-        assert trace.remote is None
-
 
 FACTS = {
     "openai": {"prompt_n": 8, "cache_n": 4, "predicted_n": 2, "thinking_n": 0},

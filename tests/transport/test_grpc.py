@@ -2,29 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import random
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 
-from s2a_bench.errors import RequestFailed, ServerDied, UsageError
+from s2a_bench.errors import EngineError, RequestFailed, ServerDied, UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.facts import GET_ACTIONS_MS, PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
-from s2a_bench.testing.transport import ask, wiring_of, yuyv_frame
-from s2a_bench.trace import budget
-from s2a_bench.transport import Choice, Client, open_client, open_server
+from s2a_bench.testing.transport import Connect, TransportSuite, ask, wiring_of, yuyv_frame
+from s2a_bench.trace import Trace, budget
+from s2a_bench.transport import Choice, Client, Handler, Wiring, open_client, open_server
 from s2a_bench.transport.grpc import GRPC, PAYLOAD_DOWN_BYTES, GrpcOptions
 from s2a_bench.transport.grpc.pickles import OPCODES, chunk_in
-from s2a_bench.types import Request
+from s2a_bench.types import Action, Frame, Request
 from tests.servers.lerobot import (
     PolicyServer,
     action,
@@ -139,6 +141,47 @@ class TestClient:
             server, _ = stack.enter_context(policy(port=int(url.rpartition(":")[2])))
             assert [ask(opened, request())[1].facts[RECONNECTS] for opened in clients] == [1, 1]
             assert len(server.policies) == 1
+
+
+class TestContract(TransportSuite):
+    """The contract, as far as lerobot's server carries it: no ids, no marks; its log has the policy's error."""
+
+    carries_id_and_limit = False
+    carries: ClassVar[frozenset[str]] = frozenset()
+    whole = True
+    burst = 400  # bytes grow with the square
+    failure = "its policy raised an error"
+
+    @pytest.fixture
+    def wiring(self, tmp_path: Path) -> Wiring[Any]:
+        path = tmp_path / "optional.json"
+        cameras = {f"camera_{index}?": f"{{image:{index}}}" for index in range(3)}
+        path.write_text(json.dumps({**cameras, "state?": "{state}", "task": "{prompt}"}))
+        return wiring_of("grpc/lerobot", url="grpc://a:1", policy_type="act", pretrained="x", template=str(path))
+
+    @pytest.fixture
+    def connect(self, wiring: Wiring[Any]) -> Iterator[Connect]:
+        with ExitStack() as stack:
+
+            def connect(handler: Handler) -> Client:
+                _, url = stack.enter_context(policy(lambda seen: policy_of(handler, seen)))
+                client = open_client(replace(wiring, address=url))
+                stack.callback(client.close)
+                return client
+
+            yield connect
+
+
+def policy_of(handler: Handler, seen: Any) -> bytes | None:
+    """Return the chunk with which a handler answers an observation; None where it fails, as lerobot's server does."""
+    numbers = [value for value in seen.observation.values() if isinstance(value, float)]
+    pictures = [value for value in seen.observation.values() if isinstance(value, np.ndarray)]
+    frames = tuple(Frame(-1, 0, each.shape[1], each.shape[0], "rgb8", each) for each in pictures)
+    request = Request("", seen.observation["task"], frames, state=tuple(numbers))
+    with suppress(EngineError):
+        actions = [piece.values for piece in handler(request, Trace()) if isinstance(piece, Action)]
+        return chunk(seen.timestamp, np.stack(actions))
+    return None
 
 
 FAULTS = {
