@@ -27,7 +27,7 @@ from s2a_bench.sweep import WORKERS, CellWorkers, SweepCell, SweepCommand, Sweep
 from s2a_bench.sweep.file import read_sweep_file
 from s2a_bench.sweep.json import plan_json, sweep_json
 from s2a_bench.sweep.plan import SweepPlan, plan_sweep
-from s2a_bench.sweep.run import Expected, SweepRun, check_resume, earlier, expect, only_one, pending, start_sweep
+from s2a_bench.sweep.run import SweepRun, check_resume, only_one, pending, start_sweep
 from s2a_bench.text import none_of, visible
 from s2a_bench.writers.tables import TextTable
 
@@ -48,7 +48,9 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
     if missing:
         raise MissingExtra(_lacking(source, missing))
     with RunProgress("cells") as progress, ExitStack() as stack:
-        workers = _workers(plan, config.ray, config.width)
+        workers: CellWorkers = resolve_name(WORKERS["ray" if config.ray else "local"])(
+            ENTRY, config.ray, plan, config.width
+        )
         if resume is None:
             writer = start_sweep(plan, source, config.output, boards)
             stack.enter_context(only_one(writer.path))
@@ -78,11 +80,6 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
         )
 
 
-def _workers(plan: SweepPlan, ray: str, width: int) -> CellWorkers:
-    workers: CellWorkers = resolve_name(WORKERS["ray" if ray else "local"])(ENTRY, ray, plan, width)
-    return workers
-
-
 def _lacking(source: Path, missing: Collection[str]) -> str:
     return f"{source}: its cells need packages that are not installed; {extras.how_to_install(*missing)}"
 
@@ -90,23 +87,18 @@ def _lacking(source: Path, missing: Collection[str]) -> str:
 def _show_plan(plan: SweepPlan, config: SweepConfig, missing: Collection[str], *, as_json: bool) -> None:
     resume = config.resume
     cells = pending(plan, read_sweep(resume).attempts.to_dict("records") if resume else [], retry_failed=False)
-    sweeps = earlier(resume.parent if resume else config.output, plan.command)
-    expected = expect(cells, plan.rest_s, config.width, sweeps, _workers(plan, "", config.width))
     if as_json:
-        print_json(plan_json(cells, expected, collect()))
+        print_json(plan_json(cells, collect()))
     else:
-        print_plan(plan, cells, expected)
+        print_plan(plan, cells)
     if missing:
         print_error(_lacking(config.source, missing))
 
 
 sweep = command(_sweep, SweepConfig)
 
-MINUTE_S, HOUR_S = 60, 3600
 
-
-def print_plan(plan: SweepPlan, cells: Sequence[SweepCell], expected: Expected) -> None:
-    """Print the command of every cell, and the expected time."""
+def print_plan(plan: SweepPlan, cells: Sequence[SweepCell]) -> None:
     console = open_console()
     for cell in cells:
         board = f"  on {cell.board}" if cell.board else ""
@@ -115,9 +107,7 @@ def print_plan(plan: SweepPlan, cells: Sequence[SweepCell], expected: Expected) 
     virtual = sum(cell.virtual for cell in cells)
     counts = f"{len(cells)} of {len(plan.cells)} cells to run, {virtual} virtual and {len(cells) - virtual} measured"
     rests = f", {plan.rest_s:g} s of rest after each measured one" if plan.rest_s and virtual < len(cells) else ""
-    time = "not known" if expected.seconds is None else f"about {duration(expected.seconds)}"
     print_line(f"{counts}{rests}")
-    print_line(f"time to expect: {time}: {expected.source}")
 
 
 def print_sweep(sweep: Sweep) -> None:
@@ -132,15 +122,6 @@ def print_sweep(sweep: Sweep) -> None:
         print_table(TextTable("Cells that failed", ("cell", "setting", "error"), rows, 3))
     print_line(f"{len(cells) - len(failed)} of {len(cells)} cells finished on {', '.join(sorted(set(cells['host'])))}")
     print_line(f"sweep folder: {sweep.path}")
-
-
-def duration(seconds: float) -> str:
-    """Write a time in s, min or h."""
-    if seconds < MINUTE_S:
-        return f"{max(seconds, 1):.0f} s"
-    if seconds < HOUR_S:
-        return f"{seconds / MINUTE_S:.0f} min"
-    return f"{seconds / HOUR_S:.1f} h"
 
 
 ENTRY = f"{__name__}:run"

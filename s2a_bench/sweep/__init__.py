@@ -96,7 +96,7 @@ class SweepConfig(Options):
     )
     resume: Path | None = option(None, "folder of an interrupted sweep: run the cells that it has not run yet")
     retry_failed: bool = option(False, "with --resume: run the cells that failed once more")
-    dry_run: bool = option(False, "print the cells and how long they will take, and run nothing")
+    dry_run: bool = option(False, "print the cells, and run nothing")
     trust_file: bool = option(
         False, "allow a file to name programs, URLs off this machine, or keys for a URL: only one that you have read"
     )

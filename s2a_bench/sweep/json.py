@@ -11,7 +11,6 @@ from s2a_bench.store.manifest import plain
 from s2a_bench.store.schema import SCHEMA
 from s2a_bench.store.sweep import Sweep
 from s2a_bench.sweep import SweepCell
-from s2a_bench.sweep.run import Expected
 from s2a_bench.writers.json import frame
 
 
@@ -46,7 +45,7 @@ class SweptCell(_Setting):
     wall_s: Annotated[float, {"minimum": 0}]
 
 
-def plan_json(cells: Sequence[SweepCell], expected: Expected, environment: dict[str, Any]) -> dict[str, Any]:
+def plan_json(cells: Sequence[SweepCell], environment: dict[str, Any]) -> dict[str, Any]:
     planned = [
         PlannedCell(
             cell=cell.name,
@@ -61,7 +60,6 @@ def plan_json(cells: Sequence[SweepCell], expected: Expected, environment: dict[
         "schema": SCHEMA,
         "command": "sweep",
         "environment": environment,
-        "expected": ({} if expected.seconds is None else {"s": expected.seconds}) | {"source": expected.source},
         "cells": plain(planned),
         "ratios": [],
         "warnings": [],

@@ -9,9 +9,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from s2a_bench.clock import Clock, SystemClock
@@ -20,7 +18,7 @@ from s2a_bench.machine import environment
 from s2a_bench.progress import Progress
 from s2a_bench.store.manifest import SWEEP
 from s2a_bench.store.run import RunWriter, read_run
-from s2a_bench.store.sweep import CELLS, CellRow, Sweep, is_sweep, read_sweep
+from s2a_bench.store.sweep import CELLS, CellRow, is_sweep
 from s2a_bench.sweep import COPY, CellWorkers, Outcome, SweepCell
 from s2a_bench.sweep.perform import run_folder
 from s2a_bench.sweep.plan import SweepPlan
@@ -217,63 +215,3 @@ def _plain(value: Any) -> str:
     if isinstance(value, list):
         return " + ".join(str(each.get("name", each)) for each in value)
     return "unknown" if value is None else str(value)
-
-
-@dataclass(frozen=True, slots=True)
-class Expected:
-    """An expected time, None if it is unknown, and its source."""
-
-    seconds: float | None
-    source: str
-
-
-def earlier(output: Path, command: str) -> list[Sweep]:
-    """Return the sweeps of a command on this machine below a folder, the newest first."""
-    machine = facts_of(environment.collect())
-    found = []
-    for folder in sorted(output.glob("*-sweep-*"), reverse=True):
-        try:
-            sweep = read_sweep(folder)
-        except StoreError:
-            continue
-        swept = sweep.manifest["configuration"].get("command")
-        if swept == command and not difference(machine, facts_of(sweep.manifest["environment"])):
-            found.append(sweep)
-    return found
-
-
-def expect(
-    cells: Sequence[SweepCell], rest_s: float, width: int, sweeps: Sequence[Sweep], workers: CellWorkers
-) -> Expected:
-    """Estimate the time of cells from earlier sweeps of the command, or by running the first virtual cell."""
-    for sweep in sweeps:
-        done = sweep.cells[sweep.cells["state"] == "finished"]
-        if len(done):
-            times = {str(name): float(value) for name, value in done.groupby("config_hash")["wall_s"].median().items()}
-            typical = float(done["wall_s"].median())
-            known = sum(cell.config_hash in times for cell in cells)
-            rest = f", {typical:.1f} s for each of the others" if known < len(cells) else ""
-            source = f"as {known} of these cells took in {sweep.path}{rest}"
-            spent = [(cell, times.get(cell.config_hash, typical)) for cell in cells]
-            return Expected(_total(spent, rest_s, width), source)
-    first = next((cell for cell in cells if cell.virtual), None)
-    if first is None:
-        return Expected(None, "no sweep of this command has run here; once a cell is done, the time left is shown")
-    with TemporaryDirectory(prefix="s2a-bench-sweep-") as place, workers:
-        turns = [
-            workers.collect(workers.submit(first, folder), folder).wall_s
-            for folder in (Path(place) / "first", Path(place) / "second")
-        ]
-    source = f"cell {first.name} was run for it and took {turns[1]:.2f} s, not counting the first time"
-    total_s = _total([(cell, turns[1]) for cell in cells], rest_s, width)
-    return Expected(total_s + max(turns[0] - turns[1], 0), source)
-
-
-def _total(spent: Sequence[tuple[SweepCell, float]], rest_s: float, width: int) -> float:
-    """Sum up: measured cells in sequence on each board, the boards in parallel, then the virtual cells."""
-    boards: dict[str, float] = {}
-    for cell, seconds in spent:
-        if not cell.virtual:
-            boards[cell.board] = boards.get(cell.board, -rest_s) + seconds + rest_s
-    virtual = [seconds for cell, seconds in spent if cell.virtual]
-    return max(boards.values(), default=0.0) + sum(virtual) / min(width, max(len(virtual), 1))

@@ -233,24 +233,20 @@ def test_latencies_are_an_axis_as_numbers_and_as_families(tmp_path: Path) -> Non
     assert latencies == {"20", "lognormal:mean_ms=20,cv=.5"}
 
 
-def test_dry_run_prints_cells_and_time_and_leaves_nothing(many: Path) -> None:
+def test_dry_run_prints_cells_and_leaves_nothing(many: Path) -> None:
     output = many.parent / "results"
     done = called("sweep", many, "--dry-run", "--output", output)
     lines = done.stdout.splitlines()
     assert sum("s2a-bench timeline" in line for line in lines) == CELLS
     assert [line.split("-r")[1][0] for line in lines[:CELLS]] == ["1"] * (CELLS // 2) + ["2"] * (CELLS // 2)
-    assert lines[-2] == f"{CELLS} of {CELLS} cells to run, {CELLS} virtual and 0 measured"
-    assert "was run for it and took" in lines[-1]
+    assert lines[-1] == f"{CELLS} of {CELLS} cells to run, {CELLS} virtual and 0 measured"
     assert not output.exists()
     found = json.loads(called("sweep", many, "--dry-run", "--json", "--output", output).stdout)
     jsonschema.validate(found, schema())
     assert {cell["state"] for cell in found["cells"]} == {"planned"}
-    assert found["expected"]["s"] > 0
 
 
-def test_dry_run_of_measured_cells_says_that_nobody_knows_and_a_killed_sweep_what_is_left(whole: Sweep) -> None:
-    done = called("sweep", "quick", "--dry-run", "--output", whole.path / "nowhere")
-    assert "time to expect: not known: no sweep of this command has run here" in done.stdout
+def test_dry_run_of_a_killed_sweep_says_what_is_left(whole: Sweep) -> None:
     done = called("sweep", "--resume", whole.path, "--dry-run")
     assert f"0 of {CELLS} cells to run" in done.stdout
 

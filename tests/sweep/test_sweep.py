@@ -21,7 +21,7 @@ from s2a_bench.store.sweep import CELLS, read_sweep
 from s2a_bench.sweep import Outcome, SweepCell, SweepCommand
 from s2a_bench.sweep.file import SweepFile, expand, read_sweep_file, rounds
 from s2a_bench.sweep.plan import SweepPlan, plan_sweep
-from s2a_bench.sweep.run import SweepRun, check_resume, difference, expect, only_one, start_sweep
+from s2a_bench.sweep.run import SweepRun, check_resume, difference, only_one, start_sweep
 from s2a_bench.testing import NullProgress
 
 values = st.lists(st.integers(0, 9), min_size=1, max_size=4, unique=True)
@@ -420,23 +420,3 @@ def test_two_processes_do_not_write_one_sweep(folder: Path) -> None:
         pass
     with only_one(folder):
         pass
-
-
-def test_the_time_to_expect_is_that_of_the_same_cells_before(folder: Path) -> None:
-    sit(folder, Fake())  # half a second each
-    sweep = read_sweep(folder)
-    virtual = [cell for cell in PLAN.cells if cell.virtual]
-    found = expect(virtual, 0.0, 2, [sweep], Fake())
-    assert found.seconds == 1.0
-    assert found.source == f"as 4 of these cells took in {folder}"
-    found = expect(PLAN.cells, 10.0, 1, [sweep], Fake())
-    assert found.seconds == pytest.approx(2 * 0.5 + 10 + 4 * 0.5)
-
-
-def test_without_earlier_cells_a_virtual_one_is_run_for_it_and_a_measured_one_is_not() -> None:
-    real = [cell for cell in PLAN.cells if not cell.virtual]
-    assert expect(real, 0.0, 1, [], Fake()).seconds is None
-    workers = Fake()
-    found = expect([cell for cell in PLAN.cells if cell.virtual], 0.0, 4, [], workers)
-    assert found.seconds == 0.5
-    assert len(workers.ran) == 2
