@@ -32,12 +32,12 @@ import httpx
 
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.stats.change import ratio_of_blocks
-from s2a_bench.testing.hostile import Attack, Case
-from s2a_bench.testing.hostile.client import Usage, family, usage
 from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.http.native import PATHS
 from s2a_bench.types import Request
+from tests.hostile.asking import Usage, family, usage
+from tests.hostile.suite import Attack, Case
 from tests.hostile.test_floods import FLOODS
 from tests.hostile.wires import http, ros, shm, websocket, zmq
 

@@ -14,7 +14,6 @@ fixtures that the suite's docstring names:
 | seam | suite | fixtures |
 |---|---|---|
 | transport | `transport.TransportSuite` | ``wiring``, or the pipeline's ``name`` as an attribute |
-| transport, against hostile peers | `hostile.HostileSuite` | the pipeline's ``name``, ``clients``, ``servers`` |
 | engine | `engine.EngineSuite` | ``engine``, and ``fresh_engine``, which is closed |
 | frame source | `frame_source.FrameSourceSuite` | ``make_source``: opens it with a width and a height |
 | policy | `policy.PolicySuite` | ``policy`` |

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.testing.hostile import own_server
-from s2a_bench.testing.hostile.client import usage
-from s2a_bench.testing.hostile.tcp import crowd, sends
 from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.transport import open_client
 from s2a_bench.transport.http.native import PATHS
 from s2a_bench.types import Request
+from tests.hostile.asking import usage
+from tests.hostile.suite import own_server
+from tests.hostile.tcp import crowd, sends
 from tests.hostile.wires.http import chat
 
 CLIENTS = 1000

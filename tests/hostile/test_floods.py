@@ -21,12 +21,12 @@ from typing import Any
 import pytest
 
 from s2a_bench.clock import SystemClock, now_ns
-from s2a_bench.testing.hostile import Attack, honest_answer, own_server
-from s2a_bench.testing.hostile.client import forget_peak, usage
-from s2a_bench.testing.hostile.tcp import RESET, connect, crowd, sends, sends_made
 from s2a_bench.testing.transport import wiring_of
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.http.native import PATHS
+from tests.hostile.asking import forget_peak, usage
+from tests.hostile.suite import Attack, honest_answer, own_server
+from tests.hostile.tcp import RESET, connect, crowd, sends, sends_made
 from tests.hostile.wires import websocket, zmq
 from tests.hostile.wires.http import CHUNKS, JSON, chat, head, post
 

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import pytest
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.testing.hostile import honest_answer
 from s2a_bench.trace import Trace
 from s2a_bench.types import Piece, Request, Token
+from tests.hostile.suite import honest_answer
 
 
 class Refused:

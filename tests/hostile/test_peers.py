@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.testing.hostile import HostileSuite
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Limits
+from tests.hostile.suite import HostileSuite
 from tests.hostile.wires import http, ros, ros_servers, shm, websocket, zmq
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.soak import HOSTILE, served, wiring
-from s2a_bench.testing.hostile.client import usage
+from tests.hostile.asking import usage
 
 MINUTES = float(os.environ.get("S2A_SOAK_MINUTES", "0.5"))
 KEPT_MIB = 100.0

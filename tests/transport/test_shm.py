@@ -24,7 +24,6 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import PortInUse, RequestFailed, ServerDied, TransportError, UsageError
 from s2a_bench.frames.convert import to_bgr, to_rgb
 from s2a_bench.machine.doctor import Machine
-from s2a_bench.testing.hostile.client import usage
 from s2a_bench.testing.transport import Connect, RecordingHandler, ask, connector, wiring_of, yuyv_frame
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import open_client, open_server
@@ -36,6 +35,7 @@ from s2a_bench.transport.shm.pieces import packed, unpacked
 from s2a_bench.transport.shm.reading import HEADER_BYTES, request_at, size_of
 from s2a_bench.transport.shm.server import Writer
 from s2a_bench.types import Action, Frame, Request, Token
+from tests.hostile.asking import usage
 from tests.waiting import until
 
 NOBODY = 65534

@@ -11,10 +11,10 @@ from collections.abc import Iterator, Sequence
 from functools import cache, partial
 from typing import Any
 
-from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
-from s2a_bench.testing.hostile.tcp import CLIENTS as ANY_CLIENT
-from s2a_bench.testing.hostile.tcp import NOISE, answers, crowd, sends, sends_made, servers
 from s2a_bench.transport.http.native import PARAMETERS_HEADER, PATHS
+from tests.hostile.suite import FAILED, Attack, Case, Trap
+from tests.hostile.tcp import CLIENTS as ANY_CLIENT
+from tests.hostile.tcp import NOISE, answers, crowd, sends, sends_made, servers
 
 CHAT = PATHS["as-deployed"]
 MIB = 1 << 20

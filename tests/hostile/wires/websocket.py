@@ -11,9 +11,9 @@ import numpy as np
 from websockets.frames import Frame, Opcode
 from websockets.utils import accept_key
 
-from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
-from s2a_bench.testing.hostile.tcp import CLIENTS as ANY_CLIENT
-from s2a_bench.testing.hostile.tcp import NOISE, Block, answers, crowd, sends, sends_made, servers
+from tests.hostile.suite import FAILED, Attack, Case, Trap
+from tests.hostile.tcp import CLIENTS as ANY_CLIENT
+from tests.hostile.tcp import NOISE, Block, answers, crowd, sends, sends_made, servers
 from tests.hostile.wires.http import CONTROL, MIB, bomb
 
 SCHEME = "ws://"

@@ -12,11 +12,11 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from s2a_bench.testing.hostile import FAILED, PATIENCE_S, Attack, Case, Trap
-from s2a_bench.testing.hostile.tcp import CLIENTS as ANY_CLIENT
-from s2a_bench.testing.hostile.tcp import NOISE, answers, crowd, sends, sends_made, servers
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.zmq.npy import file_of
+from tests.hostile.suite import FAILED, PATIENCE_S, Attack, Case, Trap
+from tests.hostile.tcp import CLIENTS as ANY_CLIENT
+from tests.hostile.tcp import NOISE, answers, crowd, sends, sends_made, servers
 from tests.hostile.wires.http import CONTROL, MIB, bomb
 
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)

@@ -19,7 +19,6 @@ from s2a_bench.policy import Policy
 from s2a_bench.policy.chunks import Mode
 from s2a_bench.testing.engine import EngineSuite
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
-from s2a_bench.testing.hostile import HostileSuite, tcp
 from s2a_bench.testing.mode import ModeSuite
 from s2a_bench.testing.policy import PolicySuite
 from s2a_bench.testing.transport import Connect, TransportSuite
@@ -44,12 +43,6 @@ class TestToyTransport(TransportSuite):
                 return client
 
             yield connect
-
-
-class TestToyPeers(HostileSuite):
-    name = "toy"
-    clients = tcp.CLIENTS
-    servers = tcp.SERVERS
 
 
 class TestStripes(FrameSourceSuite):

@@ -1,13 +1,4 @@
-"""Tables of hostile peers for both ends of a transport: subclass `HostileSuite`.
-
-A package tests a transport over TCP like this, and adds cases that know its messages::
-
-    from s2a_bench.testing.hostile import Case, HostileSuite, tcp
-
-    class TestToy(HostileSuite):
-        name = "toy"
-        clients = (*tcp.CLIENTS, Case("no JSON", tcp.sends(b"{]"), says="no JSON"))
-        servers = tcp.SERVERS
+"""Tables of hostile peers for both ends of a transport: subclass `HostileSuite`, as `test_peers` does.
 
 Each case has measured bounds: the time until the other side has reported its error in one line, and its memory. Most
 peers are silent most of the time, so several run at once, each with a process of ours alone, whose use is measured.
@@ -35,11 +26,11 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.harness.processes import OwnServer
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import STAND_IN, EngineConfig
-from s2a_bench.testing.hostile.client import TOKENS, forget_peak, usage
 from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.limits import PIECES, PIECES_A_TOKEN
 from s2a_bench.types import Request
+from tests.hostile.asking import TOKENS, forget_peak, usage
 
 Attack: TypeAlias = "Callable[[Wiring[Any]], str]"
 """A hostile client: takes the wiring of a running server, and returns the server's reply."""
@@ -50,6 +41,7 @@ End = TypeVar("End")
 Outcome = TypeVar("Outcome")
 FAILED = "^(RequestFailed|MessagesLost|ServerDied|TransportError): ."
 """Any error of a client."""
+ROOT = Path(__file__).parents[2]
 PATIENCE_S = 2.0
 """The client's ``timeout_s``, the longest silence."""
 SETTLES_S = 10.0
@@ -78,8 +70,8 @@ class ClientProcess:
         """Return the outcome of one request; fails the test after ``seconds``."""
         process = self._process
         if process is None or process.poll() is not None:
-            command = [sys.executable, "-c", "from s2a_bench.testing.hostile.client import main; main()"]
-            process = self._process = subprocess.Popen(command, stdin=-1, stdout=-1, text=True)  # noqa: S603 - ours
+            command = [sys.executable, "-c", "from tests.hostile.asking import main; main()"]
+            process = self._process = subprocess.Popen(command, stdin=-1, stdout=-1, text=True, cwd=ROOT)
         assert process.stdin
         assert process.stdout
         process.stdin.write(json.dumps(wiring.to_json()) + "\n")

@@ -12,8 +12,8 @@ from threading import Event, Thread
 from typing import Any, Literal, TypeAlias
 
 from s2a_bench.clock import SystemClock, now_ns
-from s2a_bench.testing.hostile import FAILED, Attack, Case, Trap
 from s2a_bench.transport import Wiring
+from tests.hostile.suite import FAILED, Attack, Case, Trap
 
 Then: TypeAlias = Literal["waits", "goes", "resets"]
 """A peer's last act: it reads until the other side closes, closes in order, or resets the connection."""
@@ -156,6 +156,3 @@ def servers(scheme: str = "") -> tuple[Case[Trap], ...]:
         Case("endless zeros", answers(again=[bytes(1 << 16)], scheme=scheme), FAILED),
         Case("endless noise", answers(again=[NOISE], scheme=scheme), FAILED),
     )
-
-
-SERVERS = servers()
