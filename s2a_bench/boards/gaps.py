@@ -30,8 +30,6 @@ STRICT: Final = ConfigDict(strict=True)
 
 
 class Gaps(Protocol):
-    """A family with its parameters."""
-
     @property
     def mean_s(self) -> float:
         """Return the mean gap, 1 / rate."""

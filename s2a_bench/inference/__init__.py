@@ -49,7 +49,6 @@ class Engine(Protocol):
 
     @classmethod
     def check(cls, config: EngineConfig) -> None:  # noqa: ARG003 - for subclasses
-        """Raise UsageError if the engine's options contradict each other."""
         return
 
     @classmethod
@@ -225,7 +224,6 @@ class _UndeclaredEngine(Engine):
 
 
 def acting() -> str:
-    """Name the engines that answer with actions, for errors."""
     return " or ".join(name for name, kind in ENGINES.loaded() if kind.acts)
 
 

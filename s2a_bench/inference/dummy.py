@@ -65,7 +65,6 @@ class Tensor:
         return 1 / math.sqrt(math.prod(self.shape[1:])) if len(self.shape) > 1 else 0.02
 
     def parts(self, seed: int) -> Iterator[Bytes]:
-        """Yield the tensor's bytes, which depend on the seed and the name."""
         block, size, draw = KINDS[self.kind]
         left = math.prod(self.shape) // block
         generator = np.random.Generator(np.random.SFC64([seed, zlib.crc32(self.name.encode())]))
@@ -176,7 +175,6 @@ def byte_names() -> dict[int, str]:
 
 
 def make_vocab(*, full: bool) -> Vocab:
-    """Make the vocabulary of Qwen2's size, or the byte-level one of the tiny model."""
     tokens, merges = list(byte_names().values()), ["\u0120 t"]  # at least one for llama.cpp; \u0120 stands for a space
     if full:
         merges = _letter_merges(FULL_BASE - len(tokens))

@@ -29,8 +29,6 @@ Value: TypeAlias = str | int | float | bool
 
 @dataclass(frozen=True, slots=True)
 class GgufHeader:
-    """The scalar and string fields of a header."""
-
     path: Path
     fields: dict[str, Value]
 

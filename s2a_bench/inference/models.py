@@ -21,8 +21,6 @@ CACHE_VARIABLE = "S2A_BENCH_CACHE"
 
 @dataclass(frozen=True, slots=True)
 class HubModel:
-    """The names of a model's two files on the hub."""
-
     repository: str
     model: str
     """File name of the language model with ``{quant}`` in it."""
@@ -63,8 +61,6 @@ def fetched(name: str) -> tuple[Path, Path]:
 
 @dataclass(frozen=True, slots=True)
 class ModelFiles:
-    """The headers of the two files of a model, both checked."""
-
     model: GgufHeader
     mmproj: GgufHeader
 

@@ -70,7 +70,6 @@ def collect(packages: Iterable[str] = ()) -> dict[str, Any]:
 
 
 def board_facts() -> dict[str, Any]:
-    """Return device-tree model, GPU, CPU, cores, memory, power mode and governor."""
     known = collect()
     facts = {
         "model": known.get("board"),

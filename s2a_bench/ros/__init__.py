@@ -92,8 +92,6 @@ class Rejected:
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """Feedback on a goal of this client, packed."""
-
     goal_id: bytes
     packed: Any
 
@@ -233,8 +231,6 @@ REQUEST_BYTES = 1 << 20
 
 
 class Middleware(Protocol):
-    """One node in a ROS 2 domain."""
-
     def publisher(self, topic: str, type_name: str, qos: QoS) -> Publisher:
         """Publish messages of ROS type ``pkg/msg/Name`` on the absolute ROS topic name ``/x``."""
 

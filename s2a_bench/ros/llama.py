@@ -14,7 +14,6 @@ DRY_SEQUENCE_BREAKERS = ("\\n", ":", '\\"",', '*"')
 
 
 def sampling_config(version: str = DEFAULT_VERSION, /, **overrides: Any) -> Any:
-    """Build a llama_msgs/SamplingConfig with the defaults ROS encodes."""
     fields = {"dry_sequence_breakers": DRY_SEQUENCE_BREAKERS} | overrides
     return default("llama_msgs/msg/SamplingConfig", version, **fields)
 

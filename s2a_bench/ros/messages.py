@@ -145,7 +145,6 @@ def char_as_uint8(description: Description) -> Description:
 
 @cache
 def _types(version: str) -> tuple[Typestore, Defaults]:
-    """Build a type store, and collect the defaults of the types that came from files."""
     if version not in VERSIONS:
         raise UsageError(f"llama_msgs version {none_of(version, VERSIONS)}")
     humble = os.environ.get("ROS_DISTRO") == "humble"

@@ -61,7 +61,6 @@ class _DrainingClient(ActionClient):  # type: ignore[misc]
         return batches
 
     async def execute(self, taken_data: list[dict[str, Any]]) -> None:
-        """Let rclpy settle its futures, and tell the owner."""
         feedback = [batch.pop("feedback") for batch in taken_data if "feedback" in batch]
         with self._owner.lock:
             for batch in taken_data:

@@ -138,7 +138,6 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
                 self.flush()
 
     def _write_down(self, topic: str, type_name: str, data: Any, stamp_ns: int) -> None:
-        """Hand one message to rosbags, keeping the first failure."""
         with self._counting:
             self._backlog -= _size(data)
         try:

@@ -82,7 +82,6 @@ def latest(rows: Iterable[Mapping[Any, Any]]) -> dict[tuple[str, int], tuple[int
 
 
 def pending(plan: SweepPlan, rows: Iterable[Mapping[Any, Any]], *, retry_failed: bool) -> list[SweepCell]:
-    """Return the cells of a plan that must still run, in order."""
     over = {"finished"} if retry_failed else {"finished", "failed"}
     ended = latest(rows)
     return [cell for cell in plan.cells if ended.get(cell.key, (0, ""))[1] not in over]
@@ -125,7 +124,6 @@ class SweepRun:
     def _drain(
         self, lanes: dict[str, deque[SweepCell]], width: dict[str, int], workers: CellWorkers, rest_ns: int
     ) -> None:
-        """Keep every lane busy until its cells are done, with a pause after each."""
         running: dict[Future[Any], tuple[str, SweepCell, Path]] = {}
         ready_ns = dict.fromkeys(lanes, 0)
         while running or any(lanes.values()):

@@ -331,8 +331,6 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
 
 
 class _UndeclaredTransport(Transport[TransportOptions]):
-    """Stands for a transport of an old run whose package is not installed."""
-
     options = TransportOptions
     order = inf
 

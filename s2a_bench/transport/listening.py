@@ -99,7 +99,6 @@ def bound_socket(address: str, scheme: str, options: ListeningOptions) -> tuple[
 
 
 def cannot_bind(host: str, port: str, number: int | None, why: str | None) -> PortInUse:
-    """Return the exception for a system error of this number on binding."""
     if number == errno.EADDRINUSE:
         return PortInUse(f"`port`: {port} is in use on {host}; choose another, or 0 for any free one")
     return PortInUse(f"`port`: cannot bind {host}:{port}: {why}")

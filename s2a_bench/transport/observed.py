@@ -97,7 +97,6 @@ def _pictures(key: str, value: Any, trace: Trace, limits: Limits) -> Sequence[Fr
 
 
 def extension_of(request: Request) -> dict[str, Any]:
-    """Return the fields of a request that no observation has."""
     fields = {"id": request.id, "max_tokens": request.max_tokens, "seed": request.seed, "grammar": request.grammar}
     return {name: value for name, value in fields.items() if value}
 

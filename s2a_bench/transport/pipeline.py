@@ -212,7 +212,6 @@ def _filled(options: O, payload: str) -> O:
 
 
 def require_payload(pipeline: Pipeline) -> None:
-    """Raise UsageError if a pipeline cannot carry its payload."""
     can = pipeline.capabilities.payloads
     if pipeline.payload and pipeline.payload not in can:
         path = pipeline.name.partition("?")[0]

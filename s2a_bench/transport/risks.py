@@ -55,7 +55,6 @@ def examine(url: str) -> list[Finding]:
 
 
 def printable(text: str, most: int = 120) -> str:
-    """Return a server's text as one short line."""
     return "".join(letter if letter.isprintable() else "?" for letter in text[:most])
 
 

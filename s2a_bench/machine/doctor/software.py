@@ -20,7 +20,6 @@ def python(machine: Machine) -> Finding:
 
 
 def packages(machine: Machine) -> Finding:  # noqa: ARG001 - the packages of this interpreter
-    """Compare the installed packages with the requirements, and report the missing extras."""
     try:
         stated = [Requirement(text) for text in requires("s2a-bench") or ()]
     except PackageNotFoundError:

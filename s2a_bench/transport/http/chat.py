@@ -117,7 +117,6 @@ class ChatExchange(Exchange):
         raise NotImplementedError
 
     def whole(self, status: int, value: Any, headers: dict[str, str]) -> None:
-        """Send an answer that is one JSON value."""
         raise NotImplementedError
 
     def request(self) -> Request:

@@ -241,7 +241,6 @@ class HttpClient:
 
 
 def refusal(url: str, response: HttpResponse, body: str, options: HttpOptions, expected: str) -> RequestFailed:
-    """Return the error for an answer with a wrong status or content type."""
     try:
         value = json.loads(body)
     except (ValueError, RecursionError):

@@ -78,7 +78,6 @@ STATUSES = ((Busy, 503), (TooLarge, 413), (Overdue, 504), (BadRequest, 400), (En
 
 
 def refusal_of(error: S2AError) -> tuple[int, str, dict[str, str]]:
-    """Return the status, the message and the headers for an error before the answer begins."""
     status = next((status for kind, status in STATUSES if isinstance(error, kind)), 400)
     headers = {"retry-after": f"{error.retry_after_s:.0f}"} if isinstance(error, Busy) else {}
     return status, str(error), headers

@@ -21,8 +21,6 @@ _numbers = count()
 
 
 class LoopbackServer:
-    """A handler that clients of this process find by its address."""
-
     def __init__(self, wiring: Wiring[TransportOptions], handler: Handler) -> None:
         self.address = wiring.address or f"loopback-{next(_numbers)}"
         self.handler = handler

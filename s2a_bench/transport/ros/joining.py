@@ -52,7 +52,6 @@ def router_of(wiring: Wiring[RosOptions]) -> str:
 
 
 def place_of(wiring: Wiring[RosOptions]) -> str:
-    """Return where nodes of a wiring meet, in words."""
     domain = f"domain {domain_of(wiring)}"
     return f"{domain} of the Zenoh router {router_of(wiring)}" if is_routed(wiring.options) else f"DDS {domain}"
 

@@ -102,7 +102,6 @@ class ShmClient:
         return link, at, len(header)
 
     def _picture(self, frame: Frame, trace: Trace) -> tuple[dict[str, Any], Frame]:
-        """Return what the header says of a picture, and what is to be written."""
         about: dict[str, Any] = {"encoding": "bgr8", "width": frame.width, "height": frame.height}
         if self._payload == "raw":
             return {**about, "bytes": 3 * frame.width * frame.height}, frame
@@ -198,7 +197,6 @@ class ShmConnection:
         return self._answers.map[begin : begin + length]
 
     def _reason(self, error: BaseException) -> None:
-        """Raise the reason with which a server closed a new link."""
         if isinstance(error, BrokenPipeError | ConnectionResetError) and self._answers is None:
             with suppress(OSError, EOFError):
                 accept(self._socket, ANSWER_BYTES)

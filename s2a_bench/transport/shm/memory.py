@@ -50,7 +50,6 @@ class SharedMemory:
     __slots__ = ("map", "pixels", "size")
 
     def __init__(self, file: int, size: int, *, writes: bool) -> None:
-        """Map the file, which need not stay open."""
         self.map = mmap(file, size, access=ACCESS_WRITE if writes else ACCESS_READ)
         self.pixels: Pixels = np.frombuffer(self.map, np.uint8)
         self.size = size

@@ -76,7 +76,6 @@ def user_of(link: socket.socket) -> int:
 
 
 def _folder() -> Path:
-    """Return the folder of our sockets, which only this user may enter."""
     folder = Path(os.environ.get("XDG_RUNTIME_DIR") or tempfile.gettempdir()) / f"s2a_bench-{os.getuid()}"
     try:
         folder.mkdir(mode=0o700, exist_ok=True)

@@ -75,7 +75,6 @@ class PolicyConnection:
         self._count()
 
     def serve(self) -> None:
-        """Shake hands, then read until the client goes or is refused."""
         plain = self.wire.socket
         plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         plain.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -181,7 +180,6 @@ class PolicyConnection:
         return data
 
     def _take(self, data: bytes) -> None:
-        """Answer what the protocol answers itself, and have whole messages answered."""
         with self._lock:
             self._protocol.receive_data(data)
             self._flush()
@@ -195,7 +193,6 @@ class PolicyConnection:
             self.wire.read_until(now_ns() + round(self.core.limits.body_s * 1e9))
 
     def _join(self, frame: Frame) -> None:
-        """Add a frame to the message, and have a whole one answered."""
         data = frame.opcode in DATA_OPCODES
         if len(frame.data) <= SMALL and not (data and frame.fin):
             now_s = now_ns() / 1e9

@@ -127,7 +127,6 @@ class BoundedConnection:
 
     @contextmanager
     def _in_time(self) -> Iterator[float]:
-        """Give the seconds that there are, and name what goes wrong."""
         try:
             yield min(self._timeout_s, self._connection.bounds.left_s())
         except (OSError, ConnectionClosed, InvalidHandshake) as error:

@@ -52,7 +52,6 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
 
 
 def _slow(parts: SplitResult, headers: Mapping[str, str]) -> Iterator[Finding]:
-    """Yield what the headers of the handshake tell about time."""
     if "permessage-deflate" in headers.get("Sec-WebSocket-Extensions", ""):
         yield Finding(
             "compression",
@@ -76,7 +75,6 @@ def _slow(parts: SplitResult, headers: Mapping[str, str]) -> Iterator[Finding]:
 
 
 def _deflate_ms() -> float:
-    """Return how long websockets' compression takes for two pictures that do not shrink."""
     noise, deflate = os.urandom(2 * 224 * 224 * 3), zlib.compressobj(wbits=-12, memLevel=5)
     started_ns = now_ns()
     deflate.compress(noise)

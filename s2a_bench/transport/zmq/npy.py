@@ -34,10 +34,7 @@ _HEADER = re.compile(
 
 
 class PictureFile:
-    """The file of a picture, allocated before its pixels are known."""
-
     def __init__(self, height: int, width: int) -> None:
-        """Make room for (H, W, 3) uint8, and for a header in front of it."""
         self._whole = np.empty(BEFORE + height * width * 3, np.uint8)
         self.pixels: Pixels = self._whole[BEFORE:].reshape(height, width, 3)
         self.address: int = self.pixels.__array_interface__["data"][0]

@@ -222,7 +222,6 @@ class ZmqServer:
 
 class ReplyAddress:
     def __init__(self, envelope: list[bytes], connection: Connection, send: Callable[[list[Any]], None]) -> None:
-        """Answer to the frames before a message, as long as the connection is there."""
         self.name = envelope[0]
         self.connection = connection
         self._envelope, self._send = envelope, send

@@ -17,8 +17,6 @@ REFUSED: Final = {zmq.EVENT_CONNECT_RETRIED, zmq.EVENT_CLOSED}
 
 
 class Connection:
-    """One TCP connection of a ZeroMQ socket."""
-
     __slots__ = ("disconnected", "ready")
 
     def __init__(self) -> None:

@@ -72,7 +72,6 @@ class Dialect:
     def fields(
         self, request: Request, payload: str, model: str, to_base64: Callable[[Pixels], str], trace: Trace
     ) -> dict[str, Any]:
-        """Encode the pictures and return the request's body, marking each step."""
         pictures = []
         for frame in request.images:
             media_type, data = self.encode(frame, payload, trace)
