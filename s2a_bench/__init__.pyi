@@ -96,7 +96,6 @@ class _Boundary(_Run, total=False):
     tokens_per_skill: _Several[int]
 
 class _Ccrb(_Run, total=False):
-    all_followers: bool
     engine: str
     follower: str
     front_gap: float
@@ -130,8 +129,6 @@ class _Ccrb(_Run, total=False):
     rear_gap_m: float
     reflex: bool
     seed: int
-    seeds: int
-    sensitivity: bool
     simulator: str
     skills: int
     speed: float

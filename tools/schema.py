@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from s2a_bench.experiments import EXPERIMENTS
-from s2a_bench.experiments.ccrb.view.tables import CcrbFollower, CcrbSensitivity, CcrbStudy
+from s2a_bench.experiments.ccrb.view.tables import CcrbStudy
 from s2a_bench.experiments.profile_capture import BoardFacts, ProfileJson
 from s2a_bench.experiments.throughput.metrics import Reference
 from s2a_bench.inference.fetch import FetchedFile
@@ -105,7 +105,7 @@ def frame_schema() -> dict[str, Any]:
     """Return the schema of what the measuring commands print, with what is declared in the place of what was there."""
     cells = [cell for name in EXPERIMENTS.built_in() if (cell := EXPERIMENTS[name].cell_class())]
     named: dict[str, Any] = {"ratio": RatioJson, "warning": RunWarning, "origins": Origins}
-    named |= {_name(each): each for each in (*cells, Reference, CcrbStudy, CcrbFollower, CcrbSensitivity)}
+    named |= {_name(each): each for each in (*cells, Reference, CcrbStudy)}
     named["sweep_cell"] = PlannedCell | SweptCell
     return _redefined("s2a-bench-1", named, kept=("level", "check"))
 

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-import jsonschema
-import numpy as np
 import pytest
 
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.ccrb.rows import FOLLOWER_STUDY, METRICS, ROLLOUTS, SENSITIVITY
+from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
-from s2a_bench.experiments.ccrb.studies import VARIED
-from s2a_bench.experiments.ccrb.view.figures import build_phase, build_scenario, build_sensitivity, region_of
+from s2a_bench.experiments.ccrb.view.figures import build_phase, build_scenario, region_of
 from s2a_bench.experiments.ccrb.view.outcomes import (
     Share,
     cells_of,
@@ -30,14 +25,9 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
 )
 from s2a_bench.experiments.ccrb.view.tables import ccrb_json, ccrb_tables, findings, show
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.policy import Schedule
-from s2a_bench.scenario.ccrb import FOLLOWERS
-from s2a_bench.scenario.ccrb.drive import drive
 from s2a_bench.scenario.ccrb.labels import MARK, NO_SCORE
 from s2a_bench.scenario.ccrb.options import CcrbOptions
-from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.store.run import StoredRun, read_run
-from tests.made_runs import SCHEMA
 
 GRID = {"phase": True, "phase_points": (21, 13)}
 
@@ -220,83 +210,3 @@ def test_the_run_shows_what_its_options_ask_for(made: Callable[..., StoredRun]) 
 def test_what_makes_no_sense_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         CcrbConfig(**options)
-
-
-FEW: dict[str, Any] = {"seeds": 2, "seed_points": 16}
-
-
-def json_of(run: StoredRun) -> dict[str, Any]:
-    """What --json prints, as its schema describes it."""
-    whole: dict[str, Any] = json.loads(json.dumps(ccrb_json(run)))
-    jsonschema.validate(whole, SCHEMA)
-    return whole
-
-
-def test_every_follower_meets_the_four_combinations_and_says_whether_it_survives(
-    made: Callable[..., StoredRun],
-) -> None:
-    run = made(all_followers=True, **FEW)
-    rows = run.table(FOLLOWER_STUDY)
-    assert len(rows) == 4 * 4 * 3 * (FEW["seeds"] + 1)
-    tables = ccrb_tables(run)
-    table = tables["followers"]
-    assert [row[0] for row in table.rows[::4]] == list(FOLLOWERS)
-    assert [row[1] for row in table.rows[:4]] == ["12 m, -2", "12 m, -6", "40 m, -2", "40 m, -6"]
-    by_follower = {(row[0], row[1]): row for row in table.rows}
-    assert by_follower["careful", "40 m, -2"][2:] == ("yes", "rear", "front", "none")
-    assert by_follower["hdm", "40 m, -2"][2:] == ("yes", "none", "front", "none")
-    assert by_follower["idm", "40 m, -2"][2:] == ("yes", "none", "front", "none")
-    assert by_follower["hybrid", "40 m, -2"][2:] == ("no", f"rear {MARK}", "front", f"rear {MARK}")
-    shares = {row[:2]: row for row in tables["follower-shares"].rows}
-    assert shares["idm", "40 m, -6"][3:] == ("100", "0", "0", "0", "0")
-    assert NO_SCORE in table.notes
-    followers = json_of(run)["followers"]
-    assert (len(followers), sum("seed" not in row for row in followers)) == (len(rows), 4 * 4 * 3)
-    assert sum(row["rear"] for row in followers) == rows["rear"].sum()
-
-
-def test_who_never_stalls_is_not_hit_where_the_follower_survives(made: Callable[..., StoredRun]) -> None:
-    rows = made(all_followers=True, **FEW).table(FOLLOWER_STUDY)
-    assert rows[rows["policy"] != "naive"]["rear_survived"].sum() == 0
-    assert (rows["rear_survived"] <= rows["survived"]).all()
-    assert (rows["survived"] <= rows["points"]).all()
-    idm = rows[rows["follower"] == "idm"]
-    assert (idm["survived"] == idm["points"]).all()
-
-
-@pytest.mark.slow
-def test_six_numbers_are_varied_over_the_same_points(made: Callable[..., StoredRun]) -> None:
-    run = made(sensitivity=True, seeds=2, seed_points=64)
-    rows = run.table(SENSITIVITY)
-    assert list(rows["varied"].unique()) == list(VARIED)
-    shares = rows.groupby(["varied", "value"])["paper"].sum() / rows.groupby(["varied", "value"])["points"].sum()
-    at_defaults = {
-        name: float(shares[name][value])
-        for name, value in (("gap_decel_mps2", 8.0), ("build_s", 0.6), ("reaction_s", 1.3), ("onset_s", 0.0))
-    }
-    assert len(set(at_defaults.values())) == 1
-    assert shares.min() == 0
-    assert shares["build_s"].max() > 2 * at_defaults["build_s"] > 0
-    assert set(show(run).figures) == {"scenario", "sensitivity"}
-    assert len(build_sensitivity(run).axes) == len(VARIED)
-    assert any("build" in sentence for sentence in show(run).sentences)
-    assert [row["varied"] for row in json_of(run)["sensitivity"]] == list(rows["varied"])
-
-
-def test_a_lead_that_brakes_later_is_the_same_request_made_earlier() -> None:
-    cars = CcrbOptions().cars
-    plan = CcrbOptions().driving
-    later = np.array([[2.0], [2.8], [3.6], [4.4], [5.2]])
-    lasts = np.full((5, 1), 0.8)
-    found = [
-        drive(Longitudinal(), replace(cars, onset_s=onset), plan, Schedule(later + shift, lasts)).outcomes
-        for onset, shift in ((0.0, 0.0), (0.5, 0.5), (-0.5, -0.5))
-    ]
-    for other in found[1:]:
-        assert other.min_front_gap_m == pytest.approx(found[0].min_front_gap_m, abs=1e-6)
-        assert other.code.tolist() == found[0].code.tolist()
-
-
-def test_studies_that_are_not_asked_for_leave_the_manifest_as_it_was() -> None:
-    assert not {"all_followers", "sensitivity", "seeds"} & CcrbConfig().to_manifest().keys()
-    assert CcrbConfig(sensitivity=True, seeds=3).to_manifest()["seeds"] == 3

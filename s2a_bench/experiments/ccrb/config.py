@@ -44,10 +44,8 @@ class PlanRequest(Options):
 LONG_S: Final = 600.0
 SPANS: Final = {"phase_rates": 10_000.0, "phase_gaps_m": 1000.0}
 """Fields with a span (from, to) -> its greatest end."""
-MODELLED: Final = ("rate", "prompt_s", "phase", "random", "all_followers", "sensitivity")
+MODELLED: Final = ("rate", "prompt_s", "phase", "random")
 """Fields of modelled tokens, besides the profile: refused with `live`."""
-DRAWN: Final = ("all_followers", "sensitivity", "seeds", "seed_points")
-"""Fields that change no other roll-out; the manifest omits their defaults."""
 
 
 class CcrbConfig(Options):
@@ -78,10 +76,6 @@ class CcrbConfig(Options):
     phase_gaps_m: Numbers = option((6.0, 30.0), "m to the car behind in the phase diagram: from, to", flag="phase-gaps")
     phase_points: tuple[int, int] = option((41, 25), "rates and gaps of the phase diagram", hidden=True)
     random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000, first=True)
-    all_followers: bool = option(False, "also a table of every follower at Euro NCAP's four combinations")
-    sensitivity: bool = option(False, "also a figure of six numbers varied one at a time")
-    seeds: int = option(10, "draws of --all-followers and --sensitivity", ge=1, le=1000)
-    seed_points: int = option(128, "points that each of them draws", ge=1, le=65_536, hidden=True)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
     plan_request: PlanRequest = Field(default_factory=PlanRequest)
 
@@ -153,7 +147,6 @@ class CcrbConfig(Options):
 
     def to_manifest(self) -> dict[str, Any]:
         left_out = {"scenario", "plan_request"}
-        left_out |= {name for name in DRAWN if getattr(self, name) == type(self).model_fields[name].default}
         left_out |= (
             {"profile", *MODELLED, "phase_rates", "phase_gaps_m", "phase_points"} if self.plan_request.live else set()
         )

@@ -107,47 +107,6 @@ RolloutRow: Final = with_fields(
 
 
 @dataclass(frozen=True, slots=True)
-class FollowerRow:
-    """Counts of outcomes over points of the plane under one policy, with one follower and lead.
-
-    ``seed`` drew the points over rate and rear gap; null: the operating point alone. ``survived``: the follower avoids
-    an ego with immediate tokens; ``rear_survived``: rear impacts among those; ``paper``: all three policies have the
-    paper's outcome.
-    """
-
-    cell: str
-    policy: str
-    follower: str
-    gap_behaviour: str
-    front_gap_m: float
-    lead_decel_mps2: float
-    seed: int | None
-    points: int
-    survived: int
-    front: int
-    rear: int
-    rear_survived: int
-    paper: int
-
-
-@dataclass(frozen=True, slots=True)
-class SensitivityRow:
-    """The number of a seed's points where the paper's ordering holds, with one number changed.
-
-    ``varied`` names the number, in SI units; ``rear_gap_m`` leaves the rate as the only axis.
-    """
-
-    cell: str
-    varied: str
-    value: float
-    follower: str
-    gap_behaviour: str
-    seed: int
-    points: int
-    paper: int
-
-
-@dataclass(frozen=True, slots=True)
 class TrajectoryRow:
     """The three cars of a recorded roll-out at one time from the request; positions are bumper to bumper.
 
@@ -172,5 +131,3 @@ class TrajectoryRow:
 
 ROLLOUTS: Final[Table[AboutRollout]] = Table("rollouts", RolloutRow)
 TRAJECTORIES: Final[Table[TrajectoryRow]] = Table("trajectories", TrajectoryRow)
-FOLLOWER_STUDY: Final[Table[FollowerRow]] = Table("followers", FollowerRow)
-SENSITIVITY: Final[Table[SensitivityRow]] = Table("sensitivity", SensitivityRow)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
@@ -11,18 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.ccrb.rows import FOLLOWER_STUDY, ROLLOUTS, SENSITIVITY, TRAJECTORIES
-from s2a_bench.experiments.ccrb.studies import (
-    VARIED,
-    count_blocks,
-    follower_rows,
-    motion_of,
-    rollout_rows,
-    sensitivity_rows,
-    studies,
-    study_rows,
-    trajectory_rows,
-)
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
+from s2a_bench.experiments.ccrb.studies import SCENES, drive_block, motion_of, rollout_rows, studies, trajectory_rows
 from s2a_bench.harness.timelines.config import PlanSetting, settings
 from s2a_bench.harness.timelines.policies import draw, learn
 from s2a_bench.harness.timelines.rows import skill_rows, to_ns, token_rows
@@ -30,14 +20,11 @@ from s2a_bench.machine import environment
 from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.provenance import Origins
 from s2a_bench.scenario import Simulator, simulator
-from s2a_bench.scenario.ccrb import FOLLOWERS
-from s2a_bench.scenario.ccrb.cars import NCAP_DECELS_MPS2, NCAP_GAPS_M
 from s2a_bench.scenario.ccrb.drive import drive
 from s2a_bench.scenario.ccrb.ttc import NAME as TTC
 from s2a_bench.scenario.ccrb.ttc import ttc_aware
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import RunWriter
-from s2a_bench.store.schema import Table
 from s2a_bench.types import Timing
 
 if TYPE_CHECKING:
@@ -150,31 +137,21 @@ def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
 
 
 def _drive_studies(config: CcrbConfig, writer: RunWriter, progress: Progress) -> None:
-    work = list(_work(config))
-    if not work:
+    blocks = [
+        (study, scenes.cut(slice(first, first + SCENES)))
+        for study, scenes in studies(config)
+        for first in range(0, len(scenes), SCENES)
+    ]
+    if not blocks:
         return
-    progress.stage("driving " + " and ".join(dict.fromkeys(name for name, *_ in work)))
-    progress.expect(sum(count for _, count, *_ in work))
+    progress.stage("driving " + " and ".join(dict.fromkeys(study for study, _ in blocks)))
+    progress.expect(len(blocks))
     driven, spent_s = 0, 0.0
-    for _, _, table, rows_of in work:
-        while True:
-            before = process_time()
-            block = next(rows_of, None)
-            spent_s += process_time() - before
-            if block is None:
-                break
-            driven += block[0]
-            writer.append(table, block[1])
-            progress.advance()
+    for study, scenes in blocks:
+        before = process_time()
+        count, rows = drive_block(config, study, scenes)
+        spent_s += process_time() - before
+        driven += count
+        writer.append(ROLLOUTS, rows)
+        progress.advance()
     writer.update(studies={"rollouts": driven, "rollouts_per_cpu_s": driven / spent_s})
-
-
-def _work(config: CcrbConfig) -> Iterator[tuple[str, int, Table[Any], Iterator[tuple[int, list[Any]]]]]:
-    """Yield each study's name, number of blocks, table, and iterator of (roll-outs, rows) block by block."""
-    for study, scenes in studies(config):
-        yield study, count_blocks(scenes), ROLLOUTS, study_rows(config, study, scenes)
-    if config.all_followers:
-        count = len(FOLLOWERS) * len(NCAP_GAPS_M) * len(NCAP_DECELS_MPS2)
-        yield "all followers", count, FOLLOWER_STUDY, follower_rows(config)
-    if config.sensitivity:
-        yield "sensitivity", sum(map(len, VARIED.values())), SENSITIVITY, sensitivity_rows(config)

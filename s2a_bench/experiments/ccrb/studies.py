@@ -1,16 +1,14 @@
-"""Roll-outs as rows, and the studies: phase diagram, random scenarios, every follower, six numbers varied.
+"""Roll-outs as rows, and the studies: phase diagram, and random scenarios.
 
 Tokens arrive evenly, so that stream-to-act starts at S0 (closed form: the online rule does the same with even tokens),
-and the ego is the bare integrator. For followers and varied numbers each seed draws points of the phase diagram's
-plane, by a scrambled Sobol sequence; all followers and numbers use the same points.
+and the ego is the bare integrator.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, replace
-from itertools import product
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -20,9 +18,7 @@ from s2a_bench.experiments.ccrb.rows import (
     IMPACTS,
     MARGINS,
     AboutRollout,
-    FollowerRow,
     RolloutRow,
-    SensitivityRow,
     TrajectoryRow,
 )
 from s2a_bench.harness.timelines.rows import to_ns
@@ -31,19 +27,16 @@ from s2a_bench.policy import COMPARED, Plans, Schedule, policy
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.metrics import peak_jerk, rms_jerk, sparc, stalls
 from s2a_bench.scenario import EGO, ROLES
-from s2a_bench.scenario.ccrb import FOLLOWERS
-from s2a_bench.scenario.ccrb.cars import NCAP_DECELS_MPS2, NCAP_GAPS_M, OUTCOMES, Cars, start_deadline
+from s2a_bench.scenario.ccrb.cars import start_deadline
 from s2a_bench.scenario.ccrb.drive import Trajectory
 from s2a_bench.scenario.ccrb.ego import PHASES
-from s2a_bench.scenario.ccrb.labels import PAPER
-from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.outcome import Outcomes
-from s2a_bench.scenario.ccrb.studies import Scenes, draw, drive_along, plane, spread, survived
+from s2a_bench.scenario.ccrb.studies import Scenes, draw, drive_along, plane, survived
 from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    pass
 
 _TOLERANCE_S = 0.02
 """Shorter stalls are not counted (POLICY section 1)."""
@@ -107,14 +100,6 @@ def _finite(value: float) -> float | None:
 FORMS: Final = {name: policy(name).foreseeing for name in COMPARED}
 SCENES: Final = 1366
 """Scenarios of a block, driven in lock step: about 8,000 roll-outs."""
-VARIED: Final[dict[str, tuple[float, ...]]] = {
-    "gap_decel_mps2": (3.0, 4.0, 5.0, 6.0, 7.0, 8.0),
-    "build_s": (0.2, 0.4, 0.6, 0.8, 1.0, 1.2),
-    "reaction_s": (0.7, 0.9, 1.1, 1.3, 1.5, 1.7),
-    "ego_jerk_mps3": (5.0, 10.0, 20.0, 30.0, 45.0, 60.0),
-    "rear_gap_m": (8.0, 11.0, 14.0, 17.0, 20.0, 24.0),
-    "onset_s": (-0.5, -0.25, 0.0, 0.25, 0.5, 1.0),
-}
 
 
 def studies(config: CcrbConfig) -> Iterator[tuple[str, Scenes]]:
@@ -135,22 +120,12 @@ def studies(config: CcrbConfig) -> Iterator[tuple[str, Scenes]]:
         yield "random", draw(generator(config.seed, "ccrb", "random"), config.random)
 
 
-def study_rows(config: CcrbConfig, study: str, scenes: Scenes) -> Iterator[tuple[int, list[AboutRollout]]]:
-    """Drive every scenario with every gap behaviour and policy; yield roll-outs and rows block by block.
+def drive_block(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[AboutRollout]]:
+    """Drive every scenario with every gap behaviour and policy; return the number of roll-outs, and the rows.
 
     The check on the car behind is one more roll-out a scenario. A policy that never stalls is driven once, with a row
     for every gap behaviour.
     """
-    for first in range(0, len(scenes), SCENES):
-        yield _block(config, study, scenes.cut(slice(first, first + SCENES)))
-
-
-def count_blocks(scenes: Scenes) -> int:
-    """Return the number of blocks that `study_rows` yields."""
-    return -(-len(scenes) // SCENES)
-
-
-def _block(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[AboutRollout]]:
     scenario = config.scenario
     cases = [(name, gap) for name, form in FORMS.items() for gap in (GAPS if form.stalls else (scenario.gap,))]
     gaps = np.repeat([gap for _, gap in cases], len(scenes))
@@ -205,107 +180,3 @@ def schedules(config: CcrbConfig, scenes: Scenes, names: Sequence[str]) -> Sched
         np.concatenate([start_s[name] for name in names], axis=1),
         np.concatenate([duration_s[name] for name in names], axis=1),
     )
-
-
-def follower_rows(config: CcrbConfig) -> Iterator[tuple[int, list[FollowerRow]]]:
-    """Drive every follower in Euro NCAP's combinations; yield roll-outs and rows of each."""
-    for follower, front_m, decel in product(FOLLOWERS, NCAP_GAPS_M, NCAP_DECELS_MPS2):
-        changed: dict[str, Any] = {"follower": follower, "front_gap_m": front_m, "lead_decel_mps2": decel}
-        scenario = config.scenario.but(lane_change=False, **changed)
-        seeds, scenes = _points(config, scenario)
-        cars = _cars(scenes, scenario)
-        safe = survived(scenes, cars)
-        codes = _codes(config, scenes, cars)
-        paper = _paper(codes)
-        yield (
-            (len(FORMS) + 1) * len(scenes),
-            [
-                FollowerRow(
-                    cell=f"followers/{follower}/{policy}",
-                    policy=policy,
-                    gap_behaviour=scenario.gap,
-                    seed=None if seed < 0 else int(seed),
-                    points=int(mine.sum()),
-                    survived=int(safe[mine].sum()),
-                    front=int((code[mine] & 1).sum()),
-                    rear=int((code[mine] >> 1).sum()),
-                    rear_survived=int((code[mine & safe] >> 1).sum()),
-                    paper=int(paper[mine].sum()),
-                    **changed,
-                )
-                for policy, code in codes.items()
-                for seed in np.unique(seeds)
-                for mine in (seeds == seed,)
-            ],
-        )
-
-
-def sensitivity_rows(config: CcrbConfig) -> Iterator[tuple[int, list[SensitivityRow]]]:
-    """Drive the plane with one number changed at a time; yield roll-outs and rows of each value."""
-    scenario = config.scenario.but(lane_change=False)
-    seeds, scenes = _points(config, scenario)
-    drawn = seeds >= 0
-    seeds, scenes = seeds[drawn], Scenes({name: values[drawn] for name, values in scenes.numbers.items()})
-    for varied, values in VARIED.items():
-        for value in values:
-            changed: dict[str, Any] = {varied: np.full(len(scenes), value)}
-            cars = replace(_cars(scenes, scenario), **changed)
-            paper = _paper(_codes(config, scenes, cars))
-            yield (
-                len(FORMS) * len(scenes),
-                [
-                    SensitivityRow(
-                        cell=f"sensitivity/{varied}",
-                        varied=varied,
-                        value=value,
-                        follower=scenario.follower,
-                        gap_behaviour=scenario.gap,
-                        seed=int(seed),
-                        points=int((seeds == seed).sum()),
-                        paper=int(paper[seeds == seed].sum()),
-                    )
-                    for seed in np.unique(seeds)
-                ],
-            )
-
-
-def _points(config: CcrbConfig, scenario: CcrbOptions) -> tuple[NDArray[np.int64], Scenes]:
-    """Return the seeds of the drawn points, and the points; the last is the operating point, of seed -1."""
-    from scipy.stats import qmc
-
-    seeds = range(config.seed, config.seed + config.seeds)
-    draws = [qmc.Sobol(2, rng=generator(seed, "ccrb", "plane")).random(config.seed_points) for seed in seeds]
-    board, point = config.timeline.boards[0], np.zeros((1, 2))
-    scenes = spread(
-        scenario,
-        config.phase_rates,
-        config.phase_gaps_m,
-        np.concatenate([*draws, point]),
-        prompt_s=board.prompt_s,
-        tokens_per_skill=config.tokens_per_skill,
-    )
-    scenes.numbers["tokens_per_s"][-1] = board.tokens_per_s
-    scenes.numbers["rear_gap_m"][-1] = scenario.rear_gap_m
-    return np.append(np.repeat(np.array(seeds), config.seed_points), -1), scenes
-
-
-def _cars(scenes: Scenes, scenario: CcrbOptions) -> Cars:
-    return scenes.cars(np.full(len(scenes), scenario.gap), scenario)
-
-
-def _codes(config: CcrbConfig, scenes: Scenes, cars: Cars) -> dict[str, NDArray[np.int64]]:
-    every = scenes.times(len(FORMS))
-    numbers: dict[str, Any] = {
-        name: np.tile(value, len(FORMS))
-        for name in (each.name for each in fields(cars))
-        if isinstance(value := getattr(cars, name), np.ndarray)
-    }
-    outcomes = drive_along(every, replace(cars, **numbers), schedules(config, scenes, list(FORMS)))
-    return dict(zip(FORMS, np.split(outcomes.code, len(FORMS)), strict=True))
-
-
-def _paper(codes: dict[str, NDArray[np.int64]]) -> NDArray[np.bool_]:
-    held: NDArray[np.bool_] = np.logical_and.reduce(
-        [codes[policy] == OUTCOMES.index(outcome) for policy, outcome in PAPER.items()]
-    )
-    return held

@@ -23,6 +23,9 @@ NCAP_DECELS_MPS2: Final = (2.0, 6.0)
 LEAD_JERK_MPS3: Final = 6.0
 EGO_MOST_MPS2, EGO_LEAST_MPS2 = 2.0, -8.0
 EGO_LOOP_S: Final = 0.3
+EGO_JERK_MPS3: Final = 30.0
+STOP_MPS2: Final = 8.0
+"""Deceleration of the gap behaviour *stop*."""
 LEAST_IMPACT_MPS: Final = 0.5
 """Slower contacts are no impacts."""
 SAFETY_M: Final = 2.0
@@ -47,14 +50,6 @@ class Cars:
     """The ego's behaviour between skills; one name, or an array of them."""
     follower: str = "careful"
     """The trailing car's law, a name of FOLLOWERS."""
-    gap_decel_mps2: ArrayLike = 8.0
-    """Deceleration of the gap behaviour *stop*."""
-    ego_jerk_mps3: ArrayLike = 30.0
-    """Limit of the ego's jerk."""
-    build_s: ArrayLike = 0.6
-    """Time until the trailing car's full brake force."""
-    onset_s: ArrayLike = 0.0
-    """When the lead begins to brake, from the request on; until then all cars drive at v0."""
     reflex: bool = False
     """Whether the ego also brakes independently of the plan: `ego.Reflex`."""
 

@@ -85,7 +85,7 @@ def follower_survives(cars: Cars, plan: DrivingPlan, n_skills: ArrayLike, t_nom_
     count, nominal_s = np.broadcast_arrays(np.atleast_1d(n_skills), np.atleast_1d(np.asarray(t_nom_s, float)))
     skill = np.arange(count.max())[:, np.newaxis]
     schedule = Schedule(np.minimum(skill, count) * nominal_s, np.where(skill < count, nominal_s, 0.0))
-    alone = replace(cars, front_gap_m=NO_LEAD_M, onset_s=0.0, reflex=False)
+    alone = replace(cars, front_gap_m=NO_LEAD_M, reflex=False)
     along = DrivingPlan(plan.set_point_mps, (0,) * len(plan.lane))
     found = drive(Longitudinal(), alone, along, schedule, resting_mps=LEAST_IMPACT_MPS).outcomes
     return np.asarray(found.code & 2 == 0)
@@ -99,8 +99,6 @@ class _Drive(LockStep):
         self._ego = Ego(cars, plan, schedule, rollouts)
         self._rear = follower(cars, rollouts)
         self._lead_decel = each(cars.lead_decel_mps2, rollouts)
-        self._onset_s = each(cars.onset_s, rollouts)
-        self._begin_s = min(float(self._onset_s.min()), 0.0)
         position, speed = np.zeros((3, rollouts)), np.empty((3, rollouts))
         position[LEAD], position[REAR] = cars.front_gap_m, -np.asarray(cars.rear_gap_m, float)
         speed[:] = cars.speed_mps
@@ -116,9 +114,9 @@ class _Drive(LockStep):
     def run(self, *, record: bool, resting_mps: float) -> Driven:
         step_s = self._simulator.step_s
         every = max(round(RECORD_S / step_s), 1)
-        last = int((float(self._ego.end_s.max()) + AFTER_S - self._begin_s) / step_s)
+        last = int((float(self._ego.end_s.max()) + AFTER_S) / step_s)
         for step in range(last):
-            self._decide(self._begin_s + step * step_s)
+            self._decide(step * step_s)
             if record and step % every == 0:
                 now = (self._state, self._acceleration.copy(), self._ego.phase, self._ego.index.copy())
                 self._records.append(now)
@@ -148,8 +146,7 @@ class _Drive(LockStep):
         seen = self._delay.see(state, self._ego.acceleration_mps2, acceleration[REAR])
         self._seen_at_rest = seen.ego_then.speed_mps <= 0
         lead = acceleration[LEAD]
-        braking = now_s >= self._onset_s - 1e-12
-        np.maximum(lead - LEAD_JERK_MPS3 * step_s, -self._lead_decel, out=lead, where=braking)
+        np.maximum(lead - LEAD_JERK_MPS3 * step_s, -self._lead_decel, out=lead)
         lead_decel = np.where(state.speed_mps[LEAD] > 0, -lead, 0.0)
         gap = state.position_m[LEAD] - state.position_m[EGO]
         acceleration[EGO] = self._ego.decide(
@@ -170,7 +167,7 @@ class _Drive(LockStep):
     def _trajectory(self, step_s: float) -> Trajectory:
         states, accelerations, phases, skills = zip(*self._records, strict=True)
         return Trajectory(
-            time_s=self._begin_s + np.arange(len(states), dtype=np.float64) * step_s,
+            time_s=np.arange(len(states), dtype=np.float64) * step_s,
             position_m=np.stack([state.position_m for state in states]),
             speed_mps=np.stack([state.speed_mps for state in states]),
             lateral_m=np.stack([state.lateral_m for state in states]),

@@ -15,9 +15,17 @@ from numpy.typing import NDArray
 from s2a_bench.errors import UsageError
 from s2a_bench.plan.skillset import GAPS, Gap
 from s2a_bench.policy import Floats, Schedule
-from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, EGO_LOOP_S, EGO_MOST_MPS2, Cars, DrivingPlan
+from s2a_bench.scenario.ccrb.cars import (
+    EGO_JERK_MPS3,
+    EGO_LEAST_MPS2,
+    EGO_LOOP_S,
+    EGO_MOST_MPS2,
+    STOP_MPS2,
+    Cars,
+    DrivingPlan,
+)
 from s2a_bench.scenario.ccrb.follower import needed
-from s2a_bench.scenario.longitudinal import LockStep, each
+from s2a_bench.scenario.longitudinal import LockStep
 from s2a_bench.text import none_of
 
 WAITING, ACTING, GAP, DONE = 0, 1, 2, 3
@@ -25,13 +33,13 @@ PHASES: Final = ("waiting", "acting", "gap", "done")
 REFLEX_MPS2, REFLEX_TTC_S = 4.0, 1.5
 """The reflex brakes fully above this required deceleration, or below this time to collision."""
 
-BETWEEN: dict[Gap, Callable[[Floats, Floats, Floats, Floats], Floats]] = {
-    "stop": lambda _speed, _slope, _first, hard: -hard,
-    "coast": lambda speed, _slope, _first, _hard: np.zeros(speed.shape),
-    "hold": lambda _speed, slope, _first, _hard: slope,
-    "cruise": lambda speed, _slope, first, _hard: (first - speed) / EGO_LOOP_S,
+BETWEEN: dict[Gap, Callable[[Floats, Floats, Floats], Floats]] = {
+    "stop": lambda speed, _slope, _first: np.full(speed.shape, -STOP_MPS2),
+    "coast": lambda speed, _slope, _first: np.zeros(speed.shape),
+    "hold": lambda _speed, slope, _first: slope,
+    "cruise": lambda speed, _slope, first: (first - speed) / EGO_LOOP_S,
 }
-"""Gap behaviour -> acceleration, a function of speed, the last skill's slope, v0, and the deceleration of *stop*."""
+"""Gap behaviour -> acceleration, a function of speed, the last skill's slope, and v0."""
 
 
 class Ego(LockStep):
@@ -47,8 +55,6 @@ class Ego(LockStep):
         self._points = np.broadcast_to(plan.set_point_mps, (shape[0] + 1, rollouts))
         self._lanes = (0, *plan.lane)
         self._gaps = gaps
-        self._hard_mps2 = each(cars.gap_decel_mps2, rollouts)
-        self._jerk_mps3 = each(cars.ego_jerk_mps3, rollouts)
         self._between = {gap: rule for gap, rule in BETWEEN.items() if (gaps == gap).any()}
         self._reflex = Reflex(rollouts) if cars.reflex else None
         self.index = np.full(rollouts, -1)
@@ -74,12 +80,12 @@ class Ego(LockStep):
         between = self.phase == GAP
         if between.any():
             for gap, rule in self._between.items():
-                wanted = rule(speed, self._slope, self._points[0], self._hard_mps2)
+                wanted = rule(speed, self._slope, self._points[0])
                 wish = np.where(between & (self._gaps == gap), wanted, wish)
         wish = np.clip(wish, EGO_LEAST_MPS2, EGO_MOST_MPS2)
         if self._reflex is not None:
             wish = self._reflex.limit(wish, speed, gap_m, lead_mps, lead_decel)
-        most = self._jerk_mps3 * step_s
+        most = EGO_JERK_MPS3 * step_s
         self.acceleration_mps2 = self.acceleration_mps2 + np.clip(wish - self.acceleration_mps2, -most, most)
         return self.acceleration_mps2
 

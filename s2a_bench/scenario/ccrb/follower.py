@@ -36,7 +36,7 @@ BRAKES_MPS2: Final = 0.5
 """Above this a car ahead counts as braking."""
 LEAST_ROOM_M: Final = 0.05
 MOST_MPS2: Final = 7.0
-RELEASE_S: Final = 0.2
+BUILD_S, RELEASE_S = 0.6, 0.2
 SPARE_M: Final = 1.0
 LEAST_MPS2: Final = 1e-6
 """Smaller decelerations count as zero."""
@@ -87,13 +87,12 @@ class Follower(LockStep):
 class Brake(LockStep):
     """The trailing car's brake: its force builds up slowly and releases fast."""
 
-    def __init__(self, cars: Cars, rollouts: int) -> None:
-        self._build_mps3 = MOST_MPS2 / each(cars.build_s, rollouts)
+    def __init__(self, rollouts: int) -> None:
         self.force_mps2 = np.zeros(rollouts)
 
     def press(self, want_mps2: Floats, step_s: float) -> Floats:
         change = np.minimum(want_mps2, MOST_MPS2) - self.force_mps2
-        self.force_mps2 += np.clip(change, -MOST_MPS2 / RELEASE_S * step_s, self._build_mps3 * step_s)
+        self.force_mps2 += np.clip(change, -MOST_MPS2 / RELEASE_S * step_s, MOST_MPS2 / BUILD_S * step_s)
         return self.force_mps2.copy()
 
 
@@ -109,7 +108,7 @@ class Careful(Follower):
         self._reaction_s = each(cars.reaction_s, rollouts)
         self._far_m = each(cars.rear_gap_m, rollouts)
         self._braking = np.zeros(rollouts, bool)
-        self._brake = Brake(cars, rollouts)
+        self._brake = Brake(rollouts)
 
     def acceleration(self, seen: DriverView, step_s: float) -> Floats:
         ego, rear = seen.ego_then, seen.rear
@@ -140,7 +139,7 @@ class Idm(Follower):
         self._desired_mps = IDM_HASTE * speed
         at_ease_m = np.asarray(cars.rear_gap_m, float) * np.sqrt(1 - IDM_HASTE**-IDM_EXPONENT)
         self._headway_s = np.maximum((at_ease_m - IDM_STANDSTILL_M) / speed, IDM_LEAST_HEADWAY_S)
-        self._brake = Brake(cars, rollouts)
+        self._brake = Brake(rollouts)
 
     def acceleration(self, seen: DriverView, step_s: float) -> Floats:
         gap_m, speed, closing, ahead = self._perceived(seen)

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from s2a_bench.policy import Floats, Schedule
+from s2a_bench.policy import Schedule
 from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, LEAST_IMPACT_MPS, Cars, DrivingPlan, braking_plan, plan_decel
 from s2a_bench.scenario.ccrb.drive import drive, follower_survives
 from s2a_bench.scenario.ccrb.options import CcrbOptions
@@ -66,22 +66,9 @@ def plane(
 ) -> Scenes:
     """Return a grid over rate and rear gap, each (from, to), the rate on a logarithmic scale."""
     axes = (np.linspace(0.0, 1.0, number) for number in points)
-    share = np.stack([values.ravel() for values in np.meshgrid(*axes, indexing="ij")], axis=1)
-    return spread(options, rates, gaps_m, share, prompt_s=prompt_s, tokens_per_skill=tokens_per_skill)
-
-
-def spread(
-    options: CcrbOptions,
-    rates: Sequence[float],
-    gaps_m: Sequence[float],
-    share: Floats,
-    *,
-    prompt_s: float,
-    tokens_per_skill: int,
-) -> Scenes:
-    """Return scenarios at points of that plane, given as shares of its sides, shape (M, 2)."""
+    along, aside = (values.ravel() for values in np.meshgrid(*axes, indexing="ij"))
     (slow, fast), (near, far) = rates, gaps_m
-    rate, gap = slow * (fast / slow) ** share[:, 0], near + (far - near) * share[:, 1]
+    rate, gap = slow * (fast / slow) ** along, near + (far - near) * aside
     cars = options.cars
     fixed = {
         "prompt_s": prompt_s,

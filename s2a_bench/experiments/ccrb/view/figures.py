@@ -1,4 +1,4 @@
-"""The figures of a CCRB run: the operating point as curves (figure 3 of the paper), phase diagram and sensitivity."""
+"""The figures of a CCRB run: the operating point as curves (figure 3 of the paper), phase diagram."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from s2a_bench.experiments.ccrb.rows import SENSITIVITY, TRAJECTORIES
+from s2a_bench.experiments.ccrb.rows import TRAJECTORIES
 from s2a_bench.experiments.ccrb.view.outcomes import (
-    VARIED_TITLES,
     configuration,
     has,
     origin_notes,
-    plane_text,
     rate_span_at_point,
     rollouts_of,
     scenes_of,
@@ -23,8 +21,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     token_times_s,
 )
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.scenario.ccrb.cars import Cars
-from s2a_bench.scenario.ccrb.labels import NAIVE, NO_SCORE, ORDERING, PAPER, ahead, law, operating_point, outcome_label
+from s2a_bench.scenario.ccrb.labels import NAIVE, ORDERING, PAPER, ahead, law, operating_point, outcome_label
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.style import WIDE_IN
@@ -110,8 +107,6 @@ def ccrb_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
     builders: dict[str, Callable[[], Figure]] = {"scenario": partial(build_scenario, run)}
     if has(run, "phase"):
         builders["phase"] = partial(build_phase, run)
-    if len(run.table(SENSITIVITY)):
-        builders["sensitivity"] = partial(build_sensitivity, run)
     return builders
 
 
@@ -260,33 +255,3 @@ def _draw_panel(axes: Axes, scenes: pd.DataFrame, settings: dict[str, Any], run:
     rate = run.manifest["boards"][0]["tokens_per_s"]
     axes.plot(rate, settings["rear_gap_m"], **_POINT)
     return set(np.unique(named))
-
-
-def build_sensitivity(run: StoredRun) -> Figure:
-    """Draw the ordering's share of the plane over each varied number, with the range over the seeds as a band."""
-    found, settings = run.table(SENSITIVITY), configuration(run)
-    shares = found.assign(share=100 * found["paper"] / found["points"])
-    seeds, points = found["seed"].nunique(), int(found["points"].iloc[0])
-    scene = f"{ahead(settings)}, gap behaviour {settings['gap']}"
-    caption = (
-        f"The paper's ordering as a share of {plane_text(settings)}: {scene}",
-        f"Mean, least and most of {seeds} seeds of {points} points; dotted: the default.",
-        f"Rear: {law(settings)}.",
-        f"EMULATED: tokens come evenly. {NO_SCORE}",
-    )
-    figure = new_figure(3.3, caption, WIDE_IN)
-    grid = figure.subplots(2, 3, sharey=True)
-    for axes, varied in zip(grid.flat, VARIED_TITLES, strict=True):
-        _draw_share(axes, shares[shares["varied"] == varied], float(settings.get(varied, getattr(Cars(), varied))))
-        axes.set_xlabel(VARIED_TITLES[varied])
-    for axes in grid[:, 0]:
-        axes.set_ylabel("paper's ordering (%)")
-        axes.set_ylim(bottom=0)
-    return figure
-
-
-def _draw_share(axes: Axes, group: pd.DataFrame, default: float) -> None:
-    share = group.groupby("value")["share"].agg(["mean", "min", "max"]).astype("float64")
-    axes.fill_between(share.index, share["min"], share["max"], color="#0072B2", alpha=0.25, linewidth=0)
-    axes.plot(share.index, share["mean"], "o-", color="#0072B2", linewidth=1.2, markersize=3)
-    axes.axvline(default, color="#555555", linestyle=":", linewidth=1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments import TIME
 from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
@@ -17,15 +17,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from s2a_bench.store.run import StoredRun
-
-VARIED_TITLES: Final = {
-    "gap_decel_mps2": "braking in gaps (m/s\N{SUPERSCRIPT TWO})",
-    "build_s": "follower's brake builds up in (s)",
-    "reaction_s": "follower's reaction (s)",
-    "ego_jerk_mps3": "ego's jerk (m/s\N{SUPERSCRIPT THREE})",
-    "rear_gap_m": "rear gap (m); over rates only",
-    "onset_s": "lead's onset after the request (s)",
-}
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,9 +185,3 @@ def _emulated_notes(run: StoredRun) -> list[str]:
     if board["prompt_origin"] == "assumed":
         notes.append(Note(f"c = {board['prompt_s']:g} s before decoding is our assumption.", ASSUMED))
     return notes
-
-
-def plane_text(settings: dict[str, Any]) -> str:
-    """Return the plane's axes as text."""
-    (slow, fast), (near, far) = settings["phase_rates"], settings["phase_gaps_m"]
-    return f"the plane of R {slow:g} to {fast:g} tokens/s, rear gap {near:g} to {far:g} m"

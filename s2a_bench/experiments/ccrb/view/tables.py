@@ -7,26 +7,20 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from s2a_bench.experiments import TIME, Shown
 from s2a_bench.experiments.ccrb.rows import (
-    FOLLOWER_STUDY,
     IMPACTS,
     MARGINS,
     METRICS,
     MOTION,
-    SENSITIVITY,
     TIMES,
-    FollowerRow,
     RolloutRow,
-    SensitivityRow,
 )
 from s2a_bench.experiments.ccrb.view.figures import ccrb_figures
 from s2a_bench.experiments.ccrb.view.outcomes import (
-    VARIED_TITLES,
     Share,
     cells_of,
     configuration,
     has,
     origin_notes,
-    plane_text,
     rate_span,
     rate_span_at_point,
     rollouts_of,
@@ -35,19 +29,14 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     survives_of,
 )
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.scenario.ccrb.cars import OUTCOMES as CODES
 from s2a_bench.scenario.ccrb.labels import (
-    MARK,
-    NAIVE,
     NO_SCORE,
     ORDERING,
-    PAPER,
     law,
-    marked,
     operating_point,
     outcome_label,
 )
-from s2a_bench.store.schema import PROVENANCE, Count, Facts, Fraction, Many, Positive, about
+from s2a_bench.store.schema import Count, Facts, Fraction, Many, Positive, about
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, number
@@ -55,11 +44,8 @@ from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, number
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    import pandas as pd
-
     from s2a_bench.experiments import Metric
     from s2a_bench.store.run import StoredRun
-    from s2a_bench.store.schema import Table
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
@@ -68,7 +54,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
     return Shown(
         sentences=_ccrb_sentences(run),
         tables=tables,
-        main=[name for name in ("outcomes", "phase", "random", "followers", "follower-shares") if name in tables],
+        main=[name for name in ("outcomes", "phase", "random") if name in tables],
         csvs=_ccrb_csv(run),
         figures=ccrb_figures(run),
         json=lambda: ccrb_json(run),
@@ -84,8 +70,6 @@ def _ccrb_sentences(run: StoredRun) -> list[str]:
         for row in rows.to_dict("records")
     ]
     sentences += [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
-    if len(run.table(SENSITIVITY)):
-        sentences.append(_sensitivity(run))
     if studies := run.manifest.get("studies"):
         speed = studies["rollouts_per_cpu_s"]
         sentences.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time.")
@@ -108,16 +92,6 @@ def _finding(run: StoredRun, gap: str) -> str:
     return f"{sentence}, for R = {span[0]:.1f} to {span[1]:.1f} tokens/s; {where}."
 
 
-def _sensitivity(run: StoredRun) -> str:
-    found = run.table(SENSITIVITY)
-    summed = found.groupby(["varied", "value"], sort=False)[["paper", "points"]].sum()
-    share = 100 * summed["paper"] / summed["points"]
-    spans = share.groupby("varied", sort=False).agg(["min", "max"])
-    names = {varied: title.split(" (")[0] for varied, title in VARIED_TITLES.items()}
-    spans_text = ", ".join(f"{names[varied]} {least:.0f} to {most:.0f} %" for varied, least, most in spans.itertuples())
-    return f"Sensitivity, the paper's ordering in the plane: {spans_text}."
-
-
 ORDERINGS: Final = {
     "paper": "the paper's ordering",
     "wait_worse": "wait worse than stream",
@@ -128,7 +102,6 @@ ORDERINGS: Final = {
     "naive_rear_better": "naive better behind",
 }
 
-_SETTING: Final = ["follower", "front_gap_m", "lead_decel_mps2"]
 _ORDERING_NOTES: Final = (
     Note(ORDERING, PAPERS),
     "Worse, better: an impact more than 0.5 m/s faster or slower than stream-to-act's; behind: rear impacts alone.",
@@ -146,19 +119,6 @@ CcrbCell = cell_of_row(
         "rate_tokens_per_s": Positive,
         **{metric.name: Annotated[float, Facts(metric.schema)] for metric in _TIMES},
     },
-)
-
-CcrbFollower = cell_of_row(
-    "CcrbFollower",
-    "Counts of points of the plane under one policy, with one follower and lead; without a seed: the operating point.",
-    FollowerRow,
-    without=("cell",),
-)
-CcrbSensitivity = cell_of_row(
-    "CcrbSensitivity",
-    "At how many of the points that a seed drew the paper's ordering holds, one number changed.",
-    SensitivityRow,
-    without=("cell",),
 )
 
 
@@ -243,79 +203,6 @@ def _share_rows(run: StoredRun, study: str, written: Callable[[Share], str]) -> 
     return [(text, *(written(share_of(scenes[gap], name)) for gap in GAPS)) for name, text in counted.items()]
 
 
-def _follower_tables(run: StoredRun) -> dict[str, TextTable]:
-    found, settings = run.table(FOLLOWER_STUDY), configuration(run)
-    rate = run.manifest["boards"][0]["tokens_per_s"]
-    where = f"R = {rate:g} tokens/s, rear gap {settings['rear_gap_m']:g} m, gap behaviour {settings['gap']}"
-    drawn = found[found["seed"].notna()]
-    seeds, points = drawn["seed"].nunique(), int(drawn["points"].iloc[0])
-    notes = (
-        "Survives: the follower avoids an ego with immediate tokens, at the same gap.",
-        f"{MARK} It does not: a rear outcome says nothing about the policy.",
-        *(f"{law({**settings, 'follower': follower})}." for follower in dict.fromkeys(found["follower"])),
-        NO_SCORE,
-    )
-    shares = (
-        Note(ORDERING, PAPERS),
-        f"Mean [least, most] of {seeds} seeds that draw {points} points of {plane_text(settings)} each.",
-        "naive*: of the points where the follower survives; a policy without stalls is never hit there.",
-        "A front impact ends a roll-out.",
-        *notes,
-    )
-    header = ("follower", "lead", "ordering", "survives", "rear: naive", "wait", "stream", "naive*")
-    title = "Every follower at Euro NCAP's four CCRb combinations"
-    return {
-        "follower-shares": TextTable(f"{title}: % of the plane", header, _follower_rows(drawn), 2, notes=shares),
-        "followers": TextTable(
-            f"{title}: {where}",
-            ("follower", "lead", "survives", *PAPER),
-            _point_rows(found[found["seed"].isna()]),
-            2,
-            notes=notes,
-        ),
-    }
-
-
-def _point_rows(point: pd.DataFrame) -> list[tuple[str, ...]]:
-    rows = []
-    for key, group in point.groupby(_SETTING, sort=False):
-        by_policy = {row["policy"]: row for row in group.to_dict("records")}
-        survives = "yes" if by_policy[NAIVE]["survived"] else "no"
-        rows.append((*_names(key), survives, *(_outcome(by_policy[policy]) for policy in PAPER)))
-    return rows
-
-
-def _follower_rows(drawn: pd.DataFrame) -> list[tuple[str, ...]]:
-    rows = []
-    for key, group in drawn.groupby(_SETTING, sort=False):
-        policies = {str(policy): mine for policy, mine in group.groupby("policy", sort=False)}
-        naive = policies[NAIVE]
-        of_all = (_range(naive[name], naive["points"]) for name in ("paper", "survived"))
-        rear = (_range(policies[policy]["rear"], policies[policy]["points"]) for policy in PAPER)
-        rows.append((*_names(key), *of_all, *rear, _range(naive["rear_survived"], naive["survived"])))
-    return rows
-
-
-def _names(setting: Any) -> tuple[str, str]:
-    follower, front_m, decel = setting
-    return str(follower), f"{front_m:g} m, -{decel:g}"
-
-
-def _outcome(row: dict[Any, Any]) -> str:
-    outcome = CODES[int(row["front"]) + 2 * int(row["rear"])]
-    return outcome + marked(outcome, bool(row["survived"]))
-
-
-def _range(count: pd.Series[Any], of: pd.Series[Any]) -> str:
-    """Return the shares over the seeds in percent: mean [least, most]."""
-    share = (100 * count[of > 0] / of[of > 0]).astype("float64")
-    if share.empty:
-        return ABSENT
-    if share.max() == share.min():
-        return f"{share.max():.0f}"
-    return f"{share.mean():.0f} [{share.min():.0f}, {share.max():.0f}]"
-
-
 def ccrb_tables(run: StoredRun) -> dict[str, TextTable]:
     """Return every table of a run by its file's name."""
     tables = {}
@@ -323,8 +210,6 @@ def ccrb_tables(run: StoredRun) -> dict[str, TextTable]:
         tables["random"] = _random_table(run)
     if has(run, "phase"):
         tables["phase"] = _phase_table(run)
-    if len(run.table(FOLLOWER_STUDY)):
-        tables |= _follower_tables(run)
     return {**tables, "margins": _margin_table(run), "outcomes": _outcome_table(run)}
 
 
@@ -347,14 +232,7 @@ def ccrb_json(run: StoredRun) -> dict[str, Any]:
     """Return the ``--json`` object (docs/schema/s2a-bench-1.json): SI units, a cell a policy, studies as shares."""
     studies = [_study(run, study, gap) for study in ("phase", "random") if has(run, study) for gap in GAPS]
     live = {"live": run.manifest["live"]} if "live" in run.manifest else {}
-    varied = {"followers": _counts(run, FOLLOWER_STUDY), "sensitivity": _counts(run, SENSITIVITY)}
-    more = {name: rows for name, rows in varied.items() if rows}
-    return frame(run, cells_of(run), [], **live, follower_law=law(configuration(run)), studies=studies, **more)
-
-
-def _counts(run: StoredRun, table: Table[Any]) -> list[dict[str, Any]]:
-    rows = run.table(table).drop(columns=["cell", PROVENANCE])
-    return [{str(name): value for name, value in row.dropna().items()} for _, row in rows.astype(object).iterrows()]
+    return frame(run, cells_of(run), [], **live, follower_law=law(configuration(run)), studies=studies)
 
 
 def _study(run: StoredRun, study: str, gap: str) -> dict[str, Any]:
