@@ -185,9 +185,6 @@ def present(run: StoredRun, shown: Shown, *, verbose: bool = False) -> None:
     if rest:
         written = f"{run.path / 'tables'}; " if (run.path / "tables").exists() else ""
         print_line(f"more tables ({', '.join(rest)}): {written}--verbose prints them")
-    for name in shown.files:
-        if (run.path / name).exists():
-            print_line(f"{name}: {run.path / name}")
     print_line(f"run folder: {run.path}")
 
 

@@ -112,8 +112,8 @@ class Shown:
     """What a run shows, each item by its file's name.
 
     ``main`` are the tables that are open on the page; a terminal shows the first of them, or all tables if it is empty.
-    ``figures`` are drawn when called, ``files`` write themselves into the run folder, ``json`` returns the ``--json``
-    object, ``lanes`` are the timelines of the page's interactive view.
+    ``figures`` are drawn when called, ``json`` returns the ``--json`` object, ``lanes`` are the timelines of the page's
+    interactive view.
     """
 
     sentences: Sequence[str] = ()
@@ -121,7 +121,6 @@ class Shown:
     main: Sequence[str] = ()
     csvs: Mapping[str, CsvTable] = field(default_factory=dict)
     figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
-    files: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
     json: Callable[[], dict[str, Any]] = dict
     lanes: Sequence[Any] = ()
 
@@ -206,7 +205,7 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
 
 
 def write_shown(run: StoredRun, shown: Shown) -> None:
-    """Write tables, figures and files into the run folder; raises StoreError."""
+    """Write tables and figures into the run folder; raises StoreError."""
     from s2a_bench.writers.csv_text import write_texts
 
     write_texts(run, shown.tables, shown.csvs)
@@ -214,8 +213,6 @@ def write_shown(run: StoredRun, shown: Shown) -> None:
         from s2a_bench.writers.figures import save
 
         save(run.path / "figures", shown.figures)
-    for name, write_file in shown.files.items():
-        write_file(run.path / name)
 
 
 def experiment_of(command: str) -> Experiment | None:

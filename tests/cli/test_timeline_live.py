@@ -25,7 +25,7 @@ def test_a_live_run_prints_one_json_object_and_leaves_a_whole_folder(fast_board:
     assert printed["start_jitter"]["starts"] == 24
     assert "  wait-then-act: started at " in done.stderr
     folder = Path(printed["run"])
-    for name in ("figures/timeline.png", "trace.json", "tables/timelines.md", "skills.parquet", "samples.parquet"):
+    for name in ("figures/timeline.png", "tables/timelines.md", "skills.parquet", "samples.parquet"):
         assert (folder / name).stat().st_size > 0
     assert read_run(folder).manifest["state"] == "finished"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -16,7 +15,6 @@ from matplotlib.patches import Rectangle
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.view.cells import timelines_json, timelines_of
-from s2a_bench.experiments.timeline.view.chrome_trace import TRACE, to_trace, write_trace
 from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours
 from s2a_bench.experiments.timeline.view.tables import (
     execution_table,
@@ -163,69 +161,6 @@ def test_requests_of_their_own_have_their_tokens_in_their_lanes(live: StoredRun)
     assert [segments[0][0][0] for segments in ticks] == pytest.approx(
         [0.5 + 1 / 4.8 + shift for shift in (0, 0.1, 0.2)]
     )
-
-
-def check_trace(trace: dict[str, Any]) -> None:
-    """Check what ui.perfetto.dev and chrome://tracing are particular about."""
-    events = trace["traceEvents"]
-    names: dict[tuple[str, int], str] = {}
-    process_of: dict[int, int] = {}
-    ends: dict[int, int] = {}
-    for event in events:
-        assert event["ph"] in {"M", "X", "i"}
-        assert isinstance(event["name"], str)
-        assert isinstance(event["pid"], int)
-        assert event["pid"] > 0
-        if event["ph"] == "M":
-            assert "ts" not in event
-            if event["name"].endswith("_name"):
-                key = (event["name"], event.get("tid", event["pid"]))
-                assert key not in names
-                names[key] = event["args"]["name"]
-            continue
-        assert process_of.setdefault(event["tid"], event["pid"]) == event["pid"]
-        assert isinstance(event["ts"], int)
-        assert event["ts"] >= 0
-        if event["ph"] == "i":
-            assert event["s"] == "t"
-            continue
-        assert event["dur"] > 0
-        assert event["ts"] >= ends.get(event["tid"], 0)  # slices of a thread neither nest nor overlap
-        ends[event["tid"]] = event["ts"] + event["dur"]
-    assert {tid for name, tid in names if name == "thread_name"} == set(process_of)
-    assert {tid for name, tid in names if name == "process_name"} == set(process_of.values())
-
-
-def test_the_trace_is_one_that_viewers_open(computed: StoredRun, live: StoredRun) -> None:
-    for run in (computed, live):
-        write_trace(run, run.path / TRACE)
-        trace = json.loads((run.path / TRACE).read_text())
-        assert set(trace) == {"traceEvents", "displayTimeUnit", "otherData"}
-        check_trace(trace)
-
-
-def test_the_trace_holds_skills_stalls_waiting_and_tokens(computed: StoredRun) -> None:
-    trace = to_trace(computed)
-    threads = {event["tid"]: event["args"]["name"] for event in trace["traceEvents"] if event["name"] == "thread_name"}
-    assert list(threads.values()) == ["tokens", *STARTS] * 2
-    naive = [event for event in trace["traceEvents"] if event["ph"] == "X" and event["tid"] == 2]
-    assert [event["name"] for event in naive][:4] == ["waiting", "skill 1", "stall", "skill 2"]
-    assert [(event["ts"], event["dur"]) for event in naive][:3] == [
-        (0, 1_750_000),
-        (1_750_000, 1_000_000),
-        (2_750_000, 250_000),
-    ]
-    assert sum(event["dur"] for event in naive if event["name"] == "stall") == 1_750_000
-    marks = [event["name"] for event in trace["traceEvents"] if event["ph"] == "i" and event["tid"] == 1]
-    assert len(marks) == 48 + 8
-    assert "EMULATED" in trace["otherData"]["about"]
-
-
-def test_the_trace_names_the_calls_that_a_model_wrote(live: StoredRun) -> None:
-    slices = [event for event in to_trace(live)["traceEvents"] if event["ph"] == "X"]
-    assert {"pick(cup0)", "waiting", "stall"} <= {event["name"] for event in slices}
-    last = [event for event in slices if event["name"] == "pick(cup7)"]
-    assert {event["args"]["stretch"] for event in last} == {1.5}
 
 
 def column(table: TextTable, name: str) -> list[str]:

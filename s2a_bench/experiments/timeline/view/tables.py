@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +16,6 @@ from s2a_bench.experiments.timeline.view.cells import (
     timelines_json,
     timelines_of,
 )
-from s2a_bench.experiments.timeline.view.chrome_trace import TRACE, write_trace
 from s2a_bench.experiments.timeline.view.figures import timeline_figures
 from s2a_bench.policy import ONLINE
 from s2a_bench.policy.conformal import promise
@@ -37,7 +35,6 @@ def show(run: StoredRun, **_: Any) -> Shown:
         main=["timelines"],
         csvs=timeline_csv(run),
         figures=timeline_figures(run),
-        files={TRACE: partial(write_trace, run)},
         json=lambda: timelines_json(run),
         lanes=[cell for cell in timelines_of(run) if len(cell.skills)],
     )
