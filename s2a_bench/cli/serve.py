@@ -70,6 +70,8 @@ def _config() -> type[Options]:
 def _serve(config: Any) -> None:
     """Serve a pipeline; raises UsageError for an option of another transport."""
     chosen = TRANSPORTS[config.pipeline.partition("?")[0].partition("/")[0]]
+    if not chosen.serves:
+        raise UsageError(f"`transport`: {chosen.name} is a client alone; start the server of which it is one")
     for other, _ in TRANSPORTS.loaded():
         if stray := [each for each in getattr(config, other, Options()).given() if each not in served_options(chosen)]:
             raise UsageError(f"`{stray[0]}` is no option of {chosen.name}; it has {', '.join(served_options(chosen))}")

@@ -280,6 +280,9 @@ class RequestsConfig(Options):
             raise UsageError(f"`resize`: {pipeline.payload} is what the camera gave; use `payload` raw, jpeg or png")
         if self.state and not pipeline.capabilities.accepts_state:
             raise UsageError(f"`state`: a request of {pipeline.name} has no place for it; leave one of them out")
+        if not (pipeline.transport.serves or pipeline.black_box):
+            scheme = pipeline.transport.urls.schemes[0]
+            raise UsageError(f"`transport` {pipeline.name} is a client alone: name its `url`, {scheme}://HOST:PORT")
         chosen = Choice(pipeline.options, pipeline.variant, self.mode, self.engine.name, self.cameras, self.state)
         pipeline.transport.require(chosen)
         require_payload(pipeline)
@@ -308,7 +311,7 @@ class RequestsConfig(Options):
             raise UsageError(f"`{name}`: in `mode` stream one camera runs, whose frames are sent as they are")
 
     def _check_unused(self) -> None:
-        """Refuse an external server that no cell uses, and a model that no server loads."""
+        """Refuse an external server or a template that no cell uses, and a model that no server loads."""
         used = {(each.transport.name, each.options.external) for each in self.pipelines}
         for name, given in self.options:
             transport, field = TRANSPORTS[name], given.external
@@ -317,6 +320,9 @@ class RequestsConfig(Options):
                 able = [each for each in variants if transport.capabilities(Choice(given, each)).options.external]
                 fit = [f"{name}/{each}" for each in able]
                 raise UsageError(f"`{field}` needs {' or '.join(fit) or name} among `transport`")
+        templates = [each.options for each in self.pipelines if "template" in each.options.model_fields_set]
+        if templates and not any(options.template_name for options in templates):
+            raise UsageError("`template` is about a server that runs already; name it with `url`")
         if (given := self.engine.of_model) and not self.reads_model:
             raise UsageError(f"`{given}`: no server of this run loads a model; leave it out with `{self.foreign}`")
 

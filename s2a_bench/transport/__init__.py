@@ -113,6 +113,11 @@ class TransportOptions(base.Options):
         return None
 
     @property
+    def template_name(self) -> str:
+        """Return the template of its observations, empty where it makes none."""
+        return ""
+
+    @property
     def tuned(self) -> bool:
         """Whether processes are tuned: they keep large blocks of memory for the next picture, for example."""
         return True
@@ -293,13 +298,15 @@ class Transport(Generic[O]):
     """Codes of the checks that matter before a run that sends large pictures by UDP, whose packets can be lost."""
     in_process: ClassVar[bool] = False
     """Whether its server is a thread of the client's process."""
+    serves: ClassVar[bool] = True
+    """Whether it has a server of ours; else it is a client alone."""
     urls: ClassVar[Urls] = Urls()
 
     def client(self, wiring: Wiring[O], alive: Callable[[], bool]) -> Client:
         raise NotImplementedError
 
-    def server(self, wiring: Wiring[O], handler: Handler) -> Server:  # noqa: ARG002 - for those that have one
-        raise UsageError(f"`transport`: {self.name} is a client alone; name a server that runs already with `url`")
+    def server(self, wiring: Wiring[O], handler: Handler) -> Server:
+        raise NotImplementedError
 
     def measured(self, choice: Choice[O]) -> Sequence[str]:  # noqa: ARG002 - for those whose variants depend on it
         return self.variants[:1] or ("",)

@@ -41,7 +41,7 @@ class PolicyTransport(Transport[P]):
     """Modules that the extra installs."""
     client_class: ClassVar[str]
     """``module:class`` of its `PolicyClient`."""
-    server_class: ClassVar[str] = ""
+    server_class: ClassVar[str]
 
     def client(self, wiring: Wiring[P], alive: Callable[[], bool]) -> Client:
         """Prepare to ask the server at ``wiring.address``, a URL."""
@@ -51,8 +51,6 @@ class PolicyTransport(Transport[P]):
 
     def server(self, wiring: Wiring[P], handler: Handler) -> Server:
         """Bind ``host:port``; raises PortInUse."""
-        if not self.server_class:
-            return super().server(wiring, handler)
         extras.need(self.extra, *self.modules)
         bound: Server = resolve_name(self.server_class)(wiring, handler)
         return bound

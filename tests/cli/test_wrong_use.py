@@ -72,6 +72,10 @@ WRONG = {
             "--template droid wants 2; use --cameras 2",
         ),
         ("--transport websocket --template nope", "--template: 'nope' is none of aloha, droid"),
+        ("--transport http,ros --template openvla-oft", "--template is about a server that runs already"),
+        ("--transport grpc", "--transport grpc/lerobot is a client alone: name its --url, grpc://HOST:PORT"),
+        ("--transport grpc --url ws://h:1", "is a client alone: name its --url, grpc://HOST:PORT"),
+        ("--url grpc://h:1 --policy-type act --pretrained x", "--state: --template lerobot: state wants"),
         ("--output /dev/null", "/dev/null is not a folder; name another one", 1),
         ("--profile rtx-4080", "--profile needs --engine replay; --engine llama answers at its own speed"),
         ("--engine replay --profile rtx-4080 --gaps trace", "profile rtx-4080 holds no recording"),
@@ -98,6 +102,7 @@ WRONG = {
     ],
     "serve": [
         ("pigeon", "--transport: 'pigeon' is none of http, ros, loopback"),
+        ("grpc", "--transport: grpc is a client alone"),
         ("http --port 99999", "--port: 99999 should be less than or equal to 65535"),
         ("http --model /no/such", "--model /no/such: no such file; check the path", 1),
         ("http --ros-args -r a:=b", "--ros-args are for ROS 2 nodes, not for serve http"),

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Final
 import pytest
 
 from s2a_bench.testing.transport import TransportSuite, wiring_of
-from s2a_bench.transport import PAYLOADS, Transport, Wiring, paths
+from s2a_bench.transport import PAYLOADS, Wiring, paths
 from s2a_bench.transport.http import LLAMA_SERVER
 from s2a_bench.transport.pipeline import Pipeline, pipelines
 
@@ -16,8 +16,7 @@ ENCODED: Final = [payload for payload in PAYLOADS if payload != "jpeg-preencoded
 OURS: Final = [
     pipeline
     for pipeline in pipelines(paths(), payloads=ENCODED, strict=False, mode="request")
-    if type(pipeline.transport).server is not Transport.server  # a client alone
-    and pipeline.variant != LLAMA_SERVER  # llama.cpp's own program
+    if pipeline.transport.serves and pipeline.variant != LLAMA_SERVER  # llama.cpp's own program
 ]
 OF_LLAMA_SERVER, OF_ACTIONS = frozenset({"ingest"}), frozenset({"accept"})
 PECULIAR: Final[dict[tuple[str, str], dict[str, Any]]] = {

@@ -23,7 +23,7 @@ from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import Connect, TransportSuite, ask, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Choice, Client, Handler, Wiring, open_client, open_server
+from s2a_bench.transport import Choice, Client, Handler, Wiring, open_client
 from s2a_bench.transport.grpc import GRPC, PAYLOAD_DOWN_BYTES, GrpcOptions
 from s2a_bench.transport.grpc.pickles import OPCODES, chunk_in
 from s2a_bench.types import Action, Frame, Request
@@ -241,11 +241,6 @@ class TestOtherServers:
 
 
 MISUSES = {
-    "no server": (
-        {"pretrained": "x", "policy_type": "act"},
-        1,
-        "a client alone; name its server: `url` grpc://HOST:PORT",
-    ),
     "no policy": ({"url": "grpc://a:1", "policy_type": "act"}, 1, "give `policy_type` and `pretrained`"),
     "no type": ({"url": "grpc://a:1", "pretrained": "x"}, 1, "give `policy_type` and `pretrained`"),
     "cameras": ({"url": "grpc://a:1", "pretrained": "x", "policy_type": "act"}, 5, "has places for 4"),
@@ -254,7 +249,7 @@ MISUSES = {
 
 
 @pytest.mark.parametrize(("options", "cameras", "says"), MISUSES.values(), ids=MISUSES)
-def test_a_choice_without_its_server_or_policy_is_refused(options: dict[str, str], cameras: int, says: str) -> None:
+def test_a_choice_without_a_policy_or_its_needs_is_refused(options: dict[str, str], cameras: int, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         GRPC.require(Choice(GrpcOptions(**options), cameras=cameras))
 
@@ -263,11 +258,6 @@ def test_a_choice_without_its_server_or_policy_is_refused(options: dict[str, str
 def test_other_urls_are_refused(url: str) -> None:
     with pytest.raises(UsageError, match="url"):
         GrpcOptions(url=url)
-
-
-def test_it_serves_nobody() -> None:
-    with pytest.raises(UsageError, match="`transport`: grpc is a client alone"):
-        open_server(wiring_of("grpc"), lambda *_: iter(()))  # type: ignore[arg-type,return-value]
 
 
 def test_a_template_with_what_lerobot_does_not_take_is_refused(tmp_path: Path) -> None:

@@ -39,6 +39,7 @@ class Grpc(PolicyTransport[GrpcOptions]):
     name = "grpc"
     options = GrpcOptions
     variants = (LEROBOT,)
+    serves = False
     payloads = ("raw",)
     stages: ClassVar[dict[str, str]] = {"pickle_pack": "pack", "send": "network", "pickle_parse": "parse"}
     urls = Urls(GrpcOptions.SCHEMES, examine="s2a_bench.transport.grpc.risks:examine")
@@ -51,12 +52,8 @@ class Grpc(PolicyTransport[GrpcOptions]):
     packages = ("grpcio",)
 
     def require(self, choice: Choice[GrpcOptions]) -> None:
-        """Refuse a choice without a server or a policy, and an observation that lerobot does not take."""
+        """Refuse a choice without a policy, and an observation that lerobot does not take."""
         options = choice.options
-        if not options.url:
-            raise UsageError(
-                f"`transport` {self.name}/{LEROBOT} is a client alone; name its server: `url` grpc://HOST:PORT"
-            )
         if not (options.policy_type and options.pretrained):
             raise UsageError(
                 "`pretrained`: lerobot's server loads what its client names; give `policy_type` and `pretrained`"

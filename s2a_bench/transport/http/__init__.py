@@ -114,7 +114,7 @@ class Http(Transport[HttpOptions]):
         from s2a_bench.transport.http.dialects import open_dialect
 
         possible = (options.spoken,) if options.spoken else ("openai", *OWNERS.values())
-        dialects = [open_dialect(name, options.observation) for name in possible]
+        dialects = [open_dialect(name, options.template_name) for name in possible]
         return replace(
             can,
             payloads=jpeg if choice.variant == LLAMA_SERVER else dialects[0].payloads,
@@ -125,10 +125,10 @@ class Http(Transport[HttpOptions]):
 
     def require(self, choice: Choice[HttpOptions]) -> None:
         variant, options = choice.variant, choice.options
-        if options.observation:
+        if options.template_name:
             from s2a_bench.transport.http.dialects import open_dialect
 
-            open_dialect(options.dialect, options.observation).check(choice.cameras, choice.state)
+            open_dialect(options.dialect, options.template_name).check(choice.cameras, choice.state)
         if options.url and variant in {BINARY, LLAMA_SERVER}:
             raise UsageError(f"`transport` {self.name}/{variant} needs our own server; leave it out with `url`")
         if variant == LLAMA_SERVER:

@@ -41,7 +41,7 @@ def met(base: str, key: str, options: HttpOptions) -> tuple[Dialect, str, str]:
         if not spoken:
             owner, first = first_model(base, getter(client, open_dialect("openai").authorization(key) if key else {}))
             spoken, model = OWNERS.get(owner, "openai"), model or first or NO_MODEL
-        dialect = open_dialect(spoken, options.observation)
+        dialect = open_dialect(spoken, options.template_name)
         base, model = dialect.met(base, model, getter(client, dialect.authorization(key) if key else {}))
     return dialect, dialect.url(base, model), model
 

@@ -101,8 +101,8 @@ class HttpOptions(WebOptions):
         return "llama-server" if self.llama_server else self.dialect
 
     @property
-    def observation(self) -> str:
-        """The template of requests to the url; our own server reads no observations."""
+    def template_name(self) -> str:
+        """Return the template of requests to the url; our own server reads no observations."""
         return self.template if self.url else ""
 
     @property
