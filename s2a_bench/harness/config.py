@@ -265,10 +265,6 @@ class RequestsConfig(Options):
             raise UsageError(f"`record`: {self.record} exists already and is not overwritten; name another")
         for pipeline in self.pipelines:
             self._check(pipeline)
-        running = [each for each in self.pipelines if each.options.external_address]
-        if self.launches > 1 and running:
-            field = running[0].options.external
-            raise UsageError(f"`launches`: a server that runs already cannot be started afresh; leave out `{field}`")
         if self.engine.kind.plays and self.foreign:
             raise UsageError(f"`engine` {self.engine.name} needs our own servers; leave out `{self.foreign}`")
         if self.engine.latency and self.foreign:

@@ -159,6 +159,11 @@ class _Run:
         plan, warnings = self.plan, self.warnings
         watches_udp = any(cell.transport.udp_checks for cell in plan.cells)
         warnings += before_run(plan.checks, Machine(output=self.writer.path))
+        kept = ", ".join(cell.name for cell in plan.cells if cell.options.external_address)
+        if kept and plan.blocks.launches > 1:
+            what = f"the server of {kept} ran on through all launches, of which its clients alone started afresh"
+            advice = "start the server again between runs, and compare these, to see how its own launches differ"
+            warnings.append(RunWarning("same-server", what, advice))
         before = Counters.read(watches_udp=watches_udp)
         self.writer.update(warnings=[warning.to_manifest() for warning in warnings])
         try:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import pytest
-
-from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.harness.plan import BlocksPlan
@@ -66,8 +63,3 @@ def test_blocks_count_on_over_launches() -> None:
         (1, 4, False),
         (1, 5, False),
     ]
-
-
-def test_a_server_that_runs_already_has_one_launch() -> None:
-    with pytest.raises(UsageError, match=r"`launches`: a server that runs already .*; leave out `url`"):
-        LatencyConfig(transports=("http/best-effort?url=http://x",), launches=2)

@@ -340,10 +340,20 @@ def test_a_damaged_pickle_is_read_or_refused() -> None:
 def test_a_run_has_its_stages_and_facts(tmp_path: Path) -> None:
     with policy() as (server, url):
         options = {"grpc": {"url": url, "policy_type": "act", "pretrained": "me/act"}}
-        few: dict[str, Any] = {"requests": 4, "warmup": 1, "size": (64, 48), "state": 2, "sample_resources_hz": 0}
+        few: dict[str, Any] = {
+            "requests": 4,
+            "warmup": 1,
+            "launches": 2,
+            "size": (64, 48),
+            "state": 2,
+            "sample_resources_hz": 0,
+        }
         config = LatencyConfig(transports=("loopback", "grpc"), engine={"name": "echo"}, options=options, **few)
         run = read_run(run_latency(config, tmp_path, NullProgress()))
-    assert len(server.policies) == 1
+    assert len(server.policies) == 2  # a launch has a client of its own
+    assert run.samples.groupby("launch").size().tolist() == [10, 10]
+    (same,) = [each["message"] for each in run.manifest["warnings"] if each["code"] == "same-server"]
+    assert same.startswith("the server of grpc/lerobot ran on")
     assert (run.samples["error"] == "").all()
     assert {"pickle_pack": "pack", "send": "network", "pickle_parse": "parse"}.items() <= dict(run.stages).items()
     assert {"payload_bytes", "payload_down_bytes", "get_actions_ms"} <= set(run.manifest["facts"])
