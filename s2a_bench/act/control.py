@@ -1,4 +1,4 @@
-"""Act on chunks of actions: a loop at control rate, on its own thread, that nothing blocks.
+"""Act on chunks of actions: robots at control rate, on one thread that nothing blocks.
 
 Ticks begin at fixed times. A tick depends on what had arrived by its time, not by the time the thread woke up: requests
 see what had arrived when the tick began; an action leaves at the end of its tick if d is the floor of latency over
@@ -9,6 +9,7 @@ control tick, at its start if d is the ceiling (`policy.chunks.Rounding`). So th
 from __future__ import annotations
 
 import gc
+import heapq
 import sys
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -56,18 +57,19 @@ class Acted:
         return next(missing, len(self.arrival_ns))
 
 
-class ControlLoop:
-    """One robot that acts on chunks for ``ticks`` control ticks."""
+class RobotTicks:
+    """One robot that acts on chunks for ``ticks`` control ticks; `ControlLoop` steps it when a tick is due."""
 
     def __init__(
-        self, mode: Mode, setting: ControlSetting, send: Send, ask: RequestChunk, ticks: int, clock: Clock | None = None
+        self, mode: Mode, setting: ControlSetting, send: Send, ask: RequestChunk, ticks: int, phase_ns: int = 0
     ) -> None:
+        """Begin the first tick ``phase_ns`` after the loop's start."""
         self.stepper, self._setting = mode.stepper(setting), setting
         self._weight = mode.weight
         self._blended: deque[Vector] = deque()
         self._send, self._ask = send, ask
         self._ticks = ticks
-        self._clock = clock or SystemClock()
+        self._phase_ns = phase_ns
         self._inbox: deque[tuple[int, int, int]] = deque()
         self._actions: dict[int, Sequence[Vector]] = {}
         self._executing = 0
@@ -78,25 +80,30 @@ class ControlLoop:
         """Each tick's request and index, -1 for no action, and its lateness in ns."""
         self._busy: list[int] = []
         self._start_ns = 0
-        self._stopped = False
-        self._failure: BaseException | None = None
-        self._thread = Thread(target=self._guarded, name="control", daemon=True)
+        self._tick = 0
 
-    def start(self) -> None:
-        self._start_ns = self._clock.now_ns() + HEAD_START_NS
-        self._thread.start()
+    def begin(self, start_ns: int) -> int:
+        """Return the time of the first tick of a loop that starts at ``start_ns``."""
+        self._start_ns = start_ns + self._phase_ns
+        return self._start_ns
 
-    def stop(self) -> None:
-        self._stopped = True
-
-    def join(self, timeout_s: float | None = None) -> bool:
-        """Wait for the end and return whether it is reached; raises what the loop raised."""
-        self._thread.join(timeout_s)
-        if self._thread.is_alive():
-            return False
-        if self._failure is not None:
-            raise self._failure
-        return True
+    def step(self, begins_ns: int, clock: Clock) -> int | None:
+        """Make the tick that begins at ``begins_ns`` and return when the next one does; None after the last."""
+        woke_ns, tick, floor = clock.now_ns(), self._tick, self._setting.rounding == "floor"
+        if floor and tick:
+            self._deliver(begins_ns, tick - 1)
+            self._act(tick - 1, begins_ns, clock)
+        if tick < self._ticks:
+            self._deliver(begins_ns + 1, tick)
+            if self.stepper.ask(tick):
+                self._request_ticks.append(tick)
+                self._ask(len(self._request_ticks) - 1, tick)
+            if not floor:
+                self._deliver(begins_ns + 1, tick)
+                self._act(tick, begins_ns, clock)
+        self._busy.append(clock.now_ns() - woke_ns)
+        self._tick += 1
+        return begins_ns + self._setting.period_ns if self._tick < self._ticks + floor else None
 
     def arrived(self, request: int, actions: Sequence[Vector], at_ns: int) -> None:
         """Deliver, from any thread, the ``actions`` of a chunk that have arrived so far, of shape (D,) each.
@@ -111,51 +118,20 @@ class ControlLoop:
             self._actions[request] = actions
         self._inbox.append((at_ns, request, len(actions)))
 
-    def run(self) -> None:
-        period_ns, floor = self._setting.period_ns, self._setting.rounding == "floor"
-        for tick in range(self._ticks + floor):
-            begins_ns = self._start_ns + tick * period_ns
-            self._clock.sleep_until_ns(begins_ns)
-            if self._stopped:
-                return
-            woke_ns = self._clock.now_ns()
-            if floor and tick:
-                self._deliver(begins_ns, tick - 1)
-                self._act(tick - 1, begins_ns)
-            if tick < self._ticks:
-                self._deliver(begins_ns + 1, tick)
-                if self.stepper.ask(tick):
-                    self._request_ticks.append(tick)
-                    self._ask(len(self._request_ticks) - 1, tick)
-                if not floor:
-                    self._deliver(begins_ns + 1, tick)
-                    self._act(tick, begins_ns)
-            self._busy.append(self._clock.now_ns() - woke_ns)
-
     def acted(self) -> Acted:
-        """Return the record, after the last call of `arrived`."""
+        """Return the record so far; while the loop runs, that of the ticks that have ended."""
         import numpy as np
 
-        request_tick, horizon = np.array(self._request_ticks, np.int64), self._setting.horizon
+        acts, horizon = np.array(self._acts[:], np.int64).reshape(-1, 3), self._setting.horizon
+        request_tick = np.array(self._request_ticks[:], np.int64)
         arrival_ns = np.full((request_tick.size, horizon), -1)
-        for request, times in self._arrivals.items():
+        for request in range(request_tick.size):
+            times = self._arrivals.get(request, ())[:horizon]
             began_ns = self._start_ns + self._request_ticks[request] * self._setting.period_ns
-            arrival_ns[request, : len(times)] = np.array(times[:horizon]) - began_ns
-        chunk, index, late_ns = np.array(self._acts, np.int64).reshape(-1, 3).T
-        busy_ns = np.array(self._busy[: len(self._acts)], np.int64)
+            arrival_ns[request, : len(times)] = np.array(times, np.int64) - began_ns
+        chunk, index, late_ns = acts.T
+        busy_ns = np.array(self._busy[: len(acts)], np.int64)
         return Acted(self._start_ns, chunk, index, late_ns, busy_ns, request_tick, arrival_ns)
-
-    def _guarded(self) -> None:
-        gc.freeze()  # no garbage collection of existing objects between two ticks
-        switch_s = sys.getswitchinterval()
-        sys.setswitchinterval(SWITCH_S)
-        try:
-            self.run()
-        except BaseException as error:  # noqa: BLE001 - `join` raises it again
-            self._failure = error
-        finally:
-            sys.setswitchinterval(switch_s)
-            gc.unfreeze()
 
     def _deliver(self, before_ns: int, tick: int) -> None:
         """Pass the stepper what had arrived before a time; the next call passes what was delivered late."""
@@ -175,7 +151,7 @@ class ControlLoop:
             weight * new + (1 - weight) * left[index] if index < len(left) else new for index, new in enumerate(due)
         )
 
-    def _act(self, tick: int, due_ns: int) -> None:
+    def _act(self, tick: int, due_ns: int, clock: Clock) -> None:
         action = self.stepper.act(tick)
         value = None
         if action is not None:
@@ -185,4 +161,59 @@ class ControlLoop:
                 self._executing += 1
         self._send(value, due_ns)
         request, index = (-1, -1) if action is None else (action.request, action.index)
-        self._acts.append((request, index, self._clock.now_ns() - due_ns))
+        self._acts.append((request, index, clock.now_ns() - due_ns))
+
+
+class ControlLoop:
+    """One thread that steps robots, each when its tick is due."""
+
+    def __init__(self, robots: Sequence[RobotTicks], clock: Clock | None = None) -> None:
+        self._robots = robots
+        self._clock = clock or SystemClock()
+        self._start_ns = 0
+        self._stopped = False
+        self._failure: BaseException | None = None
+        self._thread = Thread(target=self._guarded, name="control", daemon=True)
+
+    def start(self, start_ns: int | None = None) -> None:
+        """Start at a time of the clock; None: in `HEAD_START_NS`."""
+        self._start_ns = self._clock.now_ns() + HEAD_START_NS if start_ns is None else start_ns
+        self._thread.start()
+
+    def stop(self) -> None:
+        self._stopped = True
+
+    def join(self, timeout_s: float | None = None) -> bool:
+        """Wait for the end and return whether it is reached; raises what the loop raised."""
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            return False
+        if self._failure is not None:
+            raise self._failure
+        return True
+
+    def run(self) -> None:
+        due = [(robot.begin(self._start_ns), place) for place, robot in enumerate(self._robots)]
+        heapq.heapify(due)
+        while due:
+            begins_ns, place = due[0]
+            self._clock.sleep_until_ns(begins_ns)
+            if self._stopped:
+                return
+            next_ns = self._robots[place].step(begins_ns, self._clock)
+            if next_ns is None:
+                heapq.heappop(due)
+            else:
+                heapq.heapreplace(due, (next_ns, place))
+
+    def _guarded(self) -> None:
+        gc.freeze()  # no garbage collection of existing objects between two ticks
+        switch_s = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCH_S)
+        try:
+            self.run()
+        except BaseException as error:  # noqa: BLE001 - `join` raises it again
+            self._failure = error
+        finally:
+            sys.setswitchinterval(switch_s)
+            gc.unfreeze()

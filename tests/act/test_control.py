@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from s2a_bench.act.control import SWITCH_S, Acted, ControlLoop
+from s2a_bench.act.control import SWITCH_S, Acted, ControlLoop, RobotTicks
 from s2a_bench.clock import SystemClock, VirtualClock, now_ns
 from s2a_bench.policy.chunks import ControlSetting, mode
 from s2a_bench.policy.chunks.cycles import NEVER, follow
@@ -51,18 +51,18 @@ def act(written: str, setting: ControlSetting, latency_ns: list[int], clock: Vir
 
     def ask(request: int, tick: int) -> None:
         if not start_ns:
-            start_ns.append(loop.acted().start_ns)
+            start_ns.append(robot.acted().start_ns)
         if request < len(latency_ns):
             began_ns = start_ns[0] + tick * setting.period_ns + latency_ns[request]
             if chosen.streams:
                 for place in range(setting.horizon):
-                    loop.arrived(request, actions[: place + 1], began_ns + place * chosen.gap_ns)
+                    robot.arrived(request, actions[: place + 1], began_ns + place * chosen.gap_ns)
             else:
-                loop.arrived(request, actions, began_ns)
+                robot.arrived(request, actions, began_ns)
 
-    loop = ControlLoop(chosen, setting, lambda *_: None, ask, ticks, clock)
-    loop.run()
-    return loop.acted()
+    robot = RobotTicks(chosen, setting, lambda *_: None, ask, ticks)
+    ControlLoop([robot], clock).run()
+    return robot.acted()
 
 
 @pytest.mark.parametrize("written", MODES)
@@ -102,16 +102,17 @@ def test_a_chunk_that_never_comes_ends_what_is_decided() -> None:
 def test_robot_is_sent_each_action_and_each_stall() -> None:
     setting, sent = ControlSetting(2_000_000, 3), []
     chunk = [np.full(2, place, np.float32) for place in range(3)]
-    loop = ControlLoop(
+    robot = RobotTicks(
         mode("sync"),
         setting,
         lambda action, due_ns: sent.append((None if action is None else float(action[0]), due_ns)),
-        lambda request, _: loop.arrived(request, chunk, now_ns() + 3_000_000),
+        lambda request, _: robot.arrived(request, chunk, now_ns() + 3_000_000),
         ticks=10,
     )
+    loop = ControlLoop([robot])
     loop.start()
     assert loop.join(10)
-    acted = loop.acted()
+    acted = robot.acted()
     assert len(sent) == 10
     assert [value for value, _ in sent] == [None if place < 0 else float(place) for place in acted.index]
     assert {late - early for (_, early), (_, late) in pairwise(sent)} == {2_000_000}
@@ -127,10 +128,10 @@ def test_overlapping_actions_are_blended_as_virtual_time_says() -> None:
     def ask(request: int, tick: int) -> None:
         if request < len(chunks):
             began_ns = tick * PERIOD_NS
-            loop.arrived(request, list(chunks[request]), began_ns + int(latency_ns[request]))
+            robot.arrived(request, list(chunks[request]), began_ns + int(latency_ns[request]))
 
-    loop = ControlLoop(chosen, setting, lambda action, _: sent.append(action), ask, 80, VirtualClock())
-    loop.run()
+    robot = RobotTicks(chosen, setting, lambda action, _: sent.append(action), ask, 80)
+    ControlLoop([robot], VirtualClock()).run()
     cycles, ticks = follow(chosen, np.repeat(latency_ns[:, np.newaxis], HORIZON, axis=1), setting)
     expected = np.full((cycles.ticks, 2), np.nan)
     for tick, chunk, index, share in chosen.blend(cycles, ticks):
@@ -148,7 +149,7 @@ def test_failure_of_a_robot_reaches_who_waits_and_the_interpreter_is_as_before()
         raise ValueError("the arm fell off")
 
     setting = ControlSetting(1_000_000, 3)
-    loop = ControlLoop(mode("sync"), setting, broken, lambda *_: None, 10)
+    loop = ControlLoop([RobotTicks(mode("sync"), setting, broken, lambda *_: None, 10)])
     loop.start()
     with pytest.raises(ValueError, match="fell off"):
         loop.join(10)
@@ -159,7 +160,8 @@ def test_failure_of_a_robot_reaches_who_waits_and_the_interpreter_is_as_before()
 def test_stop_ends_it_before_its_time() -> None:
     request_left = Event()
     setting = ControlSetting(1_000_000, 3)
-    loop = ControlLoop(mode("sync"), setting, lambda *_: None, lambda *_: request_left.set(), 10**9, SystemClock())
+    robot = RobotTicks(mode("sync"), setting, lambda *_: None, lambda *_: request_left.set(), 10**9)
+    loop = ControlLoop([robot], SystemClock())
     loop.start()
     assert request_left.wait(10)
     assert not loop.join(0.001)
@@ -173,11 +175,32 @@ def test_what_was_told_before_is_passed_over_and_old_chunks_are_forgotten() -> N
 
     def ask(request: int, tick: int) -> None:
         for chunk in (one, other):
-            loop.arrived(request, chunk, tick * PERIOD_NS)
+            robot.arrived(request, chunk, tick * PERIOD_NS)
 
-    loop = ControlLoop(
-        mode("replace?execute=2"), setting, lambda action, _: sent.append(action), ask, 300, VirtualClock()
-    )
-    loop.run()
+    robot = RobotTicks(mode("replace?execute=2"), setting, lambda action, _: sent.append(action), ask, 300)
+    ControlLoop([robot], VirtualClock()).run()
     assert {float(action[0]) for action in sent} == {1.0}
-    assert len(loop._actions) < 3
+    assert len(robot._actions) < 3
+
+
+def test_robots_of_one_loop_act_as_each_alone_does() -> None:
+    setting, action = ControlSetting(PERIOD_NS, HORIZON), [np.zeros(1, np.float32)] * HORIZON
+    latency_ns = [PERIOD_NS // 2, 3 * PERIOD_NS]
+    phases_ns = [0, PERIOD_NS // 3]
+
+    def robot(place: int) -> RobotTicks:
+        def ask(request: int, tick: int) -> None:
+            began_ns = phases_ns[place] + tick * PERIOD_NS
+            made.arrived(request, action, began_ns + latency_ns[place])
+
+        made = RobotTicks(mode("queue?trigger=2"), setting, lambda *_: None, ask, 50, phases_ns[place])
+        return made
+
+    together = [robot(place) for place in range(2)]
+    ControlLoop(together, VirtualClock()).run()
+    for place, each in enumerate(together):
+        alone = robot(place)
+        ControlLoop([alone], VirtualClock()).run()
+        assert each.acted().start_ns == phases_ns[place]
+        np.testing.assert_array_equal(each.acted().chunk, alone.acted().chunk)
+        np.testing.assert_array_equal(each.acted().arrival_ns, alone.acted().arrival_ns)

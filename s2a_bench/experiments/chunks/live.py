@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.act import open_robot
-from s2a_bench.act.control import ControlLoop
+from s2a_bench.act.control import ControlLoop, RobotTicks
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.chunks.build_rows import stall_metrics, stalls_of, write_cell
 from s2a_bench.experiments.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes
 from s2a_bench.experiments.chunks.config import PROMISING
 from s2a_bench.experiments.chunks.latencies import Source, delay_rows, measured, write_delays
-from s2a_bench.experiments.chunks.requester import ChunkRequester, Job
 from s2a_bench.experiments.chunks.smooth import MOST_TICKS, smoothness
 from s2a_bench.harness.plan import resolve
+from s2a_bench.harness.requester import ChunkRequester, Job
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Session
 from s2a_bench.harness.warnings import exchange_warnings
@@ -172,11 +172,11 @@ def _drive(config: ChunksConfig, launch: RunningLaunch) -> None:
         robot = open_robot(config.robot, dims, setting.period_ns) if config.robot else None
         with nullcontext() if robot is None else closing(robot):
             launch.writer.update(robot={} if robot is None else robot.describe())
-            loop, requester = _run(
+            acting, requester = _run(
                 config, cell.acting, setting, sessions, launch, blocks, ticks=ticks, streams=streams, robot=robot
             )
-            triggers = tuple(loop.stepper.triggers)
-            live = LiveResult(cell, setting, sessions[0], loop.acted(), requester, robot, triggers)
+            triggers = tuple(acting.stepper.triggers)
+            live = LiveResult(cell, setting, sessions[0], acting.acted(), requester, robot, triggers)
             write(config, launch.writer, live)
             seen_ns = live.judged.drawn.judged
             if cell.rule in PROMISING and (changed := changes(config, cell.cell, cell.drawn.learnt, seen_ns)):
@@ -197,8 +197,8 @@ def _warm_up(
     latency_ns, dims = [np.empty(0, np.int64)], 0
     for session in sessions:
         warmup = launch.plan.blocks.warmup
-        loop, requester = _run(config, mode(ONE_BY_ONE), setting, [session], launch, blocks, warmup=warmup)
-        arrival_ns, dims = loop.acted().arrival_ns[:, 0], dims or requester.dims
+        acting, requester = _run(config, mode(ONE_BY_ONE), setting, [session], launch, blocks, warmup=warmup)
+        arrival_ns, dims = acting.acted().arrival_ns[:, 0], dims or requester.dims
         latency_ns.append(arrival_ns[arrival_ns >= 0])
         error = requester.error
     if not dims:
@@ -208,7 +208,7 @@ def _warm_up(
 
 def _run(
     config: ChunksConfig,
-    acting: Mode,
+    chosen: Mode,
     setting: ControlSetting,
     sessions: Sequence[Session],
     launch: RunningLaunch,
@@ -218,12 +218,12 @@ def _run(
     streams: bool = False,
     robot: ActionRobot | None = None,
     warmup: int = 0,
-) -> tuple[ControlLoop, ChunkRequester]:
+) -> tuple[RobotTicks, ChunkRequester]:
     """Act for ``ticks``, or until ``warmup`` requests have been made; write the requests."""
     sends_state = robot is not None and _accepts_state(config, sessions[0], robot)
 
     def on_actions(request: int, actions: Sequence[Any], at_ns: int) -> None:
-        loop.arrived(request, actions, at_ns)
+        acting.arrived(request, actions, at_ns)
 
     def send(action: Vector | None, at_ns: int) -> None:
         if robot is not None:
@@ -234,7 +234,8 @@ def _run(
     def request_chunk(request: int, tick: int) -> None:
         requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else ()))
 
-    loop = ControlLoop(acting, setting, send, request_chunk, ticks)
+    acting = RobotTicks(chosen, setting, send, request_chunk, ticks)
+    loop = ControlLoop([acting])
     with requester.running():
         try:
             loop.start()
@@ -246,7 +247,7 @@ def _run(
             loop.stop()
     _keep(requester, launch)
     loop.join()
-    return loop, requester
+    return acting, requester
 
 
 def _accepts_state(config: ChunksConfig, session: Session, robot: ActionRobot) -> bool:

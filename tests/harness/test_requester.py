@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.requester import ChunkRequester, Job
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.plan import RequestPlan, resolve
+from s2a_bench.harness.requester import ChunkRequester, Job
 from s2a_bench.harness.session import Measured, Place, RequestContext, Session
 from s2a_bench.types import Action, Vector
 
