@@ -265,7 +265,7 @@ class Tracker:
         return tracker
 
 
-def upper_bound(stalled: int, plans: int, confidence: float) -> float:
+def upper_bound(stalled: float, plans: float, confidence: float) -> float:
     """Return the share x with P(Bin(plans, x) <= stalled) = 1 - confidence (Clopper and Pearson, Biometrika 1934).
 
     The upper end of their two-sided 95 % interval is the bound with confidence 0.975.

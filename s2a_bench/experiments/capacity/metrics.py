@@ -1,0 +1,203 @@
+"""What a robot of a fleet does, measured or simulated, and the metrics of a fleet: one function for both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from s2a_bench.experiments import COUNT, SHARE, TIME, Metric, by_name
+from s2a_bench.policy.conformal import upper_bound
+from s2a_bench.stats.batches import BATCHES, FEWEST_ROWS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from s2a_bench.policy.chunks import ControlSetting, Flags, Ints, Ticks
+
+
+def _time(name: str, title: str, about: str) -> Metric:
+    return Metric(f"{name}_s", "s", title=title, about=about, bounds=(0, None), kind=TIME, optional=True)
+
+
+def _share(name: str, title: str, about: str, better: Any = "lower") -> Metric:
+    return Metric(name, "", better, title, "mean", about, bounds=(0, 1), kind=SHARE, optional=True)
+
+
+def _number(name: str, unit: str, title: str, about: str, better: Any = "neither", **more: Any) -> Metric:
+    return Metric(name, unit, better, title, "mean", about, bounds=(0, None), optional=True, **more)
+
+
+METRICS: Final[Mapping[str, Metric]] = by_name(
+    (
+        _number("requests_per_s", "1/s", "req/s", "Complete answers a second, of all robots.", "higher"),
+        _time("latency_mean", "latency", "From the intended time of a request to its complete answer, the mean."),
+        _time("latency_p50", "p50", "Its median."),
+        _time("latency_p99", "p99", "Its 99th percentile."),
+        _time("ttft_p50", "TTFT p50", "From the intended time of a request to the first piece of its answer."),
+        _time("ttft_p99", "TTFT p99", "Its 99th percentile."),
+        _share("in_time", "in time, %", "Share of the answers that came before the robot had to wait.", "higher"),
+        _share("stalled", "stalled, %", "Share of the due ticks without an action; of the plans, those that stall."),
+        _share("stalled_low", "from", "Its interval, over robots and blocks of time; the lower end."),
+        _share("stalled_high", "to", "The upper end."),
+        _share("stalled_alone", "alone", "The share of one robot alone.", "neither"),
+        _share("stalled_worst", "worst", "The greatest share of a robot."),
+        _time("age_p50", "age p50", "Of the observation behind an executed action, the median."),
+        _time("age_p99", "p99", "Its 99th percentile."),
+        _number("unfair", "", "worst/mean", "The greatest mean latency of a robot over that of all.", "lower"),
+        _number("unanswered", "", "unanswered", "Requests without a complete answer.", "lower", kind=COUNT),
+        _time("late_p99", "late", "Measured: lateness of the generator's own ticks, 99th percentile."),
+        _number("generator_cpu", "cores", "generator", "Measured: CPU time of the generator a second."),
+        _number("server_cpu", "cores", "server", "Measured: CPU time of the server a second."),
+        _share("gpu", "GPU, %", "Measured: utilisation.", "neither"),
+        _number("watts", "W", "W", "Measured: power."),
+    )
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotTrace:
+    """What one robot requested and executed from ``start_ns`` to ``end_ns``, times on the run's clock.
+
+    With episodes a robot has a trace for each of them. A robot without a clock (closed loop) has no ``ticks``.
+    """
+
+    robot: int
+    start_ns: int
+    """When its first tick began; without a clock, when it started."""
+    end_ns: int
+    request_ns: Ints
+    """Intended time of each request, the tick in which its mode wanted it: shape (R,)."""
+    arrival_ns: Ints
+    """Complete answer after the intended time: shape (R,), -1 for none."""
+    ticks: Ticks | None = None
+    first_ns: Ints | None = None
+    """First piece of the answer after the intended time, where it streams: shape (R,), -1 for none."""
+    late_ns: Ints | None = None
+    """Lateness of each tick, or of each request without a clock; None in virtual time."""
+    plan_stalled: Flags | None = None
+    """Whether each plan stalls: shape (R,)."""
+
+
+def measures(
+    traces: Sequence[RobotTrace], setting: ControlSetting, settle_ns: int = 0, *, confidence: float = 0.95
+) -> dict[str, Any]:
+    """Return the metrics of a fleet by column, None for none; each trace counts from ``settle_ns`` after its start.
+
+    Every due tick without an action is stalled, before the first action too: a robot without an answer stands still.
+    """
+    robots = _joined(np.full(trace.request_ns.size, trace.robot) for trace in traces)
+    counts = _joined(trace.request_ns - trace.start_ns >= settle_ns for trace in traces)
+    latency_ns = _joined(trace.arrival_ns for trace in traces)
+    answered = counts & (latency_ns >= 0)
+    seconds = sum(max(0, trace.end_ns - trace.start_ns - settle_ns) for trace in traces) / 1e9
+    of_robot = np.bincount(robots[answered])
+    means = np.bincount(robots[answered], latency_ns[answered])[of_robot > 0] / of_robot[of_robot > 0]
+    first_ns = _joined(trace.first_ns for trace in traces if trace.first_ns is not None)
+    skipped = -(-settle_ns // setting.period_ns)
+    late_ns = _joined(
+        trace.late_ns[skipped if trace.ticks is not None else 0 :] for trace in traces if trace.late_ns is not None
+    )
+    age = _joined(trace.ticks.age[skipped:] for trace in traces if trace.ticks is not None)
+    found: dict[str, Any] = {
+        "requests_per_s": answered.sum() * len({trace.robot for trace in traces}) / seconds if seconds else None,
+        "latency_mean_ns": _mean(latency_ns[answered]),
+        **_quantiles("latency", latency_ns[answered]),
+        **_quantiles("ttft", first_ns[counts & (first_ns >= 0)] if first_ns.size else first_ns),
+        "in_time": _mean(_joined(_in_time(trace.ticks, skipped) for trace in traces)),
+        **_quantiles("age", age[age >= 0] * setting.period_ns),
+        **_stalls(traces, setting, settle_ns, confidence),
+        "unfair": means.max() / latency_ns[answered].mean() if means.any() else None,
+        "unanswered": int((counts & (latency_ns < 0)).sum()),
+        **_quantiles("late", late_ns),
+    }
+    values = {metric: found.get(metric.column) for metric in METRICS.values()}
+    return {
+        metric.column: round(value) if value is not None and metric.column_type is int else value
+        for metric, value in values.items()
+    }
+
+
+def _stalls(
+    traces: Sequence[RobotTrace], setting: ControlSetting, settle_ns: int, confidence: float
+) -> dict[str, float]:
+    """Return the stalled share, its interval and that of the worst robot, of ticks or of plans; empty without any."""
+    robots, at_ns, stalled, runs = [], [], [], 0
+    for trace in traces:
+        if trace.plan_stalled is not None:
+            since_ns, stops = trace.request_ns - trace.start_ns, trace.plan_stalled
+        elif trace.ticks is not None:
+            stops = trace.ticks.chunk < 0
+            since_ns = np.arange(stops.size) * setting.period_ns
+        else:
+            continue
+        stops, since_ns = stops[since_ns >= settle_ns], since_ns[since_ns >= settle_ns]
+        runs += int(np.count_nonzero(np.diff(stops.astype(np.int8), prepend=0) > 0))
+        robots.append(np.full(stops.size, trace.robot))
+        at_ns.append(trace.start_ns + since_ns)
+        stalled.append(stops)
+    of_robot, times, stops = _joined(robots), _joined(at_ns), _joined(stalled)
+    if not stops.size:
+        return {}
+    block = (times - times.min()) * BATCHES // (np.ptp(times) + 1)
+    low, high = share_interval(stops, (block, of_robot), runs, confidence)
+    due = np.bincount(of_robot)
+    worst = (np.bincount(of_robot, stops)[due > 0] / due[due > 0]).max()
+    return {"stalled": float(stops.mean()), "stalled_low": low, "stalled_high": high, "stalled_worst": float(worst)}
+
+
+def share_interval(
+    stalled: Flags, groupings: Sequence[Ints], runs: int, confidence: float = 0.95
+) -> tuple[float, float]:
+    """Return the interval of the share of true values, shape (K,), that follow each other in ``runs``.
+
+    Clopper and Pearson's, with the effective number of values of Korn and Graubard (Survey Methodology 24, 1998). It is
+    the number of values over the mean length of a run, or fewer: as many as show the variance between groups, of which
+    ``groupings`` has one label a value; the grouping with the greater variance counts.
+    """
+    from scipy import stats
+
+    share, side = float(stalled.mean()), (1 + confidence) / 2
+    effective = stalled.size * runs / max(runs, int(stalled.sum())) if runs else float(stalled.size)
+    variance, freedom = 0.0, 1
+    for labels in groupings:
+        size = np.bincount(labels)
+        groups = int((size > 0).sum())
+        if groups >= FEWEST_ROWS:
+            off = np.bincount(labels, stalled) - share * size
+            variance, freedom = max(
+                (variance, freedom), (float(groups / (groups - 1) * (off @ off) / stalled.size**2), groups - 1)
+            )
+    if variance:
+        wider = float(stats.norm.ppf(side) / stats.t.ppf(side, freedom))
+        effective = min(effective, share * (1 - share) / variance * wider**2)
+    hits = share * effective
+    return 1 - upper_bound(effective - hits, effective, side), upper_bound(hits, effective, side)
+
+
+def _in_time(ticks: Ticks | None, skipped: int) -> Flags:
+    """Return for each chunk but the first whether it took over without a stall."""
+    acted = np.flatnonzero(ticks.chunk >= 0) if ticks is not None else np.empty(0, np.int64)
+    if ticks is None or acted.size == 0:
+        return acted > 0
+    later = np.flatnonzero(np.diff(ticks.chunk[acted])) + 1
+    found: Flags = np.diff(acted)[later - 1] == 1
+    return found[acted[later] >= skipped]
+
+
+def _joined(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
+    found = list(parts)
+    return np.concatenate(found) if found else np.empty(0, np.int64)
+
+
+def _quantiles(name: str, values_ns: NDArray[Any]) -> dict[str, float]:
+    if not values_ns.size:
+        return {}
+    p50, p99 = np.quantile(values_ns, (0.5, 0.99)).tolist()
+    return {f"{name}_p50_ns": p50, f"{name}_p99_ns": p99}
+
+
+def _mean(values: NDArray[Any]) -> float | None:
+    return float(values.mean()) if values.size else None
