@@ -92,6 +92,7 @@ def measures(
     counts = _joined(trace.request_ns - trace.start_ns >= settle_ns for trace in traces)
     latency_ns = _joined(trace.arrival_ns for trace in traces)
     answered = counts & (latency_ns >= 0)
+    done = sum(_done(trace, settle_ns) for trace in traces)
     seconds = sum(max(0, trace.end_ns - trace.start_ns - settle_ns) for trace in traces) / 1e9
     of_robot = np.bincount(robots[answered])
     means = np.bincount(robots[answered], latency_ns[answered])[of_robot > 0] / of_robot[of_robot > 0]
@@ -102,14 +103,14 @@ def measures(
     )
     age = _joined(trace.ticks.age[skipped:] for trace in traces if trace.ticks is not None)
     found: dict[str, Any] = {
-        "requests_per_s": answered.sum() * len({trace.robot for trace in traces}) / seconds if seconds else None,
+        "requests_per_s": done * len({trace.robot for trace in traces}) / seconds if seconds else None,
         "latency_mean_ns": _mean(latency_ns[answered]),
         **_quantiles("latency", latency_ns[answered]),
         **_quantiles("ttft", first_ns[counts & (first_ns >= 0)] if first_ns.size else first_ns),
         "in_time": _mean(_joined(_in_time(trace.ticks, skipped) for trace in traces)),
         **_quantiles("age", age[age >= 0] * setting.period_ns),
         **_stalls(traces, setting, settle_ns, confidence),
-        "unfair": means.max() / latency_ns[answered].mean() if means.any() else None,
+        "unfair": float(means.max() / latency_ns[answered].mean()) if means.any() else None,
         "unanswered": int((counts & (latency_ns < 0)).sum()),
         **_quantiles("late", late_ns),
     }
@@ -118,6 +119,13 @@ def measures(
         metric.column: round(value) if value is not None and metric.column_type is int else value
         for metric, value in values.items()
     }
+
+
+def _done(trace: RobotTrace, settle_ns: int) -> int:
+    """Return the number of answers between the settling time and the end."""
+    at_ns = trace.request_ns + trace.arrival_ns
+    counts = (trace.arrival_ns >= 0) & (at_ns >= trace.start_ns + settle_ns) & (at_ns < trace.end_ns)
+    return int(np.count_nonzero(counts))
 
 
 def _stalls(
