@@ -10,20 +10,17 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
 
 from pydantic import BeforeValidator
 
-from s2a_bench import extras
 from s2a_bench.act import ROBOTS
 from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.chunks.latencies import split
-from s2a_bench.harness.config import FirstVariants
-from s2a_bench.inference import STAND_IN, EngineConfig
+from s2a_bench.harness.config import LiveRequests
+from s2a_bench.inference import STAND_IN
 from s2a_bench.options import Names, Options, group, one_of, option
 from s2a_bench.policy.chunks import COMPARED, MODES, Rounding
 from s2a_bench.policy.conformal import GUARANTEE, Guarantee
 from s2a_bench.text import none_of
-from s2a_bench.transport import TRANSPORTS
-from s2a_bench.transport.defaults import ACTING
 
 if TYPE_CHECKING:
     from s2a_bench.act import ActionKind
@@ -35,29 +32,6 @@ SHOWN: Final = (
     *("prompt", "warmup", "timeout_s", "deadline_s", "sample_resources_hz", "nonce"),
 )
 """The options that are flags of `chunks`."""
-
-
-class LiveRequests(FirstVariants):
-    """The requests of a control loop."""
-
-    COUNTS_TOKENS: ClassVar[str] = ""
-
-    transports: Names = option(
-        ACTING[:1] if all(map(extras.installed, TRANSPORTS[ACTING[0]].packages)) else ACTING[1:],
-        "transports as in latency; several with commas, each with every mode "
-        f"[default: {ACTING[0]}, {ACTING[1]} where its packages are not installed]",
-        flag="transport",
-    )
-    engine: EngineConfig = group(EngineConfig, only=("name", "profile", "gaps", "action_dim"))
-    warmup: int = option(5, "requests before a cell's loop starts, kept and marked", ge=1, le=10**6)
-    sample_resources_hz: float = option(
-        0.0, "readings a second of CPU, memory, GPU and power beside the run; 0: none", flag="sample-resources", ge=0
-    )
-
-    def check(self) -> None:
-        """Check as other requests do, unless none are configured (virtual time)."""
-        if self.model_fields_set:
-            super().check()
 
 
 RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
