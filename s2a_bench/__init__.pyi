@@ -23,7 +23,7 @@ class _Run(TypedDict, total=False):
     progress: Progress | None
     tune: bool
 
-class _ChunksLatencyThroughput(TypedDict, total=False):
+class _CapacityChunksLatencyThroughput(TypedDict, total=False):
     action: str
     actions_per_chunk: int
     api_key_env: str
@@ -59,7 +59,7 @@ class _ChunksLatencyThroughput(TypedDict, total=False):
     transport: _Several[str]
     transports: _Several[str]
 
-class _ChunksLatencyThroughputTimeline(TypedDict, total=False):
+class _CapacityChunksLatencyThroughputTimeline(TypedDict, total=False):
     dialect: str
     nonce: str
     size: str | tuple[int, int]
@@ -68,17 +68,6 @@ class _ChunksLatencyThroughputTimeline(TypedDict, total=False):
     timeout_s: float
     url: str
     warmup: int
-
-class _LatencyThroughput(TypedDict, total=False):
-    context: int
-    flash_attention: str
-    fps: float
-    grammar: str
-    launches: int
-    max_tokens: int
-    mode: Literal["request", "stream"]
-    quick: bool
-    record: str | Path | None
 
 class _Boundary(_Run, total=False):
     jitter: str
@@ -94,6 +83,44 @@ class _Boundary(_Run, total=False):
     t_nom: float
     t_nom_s: float
     tokens_per_skill: _Several[int]
+
+class _Capacity(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
+    action_dim: int
+    batch: str | Path | None
+    closed_loop: bool
+    context: int
+    control_hz: float
+    engine: str
+    episodes: float
+    episodes_s: float
+    flash_attention: str
+    gpu_layers: int
+    horizon: int
+    kv_type: str
+    latency: str | float
+    limit: str
+    looks: int
+    max_tokens: int
+    mmproj: str | Path | None
+    model: str | Path | None
+    modes: _Several[str]
+    pace: float | None
+    plan_every: float | None
+    plan_every_s: float | None
+    predict: str
+    processes: int
+    profile: str
+    robots: str | int
+    rounding: Literal["floor", "ceil"]
+    sampling: str
+    seconds: float
+    seed: int
+    servers: int
+    settle: float | None
+    settle_s: float | None
+    think: float
+    think_s: float
+    threads: int
 
 class _Ccrb(_Run, total=False):
     engine: str
@@ -140,7 +167,7 @@ class _Ccrb(_Run, total=False):
     transport: str
     ttc: bool
 
-class _Chunks(_Run, _ChunksLatencyThroughput, _ChunksLatencyThroughputTimeline, total=False):
+class _Chunks(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
     action_dim: int
     calibration_cycles: int
     control_hz: float
@@ -165,35 +192,53 @@ class _Chunks(_Run, _ChunksLatencyThroughput, _ChunksLatencyThroughputTimeline, 
     slowest: float
     tokens_per_action: int
 
-class _Latency(_Run, _ChunksLatencyThroughput, _ChunksLatencyThroughputTimeline, _LatencyThroughput, total=False):
+class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
     action_dim: int
     answer: Literal["auto", "tokens", "actions"]
+    context: int
     engine: str
+    flash_attention: str
+    fps: float
     gpu_layers: int
+    grammar: str
     horizon: int
     latency: str | float
+    launches: int
+    max_tokens: int
     mmproj: str | Path | None
+    mode: Literal["request", "stream"]
     model: str | Path | None
     profile: str
+    quick: bool
+    record: str | Path | None
     requests: int
     seed: int
     threads: int
 
-class _Throughput(_Run, _ChunksLatencyThroughput, _ChunksLatencyThroughputTimeline, _LatencyThroughput, total=False):
+class _Throughput(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
     batch: int
+    context: int
     engine: str
+    flash_attention: str
+    fps: float
     gpu_layers: int
+    grammar: str
     kv_type: str
+    launches: int
+    max_tokens: int
     mmproj: str | Path | None
+    mode: Literal["request", "stream"]
     model: str | Path | None
     profile: str
+    quick: bool
+    record: str | Path | None
     reference: str | Path | None
     requests: int
     sampling: str
     seed: int
     threads: int
 
-class _Timeline(_Run, _ChunksLatencyThroughputTimeline, total=False):
+class _Timeline(_Run, _CapacityChunksLatencyThroughputTimeline, total=False):
     calibrate: str | Path | None
     calibration_plans: int
     engine: str
@@ -234,6 +279,9 @@ class _Timeline(_Run, _ChunksLatencyThroughputTimeline, total=False):
 
 def boundary(**options: Unpack[_Boundary]) -> Run:
     """Show at which rates and granularities naive execution never stalls: by formula, and by trying every point."""
+
+def capacity(**options: Unpack[_Capacity]) -> Run:
+    """Find how many robots one server carries, each with its control clock: measured, or predicted."""
 
 def ccrb(**options: Unpack[_Ccrb]) -> Run:
     """Drive car-to-car rear braking with a car behind, under each policy, in virtual time: who hits whom, and when."""

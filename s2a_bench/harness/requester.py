@@ -71,7 +71,7 @@ class ChunkRequester:
     def running(self) -> Iterator[None]:
         """Serve jobs during the block and until the last answer; for at most `GRACE_S` more if the block raises."""
         threads = [
-            Thread(target=self._work, args=(session,), name=f"requester-{place}", daemon=True)
+            Thread(target=self.work, args=(session,), name=f"requester-{place}", daemon=True)
             for place, session in enumerate(self.sessions)
         ]
         for thread in threads:
@@ -88,7 +88,8 @@ class ChunkRequester:
             for thread in threads:
                 thread.join(None if patience_s is None else max(0, until_s - monotonic()))
 
-    def _work(self, session: Session) -> None:
+    def work(self, session: Session) -> None:
+        """Serve jobs on this thread until None or the end of the run."""
         try:
             while (job := self.jobs.get()) is not None and not self.over.is_set():
                 self._ask(session, job)

@@ -32,7 +32,8 @@ from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.schema import Table
 from s2a_bench.trace import mark_cost_ns
-from s2a_bench.transport import Client
+from s2a_bench.transport import Client, Wiring
+from s2a_bench.transport.pipeline import Pipeline
 
 GIVE_UP_AFTER = 5
 """Failures of one cell in a row, after which the run ends."""
@@ -59,6 +60,9 @@ class RunningLaunch:
     progress: Progress
     warnings: list[RunWarning]
     """Warnings of the run besides those about its requests."""
+    wiring: Callable[[Pipeline], Wiring[Any]]
+    """Returns the wiring of further clients of a cell."""
+    sampler: ResourceSampler
 
 
 def in_blocks(launch: RunningLaunch, others: Sequence[Slot] = ()) -> None:
@@ -193,7 +197,10 @@ class _Run:
         hits = servers.cache_hits()
         keep = partial(self._keep, servers, sampler)
         try:
-            self.task.drive(RunningLaunch(number, self.plan, writer, sessions, keep, self.progress, self.warnings))
+            launch = RunningLaunch(
+                number, self.plan, writer, sessions, keep, self.progress, self.warnings, servers.wiring, sampler
+            )
+            self.task.drive(launch)
             self.guard.see_hits(hits, servers.cache_hits())
             for session in sessions:
                 for row in session.frames(keep=0):

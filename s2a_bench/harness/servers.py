@@ -29,8 +29,8 @@ from s2a_bench.transport.risks import is_local
 LAST_MOMENT_S = 0.5
 """A killed process breaks its connections before the kernel reports its end: on a busy machine, long before."""
 
-RUN_LIMITS = Limits(answer_s=86_400, answer_tokens=1 << 20)
-"""In a run the client limits the length and time of an answer: a slow model is a result."""
+RUN_LIMITS = Limits(answer_s=86_400, answer_tokens=1 << 20, waiting=1000, connections=1000)
+"""In a run the client limits the length and time of an answer, and the number of clients: a slow model is a result."""
 
 
 def on_files(engine: EngineConfig, progress: Progress) -> EngineConfig:
@@ -149,7 +149,11 @@ class ServerSet:
         server = self._servers[pipeline.server]
         with self.death_explained(pipeline):
             alive = server.process.alive if server.process else lambda: True
-            return open_client(self._wiring(pipeline, server.address), alive)
+            return open_client(self.wiring(pipeline), alive)
+
+    def wiring(self, pipeline: Pipeline) -> Wiring[Any]:
+        """Return the wiring of a running server's clients."""
+        return self._wiring(pipeline, self._servers[pipeline.server].address)
 
     def raise_if_dead(self, pipeline: Pipeline, *, suspect: bool = False) -> None:
         """Raise ServerDied, with the log's end, if the process has ended; wait a moment for a ``suspect``."""

@@ -1,0 +1,309 @@
+"""The measured run: fleets of growing size against one server, and against an instant one that checks the generator."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from s2a_bench.clock import SystemClock, now_ns
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.capacity.generator import STRIDE, Fleet, FleetPlan, FleetProcess
+from s2a_bench.experiments.capacity.metrics import measures
+from s2a_bench.experiments.capacity.rows import (
+    FLEETS,
+    KNEES,
+    REQUESTS,
+    ROBOTS,
+    FleetRow,
+    KneeRow,
+    RequestRow,
+    RobotRow,
+    Source,
+)
+from s2a_bench.experiments.capacity.search import Tried, judge, knee, search
+from s2a_bench.harness.plan import resolve
+from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
+from s2a_bench.harness.session import Place
+from s2a_bench.machine.resources import POWER_W
+from s2a_bench.stats.seeds import generator
+from s2a_bench.store.manifest import RunWarning
+from s2a_bench.transport import EXTERNAL, PROGRAM, Choice
+from s2a_bench.transport.defaults import LOOPBACK
+from s2a_bench.transport.pipeline import Pipeline, pipelines
+
+if TYPE_CHECKING:
+    from s2a_bench.experiments.capacity.config import CapacityConfig
+    from s2a_bench.experiments.capacity.metrics import RobotTrace
+    from s2a_bench.harness.session import Session
+    from s2a_bench.progress import Progress
+    from s2a_bench.store.run import RunWriter
+
+KEEP_S: Final = 0.2
+"""Period in which requests are written while the robots act."""
+HEAD_START_S: Final = 0.2
+LATEST: Final = 0.05
+"""Lateness of the generator's ticks at p99, as a share of a tick, above which a fleet is no measurement."""
+INSTANT: Final = "instant"
+ECHO: Final = (("name", "echo"), ("latency", ""), ("pace", None), ("profile", ""), ("gaps", ""))
+ECHO_OF_MODEL: Final = (("model", None), ("mmproj", None), ("gpu_layers", 0))
+
+
+def run_capacity(config: CapacityConfig, output: Path, progress: Progress) -> Path:
+    """Measure, or predict, and return the run folder, which keeps what was measured if S2AError is raised."""
+    plan = resolve(config.live_requests.answered(progress.say))
+    settings = {**plan.manifest["configuration"], **config.to_manifest()}
+    cadence = {
+        "chunks": f"control loops at {config.control_hz:g} Hz",
+        "plans": f"a plan every {config.plan_ns / 1e9:g} s",
+        "closed": f"closed loop, {config.think_s:g} s from an answer to the next request",
+    }
+    plan = plan.with_manifest(configuration=settings, cadence=cadence[config.load])
+    plan = replace(plan, cells=(*plan.cells, *(twin(cell) for cell in plan.cells)))
+    task = Task("capacity", drive=partial(_drive, config), tables=(FLEETS, KNEES))
+    return run_requests(task, plan, output, progress)
+
+
+def twin(cell: Pipeline) -> Pipeline:
+    """Return the cell of an instant server: echo over the same transport; in this process where it has none."""
+    options = cell.options
+    kept = {
+        name: value for name, value in options.given_values().items() if name not in options.of_sides(EXTERNAL, PROGRAM)
+    }
+    try:
+        options = type(options)(**kept)
+        cell.transport.require(Choice(options, cell.variant))
+    except UsageError:
+        cell = pipelines([LOOPBACK])[0]
+        options = cell.options
+    return replace(cell, name=f"{cell.name}, {INSTANT}", options=options, engine=(*ECHO, *ECHO_OF_MODEL))  # type: ignore[arg-type]
+
+
+def _drive(config: CapacityConfig, launch: RunningLaunch) -> None:
+    half = len(launch.sessions) // 2
+    for position, session in enumerate(launch.sessions):
+        launch.progress.stage(f"warming up: {session.cell.name}")
+        for block in range(max(1, launch.plan.blocks.warmup)):
+            launch.keep(session, session.measure(Place(block, position, warmup=position < half)))
+    modes = [*config.made] if config.load == "chunks" else [""]
+    launch.progress.expect(half * len(modes) * config.most_fleets)
+    for session, instant in zip(launch.sessions[:half], launch.sessions[half:], strict=True):
+        for mode in modes:
+            _Cell(config, launch, session, instant, mode).run()
+
+
+@dataclass(slots=True)
+class _Cell:
+    """The fleets of one pipeline and mode."""
+
+    config: CapacityConfig
+    launch: RunningLaunch
+    session: Session
+    instant: Session
+    mode: str
+    tried: dict[int, Tried] = field(default_factory=dict)
+    alone: float | None = None
+
+    @property
+    def name(self) -> str:
+        return f"{self.session.cell.name}, {self.mode}" if self.mode else self.session.cell.name
+
+    def run(self) -> None:
+        config = self.config
+        try:
+            with _Robots(config, self.launch, self.session, self.mode) as robots:
+                if config.load == "chunks":
+                    self._attempt(robots, 1)
+                search(config.numbers, partial(self._attempt, robots), bisects=config.searches)
+            with _Robots(config, self.launch, self.instant, self.mode) as robots:
+                for number in sorted(self.tried, reverse=True):
+                    if self.tried[number].clean and self._twin_is_clean(robots, number):
+                        break
+                    self.tried[number] = replace(self.tried[number], clean=False)
+        finally:
+            self._conclude()
+
+    def _attempt(self, robots: _Robots, number: int) -> bool:
+        if number not in self.tried:
+            self.tried[number] = self._fleet(robots, number, "measured")
+        return self.tried[number].within
+
+    def _twin_is_clean(self, robots: _Robots, number: int) -> bool:
+        found = self._fleet(robots, number, "twin")
+        return found.clean and found.within
+
+    def _fleet(self, robots: _Robots, number: int, source: Source) -> Tried:
+        config, launch, limit = self.config, self.launch, self.config.limited
+        launch.progress.stage(
+            f"{self.name}: {number} robot{'s' * (number > 1)}{', instant server' * (source == 'twin')}"
+        )
+        blocks = bool(self.mode) and config.made[self.mode].blocks
+        traces: list[RobotTrace] = []
+        looks = 0
+        for looks, (traces, used) in enumerate(robots.looks(number), 1):  # noqa: B007 - how many there were
+            row = measures(traces, config.setting, config.settle_ns, confidence=config.confidence) | used
+            if self.alone is None and source == "measured" and number == 1:
+                self.alone = row["stalled"]
+            row["stalled_alone"] = self.alone
+            alone = self.alone or 0.0
+            verdict, within = judge(
+                limit, row, traces, config.settle_ns, config.confidence, alone=alone if blocks else 0.0
+            )
+            if verdict != "undecided" or source == "twin":
+                break
+        robots.stop()
+        tick_ns = config.setting.period_ns if config.load == "chunks" else row["latency_p50_ns"] or 0
+        clean = not tick_ns or (row["late_p99_ns"] or 0) <= LATEST * tick_ns
+        seconds = sum(max(0, each.end_ns - each.start_ns - config.settle_ns) for each in traces) / number / 1e9
+        about = {"cell": self.name, "source": source, "robots": number}
+        fleet = FleetRow(**about, seconds=seconds, looks=looks, verdict=verdict, within=within, clean=clean, **row)
+        self._write(launch.writer, about, fleet, traces)
+        launch.progress.advance()
+        return Tried(number, verdict, within, clean)
+
+    def _write(self, writer: RunWriter, about: Mapping[str, Any], fleet: Any, traces: list[RobotTrace]) -> None:
+        config = self.config
+        writer.append(FLEETS, [fleet])
+        for robot in sorted({trace.robot for trace in traces}):
+            own = [trace for trace in traces if trace.robot == robot]
+            writer.append(ROBOTS, [RobotRow(**about, robot=robot, **measures(own, config.setting, config.settle_ns))])
+            writer.append(REQUESTS, (row for trace in own for row in self._requests(about, trace)))
+
+    def _requests(self, about: Mapping[str, Any], trace: RobotTrace) -> Iterator[RequestRow]:
+        since_ns = (trace.request_ns - trace.start_ns).tolist()
+        for intended_ns, latency_ns in zip(since_ns, trace.arrival_ns.tolist(), strict=True):
+            answered = latency_ns if latency_ns >= 0 else None
+            settling = intended_ns < self.config.settle_ns
+            yield RequestRow(
+                **about, robot=trace.robot, intended_ns=intended_ns, latency_ns=answered, settling=settling
+            )
+
+    def _conclude(self) -> None:
+        """Write the knee of the fleets so far, and a warning about those that the generator did not drive."""
+        limit, tried = self.config.limited, self.tried.values()
+        driven = max((each.robots for each in tried if each.clean), default=0)
+        found = knee(tried)
+        if limit is not None and found is not None:
+            row = KneeRow(self.name, "measured", limit.text, found.robots, found.low, found.high, driven)
+            self.launch.writer.append(KNEES, [row])
+        if late := sorted(each.robots for each in tried if not each.clean):
+            self.launch.warnings.append(
+                RunWarning(
+                    "generator-late",
+                    f"{self.name}: {', '.join(map(str, late))} robots are no measurement, as the generator was late",
+                    "spread the robots with --processes, send smaller pictures (--size), or quiet the machine",
+                )
+            )
+
+
+class _Robots(ExitStack):
+    """The robots of one cell, spread over processes; a context manager that closes their connections."""
+
+    def __init__(self, config: CapacityConfig, launch: RunningLaunch, session: Session, mode: str) -> None:
+        super().__init__()
+        self._config, self._launch, self._session = config, launch, session
+        plan = self._plan = FleetPlan(
+            session.cell.name,
+            launch.wiring(session.cell).to_json(),
+            launch.plan.feed,
+            launch.plan.request,
+            launch.plan.tuned,
+            config.setting,
+            mode,
+            config.seed,
+            every_ns=config.plan_ns if config.load == "plans" else 0,
+            think_ns=round(config.think_s * 1e9),
+        )
+        many = config.processes > 1 and not session.cell.transport.in_process
+        self._fleets: list[Any] = []
+        for _ in range(config.processes if many else 1):
+            self._fleets.append(FleetProcess(plan) if many else Fleet(plan))
+            self.callback(self._fleets[-1].close)
+
+    def looks(self, number: int) -> Iterator[tuple[list[RobotTrace], dict[str, Any]]]:
+        """Act with ``number`` robots, and yield what they did since the start, and what that used, look by look.
+
+        They act on until `stop`.
+        """
+        config = self._config
+        seconds_ns = round(config.seconds * 1e9)
+        if not config.episodes_s:
+            start_ns = self._start(self._phases(number))
+            for look in range(1, config.looks + 1):
+                yield self._until(start_ns, config.settle_ns, config.settle_ns + look * seconds_ns)
+            return
+        done: list[RobotTrace] = []
+        episode_ns = round(config.episodes_s * 1e9)
+        for _ in range(config.looks):
+            for _ in range(max(1, -(-seconds_ns // episode_ns))):
+                start_ns = self._start(dict.fromkeys(range(number), 0))
+                traces, used = self._until(start_ns, config.settle_ns, episode_ns)
+                self.stop()
+                done += traces
+            yield done, used
+
+    def _phases(self, number: int) -> dict[int, int]:
+        """Return random moments of a cycle, in ns, by robot."""
+        config, plan = self._config, self._plan
+        cycle_ns = plan.every_ns or plan.think_ns
+        if plan.mode:
+            cycle_ns = config.made[plan.mode].execution_horizon(config.setting) * config.setting.period_ns
+        phases_ns = generator(config.seed, "capacity phases").integers(0, cycle_ns + 1, number)
+        return dict(enumerate(phases_ns.tolist()))
+
+    def _start(self, phases_ns: dict[int, int]) -> int:
+        fleets = self._fleets
+        shares = [
+            {robot: phase_ns for robot, phase_ns in phases_ns.items() if robot % len(fleets) == place}
+            for place in range(len(fleets))
+        ]
+        for fleet, share in zip(fleets, shares, strict=True):
+            fleet.connect([*share])
+        start_ns = now_ns() + round(HEAD_START_S * 1e9)
+        for fleet, share in zip(fleets, shares, strict=True):
+            fleet.start(share, start_ns)
+        return start_ns
+
+    def _until(self, start_ns: int, settle_ns: int, end_ns: int) -> tuple[list[RobotTrace], dict[str, Any]]:
+        """Wait until ``end_ns`` after the start; return traces, and the CPU and power used since the last settling."""
+        clock, launch = SystemClock(), self._launch
+        self._wait(clock, start_ns + settle_ns)
+        before_ns, before_s = now_ns(), self._cpu_s()
+        self._wait(clock, start_ns + end_ns)
+        after_ns = now_ns()
+        spent = launch.sampler.window(before_ns, after_ns)
+        server_ns = spent.get("server_cpu_ns")
+        traces = [trace for fleet in self._fleets for trace in fleet.traces()]
+        self._keep()
+        return traces, {
+            "generator_cpu": (self._cpu_s() - before_s) / (after_ns - before_ns) * 1e9,
+            "server_cpu": None if server_ns is None else server_ns / (after_ns - before_ns),
+            "gpu": spent.get("gpu_busy"),
+            "watts": spent.get(POWER_W),
+        }
+
+    def _cpu_s(self) -> float:
+        return float(sum(fleet.cpu_s() for fleet in self._fleets))
+
+    def _wait(self, clock: SystemClock, until_ns: int) -> None:
+        while (left_ns := until_ns - now_ns()) > 0:
+            clock.sleep_until_ns(now_ns() + min(left_ns, round(KEEP_S * 1e9)))
+            self._keep()
+
+    def _keep(self) -> None:
+        """Write the requests since the last call; raises what makes further ones useless."""
+        for fleet in self._fleets:
+            for measured in fleet.measured():
+                sample = measured.sample
+                if sample.error:
+                    self._launch.progress.say(f"robot {sample.block % STRIDE} of {sample.cell}: {sample.error}")
+                self._launch.keep(self._session, replace(measured, retry_after_s=0.0))  # its robot waits
+
+    def stop(self) -> None:
+        """Stop the robots when their answers under way have come."""
+        for fleet in self._fleets:
+            fleet.stop()
+        self._keep()

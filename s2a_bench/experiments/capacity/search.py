@@ -1,0 +1,138 @@
+"""The search for the largest fleet within a limit: which fleets to try, when one is decided, and what follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from s2a_bench.experiments.capacity.metrics import share_interval
+from s2a_bench.stats.batches import BATCHES
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from s2a_bench.experiments.capacity.config import Limit
+    from s2a_bench.experiments.capacity.metrics import RobotTrace
+    from s2a_bench.experiments.capacity.rows import Verdict
+    from s2a_bench.policy.chunks import Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """A fleet that was tried."""
+
+    robots: int
+    verdict: Verdict
+    within: bool
+    """Whether the value itself keeps to the limit, decided or not."""
+    clean: bool = True
+    """Whether the generator was in time; if not, it is no measurement."""
+
+
+@dataclass(frozen=True, slots=True)
+class Knee:
+    """The largest fleet within the limit, surely ``low`` to ``high`` robots; None: no fleet was surely too large."""
+
+    robots: int
+    low: int
+    high: int | None
+
+
+def search(numbers: Sequence[int], attempt: Callable[[int], bool], *, bisects: bool) -> None:
+    """Try fleets of ``numbers`` robots, ascending; ``attempt`` returns whether one keeps to the limit.
+
+    With ``bisects`` the first that does not ends that, and the numbers between it and the one before are bisected.
+    """
+    good = numbers[0] - 1
+    for number in numbers:
+        if attempt(number):
+            good = number
+        elif bisects:
+            bad = number
+            break
+    else:
+        return
+    while bad - good > 1:
+        middle = (good + bad) // 2
+        good, bad = (middle, bad) if attempt(middle) else (good, middle)
+
+
+def knee(tried: Iterable[Tried]) -> Knee | None:
+    """Return what fleets show together, taking a larger fleet to fare no better; None without a measurement."""
+    clean = [each for each in tried if each.clean]
+    if not clean:
+        return None
+    broken = min((each.robots for each in clean if not each.within), default=None)
+    above = min((each.robots for each in clean if each.verdict == "above"), default=None)
+
+    def largest(fit: Callable[[Tried], bool], before: int | None) -> int:
+        return max((each.robots for each in clean if fit(each) and (before is None or each.robots < before)), default=0)
+
+    found = largest(lambda each: each.within, broken)
+    low = largest(lambda each: each.verdict == "below", above)
+    return Knee(found, min(low, found), None if above is None else max(above - 1, found))
+
+
+def judge(
+    limit: Limit | None,
+    row: Mapping[str, Any],
+    traces: Sequence[RobotTrace],
+    settle_ns: int,
+    confidence: float,
+    *,
+    alone: float = 0.0,
+) -> tuple[Verdict, bool]:
+    """Return where a fleet's interval lies against a limit, and whether its value keeps to it.
+
+    ``alone`` is the share of stalled ticks that one robot alone has, which a mode that blocks may have in a fleet too.
+    """
+    if limit is None:
+        return "none", True
+    if limit.column == "stalled":
+        share, low, high = (row["stalled"], row["stalled_low"], row["stalled_high"])
+        if share is None:
+            return "undecided", False
+        low, high, share = low - alone, high - alone, share - alone
+    else:
+        at_ns, robots, above = above_limit(limit, traces, settle_ns)
+        if not above.size:
+            return "undecided", False
+        block = (at_ns - at_ns.min()) * BATCHES // (np.ptp(at_ns) + 1)
+        runs = int(np.count_nonzero(np.diff(above.astype(np.int8), prepend=0) > 0))
+        low, high = share_interval(above, (block, robots), runs, confidence)
+        share = float(above.mean())
+    verdict: Verdict = "below" if high <= limit.share else "above" if low > limit.share else "undecided"
+    return verdict, share <= limit.share
+
+
+def above_limit(limit: Limit, traces: Sequence[RobotTrace], settle_ns: int) -> tuple[Ints, Ints, Any]:
+    """Return time, robot and whether above the limit, of the values of a limit on latencies or ages: shapes (K,).
+
+    A request without an answer counts once it waits for longer than the limit.
+    """
+    found = []
+    for trace in traces:
+        if limit.column.startswith("age"):
+            if trace.ticks is None:
+                continue
+            age = trace.ticks.age
+            period_ns = (trace.end_ns - trace.start_ns) / max(1, age.size)
+            since_ns = (np.arange(age.size) * period_ns).astype(np.int64)
+            known, exceeds = age >= 0, age * period_ns > limit.above_ns
+        else:
+            taken_ns = trace.first_ns if limit.column.startswith("ttft") else trace.arrival_ns
+            if taken_ns is None:
+                continue
+            since_ns, waits_ns = trace.request_ns - trace.start_ns, trace.end_ns - trace.request_ns
+            exceeds = np.where(taken_ns < 0, waits_ns, taken_ns) > limit.above_ns
+            known = (taken_ns >= 0) | exceeds
+        kept = known & (since_ns >= settle_ns)
+        robots = np.full(int(kept.sum()), trace.robot)
+        found.append((trace.start_ns + since_ns[kept], robots, exceeds[kept]))
+    if not found:
+        return (np.empty(0, np.int64),) * 2 + (np.empty(0, bool),)
+    at_ns, of, above = (np.concatenate(each) for each in zip(*found, strict=True))
+    return at_ns, of, above
