@@ -6,6 +6,7 @@ With arrays, an executed chunk is one run of ticks; stalls lie between runs.
 from __future__ import annotations
 
 import heapq
+from collections.abc import Generator
 from typing import Final, TypeAlias
 
 import numpy as np
@@ -116,11 +117,25 @@ def follow(mode: Mode, arrival_ns: Ints, setting: ControlSetting, most: int = NE
 
     It ends after ``most`` ticks, or before the first request without arrivals.
     """
-    count, horizon = len(arrival_ns), setting.horizon
-    usable, known = setting.delay_ticks(arrival_ns), setting.known_ticks(arrival_ns)
+    steps = drive(mode, setting, most)
+    try:
+        next(steps)
+        for row in (*arrival_ns, None):
+            steps.send(row)
+    except StopIteration as end:
+        done: tuple[Cycles, Ticks] = end.value
+    return done
+
+
+def drive(mode: Mode, setting: ControlSetting, most: int = NEVER) -> Generator[int, Ints | None, tuple[Cycles, Ticks]]:
+    """Run a mode's stepper: yield the tick of each request, to be sent the arrivals of its actions, as in `follow`.
+
+    It ends after ``most`` ticks, or before the first request that is sent None.
+    """
     stepper = mode.stepper(setting)
     coming: list[_Arrival] = []
     leaves: list[int] = []
+    usable_tick: list[int] = []
     chunk: list[int] = []
     index: list[int] = []
     tick = 0
@@ -128,22 +143,26 @@ def follow(mode: Mode, arrival_ns: Ints, setting: ControlSetting, most: int = NE
         while coming and coming[0][:2] <= (tick, tick):
             _deliver(stepper, heapq.heappop(coming))
         if stepper.ask(tick):
-            request = len(leaves)
-            if request == count:
+            arrival_ns = yield tick
+            if arrival_ns is None:
                 break
+            usable, known = (
+                (tick + ticks(arrival_ns)).tolist() for ticks in (setting.delay_ticks, setting.known_ticks)
+            )
+            for at, actions in {at: actions for actions, at in enumerate(zip(usable, known, strict=True), 1)}.items():
+                heapq.heappush(coming, (*at, len(leaves), actions))
             leaves.append(tick)
-            times = list(zip((tick + usable[request]).tolist(), (tick + known[request]).tolist(), strict=True))
-            for at, actions in {at: actions for actions, at in enumerate(times, 1)}.items():
-                heapq.heappush(coming, (*at, request, actions))
+            usable_tick.append(usable[0])
         while coming and coming[0][0] <= tick:
             _deliver(stepper, heapq.heappop(coming))
         acted = stepper.act(tick)
         chunk.append(-1 if acted is None else acted.request)
         index.append(-1 if acted is None else acted.index)
         tick += 1
-    request_tick = np.array(leaves, np.int64)
-    usable_tick = request_tick + usable[:, 0]
-    return gather(request_tick, usable_tick, np.array(chunk, np.int64), np.array(index, np.int64), horizon)
+    request_tick, usable_at, chunks, indices = (
+        np.array(each, np.int64) for each in (leaves, usable_tick, chunk, index)
+    )
+    return gather(request_tick, usable_at, chunks, indices, setting.horizon)
 
 
 def _deliver(stepper: ChunkStepper, arrival: _Arrival) -> None:
