@@ -51,6 +51,16 @@ class ModeSuite:
 
     @shared
     @given(case=drawn)
+    def test_its_pace_is_when_it_asks(self, mode: Mode, case: Case) -> None:
+        latency_ns, setting = case
+        if (pace := mode.pace(setting)) is not None:
+            delays = zip(setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns), strict=True)
+            ticks = [tick for tick, _ in (next(pace), *map(pace.send, delays))]
+            cycles = mode.cycles(*case)
+            assert ticks == [*cycles.request_tick, cycles.ticks]
+
+    @shared
+    @given(case=drawn)
     def test_it_asks_at_once_and_then_at_most_once_a_tick(self, mode: Mode, case: Case) -> None:
         request_tick = mode.cycles(*case).request_tick
         assert request_tick.size == case[0].size

@@ -23,7 +23,7 @@ A simulation has one latency per request, and ends before the first request with
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, Protocol, TypeAlias
 
@@ -42,6 +42,9 @@ Rounding: TypeAlias = Literal["floor", "ceil"]
 """floor: an action leaves at the end of its tick, so a chunk that arrives within it is in time (Real-time chunking,
 arXiv 2506.07339). ceil: it leaves at the tick's start (lerobot). They differ by one tick unless L is a multiple of
 Delta t."""
+
+Pace: TypeAlias = "Generator[tuple[int, int], tuple[int, int], None]"
+"""Yields the tick of each request and the actions left then, to be sent its d and ceil(L / Delta t)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,6 +239,10 @@ class Mode(Protocol):
 
         `Ticks.age` is that of the newest observation in the blend. None if nothing is blended.
         """
+        return None
+
+    def pace(self, setting: ControlSetting) -> Pace | None:  # noqa: ARG002 - for subclasses
+        """Return the requests without the stepper, one after another; None where `arrays` may be None."""
         return None
 
     def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles | None:  # noqa: ARG002 - for subclasses

@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from s2a_bench.policy import Floats
-from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode, Ticks
+from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode, Pace, Ticks
 from s2a_bench.policy.chunks.closed import Closed, stall_share
 from s2a_bench.policy.chunks.cycles import assemble, lay
 
@@ -55,6 +55,14 @@ class Aggregate(Mode):
         cycle = delay + setting.horizon - np.minimum(delay, self.trigger) - self.trigger
         return Closed(stall_share(delay, self.trigger), delay, cycle)
 
+    def pace(self, setting: ControlSetting) -> Pace:
+        now = left = 0
+        while True:
+            delay, known = yield now, left
+            end = now + max(delay - left, 0) + setting.horizon
+            now = max(end - self.trigger, now + max(known, 1))
+            left = max(end - now, 0)
+
     def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles:
         # With q actions left at the request, min(d, q) of the new chunk are past when it arrives.
         latency_ns = arrival_ns[:, -1]
@@ -65,13 +73,10 @@ class Aggregate(Mode):
             first[:1] = 0
             leaves = np.concatenate(([0], np.cumsum(delay + horizon - first - most)))
         else:
-            leaves_at, skipped, left = [0], [], 0
-            for ticks, known_ticks in zip(delay.tolist(), known.tolist(), strict=True):
-                skipped.append(min(ticks, left))
-                end = leaves_at[-1] + ticks + horizon - skipped[-1]
-                leaves_at.append(max(end - most, leaves_at[-1] + max(known_ticks, 1)))
-                left = max(end - leaves_at[-1], 0)
-            leaves, first = np.array(leaves_at), np.array(skipped, np.int64)
+            requests = self.pace(setting)
+            start, delays = next(requests), zip(delay.tolist(), known.tolist(), strict=True)
+            leaves, left = np.array([start, *map(requests.send, delays)], np.int64).T
+            first = np.minimum(delay, left[:-1])
         request = leaves[:-1]
         usable = request + delay
         until = np.minimum(np.append(usable[1:], leaves[-1]), usable + horizon - first)

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, field, replace
+from itertools import count
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 
-from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode
+from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode, Pace
 from s2a_bench.policy.chunks.closed import Closed, appended
 from s2a_bench.policy.chunks.cycles import assemble
 from s2a_bench.policy.chunks.trigger import Varied
@@ -35,6 +36,9 @@ class Appending(Mode):
     def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:
         delay, known = setting.delay_ticks(latency_ns), setting.known_ticks(latency_ns)
         return appended(delay, known, self.trigger or 0, self.execution_horizon(setting))
+
+    def pace(self, setting: ControlSetting) -> Pace | None:
+        return None if self.streams else _requests((self.trigger or 0,), self.execution_horizon(setting))
 
     def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles | None:
         delay, known = setting.delay_ticks(arrival_ns[:, -1]), setting.known_ticks(arrival_ns[:, -1])
@@ -161,6 +165,15 @@ class QueueStepper(ChunkStepper):
         return self.waiting.popleft()[0]
 
 
+def _requests(triggers: tuple[int, ...], length: int) -> Pace:
+    now = left = 0
+    for request in count(1):
+        ready, known = yield now, left
+        end = now + max(left, ready) + length
+        now = max(end - triggers[min(request, len(triggers) - 1)], now + known, now + 1)
+        left = end - now
+
+
 def _append(delay: Ints, ready: Ints, known: Ints, triggers: tuple[int, ...], length: int, horizon: int) -> Cycles:
     """Append chunks that may begin ``ready`` ticks after the request, shapes (R,).
 
@@ -176,13 +189,10 @@ def _append(delay: Ints, ready: Ints, known: Ints, triggers: tuple[int, ...], le
     if len(triggers) == 1 and (step >= np.maximum(known, 1)).all():
         leaves = np.concatenate(([0], np.cumsum(step)))
     else:
-        leaves_at, left_then = [0], [0]
-        for request, (ready_ticks, known_ticks) in enumerate(zip(ready.tolist(), known.tolist(), strict=True), 1):
-            now = leaves_at[-1]
-            end = now + max(left_then[-1], ready_ticks) + length
-            leaves_at.append(max(end - triggers[min(request, len(triggers) - 1)], now + known_ticks, now + 1))
-            left_then.append(end - leaves_at[-1])
-        leaves, left = np.array(leaves_at), np.array(left_then[:-1], np.int64)
+        requests = _requests(triggers, length)
+        first, delays = next(requests), zip(ready.tolist(), known.tolist(), strict=True)
+        leaves, left = np.array([first, *map(requests.send, delays)], np.int64).T
+        left = left[:-1]
     request_tick = leaves[:-1]
     start = request_tick + np.maximum(left, ready)
     first, until = np.zeros_like(start), start + length

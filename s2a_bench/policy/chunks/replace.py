@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field
 
-from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode
+from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode, Pace
 from s2a_bench.policy.chunks.closed import Closed, replace_stall_share, slack_ticks, stall_share
 from s2a_bench.policy.chunks.cycles import assemble
 
@@ -62,6 +62,16 @@ class Replace(Mode):
             share = stall_share(delay, setting.horizon - self.execute)
             cycle = np.full_like(delay, self.execute)
         return Closed(share, delay, cycle) if delay.max() < setting.horizon else Closed(share)
+
+    def pace(self, setting: ControlSetting) -> Pace | None:  # noqa: ARG002 - the horizon does not matter
+        return None if self.several else self._requests()
+
+    def _requests(self) -> Pace:
+        delay, _ = yield 0, 0
+        now = delay + self.execute
+        while True:
+            _, known = yield now, 0
+            now += max(self.execute, known)
 
     def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles:
         latency_ns = arrival_ns[:, -1]
