@@ -23,7 +23,7 @@ from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.chunks.config import ChunksConfig
-    from s2a_bench.experiments.chunks.latencies import Source
+    from s2a_bench.experiments.latencies import Source
     from s2a_bench.policy.chunks import Ints, Mode
     from s2a_bench.policy.conformal import Calibration
     from s2a_bench.store.manifest import RunWarning

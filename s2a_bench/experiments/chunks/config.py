@@ -14,7 +14,7 @@ from s2a_bench.act import ROBOTS
 from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.latencies import split
+from s2a_bench.experiments.latencies import split
 from s2a_bench.harness.config import LiveRequests
 from s2a_bench.inference import STAND_IN
 from s2a_bench.options import Names, Options, group, one_of, option
@@ -24,7 +24,7 @@ from s2a_bench.text import none_of
 
 if TYPE_CHECKING:
     from s2a_bench.act import ActionKind
-    from s2a_bench.experiments.chunks.latencies import Source
+    from s2a_bench.experiments.latencies import Source
     from s2a_bench.policy.chunks import ControlSetting, Mode
 
 SHOWN: Final = (
@@ -156,7 +156,7 @@ class ChunksConfig(Options):
 
     @cached_property
     def sources(self) -> tuple[Source, ...]:
-        from s2a_bench.experiments.chunks.latencies import sources
+        from s2a_bench.experiments.latencies import sources
 
         return tuple(
             each for written in self.latency for each in sources(written, self.horizon * self.tokens_per_action)

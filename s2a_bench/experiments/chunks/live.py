@@ -22,8 +22,9 @@ from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.chunks.build_rows import stall_metrics, stalls_of, write_cell
 from s2a_bench.experiments.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes
 from s2a_bench.experiments.chunks.config import PROMISING
-from s2a_bench.experiments.chunks.latencies import Source, delay_rows, measured, write_delays
+from s2a_bench.experiments.chunks.delays import delay_rows, write_delays
 from s2a_bench.experiments.chunks.smooth import MOST_TICKS, smoothness
+from s2a_bench.experiments.latencies import Source, measured
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.requester import ChunkRequester, Job
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests

@@ -21,7 +21,7 @@ from s2a_bench.experiments.chunks.cells import (
     without_trigger,
 )
 from s2a_bench.experiments.chunks.config import PROMISING, ChunksConfig
-from s2a_bench.experiments.chunks.latencies import delay_rows, write_delays
+from s2a_bench.experiments.chunks.delays import delay_rows, write_delays
 from s2a_bench.experiments.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS, MeanRow, TriggerRow
 from s2a_bench.experiments.chunks.smooth import TrackingPlant, follower
 from s2a_bench.harness.warnings import exchange_warnings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.chunks.latencies import Source, sources, split
+from s2a_bench.experiments.latencies import Source, sources, split
 from tests.made_runs import MakeRun
 
 MS = 1_000_000
