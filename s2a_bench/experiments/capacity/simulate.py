@@ -1,0 +1,185 @@
+"""A fleet in virtual time: the robots' own steppers ask a server that answers in order of arrival.
+
+A robot has one request under way. A request waits until one of the servers is free, then takes its service time; what
+is spent beside the server (network, client) delays its answer and occupies no server. A free server takes as many
+waiting requests as it batches. Nothing is late: a request leaves at its intended time.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections import deque
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+import numpy as np
+
+from s2a_bench.experiments.capacity.metrics import RobotTrace
+from s2a_bench.policy.chunks import Ticks
+from s2a_bench.policy.chunks.cycles import drive
+
+if TYPE_CHECKING:
+    from s2a_bench.policy.chunks import ControlSetting, Mode, Pace
+
+
+class ServiceTime(NamedTuple):
+    """The time of one answer, in ns."""
+
+    first_ns: int
+    """From the start of its service to its first piece."""
+    whole_ns: int
+    """To its last piece; the server is free then."""
+    beside_ns: int = 0
+    """Besides, where no server is occupied."""
+
+
+class Answer(NamedTuple):
+    """When an answer began and when it was complete, on the run's clock."""
+
+    first_ns: int
+    whole_ns: int
+
+
+Robot: TypeAlias = "Generator[int, Answer, RobotTrace]"
+"""Yields the time at which each request leaves, to be sent its answer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """What the robots of a fleet have in common: a mode of acting, a plan every ``every_ns``, or a closed loop."""
+
+    setting: ControlSetting
+    span_ns: int
+    """For how long each robot acts."""
+    mode: Mode | None = None
+    every_ns: int = 0
+    think_ns: int = 0
+    """Closed loop: from an answer to the next request."""
+    episode_ns: int = 0
+    """The robots start together every so often; 0: once, at random moments of their first cycle."""
+
+    @property
+    def cycle_ns(self) -> int:
+        if self.mode is not None:
+            return self.mode.execution_horizon(self.setting) * self.setting.period_ns
+        return self.every_ns or self.think_ns
+
+    def robot(self, number: int, start_ns: int, span_ns: int) -> Robot:
+        if self.mode is not None:
+            return _acting(number, self.mode, self.setting, start_ns, max(1, span_ns // self.setting.period_ns))
+        return _asking(number, self.every_ns, self.think_ns, start_ns, start_ns + span_ns)
+
+
+def simulate(
+    fleet: Fleet,
+    robots: int,
+    times: Iterator[ServiceTime],
+    rng: np.random.Generator,
+    servers: int,
+    slower: Sequence[float],
+) -> list[RobotTrace]:
+    """Return the traces of ``robots`` robots, in each episode; see `serve` for the server."""
+    if not fleet.episode_ns:
+        starts = rng.integers(0, fleet.cycle_ns + 1, robots).tolist()
+        return serve([fleet.robot(*each, fleet.span_ns) for each in enumerate(starts)], times, servers, slower)
+    found = []
+    for start_ns in range(0, fleet.span_ns, fleet.episode_ns):
+        span_ns = min(fleet.episode_ns, fleet.span_ns - start_ns)
+        order = rng.permutation(robots).tolist()
+        found += serve([fleet.robot(each, start_ns, span_ns) for each in order], times, servers, slower)
+    return found
+
+
+def serve(
+    robots: Sequence[Robot], times: Iterator[ServiceTime], servers: int = 1, slower: Sequence[float] = (1.0,)
+) -> list[RobotTrace]:
+    """Serve robots until all have ended.
+
+    ``slower[b - 1]`` is by how many times longer b requests take together than one. Of those that arrive at one moment,
+    the first robot is served first.
+    """
+    coming = [(next(robot), place) for place, robot in enumerate(robots)]
+    heapq.heapify(coming)
+    free_ns = [0] * servers
+    waiting: deque[tuple[int, int]] = deque()
+    traces: dict[int, RobotTrace] = {}
+    while coming or waiting:
+        if not waiting:
+            waiting.append(heapq.heappop(coming))
+        start_ns = max(free_ns[0], waiting[0][0])
+        while coming and coming[0][0] <= start_ns:
+            waiting.append(heapq.heappop(coming))
+        batch = [waiting.popleft() for _ in range(min(len(waiting), len(slower)))]
+        time, factor = next(times), slower[len(batch) - 1]
+        whole_ns = start_ns + round(time.whole_ns * factor)
+        answer = Answer(start_ns + round(time.first_ns * factor) + time.beside_ns, whole_ns + time.beside_ns)
+        heapq.heapreplace(free_ns, whole_ns)
+        for _, place in batch:
+            try:
+                heapq.heappush(coming, (robots[place].send(answer), place))
+            except StopIteration as end:
+                traces[place] = end.value
+    return [traces[place] for place in range(len(robots))]
+
+
+def _acting(robot: int, mode: Mode, setting: ControlSetting, start_ns: int, most: int) -> Robot:
+    """Act for ``most`` ticks."""
+    times: list[tuple[int, int, int]] = []
+    pace = mode.pace(setting)
+    steps = _stepped(mode, setting, most) if pace is None else _paced(pace, mode, setting, most)
+    try:
+        tick = next(steps)
+        while True:
+            leave_ns = start_ns + tick * setting.period_ns
+            answer = yield leave_ns
+            times.append((leave_ns, answer.first_ns - leave_ns, answer.whole_ns - leave_ns))
+            tick = steps.send(answer.whole_ns - leave_ns)
+    except StopIteration as end:
+        request_ns, first_ns, arrival_ns = np.array(times, np.int64).T
+        end_ns = start_ns + most * setting.period_ns
+        return RobotTrace(robot, start_ns, end_ns, request_ns, arrival_ns, end.value, first_ns)
+
+
+def _stepped(mode: Mode, setting: ControlSetting, most: int) -> Generator[int, int, Ticks]:
+    """Yield the tick of each request, to be sent its latency in ns, with the mode's stepper."""
+    steps, before_ns = drive(mode, setting, most), np.arange(setting.horizon)[::-1] * mode.gap_ns
+    try:
+        tick = next(steps)
+        while True:
+            latency_ns = yield tick
+            tick = steps.send(np.maximum(0, latency_ns - before_ns))
+    except StopIteration as end:
+        ticks: Ticks = end.value[1]
+        return ticks
+
+
+def _paced(pace: Pace, mode: Mode, setting: ControlSetting, most: int) -> Generator[int, int, Ticks]:
+    """Do what `_stepped` does, without the stepper."""
+    latencies: list[int] = []
+    tick, _ = next(pace)
+    while tick < most:
+        latency_ns = yield tick
+        latencies.append(min(latency_ns, (most + 1 - tick) * setting.period_ns))  # no matter how long after the end
+        known = -(-latency_ns // setting.period_ns)
+        tick, _ = pace.send((latency_ns // setting.period_ns if setting.rounding == "floor" else known, known))
+    done = mode.ticks(np.array(latencies, np.int64), setting)
+    chunk, index, age = (each[:most].copy() for each in (done.chunk, done.index, done.age))
+    return Ticks(chunk, index, age, done.stalled[:most].copy())
+
+
+def _asking(robot: int, every_ns: int, think_ns: int, start_ns: int, end_ns: int) -> Robot:
+    """Ask for a plan every ``every_ns``, after the one before it; without it, again when it has the answer.
+
+    A plan lasts until the next one is due, its pieces are even. It stalls if no start within that time is safe.
+    """
+    times: list[tuple[int, int, int]] = []
+    due_ns, done_ns = start_ns, start_ns
+    while due_ns < end_ns:
+        answer = yield max(due_ns, done_ns)
+        done_ns = answer.whole_ns
+        times.append((due_ns, answer.first_ns - due_ns, done_ns - due_ns))
+        due_ns = due_ns + every_ns if every_ns else done_ns + think_ns
+    request_ns, first_ns, arrival_ns = np.array(times, np.int64).T
+    stalled = np.maximum(first_ns, arrival_ns - every_ns) > every_ns if every_ns else None
+    return RobotTrace(robot, start_ns, end_ns, request_ns, arrival_ns, first_ns=first_ns, plan_stalled=stalled)
