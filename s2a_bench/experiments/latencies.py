@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -37,6 +38,9 @@ class Source:
     weights: str = NONE
     requests: tuple[Mapping[str, object], ...] = ()
     """Measured requests, as the columns of `chunks.delays`."""
+    service_ns: Ints | None = None
+    """Of measured requests, shape (R, 3): from the engine's start to its first and to its last piece, and the rest of
+    the latency without the queue. None for a server that sends no marks."""
 
     @property
     def provenance(self) -> Provenance:
@@ -104,12 +108,15 @@ def measured(folder: Path, only: str = "") -> Iterator[Source]:
             raise UsageError(f"`latency`: {folder} has no cell '{only}', only {', '.join(cells)}")
         spans = _pieces(run)
         for cell in [only] if only else cells:
-            requests = [_request(row, run, spans) for row in good[good["cell"] == cell].to_dict("records")]
+            rows = good[good["cell"] == cell].to_dict("records")
+            requests = [_request(row, run, spans) for row in rows]
+            services = [_service(row, run, spans) for row in rows]
             yield Source(
                 f"{folder}#{cell}",
                 recorded_ns=np.array([request["latency_ns"] for request in requests], np.int64),
                 weights=run.origins.of(cell).weights,
                 requests=tuple({**request, "provenance": run.origins.of_row(cell)} for request in requests),
+                service_ns=None if None in services else np.array(services, np.int64),
             )
 
 
@@ -128,6 +135,22 @@ def _request(row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[
         "bytes": _whole(row["payload_bytes"]),
         "latency_ns": latency_ns,
     }
+
+
+def _service(
+    row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[int, int | None]]
+) -> tuple[int, int, int] | None:
+    """Return the row of `Source.service_ns` of a request; None without marks of the engine."""
+    marks = [(run.stages.get(stage, ""), at_ns) for stage, at_ns in json.loads(row["marks"])]
+    spent = [(group, before_ns, at_ns) for (_, before_ns), (group, at_ns) in pairwise(marks)]
+    engine = [(before_ns, at_ns) for group, before_ns, at_ns in spent if group == "inference"]
+    if not engine:
+        return None
+    streaming_ns, last_ns = pieces.get(row["request_id"], (0, None))
+    began_ns, first_ns = engine[0][0], engine[-1][1]
+    queue_ns = sum(at_ns - before_ns for group, before_ns, at_ns in spent if group == "queue")
+    whole_ns = max(last_ns or 0, first_ns) - began_ns
+    return first_ns - began_ns, whole_ns, max(0, int(row["e2e_ns"]) + streaming_ns - whole_ns - queue_ns)
 
 
 def _pieces(run: StoredRun) -> dict[str, tuple[int, int | None]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -92,8 +93,6 @@ def measures(
     counts = _joined(trace.request_ns - trace.start_ns >= settle_ns for trace in traces)
     latency_ns = _joined(trace.arrival_ns for trace in traces)
     answered = counts & (latency_ns >= 0)
-    done = sum(_done(trace, settle_ns) for trace in traces)
-    seconds = sum(max(0, trace.end_ns - trace.start_ns - settle_ns) for trace in traces) / 1e9
     of_robot = np.bincount(robots[answered])
     means = np.bincount(robots[answered], latency_ns[answered])[of_robot > 0] / of_robot[of_robot > 0]
     first_ns = _joined(trace.first_ns for trace in traces if trace.first_ns is not None)
@@ -103,7 +102,7 @@ def measures(
     )
     age = _joined(trace.ticks.age[skipped:] for trace in traces if trace.ticks is not None)
     found: dict[str, Any] = {
-        "requests_per_s": done * len({trace.robot for trace in traces}) / seconds if seconds else None,
+        "requests_per_s": _rate(traces, settle_ns),
         "latency_mean_ns": _mean(latency_ns[answered]),
         **_quantiles("latency", latency_ns[answered]),
         **_quantiles("ttft", first_ns[counts & (first_ns >= 0)] if first_ns.size else first_ns),
@@ -121,11 +120,20 @@ def measures(
     }
 
 
-def _done(trace: RobotTrace, settle_ns: int) -> int:
-    """Return the number of answers between the settling time and the end."""
-    at_ns = trace.request_ns + trace.arrival_ns
-    counts = (trace.arrival_ns >= 0) & (at_ns >= trace.start_ns + settle_ns) & (at_ns < trace.end_ns)
-    return int(np.count_nonzero(counts))
+def _rate(traces: Sequence[RobotTrace], settle_ns: int) -> float | None:
+    """Return the answers a second while all robots act; counted from each one's own start, cycles would line up."""
+    episodes: defaultdict[int, list[RobotTrace]] = defaultdict(list)
+    robots: Counter[int] = Counter()
+    for trace in traces:
+        episodes[robots[trace.robot]].append(trace)
+        robots[trace.robot] += 1
+    done = spent_ns = 0
+    for episode in episodes.values():
+        start_ns, end_ns = max(trace.start_ns for trace in episode) + settle_ns, min(trace.end_ns for trace in episode)
+        at_ns = _joined((trace.request_ns + trace.arrival_ns)[trace.arrival_ns >= 0] for trace in episode)
+        done += int(np.count_nonzero((at_ns >= start_ns) & (at_ns < end_ns)))
+        spent_ns += max(0, end_ns - start_ns)
+    return done / spent_ns * 1e9 if spent_ns else None
 
 
 def _stalls(

@@ -108,7 +108,7 @@ def serve(
         if not waiting:
             waiting.append(heapq.heappop(coming))
         start_ns = max(free_ns[0], waiting[0][0])
-        while coming and coming[0][0] <= start_ns:
+        while coming and (coming[0][0] < start_ns or coming[0][0] == waiting[0][0]):
             waiting.append(heapq.heappop(coming))
         batch = [waiting.popleft() for _ in range(min(len(waiting), len(slower)))]
         time, factor = next(times), slower[len(batch) - 1]
