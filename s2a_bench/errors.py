@@ -5,7 +5,7 @@ A field of a configuration is in backquotes, as `requests`: the command line sho
 S2AError
 ├── UsageError, MissingExtra, SourceError, RobotError, StoreError, UnlikeRuns
 ├── EngineError: ModelError, BadRequest, Overdue
-└── TransportError: MissingInterface, PortInUse, ServerDied
+└── TransportError: MissingInterface, PortInUse, ServerDied, ClockMoved
     └── RequestFailed: Busy, TooLarge, MessagesLost
 """
 
@@ -68,6 +68,10 @@ class Overdue(EngineError):
 
 class TransportError(S2AError):
     """A request failed between client and server."""
+
+
+class ClockMoved(TransportError):
+    """The clocks of two hosts cannot be joined: one was stepped or slewed."""
 
 
 class RequestFailed(TransportError):

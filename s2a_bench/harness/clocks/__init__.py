@@ -1,0 +1,137 @@
+"""The offset of another host's clock, as an interval at each instant, from exchanges of four time stamps.
+
+An exchange leaves this host at t1 and its answer arrives at t4, both on this host's clock; the other host receives it
+at t2 and answers at t3, on its own. Delays are not negative, so t3 - t4 <= offset(t4) and offset(t1) <= t2 - t1,
+whatever the asymmetry. Within `WINDOW_NS` the offset is a line a + b t, below every upper point and above every lower
+one; the possible (a, b) are a polygon, and the interval at t is the least and the greatest a + b t over it (Moon,
+Skelly, Towsley, Infocom 1999; Zhang, Liu, Xia, Infocom 2002). If a clock was stepped or slewed, no line is left: that
+is an error and never widened away.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from itertools import pairwise, product
+from math import ceil, floor
+from typing import Final, TypeAlias
+
+from s2a_bench.errors import ClockMoved
+
+WINDOW_NS: Final = 60 * 10**9
+KEPT: Final = 2000
+"""Most exchanges that count: a fast client's windows are shorter, so that an interval is found in a few ms."""
+RATE: Final = 0.1
+"""Limit on the relative rate of two clocks: chrony slews by at most 100,000 ppm."""
+ROUNDING_NS: Final = 1
+"""Added on both sides, for what floats lose."""
+VERTICES: Final = 100
+"""Most vertices of a hull that count: without some the interval is wider, never wrong."""
+
+Point: TypeAlias = tuple[int, int]
+"""Time on this host's clock, and a bound of the offset there, in ns."""
+
+
+@dataclass(frozen=True, slots=True)
+class Exchange:
+    """The four time stamps t1 to t4."""
+
+    sent_ns: int
+    received_ns: int
+    answered_ns: int
+    seen_ns: int
+
+    @property
+    def upper(self) -> Point:
+        return self.sent_ns, self.received_ns - self.sent_ns
+
+    @property
+    def lower(self) -> Point:
+        return self.seen_ns, self.answered_ns - self.seen_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Interval:
+    """An offset lies within it, both ends included."""
+
+    lo_ns: int
+    hi_ns: int
+
+    @property
+    def middle_ns(self) -> int:
+        return (self.lo_ns + self.hi_ns) // 2
+
+    @property
+    def half_ns(self) -> int:
+        """Return the distance from the middle to the farther end."""
+        return self.hi_ns - self.middle_ns
+
+    def __or__(self, other: Interval) -> Interval:
+        return Interval(min(self.lo_ns, other.lo_ns), max(self.hi_ns, other.hi_ns))
+
+
+class Offset:
+    """The offset of another clock from this host's, the other minus this one."""
+
+    def __init__(self) -> None:
+        self._exchanges: deque[Exchange] = deque(maxlen=KEPT)
+
+    def add(self, exchange: Exchange) -> None:
+        """Add an exchange; they come in order of time."""
+        self._exchanges.append(exchange)
+
+    def over(self, *times_ns: int) -> Interval:
+        """Return an interval that holds the offset at each of these times, and between them.
+
+        Raises ClockMoved if the exchanges around one of them contradict each other.
+        """
+        return reduce(Interval.__or__, map(self._at, times_ns))
+
+    def _at(self, at_ns: int) -> Interval:
+        end_ns = min(at_ns + WINDOW_NS // 2, self._exchanges[-1].seen_ns)
+        near = (each for each in self._exchanges if each.seen_ns >= end_ns - WINDOW_NS and each.sent_ns <= end_ns)
+        return interval_at(at_ns, [*near])
+
+
+def interval_at(at_ns: int, exchanges: Sequence[Exchange]) -> Interval:
+    """Return the interval of the offset at an instant; raises ClockMoved if no line passes between the exchanges.
+
+    The least and the greatest value are those of vertices of the polygon: of lines through two of the bounds, or
+    through one at the limit of `RATE`.
+    """
+    import numpy as np
+
+    base_ns = exchanges[0].upper[1]
+    upper = _lower_hull((time - at_ns, bound - base_ns) for time, bound in (each.upper for each in exchanges))
+    mirrored = _lower_hull((time - at_ns, base_ns - bound) for time, bound in (each.lower for each in exchanges))
+    lower = [(time, -bound) for time, bound in mirrored]
+    above, below = np.array(upper, np.float64), np.array(lower, np.float64)
+    pairs = [*pairwise(upper), *pairwise(lower), *product(upper, lower)]
+    lines = [(one, (other[1] - one[1]) / (other[0] - one[0])) for one, other in pairs if one[0] != other[0]]
+    lines += [(point, rate) for point in (*upper, *lower) for rate in (-RATE, RATE)]
+    found = np.array([(bound - rate * time, rate) for (time, bound), rate in lines if abs(rate) <= RATE])
+    at, rate = found[:, :1], found[:, 1:]
+    over, under = at + rate * above[:, 0] - above[:, 1], below[:, 1] - at - rate * below[:, 0]
+    beyond = np.maximum(over.max(axis=1), under.max(axis=1))
+    if beyond.min() > ROUNDING_NS / 2:
+        raise ClockMoved(
+            f"the clocks of the two hosts moved against each other by about {2 * beyond.min() / 1e6:.2g} ms within "
+            f"{WINDOW_NS // 10**9} s: one was stepped or slewed, and one-way times cannot be told; wait until NTP has "
+            "settled (chronyc waitsync), or stop it for the run"
+        )
+    possible = at[beyond <= ROUNDING_NS / 2]
+    return Interval(base_ns + floor(possible.min()) - ROUNDING_NS, base_ns + ceil(possible.max()) + ROUNDING_NS)
+
+
+def _lower_hull(points: Iterable[Point]) -> list[Point]:
+    """Return vertices of the lower convex hull (Andrew's monotone chain), at most `VERTICES`."""
+    hull: list[Point] = []
+    for time, bound in sorted(points):
+        while len(hull) > 1 and (hull[-1][1] - hull[-2][1]) * (time - hull[-2][0]) >= (bound - hull[-2][1]) * (
+            hull[-1][0] - hull[-2][0]
+        ):
+            hull.pop()
+        hull.append((time, bound))
+    return hull[:: len(hull) // VERTICES + 1]
