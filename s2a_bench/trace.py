@@ -11,7 +11,7 @@ first token seen by the client is the mark `return`. Everything is in integer na
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Final, TypeAlias
 
 from s2a_bench.clock import clock_id, now_ns
@@ -110,6 +110,16 @@ class Remote:
     def to_json(self) -> dict[str, Any]:
         return asdict(self)
 
+    def shifted(self, offset_ns: int) -> Remote:
+        """Return the report on this host's clock, which the server's is ``offset_ns`` ahead of."""
+        return replace(
+            self,
+            clock=clock_id(),
+            marks=[(stage, stamp - offset_ns) for stage, stamp in self.marks],
+            token_ns=[stamp - offset_ns for stamp in self.token_ns],
+            frame_marks=[(stage, stamp - offset_ns) for stage, stamp in self.frame_marks],
+        )
+
     def check(self) -> Remote:
         """Return the report; raises ValueError if its values, which come from outside, are impossible."""
         marks = [*self.marks, *self.frame_marks]
@@ -170,9 +180,11 @@ class Trace:
         return Remote(clock_id(), self.marks, self.token_ns, *frame, facts, self.provenance)
 
     def chain(self) -> list[Mark]:
-        """Join both sides' marks in order of time, without those of another clock."""
-        if self.remote is None or self.remote.clock != clock_id():
+        """Join both sides' marks in order of time; of another clock's all up to the answer is the stage `server`."""
+        if self.remote is None:
             return list(self.marks)
+        if self.remote.clock != clock_id():
+            return [("server" if stage == "return" else stage, stamp) for stage, stamp in self.marks]
         return sorted([*self.marks, *self.remote.marks], key=lambda mark: mark[1])
 
 

@@ -102,11 +102,15 @@ def test_both_sides_join_in_order_of_time() -> None:
     assert trace.facts == {"prompt_n": 3.0}
 
 
-def test_marks_of_another_clock_are_not_mixed_in() -> None:
+def test_marks_of_another_clock_are_not_mixed_in_unless_shifted() -> None:
     trace = Trace()
     trace.marks = [("", 10), ("return", 90)]
     trace.receive(Remote("another host", [("network", 40)]))
-    assert trace.chain() == [("", 10), ("return", 90)]
+    assert trace.chain() == [("", 10), ("server", 90)]
+    trace.receive(Remote("another host", [("network", 1040)], [1060], frame_marks=[("network", 1005)]).shifted(1000))
+    assert trace.chain() == [("", 10), ("network", 40), ("return", 90)]
+    assert trace.remote is not None
+    assert (trace.remote.token_ns, trace.remote.frame_marks) == ([60], [("network", 5)])
 
 
 def test_a_trace_that_knows_nothing_tells_that_there_is_no_frame() -> None:

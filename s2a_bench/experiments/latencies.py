@@ -126,11 +126,12 @@ def _request(row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[
     ends = {run.stages.get(stage, ""): at_ns for stage, at_ns in marks}
     streaming_ns, last_engine_ns = pieces.get(row["request_id"], (0, None))
     latency_ns = int(row["e2e_ns"]) + streaming_ns
+    one_clock = _whole(row.get("clock_error_ns")) is None
     return {
         "observation_ns": marks[0][1],
         "sent_ns": ends.get("pack"),
-        "server_in_ns": ends.get("network"),
-        "server_out_ns": last_engine_ns or ends.get("inference"),
+        "server_in_ns": ends.get("network") if one_clock else None,
+        "server_out_ns": last_engine_ns or ends.get("inference") if one_clock else None,
         "received_ns": marks[0][1] + latency_ns,
         "bytes": _whole(row["payload_bytes"]),
         "latency_ns": latency_ns,

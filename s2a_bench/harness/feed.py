@@ -66,6 +66,8 @@ class StreamedFrame:
     used_by: str = ""
     sequence: int = 0
     """Frames published so far, this one included."""
+    clock_error_ns: int | None = None
+    """Of the server's marks, if its clock is another."""
 
     @property
     def key(self) -> int:

@@ -5,21 +5,33 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 from s2a_bench.act.events import PlanFeed
 from s2a_bench.clock import clock_id, now_ns
-from s2a_bench.errors import EngineError, RequestFailed, S2AError, ServerDied, SourceError, UsageError
+from s2a_bench.errors import (
+    EngineError,
+    RequestFailed,
+    S2AError,
+    ServerDied,
+    SourceError,
+    TransportError,
+    UsageError,
+)
 from s2a_bench.facts import (
     CACHE_N,
     CAMERA_FRAMES,
+    CAMERA_STAMP_AGE_MS,
     FRAMES_LOST,
     FRAMES_PUBLISHED,
     PAYLOAD_BYTES,
     PROMPT_MS,
     PROMPT_N,
 )
-from s2a_bench.harness.feed import Feed, StreamedFrame, StreamFeed
+from s2a_bench.frames import open_source
+from s2a_bench.harness.clocks.remote import Joined, RemoteClock
+from s2a_bench.harness.feed import Feed, RequestFeed, StreamedFrame, StreamFeed
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint, together
 from s2a_bench.harness.plan import RequestPlan
 from s2a_bench.harness.recording import RunRecorder
@@ -31,6 +43,7 @@ from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import STAGES, Mark, Trace
 from s2a_bench.transport import LOSSLESS, Client
 from s2a_bench.transport.pipeline import Pipeline
+from s2a_bench.transport.serving import CLOCK_PROMPT
 from s2a_bench.types import Frame, Piece, Request, Token
 
 FATAL = (ServerDied, SourceError, UsageError, EngineError)
@@ -82,6 +95,7 @@ class RequestContext:
 
 PLAIN = RequestContext()
 UNKNOWN_ORIGIN = Provenance()
+SMALL = (16, 16)
 KEPT_FRAMES = 90
 """Frames that a later answer may name: three seconds at 30 Hz."""
 
@@ -108,6 +122,9 @@ class Session:
         self._recorder = recorder
         self._sampler = sampler or ResourceSampler({}, 1)
         self._frames: dict[int, StreamedFrame] = {}
+        self._clock = RemoteClock(self._exchange)
+        self._pictures = 0
+        """Of the last request."""
         self.busy = False
         """Whether a request is under way, so that no other thread may use the client."""
         self.prompt_n = 0
@@ -117,6 +134,7 @@ class Session:
         """Make one request; a failure becomes a row with its error, and `Measured.fatal` if it ends the run."""
         self.busy = True
         try:
+            self._clock.refresh()
             return self._measure(place, context)
         finally:
             self.busy = False
@@ -146,6 +164,7 @@ class Session:
         except KeyboardInterrupt as interrupt:
             error, fatal = INTERRUPTED, interrupt
         self._sampler.edge()
+        self._pictures = len(frames)
         texts = iter(struck_pieces([piece.text for piece, _ in seen if isinstance(piece, Token)]))
         seen = [(replace(piece, text=next(texts)) if isinstance(piece, Token) else piece, at) for piece, at in seen]
         trace.facts.update(self._sampler.window(started_ns, now_ns()))
@@ -158,7 +177,22 @@ class Session:
             self._recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
             self._recorder.flush()
         rows = self._rows(place, request_id, frames, trace, seen, error)
-        return replace(rows, fatal=fatal, retry_after_s=retry_after_s)
+        return replace(rows, fatal=fatal or rows.fatal, retry_after_s=retry_after_s)
+
+    @cached_property
+    def _small(self) -> RequestFeed:
+        """The least pictures that a request can carry, as many as the last one had."""
+        source = open_source("synthetic", *SMALL, fps=30, seed=0)
+        return RequestFeed(source, preencoded=self.cell.payload == "jpeg-preencoded", cameras=self._pictures)
+
+    def _exchange(self) -> Trace:
+        """Make a request that our server answers without its engine."""
+        trace, plan = Trace(), self.request
+        self._small.get_ready()
+        frames, prompt = self._small.capture(trace), CLOCK_PROMPT + self.cell.capabilities.answer_kinds[0]
+        for _ in self.client.request(Request("clock", prompt, frames, 1, state=(0.0,) * plan.state), trace):
+            pass
+        return trace
 
     def _pieces(self, request: Request, trace: Trace, context: RequestContext) -> Iterator[tuple[Piece, int]]:
         plan = context.plan
@@ -194,7 +228,10 @@ class Session:
             self.origin = replace(self.origin, link="real" if trace.remote.clock == clock_id() else UNKNOWN)
         if origin.known:
             self.origin = replace(origin, link=self.origin.link)
-        streamed = self._streamed(trace, request_id)
+        joined, apart = self._joined(trace, seen) if seen and not error else (None, None)
+        if apart:
+            error = f"{type(apart).__name__}: {apart}"
+        streamed = self._streamed(trace, request_id, joined)
         if streamed:
             index, captured_ns, picture = streamed.index, streamed.captured_ns, streamed.index
         elif frames:
@@ -208,6 +245,9 @@ class Session:
         rgb_engine = _whole(facts.pop(RGB_ENGINE, None))
         error = error or self._doubt(trace, rgb_source, rgb_engine)
         started_ns = inference_start_ns(trace)
+        age_ns = started_ns - captured_ns if started_ns is not None and captured_ns >= 0 else None
+        if joined:
+            facts.pop(CAMERA_STAMP_AGE_MS, None)  # the difference of two hosts' wall clocks
         self.prompt_n = _whole(facts.get(PROMPT_N)) or self.prompt_n
         sample = SampleRow(
             cell=self.cell.name,
@@ -225,7 +265,7 @@ class Session:
             marks=trace.chain(),
             n_tokens=len(seen),
             last_token_ns=seen[-1][1] if seen else None,
-            frame_age_ns=started_ns - captured_ns if started_ns is not None and captured_ns >= 0 else None,
+            frame_age_ns=None if joined else age_ns,
             cache_n=_whole(facts.get(CACHE_N)),
             prompt_n=_whole(facts.get(PROMPT_N)),
             server_prompt_ms=facts.get(PROMPT_MS),
@@ -233,8 +273,11 @@ class Session:
             rgb_engine=rgb_engine,
             payload_bytes=_whole(facts.get(PAYLOAD_BYTES)),
             facts=facts,
+            clock_error_ns=joined.error_ns if joined else None,
+            frame_age_lo_ns=max(0, age_ns - joined.error_ns) if joined and age_ns is not None else None,
+            frame_age_hi_ns=age_ns + joined.error_ns if joined and age_ns is not None else None,
         )
-        engine_ns = trace.remote.token_ns if trace.remote else []
+        engine_ns = dict(enumerate(trace.remote.token_ns if trace.remote and trace.remote.clock == clock_id() else []))
         tokens = [
             TokenRow(
                 request_id=request_id,
@@ -242,12 +285,24 @@ class Session:
                 index=token.index,
                 token_id=token.id,
                 text=token.text,
-                engine_ns=engine_ns[position] if position < len(engine_ns) else None,
+                engine_ns=None if joined else left_ns,
                 client_ns=client_ns,
+                engine_lo_ns=left_ns - joined.early_ns if joined and left_ns else None,
+                engine_hi_ns=min(left_ns + joined.late_ns, client_ns) if joined and left_ns else None,
             )
             for position, (token, client_ns) in enumerate(seen)
+            for left_ns in (engine_ns.get(position),)
         ]
-        return Measured(sample, tokens, picture, odd=frozenset(trace.odd))
+        return Measured(sample, tokens, picture, apart, odd=frozenset(trace.odd))
+
+    def _joined(self, trace: Trace, seen: list[tuple[Piece, int]]) -> tuple[Joined | None, TransportError | None]:
+        """Put the report of a server on another host on this host's clock, or return why that cannot be done."""
+        if trace.remote is None or trace.remote.clock == clock_id():
+            return None, None
+        try:
+            return self._clock.join(trace, seen[-1][1]), None
+        except TransportError as failure:
+            return None, failure
 
     def _doubt(self, trace: Trace, rgb_source: int | None, rgb_engine: int | None) -> str:
         if unknown := {stage for stage, _ in trace.chain() if stage} - self.request.stages.keys():
@@ -256,7 +311,7 @@ class Session:
             return "TransportError: the engine saw other pixels than the camera gave, though nothing should be lost"
         return ""
 
-    def _streamed(self, trace: Trace, request_id: str) -> StreamedFrame | None:
+    def _streamed(self, trace: Trace, request_id: str, joined: Joined | None) -> StreamedFrame | None:
         """Find the camera frame that the answer is about, and complete its marks with the server's."""
         if not isinstance(self.feed, StreamFeed):
             return None
@@ -265,7 +320,9 @@ class Session:
         if self.feed.sink is not None:
             used = self._frames.get(trace.remote.frame_stamp_ns) if trace.remote else None
             if used is not None and trace.remote is not None:
-                used.marks = used.marks if used.used_by else [*used.marks, *trace.remote.frame_marks]
+                if not used.used_by and trace.remote.clock == clock_id():
+                    used.marks = [*used.marks, *trace.remote.frame_marks]
+                    used.clock_error_ns = max(joined.early_ns, joined.late_ns) if joined else None
                 if CAMERA_FRAMES in trace.facts:
                     trace.facts[FRAMES_PUBLISHED] = used.sequence
                     trace.facts[FRAMES_LOST] = used.sequence - trace.facts[CAMERA_FRAMES]
@@ -278,7 +335,8 @@ class Session:
         rows = []
         while len(self._frames) > keep:
             frame = self._frames.pop(next(iter(self._frames)))
-            rows.append(FrameRow(self.cell.name, frame.index, frame.intended_ns, frame.marks, frame.used_by))
+            about = frame.marks, frame.used_by, frame.clock_error_ns
+            rows.append(FrameRow(self.cell.name, frame.index, frame.intended_ns, *about))
         return rows
 
 

@@ -6,7 +6,7 @@ the chain does not have is null, never zero; every derived column of a failed re
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -22,7 +22,9 @@ class SampleRow:
     png, empty for loopback. An empty ``error`` means success. ``frame_age_ns`` is the age of the frame when inference
     starts. ``rgb_source`` is a checksum of the RGB from a reference conversion of the source frame, ``rgb_engine`` of
     the RGB at the engine; null if unknown, as behind a black box. ``launch`` counts the sets of servers from 0,
-    ``block`` counts over all launches.
+    ``block`` counts over all launches. Behind a server on another host its marks are where the middle of the offset's
+    interval puts them, and may all be off by ``clock_error_ns`` either way; null on one host. What begins on one clock
+    and ends on the other is then null, and has its least and greatest value in columns with ``_lo`` and ``_hi``.
     """
 
     cell: str
@@ -51,11 +53,17 @@ class SampleRow:
     rgb_engine: int | None = None
     facts: dict[str, float] = field(default_factory=dict)
     launch: int = 0
+    clock_error_ns: int | None = None
+    frame_age_lo_ns: int | None = None
+    frame_age_hi_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class TokenRow:
-    """One token: when it left the engine (null behind a black box) and when the client received it."""
+    """One token: when it left the engine (null behind a black box) and when the client received it.
+
+    On another host it left the engine between ``engine_lo_ns`` and ``engine_hi_ns``.
+    """
 
     request_id: str
     cell: str
@@ -64,6 +72,8 @@ class TokenRow:
     text: str
     engine_ns: int | None
     client_ns: int
+    engine_lo_ns: int | None = None
+    engine_hi_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +85,7 @@ class FrameRow:
     intended_ns: int
     marks: list[Mark] = field(default_factory=list)
     used_by: str = ""
+    clock_error_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +115,24 @@ def _stage_values(spent: Budget) -> dict[str, Value]:
     return {f"{stage}_ns": duration for stage, duration in spent.stages_ns.items()}
 
 
+ONE_WAY: Final = ("network", "return")
+"""The stages that begin on one side of the wire and end on the other."""
+ONE_WAY_OF_FRAME: Final = ("network", "path", "latency")
+
+
+def _as_intervals(values: dict[str, Value], names: Iterable[str], error_ns: int | None) -> dict[str, Value]:
+    """Return ``values``, between two clocks with the ends of intervals in place of those of ``names``."""
+    for name in names if error_ns is not None else ():
+        middle_ns = values.pop(f"{name}_ns", None)
+        if isinstance(middle_ns, int) and error_ns is not None:
+            values |= {f"{name}_lo_ns": max(0, middle_ns - error_ns), f"{name}_hi_ns": middle_ns + error_ns}
+    return values
+
+
+def _ends(names: Iterable[str]) -> dict[str, Kind]:
+    return {f"{name}_{end}_ns": "int64" for name in names for end in ("lo", "hi")}
+
+
 FIRST_TOKEN: Final = frozenset({"return", "ingest", "server"})
 """A chain with one of these stages ends when the client receives the first token; the last two are of black boxes."""
 
@@ -113,7 +142,8 @@ def _derive_sample(row: SampleRow) -> dict[str, Value]:
     if row.error or not any(stage in FIRST_TOKEN for stage, _ in row.marks):
         return {}
     spent = budget(row.marks)
-    return {**_stage_values(spent), **{name: of(row, spent) for name, (_, of) in _OF_SAMPLE.items()}}
+    values = {**_stage_values(spent), **{name: of(row, spent) for name, (_, of) in _OF_SAMPLE.items()}}
+    return _as_intervals(values, ONE_WAY, row.clock_error_ns)
 
 
 def _without_model_ns(row: SampleRow, spent: Budget) -> int | None:
@@ -139,12 +169,9 @@ def _derive_frame(row: FrameRow) -> dict[str, Value]:
     if not row.marks:
         return {}
     spent = budget(row.marks)
-    return {
-        **_stage_values(spent),
-        "path_ns": spent.e2e_ns,
-        "latency_ns": row.marks[-1][1] - row.intended_ns,
-        "residual_ns": spent.residual_ns,
-    }
+    whole = {"path_ns": spent.e2e_ns, "latency_ns": row.marks[-1][1] - row.intended_ns}
+    values = {**_stage_values(spent), **whole, "residual_ns": spent.residual_ns}
+    return _as_intervals(values, ONE_WAY_OF_FRAME, row.clock_error_ns)
 
 
 TOKENS: Final[Table[TokenRow]] = Table("tokens", TokenRow)
@@ -167,13 +194,13 @@ SKILLS: Final[Table[SkillRow]] = Table(
 def samples_table(stages: Mapping[str, str]) -> Table[SampleRow]:
     """Return the table of requests, with a column for each of a run's stages."""
     derived = {name: kind for name, (kind, _) in _OF_SAMPLE.items()}
-    return Table("samples", SampleRow, _columns(stages) | derived, _derive_sample)
+    return Table("samples", SampleRow, _columns(stages) | derived | _ends(ONE_WAY), _derive_sample)
 
 
 def frames_table(stages: Mapping[str, str]) -> Table[FrameRow]:
     """Return the table of frames in stream mode; `latency_ns` has no coordinated omission."""
     derived: dict[str, Kind] = {"path_ns": "int64", "latency_ns": "int64", "residual_ns": "int64"}
-    return Table("frames", FrameRow, _columns(stages) | derived, _derive_frame)
+    return Table("frames", FrameRow, _columns(stages) | derived | _ends(ONE_WAY_OF_FRAME), _derive_frame)
 
 
 def _columns(stages: Mapping[str, str]) -> dict[str, Kind]:

@@ -17,17 +17,22 @@ from contextlib import ExitStack, closing, contextmanager
 from threading import Event, Lock, Semaphore, Thread, current_thread
 from typing import TYPE_CHECKING, Final, TypeAlias
 
+import numpy as np
+
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, EngineError, Overdue, S2AError, TooLarge
 from s2a_bench.machine.tuning import give_back_memory
 from s2a_bench.trace import RESIDUAL, Trace
+from s2a_bench.transport import ACTIONS
 from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.types import Piece, Request
+from s2a_bench.types import Action, Piece, Request, Token
 
 if TYPE_CHECKING:
     from s2a_bench.options import Options
     from s2a_bench.transport import Handler
 
+CLOCK_PROMPT: Final = "s2a-bench exchanges time stamps: "
+"""Followed by `TOKENS` or `ACTIONS`, the prompt of a request that is answered without the engine, for its marks."""
 RETRY_AFTER_S = 1.0
 STUCK_S = 120
 """Silence after which a running answer counts as stuck: a long prompt on a small board takes its time."""
@@ -174,9 +179,16 @@ class Queued:
         trace.mark(RESIDUAL)
         try:
             turn.check(now_ns())
-            yield from self._answering(request, trace, turn)
+            yield from (_stamped if request.prompt.startswith(CLOCK_PROMPT) else self._answering)(request, trace, turn)
         finally:
             turn.leave()
+
+
+def _stamped(request: Request, trace: Trace, turn: Turn) -> Generator[Piece, None, None]:  # noqa: ARG001
+    """Answer a client that compares its clock with this host's; at the piece the answer leaves."""
+    trace.mark("inference")
+    trace.token_ns.append(trace.marks[-1][1])
+    yield Action(0, np.zeros(1, np.float32)) if request.prompt.endswith(ACTIONS) else Token(0, ".")
 
 
 class Disconnected(Exception):

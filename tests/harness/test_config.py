@@ -271,7 +271,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"options": {"http": {"llama_server": "/no/such"}}}, "`llama_server`: /no/such is no program that can be run"),
         (
             {"url": "gopher://x"},
-            "`url`: no installed transport speaks gopher://, only http://, https://, ws://, wss://, tcp://",
+            "`url`: no installed transport speaks gopher://, only http://, https://, ros://, ws://, wss://, tcp://",
         ),
         ({"options": {"http": {"url": "localhost:1"}}}, "`url`: 'localhost:1' should start with http"),
         ({"options": {"ros": {"action": "generate"}}}, "`action`: 'generate' should look like /name"),

@@ -84,7 +84,6 @@ def test_our_own_server_is_known_by_its_url_and_keeps_its_marks(url: str) -> Non
 
 
 def test_marks_of_another_hosts_clock_are_not_mixed_with_ours(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.transport.http.client.clock_id", lambda: "another boot")
     monkeypatch.setattr("s2a_bench.trace.clock_id", lambda: "another boot")
     monkeypatch.setattr(Remote, "to_json", lambda remote: {**asdict(remote), "clock": "this boot"})
     client = open_client(wiring_of("http/as-deployed", url))

@@ -256,7 +256,7 @@ class TestClientsOfOthers:
     def test_n1_7s_modalities_have_a_mark_of_their_own(self) -> None:
         with serving(RecordingHandler([]), layout="n1.7") as server, plain(server.address) as call:
             configs = call("get_modality_config")
-        assert [list(config) for config in configs.values()] == [["__ModalityConfig__", "as_json"]] * 4
+        assert [list(config) for config in configs.values()] == [["__ModalityConfig__", "s2a-bench", "as_json"]] * 4
         assert configs["video"]["as_json"]["modality_keys"] == ["ego_view"]
 
     def test_nobody_ends_the_server_over_the_network(self) -> None:

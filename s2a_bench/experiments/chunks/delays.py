@@ -33,7 +33,8 @@ COLUMNS: Final = (
 |---|---|
 | request | number, from 0 |
 | observation_ns, received_ns | when the observation was made, when the whole chunk was there; L is their difference |
-| sent_ns, server_in_ns, server_out_ns | when it left the client, reached and left the server; empty if unknown |
+| sent_ns, server_in_ns, server_out_ns | when it left the client, reached and left the server; empty if unknown, as
+those of a server on another host |
 | bytes | of the request; empty in process |
 | latency_ns | L |
 | d | L in control ticks, by the convention of the column ``rounding`` (floor, ceil) |

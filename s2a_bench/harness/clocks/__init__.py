@@ -18,7 +18,8 @@ from itertools import pairwise, product
 from math import ceil, floor
 from typing import Final, TypeAlias
 
-from s2a_bench.errors import ClockMoved
+from s2a_bench.errors import ClockMoved, RequestFailed
+from s2a_bench.trace import Trace
 
 WINDOW_NS: Final = 60 * 10**9
 KEPT: Final = 2000
@@ -42,6 +43,17 @@ class Exchange:
     received_ns: int
     answered_ns: int
     seen_ns: int
+
+    @staticmethod
+    def of(trace: Trace) -> Exchange:
+        """Read the exchange that a request is, from its last byte packed to its first piece seen.
+
+        Raises RequestFailed for a report without marks.
+        """
+        remote = trace.remote
+        if remote is None or not remote.marks:
+            raise RequestFailed("the server reported no marks, so that its clock cannot be compared with this host's")
+        return Exchange(trace.marks[-2][1], remote.marks[0][1], remote.marks[-1][1], trace.marks[-1][1])
 
     @property
     def upper(self) -> Point:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_STAMP_AGE_MS, PAYLOAD_BYTES, STALE_FRAMES, Fact
-from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Client, Handler, Server, Transport, Wiring
+from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Client, Handler, Server, Transport, Urls, Wiring
 from s2a_bench.transport.ros.options import RosOptions
 
 TOPIC, ACTION = VARIANTS = ("topic", "action")
@@ -45,6 +45,7 @@ class Ros(Transport[RosOptions]):
         "dds-buffers": "s2a_bench.transport.ros.buffers:check",
     }
     udp_checks = ("rmem-max",)
+    urls = Urls(("ros",))
 
     def client(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> Client:
         if wiring.variant == ACTION:

@@ -45,7 +45,7 @@ class GenerateClient(RosClient):
             self._origin = self.middleware.subscription(
                 self._name.rpartition("/")[0] + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
             )
-            if not wiring.black_box:
+            if not wiring.options.action:
                 self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, READER_QOS)
                 self._wait(lambda: bool(self._marks and self._marks.matched()))
         except TransportError:

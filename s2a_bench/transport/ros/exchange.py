@@ -10,7 +10,7 @@ from s2a_bench.errors import S2AError
 from s2a_bench.trace import Trace
 from s2a_bench.transport.ros.camera import CameraCache
 from s2a_bench.transport.ros.node import Activity
-from s2a_bench.transport.serving import Exchange
+from s2a_bench.transport.serving import CLOCK_PROMPT, Exchange
 from s2a_bench.types import Piece, Request
 
 END_S: Final = 5.0
@@ -70,7 +70,9 @@ class RosExchange(Exchange):
         self._ended = shared.ended
         if not self.started():
             return None
-        return request if request.images else replace(request, images=shared.cache.newest(self.trace))
+        if request.images or request.prompt.startswith(CLOCK_PROMPT):
+            return request
+        return replace(request, images=shared.cache.newest(self.trace))
 
     def send(self, piece: Piece) -> bool:
         self._shared.activity.tokens += 1

@@ -127,7 +127,7 @@ def refuse_company(wiring: Wiring[RosOptions], namespace: str) -> None:
         if publisher.matched() or offered():
             raise TransportError(
                 f"another server answers under {namespace} in {place_of(wiring)}: stop it, "
-                "or choose another domain with ROS_DOMAIN_ID or another `namespace`"
+                f"choose another domain with ROS_DOMAIN_ID or another `namespace`, or measure that server with `url` ros://{namespace}"
             )
     finally:
         probe.close()
@@ -164,7 +164,7 @@ class RosClient:
     @cached_property
     def camera(self) -> CameraPublisher | None:
         """The server's camera, from the first use on; none of a server that is not ours."""
-        return None if self._wiring.black_box else open_camera(self.middleware, self._wiring, self._alive)
+        return None if self._wiring.options.action else open_camera(self.middleware, self._wiring, self._alive)
 
     def taken(self, take: Callable[[float], T | None], bounds: Bounds) -> Iterator[T | None]:
         """Yield what comes, None where nothing came for a moment, until the longest silence is over."""

@@ -11,6 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import field_validator
 
+from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, one_of, option
 from s2a_bench.ros import MIDDLEWARES
 from s2a_bench.ros.router import ROUTER, endpoint_of
@@ -19,6 +20,7 @@ from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
 NAMESPACE = "/s2a_bench"
 """The default namespace; servers of a run add a random suffix."""
 
+SCHEME = "ros://"
 NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 """ROS 2's rules for an absolute name."""
 BASE_NAME = r"^[A-Za-z_][A-Za-z0-9_]*$"
@@ -46,6 +48,7 @@ class RosOptions(TransportOptions):
         "an action that runs already, as /llama/generate_response of llama_ros (a black box)",
         side=EXTERNAL,
     )
+    url: str = option("", "our server that runs already, by its namespace, as ros:///llama", side=EXTERNAL, risk="url")
     namespace: str = option("", "namespace of the topics [default: a new one for each run]", side=SERVER, first=True)
     domain_id: int | None = option(None, "DDS domain [default: ROS_DOMAIN_ID, else 0]", ge=0, le=232, side=SERVER)
     middleware: Annotated[str, one_of(lambda: ("", *MIDDLEWARES))] = option(
@@ -113,12 +116,27 @@ class RosOptions(TransportOptions):
             raise ValueError(f"'{text}' should look like /name or /name/name: letters, digits, underscores")
         return text
 
+    @field_validator("url")
+    @classmethod
+    def _names_a_namespace(cls, url: str) -> str:
+        if url and not (url.startswith(SCHEME) and NAME.fullmatch(url.removeprefix(SCHEME))):
+            raise ValueError(f"'{url}' should look like {SCHEME}/llama, with the namespace of the server")
+        return url
+
     @field_validator("router")
     @classmethod
     def _is_an_endpoint(cls, text: str) -> str:
         if text:
             endpoint_of(text)
         return text
+
+    def check(self) -> None:
+        if self.url and self.action:
+            raise UsageError("`url` and `action` name two servers; give one of them")
+
+    @property
+    def external_address(self) -> str:
+        return self.action or self.url.removeprefix(SCHEME)
 
     @property
     def tuned(self) -> bool:

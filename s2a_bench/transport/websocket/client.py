@@ -1,7 +1,8 @@
 """The WebSocket client: fill the template, pack, send, read the actions, and mark each step.
 
-Our own server sends its marks in one more frame after an answer. A foreign one sends none: all from the last byte that
-was packed to the answer is the stage `server`, and where it tells ``infer_ms`` that much of it is `inference`.
+Our own server, which its greeting names, sends its marks in one more frame after an answer. A foreign one sends none:
+all from the last byte that was packed to the answer is the stage `server`, and where it tells ``infer_ms`` that much of
+it is `inference`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from urllib.parse import urlsplit, urlunsplit
 
 import numpy as np
 
-from s2a_bench.clock import clock_id, now_ns
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied
 from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.provenance import Provenance
@@ -45,8 +46,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             self._url += STREAM_PATH
         key = read_key(wiring.options.api_key_env)
         self._headers = {"Authorization": f"{codec.SCHEME} {key}"} if key else {}
-        if self._native:
-            self._headers[codec.MARKS_HEADER] = "1"
+        self._headers[codec.MARKS_HEADER] = "1"
         self._link: BoundedConnection | None = None
         self._metadata: dict[str, str] = {}
         self._provenance: dict[str, str] = {}
@@ -115,6 +115,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             raise RequestFailed(f"{self._url}: its metadata is {type(metadata).__name__}, not a dictionary")
         origin = metadata.get("provenance")
         self._provenance = Provenance.from_dict(origin if isinstance(origin, dict) else {}).to_dict()
+        self._native = metadata.get("server") == codec.OURS
         plain = {name: value for name, value in metadata.items() if isinstance(value, (str, int, float, bool))}
         self._metadata = {str(name)[:64]: struck(str(value))[:64] for name, value in list(plain.items())[:32]}
 
@@ -169,7 +170,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             trace.learn({TIMING[name]: _plain(value) for name, value in timing.items() if name in TIMING})
 
     def _mark(self, trace: Trace, packed_ns: int, first_ns: int) -> None:
-        if trace.remote is not None and trace.remote.clock == clock_id():
+        if trace.remote is not None:
             trace.marks.append(("return", first_ns))
             return
         infer_ns = round(trace.facts.get(INFER_MS, 0) * 1e6)

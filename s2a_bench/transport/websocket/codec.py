@@ -22,6 +22,8 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.transport.messagepack import array_in, unpacked
 
 MARKS_HEADER: Final = "S2A-Marks"
+OURS: Final = "s2a-bench"
+"""The ``server`` of our server's greeting."""
 SCHEME: Final = "Api-Key"
 """Of the Authorization header, as openpi's client sends it."""
 HEALTH: Final = "/healthz"

@@ -103,4 +103,4 @@ def metadata_of(queued: Queued) -> Mapping[str, Any]:
     settings = queued.settings.model_dump() if queued.settings is not None else {}
     names = {"name": "engine", "horizon": "action_horizon", "action_dim": "action_dim"}
     extension = {key: settings[name] for name, key in names.items() if isinstance(settings.get(name), (str, int))}
-    return {"server": "s2a-bench", **extension, "provenance": queued.provenance}
+    return {"server": codec.OURS, **extension, "provenance": queued.provenance}

@@ -1,8 +1,9 @@
 """The client of GR00T's protocol: fill the template, pack, send, read the chunk, and mark each step.
 
-A REQ socket takes one answer a request, so the client requests our server's marks once it has the chunk. A foreign one
-sends none: all from the last byte that was packed to the chunk is the stage `server`. A socket whose request failed is
-thrown away, for it would wait for that answer for ever.
+A REQ socket takes one answer a request, so the client requests our server's marks once it has the chunk; a server that
+runs already is ours if its modality configurations say so. A foreign one sends none: all from the last byte that was
+packed to the chunk is the stage `server`. A socket whose request failed is thrown away, for it would wait for that
+answer for ever.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any, Final
 
 import zmq
 
-from s2a_bench.clock import clock_id, now_ns
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
@@ -53,15 +54,15 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         self._connected = False
         self._layout: str = wiring.options.layout
         if self._layout == layouts.AUTO:
-            self._layout = layouts.N1_6 if self._native else self._server_layout()
+            marks = set() if self._native else self._server_marks()
+            self._native, self._layout = self._native or layouts.OURS in marks, layouts.marked(marks)
 
-    def _server_layout(self) -> str:
-        """Return the layout of a foreign server, by the marks of its modality configurations."""
+    def _server_marks(self) -> set[str]:
+        """Return the marks of the server's modality configurations: its layout, and whether it is ours."""
         bounds = self._bounds(1)
         with closing(ReqSocket(self._url, self._wiring.timeout_s, self._alive)) as link:
             link.greet(bounds)
-            _, marks = self._read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))
-        return layouts.marked(marks)
+            return self._read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))[1]
 
     def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:
         link = self._open(bounds, trace)
@@ -71,8 +72,7 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         if self._native:
             wanted = {layouts.ENDPOINT: layouts.MARKS, EXTENSION: {"id": request.id}, **self._token()}
             trace.receive(observed.remote_of(self._checked(link.exchange(pack(wanted), bounds))))
-        same_clock = trace.remote is not None and trace.remote.clock == clock_id()
-        trace.marks.append(("return" if same_clock else "server", seen_ns))
+        trace.marks.append(("return" if self._native else "server", seen_ns))
 
     def _open(self, bounds: Bounds, trace: Trace) -> ReqSocket:
         """Return the kept connection, or a new one that both sides have greeted over, marking `connect`."""
