@@ -3,7 +3,7 @@
 A field of a configuration is in backquotes, as `requests`: the command line shows it as its flag, --requests.
 
 S2AError
-├── UsageError, MissingExtra, SourceError, RobotError, StoreError, UnlikeRuns
+├── UsageError, MissingExtra, SourceError, RobotError, StoreError, UnlikeRuns, NotPermitted
 ├── EngineError: ModelError, BadRequest, Overdue
 └── TransportError: MissingInterface, PortInUse, ServerDied, ClockMoved
     └── RequestFailed: Busy, TooLarge, MessagesLost
@@ -116,6 +116,10 @@ class StoreError(S2AError):
 
 class UnlikeRuns(S2AError):
     """Runs of different machines, models or settings, which must not be compared."""
+
+
+class NotPermitted(S2AError):
+    """This process may not create network namespaces."""
 
 
 def how_it_ended(code: int | None, cure: str = SETUP_AGAIN) -> str:

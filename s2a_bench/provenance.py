@@ -33,8 +33,9 @@ class Provenance:
 
     ``weights`` are real, dummy, or none without a model; emulated tokens have none, or the dummy ones of their profile.
     ``tokens`` are measured, emulated (their times come from a profile, a rate or a distribution) or paced (held back);
-    ``link`` real (within this machine), emulated, or none; ``clock`` monotonic or virtual. ``profile`` names the
-    emulated profile or latencies. A field that nothing reported is "unknown", as the link to another machine is.
+    ``link`` real (within this machine), emulated after ``link_profile``, or none; ``clock`` monotonic or virtual.
+    ``profile`` names the emulated profile or latencies. A field that nothing reported is "unknown", as the link to
+    another machine is.
     """
 
     engine: str = UNKNOWN
@@ -46,6 +47,7 @@ class Provenance:
     profile: str = ""
     link: str = UNKNOWN
     clock: str = "monotonic"
+    link_profile: str = ""
 
     def __post_init__(self) -> None:
         if self.emulated and self.weights == "real":
@@ -81,7 +83,8 @@ class Provenance:
         return cls(**{name: _text(value) for name in _FIELDS if isinstance(value := values.get(name), str) and value})
 
     def to_dict(self) -> dict[str, str]:
-        return asdict(self)
+        """Return the fields; a server's has no ``link_profile``, which only the client's side knows."""
+        return {name: value for name, value in asdict(self).items() if value or name != "link_profile"}
 
     @property
     def known(self) -> bool:
@@ -107,7 +110,8 @@ class Provenance:
     @property
     def line(self) -> str:
         """Return a sentence: "llama (tiny-f16.gguf, DUMMY WEIGHTS), tokens measured"."""
-        link = [f"link {self.link.upper()}"] if self.link in _UNPLAIN else []
+        after = f" after {self.link_profile}" if self.link_profile else ""
+        link = [f"link {self.link.upper()}{after}"] if self.link in _UNPLAIN else []
         if not self.known:
             return ", ".join(("engine UNKNOWN (the server does not report it)", *link))
         model = ", ".join(filter(None, (self.model, self.quantisation, _WEIGHTS.get(self.weights, ""))))
@@ -173,7 +177,8 @@ class Origins:
         def kind(each: Provenance) -> Provenance:
             engine = each.engine if each.engine in {NONE, UNKNOWN} else ""
             link = each.link if each.link in _UNPLAIN else ""
-            return replace(each, engine=engine, model="", model_sha256="", quantisation="", profile="", link=link)
+            model = dict.fromkeys(("model", "model_sha256", "quantisation", "profile", "link_profile"), "")
+            return replace(each, engine=engine, link=link, **model)
 
         return self._grouped("engine", kind)
 

@@ -5,9 +5,12 @@ The modules of this package import heavy libraries inside functions, so that ``-
 
 from __future__ import annotations
 
+import os
 import resource
 import signal
+import subprocess
 import sys
+from contextlib import suppress
 from errno import EAGAIN, EDQUOT, EMFILE, ENFILE, ENOMEM, ENOSPC
 from typing import Any, ClassVar, Final
 
@@ -18,7 +21,7 @@ from s2a_bench.cli.adapter import with_flags
 from s2a_bench.cli.experiment import PLAIN, Commands, ParseError
 from s2a_bench.cli.output import print_error
 from s2a_bench.cli.ros_args import folded
-from s2a_bench.errors import S2AError
+from s2a_bench.errors import NotPermitted, S2AError
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.machine import tuning
 
@@ -99,6 +102,10 @@ def main() -> None:
             code = app(args=folded(sys.argv[1:]), prog_name=app.info.name, standalone_mode=False)
         if code == INTERRUPTED:  # newer typer turns Ctrl-C into this code itself
             print_error("interrupted")
+    except NotPermitted as error:
+        _enter_user_namespace()
+        print_error(f"error: {with_flags(str(error))}")
+        code = error.exit_code
     except S2AError as error:
         print_error(f"error: {with_flags(str(error))}")
         code = error.exit_code
@@ -123,6 +130,14 @@ def main() -> None:
         print_error(f"error: {line}")
         code = 1
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _enter_user_namespace() -> None:
+    """Execute the command again in a user namespace of its own, where it may create others; return if that fails."""
+    enter = ("unshare", "--user", "--map-root-user", "--net")
+    with suppress(OSError):
+        if not subprocess.run([*enter, "true"], check=False, capture_output=True).returncode:  # noqa: S603
+            os.execvp(enter[0], [*enter, sys.executable, "-m", "s2a_bench", *sys.argv[1:]])  # noqa: S606
 
 
 LEAST_FILES: Final = 64

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 from pydantic import create_model
 
 from s2a_bench import extras
+from s2a_bench.boards.links import LinkProfile, load_link, published
 from s2a_bench.errors import UsageError
 from s2a_bench.frames import SOURCES
 from s2a_bench.inference import STAND_IN, EngineConfig, acting, check_engine
@@ -111,6 +112,13 @@ class RequestsConfig(Options):
         panel=TRANSPORT,
         first=True,
     )
+    link: str = option(
+        "",
+        f"emulated link between client and servers: {', '.join(published())}, a FILE (TOML, a trace as CSV), or "
+        "rate=UP/DOWN,delay=MS,jitter=MS,loss=SHARE, also after a name [default: none]",
+        panel=TRANSPORT,
+        names=published,
+    )
     engine: EngineConfig = group(EngineConfig)
     requests: int = option(50, "requests a pipeline [default: 50, quick: 10]", ge=1, le=10**9, first=True)
     warmup: int = option(5, "warm-ups a pipeline, kept and marked [default: 5, quick: 2]", ge=0, le=10**9)
@@ -177,6 +185,10 @@ class RequestsConfig(Options):
             strict=bool(self.payload),
             mode=self.mode,
         )
+
+    @cached_property
+    def link_profile(self) -> LinkProfile | None:
+        return load_link(self.link) if self.link else None
 
     @property
     def usual_payloads(self) -> tuple[str, ...]:
@@ -270,6 +282,12 @@ class RequestsConfig(Options):
         if self.engine.latency and self.foreign:
             raise UsageError(f"`latency` is about our own servers; leave out `{self.foreign}`")
         self._check_unused()
+        if self.link_profile and running:
+            raise UsageError(
+                f"`link`: a server that runs already is not behind it; leave out `{running[0].options.external}`"
+            )
+        if self.link_profile and (local := [each.name for each in self.pipelines if not each.transport.crosses_links]):
+            raise UsageError(f"`link`: {', '.join(local)} sends nothing over a network; leave it out of `transport`")
 
     def _check(self, pipeline: Pipeline) -> None:
         if self.resize and pipeline.payload in {"yuyv", "jpeg-preencoded"}:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from s2a_bench import extras
+from s2a_bench.boards.links import LinkProfile
 from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, facts_json
 from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.frames.stamp import new_nonce
@@ -78,6 +79,8 @@ class RunPlan:
     blocks: BlocksPlan
     feed: FeedPlan
     request: RequestPlan
+    link: LinkProfile | None
+    """Emulated between client and servers."""
     engine: EngineConfig
     """Of all cells; a cell's name may change some of its options."""
     tuned: bool
@@ -126,6 +129,7 @@ def resolve(config: RequestsConfig) -> RunPlan:
         request=RequestPlan(
             config.sent_prompt, config.grammar, max_pieces, seed, config.state, config.mode, size, stages
         ),
+        link=config.link_profile,
         engine=engine,
         tuned=config.tuned,
         timeout_s=config.timeout_s,

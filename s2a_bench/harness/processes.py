@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +39,7 @@ POLL_S = 1.0
 class ServerProcess(AbstractContextManager["ServerProcess"]):
     """A child process that serves; use as a context manager."""
 
-    def __init__(self, name: str, command: list[str], log: Path | None) -> None:
+    def __init__(self, name: str, command: list[str], log: Path | None, pass_fds: Sequence[int] = ()) -> None:
         """Start ``command``; its output goes to ``log``, without one to this process's standard error."""
         self.name = name
         self.log = log
@@ -51,6 +51,7 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE if self._speaks_json else self._log,
             stderr=self._log,
+            pass_fds=pass_fds,
             start_new_session=True,  # Ctrl-C is the harness's to handle
         )
 
@@ -129,8 +130,8 @@ class ServerProcess(AbstractContextManager["ServerProcess"]):
 class OwnProcess(ServerProcess):
     """A module of this package: it reads its job as one line, answers with one, and serves until its input ends."""
 
-    def __init__(self, name: str, module: str, job: str, log: Path | None) -> None:
-        super().__init__(name, [sys.executable, "-m", module], log)
+    def __init__(self, name: str, module: str, job: str, log: Path | None, pass_fds: Sequence[int] = ()) -> None:
+        super().__init__(name, [sys.executable, "-m", module], log, pass_fds)
         assert self._process.stdin is not None  # noqa: S101 - opened as a pipe above
         self._process.stdin.write(job.encode() + b"\n")
         self._process.stdin.flush()
@@ -138,6 +139,20 @@ class OwnProcess(ServerProcess):
     def _ask_to_stop(self) -> None:
         if self._process.stdin is not None:
             self._process.stdin.close()
+
+    def ask(self) -> dict[str, Any]:
+        """Send an empty line, and return the JSON line that a relay answers with; raises ServerDied."""
+        stdin, stdout = self._process.stdin, self._process.stdout
+        assert stdin is not None  # noqa: S101 - opened as pipes above
+        assert stdout is not None  # noqa: S101
+        try:
+            stdin.write(b"\n")
+            stdin.flush()
+            answer: dict[str, Any] = json.loads(stdout.readline())
+        except (OSError, ValueError):
+            self.ends_within(STOP_TIMEOUT_S)
+            raise self.death() from None
+        return answer
 
     def wait_ready(self) -> None:
         stdout = self._process.stdout

@@ -17,6 +17,8 @@ from s2a_bench.errors import TransportError
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
+from s2a_bench.harness.links import EmulatedLink, emulated
+from s2a_bench.harness.links.probe import probed
 from s2a_bench.harness.plan import BlocksPlan, FeedPlan, RunPlan
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.servers import ServerSet, on_files
@@ -102,6 +104,7 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
         "process": is_allowed(),
     }
     with ExitStack() as stack:
+        link = stack.enter_context(emulated(plan.link)) if plan.link else None
         sources = _Sources(task, plan.feed, stack)
         packages = [package for cell in plan.cells for package in cell.transport.packages]
         facts = {"environment": environment.collect(packages), "mark_cost_ns": round(mark_cost_ns(), 1)}
@@ -110,10 +113,13 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
         for table in task.tables:
             writer.append(table, [])
         progress.opened(writer.path)
+        if link:
+            progress.stage(f"probing the link {link.profile.name}")
+            writer.update(link=link.facts() | probed(link))
         if plan.finds_model and extras.installed("gguf"):  # without gguf no file is read
             plan = replace(plan, engine=on_files(plan.engine, progress))
         guard = SampleGuard({cell.name: cell.options.against_loss for cell in plan.cells})
-        run = _Run(task, plan, sources, writer, progress, guard)
+        run = _Run(task, plan, sources, writer, progress, guard, link)
         if plan.record is not None:
             run.recorder = stack.enter_context(RunRecorder(plan.record, plan.namespace, live=plan.feed.stream))
         run.measure()
@@ -156,6 +162,7 @@ class _Run:
     writer: RunWriter
     progress: Progress
     guard: SampleGuard
+    link: EmulatedLink | None = None
     recorder: RunRecorder | None = None
     warnings: list[RunWarning] = field(default_factory=list)
 
@@ -182,7 +189,7 @@ class _Run:
 
     def _launch(self, number: int, stack: ExitStack) -> None:
         writer = self.writer
-        servers = ServerSet(self.plan, stack, writer.path, number)
+        servers = ServerSet(self.plan, stack, writer.path, number, self.link)
         if servers.count:
             self.progress.stage(f"starting {servers.count} server{'s' if servers.count > 1 else ''}")
         facts = servers.start()
@@ -211,6 +218,8 @@ class _Run:
         finally:
             sampler.flush(writer)
             writer.update(resources=sampler.describe())
+            if self.link:
+                writer.update(link={"relay": self.link.statistics()})
 
     def _sessions(self, servers: ServerSet, sampler: ResourceSampler, stack: ExitStack) -> Iterator[Session]:
         plan, recorder = self.plan.feed, self.recorder

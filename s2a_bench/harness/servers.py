@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from pkgutil import resolve_name
 from threading import Thread
@@ -13,6 +13,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from s2a_bench.errors import ServerDied
+from s2a_bench.harness.links import EmulatedLink, server_side
 from s2a_bench.harness.plan import RunPlan
 from s2a_bench.harness.processes import OwnServer, ServerProcess, start_program
 from s2a_bench.harness.serving import ServerJob, engine_handler
@@ -52,8 +53,11 @@ class _Running:
 class ServerSet:
     """The servers of a run; cells whose server would get the same settings share one."""
 
-    def __init__(self, plan: RunPlan, stack: ExitStack, folder: Path, launch: int = 0) -> None:
+    def __init__(
+        self, plan: RunPlan, stack: ExitStack, folder: Path, launch: int = 0, link: EmulatedLink | None = None
+    ) -> None:
         """Prepare; ``stack`` stops the servers. The names of servers of a later launch than 0 contain its number."""
+        self._link = link
         self._cells = plan.cells
         self._plan = plan
         self._suffix = f"-launch-{launch + 1}" if launch else ""
@@ -70,9 +74,10 @@ class ServerSet:
 
     def start(self) -> dict[str, Any]:
         """Start all servers and wait until they are ready; return the facts that each reports."""
-        for pipeline in self._cells:
-            if pipeline.server not in self._servers:
-                self._servers[pipeline.server] = self._launch(pipeline)
+        with server_side(self._link):
+            for pipeline in self._cells:
+                if pipeline.server not in self._servers:
+                    self._servers[pipeline.server] = self._launch(pipeline)
         facts = {}
         for server in self._servers.values():
             if server.process is not None:
@@ -142,7 +147,9 @@ class ServerSet:
         if pipeline.transport.in_process:
             return Provenance.of_engine(self._local_facts, link=NONE)
         if server.process:
-            return Provenance.of_engine(server.process.facts.get("engine", {}), link="real")
+            origin = Provenance.of_engine(server.process.facts.get("engine", {}), link="real")
+            link = self._link and self._link.profile
+            return replace(origin, link="emulated", link_profile=link.about) if link else origin
         return Provenance(link="real" if is_local(urlsplit(server.address).hostname or "") else UNKNOWN)
 
     def client(self, pipeline: Pipeline) -> Client:

@@ -227,7 +227,7 @@ class Session:
         if trace.remote and self.origin.link in {"real", UNKNOWN}:  # behind a tunnel, loopback is another machine
             self.origin = replace(self.origin, link="real" if trace.remote.clock == clock_id() else UNKNOWN)
         if origin.known:
-            self.origin = replace(origin, link=self.origin.link)
+            self.origin = replace(origin, link=self.origin.link, link_profile=self.origin.link_profile)
         joined, apart = self._joined(trace, seen) if seen and not error else (None, None)
         if apart:
             error = f"{type(apart).__name__}: {apart}"

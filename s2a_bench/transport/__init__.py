@@ -300,6 +300,8 @@ class Transport(Generic[O]):
     """Whether its server is a thread of the client's process."""
     serves: ClassVar[bool] = True
     """Whether it has a server of ours; else it is a client alone."""
+    crosses_links: ClassVar[bool] = True
+    """Whether its client reaches its server through the network, which can be emulated."""
     urls: ClassVar[Urls] = Urls()
 
     def client(self, wiring: Wiring[O], alive: Callable[[], bool]) -> Client:

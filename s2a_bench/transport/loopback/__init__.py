@@ -19,6 +19,7 @@ class Loopback(Transport[TransportOptions]):
     style = {"": ("#009E73", ":")}
     compared_with = ()
     in_process = True
+    crosses_links = False
 
     def client(self, wiring: Wiring[TransportOptions], alive: Callable[[], bool]) -> Client:
         from s2a_bench.transport.loopback.in_process import LoopbackClient

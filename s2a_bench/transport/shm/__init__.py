@@ -46,6 +46,7 @@ class Shm(Transport[ShmOptions]):
     stages: ClassVar[Mapping[str, str]] = {"header_pack": "pack", "header_parse": "parse"}
     facts = (PAYLOAD_BYTES,)
     order = 90
+    crosses_links = False
     style: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#6A3D9A", "--")}
     checks: ClassVar[Mapping[str, str]] = {"shared-memory": "s2a_bench.transport.shm:shared_memory"}
 

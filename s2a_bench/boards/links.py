@@ -1,0 +1,280 @@
+"""Link profiles: rate, delay, jitter and loss of a network between client and server, and the bound that follows.
+
+A rate counts the bits of IP packets. A delay is one-way; jitter adds a uniform share of itself, and packets keep their
+order. Lost packets take none of the rate. After idle the first ``burst_kib`` travel at ``burst_mbps``, the rest at the
+rate; the credit grows at the rate while the link is idle.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from random import Random
+from typing import Annotated, Any, Final
+
+from pydantic import Field, field_validator
+
+from s2a_bench.boards.profile import SHIPPED
+from s2a_bench.errors import UsageError
+from s2a_bench.text import none_of, read_text
+from s2a_bench.toml_file import Line, TomlTable, checked, loads
+
+PUBLISHED: Final = SHIPPED / "links" / "published.toml"
+OPPORTUNITY_BYTES: Final = 1500
+"""Bytes of a delivery opportunity in mahimahi's traces."""
+MOST_STEPS: Final = 1_000_000
+STEP_S, MEMORY_S, SYNTHETIC_S = 0.1, 1.0, 600.0
+"""Of a synthetic rate: its step, the time in which it forgets, and its period."""
+KEYS: Final = {"delay": "delay_ms", "jitter": "jitter_ms", "up": "up_mbps", "down": "down_mbps"}
+"""Short names of keys in text."""
+
+Rate = Annotated[float, Field(gt=0, le=1e6)]
+Delay = Annotated[float, Field(ge=0, le=60_000)]
+Share = Annotated[float, Field(ge=0, lt=1)]
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A part of a trace, which lasts until the next starts."""
+
+    start_s: float
+    mbps: float
+    delay_ms: float
+    loss: float
+
+
+@dataclass(frozen=True, slots=True)
+class Direction:
+    """One direction of a link; ``mbps`` is infinite if it is not limited, the greatest of ``steps`` if it has any."""
+
+    mbps: float
+    delay_ms: float = 0.0
+    """With ``steps`` the least of them, without jitter."""
+    jitter_ms: float = 0.0
+    loss: float = 0.0
+    burst_bytes: float = 0.0
+    burst_mbps: float = math.inf
+    queue_ms: float = 1000.0
+    seed: int = 0
+    steps: tuple[Step, ...] = ()
+    period_s: float = 0.0
+    """The steps repeat after it."""
+
+    def least_s(self, size: int) -> float:
+        """Return the least time in s that so many bytes take."""
+        fast = min(float(size), self.burst_bytes)
+        return self.delay_ms / 1e3 + fast * 8e-6 / self.burst_mbps + (size - fast) * 8e-6 / self.mbps
+
+    def mean_mbps(self, start_s: float, end_s: float) -> float:
+        """Return the mean rate between two times since the link's start."""
+        if not self.steps:
+            return self.mbps
+        return (self._megabits(end_s) - self._megabits(start_s)) / (end_s - start_s)
+
+    def _megabits(self, until_s: float) -> float:
+        ends = (*(step.start_s for step in self.steps[1:]), self.period_s)
+        periods, rest_s = divmod(until_s, self.period_s)
+        lasting = [(step, end - step.start_s) for step, end in zip(self.steps, ends, strict=True)]
+        whole = sum(step.mbps * lasts for step, lasts in lasting)
+        rest = sum(step.mbps * min(max(rest_s - step.start_s, 0), lasts) for step, lasts in lasting)
+        return periods * whole + rest
+
+
+class LinkProfile(TomlTable):
+    """A link between client and server; up is from the client to the server."""
+
+    name: str = ""
+    up_mbps: Rate | None = None
+    """None: not limited."""
+    down_mbps: Rate | None = None
+    delay_ms: Delay = 0.0
+    jitter_ms: Delay = 0.0
+    loss: Share = 0.0
+    burst_kib: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    burst_mbps: Rate | None = None
+    queue_ms: Annotated[float, Field(gt=0, le=60_000)] = 1000.0
+    """What waits longer than this for the rate is lost, as in a router's full buffer."""
+    rate_cv: Annotated[float, Field(ge=0, le=2)] = 0.0
+    """Spread of a synthetic rate."""
+    outage_every_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
+    """Mean time between synthetic outages; 0: none."""
+    outage_s: Annotated[list[Annotated[float, Field(ge=0, le=60)]], Field(min_length=2, max_length=2)] = Field([1, 1])
+    """Shortest and longest outage."""
+    seed: Annotated[int, Field(ge=0, le=2**31 - 1)] = 0
+    trace: str = ""
+    """CSV file of both directions: t_s, up_mbps, down_mbps, and perhaps delay_ms and loss."""
+    up_trace: str = ""
+    """File in mahimahi's format: a line for each opportunity to deliver 1,500 bytes, in ms."""
+    down_trace: str = ""
+    source: Line = "the user's"
+
+    @field_validator("outage_s")
+    @classmethod
+    def _in_order(cls, outage_s: list[float]) -> list[float]:
+        if outage_s[0] > outage_s[1]:
+            raise ValueError("should be the shortest and the longest")
+        return outage_s
+
+    @property
+    def about(self) -> str:
+        return f"{self.name} ({self.source})"
+
+    def directions(self) -> tuple[Direction, Direction]:
+        """Return up and down, their traces read; raises UsageError naming file and line."""
+        ways = ("up", self.up_mbps, self.up_trace), ("down", self.down_mbps, self.down_trace)
+        up, down = (self._direction(*way) for way in ways)
+        return up, down
+
+    def _direction(self, name: str, mbps: float | None, mahimahi: str) -> Direction:
+        rate, seed = mbps or math.inf, 2 * self.seed + (name == "down")
+        steps: list[Step] = []
+        period_s = 0.0
+        if self.trace:
+            steps, period_s = _csv_steps(self.trace, f"{name}_mbps", self)
+        elif mahimahi:
+            steps, period_s = _mahimahi_steps(mahimahi, self)
+        elif self.rate_cv or self.outage_every_s:
+            if math.isinf(rate):
+                raise UsageError(f"`link`: {self.name} needs a rate for `rate_cv` or `outage_every_s`")
+            steps, period_s = [*_synthetic_steps(self, rate, seed)], SYNTHETIC_S
+        return Direction(
+            max((step.mbps for step in steps), default=rate),
+            min((step.delay_ms for step in steps), default=self.delay_ms),
+            self.jitter_ms,
+            self.loss,
+            self.burst_kib * 1024 if mbps else 0.0,
+            self.burst_mbps or math.inf,
+            self.queue_ms,
+            seed,
+            tuple(steps),
+            period_s,
+        )
+
+
+def bound_s(link: tuple[Direction, Direction], bytes_up: int, bytes_first_down: int = 0) -> float:
+    """Return the least time in s of a request on a link: its body up, and the first piece of its answer down."""
+    return link[0].least_s(bytes_up) + link[1].least_s(bytes_first_down)
+
+
+def published() -> dict[str, LinkProfile]:
+    """Return the shipped profiles by name."""
+    tables = loads(PUBLISHED.read_text(encoding="utf-8"), str(PUBLISHED))
+    return {name: _made({**table, "name": name}, f"{PUBLISHED}: {name}") for name, table in tables.items()}
+
+
+def load_link(text: str) -> LinkProfile:
+    """Return the profile of a name, of a file (TOML or a CSV trace), or of KEY=VALUE pairs, which may follow either.
+
+    Pairs are keys of a profile, ``rate=UP/DOWN`` or ``rate=BOTH``, ``delay`` and ``jitter`` in ms, ``loss`` as a share
+    or with %. Raises UsageError.
+    """
+    first, *pairs = text.split(",")
+    values: dict[str, Any] = {}
+    if "=" in first:
+        pairs.insert(0, first)
+    elif first.endswith(".csv"):
+        values = {"trace": first}
+    elif "/" in first or first.endswith(".toml"):
+        try:
+            values = {"name": Path(first).stem, **loads(read_text(first), f"link {first}")}
+        except (OSError, UnicodeDecodeError) as error:
+            raise UsageError(f"`link`: cannot read {first}: {error}") from error
+    elif first in (known := published()):
+        values = known[first].model_dump(exclude_unset=True)
+    else:
+        raise UsageError(f"`link`: {none_of(first, known, ', and no file (.toml, .csv) and no KEY=VALUE')}")
+    for pair in pairs:
+        values |= _pair(pair)
+    return _made({**values, "name": text if pairs or not values.get("name") else values["name"]}, "`link`")
+
+
+def _pair(text: str) -> dict[str, Any]:
+    key, _, value = text.partition("=")
+    if key in {"trace", "up_trace", "down_trace", "source"}:
+        return {key: value}
+    try:
+        if key == "rate":
+            up, _, down = value.partition("/")
+            return {"up_mbps": float(up), "down_mbps": float(down or up)}
+        share = key == "loss" and value.endswith("%")
+        number = float(value.removesuffix("%")) / 100 if share else float(value)
+    except ValueError:
+        raise UsageError(f"`link`: '{text}' should be KEY=NUMBER, as rate=54 or rate=18.75/75, loss=10%") from None
+    return {KEYS.get(key, key): int(number) if key == "seed" else number}
+
+
+def _made(values: Mapping[str, Any], where: str) -> LinkProfile:
+    return checked(LinkProfile, values, where)
+
+
+def _csv_steps(path: str, column: str, profile: LinkProfile) -> tuple[list[Step], float]:
+    def value(row: Mapping[str, str], name: str, default: float, most: float) -> float:
+        number = float(row[name]) if row.get(name) else default
+        if not 0 <= number <= most:
+            raise ValueError(f"{name} {number:g} should be 0 to {most:g}")
+        return number
+
+    steps: list[Step] = []
+    where = f"link trace {path}"
+    reader = csv.DictReader(_lines(path))
+    if missing := {"t_s", "up_mbps", "down_mbps"} - set(reader.fieldnames or ()):
+        raise UsageError(f"{where}: the first line should name the column {', '.join(sorted(missing))}")
+    for row in reader:
+        try:
+            start_s = value(row, "t_s", math.nan, 1e9)
+            delay_ms, loss = value(row, "delay_ms", profile.delay_ms, 6e4), value(row, "loss", profile.loss, 1)
+            steps.append(Step(start_s, value(row, column, math.nan, 1e6), delay_ms, loss))
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"{where}, line {reader.line_num}: {error}") from None
+    last_s = steps[-1].start_s - steps[-2].start_s if len(steps) > 1 else 1.0
+    return _checked_steps(steps, where), (steps[-1].start_s if steps else 0) + last_s
+
+
+def _mahimahi_steps(path: str, profile: LinkProfile) -> tuple[list[Step], float]:
+    where = f"link trace {path}"
+    times: list[int] = []
+    for number, line in enumerate(_lines(path), 1):
+        if not (line.strip().isdecimal() and len(line) < 12 and int(line) >= (times[-1] if times else 0)):  # noqa: PLR2004
+            raise UsageError(f"{where}, line {number}: should be a whole number of ms, not less than the one before")
+        times.append(int(line))
+    opportunities = Counter(max(time - 1, 0) for time in times)  # in the ms that ends then
+    starts = {0: 0, **{ms + 1: 0 for ms in opportunities if ms + 1 < times[-1]}, **opportunities}
+    mbps = {ms: count * OPPORTUNITY_BYTES * 8e-3 for ms, count in starts.items()}
+    steps = [Step(ms / 1e3, mbps[ms], profile.delay_ms, profile.loss) for ms in sorted(mbps)]
+    return _checked_steps(steps, where), max(times[-1] if times else 0, 1) / 1e3
+
+
+def _lines(path: str) -> list[str]:
+    try:
+        return read_text(path, 64 * MOST_STEPS).splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"`link`: cannot read {path}: {error}") from error
+
+
+def _checked_steps(steps: list[Step], where: str) -> list[Step]:
+    if len(steps) > MOST_STEPS or not any(step.mbps for step in steps):
+        raise UsageError(f"{where}: should have 1 to {MOST_STEPS} steps, and a rate")
+    if steps[0].start_s or any(one.start_s >= two.start_s for one, two in pairwise(steps)):
+        raise UsageError(f"{where}: its times should start at 0 and increase")
+    return steps
+
+
+def _synthetic_steps(profile: LinkProfile, mbps: float, seed: int) -> Iterator[Step]:
+    """Yield a log-normal rate of mean ``mbps`` with memory, which is 0 during outages of uniform length."""
+    rate, outage = Random(seed), Random(profile.seed)  # noqa: S311 - reproducible; outages hit both directions
+    sigma, kept = math.sqrt(math.log1p(profile.rate_cv**2)), math.exp(-STEP_S / MEMORY_S)
+    level, until_s = rate.gauss(0, 1), -1.0
+    next_s = outage.expovariate(1 / profile.outage_every_s) if profile.outage_every_s else math.inf
+    for number in range(round(SYNTHETIC_S / STEP_S)):
+        now_s = number * STEP_S
+        if now_s >= next_s:
+            until_s = now_s + outage.uniform(*profile.outage_s)
+            next_s = until_s + outage.expovariate(1 / profile.outage_every_s)
+        level = kept * level + math.sqrt(1 - kept * kept) * rate.gauss(0, 1)
+        factor = 0.0 if now_s < until_s else math.exp(sigma * level - sigma * sigma / 2)
+        yield Step(now_s, mbps * factor, profile.delay_ms, profile.loss)

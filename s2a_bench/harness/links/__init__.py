@@ -1,0 +1,168 @@
+"""Emulated links: client and servers in two unnamed network namespaces, joined by a relay.
+
+The thread that enters a link is the client's side; programs and sockets made in `EmulatedLink.server_side` are the
+server's. The server's address is 127.0.0.1, as without a link: there it belongs to a TUN device instead of ``lo``, and
+the client reaches it through its own TUN device, 127.0.0.2. Namespaces and devices end with the processes that
+use them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import json
+import os
+import socket
+import struct
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from dataclasses import asdict
+from errno import EPERM
+from pathlib import Path
+from typing import Any, Final
+
+from s2a_bench.boards.links import Direction, LinkProfile
+from s2a_bench.errors import NotPermitted, UsageError
+from s2a_bench.harness.processes import OwnProcess
+
+SERVER, CLIENT = "127.0.0.1", "127.0.0.2"
+DEVICE: Final = b"link"
+PEERS: Final = {"ROS_STATIC_PEERS": f"{SERVER};{CLIENT}", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+"""The environment in which DDS finds the other side; it is on no loopback interface."""
+CLONE_NEWNET: Final = 0x40000000
+TUNSETIFF, IFF_TUN, IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
+SIOCSIFFLAGS, SIOCSIFADDR, SIOCSIFDSTADDR = 0x8914, 0x8916, 0x8918
+RTM_NEWLINK, NLM_F_REQUEST, IFLA_TXQLEN = 16, 1, 13
+IFF_UP: Final = 0x1
+QUEUE_PACKETS: Final = 10_000
+"""Of a device, so that a packet waits for the relay rather than is lost."""
+_libc = ctypes.CDLL(None, use_errno=True)
+
+
+class EmulatedLink:
+    """A running link; the thread that made it is on the client's side."""
+
+    def __init__(self, profile: LinkProfile, server: int, client: int, relay: OwnProcess) -> None:
+        self.profile = profile
+        self.directions: tuple[Direction, Direction] = profile.directions()
+        self._server, self._client, self._relay = server, client, relay
+
+    @property
+    def started_ns(self) -> int:
+        """When the link's traces started."""
+        return int(self._relay.facts["started_ns"])
+
+    @contextmanager
+    def server_side(self) -> Iterator[None]:
+        """Make programs and sockets on the server's side."""
+        _join(self._server)
+        try:
+            yield
+        finally:
+            _join(self._client)
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the manifest records of the profile."""
+        peaks = {name: way.mbps for name, way in zip(("up_mbps", "down_mbps"), self.directions, strict=True)}
+        return {"profile": self.profile.model_dump(exclude_defaults=True), "greatest": peaks, "method": "relay"}
+
+    def statistics(self) -> dict[str, Any]:
+        """Return what the relay carried and lost, and how late it was."""
+        return self._relay.ask()
+
+
+def server_side(link: EmulatedLink | None) -> Any:
+    """Return a context in which programs are servers of a run, on a link or without one."""
+    return link.server_side() if link else nullcontext()
+
+
+@contextmanager
+def emulated(profile: LinkProfile) -> Iterator[EmulatedLink]:
+    """Put this thread on the client's side of a link; its old namespace and environment return at the end.
+
+    Raises NotPermitted without the right to create namespaces, UsageError if a device cannot be made.
+    """
+    directions = [asdict(each) for each in profile.directions()]
+    with ExitStack() as stack:
+        home = _opened(stack)
+        _new_namespace()
+        stack.callback(_join, home)
+        sides, devices = [], []
+        for own, peer in ((SERVER, CLIENT), (CLIENT, SERVER)):
+            _new_namespace()
+            sides.append(_opened(stack))
+            devices.append(_tun())
+            stack.callback(os.close, devices[-1])
+            _configure(own, peer)
+        job = json.dumps({"devices": devices[::-1], "directions": directions})
+        relay = OwnProcess("relay", "s2a_bench.harness.links.relay", job, None, devices)
+        stack.enter_context(relay)
+        relay.wait_ready()
+        before = {name: os.environ.get(name) for name in PEERS}
+        stack.callback(_restore, before)
+        os.environ.update(PEERS)
+        yield EmulatedLink(profile, sides[0], sides[1], relay)
+
+
+def _restore(environ: dict[str, str | None]) -> None:
+    for name, value in environ.items():
+        os.environ.pop(name, None)
+        if value is not None:
+            os.environ[name] = value
+
+
+def _opened(stack: ExitStack) -> int:
+    """Return a descriptor of this thread's namespace."""
+    number = os.open("/proc/thread-self/ns/net", os.O_RDONLY | os.O_CLOEXEC)
+    stack.callback(os.close, number)
+    return number
+
+
+def _join(namespace: int) -> None:
+    if _libc.setns(namespace, CLONE_NEWNET):
+        raise OSError(ctypes.get_errno(), "setns")
+
+
+def _new_namespace() -> None:
+    if not _libc.unshare(CLONE_NEWNET):
+        return
+    number = ctypes.get_errno()
+    if number == EPERM:
+        raise NotPermitted(
+            "`link` needs network namespaces: run it as root, or allow user namespaces until `unshare -Urn true` works"
+        )
+    raise UsageError(f"`link` needs network namespaces: {os.strerror(number)}")
+
+
+def _tun() -> int:
+    """Return the descriptor of a new TUN device in this thread's namespace."""
+    try:
+        device = os.open("/dev/net/tun", os.O_RDWR | os.O_CLOEXEC)
+    except OSError as error:
+        raise UsageError(
+            f"`link` needs /dev/net/tun: {error.strerror}; `modprobe tun`, or in a container --device /dev/net/tun"
+        ) from None
+    fcntl.ioctl(device, TUNSETIFF, struct.pack("16sH22x", DEVICE, IFF_TUN | IFF_NO_PI))
+    return device
+
+
+def _configure(own: str, peer: str) -> None:
+    """Give the device a loopback address in place of ``lo``, so that servers bind where they always do."""
+    conf = Path("/proc/sys/net")
+    (conf / "ipv4/conf/link/route_localnet").write_text("1")
+    with suppress(OSError):  # a kernel without IPv6
+        (conf / "ipv6/conf/all/disable_ipv6").write_text("1")
+
+    def address(request: int, device: bytes, text: str) -> None:
+        fcntl.ioctl(control, request, struct.pack("16sH2x4s16x", device, socket.AF_INET, socket.inet_aton(text)))
+
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
+        fcntl.ioctl(control, SIOCSIFFLAGS, struct.pack("16sh22x", b"lo", IFF_UP))
+        address(SIOCSIFADDR, b"lo", "0.0.0.0")  # noqa: S104 - it removes 127.0.0.1/8
+        address(SIOCSIFADDR, DEVICE, own)
+        address(SIOCSIFDSTADDR, DEVICE, peer)
+        fcntl.ioctl(control, SIOCSIFFLAGS, struct.pack("16sh22x", DEVICE, IFF_UP))
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as route:  # the ioctl needs real root
+        index = socket.if_nametoindex(DEVICE.decode())
+        header = struct.pack("=IHHIIBxHiII", 40, RTM_NEWLINK, NLM_F_REQUEST, 0, 0, socket.AF_UNSPEC, 0, index, 0, 0)
+        route.send(header + struct.pack("=HHI", 8, IFLA_TXQLEN, QUEUE_PACKETS))

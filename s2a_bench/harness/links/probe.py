@@ -1,0 +1,204 @@
+"""The probe of an emulated link: plain UDP sockets measure what it carries, before a run and apart from the relay."""
+
+from __future__ import annotations
+
+import math
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from select import select
+from statistics import median
+from typing import Any, Final
+
+from s2a_bench.boards.links import Direction
+from s2a_bench.clock import SystemClock, now_ns
+from s2a_bench.errors import UsageError
+from s2a_bench.harness.links import CLIENT, SERVER, EmulatedLink
+
+ATTEMPTS: Final = 3
+TOLERANCE: Final = 0.05
+"""Share by which a rate may be off."""
+DELAY_MS: Final = 0.3
+"""By which the median added one-way delay may be off, besides `TOLERANCE` of it."""
+RATE_S: Final = 1.0
+OFFERED: Final = 1.15
+"""Offered load over the rate."""
+IP_BYTES, UDP_BYTES, PACKET_BYTES, SMALL_BYTES = 20, 8, 1500, 128
+"""Of headers; of a full packet, and of one of the counts and round trips, headers included."""
+FRAGMENTS: Final = 10
+"""Packets of a datagram where none is lost: Python sends some 50,000 datagrams a second."""
+COUNTED: Final = 2000
+COUNTED_PER_S: Final = 4000.0
+PINGS: Final = 30
+IDLE_S: Final = 0.02
+SILENT_S: Final = 0.3
+"""Beyond the round trip: nothing more comes."""
+SIGMAS: Final = 4.0
+STRAY: Final = 0.002
+"""Share of packets that a busy machine may lose."""
+SO_RCVBUFFORCE: Final = 33
+BUFFER_BYTES: Final = 16 << 20
+POINTS: Final = 40
+"""Of a curve in the manifest."""
+AT_ONCE: Final = 32
+"""Packets sent before the receiver is read."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A measured quantity beside the profile's."""
+
+    what: str
+    unit: str
+    profile: float
+    measured: float
+    tolerance: float
+
+    @property
+    def off(self) -> bool:
+        return not abs(self.measured - self.profile) <= self.tolerance
+
+    def __str__(self) -> str:
+        return f"{self.what} {self.measured:.4g} instead of {self.profile:.4g} {self.unit}".rstrip()
+
+
+def probed(link: EmulatedLink) -> dict[str, Any]:
+    """Measure a link, again if it does not match its profile, and return the manifest's entry.
+
+    Raises UsageError if the last attempt is off as well.
+    """
+    attempts, off = 0, [""]
+    while off and attempts < ATTEMPTS:
+        attempts += 1
+        with ExitStack() as stack:
+            probe = _Probe(link, stack)
+            found = list(probe.measure())
+        off = [str(each) for each in found if each.off]
+    if off:
+        raise UsageError(
+            f"`link`: this machine does not carry {link.profile.name} within {TOLERANCE:.0%}: {'; '.join(off)}; "
+            "stop other programs, or choose a slower link"
+        )
+    quantities = [
+        {"what": each.what, "unit": each.unit, "profile": each.profile, "measured": each.measured} for each in found
+    ]
+    return {"probe": {"attempts": attempts, "quantities": quantities, "curves": probe.curves, "rtt_ms": probe.rtt_ms}}
+
+
+class _Probe:
+    """One attempt."""
+
+    def __init__(self, link: EmulatedLink, stack: ExitStack) -> None:
+        self._link = link
+        with link.server_side():
+            self._server, self._beside = (_socket(SERVER, stack) for _ in range(2))
+        self._client = _socket(CLIENT, stack)
+        up, down = link.directions
+        slowest_ms = sum(way.delay_ms + way.jitter_ms for way in (up, down))
+        self._round_s = max(slowest_ms, *(step.delay_ms * 2 for step in (*up.steps, *down.steps)), 0.0) / 1e3
+        self.curves: dict[str, list[tuple[float, float]]] = {}
+        """Megabytes that had arrived by a time in s."""
+        self.rtt_ms: list[float] = []
+
+    def measure(self) -> Iterator[Found]:
+        up, down = self._link.directions
+        ways = ("up", up, self._client, self._server), ("down", down, self._server, self._client)
+        self.rtt_ms = self._round_trips(self._client, self._server)
+        here_ms = self._round_trips(self._beside, self._server)
+        if self.rtt_ms and not (up.steps or down.steps):
+            usual_ms = sum(way.delay_ms + way.jitter_ms / 2 + 8e-3 * SMALL_BYTES / way.mbps for way in (up, down)) / 2
+            added_ms = (median(self.rtt_ms) - median(here_ms)) / 2
+            yield Found("added one-way delay", "ms", usual_ms, added_ms, DELAY_MS + TOLERANCE * usual_ms)
+        for name, way, sender, receiver in ways:
+            if not way.steps:
+                yield self._loss(name, way, sender, receiver)
+            if way.burst_bytes and math.isfinite(way.burst_mbps):
+                yield self._burst(name, way, sender, receiver)
+            if math.isfinite(way.mbps):
+                yield from self._rate(name, way, sender, receiver)
+
+    def _round_trips(self, sender: socket.socket, receiver: socket.socket) -> list[float]:
+        """Return round trips in ms, each after idle, without those that lost a packet."""
+        clock, found = SystemClock(), []
+        for each in (sender, receiver):
+            each.settimeout(self._round_s + SILENT_S)
+        for number in range(PINGS):
+            clock.sleep_until_ns(now_ns() + round(IDLE_S * 1e9))
+            sent_ns, data = now_ns(), number.to_bytes(SMALL_BYTES - IP_BYTES - UDP_BYTES, "big")
+            sender.sendto(data, receiver.getsockname())
+            with suppress(TimeoutError):
+                _receive(receiver, data)
+                receiver.sendto(data, sender.getsockname())
+                _receive(sender, data)
+                found.append((now_ns() - sent_ns) / 1e6)
+        return found
+
+    def _loss(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Found:
+        mbps = min(way.mbps / 2, COUNTED_PER_S * SMALL_BYTES * 8e-6)
+        lost = 1 - len(self._train(sender, receiver, COUNTED, SMALL_BYTES, mbps)) / COUNTED
+        spread = SIGMAS * math.sqrt(way.loss * (1 - way.loss) / COUNTED)
+        return Found(f"loss {name}", "", way.loss, lost, spread + STRAY)
+
+    def _burst(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Found:
+        SystemClock().sleep_until_ns(now_ns() + round(way.burst_bytes * 8e3 / way.mbps))  # until the credit is full
+        arrivals = self._train(sender, receiver, int(way.burst_bytes // PACKET_BYTES), PACKET_BYTES, math.inf)
+        measured = _mbps(arrivals, PACKET_BYTES)
+        return Found(f"burst {name}", "Mbit/s", way.burst_mbps, measured, TOLERANCE * way.burst_mbps)
+
+    def _rate(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Iterator[Found]:
+        loss = max((step.loss for step in way.steps), default=way.loss)
+        mbps, size = way.mbps * OFFERED / (1 - min(loss, 0.9)), PACKET_BYTES * (1 if loss else FRAGMENTS)
+        count = math.ceil(RATE_S * mbps * 125e3 / size)
+        arrivals = self._train(sender, receiver, count, size, mbps)[math.ceil(way.burst_bytes / size) :]
+        started_ns = self._link.started_ns
+        if len(arrivals) < 10:  # noqa: PLR2004 - an outage: not verified
+            return
+        each = max(len(arrivals) // POINTS, 1)
+        self.curves[name] = [
+            (round((at_ns - arrivals[0]) / 1e9, 6), number * size / 1e6)
+            for number, at_ns in enumerate(arrivals)
+            if not number % each
+        ]
+        window_s = [(at_ns - started_ns - way.delay_ms * 1e6) / 1e9 for at_ns in (arrivals[0], arrivals[-1])]
+        expected = way.mean_mbps(window_s[0], window_s[1])
+        yield Found(f"rate {name}", "Mbit/s", expected, _mbps(arrivals, size), TOLERANCE * expected)
+
+    def _train(self, sender: socket.socket, receiver: socket.socket, count: int, size: int, mbps: float) -> list[int]:
+        """Send packets at a rate; return when each that was not lost arrived, in ns."""
+        data = bytes(size - IP_BYTES * math.ceil(size / PACKET_BYTES) - UDP_BYTES)
+        target, buffer = receiver.getsockname(), bytearray(len(data))
+        receiver.setblocking(False)
+        sent, arrivals, gap_ns = 0, list[int](), size * 8e3 / mbps
+        started_ns = last_ns = now_ns()
+        while sent < count or now_ns() < last_ns + (self._round_s + SILENT_S) * 1e9:
+            due = min(count, sent + AT_ONCE, int((now_ns() - started_ns) / gap_ns) + 1 if gap_ns else count)
+            for _ in range(sent, due):
+                sender.sendto(data, target)
+            sent = max(sent, due)
+            with suppress(BlockingIOError):
+                while receiver.recv_into(buffer):
+                    arrivals.append(now_ns())
+            last_ns = now_ns() if sent < count else max([last_ns, *arrivals[-1:]])
+            if len(arrivals) == count:
+                break
+            select([receiver], [], [], SILENT_S if sent == count else max(gap_ns / 1e9, 0.0005) * (gap_ns > 0))
+        return arrivals
+
+
+def _socket(address: str, stack: ExitStack) -> socket.socket:
+    made = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    made.bind((address, 0))
+    with suppress(PermissionError):  # the usual buffer holds some 180 packets
+        made.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, BUFFER_BYTES)
+    return made
+
+
+def _receive(receiver: socket.socket, data: bytes) -> None:
+    while receiver.recv(PACKET_BYTES) != data:
+        pass
+
+
+def _mbps(arrivals: Sequence[int], size: int) -> float:
+    span_ns = arrivals[-1] - arrivals[0] if len(arrivals) > 1 else 0
+    return (len(arrivals) - 1) * size * 8e3 / span_ns if span_ns else 0.0
