@@ -204,6 +204,7 @@ class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThr
     horizon: int
     latency: str | float
     launches: int
+    link: str
     max_tokens: int
     mmproj: str | Path | None
     mode: Literal["request", "stream"]
@@ -225,6 +226,7 @@ class _Throughput(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatency
     grammar: str
     kv_type: str
     launches: int
+    link: str
     max_tokens: int
     mmproj: str | Path | None
     mode: Literal["request", "stream"]

@@ -282,10 +282,9 @@ class RequestsConfig(Options):
         if self.engine.latency and self.foreign:
             raise UsageError(f"`latency` is about our own servers; leave out `{self.foreign}`")
         self._check_unused()
+        running = next((each.options.external for each in self.pipelines if each.options.external_address), "")
         if self.link_profile and running:
-            raise UsageError(
-                f"`link`: a server that runs already is not behind it; leave out `{running[0].options.external}`"
-            )
+            raise UsageError(f"`link`: a server that runs already is not behind it; leave out `{running}`")
         if self.link_profile and (local := [each.name for each in self.pipelines if not each.transport.crosses_links]):
             raise UsageError(f"`link`: {', '.join(local)} sends nothing over a network; leave it out of `transport`")
 
