@@ -18,7 +18,7 @@ from s2a_bench.errors import EngineError, ServerDied, SourceError, TransportErro
 from s2a_bench.experiments.timeline.live import run_live
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_real_time
-from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, timelines_json, timelines_of
+from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_json, timelines_of
 from s2a_bench.experiments.timeline.view.figures import timeline_figures
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.harness.feed import RequestFeed
@@ -80,11 +80,6 @@ def live(config: TimelineConfig, output: Path) -> tuple[StoredRun, Watched]:
     return read_run(run_live(config, output / "runs", view)), view
 
 
-def planned_start_ns(cell: Timelines) -> int:
-    """Return when the first skill was to start; when it did is the machine's."""
-    return int(cell.skills["start_ns"].iloc[0] - cell.skills["start_jitter_ns"].iloc[0])
-
-
 def check(run: StoredRun, transport: str) -> None:
     """Check what holds of every live run that went well."""
     assert run.manifest["state"] == "finished"
@@ -103,8 +98,7 @@ def check(run: StoredRun, transport: str) -> None:
         assert len(cell.token_s) == 48
         np.testing.assert_allclose(cell.skills["arrival_ns"] / 1e9, cell.token_s[5::6], rtol=0, atol=1e-9)
         assert cell.skills["text"].str.fullmatch(r"\w+\(\w+(, \w+)?\)").all()
-    first, last = naive.skills["arrival_ns"].iloc[[0, -1]]
-    assert first == planned_start_ns(naive) <= planned_start_ns(online) <= planned_start_ns(wait) == last
+    assert wait.skills["start_ns"].iloc[0] >= wait.skills["arrival_ns"].iloc[-1]
     assert list(naive.skills["text"]) == list(wait.skills["text"]) == list(online.skills["text"])
     assert run.manifest["live"]["transport"] == transport
     assert run.manifest["start_jitter"]["starts"] == 24
@@ -307,7 +301,7 @@ def test_a_board_is_played_in_real_time(fast_board: str, tmp_path: Path) -> None
     # t_i = .05 + i / 20 s at least: a real clock is never early.
     assert (naive.skills["arrival_ns"].to_numpy() / 1e9 >= 0.05 + np.arange(1, 9) / 20 - 1e-6).all()
     assert clairvoyant.mean("start_s") >= 0.05 + 0.4 - 7 * 0.03 - 1e-6  # type: ignore[operator]
-    assert planned_start_ns(wait) == wait.skills["arrival_ns"].iloc[-1]
+    assert wait.skills["start_ns"].iloc[0] >= wait.skills["arrival_ns"].iloc[-1]
     assert run.manifest["configuration"]["time"] == "real-time"
     assert run.manifest["start_jitter"]["starts"] == 64
     assert any("EMULATED, executed in real time" in note for note in origin_notes(run, cells))
