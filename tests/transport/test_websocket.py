@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from socket import SHUT_RDWR, create_connection, create_server
+from socket import SHUT_RDWR, create_connection
 from threading import Event, Thread
 from typing import Any
 
@@ -638,7 +638,7 @@ def test_a_foreign_stream_is_read_whether_or_not_its_last_frame_repeats_it() -> 
 
 
 POLICY = """
-import sys, time, numpy as np
+import socket, time, numpy as np
 from policy_websocket import BasePolicy, WebsocketPolicyServer
 class Policy(BasePolicy):
     def infer(self, obs):
@@ -649,23 +649,19 @@ class Policy(BasePolicy):
             time.sleep(60)
         return {"actions": np.outer(np.arange(4), obs["observation/state"]) + obs["observation/image"].sum()}
     def reset(self): pass
-WebsocketPolicyServer(Policy(), host="127.0.0.1", port=int(sys.argv[1]), metadata={"robot": "none"}).serve_forever()
+with socket.create_server(("127.0.0.1", 0)) as found:
+    port = found.getsockname()[1]
+print(port, flush=True)
+WebsocketPolicyServer(Policy(), host="127.0.0.1", port=port, metadata={"robot": "none"}).serve_forever()
 """
 
 
 @pytest.fixture
-def free_port() -> int:
-    with create_server(("127.0.0.1", 0)) as found:
-        port: int = found.getsockname()[1]
-        return port
-
-
-@pytest.fixture
-def policy_server(free_port: int) -> Iterator[tuple[subprocess.Popen[str], str]]:
+def policy_server() -> Iterator[tuple[subprocess.Popen[str], str]]:
     pytest.importorskip("policy_websocket")
-    line = [sys.executable, "-c", POLICY, str(free_port)]
-    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process:
-        address = f"ws://127.0.0.1:{free_port}"
+    with subprocess.Popen([sys.executable, "-c", POLICY], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        address = f"ws://127.0.0.1:{int(process.stdout.readline())}"
         deadline = now_ns() + 30_000_000_000
         while True:
             try:
