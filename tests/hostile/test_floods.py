@@ -176,7 +176,7 @@ def test_out_of_descriptors_those_that_are_connected_are_answered(variant: str, 
         limits = resource.prlimit(server.pid, resource.RLIMIT_NOFILE)
         resource.prlimit(server.pid, resource.RLIMIT_NOFILE, (usage(server.pid).descriptors + 3, limits[1]))
         for _ in range(20):
-            stack.enter_context(connect(here, 5))
+            stack.enter_context(connect(here, 60))
         time.sleep(0.5)
         assert honest_answer(client) == expected
         resource.prlimit(server.pid, resource.RLIMIT_NOFILE, limits)

@@ -212,7 +212,7 @@ def test_a_plant_moves_and_the_policy_is_told_where_it_is(tmp_path: Path, monkey
     assert rows["jerk_rms"].item() > 0
     assert rows["jump_max"].item() == 0  # echo's chunks are one trajectory
     assert rows["boundary_jump_p99"].item() >= rows["boundary_jump_mean"].item() > 0
-    assert rows["boundary_jump_mean"].item() == pytest.approx(rows["action_step_mean"].item(), rel=0.2)
+    assert rows["boundary_jump_mean"].item() == pytest.approx(rows["action_step_mean"].item(), rel=0.5)
     assert rows["tracking_rms"].isna().item()  # nobody knows what the policy follows
     table = show(read_run(folder_of(tmp_path))).tables["smoothness"]
     assert table.header == ("mode", "jerk", "jump", "p99", "step")
