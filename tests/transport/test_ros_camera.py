@@ -173,6 +173,20 @@ def test_frames_that_cannot_be_used_are_named_as_the_reason(robot: Robot) -> Non
     assert re.search(reason, refusal(client))
 
 
+def test_the_log_has_each_reason_once_whatever_their_order(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
+    publisher, cache = robot.camera(), robot.server._cache
+    good = ros.image_message(Frame(0, 0, 4, 4, "mono8", np.zeros((4, 4), np.uint8)), 1, "c")
+    encodings = [{"encoding": each} for each in ("16UC1", "32FC1", "yuv9", "", "bgr8")]
+    bad = [*encodings, {"width": 0}, {"height": 0}, {"height": 5}]
+    for changes in (*bad, *bad, {}):  # each is taken before the next is sent
+        count = cache._count
+        publisher.send(publisher.pack(replace(good, **changes)))
+        until(lambda count=count: cache._count > count)  # type: ignore[misc]
+    until(lambda: cache._newest is not None)
+    lines = logged(caplog, "camera frame not used")
+    assert len(lines) == len(set(lines)) == len(bad)
+
+
 @pytest.mark.parametrize("from_pypi", ["cyclonedds"], indirect=True)
 def test_a_best_effort_camera_that_a_reliable_server_does_not_match_is_no_missing_camera(robot: Robot) -> None:
     publisher = robot.camera("sensor_data")

@@ -211,7 +211,6 @@ class CameraCache:
         return self._count, newest.received_ns if newest else None
 
     def _watch(self, camera: Subscription) -> None:
-        logged = ""
         while not self._stopped:
             try:
                 packed = camera.take(POLL_S)
@@ -220,9 +219,7 @@ class CameraCache:
                     self._unused = ""
             except Exception as error:  # noqa: BLE001 - an unusable frame is no reason to stop
                 self._unused = str(error) or type(error).__name__
-                if self._unused != logged:  # once a kind of trouble, not thirty times a second
-                    logged = self._unused
-                    _log.warning("camera frame not used: %s", logged)
+                self._once.warning(self._unused, "camera frame not used: %s", self._unused)
 
     def _keep(self, camera: Subscription, packed: Any) -> None:
         """Decode a frame and keep it, unless one that came later is there already."""
