@@ -51,6 +51,7 @@ GET_ACTIONS_MS = Fact("get_actions_ms", "ms", "lerobot's call `GetActions`, whic
 INFER_MS = Fact("infer_ms", "ms", "what a policy server says that its policy took")
 CAMERA_FRAMES = Fact("camera_frames", "frames", "camera frames that the server had received when it answered")
 CAMERA_AGE_MS = Fact("camera_age_ms", "ms", "start of inference less reception, of the frame that the server had kept")
+CAMERA_SIM_AGE_MS = Fact("camera_sim_age_ms", "ms", "the time on /clock less its header's stamp: `use_sim_time`")
 CAMERA_STAMP_AGE_MS = Fact("camera_stamp_age_ms", "ms", "start of inference less its header's stamp, by wall clock")
 STALE_FRAMES = Fact("stale_frames", "frames", "1 where it was too old to be used, so that the request failed")
 FRAMES_PUBLISHED = Fact("frames_published", "frames", "camera frames sent, up to the one that the answer is about")

@@ -33,9 +33,8 @@ QUIET: Final = re.compile("--(en|dis)able-(rosout|stdout|external-lib)-logs")
 """Ignored flags: the log goes to /rosout and, from warnings on, to stderr."""
 ENCLAVE: Final = "ROS_SECURITY_ENCLAVE_OVERRIDE"
 """ROS 2's own variable for the flag, which rclpy's nodes follow."""
-SIM_TIME: Final = "use_sim_time"
-OF_EVERY_NODE: Final = frozenset({SIM_TIME, "start_type_description_service"})
-"""Parameters that launch files set for every node."""
+OF_EVERY_NODE: Final = "start_type_description_service"
+"""Parameter that launch files set for every node."""
 PARAMETERS: Final = "ros__parameters"
 
 
@@ -117,11 +116,10 @@ def _pair(text: str, flag: str, node_name: str) -> tuple[str, str] | None:
 def _take(found: Read, values: Mapping[str, Any], known: Sequence[str], where: str, *, shared: bool = False) -> None:
     """Store parameters; raises UsageError for an unknown one unless the section is ``shared`` with other nodes."""
     for name, value in values.items():
-        if name in OF_EVERY_NODE:
-            if name == SIM_TIME and value is True:
-                found.notes.append(f"{SIM_TIME} is left out: this node's clock is the system's")
-        elif name in known:
+        if name in known:
             found.options[name] = value
+        elif name == OF_EVERY_NODE:
+            continue
         elif shared:
             found.notes.append(f"{where}: {name} is no parameter of this node and left out")
         else:

@@ -509,7 +509,7 @@ class ServedAction(Generic[Caller]):
 
     def _answer_cancel(self, request: Any, caller: Caller) -> None:
         info = request.goal_info
-        code, chosen = self._goals.cancel(info.goal_id.uuid.tobytes(), ros.stamp_of(info))
+        code, chosen = self._goals.cancel(info.goal_id.uuid.tobytes(), ros.nanoseconds(info.stamp))
         canceling = [_goal_info(goal.id, goal.stamp_ns) for goal in chosen]
         reply_type = self._cancel.reply_type
         response = ros.default(reply_type, self.version, return_code=int(code), goals_canceling=canceling)

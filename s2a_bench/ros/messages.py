@@ -57,6 +57,7 @@ ACTIONS = "s2a_msgs/msg/Actions"
 MARKS = "s2a_msgs/msg/Marks"
 PROVENANCE = "s2a_msgs/msg/Provenance"
 IMAGE = "sensor_msgs/msg/Image"
+CLOCK = "rosgraph_msgs/msg/Clock"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 
 CHANNELS: dict[str, int] = {
@@ -310,7 +311,7 @@ def frame_of_image(image: Any, index: int = -1) -> Frame:
     pixels = rows.reshape((height, image.width) if channels == 1 else (height, image.width, channels))
     if encoding in get_args(Deep) and bool(image.is_bigendian) != (sys.byteorder == "big"):
         pixels = pixels.reshape(*pixels.shape[:2], -1, 2)[..., ::-1].reshape(pixels.shape)
-    return Frame(index, stamp_of(image.header), image.width, image.height, encoding, pixels)
+    return Frame(index, nanoseconds(image.header.stamp), image.width, image.height, encoding, pixels)
 
 
 def refuse_depth(encoding: str) -> None:
@@ -320,6 +321,6 @@ def refuse_depth(encoding: str) -> None:
         )
 
 
-def stamp_of(header: Any) -> int:
-    """Return a header's stamp in ns of ROS time."""
-    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+def nanoseconds(time: Any) -> int:
+    """Return a builtin_interfaces/Time in ns."""
+    return int(time.sec) * 1_000_000_000 + int(time.nanosec)

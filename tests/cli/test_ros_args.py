@@ -11,7 +11,7 @@ import pytest
 from s2a_bench.cli.ros_args import Read, folded, read
 from s2a_bench.errors import UsageError
 
-KNOWN = ["engine", "max_tokens", "feedback_interval", "publish_tokens", "namespace", "node_name", "qos"]
+KNOWN = ["engine", "max_tokens", "feedback_interval", "publish_tokens", "namespace", "node_name", "qos", "use_sim_time"]
 NODE = {"namespace": "/llama", "node_name": "server"}
 
 
@@ -96,11 +96,12 @@ def test_sections_are_those_of_the_node_by_its_new_name(file: Path) -> None:
 
 
 def test_what_all_nodes_share_may_be_for_others(file: Path) -> None:
-    file.write_text("/**:\n  ros__parameters: {use_sim_time: true, wheel: {radius: 1}, max_tokens: 4}\n")
+    others = "start_type_description_service: true, wheel: {radius: 1}"
+    file.write_text(f"/**:\n  ros__parameters: {{use_sim_time: true, {others}, max_tokens: 4}}\n")
     found = parsed("--params-file", str(file))
-    assert found.options == {"max_tokens": 4}
-    assert found.notes[0].startswith("use_sim_time is left out")
-    assert "wheel.radius is no parameter of this node" in found.notes[1]
+    assert found.options == {"use_sim_time": True, "max_tokens": 4}
+    (note,) = found.notes
+    assert "wheel.radius is no parameter of this node" in note
 
 
 def test_a_file_for_others_is_said_to_be(file: Path) -> None:

@@ -72,7 +72,14 @@ def test_the_facts_are_those_that_transport_dialect_engine_and_harness_may_tell(
     few["engine"] = EngineConfig(name="echo")
     over_ros = facts(transports=("ros",), mode="stream", **few)
     assert {*over_ros} == {
-        *("payload_bytes", "camera_frames", "camera_age_ms", "camera_stamp_age_ms", "stale_frames"),
+        *(
+            "payload_bytes",
+            "camera_frames",
+            "camera_age_ms",
+            "camera_stamp_age_ms",
+            "camera_sim_age_ms",
+            "stale_frames",
+        ),
         *("unreadable_n", "frames_published", "frames_lost"),
     }
     assert over_ros["payload_bytes"] == {"unit": "bytes", "about": "what the payload weighs on the wire"}

@@ -22,7 +22,7 @@ from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.ros import camera as camera_module
-from s2a_bench.transport.ros.camera import CAMERA, CAMERA_QOS
+from s2a_bench.transport.ros.camera import CAMERA, CAMERA_QOS, CLOCK_QOS
 from s2a_bench.transport.ros.joining import join
 from s2a_bench.types import Frame, Request
 from tests.waiting import until
@@ -185,6 +185,30 @@ def test_the_log_has_each_reason_once_whatever_their_order(robot: Robot, caplog:
     until(lambda: cache._newest is not None)
     lines = logged(caplog, "camera frame not used")
     assert len(lines) == len(set(lines)) == len(bad)
+
+
+def test_ages_by_stamps_are_in_the_time_of_clock(
+    stack: ExitStack, wiring: Wiring[Any], caplog: pytest.LogCaptureFixture
+) -> None:
+    options = wiring.options.but(use_sim_time=True, max_frame_age=60)
+    robot = Robot(stack, replace(wiring, options=options))
+    client, publisher, cache = robot.client(), robot.camera(), robot.server._cache
+    publisher.send(publisher.pack(ros.image_message(yuyv_frame(), 2_000_000_000, "camera")))
+    until(lambda: cache._newest is not None)
+    ages = {"camera_stamp_age_ms", "camera_sim_age_ms"}
+    for _ in range(2):
+        assert not ages & ask(client, Request("a", "plan"))[1].facts.keys()
+    assert len(logged(caplog, "no time on /clock")) == 1
+    clock = robot.peer.publisher("/clock", ros.CLOCK, CLOCK_QOS)
+    packed = clock.pack(ros.message(ros.CLOCK, clock=ros.stamp(3_250_000_000)))
+
+    def ticked() -> bool:
+        clock.send(packed)
+        return cache._sim_ns is not None
+
+    until(ticked)
+    facts = ask(client, Request("a", "plan"))[1].facts
+    assert {name: facts[name] for name in ages & facts.keys()} == {"camera_sim_age_ms": 1250}
 
 
 @pytest.mark.parametrize("from_pypi", ["cyclonedds"], indirect=True)

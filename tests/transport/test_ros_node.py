@@ -192,7 +192,7 @@ def test_diagnostics_survive_the_wire() -> None:
     sent = diagnostic_array("/a/b", [PartHealth("c", Level.ERROR, "d", {"e": 0.5})], 5_000_000_007)
     array = ros.deserialise(memoryview(bytes(ros.serialise(sent, ARRAY))), ARRAY)
     (status,) = array.status
-    assert ros.stamp_of(array.header) == 5_000_000_007
+    assert ros.nanoseconds(array.header.stamp) == 5_000_000_007
     assert (status.level, status.name, status.message, values_of(status)) == (2, "a/b: c", "d", {"e": "0.5"})
     generated = (
         "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"  # in what rosidl made of Jazzy's file

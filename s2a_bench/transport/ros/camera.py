@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import logging
 import os
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from threading import Lock, Thread
 from typing import Any, cast
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
-from s2a_bench.errors import RequestFailed
-from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_STAMP_AGE_MS, STALE_FRAMES
+from s2a_bench.errors import RequestFailed, TransportError
+from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_SIM_AGE_MS, CAMERA_STAMP_AGE_MS, STALE_FRAMES
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.service import LogOnce, appeared
@@ -32,6 +33,8 @@ PIXELS = frozenset({"raw", "yuyv"})
 COLOURS = frozenset({"bgr8", "rgb8", "bgra8", "rgba8"})
 CAMERA_QOS = {"reliable": QoS(depth=1), "sensor_data": QoS(depth=5, reliable=False)}
 """By the names of ROS 2's profiles; a reliable subscription does not match a best-effort publisher."""
+CLOCK, CLOCK_QOS = "/clock", QoS(depth=1, reliable=False)
+"""Simulated time, as a simulator or a replayed recording publishes it."""
 POLL_S = 0.5
 FIRST_FRAME_S = 1.0
 """The longest that a request waits for the first frame of a publisher."""
@@ -52,7 +55,7 @@ def picture_message(frame: Frame, payload: str, offset_ns: int, trace: Trace) ->
 def picture_of(message: Any, trace: Trace, limits: Limits = LIMITS) -> Frame:
     """Turn a received image message into an RGB frame; its stamp is ROS time. Raises TransportError."""
     if hasattr(message, "format"):
-        return replace(_decompressed(message, trace, limits), stamp_ns=ros.stamp_of(message.header))
+        return replace(_decompressed(message, trace, limits), stamp_ns=ros.nanoseconds(message.header.stamp))
     check_pixels(message.width, message.height, limits)
     return rgb_of(ros.frame_of_image(message), trace)
 
@@ -119,7 +122,13 @@ class CameraCache:
         self._cameras = [
             middleware.subscription(namespace + topic, kind, CAMERA_QOS[options.qos]) for topic, kind in topics
         ]
+        self._subscriptions = [*self._cameras]
         self._threads = [Thread(target=self._watch, args=(camera,), daemon=True) for camera in self._cameras]
+        self._sim_ns: int | None = None
+        if options.use_sim_time:
+            clock = middleware.subscription(CLOCK, ros.CLOCK, CLOCK_QOS)
+            self._subscriptions.append(clock)
+            self._threads.append(Thread(target=self._follow, args=(clock,), daemon=True))
         self._newest: CachedFrame | None = None
         self._count = 0
         self._unused = ""
@@ -136,8 +145,8 @@ class CameraCache:
 
     def interrupt(self) -> None:
         self._stopped = True
-        for camera in self._cameras:
-            camera.interrupt()
+        for subscription in self._subscriptions:
+            subscription.interrupt()
 
     def join(self) -> None:
         for thread in self._threads:
@@ -158,7 +167,7 @@ class CameraCache:
         age_s = (at_ns - newest.received_ns) / 1e9
         trace.facts[CAMERA_AGE_MS] = age_s * 1e3
         if newest.frame.stamp_ns:  # some cameras leave it out
-            trace.facts[CAMERA_STAMP_AGE_MS] = (at_ns + realtime_offset_ns() - newest.frame.stamp_ns) / 1e6
+            self._note_stamp_age(trace, newest.frame.stamp_ns, at_ns)
         if age_s > self._options.max_frame_age:
             trace.facts[STALE_FRAMES] = 1.0
             raise RequestFailed(
@@ -166,6 +175,15 @@ class CameraCache:
                 f"{self._options.max_frame_age:g} s: {self.silence() or 'see whether the camera still publishes'}"
             )
         return (newest.frame,)
+
+    def _note_stamp_age(self, trace: Trace, stamp_ns: int, at_ns: int) -> None:
+        """Note the age by the stamp, on the clock that stamps it: the wall's, or that of `CLOCK`."""
+        if not self._options.use_sim_time:
+            trace.facts[CAMERA_STAMP_AGE_MS] = (at_ns + realtime_offset_ns() - stamp_ns) / 1e6
+        elif self._sim_ns is not None:
+            trace.facts[CAMERA_SIM_AGE_MS] = (self._sim_ns - stamp_ns) / 1e6
+        else:
+            self._once.warning(CLOCK, "no time on %s: frames have no age by their stamps", CLOCK)
 
     def _first(self, trace: Trace) -> CachedFrame | None:
         """Wait for the first frame; None where the topics have no publisher, which the log has once.
@@ -220,6 +238,12 @@ class CameraCache:
             except Exception as error:  # noqa: BLE001 - an unusable frame is no reason to stop
                 self._unused = str(error) or type(error).__name__
                 self._once.warning(self._unused, "camera frame not used: %s", self._unused)
+
+    def _follow(self, clock: Subscription) -> None:
+        while not self._stopped:
+            with suppress(TransportError):
+                if (packed := clock.take(POLL_S)) is not None:
+                    self._sim_ns = ros.nanoseconds(clock.unpack(packed).clock)
 
     def _keep(self, camera: Subscription, packed: Any) -> None:
         """Decode a frame and keep it, unless one that came later is there already."""

@@ -153,7 +153,6 @@ def declared(wiring: Wiring[RosOptions], settings: Options | None) -> list[Param
         *of_options(options, RosOptions.of_sides(SERVER, SERVING), LIVE),
         *of_options(wiring.limits, SET),
         *(of_options(settings, type(settings).model_fields) if settings else ()),
-        Parameter("use_sim_time", False, "this node's clock is the system's"),
     ]
 
 

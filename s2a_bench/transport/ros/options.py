@@ -40,7 +40,7 @@ class RosOptions(TransportOptions):
     }
     NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = (
         *("qos", "dds_tuning", "result_timeout", "feedback_interval", "publish_tokens"),
-        *("remap", "node_api", "log_level", "max_frame_age"),
+        *("remap", "node_api", "log_level", "max_frame_age", "use_sim_time"),
     )
 
     action: str = option(
@@ -98,6 +98,8 @@ class RosOptions(TransportOptions):
     log_level: Literal["debug", "info", "warn", "error", "fatal"] = option(
         "info", "what /rosout tells: debug, info, warn, error, fatal", side=SERVING
     )
+
+    use_sim_time: bool = option(False, "the stamps of frames are in the time of /clock", side=SERVING)
 
     @field_validator("remap")
     @classmethod
