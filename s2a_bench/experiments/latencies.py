@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.policy.chunks import Ints
     from s2a_bench.store.run import StoredRun
+    from s2a_bench.trace import Mark
 
 _PARAMETER: Final = re.compile(r"\s*\w+\s*=")
 
@@ -110,7 +111,15 @@ def measured(folder: Path, only: str = "") -> Iterator[Source]:
         for cell in [only] if only else cells:
             rows = good[good["cell"] == cell].to_dict("records")
             requests = [_request(row, run, spans) for row in rows]
-            services = [_service(row, run, spans) for row in rows]
+            services = [
+                service_of(
+                    json.loads(row["marks"]),
+                    run.stages,
+                    spans.get(row["request_id"], (0, None))[1],
+                    request["latency_ns"],
+                )
+                for row, request in zip(rows, requests, strict=True)
+            ]
             yield Source(
                 f"{folder}#{cell}",
                 recorded_ns=np.array([request["latency_ns"] for request in requests], np.int64),
@@ -138,20 +147,21 @@ def _request(row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[
     }
 
 
-def _service(
-    row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[int, int | None]]
+def service_of(
+    marks: Sequence[Mark], stages: Mapping[str, str], last_ns: int | None, latency_ns: int
 ) -> tuple[int, int, int] | None:
-    """Return the row of `Source.service_ns` of a request; None without marks of the engine."""
-    marks = [(run.stages.get(stage, ""), at_ns) for stage, at_ns in json.loads(row["marks"])]
-    spent = [(group, before_ns, at_ns) for (_, before_ns), (group, at_ns) in pairwise(marks)]
+    """Return the row of `Source.service_ns` of a request; None without marks of the engine.
+
+    ``stages`` are stage -> group, ``last_ns`` is when the last piece left the engine.
+    """
+    spent = [(stages.get(stage, ""), before_ns, at_ns) for (_, before_ns), (stage, at_ns) in pairwise(marks)]
     engine = [(before_ns, at_ns) for group, before_ns, at_ns in spent if group == "inference"]
     if not engine:
         return None
-    streaming_ns, last_ns = pieces.get(row["request_id"], (0, None))
     began_ns, first_ns = engine[0][0], engine[-1][1]
-    queue_ns = sum(at_ns - before_ns for group, before_ns, at_ns in spent if group == "queue")
     whole_ns = max(last_ns or 0, first_ns) - began_ns
-    return first_ns - began_ns, whole_ns, max(0, int(row["e2e_ns"]) + streaming_ns - whole_ns - queue_ns)
+    queue_ns = sum(at_ns - before_ns for group, before_ns, at_ns in spent if group == "queue")
+    return first_ns - began_ns, whole_ns, max(0, latency_ns - whole_ns - queue_ns)
 
 
 def _pieces(run: StoredRun) -> dict[str, tuple[int, int | None]]:

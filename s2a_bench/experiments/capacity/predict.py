@@ -1,25 +1,41 @@
-"""The service times of a prediction, and how many robots they carry."""
+"""The prediction: fleets in virtual time under the service times of one robot, and how many robots these carry."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from s2a_bench.boards.latency import STRETCH, read_delays
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.capacity.simulate import ServiceTime
+from s2a_bench.experiments.capacity.metrics import measures
+from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, FleetRow, KneeRow
+from s2a_bench.experiments.capacity.search import Tried, judge, knee, search
+from s2a_bench.experiments.capacity.simulate import Fleet, ServiceTime, simulate
 from s2a_bench.experiments.latencies import Source, sources
+from s2a_bench.machine import environment
+from s2a_bench.provenance import Origins
+from s2a_bench.stats.seeds import generator
+from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
+    from s2a_bench.experiments.capacity.config import CapacityConfig
+    from s2a_bench.experiments.capacity.rows import Verdict
     from s2a_bench.policy.chunks import Ints
+    from s2a_bench.progress import Progress
 
+SEEDS: Final = 5
+"""Of a predicted knee."""
+LEVEL: Final = 0.95
+MOST: Final = 20_000_000
+"""Ticks, or requests without a control clock, of a fleet in virtual time."""
 MOST_BATCH: Final = 4096
 
 
@@ -29,6 +45,7 @@ class Service:
 
     source: Source
     recorded_ns: Ints | None
+    mean_ns: float
 
     @staticmethod
     def read(written: str) -> Service:
@@ -48,16 +65,10 @@ class Service:
         recorded_ns = source.service_ns
         if recorded_ns is None and (latency_ns := source.recorded_ns) is not None:
             recorded_ns = np.stack([latency_ns, latency_ns, np.zeros_like(latency_ns)], 1)
-        found = Service(source, recorded_ns)
-        if not found.mean_ns:
+        drawn_ns = source.draw(np.random.default_rng(0), STRETCH) if recorded_ns is None else recorded_ns[:, 1]
+        if not drawn_ns.any():
             raise UsageError(f"`predict`: {source.name} takes no time; it would carry any number of robots")
-        return found
-
-    @property
-    def mean_ns(self) -> float:
-        if self.recorded_ns is not None:
-            return float(self.recorded_ns[:, 1].mean())
-        return float(self.source.draw(np.random.default_rng(0), STRETCH).mean())
+        return Service(source, recorded_ns, float(drawn_ns.mean()))
 
     @property
     def about(self) -> str:
@@ -92,6 +103,100 @@ def read_batches(path: Path) -> Sequence[float]:
         )
     found: list[float] = (np.interp(np.arange(1, sizes[-1] + 1), sizes, latency_ns) / latency_ns[0]).tolist()
     return found
+
+
+def run_predicted(config: CapacityConfig, output: Path, progress: Progress) -> Path:
+    """Predict every mode and return the run folder; raises S2AError."""
+    service = Service.read(config.predict)
+    slower = read_batches(config.batch) if config.batch is not None else (1.0,)
+    manifest = {
+        "configuration": config.to_manifest(),
+        "environment": environment.collect(),
+        "seeds": {"fleets": config.seed},
+        "service": service.about,
+        "provenance": Origins(service.source.provenance, {}).to_manifest(),
+    }
+    with RunWriter.create(output, "capacity", manifest, (FLEETS, KNEES)) as writer:
+        progress.opened(writer.path)
+        for mode in config.made if config.load == "chunks" else ("",):
+            name = f"{service.source.name}, {mode}" if mode else service.source.name
+            prediction = Prediction(config, name, mode, service, slower, progress)
+            knee = prediction.run(config.numbers, bisects=config.searches)
+            writer.append(FLEETS, prediction.rows)
+            writer.append(KNEES, [] if knee is None else [knee])
+        return writer.path
+
+
+@dataclass(slots=True)
+class Prediction:
+    """The fleets of one cell in virtual time; a seed draws their phases, and the order of the service times."""
+
+    config: CapacityConfig
+    cell: str
+    mode: str
+    """Empty: robots without a control clock."""
+    service: Service
+    slower: Sequence[float]
+    """As in `simulate.serve`."""
+    progress: Progress
+    rows: list[Any] = field(default_factory=list)
+    """The fleets of the first seed."""
+    alone: float | None = None
+
+    def run(self, numbers: Sequence[int], *, bisects: bool) -> KneeRow | None:
+        """Try fleets as `search`; return the median knee of `SEEDS` seeds, with the least and the greatest."""
+        limit, first = self.config.limited, self.config.seed
+        if self.mode:
+            self.alone = self._fleet(first, 1)[0]["stalled"]
+        found = []
+        for seed in range(first, first + (SEEDS if bisects else 1)):
+            self.progress.stage(f"{self.cell}: in virtual time, seed {seed}")
+            tried: list[Tried] = []
+            search(numbers, partial(self._attempt, seed, tried), bisects=bisects)
+            found += [each.robots for each in (knee(tried),) if each is not None]
+        if limit is None:
+            return None
+        high = max(found) if max(found) < numbers[-1] else None
+        return KneeRow(self.cell, "predicted", limit.text, sorted(found)[len(found) // 2], min(found), high, None)
+
+    def _attempt(self, seed: int, tried: list[Tried], robots: int) -> bool:
+        row, verdict, within = self._fleet(seed, robots)
+        tried.append(Tried(robots, verdict, within))
+        if seed == self.config.seed:
+            about = {"cell": self.cell, "source": "predicted", "robots": robots, "seconds": self.config.seconds}
+            self.rows.append(FleetRow(**about, looks=1, verdict=verdict, within=within, clean=True, **row))
+        return within
+
+    def _fleet(self, seed: int, robots: int) -> tuple[dict[str, Any], Verdict, bool]:
+        config, mode = self.config, self.config.made.get(self.mode)
+        closed = mode is None and config.load == "closed"
+        fleet = Fleet(
+            config.setting,
+            round(config.seconds * 1e9) + (0 if config.episodes_s else config.settle_ns),
+            mode,
+            every_ns=0 if closed or mode is not None else config.plan_ns,
+            think_ns=round(config.think_s * 1e9),
+            episode_ns=round(config.episodes_s * 1e9),
+        )
+        self._check(fleet, robots)
+        rng = generator(seed, "capacity service", str(robots))
+        times = self.service.times(rng)
+        traces = simulate(fleet, robots, times, generator(seed, "capacity phases"), config.servers, self.slower)
+        row = measures(traces, config.setting, config.settle_ns) | {"stalled_alone": self.alone}
+        alone = self.alone or 0.0 if mode is not None and mode.blocks else 0.0
+        return row, *judge(config.limited, row, traces, config.settle_ns, LEVEL, alone=alone)
+
+    def _check(self, fleet: Fleet, robots: int) -> None:
+        """Raise UsageError for more ticks or requests than are kept in memory."""
+        if fleet.mode is None:
+            rate = self.config.servers * len(self.slower) / self.slower[-1] / self.service.mean_ns
+        else:
+            rate = robots / fleet.setting.period_ns
+        if rate * fleet.span_ns > MOST:
+            raise UsageError(
+                f"`seconds`: {robots} robots for {fleet.span_ns / 1e9:g} s are over {MOST:.0e} ticks or requests, "
+                "which are held in memory; take fewer `seconds`, or fewer `robots`"
+            )
 
 
 @contextmanager

@@ -13,6 +13,7 @@ from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.capacity.generator import STRIDE, Fleet, FleetPlan, FleetProcess
 from s2a_bench.experiments.capacity.metrics import measures
+from s2a_bench.experiments.capacity.predict import run_predicted
 from s2a_bench.experiments.capacity.rows import (
     FLEETS,
     KNEES,
@@ -54,6 +55,8 @@ ECHO_OF_MODEL: Final = (("model", None), ("mmproj", None), ("gpu_layers", 0))
 
 def run_capacity(config: CapacityConfig, output: Path, progress: Progress) -> Path:
     """Measure, or predict, and return the run folder, which keeps what was measured if S2AError is raised."""
+    if config.virtual:
+        return run_predicted(config, output, progress)
     plan = resolve(config.live_requests.answered(progress.say))
     settings = {**plan.manifest["configuration"], **config.to_manifest()}
     cadence = {
