@@ -40,8 +40,7 @@ class Source:
     requests: tuple[Mapping[str, object], ...] = ()
     """Measured requests, as the columns of `chunks.delays`."""
     service_ns: Ints | None = None
-    """Of measured requests, shape (R, 3): from the engine's start to its first and to its last piece, and the rest of
-    the latency without the queue. None for a server that sends no marks."""
+    """Of measured requests, as `service_of`: shape (R, 3)."""
 
     @property
     def provenance(self) -> Provenance:
@@ -125,7 +124,7 @@ def measured(folder: Path, only: str = "") -> Iterator[Source]:
                 recorded_ns=np.array([request["latency_ns"] for request in requests], np.int64),
                 weights=run.origins.of(cell).weights,
                 requests=tuple({**request, "provenance": run.origins.of_row(cell)} for request in requests),
-                service_ns=None if None in services else np.array(services, np.int64),
+                service_ns=np.array(services, np.int64),
             )
 
 
@@ -149,15 +148,16 @@ def _request(row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[
 
 def service_of(
     marks: Sequence[Mark], stages: Mapping[str, str], last_ns: int | None, latency_ns: int
-) -> tuple[int, int, int] | None:
-    """Return the row of `Source.service_ns` of a request; None without marks of the engine.
+) -> tuple[int, int, int]:
+    """Return the times of a request from the engine's start to its first and to its last piece, and those beside it.
 
+    Waiting in the queue is in none of them. The engine of a server that sends no marks counts as busy all the time.
     ``stages`` are stage -> group, ``last_ns`` is when the last piece left the engine.
     """
     spent = [(stages.get(stage, ""), before_ns, at_ns) for (_, before_ns), (stage, at_ns) in pairwise(marks)]
     engine = [(before_ns, at_ns) for group, before_ns, at_ns in spent if group == "inference"]
     if not engine:
-        return None
+        return marks[-1][1] - marks[0][1], latency_ns, 0
     began_ns, first_ns = engine[0][0], engine[-1][1]
     whole_ns = max(last_ns or 0, first_ns) - began_ns
     queue_ns = sum(at_ns - before_ns for group, before_ns, at_ns in spent if group == "queue")

@@ -18,7 +18,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments.capacity.metrics import measures
 from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, FleetRow, KneeRow
 from s2a_bench.experiments.capacity.search import Tried, judge, knee, search
-from s2a_bench.experiments.capacity.simulate import Fleet, ServiceTime, simulate
+from s2a_bench.experiments.capacity.simulate import UNKNOWN, Fleet, ServiceTime, simulate
 from s2a_bench.experiments.latencies import Source, sources
 from s2a_bench.machine import environment
 from s2a_bench.provenance import Origins
@@ -61,10 +61,10 @@ class Service:
 
     @staticmethod
     def of(source: Source) -> Service:
-        """Take the engine's times of measured requests, and the whole latency where a server sends no marks."""
+        """Take the engine's times of measured requests; those that are given have no first piece."""
         recorded_ns = source.service_ns
-        if recorded_ns is None and (latency_ns := source.recorded_ns) is not None:
-            recorded_ns = np.stack([latency_ns, latency_ns, np.zeros_like(latency_ns)], 1)
+        if recorded_ns is None and (given_ns := source.recorded_ns) is not None:
+            recorded_ns = np.stack([np.full_like(given_ns, UNKNOWN), given_ns, np.zeros_like(given_ns)], 1)
         drawn_ns = source.draw(np.random.default_rng(0), STRETCH) if recorded_ns is None else recorded_ns[:, 1]
         if not drawn_ns.any():
             raise UsageError(f"`predict`: {source.name} takes no time; it would carry any number of robots")
@@ -73,9 +73,11 @@ class Service:
     @property
     def about(self) -> str:
         """What a service time is."""
-        if self.source.requests and self.source.service_ns is None:
-            return "the whole latency of one robot, as the server sends no marks: what is spent beside it counts too"
-        return "from the engine's start to its last piece" if self.source.requests else "as given"
+        if not self.source.requests:
+            return "as given"
+        if self.source.requests[0]["server_out_ns"] is None:
+            return "the whole latency of one robot: the server sends no marks, so what is spent beside it counts too"
+        return "from the engine's start to its last piece"
 
     def times(self, rng: np.random.Generator) -> Iterator[ServiceTime]:
         """Return endless service times; a recording is played from a random request on, again and again."""
@@ -83,7 +85,7 @@ class Service:
             turned = np.roll(self.recorded_ns, -int(rng.integers(len(self.recorded_ns))), axis=0)
             return chain.from_iterable(repeat([ServiceTime(*row) for row in turned.tolist()]))
         draws = (self.source.draw(rng, STRETCH).tolist() for _ in repeat(None))
-        return (ServiceTime(each, each) for each in chain.from_iterable(draws))
+        return (ServiceTime(UNKNOWN, each) for each in chain.from_iterable(draws))
 
 
 def read_batches(path: Path) -> Sequence[float]:
@@ -108,6 +110,10 @@ def read_batches(path: Path) -> Sequence[float]:
 def run_predicted(config: CapacityConfig, output: Path, progress: Progress) -> Path:
     """Predict every mode and return the run folder; raises S2AError."""
     service = Service.read(config.predict)
+    if config.limited is not None and config.limited.column.startswith("ttft") and not service.source.requests:
+        raise UsageError(
+            "`limit`: service times that are given have no first piece; take latency_p99, or `predict` a run"
+        )
     slower = read_batches(config.batch) if config.batch is not None else (1.0,)
     manifest = {
         "configuration": config.to_manifest(),

@@ -11,7 +11,7 @@ import heapq
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -23,11 +23,14 @@ if TYPE_CHECKING:
     from s2a_bench.policy.chunks import ControlSetting, Mode, Pace
 
 
+UNKNOWN: Final = -1
+
+
 class ServiceTime(NamedTuple):
     """The time of one answer, in ns."""
 
     first_ns: int
-    """From the start of its service to its first piece."""
+    """From the start of its service to its first piece, or `UNKNOWN`."""
     whole_ns: int
     """To its last piece; the server is free then."""
     beside_ns: int = 0
@@ -35,7 +38,7 @@ class ServiceTime(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """When an answer began and when it was complete, on the run's clock."""
+    """When an answer began, or `UNKNOWN`, and when it was complete, on the run's clock."""
 
     first_ns: int
     whole_ns: int
@@ -113,7 +116,8 @@ def serve(
         batch = [waiting.popleft() for _ in range(min(len(waiting), len(slower)))]
         time, factor = next(times), slower[len(batch) - 1]
         whole_ns = start_ns + round(time.whole_ns * factor)
-        answer = Answer(start_ns + round(time.first_ns * factor) + time.beside_ns, whole_ns + time.beside_ns)
+        first_ns = UNKNOWN if time.first_ns == UNKNOWN else start_ns + round(time.first_ns * factor) + time.beside_ns
+        answer = Answer(first_ns, whole_ns + time.beside_ns)
         heapq.heapreplace(free_ns, whole_ns)
         for _, place in batch:
             try:
@@ -133,12 +137,10 @@ def _acting(robot: int, mode: Mode, setting: ControlSetting, start_ns: int, most
         while True:
             leave_ns = start_ns + tick * setting.period_ns
             answer = yield leave_ns
-            times.append((leave_ns, answer.first_ns - leave_ns, answer.whole_ns - leave_ns))
+            times.append((leave_ns, answer.first_ns, answer.whole_ns))
             tick = steps.send(answer.whole_ns - leave_ns)
     except StopIteration as end:
-        request_ns, first_ns, arrival_ns = np.array(times, np.int64).T
-        end_ns = start_ns + most * setting.period_ns
-        return RobotTrace(robot, start_ns, end_ns, request_ns, arrival_ns, end.value, first_ns)
+        return _trace(robot, start_ns, start_ns + most * setting.period_ns, times, ticks=end.value)
 
 
 def _stepped(mode: Mode, setting: ControlSetting, most: int) -> Generator[int, int, Ticks]:
@@ -178,8 +180,16 @@ def _asking(robot: int, every_ns: int, think_ns: int, start_ns: int, end_ns: int
     while due_ns < end_ns:
         answer = yield max(due_ns, done_ns)
         done_ns = answer.whole_ns
-        times.append((due_ns, answer.first_ns - due_ns, done_ns - due_ns))
+        times.append((due_ns, *answer))
         due_ns = due_ns + every_ns if every_ns else done_ns + think_ns
-    request_ns, first_ns, arrival_ns = np.array(times, np.int64).T
-    stalled = np.maximum(first_ns, arrival_ns - every_ns) > every_ns if every_ns else None
-    return RobotTrace(robot, start_ns, end_ns, request_ns, arrival_ns, first_ns=first_ns, plan_stalled=stalled)
+    if not every_ns:
+        return _trace(robot, start_ns, end_ns, times)
+    late_ns = [max(first_ns - due_ns, whole_ns - due_ns - every_ns) for due_ns, first_ns, whole_ns in times]
+    return _trace(robot, start_ns, end_ns, times, plan_stalled=np.array(late_ns) > every_ns)
+
+
+def _trace(robot: int, start_ns: int, end_ns: int, times: Sequence[tuple[int, int, int]], **more: Any) -> RobotTrace:
+    """Return a trace; ``times`` are the intended time of each request, and those of its `Answer`."""
+    request_ns, first_ns, whole_ns = np.array(times, np.int64).T
+    known_ns = None if UNKNOWN in first_ns else first_ns - request_ns
+    return RobotTrace(robot, start_ns, end_ns, request_ns, whole_ns - request_ns, first_ns=known_ns, **more)
