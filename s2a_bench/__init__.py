@@ -1,7 +1,7 @@
 """s2a-bench measures the transport between a robot and a vision-language model, and when the robot may act.
 
-Every experiment is a function (`latency`, `throughput`, `timeline`, `chunks`, `boundary`, `ccrb`), `load` opens a run
-folder, `compare` compares two. See docs/library.md; the types are in __init__.pyi.
+Every experiment is a function (`latency`, `throughput`, `timeline`, `chunks`, `capacity`, `boundary`, `ccrb`), `load`
+opens a run folder, `compare` compares two. See docs/library.md; the types are in __init__.pyi.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ __all__ = [
     "Comparison",
     "Run",
     "boundary",
+    "capacity",
     "ccrb",
     "chunks",
     "compare",

@@ -117,6 +117,14 @@ RUNS: dict[str, dict[str, Any]] = {
     "throughput": {**TWO, "engine": "replay", "profile": "rtx-4080", "max_tokens": 40},
     "timeline": {"profiles": ["rtx-4080", "DUMMY"], "tokens_per_skill": [6]},
     "boundary": {"profiles": ["rtx-4080", "DUMMY"], "tokens_per_skill": [6], "points": 5},
+    "capacity": {
+        "transports": ["loopback", "shm"],
+        "size": "64x48",
+        "closed_loop": True,
+        "robots": 1,
+        "seconds": 0.2,
+        "settle": 0,
+    },
     "ccrb": {"random": 2},
     "chunks": {"cycles": 100, "latency": ["40", "DUMMY"]},
 }

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import LiveRequests
 from s2a_bench.inference import STAND_IN, EngineConfig
-from s2a_bench.options import Names, Options, group, listed, option
+from s2a_bench.options import Names, Options, group, option
 from s2a_bench.policy.chunks import MODES, Rounding
 from s2a_bench.transport import ACTIONS, TOKENS
 
@@ -33,7 +33,7 @@ MOST_CONNECTIONS: Final = 1_000
 PLAN_EVERY_S: Final = 2.0
 SETTLE_S: Final = 5.0
 LIMITS: Final = "stalled=1%, latency_p99=300ms, ttft_p99=300ms, age_p99=200ms; p50 as well as p99"
-_LIMIT: Final = re.compile(r"(stalled)=([\d.]+)%?|((?:latency|ttft|age)_p(50|99))=([\d.]+)(ms|s)")
+_LIMIT: Final = re.compile(r"(stalled)=(\d+\.?\d*)%?|((?:latency|ttft|age)_p(50|99))=(\d+\.?\d*)(ms|s)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,17 +71,19 @@ class Limit:
         return f"{self.column.removesuffix('_ns').replace('_', ' ')} of at most {self.value / 1e6:g} ms"
 
 
-def _read_robots(written: object) -> tuple[int, ...]:
+def _read_robots(written: str) -> tuple[int, ...]:
     """Return the numbers of robots: FROM..TO as powers of two times FROM, then TO; or those of a list."""
-    if isinstance(written, str) and ".." in written:
-        low, high = (int(end) for end in written.split(".."))
-        if not 0 < low <= high:
-            raise ValueError(f"{written} should go from 1 or more to as many or more")
-        return (*(low << step for step in range((high // low).bit_length()) if low << step < high), high)
-    found = tuple(sorted(int(each) for each in listed(written)))
+    low, _, high = written.partition("..")
+    try:
+        found = sorted({int(each) for each in (*low.split(","), *high.split(",")) if each.strip()})
+    except ValueError:
+        found = []
     if not found or found[0] < 1:
-        raise ValueError(f"{written} should be 1 or more: a number, a list, or FROM..TO")
-    return found
+        raise UsageError(f"`robots`: '{written}' should be 1 or more: a number, a list, or FROM..TO")
+    if not high:
+        return tuple(found)
+    first, last = found[0], found[-1]
+    return (*(first << step for step in range((last // first).bit_length()) if first << step < last), last)
 
 
 class CapacityRequests(LiveRequests):
@@ -153,10 +155,7 @@ class CapacityConfig(Options):
     @cached_property
     def numbers(self) -> Sequence[int]:
         """The numbers of robots to try, ascending; of a search, those before the bisection."""
-        try:
-            return _read_robots(self.robots)
-        except ValueError as error:
-            raise UsageError(f"`robots`: {error}") from error
+        return _read_robots(self.robots)
 
     @property
     def searches(self) -> bool:

@@ -27,8 +27,9 @@ from s2a_bench.experiments.capacity.rows import (
 )
 from s2a_bench.experiments.capacity.search import Tried, judge, knee, search
 from s2a_bench.harness.plan import resolve
-from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
+from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Place
+from s2a_bench.inference import STAND_IN
 from s2a_bench.machine.resources import POWER_W
 from s2a_bench.stats.seeds import generator
 from s2a_bench.store.manifest import RunWarning
@@ -49,7 +50,7 @@ HEAD_START_S: Final = 0.2
 LATEST: Final = 0.05
 """Lateness of the generator's ticks at p99, as a share of a tick, above which a fleet is no measurement."""
 INSTANT: Final = "instant"
-ECHO: Final = (("name", "echo"), ("latency", ""), ("pace", None), ("profile", ""), ("gaps", ""))
+ECHO: Final = (("name", STAND_IN), ("latency", ""), ("pace", None), ("profile", ""), ("gaps", ""))
 ECHO_OF_MODEL: Final = (("model", None), ("mmproj", None), ("gpu_layers", 0))
 
 
@@ -85,6 +86,11 @@ def twin(cell: Pipeline) -> Pipeline:
     return replace(cell, name=f"{cell.name}, {INSTANT}", options=options, engine=(*ECHO, *ECHO_OF_MODEL))  # type: ignore[arg-type]
 
 
+def cell_name(session: Session, mode: str) -> str:
+    """Return the name of a cell: its pipeline and mode."""
+    return f"{session.cell.name}, {mode}" if mode else session.cell.name
+
+
 def _drive(config: CapacityConfig, launch: RunningLaunch) -> None:
     half = len(launch.sessions) // 2
     for position, session in enumerate(launch.sessions):
@@ -109,21 +115,18 @@ class _Cell:
     mode: str
     tried: dict[int, Tried] = field(default_factory=dict)
     alone: float | None = None
-
-    @property
-    def name(self) -> str:
-        return f"{self.session.cell.name}, {self.mode}" if self.mode else self.session.cell.name
+    """Share of stalled ticks of one robot alone."""
 
     def run(self) -> None:
         config = self.config
         try:
             with _Robots(config, self.launch, self.session, self.mode) as robots:
-                if config.load == "chunks":
-                    self._attempt(robots, 1)
-                search(config.numbers, partial(self._attempt, robots), bisects=config.searches)
+                attempt = partial(self._attempt, robots)
+                if config.load != "chunks" or attempt(1) or not config.searches:
+                    search(config.numbers, attempt, bisects=config.searches)
             with _Robots(config, self.launch, self.instant, self.mode) as robots:
                 for number in sorted(self.tried, reverse=True):
-                    if self.tried[number].clean and self._twin_is_clean(robots, number):
+                    if self.tried[number].clean and self._is_driven(robots, number):
                         break
                     self.tried[number] = replace(self.tried[number], clean=False)
         finally:
@@ -134,35 +137,30 @@ class _Cell:
             self.tried[number] = self._fleet(robots, number, "measured")
         return self.tried[number].within
 
-    def _twin_is_clean(self, robots: _Robots, number: int) -> bool:
+    def _is_driven(self, robots: _Robots, number: int) -> bool:
+        """Return whether the generator keeps to the limit with a server that takes no time."""
         found = self._fleet(robots, number, "twin")
         return found.clean and found.within
 
     def _fleet(self, robots: _Robots, number: int, source: Source) -> Tried:
-        config, launch, limit = self.config, self.launch, self.config.limited
-        launch.progress.stage(
-            f"{self.name}: {number} robot{'s' * (number > 1)}{', instant server' * (source == 'twin')}"
-        )
-        blocks = bool(self.mode) and config.made[self.mode].blocks
-        traces: list[RobotTrace] = []
-        looks = 0
-        for looks, (traces, used) in enumerate(robots.looks(number), 1):  # noqa: B007 - how many there were
+        config, launch = self.config, self.launch
+        launch.progress.stage(f"{robots.name}: {number} robot{'s' * (number > 1)}")
+        for looks, (traces, used) in enumerate(robots.looks(number), 1):  # noqa: B007 - their number is kept
             row = measures(traces, config.setting, config.settle_ns, confidence=config.confidence) | used
-            if self.alone is None and source == "measured" and number == 1:
+            if source == "measured" and number == 1:
                 self.alone = row["stalled"]
             row["stalled_alone"] = self.alone
-            alone = self.alone or 0.0
-            verdict, within = judge(
-                limit, row, traces, config.settle_ns, config.confidence, alone=alone if blocks else 0.0
-            )
+            excused = (self.alone or 0.0) if self.mode and config.made[self.mode].blocks else 0.0
+            verdict, within = judge(config.limited, row, traces, config.settle_ns, config.confidence, excused=excused)
             if verdict != "undecided" or source == "twin":
                 break
         robots.stop()
-        tick_ns = config.setting.period_ns if config.load == "chunks" else row["latency_p50_ns"] or 0
-        clean = not tick_ns or (row["late_p99_ns"] or 0) <= LATEST * tick_ns
+        tick_ns = config.setting.period_ns if self.mode else row["latency_p50_ns"] if source == "measured" else None
+        clean = tick_ns is None or (row["late_p99_ns"] or 0) <= LATEST * tick_ns
         seconds = sum(max(0, each.end_ns - each.start_ns - config.settle_ns) for each in traces) / number / 1e9
-        about = {"cell": self.name, "source": source, "robots": number}
+        about = {"cell": robots.name, "source": source, "robots": number}
         fleet = FleetRow(**about, seconds=seconds, looks=looks, verdict=verdict, within=within, clean=clean, **row)
+        keep_origin(launch.writer, robots.name, robots.session.origin)
         self._write(launch.writer, about, fleet, traces)
         launch.progress.advance()
         return Tried(number, verdict, within, clean)
@@ -186,17 +184,17 @@ class _Cell:
 
     def _conclude(self) -> None:
         """Write the knee of the fleets so far, and a warning about those that the generator did not drive."""
-        limit, tried = self.config.limited, self.tried.values()
+        limit, tried, name = self.config.limited, self.tried.values(), cell_name(self.session, self.mode)
         driven = max((each.robots for each in tried if each.clean), default=0)
         found = knee(tried)
         if limit is not None and found is not None:
-            row = KneeRow(self.name, "measured", limit.text, found.robots, found.low, found.high, driven)
+            row = KneeRow(name, "measured", limit.text, found.robots, found.low, found.high, driven)
             self.launch.writer.append(KNEES, [row])
         if late := sorted(each.robots for each in tried if not each.clean):
             self.launch.warnings.append(
                 RunWarning(
                     "generator-late",
-                    f"{self.name}: {', '.join(map(str, late))} robots are no measurement, as the generator was late",
+                    f"{name}: {', '.join(map(str, late))} robots are no measurement, as the generator was late",
                     "spread the robots with --processes, send smaller pictures (--size), or quiet the machine",
                 )
             )
@@ -207,7 +205,8 @@ class _Robots(ExitStack):
 
     def __init__(self, config: CapacityConfig, launch: RunningLaunch, session: Session, mode: str) -> None:
         super().__init__()
-        self._config, self._launch, self._session = config, launch, session
+        self._config, self._launch, self.session = config, launch, session
+        self.name = cell_name(session, mode)
         plan = self._plan = FleetPlan(
             session.cell.name,
             launch.wiring(session.cell).to_json(),
@@ -303,7 +302,7 @@ class _Robots(ExitStack):
                 sample = measured.sample
                 if sample.error:
                     self._launch.progress.say(f"robot {sample.block % STRIDE} of {sample.cell}: {sample.error}")
-                self._launch.keep(self._session, replace(measured, retry_after_s=0.0))  # its robot waits
+                self._launch.keep(self.session, replace(measured, retry_after_s=0.0))  # its robot waits
 
     def stop(self) -> None:
         """Stop the robots when their answers under way have come."""

@@ -83,11 +83,11 @@ def judge(
     settle_ns: int,
     confidence: float,
     *,
-    alone: float = 0.0,
+    excused: float = 0.0,
 ) -> tuple[Verdict, bool]:
     """Return where a fleet's interval lies against a limit, and whether its value keeps to it.
 
-    ``alone`` is the share of stalled ticks that one robot alone has, which a mode that blocks may have in a fleet too.
+    ``excused`` is the share of stalled ticks that one robot alone has, in a mode that blocks.
     """
     if limit is None:
         return "none", True
@@ -95,7 +95,7 @@ def judge(
         share, low, high = (row["stalled"], row["stalled_low"], row["stalled_high"])
         if share is None:
             return "undecided", False
-        low, high, share = low - alone, high - alone, share - alone
+        low, high, share = low - excused, high - excused, share - excused
     else:
         at_ns, robots, above = above_limit(limit, traces, settle_ns)
         if not above.size:

@@ -10,6 +10,7 @@ from matplotlib.text import Text
 
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.boundary.config import BoundaryConfig
+from s2a_bench.experiments.capacity.config import CapacityConfig
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.harness.timelines.config import TimelineConfig
@@ -22,6 +23,7 @@ from s2a_bench.writers.style import paper_column
 Make = Callable[[Path, Any], StoredRun]
 FIGURES = {
     "boundary": ("boundary",),
+    "capacity": (),
     "ccrb": ("scenario", "phase"),
     "chunks": ("lanes", "stability", "triggers", "reactions", "smoothness"),
     "latency": ("latency_bars", "stages", "distribution"),
@@ -45,6 +47,11 @@ def measured(name: str, _: Path, make_run: Any) -> StoredRun:
 
 RUNS: dict[str, Make] = {
     "boundary": partial(computed, "boundary", BoundaryConfig(points=5, most_tokens=3)),
+    "capacity": partial(
+        computed,
+        "capacity",
+        CapacityConfig(robots="1", seconds=0.2, settle_s=0, looks=1, requests={"transports": ("loopback",)}),
+    ),
     "ccrb": partial(computed, "ccrb", CcrbConfig(phase=True, phase_points=(3, 2))),
     "chunks": partial(computed, "chunks", ChunksConfig(cycles=50)),
     "latency": partial(measured, "latency"),

@@ -1,0 +1,74 @@
+"""The options of a capacity run: what is read from text, and what makes no sense together."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments.capacity.config import CapacityConfig, Limit
+
+
+@pytest.mark.parametrize(
+    ("written", "numbers"),
+    [("1..64", (1, 2, 4, 8, 16, 32, 64)), ("3..20", (3, 6, 12, 20)), ("5", (5,)), ("4,1,2", (1, 2, 4)), (7, (7,))],
+)
+def test_robots_are_a_range_a_list_or_a_number(written: Any, numbers: tuple[int, ...]) -> None:
+    assert CapacityConfig(robots=written).numbers == numbers
+
+
+@pytest.mark.parametrize(
+    ("written", "limit"),
+    [
+        ("stalled=1%", Limit("stalled", 0.01, 0.01)),
+        ("stalled=0.02", Limit("stalled", 0.02, 0.02)),
+        ("latency_p50=0.3s", Limit("latency_p50_ns", 3e8, 0.5, 3e8)),
+        ("ttft_p99=300ms", Limit("ttft_p99_ns", 3e8, 1 - 0.99, 3e8)),
+    ],
+)
+def test_a_limit_is_a_share_of_values_that_may_be_above_it(written: str, limit: Limit) -> None:
+    assert CapacityConfig(limit=written, plan_every_s=1, requests={"transports": "loopback"}).limited == limit
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"robots": "0"}, "`robots`: '0' should be 1 or more"),
+        ({"robots": "0..4"}, "`robots`: '0..4' should be 1 or more"),
+        ({"robots": "many"}, "`robots`: 'many' should be 1 or more: a number, a list, or FROM..TO"),
+        ({"robots": "100000"}, "`robots`: 100000 are more than"),
+        ({"limit": "stalled=2"}, "`limit`: 'stalled=2' allows every tick to stall"),
+        ({"limit": "stalled=a"}, "`limit`: 'stalled=a' should be one of"),
+        ({"limit": "stalled=1.2.3%"}, "`limit`: 'stalled=1.2.3%' should be one of"),
+        ({"limit": "stalled=1%", "closed_loop": True}, "`limit`: a client without a clock never stalls"),
+        ({"limit": "age_p99=1s", "closed_loop": True}, "`limit`: only an action has an age"),
+        ({"think_s": 1}, "`think` needs `closed_loop`"),
+        ({"modes": "sync", "closed_loop": True}, "`modes` are ways to act on chunks"),
+        ({"modes": "queue?execute=20"}, "`modes`: queue: a chunk has 16 actions"),
+        ({"episodes_s": 0.01}, "`episodes`: 0.01 s need a control clock"),
+        ({"servers": 2}, "`servers` needs `predict`"),
+        ({"predict": "20", "requests": {"timeout_s": 3}}, "`timeout_s` is for a measured run"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_in_a_line(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(UsageError) as error:
+        CapacityConfig(**given)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "load"),
+    [
+        ({}, "chunks"),
+        ({"requests": {"transports": "loopback"}}, "chunks"),
+        ({"requests": {"transports": "loopback"}, "plan_every_s": 1}, "plans"),
+        ({"requests": {"transports": "http/llama-server"}}, "plans"),
+        ({"closed_loop": True}, "closed"),
+    ],
+)
+def test_what_robots_do_follows_from_what_the_server_answers(given: dict[str, Any], load: str) -> None:
+    config = CapacityConfig(**given)
+    assert config.load == load
+    assert (config.live_requests.engine.answer == "tokens") == (load == "plans")

@@ -1,0 +1,116 @@
+"""The search for the largest fleet within a limit: fleets tried, decisions, and the knee with its interval."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from s2a_bench.experiments.capacity.config import CapacityConfig, Limit
+from s2a_bench.experiments.capacity.metrics import RobotTrace, measures
+from s2a_bench.experiments.capacity.search import Knee, Tried, above_limit, judge, knee, search
+from s2a_bench.policy.chunks import ControlSetting, Ticks
+
+MS = 1_000_000
+SETTING = ControlSetting(20 * MS, 16)
+
+
+@pytest.mark.parametrize("robots", ["1..64", "3..50", "1..1"])
+def test_the_search_finds_every_knee_in_as_many_fleets_as_it_says(robots: str) -> None:
+    config = CapacityConfig(robots=robots)
+    for largest in range(70):
+        tried: list[Tried] = []
+
+        def attempt(number: int, tried: list[Tried] = tried, largest: int = largest) -> bool:
+            tried.append(Tried(number, "below" if number <= largest else "above", number <= largest))
+            return number <= largest
+
+        search(config.numbers, attempt, bisects=True)
+        first, last = config.numbers[0], config.numbers[-1]
+        found = 0 if largest < first else min(largest, last)
+        assert knee(tried) == Knee(found, found, None if largest >= last else max(found, 0) if found else first - 1)
+        assert len(tried) == len({each.robots for each in tried}) <= config.most_fleets
+
+
+def test_a_list_is_tried_to_its_end() -> None:
+    tried: list[int] = []
+    search([1, 2, 4], lambda number: tried.append(number) is not None, bisects=False)
+    assert tried == [1, 2, 4]
+
+
+B, U, A = "below", "undecided", "above"
+
+
+@pytest.mark.parametrize(
+    ("tried", "found"),
+    [
+        ([(1, B, True), (2, B, True), (4, A, False), (3, U, True)], Knee(3, 2, 3)),
+        ([(1, B, True), (2, U, False), (4, A, False)], Knee(1, 1, 3)),
+        ([(1, U, True), (2, U, True)], Knee(2, 0, None)),
+        ([(1, A, False)], Knee(0, 0, 0)),
+    ],
+)
+def test_undecided_fleets_are_inside_the_interval(tried: Any, found: Knee) -> None:
+    assert knee(Tried(*each) for each in tried) == found
+
+
+def test_a_fleet_that_the_generator_does_not_drive_is_no_measurement() -> None:
+    driven = [Tried(1, "below", within=True), Tried(2, "below", within=True)]
+    assert knee([*driven, Tried(4, "above", within=False, clean=False)]) == Knee(2, 2, None)
+    assert knee([Tried(1, "below", within=True, clean=False)]) is None
+
+
+def trace(robot: int, stalled: Any, latency_ms: Any) -> RobotTrace:
+    """Make a trace of 1,000 ticks, 20 s, with a request every second."""
+    chunk = np.where(stalled, -1, 0)
+    age = np.where(stalled, -1, np.arange(chunk.size) % 16)
+    ticks = Ticks(chunk, chunk, age, np.asarray(stalled))
+    arrival_ns = np.where(np.array(latency_ms) < 0, -1, np.array(latency_ms) * MS)
+    request_ns = np.arange(arrival_ns.size) * 1000 * MS
+    return RobotTrace(robot, 0, chunk.size * 20 * MS, request_ns, arrival_ns, ticks, arrival_ns)
+
+
+def fleet(share: float, latency_ms: Any = (50,) * 20) -> list[RobotTrace]:
+    rng = np.random.default_rng(0)
+    return [trace(robot, rng.random(1000) < share, latency_ms) for robot in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("share", "excused", "verdict"),
+    [(0, 0, "below"), (0.002, 0, "below"), (0.01, 0, "undecided"), (0.05, 0, "above"), (0.05, 0.05, "below")],
+)
+def test_stalls_are_judged_by_their_interval_less_what_one_robot_has_alone(
+    share: float, excused: float, verdict: str
+) -> None:
+    traces = fleet(share)
+    row = measures(traces, SETTING)
+    assert judge(Limit.read("stalled=1%"), row, traces, 0, 0.95, excused=excused)[0] == verdict
+
+
+@pytest.mark.parametrize(
+    ("limit", "verdict"),
+    [
+        ("latency_p50=60ms", "below"),
+        ("latency_p50=40ms", "above"),
+        ("age_p99=400ms", "below"),
+        ("age_p50=40ms", "above"),
+    ],
+)
+def test_a_percentile_is_judged_by_the_share_of_values_above_it(limit: str, verdict: str) -> None:
+    traces = fleet(0)
+    assert judge(Limit.read(limit), measures(traces, SETTING), traces, 0, 0.95)[0] == verdict
+
+
+def test_a_request_without_an_answer_is_above_the_limit_once_it_waits_for_longer() -> None:
+    latency_ms = [50] * 18 + [-1, -1]  # 2 s and 1 s before the end
+    _, robots, above = above_limit(Limit.read("latency_p99=1500ms"), [trace(3, [False] * 1000, latency_ms)], 5000 * MS)
+    assert above.tolist() == [False] * 13 + [True]
+    assert set(robots.tolist()) == {3}
+
+
+def test_without_values_nothing_is_decided() -> None:
+    row = {"stalled": None, "stalled_low": None, "stalled_high": None}
+    assert judge(Limit.read("stalled=1%"), row, [], 0, 0.95) == ("undecided", False)
+    assert judge(Limit.read("ttft_p99=1s"), row, [], 0, 0.95) == ("undecided", False)
+    assert judge(None, row, [], 0, 0.95) == ("none", True)
