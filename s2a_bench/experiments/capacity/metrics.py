@@ -140,7 +140,7 @@ def _stalls(
     traces: Sequence[RobotTrace], setting: ControlSetting, settle_ns: int, confidence: float
 ) -> dict[str, float]:
     """Return the stalled share, its interval and that of the worst robot, of ticks or of plans; empty without any."""
-    robots, at_ns, stalled, runs = [], [], [], 0
+    robots, at_ns, stalled = [], [], []
     for trace in traces:
         if trace.plan_stalled is not None:
             since_ns, stops = trace.request_ns - trace.start_ns, trace.plan_stalled
@@ -150,35 +150,29 @@ def _stalls(
         else:
             continue
         stops, since_ns = stops[since_ns >= settle_ns], since_ns[since_ns >= settle_ns]
-        runs += int(np.count_nonzero(np.diff(stops.astype(np.int8), prepend=0) > 0))
         robots.append(np.full(stops.size, trace.robot))
         at_ns.append(trace.start_ns + since_ns)
         stalled.append(stops)
     of_robot, times, stops = _joined(robots), _joined(at_ns), _joined(stalled)
     if not stops.size:
         return {}
-    block = (times - times.min()) * BATCHES // (np.ptp(times) + 1)
-    low, high = share_interval(stops, (block, of_robot), runs, confidence)
+    low, high = share_interval(stops, times, of_robot, confidence)
     due = np.bincount(of_robot)
     worst = (np.bincount(of_robot, stops)[due > 0] / due[due > 0]).max()
     return {"stalled": float(stops.mean()), "stalled_low": low, "stalled_high": high, "stalled_worst": float(worst)}
 
 
-def share_interval(
-    stalled: Flags, groupings: Sequence[Ints], runs: int, confidence: float = 0.95
-) -> tuple[float, float]:
-    """Return the interval of the share of true values, shape (K,), that follow each other in ``runs``.
+def share_interval(stalled: Flags, at_ns: Ints, robots: Ints, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the interval of the share of true values, with their times and robots: shapes (K,), K > 0.
 
-    Clopper and Pearson's, with the effective number of values of Korn and Graubard (Survey Methodology 24, 1998). It is
-    the number of values over the mean length of a run, or fewer: as many as show the variance between groups, of which
-    ``groupings`` has one label a value; the grouping with the greater variance counts.
+    Clopper and Pearson's, with the effective number of values of Korn and Graubard (Survey Methodology 24, 1998): as
+    many as show the variance between blocks of time, or between robots where that is greater; all where there is none.
     """
     from scipy import stats
 
     share, side = float(stalled.mean()), (1 + confidence) / 2
-    effective = stalled.size * runs / max(runs, int(stalled.sum())) if runs else float(stalled.size)
-    variance, freedom = 0.0, 1
-    for labels in groupings:
+    effective, variance, freedom = float(stalled.size), 0.0, 1
+    for labels in ((at_ns - at_ns.min()) * BATCHES // (np.ptp(at_ns) + 1), robots):
         size = np.bincount(labels)
         groups = int((size > 0).sum())
         if groups >= FEWEST_ROWS:

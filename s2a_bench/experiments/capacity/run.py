@@ -150,8 +150,8 @@ class _Cell:
             if source == "measured" and number == 1:
                 self.alone = row["stalled"]
             row["stalled_alone"] = self.alone
-            excused = (self.alone or 0.0) if self.mode and config.made[self.mode].blocks else 0.0
-            verdict, within = judge(config.limited, row, traces, config.settle_ns, config.confidence, excused=excused)
+            alone = (self.alone or 0.0) if self.mode and config.made[self.mode].blocks else 0.0
+            verdict, within = judge(config.limited, row, traces, config.settle_ns, config.confidence, alone=alone)
             if verdict != "undecided" or source == "twin":
                 break
         robots.stop()

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from s2a_bench.experiments.capacity.metrics import share_interval
-from s2a_bench.stats.batches import BATCHES
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -83,11 +82,11 @@ def judge(
     settle_ns: int,
     confidence: float,
     *,
-    excused: float = 0.0,
+    alone: float = 0.0,
 ) -> tuple[Verdict, bool]:
     """Return where a fleet's interval lies against a limit, and whether its value keeps to it.
 
-    ``excused`` is the share of stalled ticks that one robot alone has, in a mode that blocks.
+    ``alone`` is the share of stalled ticks that one robot alone has, in a mode that blocks.
     """
     if limit is None:
         return "none", True
@@ -95,14 +94,12 @@ def judge(
         share, low, high = (row["stalled"], row["stalled_low"], row["stalled_high"])
         if share is None:
             return "undecided", False
-        low, high, share = low - excused, high - excused, share - excused
+        low, high, share = low - alone, high - alone, share - alone
     else:
         at_ns, robots, above = above_limit(limit, traces, settle_ns)
         if not above.size:
             return "undecided", False
-        block = (at_ns - at_ns.min()) * BATCHES // (np.ptp(at_ns) + 1)
-        runs = int(np.count_nonzero(np.diff(above.astype(np.int8), prepend=0) > 0))
-        low, high = share_interval(above, (block, robots), runs, confidence)
+        low, high = share_interval(above, at_ns, robots, confidence)
         share = float(above.mean())
     verdict: Verdict = "below" if high <= limit.share else "above" if low > limit.share else "undecided"
     return verdict, share <= limit.share

@@ -77,15 +77,15 @@ def fleet(share: float, latency_ms: Any = (50,) * 20) -> list[RobotTrace]:
 
 
 @pytest.mark.parametrize(
-    ("share", "excused", "verdict"),
+    ("share", "alone", "verdict"),
     [(0, 0, "below"), (0.002, 0, "below"), (0.01, 0, "undecided"), (0.05, 0, "above"), (0.05, 0.05, "below")],
 )
 def test_stalls_are_judged_by_their_interval_less_what_one_robot_has_alone(
-    share: float, excused: float, verdict: str
+    share: float, alone: float, verdict: str
 ) -> None:
     traces = fleet(share)
     row = measures(traces, SETTING)
-    assert judge(Limit.read("stalled=1%"), row, traces, 0, 0.95, excused=excused)[0] == verdict
+    assert judge(Limit.read("stalled=1%"), row, traces, 0, 0.95, alone=alone)[0] == verdict
 
 
 @pytest.mark.parametrize(
@@ -100,6 +100,23 @@ def test_stalls_are_judged_by_their_interval_less_what_one_robot_has_alone(
 def test_a_percentile_is_judged_by_the_share_of_values_above_it(limit: str, verdict: str) -> None:
     traces = fleet(0)
     assert judge(Limit.read(limit), measures(traces, SETTING), traces, 0, 0.95)[0] == verdict
+
+
+def test_stalls_that_come_back_every_cycle_are_decided() -> None:
+    cycle = np.arange(1000) % 19 < 3  # sync: 3 of 19 ticks
+    traces = [trace(robot, np.roll(cycle, robot * 5), [50] * 20) for robot in range(8)]
+    row = measures(traces, SETTING)
+    assert judge(Limit.read("stalled=1.5%"), row, traces, 0, 0.99, alone=3 / 19)[0] == "below"
+    assert judge(Limit.read("stalled=1.5%"), row, traces, 0, 0.99, alone=2 / 18)[0] == "above"
+
+
+def test_one_long_stall_is_one_event() -> None:
+    traces = [
+        trace(robot, np.arange(1000) // 40 == 12 if robot == 3 else [False] * 1000, [50] * 20) for robot in range(8)
+    ]
+    row = measures(traces, SETTING)
+    assert row["stalled"] == 0.005
+    assert judge(Limit.read("stalled=1%"), row, traces, 0, 0.95)[0] == "undecided"
 
 
 def test_a_request_without_an_answer_is_above_the_limit_once_it_waits_for_longer() -> None:
