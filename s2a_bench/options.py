@@ -31,9 +31,6 @@ class Options(BaseModel):
     PANEL: ClassVar[str] = ""
     """The heading in ``--help`` of the options without a panel that this class declares."""
 
-    OLD: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    """Former name of an option -> the field that replaces it, and the prefix of its values."""
-
     def __init__(self, **given: Any) -> None:
         """Raise UsageError, naming the field, for an invalid value."""
         try:
@@ -154,7 +151,7 @@ def places(options: type[Options]) -> dict[str, list[Place]]:
 
     The options of a group keep their names; sibling groups share the names that both have.
     """
-    found: dict[str, list[Place]] = {name: [(name,)] for name in options.OLD}
+    found: dict[str, list[Place]] = {}
     for name, field in options.model_fields.items():
         if inner := group_of(field):
             for each, paths in places(inner).items():
@@ -192,11 +189,6 @@ def nested(values: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
 
 def _line(error: ErrorDetails, options: type[Options]) -> str:
     field = str(error["loc"][0]) if error["loc"] else ""
-    if field in options.OLD:
-        instead, prefix = options.OLD[field]
-        given = error["input"] if isinstance(error["input"], list | tuple) else listed(str(error["input"]))
-        values = ",".join(f"{prefix}{value}" for value in given)
-        return f"`{field}` has another name: write `{instead}` {values}"
     if error["type"] == "extra_forbidden":
         return f"`{field}` is none of the options {', '.join(options.model_fields)}{like(field, options.model_fields)}"
     if error["type"] == "missing":

@@ -88,7 +88,7 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
         if group is not None:
             only, about, first = extra.get("only"), extra.get("about", ""), extra.get("first")
             for flag in flags_of(group):
-                if not only or {flag.path[0], *group.OLD.get(flag.path[0], ())} & {*only}:
+                if not only or flag.path[0] in only:
                     shown = flag.first if first is None else flag.path[0] in first
                     yield replace(flag, path=(name, *flag.path), prefix=f"{about}{flag.prefix}", first=shown)
         else:
@@ -97,9 +97,6 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
             panel, first = help_place(options, name)
             flag = Flag(flag_name, (name,), kind, _about(field), field.is_required(), argument, hidden)
             yield replace(flag, panel=panel, first=first, names=completions(field))
-    for name in options.OLD:
-        about = f"old name of --{options.OLD[name][0]}"
-        yield Flag(name.replace("_", "-"), (name,), str, about, hidden=True)
 
 
 def command(function: Callable[..., None], *options: type[Options], about: str = "") -> Callable[..., None]:

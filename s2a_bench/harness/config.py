@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
@@ -62,10 +62,6 @@ class RequestsConfig(Options):
     """The defaults under ``quick``."""
     COUNTS_TOKENS: ClassVar[str] = "this command counts tokens"
     """Why the command refuses answers of actions; empty: it accepts them."""
-    OLD: ClassVar[Mapping[str, tuple[str, str]]] = {
-        "runs": ("requests", ""),
-        **{name: ("transports", f"{name}/") for name, each in TRANSPORTS.loaded() if each.variants},
-    }
     EVERY_VARIANT: ClassVar[bool] = True
     """Whether a transport named without a variant stands for all its default variants; else for its first."""
     OF_ENGINE: ClassVar[tuple[str, ...]] = ()

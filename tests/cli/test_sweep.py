@@ -218,12 +218,6 @@ def test_a_setting_that_makes_no_sense_is_told_before_anything_runs(tmp_path: Pa
     assert not (tmp_path / "results").exists()
 
 
-def test_an_old_name_of_a_setting_is_told_its_new_one(tmp_path: Path) -> None:
-    file = tmp_path / "f.toml"
-    file.write_text('command = "latency"\n[settings]\nruns = 5\n')
-    assert "f.toml: runs=5: --runs has another name: write --requests 5" in refused("sweep", file, "--dry-run")
-
-
 def test_latencies_are_an_axis_as_numbers_and_as_families(tmp_path: Path) -> None:
     file = tmp_path / "f.toml"
     axis = 'latency = [20, "lognormal:mean_ms=20,cv=.5"]'

@@ -20,12 +20,10 @@ WRONG = {
     ],
     "chunks": [
         ("--rules calibrated --eps 0.001 --calibration-cycles 100", "or take --rules maximum,mean,oracle"),
-        ("--live --zmq gr00t", "--zmq has another name: write --transport zmq/gr00t"),
         ("--latency fast", "--latency: 'fast' should be a number of ms"),
         ("--modes 'queue?execute=99'", "a chunk has 16 actions (--horizon)"),
     ],
     "throughput": [
-        ("--runs 20", "--runs has another name: write --requests 20"),
         ("--transport pigeon", "--transport: 'pigeon' is none of http, ros, loopback"),
         ("--kv-type q4_0 --flash-attention off", "--kv-type q4_0 needs flash attention"),
         ("--engine echo", "--engine echo computes nothing"),
@@ -60,7 +58,6 @@ WRONG = {
         ("--transport http/fast", "--transport: 'fast'"),
         ("--url grpc+http://x", "--url: no installed transport speaks grpc+http://, only http://"),
         ("--transport http/llama-server --llama-server /no/such", "--llama-server: /no/such is no program that can"),
-        ("--http binary", "--http has another name: write --transport http/binary"),
         ("--bogus", "No such option: --bogus"),
         ("--payload gif", "--payload: 'gif' is none of raw, yuyv, jpeg, jpeg-preencoded, png"),
         ("--size big", "--size: 'big' should look like 640x480"),

@@ -208,21 +208,6 @@ def test_a_foreign_action_is_the_only_ros_cell() -> None:
     assert cell.options.external_address == "/llama/generate_response"
 
 
-@pytest.mark.parametrize(
-    ("given", "line"),
-    [
-        ({"http": "binary"}, "`http` has another name: write `transports` http/binary"),
-        ({"ros": ("topic", "action")}, "`ros` has another name: write `transports` ros/topic,ros/action"),
-        ({"websocket": "openpi"}, "`websocket` has another name: write `transports` websocket/openpi"),
-        ({"zmq": "gr00t"}, "`zmq` has another name: write `transports` zmq/gr00t"),
-    ],
-)
-def test_an_old_list_of_variants_is_told_as_transports(given: dict[str, Any], line: str) -> None:
-    with pytest.raises(UsageError) as error:
-        RequestsConfig(**given)
-    assert str(error.value) == line
-
-
 def test_a_black_box_is_asked_without_the_binary_variant() -> None:
     config = RequestsConfig(options={"http": {"url": "http://localhost:8080"}})
     assert names(config) == ["http/as-deployed", "http/best-effort", "ros/topic"]

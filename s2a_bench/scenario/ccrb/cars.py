@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 KMH: Final = 1 / 3.6
 NCAP_SPEED_MPS: Final = 50 * KMH
-NCAP_GAPS_M: Final = (12.0, 40.0)
-NCAP_DECELS_MPS2: Final = (2.0, 6.0)
 LEAD_JERK_MPS3: Final = 6.0
 EGO_MOST_MPS2, EGO_LEAST_MPS2 = 2.0, -8.0
 EGO_LOOP_S: Final = 0.3
