@@ -108,7 +108,6 @@ class Flagged(TyperCommand):
 
 @cache
 def click_command(name: str) -> Any:
-    """Return Click's command of an experiment."""
     return _click(name, command_of(EXPERIMENTS[name]))
 
 
@@ -125,8 +124,6 @@ def config_of(experiment: Experiment, given: Mapping[str, Any]) -> Options:
 
 
 def command_of(experiment: Experiment) -> Callable[..., None]:
-    """Return the experiment's command as a function for typer."""
-
     def run(
         config: Any,
         *view: Any,

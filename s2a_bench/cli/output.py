@@ -28,7 +28,6 @@ def shown(line: str) -> str:
 
 
 def print_json(whole: dict[str, Any]) -> None:
-    """Print one strict JSON object on standard output."""
     text = json.dumps(whole, indent=2, ensure_ascii=False, allow_nan=False)
     sys.stdout.write(visible(text) + "\n")  # invisible characters occur in strings only, and are escaped as in JSON
 
@@ -42,7 +41,6 @@ def console() -> Console:
 
 
 def print_table(table: TextTable) -> None:
-    """Print a table at the width of the console."""
     to = console()
     to.print(lay_out(table, to.width))
 
@@ -53,5 +51,4 @@ def print_line(line: str, to: Console | None = None) -> None:
 
 
 def print_error(line: str) -> None:
-    """Print one line on standard error."""
     print(shown(line), file=sys.stderr)  # noqa: T201 - the command line's own output

@@ -102,7 +102,6 @@ def _gaps(profile: Profile, *, full: bool = True) -> str:
 
 
 def line_of(profile: Profile) -> str:
-    """Return name, title, speed and origin of a profile."""
     origin = profile.origin + (", dummy weights" if profile.dummy else "")
     rate = f"{profile.tokens_per_s:.4g} tokens/s, first token after {ttft_s(profile):.3g} s"
     return f"{profile.name}: {profile.title}, {rate} ({origin})"

@@ -111,7 +111,6 @@ def print_plan(plan: SweepPlan, cells: Sequence[SweepCell]) -> None:
 
 
 def print_sweep(sweep: Sweep) -> None:
-    """Print a table of the failed cells, and how many finished."""
     cells = sweep.cells
     failed = cells[cells["state"] == "failed"]
     if len(failed):

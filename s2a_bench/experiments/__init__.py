@@ -141,7 +141,6 @@ class Comparable:
 
 
 def by_name(metrics: Iterable[AnyMetric]) -> dict[str, AnyMetric]:
-    """Return name -> metric."""
     return {metric.name: metric for metric in metrics}
 
 

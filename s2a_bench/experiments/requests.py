@@ -319,7 +319,6 @@ def cells_of(run: StoredRun) -> list[RequestCell]:
 
 
 def split(runs: Iterable[StoredRun]) -> Split:
-    """Return runs, each with its cells."""
     return [(run, cells_of(run)) for run in runs]
 
 
@@ -339,7 +338,6 @@ def _cells(run: StoredRun, samples: pd.DataFrame) -> list[RequestCell]:
 
 
 def payloads_of(cells: Iterable[RequestCell]) -> list[str]:
-    """Return the distinct payloads."""
     return [each for each in dict.fromkeys(cell.payload for cell in cells) if each]
 
 
@@ -386,7 +384,6 @@ def observation_of(run: StoredRun, cells: list[RequestCell]) -> str:
 
 
 def answer_kind(run: StoredRun) -> str:
-    """Return tokens or actions."""
     engine: dict[str, Any] = run.manifest["configuration"].get("engine") or {}
     return "actions" if engine.get("answer") == "actions" else "tokens"
 
@@ -541,7 +538,6 @@ def summarised(
 
 
 def ratio_table(cells: Iterable[RequestCell], found: Iterable[tuple[str, str, str, Ratio]]) -> CsvTable:
-    """Return metric, cell, base and ratio as CSV."""
     emulated = {cell.name for cell in cells if cell.emulated}
     header = ("metric", "of", "to", "value", "ci95_low", "ci95_high", "launches", "launch_sd", "emulated")
     return CsvTable.of(
@@ -579,13 +575,11 @@ def launches_note(ratios: Iterable[Ratio]) -> tuple[str, ...]:
 
 
 def engine_notes(run: StoredRun, cells: list[RequestCell]) -> tuple[str, ...]:
-    """Return what stood in for a model, as a sentence."""
     note = engine_note(run, cells)
     return (note.sentence(),) if note else ()
 
 
 def failure_notes(cells: Iterable[RequestCell], what: str) -> tuple[str, ...]:
-    """Return the number of failures of ``what``, as a sentence."""
     failed = sum(cell.errors for cell in cells)
     return (f"{failed} {what} failed and are in no number here; samples.csv says why.",) if failed else ()
 

@@ -69,7 +69,6 @@ class Sweep:
 
 
 def is_sweep(manifest: dict[str, Any]) -> bool:
-    """Return True for the manifest of a sweep."""
     return bool(manifest.get("command") == SWEEP)
 
 

@@ -63,7 +63,6 @@ def cell_of_row(
 
 
 def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
-    """Return one entry of `ratios`."""
     return present(RatioJson(metric, of, to, ratio.value, ratio.ci95, ratio.launches, ratio.launch_sd))
 
 

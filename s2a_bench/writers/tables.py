@@ -115,7 +115,6 @@ def entries(values: NDArray[np.float64], *statistics: str) -> list[str]:
 
 
 def interval(ratio: Ratio | None) -> str:
-    """Format a ratio with its interval."""
     if ratio is None or ratio.value is None:
         return ABSENT
     if ratio.low is None or ratio.high is None:

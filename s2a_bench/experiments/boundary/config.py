@@ -78,7 +78,6 @@ class BoundaryConfig(Options):
         return self.plans if self.plans is not None else 1 if self.jitter == NO_JITTER else PLANS
 
     def check(self) -> None:
-        """Refuse what makes no sense together; raises UsageError naming the fields."""
         if len(self.rates) != 2 or not 0 < self.rates[0] < self.rates[1] < float("inf"):  # noqa: PLR2004 - from, to
             raise UsageError("`rates`: should be two tokens/s, the lower first, as 0.3,60")
         for tokens in self.tokens_per_skill:

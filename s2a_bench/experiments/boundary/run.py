@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 
 def run_boundary(config: BoundaryConfig, output: Path, progress: Progress) -> Path:
-    """Compute the plane and return the run folder; raises S2AError."""
     grid = Provenance.computed()
     boards = {board.name: Provenance.computed(board.name, board.weights) for board in config.boards}
     manifest = {

@@ -35,7 +35,6 @@ _TRIALS: Final[dict[str, dict[str, Any]]] = {
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
-    """Return what a boundary run shows."""
     return Shown(
         sentences=_boundary_sentences(run),
         tables={"boundary": line_table(run), "boards": board_table(run)},
@@ -62,7 +61,6 @@ BoundaryCell = cell_of_row(
 
 
 def grid_of(run: StoredRun, duration: str) -> pd.DataFrame:
-    """Return the points of the grid for one duration."""
     rows = run.table(BOUNDARY)
     return rows[(rows["duration"] == duration) & (rows["board"] == "")]
 
@@ -112,7 +110,6 @@ def line_table(run: StoredRun) -> TextTable:
 
 
 def boundary_csv(run: StoredRun) -> dict[str, CsvTable]:
-    """Return file name -> CSV table."""
     names = ["duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall"]
     return {"boundary.csv": CsvTable.of_frame(run.table(BOUNDARY)[[*names, PROVENANCE]])}
 

@@ -130,7 +130,6 @@ class CcrbConfig(Options):
         )
 
     def check(self) -> None:
-        """Refuse what makes no sense together; raises UsageError naming the fields."""
         for name, most in SPANS.items():
             span = getattr(self, name)
             if len(span) != 2 or not 0 < span[0] < span[1] <= most:  # noqa: PLR2004 - from, to

@@ -74,7 +74,6 @@ def _with_lane_change(plans: Plans, lane: Timing) -> Plans:
 
 
 def drive_point(config: CcrbConfig, ready: Prepared, world: Simulator, writer: RunWriter) -> None:
-    """Drive the policies one after the other, and record everything."""
     scenario = config.scenario
     for name, schedule in ready.schedules.items():
         driven = drive(world, scenario.cars, scenario.driving, schedule, record=True)
@@ -111,7 +110,6 @@ _BOARD = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_origin"
 
 
 def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
-    """Drive all roll-outs and return the run folder; raises S2AError."""
     if config.plan_request.live:
         from s2a_bench.experiments.ccrb.live import run_ccrb_live
 

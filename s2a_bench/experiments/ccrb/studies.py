@@ -76,7 +76,6 @@ def motion_of(path: Trajectory) -> dict[str, float]:
 
 
 def trajectory_rows(cell: str, path: Trajectory) -> Iterator[TrajectoryRow]:
-    """Yield every recorded moment of a single roll-out."""
     cars: dict[str, Any] = {
         f"{role}_{what}": getattr(path, what)[:, place, 0].tolist()
         for what in ("position_m", "speed_mps", "acceleration_mps2")

@@ -116,7 +116,6 @@ def metrics_of(
 
 
 def stalls_of(cycles: Cycles) -> dict[str, Any]:
-    """Return the metrics of the boundaries between chunks."""
     return stall_metrics(int((cycles.stall_ticks[cycles.settled] > 0).sum()), int(cycles.settled.sum()))
 
 

@@ -114,7 +114,6 @@ def changes(config: ChunksConfig, name: str, learnt: Ints, judged: Ints) -> list
 
 
 def without_trigger(mode: Mode) -> str:
-    """Return a mode's name without its trigger."""
     return canonical(mode.name, mode.varied((0,)))
 
 

@@ -99,7 +99,6 @@ MOST_TICKS = 100_000_000
 
 
 def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
-    """Simulate every cell, or act live, and return the run folder; raises S2AError."""
     if config.live:
         from s2a_bench.experiments.chunks.live import run_live
 

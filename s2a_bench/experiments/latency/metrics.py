@@ -64,7 +64,6 @@ def compared(metrics: Sequence[RequestMetric] = METRICS) -> Comparable:
 
 
 def latency_cell(metrics: Sequence[RequestMetric] = METRICS) -> type:
-    """Return the class of a cell of ``--json``."""
     return cell_class(
         "LatencyCell",
         "One pipeline, stage by stage; a value that no sample has is an absent key.",
@@ -80,7 +79,6 @@ LatencyCell: Final = latency_cell()
 
 
 def latency_json(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, Any]:
-    """Return the ``--json`` object (docs/schema/s2a-bench-1.json)."""
     cells = cells_of(run)
     found = [
         cell_json(

@@ -97,5 +97,4 @@ def profile_json(profile: Profile, path: Path, differences: list[str] | None = N
 
 
 def ttft_s(profile: Profile) -> float:
-    """Return the mean time to first token."""
     return profile.prompt_s + 1 / profile.tokens_per_s

@@ -157,7 +157,6 @@ def ratios_of(run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[st
 
 
 def throughput_json(run: StoredRun) -> dict[str, Any]:
-    """Return the ``--json`` object (docs/schema/s2a-bench-1.json)."""
     cells = throughput_cells(run)
     found = [
         cell_json(

@@ -47,7 +47,6 @@ _REFERENCE_FILL: Final = "#FFFFFF"
 
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
-    """Return what a throughput run shows."""
     return Shown(
         sentences=throughput_sentences(run),
         tables=throughput_tables(run),
@@ -59,7 +58,6 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
 
 
 def throughput_sentences(run: StoredRun) -> list[str]:
-    """Return each cell's tokens a second."""
     sentences, cells = [], throughput_cells(run)
     for cell in cells:
         if found := summary_of(cell.values(ENGINE_METRIC)):
@@ -75,7 +73,6 @@ def throughput_sentences(run: StoredRun) -> list[str]:
 
 
 def throughput_tables(run: StoredRun) -> dict[str, TextTable]:
-    """Return every table of a run by its file's name."""
     tables = {"throughput": speed_table(run), "prompt": _prompt_table(run), "gaps": _gap_table(run)}
     if positions := position_table(run):
         tables["positions"] = positions
@@ -83,7 +80,6 @@ def throughput_tables(run: StoredRun) -> dict[str, TextTable]:
 
 
 def speed_table(run: StoredRun) -> TextTable:
-    """Return the table of the rates: the paper's, the client's, and the ratios."""
     cells = throughput_cells(run)
     reference = reference_values(run)
     ratios = {(of, to): ratio for metric, of, to, ratio in ratios_of(run, cells) if metric == RATIO_METRIC}
@@ -181,7 +177,6 @@ def _notes(run: StoredRun, cells: list[RequestCell], launches: tuple[str, ...]) 
 
 
 def throughput_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
-    """Return every figure by its file's name; none without rates."""
     if not any(cell.values(RATIO_METRIC).size for cell in throughput_cells(run)):
         return {}
     return {
@@ -211,7 +206,6 @@ def build_throughput_bars(run: StoredRun, *, against_paper: bool = False) -> Fig
 
 
 def build_gap_distribution(run: StoredRun) -> Figure:
-    """Draw the empirical distribution of the gaps between tokens, a line a cell."""
     cells = [cell for cell in throughput_cells(run) if cell.values("itl").size]
     styles = cell_styles({cell.name: cell.path for cell in cells})
     lines = {

@@ -162,7 +162,6 @@ def _facts(record: Record) -> dict[str, Any]:
 
 
 def _warnings(setting: PlanSetting, plan: int, records: Sequence[Record]) -> Iterator[RunWarning]:
-    """Yield a warning for each way in which the plan was not completed."""
     ends: dict[tuple[str, str], list[Record]] = {}
     for record in records:
         if record.outcome != "completed":

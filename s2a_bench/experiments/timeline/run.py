@@ -40,7 +40,6 @@ MODE = "real-time"
 
 
 def run_timeline(config: TimelineConfig, output: Path, progress: Progress) -> Path:
-    """Run all timelines and return the run folder; raises S2AError."""
     if config.live:
         from s2a_bench.experiments.timeline.live import run_live
 
@@ -94,7 +93,6 @@ def _decide(
 
 
 def manifest_of(config: TimelineConfig, work: Sequence[tuple[Board, PlanSetting]]) -> dict[str, Any]:
-    """Return the manifest of a run without a model."""
     return {
         "configuration": config.to_manifest(),
         "environment": environment.collect(),

@@ -274,7 +274,6 @@ def check_tracking(config: TimelineConfig) -> None:
 
 
 def settings(config: TimelineConfig) -> Iterator[tuple[Board, PlanSetting]]:
-    """Yield the settings of the run, board by board."""
     for n_skills, t_nom_s, board, tokens in product(
         config.n_skills, config.t_nom_s or (1.0,), config.boards, config.lengths
     ):

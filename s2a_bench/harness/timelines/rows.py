@@ -61,5 +61,4 @@ def token_rows(cell: str, token_s: Floats, request_ids: Sequence[str]) -> Iterab
 
 
 def to_ns(seconds: float) -> int:
-    """Round seconds to nanoseconds."""
     return round(float(seconds) * 1e9)

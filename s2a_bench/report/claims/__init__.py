@@ -245,7 +245,6 @@ def _findings(claim: Claim, run: StoredRun) -> Iterator[ClaimFinding]:
 
 
 def claim_table(judged: Sequence[Judged]) -> TextTable:
-    """Make a table of the claims, their rules, verdicts, needs and evidence."""
     rows: list[tuple[str, ...]] = [
         (each.claim.where, each.claim.text, each.claim.rule, each.verdict, each.required, " ".join(each.evidence))
         for each in judged

@@ -75,13 +75,11 @@ class _Or(Need):
 
 
 def _unlike(settings: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    """Return the settings that are not the wanted ones."""
     found = {name: settings.get(name, UNKNOWN) for name in wanted}
     return ", ".join(f"{name} {found[name]}" for name in wanted if found[name] != wanted[name]) or AS_CHOSEN
 
 
 def _chosen(name: str, wanted: Mapping[str, Any], *more: str) -> Need:
-    """Return the need for settings of ours."""
     listed = ", ".join((*(f"{key} {value}" for key, value in wanted.items()), *more))
     return Need(name, f"{listed}: chosen, as the paper gives none", AS_CHOSEN.__eq__, chosen=True)
 
@@ -251,7 +249,6 @@ PLANE: Final = {"n_skills": 8, "t_nom_s": 1.0, "t_min": 0.8, "most_tokens": 8, "
 
 
 def plane(run: StoredRun) -> Iterator[RunPart]:
-    """Yield a boundary run."""
     if not run.table(BOUNDARY).empty:
         settings = _unlike(run.manifest.get("configuration", {}), PLANE)
         facts = {"tokens": "with jitter" if is_random(run) else "evenly", "settings": settings}

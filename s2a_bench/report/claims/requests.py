@@ -95,7 +95,6 @@ def _source(run: StoredRun, origins: Sequence[Provenance]) -> str:
 
 
 def emulated(profile: str, rate: float) -> str:
-    """Return the text of a source that emulates a board at the paper's rate."""
     return f"EMULATED after {profile}, {rate:g} tokens/s of table II"
 
 

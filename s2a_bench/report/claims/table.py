@@ -285,5 +285,4 @@ CLAIMS: Final[tuple[Claim, ...]] = (
 
 
 def judge_claims(runs: Sequence[StoredRun]) -> list[Judged]:
-    """Judge every claim of the paper by the runs that there are."""
     return [judge(claim, runs) for claim in CLAIMS]

@@ -81,7 +81,6 @@ def differing_names(found: Iterable[Difference]) -> str:
 
 
 def as_line(found: Sequence[Difference]) -> str:
-    """Return the first differences as one line."""
     more = f"; and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
     return "; ".join(map(str, found[:_LISTED])) + more
 

@@ -68,7 +68,6 @@ def title(compared: ComparedRuns) -> str:
 
 
 def compare_csv(compared: ComparedRuns) -> str:
-    """Return a CSV with a row a comparison and every digit."""
     names = [each.name for each in fields(Row) if each.name not in {"setting", "better", "change"}]
     effects = ("ratio", "difference", "superiority")
     ends = {name: (name, f"{name}_low", f"{name}_high") if name in effects else (name,) for name in names}
@@ -86,7 +85,6 @@ def percent(share: float) -> str:
 
 
 def change_text(one: CellComparison) -> str:
-    """Format a change in per cent with its interval."""
     relative, bounds = one.change.relative, one.change.bounds
     if relative is None:
         return "from 0"
@@ -95,7 +93,6 @@ def change_text(one: CellComparison) -> str:
 
 
 def detectable_text(share: float | None) -> str:
-    """Format the smallest detectable change in per cent."""
     if share is None:
         return ABSENT
     return "> 1000 %" if share > _LARGEST_DETECTABLE else f"{percent(share).lstrip('+')} %"
@@ -248,7 +245,6 @@ class CompareJson:
 def compare_json(
     compared: ComparedRuns, judgements: Sequence[Judgement], warnings: Sequence[RunWarning]
 ) -> dict[str, Any]:
-    """Return the ``--json`` object."""
     unit: Literal["batch", "launch"] = "launch" if compared.launches > 1 else "batch"
     batches = None if compared.launches > 1 else BATCHES
     whole: dict[str, Any] = plain(

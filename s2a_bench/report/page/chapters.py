@@ -50,12 +50,10 @@ def read_chapters(paths: Sequence[Path], *, against_paper: bool) -> list[Chapter
 
 
 def title_of(manifest: Mapping[str, Any]) -> str:
-    """Return command, host and time of a run."""
     return f"{manifest.get('command', 'a run')} on {manifest.get('host', 'an unknown host')}, {when(manifest)}"
 
 
 def when(manifest: Mapping[str, Any]) -> str:
-    """Return the start of a run as text."""
     return str(manifest.get("started", "at an unknown time")).replace("T", " ").replace("+00:00", " UTC")
 
 

@@ -56,7 +56,6 @@ class BoardPanel:
 
 
 def panels_of(cells: Sequence[Timelines]) -> list[BoardPanel]:
-    """Return the panels of the shown plans, one for each setting."""
     colours = policy_colours(list(dict.fromkeys(cell.policy for cell in cells)))
     return [_panel(setting, group, colours) for setting, group in list(panels(cells))[:MOST_PANELS]]
 

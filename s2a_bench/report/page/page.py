@@ -67,7 +67,6 @@ def title_of_page(chapters: Sequence[Chapter]) -> str:
 
 
 def tally(judged: Sequence[Judged]) -> str:
-    """Return the verdicts with their counts."""
     verdicts = [each.verdict for each in judged]
     return ", ".join(f"{verdicts.count(each)} {each}" for each in dict.fromkeys(verdicts))
 

@@ -57,7 +57,6 @@ def overview(sweep: Sweep, runs: Runs) -> Shown:
 
 
 def cell_table(sweep: Sweep) -> TextTable:
-    """Make a table of every cell: settings, host, state and time."""
     rows: list[tuple[str, ...]] = [
         (
             str(row["cell"]),

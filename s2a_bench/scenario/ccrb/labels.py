@@ -24,12 +24,10 @@ OUTCOME_LABELS: Final = {
 
 
 def operating_point(options: Mapping[str, Any]) -> str:
-    """Describe speeds and gaps of `CcrbOptions`."""
     return f"{options['speed_kmh']:g} km/h, {ahead(options)}, rear gap {options['rear_gap_m']:g} m"
 
 
 def ahead(options: Mapping[str, Any]) -> str:
-    """Describe the lead."""
     return f"front gap {options['front_gap_m']:g} m, lead -{options['lead_decel_mps2']:g} m/s\N{SUPERSCRIPT TWO}"
 
 
@@ -44,7 +42,6 @@ def marked(outcome: str, survives: bool) -> str:
 
 
 def follower_check(options: Mapping[str, Any], survives: bool) -> str:
-    """Describe whether the car behind stops behind an ego that never stalls."""
     ego = "an ego whose tokens come at once"
     at = f"at a gap of {options['rear_gap_m']:g} m"
     if survives:

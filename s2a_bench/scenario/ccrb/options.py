@@ -118,7 +118,6 @@ class CcrbOptions(Options):
         ]
 
     def check(self) -> None:
-        """Refuse plans that the ego cannot follow; raises UsageError naming the fields."""
         first = self.driving.set_point_mps
         if (steepest := float(first[0, 0] - first[1, 0]) / self.durations.nominal_s) > -EGO_LEAST_MPS2:
             raise UsageError(

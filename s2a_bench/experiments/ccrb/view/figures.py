@@ -103,7 +103,6 @@ def build_scenario(run: StoredRun) -> Figure:
 
 
 def ccrb_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
-    """Return every figure by its file's name."""
     builders: dict[str, Callable[[], Figure]] = {"scenario": partial(build_scenario, run)}
     if has(run, "phase"):
         builders["phase"] = partial(build_phase, run)

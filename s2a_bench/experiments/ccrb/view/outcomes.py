@@ -77,7 +77,6 @@ def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
 
 
 def share_of(scenes: pd.DataFrame, ordering: str) -> Share:
-    """Return the share of the scenarios in which an ordering holds."""
     return Share(int(scenes[ordering].sum()), len(scenes))
 
 
@@ -105,12 +104,10 @@ def _span_of(scenes: pd.DataFrame) -> tuple[float, float] | None:
 
 
 def has(run: StoredRun, study: str) -> bool:
-    """Return whether a run holds a study."""
     return bool((run.table(ROLLOUTS)["study"] == study).any())
 
 
 def configuration(run: StoredRun) -> dict[str, Any]:
-    """Return the options that the run was started with."""
     found: dict[str, Any] = run.manifest["configuration"]
     return found
 
@@ -142,7 +139,6 @@ def _compared(theirs: pd.DataFrame, mine: pd.DataFrame, column: str) -> tuple[pd
 
 
 def origin_notes(run: StoredRun) -> tuple[str, ...]:
-    """Return the origin of the numbers, and the laws that they depend on."""
     settings = configuration(run)
     notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
     notes.append(f"Rear: {law(settings)}.")
@@ -153,7 +149,6 @@ def origin_notes(run: StoredRun) -> tuple[str, ...]:
 
 
 def tokens_line(run: StoredRun) -> Note:
-    """Return the origin of the tokens as one line."""
     if (live := run.manifest.get("live")) is None:
         return Note(f"EMULATED tokens, {run.manifest['boards'][0]['tokens_per_s']:g}/s.", EMULATED)
     kind = "EMULATED (replayed)" if live["emulated"] else "LIVE"

@@ -49,7 +49,6 @@ if TYPE_CHECKING:
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
-    """Return what a CCRB run shows."""
     tables = ccrb_tables(run)
     return Shown(
         sentences=_ccrb_sentences(run),
@@ -77,7 +76,6 @@ def _ccrb_sentences(run: StoredRun) -> list[str]:
 
 
 def findings(run: StoredRun) -> list[str]:
-    """Return the findings of the phase diagram, a sentence a gap behaviour."""
     return [_finding(run, gap) for gap in GAPS] if has(run, "phase") else []
 
 
@@ -204,7 +202,6 @@ def _share_rows(run: StoredRun, study: str, written: Callable[[Share], str]) -> 
 
 
 def ccrb_tables(run: StoredRun) -> dict[str, TextTable]:
-    """Return every table of a run by its file's name."""
     tables = {}
     if has(run, "random"):
         tables["random"] = _random_table(run)

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
-    """Return what a run of chunks shows."""
     tables = chunk_tables(run)
     return Shown(
         sentences=chunk_sentences(run),

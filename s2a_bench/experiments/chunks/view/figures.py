@@ -164,7 +164,6 @@ def _legend() -> dict[str, Any]:
 
 
 def chunk_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
-    """Return every figure that the run has rows for, by its file's name."""
     found: dict[str, Callable[[], Figure]] = {}
     if lanes_of(run):
         found["lanes"] = partial(build_lanes, run)

@@ -76,13 +76,11 @@ def rows_of(run: StoredRun) -> list[Row]:
 
 
 def sources_of(rows: list[Row]) -> list[tuple[str, list[Row]]]:
-    """Return the rows of each source of latencies."""
     names = dict.fromkeys(row["latency"] for row in rows)
     return [(name, [row for row in rows if row["latency"] == name]) for name in names]
 
 
 def live(run: StoredRun) -> bool:
-    """Whether a run acted in real time."""
     return bool(run.manifest["configuration"].get("live"))
 
 
@@ -101,7 +99,6 @@ def smoothness_table(run: StoredRun) -> TextTable:
 
 
 def chunk_tables(run: StoredRun) -> dict[str, TextTable]:
-    """Return every table of a run by its file's name."""
     found = {
         "chunks": _table(run, "Stalls", _STALLS),
         "actions": _table(run, "Actions: ages in ticks", _ACTIONS),
@@ -132,12 +129,10 @@ def delay_table(run: StoredRun) -> TextTable:
 
 
 def chunk_csv(run: StoredRun) -> dict[str, CsvTable]:
-    """Return file name -> CSV table: every metric of every row."""
     return {"chunks.csv": CsvTable.of_frame(run.table(CHUNKS))}
 
 
 def chunk_json(run: StoredRun) -> dict[str, Any]:
-    """Return the object that ``--json`` prints."""
     origins = run.origins
     return frame(
         run, [present(ChunkCell(**row, emulated=origins.of(row["cell"]).emulated)) for row in rows_of(run)], []

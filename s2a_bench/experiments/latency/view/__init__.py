@@ -45,7 +45,6 @@ _MOST = 6
 
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
-    """Return what a latency run shows."""
     tables = latency_tables(run)
     return Shown(
         sentences=_latency_sentences(run),
@@ -171,7 +170,6 @@ def _by_cell(
 
 
 def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> TextTable:
-    """Return the table of n, spread, percentiles and ratios."""
     cells = cells_of(run)
     bases: dict[str, list[RequestCell]] = {}
     for base in cells:
@@ -204,7 +202,6 @@ def _token_table(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> 
 
 
 def fact_table(run: StoredRun) -> TextTable | None:
-    """Return the table of the facts of requests; None without facts."""
     cells = cells_of(run) if run.facts else []
     facts_of = [[json.loads(str(facts)) for facts in cell.good["facts"]] for cell in cells]
     rows = []
@@ -279,7 +276,6 @@ def _used(run: StoredRun, cell: RequestCell) -> dict[str, Floats]:
 
 
 def latency_tables(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, TextTable]:
-    """Return every table of a latency run by its file's name."""
     tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
     if any(cell.values_ms("e2e_without_model").size for cell in cells_of(run)):
         tables["summary-model"] = summary_table(run, "e2e_without_model")

@@ -113,7 +113,6 @@ def build_latency_distribution(run: StoredRun) -> Figure:
 
 
 def latency_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
-    """Return every figure by its file's name; none without samples."""
     if not _shown(run)[0]:
         return {}
     return {

@@ -84,7 +84,6 @@ def timelines_of(run: StoredRun) -> list[Timelines]:
 
 
 def panels(cells: Sequence[Timelines]) -> Iterator[tuple[tuple[str, int, int, float], list[Timelines]]]:
-    """Yield each setting with its cells, a cell a policy."""
     groups: dict[tuple[str, int, int, float], list[Timelines]] = {}
     for cell in cells:
         groups.setdefault(cell.setting, []).append(cell)
@@ -92,7 +91,6 @@ def panels(cells: Sequence[Timelines]) -> Iterator[tuple[tuple[str, int, int, fl
 
 
 def origin_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
-    """Return the origins of the timelines: emulated or not, the rates, the assumptions."""
     boards = run.manifest.get("boards", [])
     notes = []
     if any(cell.about("emulated") and cell.about("mode") != "live" for cell in cells):
@@ -136,7 +134,6 @@ def _live_notes(run: StoredRun) -> list[Note]:
 
 
 def jitter_notes(run: StoredRun) -> tuple[str, ...]:
-    """Return the start jitter of the executors, if any."""
     found = run.manifest.get("start_jitter")
     if not found:
         return ()
@@ -180,7 +177,6 @@ _SETTING: Final = ("tokens_per_s", "prompt_s", "tokens_per_skill", "n_skills", "
 
 
 def timelines_json(run: StoredRun) -> dict[str, Any]:
-    """Return the ``--json`` object (docs/schema/s2a-bench-1.json)."""
     executed = {name: run.manifest[name] for name in ("live", "start_jitter") if run.manifest.get(name)}
     return frame(run, [_cell(cell) for cell in timelines_of(run)], [], **executed)
 

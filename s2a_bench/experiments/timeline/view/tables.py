@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
-    """Return what a run of timelines shows."""
     return Shown(
         sentences=_timeline_sentences(run),
         tables=timeline_tables(run),
@@ -110,7 +109,6 @@ def execution_table(run: StoredRun) -> TextTable:
 
 
 def skill_table(cells: Sequence[Timelines]) -> TextTable:
-    """Return the table of the skills of the shown plans."""
     groups = []
     for cell in cells:
         name = (cell.setting[0], str(cell.setting[1]), cell.policy)
@@ -127,7 +125,6 @@ def skill_table(cells: Sequence[Timelines]) -> TextTable:
 
 
 def timeline_tables(run: StoredRun) -> dict[str, TextTable]:
-    """Return every table of a run by its file's name."""
     cells = timelines_of(run)
     shape = _common(cells)
     return {
