@@ -12,7 +12,8 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
+from statistics import median
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
 from s2a_bench.experiments import Comparable, Metric, Subject, by_name
 from s2a_bench.facts import (
@@ -31,14 +32,15 @@ from s2a_bench.facts import (
 from s2a_bench.inference import declared_engine
 from s2a_bench.machine.resources import ENERGY_J
 from s2a_bench.provenance import NONE, UNKNOWN, Provenance
-from s2a_bench.stats import Ratio, Summary, summary_of
+from s2a_bench.stats import Ratio, Summary, SummaryEnds, summary_of
 from s2a_bench.store.manifest import present
+from s2a_bench.store.requests import ONE_WAY
 from s2a_bench.store.schema import Count, about, with_fields
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
 from s2a_bench.transport import PAYLOADS, declared_transport
 from s2a_bench.transport.pipeline import without
 from s2a_bench.writers.csv_text import CsvTable
-from s2a_bench.writers.json import summaries
+from s2a_bench.writers.json import summaries, summaries_of_ends
 from s2a_bench.writers.tables import DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
@@ -58,6 +60,28 @@ RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
 _NS_PER_MS = 1e6
 
 
+class Ends(NamedTuple):
+    """The lower and the upper ends of intervals, in ms: one each a sample, or a token."""
+
+    lo: Floats
+    hi: Floats
+
+    @property
+    def named(self) -> dict[str, Floats]:
+        """Return both ends by what follows the name of a stage or metric."""
+        return {"_lo": self.lo, "_hi": self.hi}
+
+    @property
+    def middle(self) -> float:
+        """Return the middle between the medians; raises ValueError without values."""
+        return float(median(self.lo.tolist()) + median(self.hi.tolist())) / 2
+
+    @property
+    def half(self) -> float:
+        """Return half the distance between the medians; raises ValueError without values."""
+        return float(median(self.hi.tolist()) - median(self.lo.tolist())) / 2
+
+
 @dataclass(frozen=True, slots=True)
 class RequestMetric(Metric):
     """A metric of requests, times in ms; without ``of`` the column of the samples that has its name.
@@ -67,6 +91,8 @@ class RequestMetric(Metric):
 
     of: Of | None = None
     shown: tuple[str, ...] = ()
+    ends: Callable[[RequestCell], Ends] | None = None
+    """Of a metric that may begin on one host and end on another: its intervals."""
 
     @property
     def key(self) -> str:
@@ -124,9 +150,21 @@ class RequestCell:
     def values_ms(self, column: str) -> Floats:
         return numbers_ms(self._ns(column))
 
+    def ends(self, metric: RequestMetric | str) -> Ends:
+        """Return the intervals in ms of a metric, or of a column; none if it is exact, or absent."""
+        found = OF_ANSWERS.get(metric) if isinstance(metric, str) else metric
+        if found and found.ends:
+            return found.ends(self)
+        name = found.name if found else metric
+        return Ends(self.values_ms(f"{name}_lo"), self.values_ms(f"{name}_hi"))
+
     def group_ms(self, group: str) -> Floats:
         """Return the sums in ms of the stages of a group, of the samples that have any."""
         return _numbers(self.sums_ms(group))
+
+    def group_ends(self, group: str) -> Ends:
+        """Return the intervals in ms of a group's sums, as `ends` does."""
+        return Ends(_numbers(self.sums_ms(group, "_lo")), _numbers(self.sums_ms(group, "_hi")))
 
     def rows(self, metric: RequestMetric | str) -> Rows:
         """Return a metric's values, an array for each request that has any."""
@@ -149,9 +187,13 @@ class RequestCell:
         name = found.name if found else str(metric)
         return self.good[name] if name in self.good else self._ns(name.removesuffix("_ms")) / _NS_PER_MS
 
-    def sums_ms(self, group: str) -> pd.Series[Any]:
-        names = [f"{stage}_ns" for stage, of in self.stages.items() if of == group]
-        return self.good[names].sum(axis=1, min_count=1) / _NS_PER_MS
+    def sums_ms(self, group: str, end: str = "") -> pd.Series[Any]:
+        """Return the sums of a group's stages, or of one ``end`` of their intervals; null where they are the other."""
+        stages = [stage for stage, of in self.stages.items() if of == group]
+        names = [f"{stage}{end * (stage in ONE_WAY)}_ns" for stage in stages]
+        sums = self.good[names].sum(axis=1, min_count=1) / _NS_PER_MS
+        bounded = self.good["clock_error_ns"].notna() & bool({*stages} & {*ONE_WAY})
+        return sums.where(bounded if end else ~bounded)
 
     def fact(self, name: str) -> pd.Series[Any]:
         return self._facts.get(name, self._facts["events"] * float("nan"))
@@ -214,12 +256,18 @@ def _engine_rate(cell: RequestCell) -> pd.Series[Any]:
     return (steps / _some(cell.fact(PREDICTED_MS)) * 1e3).fillna(decode_rate(cell))
 
 
+def _delay_ends(cell: RequestCell) -> Ends:
+    tokens = cell.answers
+    lo, hi = (_numbers(tokens["client_ns"] - tokens[left]) / _NS_PER_MS for left in ("engine_hi_ns", "engine_lo_ns"))
+    return Ends(lo, hi)
+
+
 def _fact(name: Fact) -> Of:
     return lambda cell: cell.fact(name)
 
 
-def _ms(name: str, title: str, about: str, of: Of | None = None, shown: tuple[str, ...] = ()) -> RequestMetric:
-    return RequestMetric(name, "ms", title=title, about=about, of=of, shown=shown)
+def _ms(name: str, title: str, about: str, of: Of | None = None, **more: Any) -> RequestMetric:
+    return RequestMetric(name, "ms", title=title, about=about, of=of, **more)
 
 
 def _rate(name: str, unit: str, title: str, about: str, of: Of) -> RequestMetric:
@@ -282,13 +330,14 @@ TOKEN_METRICS: Final = (
         *("itl", "gap"),
         "Every gap between a token and the next, as the client saw them.",
         lambda cell: cell.answers["gap_ns"] / _NS_PER_MS,
-        ("median", "p99"),
+        shown=("median", "p99"),
     ),
     _ms(
         *("token_delay", "delay"),
         "From a token's leaving the engine to the client's seeing it.",
         lambda cell: (cell.answers["client_ns"] - cell.answers["engine_ns"]) / _NS_PER_MS,
-        ("median", "p90", "p99"),
+        shown=("median", "p90", "p99"),
+        ends=_delay_ends,
     ),
 )
 
@@ -436,13 +485,15 @@ def _emulated(model: dict[str, Any]) -> Note:
 
 def groups_present(cells: list[RequestCell]) -> list[str]:
     """Return the groups that some sample has, in path order."""
-    return [group for group in GROUPS if any(cell.group_ms(group).size for cell in cells)]
+    return [
+        group for group in GROUPS if any(cell.group_ms(group).size or cell.group_ends(group).lo.size for cell in cells)
+    ]
 
 
 def stages_present(cells: list[RequestCell]) -> list[str]:
     """Return the stages that some sample has, in path order."""
     stages = cells[0].stages if cells else ()
-    return [stage for stage in stages if any(cell.values_ms(stage).size for cell in cells)]
+    return [stage for stage in stages if any(cell.values_ms(stage).size or cell.ends(stage).lo.size for cell in cells)]
 
 
 def _cell(
@@ -504,7 +555,12 @@ class RequestsCell:
 
 def cell_class(name: str, meaning: str, metrics: Iterable[RequestMetric], **fields: Any) -> type:
     """Return the class of a cell of ``--json``: ``fields``, and a summary of each metric."""
-    hints = {each.key: Annotated[Summary | None, about(each.about) if each.about else {}] for each in metrics}
+    hints = {
+        each.key: Annotated[
+            Summary | SummaryEnds | None if each.ends else Summary | None, about(each.about) if each.about else {}
+        ]
+        for each in metrics
+    }
     made: type = with_fields(name, meaning, RequestsCell, {**fields, **hints})
     return made
 
@@ -523,18 +579,26 @@ def cell_json(
         "dummy": {"real": False, "dummy": True, NONE: not declared_engine(origin.engine).plays}.get(origin.weights),
         **{name: getattr(cell, name) for name in ("emulated", "n", "errors", "warmups")},
     }
-    return present(cls(**described, **fields, **summaries((each.key, cell.values(each)) for each in metrics)))
+    return present(
+        cls(
+            **described,
+            **fields,
+            **summaries((each.key, cell.values(each)) for each in metrics),
+            **summaries_of_ends((each.key, cell.ends(each)) for each in metrics),
+        )
+    )
 
 
 def summarised(
     cells: Iterable[RequestCell], metrics: Iterable[RequestMetric]
 ) -> Iterator[tuple[RequestCell, str, Summary]]:
-    """Yield cell, key of a metric and summary, where there are values."""
+    """Yield cell, key of a metric and summary, where there are values; intervals have one a side."""
     every = list(metrics)
     for cell in cells:
         for metric in every:
-            if found := summary_of(cell.values(metric)):
-                yield cell, metric.key, found
+            for end, values in {"": cell.values(metric), **cell.ends(metric).named}.items():
+                if found := summary_of(values):
+                    yield cell, f"{metric.key.removesuffix('_ms')}{end}_ms" if end else metric.key, found
 
 
 def ratio_table(cells: Iterable[RequestCell], found: Iterable[tuple[str, str, str, Ratio]]) -> CsvTable:

@@ -16,6 +16,7 @@ from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import TransportError
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
+from s2a_bench.harness.clocks import Offset
 from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
 from s2a_bench.harness.links import EmulatedLink, emulated
 from s2a_bench.harness.links.probe import probed
@@ -225,6 +226,7 @@ class _Run:
         plan, recorder = self.plan.feed, self.recorder
         clients = stack.enter_context(ExitStack())  # closed after the camera, which publishes through them, has stopped
         camera: Camera | None = None
+        offsets: dict[str, Offset] = {}
         if plan.stream:
             source = self.sources.of("camera", "camera")
             camera = Camera(source, plan.fps, on_frame=recorder.frame if recorder else None)
@@ -244,7 +246,8 @@ class _Run:
                 source = self.sources.of(user, user if cell.black_box or place else "")
                 preencoded = cell.payload == "jpeg-preencoded"
                 feed = RequestFeed(source, preencoded=preencoded, cameras=plan.cameras, size=plan.resize)
-            made.append(Session(cell, client, feed, self.plan.request, recorder, sampler, servers.origin(cell)))
+            about = self.plan.request, recorder, sampler, servers.origin(cell), offsets
+            made.append(Session(cell, client, feed, *about))
             yield made[0]
 
     def _keep(self, servers: ServerSet, sampler: ResourceSampler, session: Session, measured: Measured) -> None:

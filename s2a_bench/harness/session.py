@@ -30,6 +30,7 @@ from s2a_bench.facts import (
     PROMPT_N,
 )
 from s2a_bench.frames import open_source
+from s2a_bench.harness.clocks import Offset
 from s2a_bench.harness.clocks.remote import Joined, RemoteClock
 from s2a_bench.harness.feed import Feed, RequestFeed, StreamedFrame, StreamFeed
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint, together
@@ -112,8 +113,12 @@ class Session:
         recorder: RunRecorder | None = None,
         sampler: ResourceSampler | None = None,
         origin: Provenance = UNKNOWN_ORIGIN,
+        offsets: dict[str, Offset] | None = None,
     ) -> None:
-        """Measure ``cell`` with an open client. ``origin`` is replaced by the provenance that an answer carries."""
+        """Measure ``cell`` with an open client. ``origin`` is replaced by the provenance that an answer carries.
+
+        ``offsets`` of other hosts' clocks are shared by sessions.
+        """
         self.origin = origin
         self.cell = cell
         self.client = client
@@ -122,7 +127,7 @@ class Session:
         self._recorder = recorder
         self._sampler = sampler or ResourceSampler({}, 1)
         self._frames: dict[int, StreamedFrame] = {}
-        self._clock = RemoteClock(self._exchange)
+        self._clock = RemoteClock(self._exchange, {} if offsets is None else offsets)
         self._pictures = 0
         """Of the last request."""
         self.busy = False

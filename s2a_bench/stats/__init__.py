@@ -24,6 +24,17 @@ class Summary:
 
 
 @dataclass(frozen=True, slots=True)
+class SummaryEnds:
+    """Summaries of the lower and of the upper ends of intervals: the true values' statistics lie between the two.
+
+    That holds for the median, the mean and the percentiles, not for ``sd``.
+    """
+
+    lo: Summary
+    hi: Summary
+
+
+@dataclass(frozen=True, slots=True)
 class Ratio:
     """A ratio and its confidence interval; None if the values do not allow one, never NaN.
 

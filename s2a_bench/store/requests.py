@@ -117,6 +117,8 @@ def _stage_values(spent: Budget) -> dict[str, Value]:
 
 ONE_WAY: Final = ("network", "return")
 """The stages that begin on one side of the wire and end on the other."""
+ROUND_TRIP: Final = "round_trip"
+"""Both together, which no offset changes; a column of requests to another host."""
 ONE_WAY_OF_FRAME: Final = ("network", "path", "latency")
 
 
@@ -143,6 +145,8 @@ def _derive_sample(row: SampleRow) -> dict[str, Value]:
         return {}
     spent = budget(row.marks)
     values = {**_stage_values(spent), **{name: of(row, spent) for name, (_, of) in _OF_SAMPLE.items()}}
+    if row.clock_error_ns is not None:
+        values[f"{ROUND_TRIP}_ns"] = sum(spent.stages_ns.get(stage, 0) for stage in ONE_WAY)
     return _as_intervals(values, ONE_WAY, row.clock_error_ns)
 
 
@@ -194,7 +198,12 @@ SKILLS: Final[Table[SkillRow]] = Table(
 def samples_table(stages: Mapping[str, str]) -> Table[SampleRow]:
     """Return the table of requests, with a column for each of a run's stages."""
     derived = {name: kind for name, (kind, _) in _OF_SAMPLE.items()}
-    return Table("samples", SampleRow, _columns(stages) | derived | _ends(ONE_WAY), _derive_sample)
+    return Table(
+        "samples",
+        SampleRow,
+        _columns(stages) | derived | _ends(ONE_WAY) | {f"{ROUND_TRIP}_ns": "int64"},
+        _derive_sample,
+    )
 
 
 def frames_table(stages: Mapping[str, str]) -> Table[FrameRow]:

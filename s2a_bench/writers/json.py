@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, get_type_hints
 
-from s2a_bench.stats import Ratio, summary_of
+from s2a_bench.stats import Ratio, SummaryEnds, summarise, summary_of
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import SCHEMA, with_fields
 
@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.run import StoredRun
     from s2a_bench.store.sweep import Sweep
+
+    Ends: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +66,11 @@ def cell_of_row(
 
 def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
     return present(RatioJson(metric, of, to, ratio.value, ratio.ci95, ratio.launches, ratio.launch_sd))
+
+
+def summaries_of_ends(metrics: Iterable[tuple[str, Ends]]) -> dict[str, Any]:
+    """Summarise both ends of the metrics that are intervals."""
+    return {name: asdict(SummaryEnds(*map(summarise, ends))) for name, ends in metrics if ends[0].size}
 
 
 def summaries(metrics: Iterable[tuple[str, NDArray[np.float64]]]) -> dict[str, Any]:

@@ -114,6 +114,11 @@ def entries(values: NDArray[np.float64], *statistics: str) -> list[str]:
     return [mean_sd(found) if name == MEAN_SD else number(getattr(found, name)) for name in statistics]
 
 
+def ends_entries(ends: tuple[NDArray[np.float64], NDArray[np.float64]], *statistics: str) -> list[str]:
+    """Format statistics of both ends of intervals."""
+    return [f"[{lo}, {hi}]" for lo, hi in zip(*(entries(values, *statistics) for values in ends), strict=True)]
+
+
 def interval(ratio: Ratio | None) -> str:
     if ratio is None or ratio.value is None:
         return ABSENT

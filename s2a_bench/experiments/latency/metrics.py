@@ -20,11 +20,11 @@ from s2a_bench.experiments.requests import (
     stages_present,
     summarised,
 )
-from s2a_bench.stats import Summary, summary_of
+from s2a_bench.stats import Summary, SummaryEnds, summary_of
 from s2a_bench.store.schema import Count, about
 from s2a_bench.trace import GROUPS
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
-from s2a_bench.writers.json import frame, ratio_entry, summaries
+from s2a_bench.writers.json import frame, ratio_entry, summaries, summaries_of_ends
 
 if TYPE_CHECKING:
     from s2a_bench.experiments import Comparable
@@ -47,7 +47,15 @@ METRICS: Final = (
     ),
     RequestMetric("e2e", "ms", title="e2e"),
     RequestMetric("ttft", "ms", about="From the prompt: e2e without capture."),
-    RequestMetric("frame_age", "ms", about="Age of the frame when inference starts."),
+    RequestMetric(
+        "round_trip",
+        "ms",
+        title="round trip",
+        about="network and return together: exact, where a server on another host has them as intervals.",
+    ),
+    RequestMetric(
+        "frame_age", "ms", about="Age of the frame when inference starts.", ends=lambda cell: cell.ends("frame_age")
+    ),
     *TOKEN_METRICS,
     RequestMetric("residual", "ms", title="residual", about="The time between the stages."),
     RequestMetric("residual_share", about="The residual as a share of e2e without inference."),
@@ -69,8 +77,8 @@ def latency_cell(metrics: Sequence[RequestMetric] = METRICS) -> type:
         "One pipeline, stage by stage; a value that no sample has is an absent key.",
         metrics,
         residual_flagged=Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")],
-        stages_ms=Annotated[dict[str, Summary], {"propertyNames": {"pattern": "^[a-z][a-z0-9_]*$"}}],
-        groups_ms=Annotated[dict[str, Summary], {"propertyNames": {"enum": list(GROUPS)}}],
+        stages_ms=Annotated[dict[str, Summary | SummaryEnds], {"propertyNames": {"pattern": "^[a-z][a-z0-9_]*$"}}],
+        groups_ms=Annotated[dict[str, Summary | SummaryEnds], {"propertyNames": {"enum": list(GROUPS)}}],
     )
 
 
@@ -87,8 +95,14 @@ def latency_json(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> 
             run,
             metrics,
             residual_flagged=cell.flagged(),
-            stages_ms=summaries((stage, cell.values_ms(stage)) for stage in stages_present([cell])),
-            groups_ms=summaries((group, cell.group_ms(group)) for group in groups_present([cell])),
+            stages_ms={
+                **summaries((stage, cell.values_ms(stage)) for stage in stages_present([cell])),
+                **summaries_of_ends((stage, cell.ends(stage)) for stage in stages_present([cell])),
+            },
+            groups_ms={
+                **summaries((group, cell.group_ms(group)) for group in groups_present([cell])),
+                **summaries_of_ends((group, cell.group_ends(group)) for group in groups_present([cell])),
+            },
         )
         for cell in cells
     ]
@@ -115,8 +129,11 @@ def _ratios(cells: list[RequestCell], run: StoredRun) -> Iterator[tuple[str, str
 def _stage_rows(cells: list[RequestCell]) -> Iterator[tuple[object, ...]]:
     for cell in cells:
         for stage in (*stages_present([cell]), "residual"):
-            if summary := summary_of(cell.values_ms(stage)):
-                yield cell.name, cell.stages.get(stage, ""), stage, *summary_values(summary), cell.emulated
+            columns = {"": cell.values_ms(stage), **cell.ends(stage).named}
+            for end, values in columns.items():
+                if summary := summary_of(values):
+                    place = cell.name, cell.stages.get(stage, ""), stage + end
+                    yield *place, *summary_values(summary), cell.emulated
 
 
 def _rows(cells: list[RequestCell], metrics: Sequence[RequestMetric]) -> Iterator[tuple[object, ...]]:

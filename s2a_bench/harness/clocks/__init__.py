@@ -91,7 +91,7 @@ class Offset:
         self._exchanges: deque[Exchange] = deque(maxlen=KEPT)
 
     def add(self, exchange: Exchange) -> None:
-        """Add an exchange; they come in order of time."""
+        """Add an exchange, on any thread."""
         self._exchanges.append(exchange)
 
     def over(self, *times_ns: int) -> Interval:
@@ -103,8 +103,9 @@ class Offset:
 
     def _at(self, at_ns: int) -> Interval:
         end_ns = min(at_ns + WINDOW_NS // 2, self._exchanges[-1].seen_ns)
-        near = (each for each in self._exchanges if each.seen_ns >= end_ns - WINDOW_NS and each.sent_ns <= end_ns)
-        return interval_at(at_ns, [*near])
+        first_ns = end_ns - WINDOW_NS
+        near = [each for each in [*self._exchanges] if each.seen_ns >= first_ns and each.sent_ns <= end_ns]
+        return interval_at(at_ns, near)
 
 
 def interval_at(at_ns: int, exchanges: Sequence[Exchange]) -> Interval:

@@ -35,11 +35,13 @@ class Joined:
 class RemoteClock:
     """The offset of one server's clock; nothing is exchanged before `join` has met it."""
 
-    def __init__(self, exchange: Callable[[], Trace]) -> None:
-        """``exchange`` makes a request for its marks alone; it raises S2AError."""
-        self._exchange = exchange
+    def __init__(self, exchange: Callable[[], Trace], offsets: dict[str, Offset]) -> None:
+        """``exchange`` makes a request for its marks alone; ``offsets``, by clock, are those that others estimate too.
+
+        ``exchange`` raises S2AError.
+        """
+        self._exchange, self._offsets = exchange, offsets
         self._id = ""
-        self._offset = Offset()
         self._last_ns = 0
 
     def refresh(self) -> None:
@@ -55,16 +57,15 @@ class RemoteClock:
         own, remote = Exchange.of(trace), trace.remote
         assert remote is not None  # noqa: S101 - for mypy
         met, self._id = remote.clock == self._id, remote.clock
-        if not met:
-            self._offset = Offset()
-        self._offset.add(own)
+        offset = self._offsets.setdefault(self._id, Offset())
+        offset.add(own)
         if met:
             self.refresh()
         else:
             self._burst(FIRST, FIRST_PAUSE_NS)
         early_ns = min((stamp - own.upper[1] for _, stamp in remote.frame_marks), default=own.sent_ns)
-        near = self._offset.over(own.sent_ns, own.seen_ns)
-        whole = near | self._offset.over(min(early_ns, own.sent_ns), last_ns)
+        near = offset.over(own.sent_ns, own.seen_ns)
+        whole = near | offset.over(min(early_ns, own.sent_ns), last_ns)
         trace.remote = remote.shifted(near.middle_ns)
         return Joined(near.half_ns, whole.hi_ns - near.middle_ns, near.middle_ns - whole.lo_ns)
 
@@ -72,6 +73,6 @@ class RemoteClock:
         clock = SystemClock()
         with suppress(S2AError):  # the next request meets what is wrong, and reports it
             for _ in range(count):
-                self._offset.add(Exchange.of(self._exchange()))
+                self._offsets[self._id].add(Exchange.of(self._exchange()))
                 clock.sleep_until_ns(now_ns() + pause_ns)
         self._last_ns = now_ns()

@@ -11,6 +11,7 @@ from s2a_bench.experiments import Shown
 from s2a_bench.experiments.latency.metrics import METRICS, latency_csv, latency_json
 from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.requests import (
+    Ends,
     RequestCell,
     action_shape,
     answer_kind,
@@ -32,9 +33,11 @@ from s2a_bench.experiments.requests import (
 from s2a_bench.stats import summary_of
 from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport
-from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, entries, interval, number
+from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, ends_entries, entries, interval, number
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from s2a_bench.experiments.requests import Floats, RequestMetric
     from s2a_bench.stats import Ratio
     from s2a_bench.store.run import StoredRun
@@ -101,7 +104,7 @@ def _times(cell: RequestCell, base: RequestCell, ratio: Ratio) -> str:
     return f"{cell.label}{of} takes {value} times as long as {base.label}{_of(base.payload or cell.payload)}{between}."
 
 
-_FOOT = ("residual", "e2e_without_inference", "preprocess", "e2e_without_model", "inference", "e2e")
+_FOOT = ("residual", "round_trip", "e2e_without_inference", "preprocess", "e2e_without_model", "inference", "e2e")
 _HEADINGS = {"preprocess": "preproc.", "inference": "infer.", **{metric.name: metric.title for metric in METRICS}}
 
 _FRAME_FOOT = {
@@ -120,16 +123,16 @@ def stage_table(run: StoredRun, *, full: bool = True) -> TextTable:
     rows: list[tuple[str, ...]] = []
     last = ""
 
-    def add(group: str, name: str, values: list[Floats]) -> None:
-        rows.append((group, name, *(_entry(found, full=full) for found in values)))
+    def add(group: str, name: str, column: str) -> None:
+        rows.append((group, name, *(_entry(cell.values_ms(column), cell.ends(column), full=full) for cell in cells)))
 
     for stage in stages_present(cells):
         if (group := run.stages[stage]) != "inference":
-            add("" if group == last else group, stage, [cell.values_ms(stage) for cell in cells])
+            add("" if group == last else group, stage, stage)
             last = group
     below = len(rows)
     for metric in _foot(cells):
-        add("", metric.replace("_", " "), [cell.values_ms(metric) for cell in cells])
+        add("", metric.replace("_", " "), metric)
     title = "Stages in ms: median (mean ± sd)" if full else "Stages in ms: medians"
     header = ("group", "stage", *titles(cells))
     brief = None
@@ -145,9 +148,9 @@ def group_table(run: StoredRun) -> TextTable:
     foot = _foot(cells)[1:]
     rows = []
     for cell in cells:
-        values = [cell.group_ms(group) for group in groups]
-        values += [cell.values_ms(metric) for metric in foot]
-        rows.append(tuple(_entry(found) for found in values))
+        values = [(cell.group_ms(group), cell.group_ends(group)) for group in groups]
+        values += [(cell.values_ms(metric), cell.ends(metric)) for metric in foot]
+        rows.append(tuple(_entry(*found) for found in values))
     header = (*groups, *(_HEADINGS[metric] for metric in foot))
     return _by_cell("Groups of stages in ms: medians", header, cells, rows, _notes(run, cells))
 
@@ -191,11 +194,11 @@ def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> Text
 
 def _token_table(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> TextTable | None:
     """Return the table of gaps and delays of tokens; None if no server reports when they left the engine."""
-    cells = [cell for cell in cells_of(run) if cell.values("token_delay").size]
+    cells = [cell for cell in cells_of(run) if cell.values("token_delay").size or cell.ends("token_delay").lo.size]
     if not cells:
         return None
     columns = [metric for metric in metrics if metric.shown]
-    rows = [tuple(text for metric in columns for text in entries(cell.values(metric), *metric.shown)) for cell in cells]
+    rows = [tuple(text for metric in columns for text in _statistics(cell, metric)) for cell in cells]
     header = [f"{metric.title} {statistic}" for metric in columns for statistic in metric.shown]
     title = f"{answer_kind(run).capitalize()} in ms: from one to the next (gap), and engine to client (delay)"
     return _by_cell(title, header, cells, rows, engine_notes(run, cells))
@@ -216,11 +219,18 @@ def fact_table(run: StoredRun) -> TextTable | None:
 
 def _foot(cells: list[RequestCell]) -> list[str]:
     """Return the rows below the stages; preprocessing and e2e without model only if reported."""
-    optional = {"preprocess", "e2e_without_model"}
+    optional = {"round_trip", "preprocess", "e2e_without_model"}
     return [name for name in _FOOT if name not in optional or any(cell.values_ms(name).size for cell in cells)]
 
 
-def _entry(values: Floats, *, full: bool = False) -> str:
+def _statistics(cell: RequestCell, metric: RequestMetric) -> list[str]:
+    ends = cell.ends(metric)
+    return ends_entries(ends, *metric.shown) if ends.lo.size else entries(cell.values(metric), *metric.shown)
+
+
+def _entry(values: Floats, ends: Ends | None = None, *, full: bool = False) -> str:
+    if ends and ends.lo.size:
+        return ends_entries(ends, "median")[0]
     (middle,) = entries(values, "median")
     return f"{middle} ({entries(values, MEAN_SD)[0]})" if full and values.size else middle
 
@@ -239,6 +249,12 @@ def _notes(run: StoredRun, cells: list[RequestCell]) -> tuple[str, ...]:
             "or e2e without model. Of a llama-server that is e2e less the prompt_ms it reports, which is assumed to be "
             "all of its model's time before the first token."
         )
+    if errors_ms := [found.median for cell in cells if (found := summary_of(cell.values_ms("clock_error")))]:
+        notes.append(
+            f"[lo, hi]: the server is on another host, whose clock is known to ± {number(max(errors_ms))} ms (median). "
+            "What begins on one host and ends on the other lies in between; all other times are exact, and so is the "
+            "round trip, network and return together."
+        )
     if flagged := sum(cell.flagged() for cell in cells):
         notes.append(
             f"{flagged} of {sum(cell.n for cell in cells)} samples have a residual above {RESIDUAL_LIMIT:.0%}"
@@ -255,12 +271,13 @@ def _frame_table(run: StoredRun) -> TextTable | None:
     used = [_used(run, cell) for cell in cells]
     rows = []
     for stage, group in run.stages.items():
-        values = [frames[stage] for frames in used]
-        if any(found.size for found in values):
-            rows.append((group, stage, *(_entry(found) for found in values)))
+        entries_of = [_frame_entry(frames, stage) for frames in used]
+        if any(entry != ABSENT for entry in entries_of):
+            rows.append((group, stage, *entries_of))
     rule = len(rows)
-    rows += [("", name, *(_entry(frames[column]) for frames in used)) for column, name in _FRAME_FOOT.items()]
-    rows.append(("", "age when inference starts", *(_entry(cell.values_ms("frame_age")) for cell in cells)))
+    rows += [("", name, *(_frame_entry(frames, column) for frames in used)) for column, name in _FRAME_FOOT.items()]
+    ages = ((cell.values_ms("frame_age"), cell.ends("frame_age")) for cell in cells)
+    rows.append(("", "age when inference starts", *(_entry(*age) for age in ages)))
     return TextTable(
         "Frame path in ms: medians over the frames that a prompt was about",
         ("group", "stage", *titles(cells)),
@@ -270,9 +287,14 @@ def _frame_table(run: StoredRun) -> TextTable | None:
     )
 
 
-def _used(run: StoredRun, cell: RequestCell) -> dict[str, Floats]:
-    frames = run.frames[run.frames["used_by"].isin(cell.good["request_id"])]
-    return {name: numbers_ms(frames[f"{name}_ns"]) for name in (*run.stages, *_FRAME_FOOT)}
+def _used(run: StoredRun, cell: RequestCell) -> pd.DataFrame:
+    return run.frames[run.frames["used_by"].isin(cell.good["request_id"])]
+
+
+def _frame_entry(frames: pd.DataFrame, column: str) -> str:
+    none = frames["path_ns"].iloc[:0]
+    exact, lo, hi = (numbers_ms(frames.get(f"{column}{end}_ns", none)) for end in ("", "_lo", "_hi"))
+    return _entry(exact, Ends(lo, hi))
 
 
 def latency_tables(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, TextTable]:

@@ -78,6 +78,9 @@ def build_stage_breakdown(run: StoredRun) -> Figure:
     height = 0.85 + panels * (0.3 + 0.34 * len(cells)) + 0.16 * legend_rows
     notes = ["The line is the median of the whole; medians of the stages need not add up to it."]
     notes += ["Shares are of the sum of the stages."] if shares else []
+    apart = {cell.name: {group: ends for group in groups if (ends := cell.group_ends(group)).lo.size} for cell in cells}
+    if any(apart.values()):
+        notes.append("Whiskers: between two hosts network may end, and return begin, anywhere in them.")
     figure = new_figure(height, _caption(run, cells, "Stages, medians", metric, *notes))
     all_axes = figure.subplots(panels, 1, squeeze=False)[:, 0]
     for axes, share in zip(all_axes, (False, True), strict=False):
@@ -87,6 +90,9 @@ def build_stage_breakdown(run: StoredRun) -> Figure:
                 width = part[name] * (100 / all_of_it if share else 1)
                 axes.barh(place, width, 0.66, left, color=colour, hatch=hatch, edgecolor=_edge(name), linewidth=0.3)
                 left += width
+                if not share and name in apart[cells[place].name]:
+                    edge, half = left - width * (name == "return"), apart[cells[place].name][name].half
+                    draw_over(axes, (max(0.0, edge - half), edge + half), (place, place), "|-", "")
             if not share:
                 draw_over(axes, (whole, whole), (place - 0.42, place + 0.42), "-", "" if place else "whole")
                 write_beside(axes, place, number(whole))
@@ -149,7 +155,9 @@ def _label(cell: RequestCell) -> str:
 
 
 def _median(cell: RequestCell, name: str, n: int) -> float:
-    """Return the median of a group over all samples; a sample without the group counts as 0."""
+    """Return the median of a group over all samples, of intervals the middle; one without the group counts as 0."""
+    if (ends := cell.group_ends(name)).lo.size:
+        return ends.middle
     values: Floats = cell.values_ms("residual") if name == "residual" else cell.group_ms(name)
     return float(median((*values.tolist(), *[0.0] * (n - values.size))))
 
