@@ -65,9 +65,15 @@ class Direction:
     period_s: float = 0.0
     """The steps repeat after it."""
 
-    def least_s(self, size: int) -> float:
+    @classmethod
+    def from_facts(cls, facts: Mapping[str, Any]) -> Direction:
+        """Read plain data, in which an infinite rate may be None."""
+        steps = tuple(Step(**step) for step in facts["steps"])
+        return cls(**{name: math.inf if value is None else value for name, value in facts.items()} | {"steps": steps})
+
+    def least_s(self, size: float) -> float:
         """Return the least time in s that so many bytes take."""
-        fast = min(float(size), self.burst_bytes)
+        fast = min(size, self.burst_bytes)
         return self.delay_ms / 1e3 + fast * 8e-6 / self.burst_mbps + (size - fast) * 8e-6 / self.mbps
 
     def mean_mbps(self, start_s: float, end_s: float) -> float:
@@ -156,7 +162,7 @@ class LinkProfile(TomlTable):
         )
 
 
-def bound_s(link: tuple[Direction, Direction], bytes_up: int, bytes_first_down: int = 0) -> float:
+def bound_s(link: tuple[Direction, Direction], bytes_up: float, bytes_first_down: float = 0) -> float:
     """Return the least time in s of a request on a link: its body up, and the first piece of its answer down."""
     return link[0].least_s(bytes_up) + link[1].least_s(bytes_first_down)
 

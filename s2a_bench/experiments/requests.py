@@ -15,6 +15,7 @@ from functools import cached_property
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
+from s2a_bench.boards.links import Direction, bound_s
 from s2a_bench.experiments import Comparable, Metric, Subject, by_name
 from s2a_bench.facts import (
     END_N,
@@ -378,12 +379,22 @@ def _launches_of(run: StoredRun) -> list[tuple[int, list[RequestCell]]]:
 
 def _cells(run: StoredRun, samples: pd.DataFrame) -> list[RequestCell]:
     tokens, stages = run.tokens, run.stages
+    samples = _bounded(samples, run.manifest.get("link") or {})
     mixed = any("payload=" in name for name in run.manifest["configuration"].get("transports", ()))
     cells = []
     for name in map(str, samples["cell"].unique()):
         counted, streamed = (rows[rows["cell"] == name] for rows in (samples, tokens))
         cells.append(_cell(name, counted, streamed, stages, run.origins.of(name), mixed))
     return sorted(cells, key=_place)
+
+
+def _bounded(samples: pd.DataFrame, link: Mapping[str, Any]) -> pd.DataFrame:
+    """Add the column ``bound_ns`` to requests on an emulated link that bring their pictures."""
+    if "directions" not in link:
+        return samples
+    up, down = (Direction.from_facts(facts) for facts in link["directions"])
+    sent = samples["payload_bytes"].where(samples["mode"] == "request").astype("float64")
+    return samples.assign(bound_ns=sent.map(lambda size: 1e9 * bound_s((up, down), size), na_action="ignore"))
 
 
 def payloads_of(cells: Iterable[RequestCell]) -> list[str]:

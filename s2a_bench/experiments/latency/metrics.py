@@ -56,6 +56,18 @@ METRICS: Final = (
     RequestMetric(
         "frame_age", "ms", about="Age of the frame when inference starts.", ends=lambda cell: cell.ends("frame_age")
     ),
+        "bound",
+        "ms",
+        "neither",
+        title="bound",
+        about="The least time on the run's emulated link: the payload up at its rate, and both delays.",
+    ),
+    RequestMetric(
+        "bound_ratio",
+        title="measured / bound",
+        about="e2e without inference over the bound: what a better transport could still win.",
+        of=lambda cell: cell.column("e2e_without_inference") / cell.column("bound"),
+    ),
     *TOKEN_METRICS,
     RequestMetric("residual", "ms", title="residual", about="The time between the stages."),
     RequestMetric("residual_share", about="The residual as a share of e2e without inference."),

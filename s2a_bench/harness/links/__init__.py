@@ -16,7 +16,7 @@ import socket
 import struct
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from errno import EPERM
 from pathlib import Path
 from typing import Any, Final
@@ -63,8 +63,8 @@ class EmulatedLink:
 
     def facts(self) -> dict[str, Any]:
         """Return what the manifest records of the profile."""
-        peaks = {name: way.mbps for name, way in zip(("up_mbps", "down_mbps"), self.directions, strict=True)}
-        return {"profile": self.profile.model_dump(exclude_defaults=True), "greatest": peaks, "method": "relay"}
+        directions = [asdict(replace(way, steps=())) for way in self.directions]
+        return {"profile": self.profile.model_dump(exclude_defaults=True), "directions": directions}
 
     def statistics(self) -> dict[str, Any]:
         """Return what the relay carried and lost, and how late it was."""

@@ -109,17 +109,12 @@ class Lateness:
         return None
 
 
-def direction(facts: Mapping[str, Any]) -> Direction:
-    """Read a direction from plain data."""
-    return Direction(**{**facts, "steps": tuple(Step(**step) for step in facts["steps"])})
-
-
 class Relay:
     """Moves packets between the client's device and the server's."""
 
     def __init__(self, devices: Sequence[int], directions: Sequence[Mapping[str, Any]]) -> None:
         client, server = devices
-        self._shapers = [Shaper(direction(facts)) for facts in directions]
+        self._shapers = [Shaper(Direction.from_facts(facts)) for facts in directions]
         self._ways = {client: (self._shapers[0], server), server: (self._shapers[1], client)}
         self._held: list[tuple[float, int, int, bytes]] = []
         self._number = 0

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from s2a_bench.stats import Ratio
     from s2a_bench.store.run import StoredRun
 
+BOUNDS = ("bound", "bound_ratio")
 _STAGE_CELLS = 5
 """With more cells than this a narrow table has the cells as rows."""
 _MOST = 6
@@ -179,6 +180,7 @@ def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> Text
         if base.values_ms(metric).size and any(cell.is_compared_with(base) for cell in cells):
             bases.setdefault(base.name if base.mixed else base.label, []).append(base)
     figures = (MEAN_SD, "median", "p90", "p99")
+    bounds = [each for each in METRICS if each.name in BOUNDS and any(cell.values(each).size for cell in cells)]
     rows = []
     found: list[Ratio] = []
     for cell in cells:
@@ -186,8 +188,9 @@ def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> Text
         over = [ratio_between(cell, base, metric, run.bootstrap_seed) if base else None for base in matching]
         found += filter(None, over)
         ratios = ("1" if cell in each else interval(ratio) for each, ratio in zip(bases.values(), over, strict=True))
-        rows.append((str(cell.n), str(cell.errors), *entries(cell.values_ms(metric), *figures), *ratios))
-    header = ("n", "errors", *figures, *(f"ratio to {base}" for base in bases))
+        limits = (entries(cell.values(each), "median")[0] for each in bounds)
+        rows.append((str(cell.n), str(cell.errors), *entries(cell.values_ms(metric), *figures), *limits, *ratios))
+    header = ("n", "errors", *figures, *(each.title for each in bounds), *(f"ratio to {base}" for base in bases))
     title = f"{metric_phrase(metric)} in ms; ratios of medians [95 % interval]"
     return _by_cell(title, header, cells, rows, (*_notes(run, cells), *launches_note(found)))
 
