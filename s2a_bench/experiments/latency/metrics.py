@@ -56,6 +56,7 @@ METRICS: Final = (
     RequestMetric(
         "frame_age", "ms", about="Age of the frame when inference starts.", ends=lambda cell: cell.ends("frame_age")
     ),
+    RequestMetric(
         "bound",
         "ms",
         "neither",
