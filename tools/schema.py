@@ -89,7 +89,8 @@ def _there(schema: dict[str, Any], field: dataclasses.Field[Any]) -> dict[str, A
         return schema | {"type": next(kind for kind in schema["type"] if kind != "null")}
     if "oneOf" not in schema:
         return schema
-    (inner,) = [each for each in schema["oneOf"] if each != {"type": "null"}]
+    rest = [each for each in schema["oneOf"] if each != {"type": "null"}]
+    inner = rest[0] if len(rest) == 1 else {"oneOf": rest}
     return {name: value for name, value in schema.items() if name != "oneOf"} | inner
 
 

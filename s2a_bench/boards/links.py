@@ -68,8 +68,8 @@ class Direction:
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any]) -> Direction:
         """Read plain data, in which an infinite rate may be None."""
-        steps = tuple(Step(**step) for step in facts["steps"])
-        return cls(**{name: math.inf if value is None else value for name, value in facts.items()} | {"steps": steps})
+        values: dict[str, Any] = {name: math.inf if value is None else value for name, value in facts.items()}
+        return cls(**values | {"steps": tuple(Step(**step) for step in facts["steps"])})
 
     def least_s(self, size: float) -> float:
         """Return the least time in s that so many bytes take."""
