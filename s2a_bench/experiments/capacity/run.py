@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.capacity.generator import STRIDE, Fleet, FleetPlan, FleetProcess
 from s2a_bench.experiments.capacity.metrics import measures
-from s2a_bench.experiments.capacity.predict import run_predicted
+from s2a_bench.experiments.capacity.predict import Prediction, Service, run_predicted
 from s2a_bench.experiments.capacity.rows import (
     FLEETS,
     KNEES,
@@ -73,17 +73,14 @@ def run_capacity(config: CapacityConfig, output: Path, progress: Progress) -> Pa
 
 def twin(cell: Pipeline) -> Pipeline:
     """Return the cell of an instant server: echo over the same transport; in this process where it has none."""
-    options = cell.options
-    kept = {
-        name: value for name, value in options.given_values().items() if name not in options.of_sides(EXTERNAL, PROGRAM)
-    }
+    options, elsewhere = cell.options, {*cell.options.of_sides(EXTERNAL, PROGRAM)}
+    kept = {name: value for name, value in options.given_values().items() if name not in elsewhere}
     try:
-        options = type(options)(**kept)
-        cell.transport.require(Choice(options, cell.variant))
+        own = replace(cell, options=type(options)(**kept))
+        own.transport.require(Choice(own.options, own.variant))
     except UsageError:
-        cell = pipelines([LOOPBACK])[0]
-        options = cell.options
-    return replace(cell, name=f"{cell.name}, {INSTANT}", options=options, engine=(*ECHO, *ECHO_OF_MODEL))  # type: ignore[arg-type]
+        own = pipelines([LOOPBACK])[0]
+    return replace(own, name=f"{cell.name}, {INSTANT}", engine=(*ECHO, *ECHO_OF_MODEL))  # type: ignore[arg-type]
 
 
 def cell_name(session: Session, mode: str) -> str:
@@ -100,8 +97,11 @@ def _drive(config: CapacityConfig, launch: RunningLaunch) -> None:
     modes = [*config.made] if config.load == "chunks" else [""]
     launch.progress.expect(half * len(modes) * config.most_fleets)
     for session, instant in zip(launch.sessions[:half], launch.sessions[half:], strict=True):
+        service: Service | None = None
         for mode in modes:
-            _Cell(config, launch, session, instant, mode).run()
+            cell = _Cell(config, launch, session, instant, mode, service)
+            cell.run()
+            service = cell.service
 
 
 @dataclass(slots=True)
@@ -113,6 +113,8 @@ class _Cell:
     session: Session
     instant: Session
     mode: str
+    service: Service | None = None
+    """Of the requests of one robot alone, before any other fleet."""
     tried: dict[int, Tried] = field(default_factory=dict)
     alone: float | None = None
     """Share of stalled ticks of one robot alone."""
@@ -129,13 +131,36 @@ class _Cell:
                     if self.tried[number].clean and self._is_driven(robots, number):
                         break
                     self.tried[number] = replace(self.tried[number], clean=False)
+            self._predict()
         finally:
             self._conclude()
 
     def _attempt(self, robots: _Robots, number: int) -> bool:
         if number not in self.tried:
             self.tried[number] = self._fleet(robots, number, "measured")
+            if number == 1 and self.service is None and len(self.tried) == 1:
+                with self._says_why_not():
+                    self.service = Service.read(f"{self.launch.writer.path}#{self.session.cell.name}")
         return self.tried[number].within
+
+    def _predict(self) -> None:
+        """Write what one robot's service times predict of the fleets."""
+        if self.service is None:
+            return
+        config, name, writer = self.config, cell_name(self.session, self.mode), self.launch.writer
+        prediction = Prediction(config, name, self.mode, self.service, (1.0,), self.launch.progress)
+        with self._says_why_not():
+            found = prediction.run(config.numbers, bisects=config.searches)
+            writer.append(FLEETS, prediction.rows)
+            writer.append(KNEES, [found] if found else [])
+
+    @contextmanager
+    def _says_why_not(self) -> Iterator[None]:
+        """Say why nothing is predicted, and go on."""
+        try:
+            yield
+        except UsageError as error:
+            self.launch.progress.say(f"no prediction: {error}")
 
     def _is_driven(self, robots: _Robots, number: int) -> bool:
         """Return whether the generator keeps to the limit with a server that takes no time."""

@@ -40,8 +40,9 @@ def _sentences(run: StoredRun) -> Iterator[str]:
     clock = f" at {settings['control_hz']:g} Hz, H {settings['horizon']}" if settings["load"] == "chunks" else ""
     for knee in run.table(KNEES).to_dict("records"):
         sure = f"[{knee['low']}, {knee['high']:.0f}]" if knee["high"] == knee["high"] else f"[{knee['low']}, ...]"
-        robots = f"{knee['robots']} robot{'s' * (knee['robots'] != 1)}"
-        yield f"{robots} {sure}{clock}, {knee['cell']}, with {knee['limit']}."
+        robots = f"{knee['robots']} robot{'s' * (knee['robots'] != 1)} {sure}" if knee["robots"] else "no robot"
+        robots = robots if knee["source"] == "measured" else f"{knee['source']}: {robots}"
+        yield f"{robots}{clock}, {knee['cell']}, with {knee['limit']}."
 
 
 def _table(run: StoredRun) -> TextTable:

@@ -1,0 +1,160 @@
+"""The load generator: intended times, late and missing answers, and a fleet against a server that is really there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+from queue import SimpleQueue
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+import s2a_bench as s2a
+from s2a_bench.clock import VirtualClock
+from s2a_bench.errors import ServerDied
+from s2a_bench.experiments.capacity import generator
+from s2a_bench.experiments.capacity.generator import FleetPlan, PlainRobot
+from s2a_bench.experiments.capacity.metrics import RobotTrace
+from s2a_bench.experiments.capacity.rows import FLEETS, REQUESTS, ROBOTS
+from s2a_bench.experiments.capacity.run import twin
+from s2a_bench.harness.config import LiveRequests, RequestsConfig
+from s2a_bench.harness.plan import resolve
+from s2a_bench.harness.session import Measured, Place, RequestContext, Session
+from s2a_bench.policy.chunks import ControlSetting
+from s2a_bench.store.run import read_run
+from s2a_bench.types import Token
+
+MS = 1_000_000
+REQUEST = resolve(RequestsConfig(transports="loopback")).request
+
+
+class Over:
+    """An event whose waits move a virtual clock."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        """Be not set."""
+        self._clock, self._set = clock, False
+
+    def set(self) -> None:
+        """End the waits."""
+        self._set = True
+
+    def wait(self, timeout_s: float) -> bool:
+        """Move the clock."""
+        self._clock.sleep_until_ns(self._clock.now_ns() + round(timeout_s * 1e9))
+        return self._set
+
+
+def robot_of(
+    monkeypatch: pytest.MonkeyPatch, answers: list[list[int] | str], every_ns: int = 0, think_ns: int = 0
+) -> RobotTrace:
+    """Return what a robot does until 10 s, from 1 s on, whose answers have pieces after some ms, or fail."""
+    clock = VirtualClock()
+    monkeypatch.setattr(generator, "now_ns", clock.now_ns)
+
+    def measure(_place: Place, context: RequestContext) -> Measured:
+        pieces = answers.pop(0)
+        started_ns = clock.now_ns()
+        for index, after_ms in enumerate([] if isinstance(pieces, str) else pieces):
+            clock.sleep_until_ns(started_ns + after_ms * MS)
+            cast("Callable[[Any, int], None]", context.on_piece)(Token(index, "word"), clock.now_ns())
+        if not answers:
+            robot.end()
+        error = pieces if isinstance(pieces, str) else ""
+        sample: Any = SimpleNamespace(error=error)
+        return Measured(sample, [], 0, fatal=ServerDied("gone") if error == "fatal" else None)
+
+    session: Any = SimpleNamespace(measure=measure, request=REQUEST)
+    plan = FleetPlan("c", {}, cast("Any", None), REQUEST, False, ControlSetting(20 * MS, 16), "", 0, every_ns, think_ns)
+    robot = PlainRobot(plan, cast("Session", session), count(), 1000 * MS, SimpleQueue())
+    robot.over = cast("Any", Over(clock))
+    robot.work()
+    return robot.trace(0, 10_000 * MS)
+
+
+def test_closed_loop_requests_again_a_while_after_its_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    trace = robot_of(monkeypatch, [[100, 300], [50, 60], [1, 2]], think_ns=500 * MS)
+    assert (trace.request_ns // MS).tolist() == [1000, 1800, 2360]
+    assert (trace.arrival_ns // MS).tolist() == [300, 60, 2]
+    assert cast("Any", trace.first_ns // MS).tolist() == [100, 50, 1]
+    assert trace.plan_stalled is None
+    assert cast("Any", trace.late_ns).max() == 0
+
+
+def test_latency_of_a_plan_counts_from_when_it_was_due(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second waits for the first, and those after the third are due and never requested."""
+    trace = robot_of(monkeypatch, [[2000, 5000], [10, 1000], [10, 1000]], every_ns=2000 * MS)
+    assert (trace.request_ns // MS).tolist() == [1000, 3000, 5000, 7000]
+    assert (trace.arrival_ns // MS).tolist() == [5000, 4000, 3000, -1]
+    assert cast("Any", trace.first_ns // MS).tolist() == [2000, 3010, 2010, -1]
+
+
+@pytest.mark.parametrize(
+    ("pieces_ms", "stalls"),
+    [
+        ([1900], False),
+        ([2100], True),
+        ([100, 2900], False),  # the second piece is due 1 s after the first: S0 1.9 s
+        ([100, 3100], True),
+        ("RequestFailed: broken", True),
+    ],
+)
+def test_a_plan_stalls_if_its_safe_start_is_after_the_next_is_due(
+    monkeypatch: pytest.MonkeyPatch, pieces_ms: Any, stalls: bool
+) -> None:
+    trace = robot_of(monkeypatch, [pieces_ms], every_ns=2000 * MS)
+    assert bool(cast("Any", trace.plan_stalled)[0]) == stalls
+
+
+def test_a_robot_goes_on_after_an_answer_that_breaks_and_ends_with_its_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    trace = robot_of(monkeypatch, ["broken", [10], "fatal", [10]], think_ns=100 * MS)
+    assert [each >= 0 for each in trace.arrival_ns] == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("written", "options", "same"),
+    [
+        ("websocket/openpi", {"websocket": {"url": "ws://127.0.0.1:9"}}, "websocket/openpi"),
+        ("http/binary", {}, "http/binary"),
+        ("http/llama-server", {}, "loopback"),
+    ],
+)
+def test_the_twin_is_an_instant_server_of_ours_on_the_same_wire(written: str, options: Any, same: str) -> None:
+    cell = LiveRequests(transports=written, options=options).pipelines[0]
+    found = twin(cell)
+    assert found.name == f"{cell.name}, instant"
+    assert "/".join(filter(None, (found.transport.name, found.variant))) == same
+    assert not found.black_box
+    assert dict(found.engine)["name"] == "echo"
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_robots_act_at_their_clock_and_are_served_in_turn(tmp_path: Any, processes: int) -> None:
+    path = s2a.capacity(
+        output=tmp_path,
+        transports="http/binary",
+        size="64x48",
+        latency=30,
+        modes="queue?trigger=8",
+        robots="3",
+        seconds=1.5,
+        settle=0.5,
+        looks=1,
+        processes=processes,
+    ).path
+    run = read_run(path)
+    fleets, robots, requests = (run.table(each) for each in (FLEETS, ROBOTS, REQUESTS))
+    measured = fleets[fleets["source"] == "measured"]
+    assert measured["robots"].tolist() == [1, 3]
+    together = robots[(robots["robots"] == 3) & (robots["source"] == "measured")]
+    assert together["robot"].tolist() == [0, 1, 2]
+    mine = requests[(requests["robots"] == 3) & (requests["source"] == "measured")]
+    answered = mine["latency_ns"].dropna()
+    assert set(mine["robot"]) == {0, 1, 2}
+    assert (answered >= 30 * MS).all()
+    assert (mine["intended_ns"] % (20 * MS) == 0).all()  # a tick
+    assert (mine["settling"] == (mine["intended_ns"] < 500 * MS)).all()
+    assert np.isfinite(measured["generator_cpu"]).all()
+    assert {"measured", "predicted"} <= set(fleets["source"])
