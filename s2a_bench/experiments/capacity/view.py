@@ -9,7 +9,7 @@ from s2a_bench.experiments import SHARE, TIME, Metric, Shown
 from s2a_bench.experiments.capacity.metrics import METRICS
 from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, FleetRow
 from s2a_bench.store.manifest import present
-from s2a_bench.store.schema import PROVENANCE
+from s2a_bench.store.schema import PROVENANCE, Table
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, TextTable, number
@@ -31,15 +31,15 @@ def show(run: StoredRun, **_: Any) -> Shown:
         sentences=list(_sentences(run)),
         tables={"capacity": _table(run)},
         csvs={"capacity.csv": CsvTable.of_frame(run.table(FLEETS))},
-        json=lambda: frame(run, list(_cells(run)), [], knees=run.table(KNEES).to_dict("records")),
+        json=lambda: frame(run, list(_cells(run)), [], knees=list(_rows(run, KNEES))),
     )
 
 
 def _sentences(run: StoredRun) -> Iterator[str]:
     settings = run.manifest["configuration"]
     clock = f" at {settings['control_hz']:g} Hz, H {settings['horizon']}" if settings["load"] == "chunks" else ""
-    for knee in run.table(KNEES).to_dict("records"):
-        sure = f"[{knee['low']}, {knee['high']:.0f}]" if knee["high"] == knee["high"] else f"[{knee['low']}, ...]"
+    for knee in _rows(run, KNEES):
+        sure = f"[{knee['low']}, {'...' if knee['high'] is None else int(knee['high'])}]"
         robots = f"{knee['robots']} robot{'s' * (knee['robots'] != 1)} {sure}" if knee["robots"] else "no robot"
         robots = robots if knee["source"] == "measured" else f"{knee['source']}: {robots}"
         yield f"{robots}{clock}, {knee['cell']}, with {knee['limit']}."
@@ -55,19 +55,24 @@ def _table(run: StoredRun) -> TextTable:
             *(_entry(metric, row[metric.column]) for metric in shown),
             row["verdict"],
         )
-        for row in run.table(FLEETS).to_dict("records")
+        for row in _rows(run, FLEETS)
     ]
     titles = [f"{metric.title} (ms)" if metric.kind == TIME else metric.title for metric in shown]
     return TextTable("Robots on one server", ("cell", "source", "N", *titles, "limit"), rows, 2)
 
 
 def _entry(metric: Metric, value: float | None) -> str:
-    if value is None or value != value:  # noqa: PLR0124 - NaN, as a table has it
+    if value is None:
         return ABSENT
     return number(value / 1e6 if metric.kind == TIME else value * 100 if metric.kind == SHARE else value)
 
 
 def _cells(run: StoredRun) -> Iterator[dict[str, Any]]:
-    for row in run.table(FLEETS).drop(columns=PROVENANCE).to_dict("records"):
-        found = {str(name): None if value != value else value for name, value in row.items()}  # noqa: PLR0124
-        yield present(CapacityCell(**found))
+    for row in _rows(run, FLEETS):
+        yield present(CapacityCell(**row))
+
+
+def _rows(run: StoredRun, table: Table[Any]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a table, None for a missing value."""
+    for row in run.table(table).drop(columns=PROVENANCE).to_dict("records"):
+        yield {str(name): None if value is None or value != value else value for name, value in row.items()}  # noqa: PLR0124
