@@ -17,7 +17,7 @@ from pydantic import Field
 from s2a_bench.policy import Floats
 from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode, Pace, Ticks
 from s2a_bench.policy.chunks.closed import Closed, stall_share
-from s2a_bench.policy.chunks.cycles import assemble, lay
+from s2a_bench.policy.chunks.cycles import assemble, lay, paced
 
 Kind: TypeAlias = Literal["weighted_average", "latest_only", "average", "conservative"]
 WEIGHTS: Final[Mapping[Kind, float]] = {
@@ -66,18 +66,9 @@ class Aggregate(Mode):
     def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles:
         # With q actions left at the request, min(d, q) of the new chunk are past when it arrives.
         latency_ns = arrival_ns[:, -1]
-        delay, horizon, most = setting.delay_ticks(latency_ns), setting.horizon, self.trigger
-        known = setting.known_ticks(latency_ns)
-        if 2 * most < horizon:  # on arrival more actions are left than the trigger
-            first = np.minimum(delay, most)
-            first[:1] = 0
-            leaves = np.concatenate(([0], np.cumsum(delay + horizon - first - most)))
-        else:
-            requests = self.pace(setting)
-            start, delays = next(requests), zip(delay.tolist(), known.tolist(), strict=True)
-            leaves, left = np.array([start, *map(requests.send, delays)], np.int64).T
-            first = np.minimum(delay, left[:-1])
-        request = leaves[:-1]
+        delay, horizon = setting.delay_ticks(latency_ns), setting.horizon
+        leaves, left = paced(self.pace(setting), delay, setting.known_ticks(latency_ns))
+        request, first = leaves[:-1], np.minimum(delay, left)
         usable = request + delay
         until = np.minimum(np.append(usable[1:], leaves[-1]), usable + horizon - first)
         return assemble(request, usable, usable, first, until, ticks=int(leaves[-1]), horizon=horizon)

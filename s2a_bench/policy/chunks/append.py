@@ -16,7 +16,7 @@ from pydantic import Field
 
 from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode, Pace
 from s2a_bench.policy.chunks.closed import Closed, appended
-from s2a_bench.policy.chunks.cycles import assemble
+from s2a_bench.policy.chunks.cycles import assemble, paced
 from s2a_bench.policy.chunks.trigger import Varied
 
 Execute = Annotated[int, Field(ge=0)]
@@ -166,6 +166,7 @@ class QueueStepper(ChunkStepper):
 
 
 def _requests(triggers: tuple[int, ...], length: int) -> Pace:
+    """Request when as many actions are left as the trigger, the last for all later ones, and all have arrived."""
     now = left = 0
     for request in count(1):
         ready, known = yield now, left
@@ -175,24 +176,8 @@ def _requests(triggers: tuple[int, ...], length: int) -> Pace:
 
 
 def _append(delay: Ints, ready: Ints, known: Ints, triggers: tuple[int, ...], length: int, horizon: int) -> Cycles:
-    """Append chunks that may begin ``ready`` ticks after the request, shapes (R,).
-
-    With q actions left at the request at k, the chunk begins at e = k + max(q, ready). The next request leaves when
-    as many actions are left as its trigger, the last for all later ones, and all have arrived: at max(e + length -
-    trigger, k + known). If that is always the former with one trigger, q is always the trigger, and cycles do not
-    depend on each other.
-    """
-    trigger = triggers[-1]
-    left = np.full(ready.size, trigger)
-    left[:1] = 0
-    step = np.maximum(left, ready) + length - trigger
-    if len(triggers) == 1 and (step >= np.maximum(known, 1)).all():
-        leaves = np.concatenate(([0], np.cumsum(step)))
-    else:
-        requests = _requests(triggers, length)
-        first, delays = next(requests), zip(ready.tolist(), known.tolist(), strict=True)
-        leaves, left = np.array([first, *map(requests.send, delays)], np.int64).T
-        left = left[:-1]
+    """Append chunks that may begin ``ready`` ticks after the request, shapes (R,)."""
+    leaves, left = paced(_requests(triggers, length), ready, known)
     request_tick = leaves[:-1]
     start = request_tick + np.maximum(left, ready)
     first, until = np.zeros_like(start), start + length

@@ -11,7 +11,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from s2a_bench.policy.chunks import ChunkStepper, ControlSetting, Cycles, Ints, Mode, Ticks
+from s2a_bench.policy.chunks import ChunkStepper, ControlSetting, Cycles, Ints, Mode, Pace, Ticks
 
 _Arrival: TypeAlias = tuple[int, int, int, int]
 """The tick in which actions are usable, the tick in which `ask` knows them, the request, the number of its actions."""
@@ -42,6 +42,13 @@ def assemble(
         ticks=ticks,
         horizon=horizon,
     )
+
+
+def paced(pace: Pace, delay: Ints, known: Ints) -> tuple[Ints, Ints]:
+    """Return the tick of each request and of the one after them, and the actions left at each: (R + 1,) and (R,)."""
+    found = [next(pace), *map(pace.send, zip(delay.tolist(), known.tolist(), strict=True))]
+    leaves, left = np.array(found, np.int64).T
+    return leaves, left[:-1]
 
 
 def gather(request_tick: Ints, usable_tick: Ints, chunk: Ints, index: Ints, horizon: int) -> tuple[Cycles, Ticks]:

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode, Pace
 from s2a_bench.policy.chunks.closed import Closed, replace_stall_share, slack_ticks, stall_share
-from s2a_bench.policy.chunks.cycles import assemble
+from s2a_bench.policy.chunks.cycles import assemble, paced
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,24 +63,17 @@ class Replace(Mode):
             cycle = np.full_like(delay, self.execute)
         return Closed(share, delay, cycle) if delay.max() < setting.horizon else Closed(share)
 
-    def pace(self, setting: ControlSetting) -> Pace | None:  # noqa: ARG002 - the horizon does not matter
-        return None if self.several else self._requests()
-
-    def _requests(self) -> Pace:
+    def pace(self, setting: ControlSetting) -> Pace:  # noqa: ARG002 - the horizon does not matter
         delay, _ = yield 0, 0
         now = delay + self.execute
         while True:
             _, known = yield now, 0
-            now += max(self.execute, known)
+            now += self.execute if self.several else max(self.execute, known)
 
     def arrays(self, arrival_ns: Ints, setting: ControlSetting) -> Cycles:
         latency_ns = arrival_ns[:, -1]
         delay = setting.delay_ticks(latency_ns)
-        step = np.full(delay.size, self.execute)
-        if not self.several:
-            step = np.maximum(step, setting.known_ticks(latency_ns))
-        step[:1] = delay[:1] + self.execute
-        leaves = np.concatenate(([0], np.cumsum(step)))
+        leaves, _ = paced(self.pace(setting), delay, setting.known_ticks(latency_ns))
         request = leaves[:-1]
         usable = request + delay
         first = delay.copy() if self.assumed < 0 else np.full_like(delay, self.assumed)
