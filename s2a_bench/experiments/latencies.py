@@ -1,10 +1,11 @@
-"""Sources of latencies, shared by experiments: what `boards.latency` reads, a run folder, a profile."""
+"""Sources of latencies: what `boards.latency` reads, a run folder, a profile; and the export of delays."""
 
 from __future__ import annotations
 
+import csv
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.boards.gaps import Gaps
 from s2a_bench.boards.latency import draw_ns, read_latency, whole_ns
-from s2a_bench.errors import UsageError
+from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.provenance import NONE, Provenance
 from s2a_bench.store.run import fits, read_run
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     import numpy as np
     import pandas as pd
 
-    from s2a_bench.policy.chunks import Ints
+    from s2a_bench.policy.chunks import ControlSetting, Ints, Mode
     from s2a_bench.store.run import StoredRun
     from s2a_bench.trace import Mark
 
@@ -38,7 +39,7 @@ class Source:
     tokens: int = 0
     weights: str = NONE
     requests: tuple[Mapping[str, object], ...] = ()
-    """Measured requests, as the columns of `chunks.delays`."""
+    """Measured requests, as the columns of `COLUMNS`."""
     service_ns: Ints | None = None
     """Of measured requests, as `service_of`: shape (R, 3)."""
 
@@ -176,3 +177,68 @@ def _whole(value: Any) -> int | None:
     import pandas as pd
 
     return None if pd.isna(value) else int(value)
+
+
+COLUMNS: Final = (
+    "request",
+    "observation_ns",
+    "sent_ns",
+    "server_in_ns",
+    "server_out_ns",
+    "received_ns",
+    "bytes",
+    "latency_ns",
+    "d",
+    "rounding",
+    "delta_t_ns",
+    "provenance",
+)
+"""Columns of the exported delays, a row a request.
+
+| column | meaning |
+|---|---|
+| request | number, from 0 |
+| observation_ns, received_ns | when the observation was made, when the whole chunk was there; L is their difference |
+| sent_ns, server_in_ns, server_out_ns | when it left the client, reached and left the server; empty if unknown, as
+those of a server on another host |
+| bytes | of the request; empty in process |
+| latency_ns | L |
+| d | L in control ticks, by the convention of the column ``rounding`` (floor, ceil) |
+| delta_t_ns | the control tick that d counts in |
+
+All times are whole ns of one clock. `boards.latency` reads the file back.
+"""
+
+
+def delay_rows(source: Source, drawn_ns: Ints, mode: Mode, setting: ControlSetting) -> Iterator[dict[str, object]]:
+    """Yield a row a request: all measured requests at their times, or those of ``mode`` with drawn latencies."""
+    import numpy as np
+
+    requests = source.requests or list(_simulated(drawn_ns, mode, setting))
+    delays = setting.delay_ticks(np.array([request["latency_ns"] for request in requests], np.int64))
+    for number, (request, delay) in enumerate(zip(requests, delays.tolist(), strict=True)):
+        yield {
+            "request": number,
+            "provenance": source.provenance.code,
+            **{name: "" if value is None else value for name, value in request.items()},
+            "d": delay,
+            "rounding": setting.rounding,
+            "delta_t_ns": setting.period_ns,
+        }
+
+
+def _simulated(drawn_ns: Ints, mode: Mode, setting: ControlSetting) -> Iterator[dict[str, object]]:
+    request_ns = mode.cycles(drawn_ns, setting).request_tick * setting.period_ns
+    for at_ns, latency_ns in zip(request_ns.tolist(), drawn_ns.tolist(), strict=True):
+        yield {"observation_ns": at_ns, "received_ns": at_ns + latency_ns, "latency_ns": latency_ns}
+
+
+def write_delays(path: Path, rows: Iterable[Mapping[str, object]]) -> None:
+    """Write rows as CSV; raises StoreError."""
+    try:
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    except OSError as error:
+        raise StoreError(f"`export_delays`: cannot write {path}: {error}") from error

@@ -22,9 +22,8 @@ from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.chunks.build_rows import stall_metrics, stalls_of, write_cell
 from s2a_bench.experiments.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes
 from s2a_bench.experiments.chunks.config import PROMISING
-from s2a_bench.experiments.chunks.delays import delay_rows, write_delays
 from s2a_bench.experiments.chunks.smooth import MOST_TICKS, smoothness
-from s2a_bench.experiments.latencies import Source, measured
+from s2a_bench.experiments.latencies import Source, delay_rows, measured, write_delays
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.requester import ChunkRequester, Job
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
@@ -147,8 +146,7 @@ def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
     folder = run_requests(task, plan, output, progress)
     if config.export_delays is not None:
         source = next(measured(folder))
-        none = np.empty(0, np.int64)
-        rows = delay_rows(LatencyDraw(source, none, none), next(iter(config.made.values())), config.setting)
+        rows = delay_rows(source, np.empty(0, np.int64), next(iter(config.made.values())), config.setting)
         write_delays(config.export_delays, rows)
     return folder
 

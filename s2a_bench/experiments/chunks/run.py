@@ -21,9 +21,9 @@ from s2a_bench.experiments.chunks.cells import (
     without_trigger,
 )
 from s2a_bench.experiments.chunks.config import PROMISING, ChunksConfig
-from s2a_bench.experiments.chunks.delays import delay_rows, write_delays
 from s2a_bench.experiments.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS, MeanRow, TriggerRow
 from s2a_bench.experiments.chunks.smooth import TrackingPlant, follower
+from s2a_bench.experiments.latencies import delay_rows, write_delays
 from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
 from s2a_bench.policy.chunks.closed import closed
@@ -135,7 +135,9 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
             writer.append(TRIGGERS, trigger_rows(config, each))
         writer.append(MEANS, mean_rows(config, drawn[0], follows))
         if config.export_delays is not None:
-            write_delays(config.export_delays, delay_rows(drawn[0], tried[0].mode, config.setting))
+            write_delays(
+                config.export_delays, delay_rows(drawn[0].source, drawn[0].judged, tried[0].mode, config.setting)
+            )
         return writer.path
 
 

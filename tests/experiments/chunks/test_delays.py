@@ -11,9 +11,9 @@ import pytest
 from s2a_bench.boards.latency import read_delays
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.experiments.chunks.config import ChunksConfig
-from s2a_bench.experiments.chunks.delays import COLUMNS, write_delays
 from s2a_bench.experiments.chunks.rows import REQUESTS
 from s2a_bench.experiments.chunks.run import run_chunks
+from s2a_bench.experiments.latencies import COLUMNS, write_delays
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from tests.made_runs import MakeRun
