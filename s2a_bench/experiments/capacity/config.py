@@ -144,7 +144,9 @@ class CapacityConfig(Options):
         first=True,
     )
     servers: int = option(1, "--predict: servers that share one queue", ge=1, le=1000)
-    batch: Path | None = option(None, "--predict: CSV of a batching server, columns batch and service_ms")
+    batch: Path | None = option(
+        None, "--predict: CSV of a batching server, columns batch and latency_ms, that of so many requests together"
+    )
     seed: int = option(0, "seed of everything that is drawn", ge=0)
     requests: CapacityRequests = group(CapacityRequests, only=SHOWN, first=("transports", "url"))
 
