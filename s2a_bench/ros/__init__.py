@@ -105,18 +105,7 @@ class Result:
     packed: Any
 
 
-@dataclass(frozen=True, slots=True)
-class CancelResponse:
-    """The answer to `ActionClient.cancel`: an `action.CancelCode`, and the goals that are being cancelled."""
-
-    goal_id: bytes
-    return_code: int
-    canceling: tuple[bytes, ...]
-
-
-ActionEvent: TypeAlias = "Accepted | Rejected | Feedback | Result | CancelResponse"
-ALL_GOALS = bytes(16)
-"""The goal id that means every goal, in `ActionClient.cancel`."""
+ActionEvent: TypeAlias = "Accepted | Rejected | Feedback | Result"
 
 
 class ActionClient(Protocol):
@@ -155,8 +144,8 @@ class ActionClient(Protocol):
     def unpack_result(self, packed: Any) -> Any:
         """Deserialise `Result.packed` into the action's result; raises TransportError."""
 
-    def cancel(self, goal_id: bytes, stamp_ns: int = 0) -> None:
-        """Ask to cancel a goal, `ALL_GOALS`, or with a stamp (ROS time) also all accepted until then."""
+    def cancel(self, goal_id: bytes) -> None:
+        """Ask to cancel a goal; its result says whether it was."""
 
     def get_result(self, goal_id: bytes) -> None:
         """Ask for a result (again); after acceptance this happens by itself."""

@@ -21,7 +21,7 @@ from typing import Any, Final, Generic
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import ALL_GOALS, Accepted, ActionEvent, CancelResponse, Feedback, QoS, Rejected, Result
+from s2a_bench.ros import Accepted, ActionEvent, Feedback, QoS, Rejected, Result
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.messages import DEFAULT_VERSION
 from s2a_bench.ros.service import (
@@ -36,6 +36,8 @@ from s2a_bench.ros.service import (
     appeared,
 )
 
+ALL_GOALS: Final = bytes(16)
+"""The goal id of a cancel request that means every goal."""
 CANCEL_GOAL = "action_msgs/srv/CancelGoal"
 STATUS_ARRAY = "action_msgs/msg/GoalStatusArray"
 
@@ -247,8 +249,8 @@ class ClientAction:
         self._goals.call(packed, goal_id)
         return goal_id
 
-    def cancel(self, goal_id: bytes, stamp_ns: int = 0) -> None:
-        request = ros.default(self._cancels.request_type, self._version, goal_info=_goal_info(goal_id, stamp_ns))
+    def cancel(self, goal_id: bytes) -> None:
+        request = ros.default(self._cancels.request_type, self._version, goal_info=_goal_info(goal_id, 0))
         self._cancels.call(self._cancels.pack(request), goal_id)
 
     def get_result(self, goal_id: bytes) -> None:
@@ -273,7 +275,7 @@ class ClientAction:
         whatever preceded it has then arrived too, and goes before it into the queue.
         """
         self._ended.extend(self._replies(self._results))
-        cancels = list(self._replies(self._cancels))
+        list(self._cancels.replies())  # taken only: the result says whether the goal was cancelled
         feedback = [(bytes(packed[FEEDBACK_ID]), packed) for packed in self._feedback()]
         for goal_id, packed in self._replies(self._goals):
             if packed[self._body_at]:
@@ -283,7 +285,6 @@ class ClientAction:
                 self._active.discard(goal_id)
                 self._events.append(Rejected(goal_id))
         self._events.extend(Feedback(goal_id, packed) for goal_id, packed in feedback if goal_id in self._active)
-        self._events.extend(self._cancel_response(goal_id, packed) for goal_id, packed in cancels)
         while self._ended and len(feedback) < AT_ONCE:  # else there may be more that preceded a result
             goal_id, packed = self._ended.popleft()
             self._active.discard(goal_id)
@@ -293,15 +294,6 @@ class ClientAction:
         for goal_id, packed in service.replies():
             if packed is not None and len(packed) > self._body_at:
                 yield goal_id, packed
-
-    def _cancel_response(self, goal_id: bytes, packed: memoryview) -> CancelResponse:
-        """Read an answer to `cancel`; one that cannot be read counts as a refusal."""
-        try:
-            response = self._cancels.unpack(packed)
-        except TransportError:
-            return CancelResponse(goal_id, CancelCode.REJECTED, ())
-        canceling = tuple(info.goal_id.uuid.tobytes() for info in response.goals_canceling)
-        return CancelResponse(goal_id, response.return_code, canceling)
 
     def unpack_feedback(self, packed: memoryview) -> Any:
         return ros.deserialise(packed, self._type + "_FeedbackMessage", self._version).feedback

@@ -23,7 +23,7 @@ from rclpy.action.client import ClientGoalHandle
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import Accepted, ActionEvent, CancelResponse, Feedback, QoS, Rejected, Result
+from s2a_bench.ros import Accepted, ActionEvent, Feedback, QoS, Rejected, Result
 from s2a_bench.ros.messages import serialised_bytes
 from s2a_bench.ros.rclpy_node import SpinningNode, Unserved, for_waitable, qos_profile, run_now
 from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class, to_ros
@@ -89,7 +89,6 @@ class RclpyActionClient:
             self, node.node, self._action, name, feedback_sub_qos_profile=qos_profile(QoS(depth=0))
         )
         self._canceller = node.node.create_client(self._cancel_goal, name + "/_action/cancel_goal")
-        """rclpy's action client can cancel one goal or all, but not those until a stamp."""
         self._waiter = for_waitable(node.node, self._client)
         self.interrupt = self._waiter.interrupt
 
@@ -151,18 +150,11 @@ class RclpyActionClient:
         with self.lock:
             self._results.append((goal_id, handle.get_result_async()))
 
-    def cancel(self, goal_id: bytes, stamp_ns: int = 0) -> None:
+    def cancel(self, goal_id: bytes) -> None:
         self._node.check_open()
         request = self._cancel_goal.Request()
         request.goal_info.goal_id.uuid = list(goal_id)
-        request.goal_info.stamp.sec, request.goal_info.stamp.nanosec = divmod(stamp_ns, 1_000_000_000)
-        future = self._canceller.call_async(request)
-        future.add_done_callback(lambda done: self._answered(_cancel_response(goal_id, done.result())))
-
-    def _answered(self, response: CancelResponse) -> None:
-        """Take an answer on the spinning thread."""
-        self._events.append(response)
-        self._waiter.wake()
+        self._canceller.call_async(request)
 
     def tell(self, feedback: list[Any]) -> None:
         """Turn what has arrived into events; on the consuming thread, under the lock."""
@@ -198,8 +190,3 @@ def _settled(pending: list[tuple[bytes, Any]]) -> Iterator[tuple[bytes, Any]]:
     for entry in [entry for entry in pending if entry[1].done()]:
         pending.remove(entry)
         yield entry[0], entry[1].result()
-
-
-def _cancel_response(goal_id: bytes, response: Any) -> CancelResponse:
-    canceling = tuple(bytes(info.goal_id.uuid) for info in response.goals_canceling)
-    return CancelResponse(goal_id, response.return_code, canceling)

@@ -26,7 +26,7 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.action import Goals, Status
+from s2a_bench.ros.action import CANCEL_GOAL, Goals, Status
 
 GRAPH: list[Node] = []
 OLD_ENDS: list[bool] = []
@@ -431,8 +431,8 @@ class ActionServer(Waitable):
 
     def on_cancel(self, reply: Any, request: Any) -> None:
         code, goals = self.goals.cancel(bytes(request.goal_info.goal_id.uuid), 0)
-        infos = [SimpleNamespace(goal_id=SimpleNamespace(uuid=goal.id)) for goal in goals]
-        reply(SimpleNamespace(return_code=int(code), goals_canceling=infos))
+        infos = [ros.default("action_msgs/msg/GoalInfo", goal_id=ros.uuid(goal.id)) for goal in goals]
+        reply(ros.default(CANCEL_GOAL + "_Response", return_code=int(code), goals_canceling=infos))
 
     def on_result(self, header: Any, request: Any) -> None:
         handle = self._goal_handles.get(bytes(request.goal_id.uuid))

@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import ALL_GOALS
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.action import LISTED_ENDED, NEXT, CancelCode, Goals, Status, status_array
+from s2a_bench.ros.action import ALL_GOALS, LISTED_ENDED, NEXT, CancelCode, Goals, Status, status_array
 
 SECOND = 1_000_000_000
 

@@ -13,12 +13,17 @@ from s2a_bench.ros.remap import Remapped, table
 from s2a_bench.testing.transport import wiring_of
 from s2a_bench.transport.ros.joining import remapped
 from s2a_bench.transport.ros.options import RosOptions
-from tests.ros.action_suite import NAME, ActionSuite
+from tests.ros.action_suite import CANCEL, NAME, ActionSuite
 from tests.ros.middleware_suite import STRING, Join, MiddlewareSuite, joining, text, wait_matched
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
-RULES = {NAME: "/elsewhere/answer", "/test/order": "/other/order", "/picky": "/picky"}
+RULES = {
+    NAME: "/elsewhere/answer",
+    CANCEL: "/elsewhere/answer/_action/cancel_goal",
+    "/test/order": "/other/order",
+    "/picky": "/picky",
+}
 
 
 @pytest.mark.parametrize(
