@@ -62,13 +62,10 @@ class PlanMetrics:
     """Share of deadlines met; see `fluidity`."""
 
 
-def measure(
-    plans: Plans, schedule: Schedule, *, observed_s: float = 0.0, tolerance_s: float = TOLERANCE_S
-) -> PlanMetrics:
-    """Compute the metrics of M timelines.
+def measure(plans: Plans, schedule: Schedule, *, tolerance_s: float = TOLERANCE_S) -> PlanMetrics:
+    """Compute the metrics of M timelines; stalls longer than ``tolerance_s`` count.
 
-    ``observed_s`` is when the picture behind the plan was taken, in s from the request: negative is earlier. Stalls
-    longer than ``tolerance_s`` count; studies of P(any stall) use 1 us.
+    The picture behind a plan is as old as its request.
     """
     arrival_s, nominal_s, least_s, most_s, start_s, duration_s = align(
         plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s, schedule.start_s, schedule.duration_s
@@ -100,8 +97,8 @@ def measure(
         end_regret_elastic=_share(end - elastic_end, elastic_end),
         mean_queue_wait_s=waits.mean(axis=0),
         longest_queue_wait_s=waits.max(axis=0),
-        mean_action_age_s=start_s.mean(axis=0) - observed_s,
-        oldest_action_s=start_s.max(axis=0) - observed_s,
+        mean_action_age_s=start_s.mean(axis=0),
+        oldest_action_s=start_s.max(axis=0),
         speed_distortion=_share(duration_s.sum(axis=0), nominal_s.sum(axis=0)),
         fluidity=fluidity(stalls_s, nominal_s, tolerance_s),
     )

@@ -31,9 +31,10 @@ class Embedded:
     steers: ClassVar[bool] = True
     most: ClassVar[int | None] = 1
 
-    def __init__(self, step_s: float = STEP_S) -> None:
+    step_s = STEP_S
+
+    def __init__(self) -> None:
         extras.need("ccrb", "highway_env")
-        self.step_s = step_s
         self._cars: dict[int, Any] = {}
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:

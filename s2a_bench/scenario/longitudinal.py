@@ -34,8 +34,9 @@ class Longitudinal(LockStep):
     steers: ClassVar[bool] = False
     most: ClassVar[int | None] = None
 
-    def __init__(self, step_s: float = STEP_S) -> None:
-        self.step_s = step_s
+    step_s = STEP_S
+
+    def __init__(self) -> None:
         self._state = State(np.empty((3, 0)), np.empty((3, 0)), np.empty((3, 0)))
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:

@@ -38,15 +38,13 @@ def timeline_rows(
     first_plan: int = 0,
     requested_ns: Sequence[int] | None = None,
     caution: float | Sequence[float | None] | None = None,
-    observed_s: float = 0.0,
     tolerance_s: float = TOLERANCE_S,
 ) -> list[PlanRow]:
     """Return the rows of M timelines; gaps up to ``tolerance_s`` are no stall for ``any_stall``.
 
-    ``caution`` is one lambda, or one a plan. Motion is computed for plans below `KEPT_PLANS`. ``observed_s`` is the
-    time of the picture from the request.
+    ``caution`` is one lambda, or one a plan. Motion is computed for plans below `KEPT_PLANS`.
     """
-    found = metrics_of(plans, schedule, observed_s=observed_s, tolerance_s=tolerance_s)
+    found = metrics_of(plans, schedule, tolerance_s=tolerance_s)
     shared = asdict(setting)
     rows = []
     for place, request_id in enumerate(request_ids):
@@ -68,10 +66,10 @@ def timeline_rows(
     return rows
 
 
-def metrics_of(plans: Plans, schedule: Schedule, *, observed_s: float, tolerance_s: float) -> dict[str, NDArray[Any]]:
+def metrics_of(plans: Plans, schedule: Schedule, *, tolerance_s: float) -> dict[str, NDArray[Any]]:
     """Return the metrics of M timelines without motion: arrays of shape (M,), times in s."""
     arrival_s, nominal_s, least_s = align(plans.arrival_s, plans.nominal_s, plans.least_s)
-    found = measure(plans, schedule, observed_s=observed_s)
+    found = measure(plans, schedule)
     safe_s = safe_start(arrival_s, nominal_s)
     return {
         **{name: getattr(found, name) for name in METRICS if hasattr(found, name)},

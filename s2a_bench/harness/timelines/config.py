@@ -76,8 +76,8 @@ class PlanSetting:
         values = ", ".join(f"{field.name}={getattr(self, field.name)!r}" for field in fields(self))
         return Verbatim(f"Setting({values})")  # a name in the seeds of all published runs
 
-    def request_id(self, plan: int, policy: str = "") -> str:
-        return f"{self.name}/{policy}/{plan}" if policy else f"{self.name}/{plan}"
+    def request_id(self, plan: int) -> str:
+        return f"{self.name}/{plan}"
 
 
 class ComparedOptions(Options):

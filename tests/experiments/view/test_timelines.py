@@ -71,7 +71,7 @@ def live(tmp_path: Path) -> StoredRun:
         for place, (policy, first) in enumerate(STARTS.items()):
             plans = plans_of(6, 0.1 * place)
             requested_ns = 10**15 * (place + 1)
-            ids = [setting.request_id(0, policy)]
+            ids = [f"{setting.name}/{policy}/0"]
             times = uniform(0.5 + 0.1 * place, 1, 4.8, 48)[:, 0]
             writer.tokens(
                 TokenRow(ids[0], policy, i, 7, "x", None, requested_ns + round(at * 1e9)) for i, at in enumerate(times)
