@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -128,7 +128,7 @@ class _Cell:
                     search(config.numbers, attempt, bisects=config.searches)
             with _Robots(config, self.launch, self.instant, self.mode) as robots:
                 for number in sorted(self.tried, reverse=True):
-                    if self.tried[number].clean and self._is_driven(robots, number):
+                    if self.tried[number].clean and self._fleet(robots, number, "twin").driven:
                         break
                     self.tried[number] = replace(self.tried[number], clean=False)
             self._predict()
@@ -138,9 +138,6 @@ class _Cell:
     def _attempt(self, robots: _Robots, number: int) -> bool:
         if number not in self.tried:
             self.tried[number] = self._fleet(robots, number, "measured")
-            if number == 1 and self.service is None and len(self.tried) == 1:
-                with self._says_why_not():
-                    self.service = Service.read(f"{self.launch.writer.path}#{self.session.cell.name}")
         return self.tried[number].within
 
     def _predict(self) -> None:
@@ -149,23 +146,9 @@ class _Cell:
             return
         config, name, writer = self.config, cell_name(self.session, self.mode), self.launch.writer
         prediction = Prediction(config, name, self.mode, self.service, (1.0,), self.launch.progress)
-        with self._says_why_not():
-            found = prediction.run(config.numbers, bisects=config.searches)
-            writer.append(FLEETS, prediction.rows)
-            writer.append(KNEES, [found] if found else [])
-
-    @contextmanager
-    def _says_why_not(self) -> Iterator[None]:
-        """Say why nothing is predicted, and go on."""
-        try:
-            yield
-        except UsageError as error:
-            self.launch.progress.say(f"no prediction: {error}")
-
-    def _is_driven(self, robots: _Robots, number: int) -> bool:
-        """Return whether the generator keeps to the limit with a server that takes no time."""
-        found = self._fleet(robots, number, "twin")
-        return found.clean and found.within
+        found = prediction.run(config.numbers, bisects=config.searches)
+        writer.append(FLEETS, prediction.rows)
+        writer.append(KNEES, [found] if found else [])
 
     def _fleet(self, robots: _Robots, number: int, source: Source) -> Tried:
         config, launch = self.config, self.launch
@@ -180,32 +163,31 @@ class _Cell:
             if verdict != "undecided" or source == "twin":
                 break
         robots.stop()
+        if source == "measured" and number == 1 and not self.service and row["latency_p50_ns"] and not self.tried:
+            self.service = Service.read(f"{launch.writer.path}#{self.session.cell.name}")
         tick_ns = config.setting.period_ns if self.mode else row["latency_p50_ns"] if source == "measured" else None
         clean = tick_ns is None or (row["late_p99_ns"] or 0) <= LATEST * tick_ns
         seconds = sum(max(0, each.end_ns - each.start_ns - config.settle_ns) for each in traces) / number / 1e9
         about = {"cell": robots.name, "source": source, "robots": number}
         fleet = FleetRow(**about, seconds=seconds, looks=looks, verdict=verdict, within=within, clean=clean, **row)
         keep_origin(launch.writer, robots.name, robots.session.origin)
-        self._write(launch.writer, about, fleet, traces)
+        launch.writer.append(FLEETS, [fleet])
+        for trace in traces:
+            self._write(launch.writer, {**about, "robot": trace.robot}, trace)
         launch.progress.advance()
         return Tried(number, verdict, within, clean)
 
-    def _write(self, writer: RunWriter, about: Mapping[str, Any], fleet: Any, traces: list[RobotTrace]) -> None:
-        config = self.config
-        writer.append(FLEETS, [fleet])
-        for robot in sorted({trace.robot for trace in traces}):
-            own = [trace for trace in traces if trace.robot == robot]
-            writer.append(ROBOTS, [RobotRow(**about, robot=robot, **measures(own, config.setting, config.settle_ns))])
-            writer.append(REQUESTS, (row for trace in own for row in self._requests(about, trace)))
-
-    def _requests(self, about: Mapping[str, Any], trace: RobotTrace) -> Iterator[RequestRow]:
+    def _write(self, writer: RunWriter, about: Mapping[str, Any], trace: RobotTrace) -> None:
+        """Write what one robot did, in one episode."""
+        settle_ns = self.config.settle_ns
+        writer.append(ROBOTS, [RobotRow(**about, **measures([trace], self.config.setting, settle_ns))])
         since_ns = (trace.request_ns - trace.start_ns).tolist()
-        for intended_ns, latency_ns in zip(since_ns, trace.arrival_ns.tolist(), strict=True):
-            answered = latency_ns if latency_ns >= 0 else None
-            settling = intended_ns < self.config.settle_ns
-            yield RequestRow(
-                **about, robot=trace.robot, intended_ns=intended_ns, latency_ns=answered, settling=settling
-            )
+        latency_ns = [each if each >= 0 else None for each in trace.arrival_ns.tolist()]
+        rows = zip(since_ns, latency_ns, strict=True)
+        writer.append(
+            REQUESTS,
+            (RequestRow(**about, intended_ns=at, latency_ns=each, settling=at < settle_ns) for at, each in rows),
+        )
 
     def _conclude(self) -> None:
         """Write the knee of the fleets so far, and a warning about those that the generator did not drive."""

@@ -30,6 +30,11 @@ class Tried:
     clean: bool = True
     """Whether the generator was in time; if not, it is no measurement."""
 
+    @property
+    def driven(self) -> bool:
+        """Whether the generator alone, with a server that takes no time, keeps to the limit."""
+        return self.clean and self.within
+
 
 @dataclass(frozen=True, slots=True)
 class Knee:
