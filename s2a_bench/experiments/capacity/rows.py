@@ -43,7 +43,7 @@ class AboutRobot:
 
 
 RobotRow: Final[Any] = with_fields(
-    "RobotRow", "One robot of a fleet, with a column a metric.", AboutRobot, columns(METRICS.values())
+    "RobotRow", "One robot of a fleet in an episode, with a column a metric.", AboutRobot, columns(METRICS.values())
 )
 
 
