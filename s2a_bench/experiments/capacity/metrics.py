@@ -95,7 +95,7 @@ def measures(
     answered = counts & (latency_ns >= 0)
     of_robot = np.bincount(robots[answered])
     means = np.bincount(robots[answered], latency_ns[answered])[of_robot > 0] / of_robot[of_robot > 0]
-    first_ns = _joined(trace.first_ns for trace in traces if trace.first_ns is not None)
+    first_ns = _joined(np.full_like(each.arrival_ns, -1) if each.first_ns is None else each.first_ns for each in traces)
     skipped = -(-settle_ns // setting.period_ns)
     late_ns = _joined(
         trace.late_ns[skipped if trace.ticks is not None else 0 :] for trace in traces if trace.late_ns is not None
@@ -105,7 +105,7 @@ def measures(
         "requests_per_s": _rate(traces, settle_ns),
         "latency_mean_ns": _mean(latency_ns[answered]),
         **_quantiles("latency", latency_ns[answered]),
-        **_quantiles("ttft", first_ns[counts & (first_ns >= 0)] if first_ns.size else first_ns),
+        **_quantiles("ttft", first_ns[counts & (first_ns >= 0)]),
         "in_time": _mean(_joined(_in_time(trace.ticks, skipped) for trace in traces)),
         **_quantiles("age", age[age >= 0] * setting.period_ns),
         **_stalls(traces, setting, settle_ns, confidence),
