@@ -12,11 +12,12 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import PortInUse, RequestFailed, TransportError, UsageError
+from s2a_bench.harness.clocks import Exchange
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Client, Handler, open_client, open_server
+from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, open_client, open_server
 from s2a_bench.transport.limits import Limits
-from s2a_bench.transport.serving import Queued
+from s2a_bench.transport.serving import CLOCK_PROMPT, Queued
 from s2a_bench.types import Action, Piece, Request, Token
 from tests.waiting import until
 
@@ -118,6 +119,18 @@ def test_one_that_waits_is_answered_in_its_turn_and_says_so(name: str) -> None:
     assert gate.began == gate.ended == ["first", "other 1", "other 2"]
     assert "queue" not in budget(first.trace.chain()).stages_ns
     assert all(budget(asking.trace.chain()).stages_ns["queue"] > 0 for asking in others)
+
+
+@every
+def test_a_client_that_compares_clocks_is_answered_in_its_turn_without_the_engine(name: str) -> None:
+    handler = recorder(name)
+    kind = ACTIONS if name in POLICIES else TOKENS
+    with serving(name, handler) as connect:
+        pieces, trace = ask(connect(), Request("clock", CLOCK_PROMPT + kind, max_tokens=1))
+    assert len(pieces) == 1
+    assert not handler.requests
+    exchange = Exchange.of(trace)
+    assert exchange.sent_ns <= exchange.received_ns <= exchange.answered_ns <= exchange.seen_ns
 
 
 @every

@@ -102,7 +102,9 @@ def remapped(wiring: Wiring[RosOptions]) -> dict[str, str]:
 def wait_until(arrived: Callable[[], bool], alive: Callable[[], bool], what: str) -> None:
     """Wait for a peer to be matched; raises ServerDied, saying ``what`` did not appear."""
     if not appeared(arrived, MATCH_TIMEOUT_S, lambda: not alive()):
-        raise ServerDied(f"{what}; is ROS_DOMAIN_ID the same on both sides?")
+        raise ServerDied(
+            f"{what}; is ROS_DOMAIN_ID the same on both sides, and between hosts ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET?"
+        )
 
 
 def open_camera(middleware: Middleware, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> CameraPublisher:
