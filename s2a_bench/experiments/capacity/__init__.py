@@ -9,5 +9,6 @@ EXPERIMENT = Experiment(
     run="s2a_bench.experiments.capacity.run:run_capacity",
     view="s2a_bench.experiments.capacity.view:show",
     cell="s2a_bench.experiments.capacity.view:CapacityCell",
+    compared="s2a_bench.experiments.capacity.view:COMPARED",
     unit="fleets",
 )

@@ -1,26 +1,35 @@
-"""The sentence, table and JSON of a capacity run."""
+"""What a capacity run shows: its sentence, table, figure and JSON, and what two runs are compared by."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.experiments import SHARE, TIME, Metric, Shown
+import numpy as np
+
+from s2a_bench.experiments import SHARE, TIME, Comparable, Metric, Shown, Subject
 from s2a_bench.experiments.capacity.metrics import METRICS
-from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, FleetRow
+from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, ROBOTS, FleetRow
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import PROVENANCE, Table
 from s2a_bench.writers.csv_text import CsvTable
+from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from s2a_bench.store.run import StoredRun
 
-TABLE: Final = (
-    *("requests_per_s", "latency_p50", "latency_p99", "ttft_p99", "in_time", "stalled", "stalled_low", "stalled_high"),
-    *("age_p50", "age_p99", "unfair", "late_p99", "generator_cpu", "server_cpu"),
-)
+MAIN: Final = ("stalled", "requests_per_s", "latency_p50_s", "latency_p99_s", "ttft_p99_s", "age_p50_s", "age_p99_s")
+REST: Final = ("in_time", "stalled_worst", "unfair", "unanswered", "late_p99_s", "generator_cpu", "server_cpu")
+PANELS: Final = {"latency": "latency (ms)", "stalled": "stalled (%)", "age": "age of action (ms)"}
+COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00")
+PREDICTED: Final = "predicted"
+KNEE: Final = Metric("knee", "robots", "higher", "knee", "mean", "The largest fleet within the limit.")
 
 CapacityCell = cell_of_row("CapacityCell", "N robots on one server.", FleetRow, without=())
 
@@ -28,14 +37,16 @@ CapacityCell = cell_of_row("CapacityCell", "N robots on one server.", FleetRow, 
 def show(run: StoredRun, **_: Any) -> Shown:
     """Return what a capacity run shows."""
     return Shown(
-        sentences=list(_sentences(run)),
-        tables={"capacity": _table(run)},
+        sentences=[*_knee_sentences(run), *_parted(run)],
+        tables={"capacity": _table(run, MAIN), "robots": _table(run, REST)},
+        main=["capacity"],
         csvs={"capacity.csv": CsvTable.of_frame(run.table(FLEETS))},
-        json=lambda: frame(run, list(_cells(run)), [], knees=list(_rows(run, KNEES))),
+        figures={"capacity": partial(build_capacity, run)} if len(_fleets(run)) else {},
+        json=lambda: frame(run, [present(CapacityCell(**row)) for row in _fleets(run)], [], knees=_rows(run, KNEES)),
     )
 
 
-def _sentences(run: StoredRun) -> Iterator[str]:
+def _knee_sentences(run: StoredRun) -> Iterator[str]:
     settings = run.manifest["configuration"]
     clock = f" at {settings['control_hz']:g} Hz, H {settings['horizon']}" if settings["load"] == "chunks" else ""
     for knee in _rows(run, KNEES):
@@ -45,34 +56,174 @@ def _sentences(run: StoredRun) -> Iterator[str]:
         yield f"{robots}{clock}, {knee['cell']}, with {knee['limit']}."
 
 
-def _table(run: StoredRun) -> TextTable:
-    shown = [METRICS[name] if name in METRICS else METRICS[f"{name}_s"] for name in TABLE]
-    rows = [
-        (
-            row["cell"],
-            row["source"],
-            str(row["robots"]),
-            *(_entry(metric, row[metric.column]) for metric in shown),
-            row["verdict"],
-        )
-        for row in _rows(run, FLEETS)
+def _parted(run: StoredRun) -> Iterator[str]:
+    """Yield for each measured cell from which fleet on the prediction leaves the interval of the stalled share."""
+    fleets = {(row["cell"], row["source"], row["robots"]): row for row in _fleets(run)}
+    for cell in dict.fromkeys(row["cell"] for row in _fleets(run)):
+        both = [
+            (mine, fleets[cell, PREDICTED, mine["robots"]])
+            for mine in _fleets(run)
+            if mine["cell"] == cell and mine["source"] == "measured" and (cell, PREDICTED, mine["robots"]) in fleets
+        ]
+        pairs = [(mine, other) for mine, other in both if None not in (mine["stalled"], other["stalled"])]
+        off = [
+            mine["robots"]
+            for mine, other in pairs
+            if not mine["stalled_low"] <= other["stalled"] <= mine["stalled_high"]
+        ]
+        if off:
+            yield f"{cell}: the predicted share of stalls leaves the measured interval at {_listed(off)} robots."
+        elif pairs:
+            yield f"{cell}: the predicted share of stalls lies in the measured interval at every number of robots."
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers))
+
+
+def _table(run: StoredRun, names: Sequence[str]) -> TextTable:
+    rows = _fleets(run)
+    left_out = ("ttft_p99_s",) if run.manifest["configuration"]["load"] == "chunks" else ()  # chunks arrive whole
+    shown = [
+        metric
+        for metric in (METRICS[name] for name in names if name not in left_out)
+        if any(row[metric.column] is not None for row in rows)
     ]
     titles = [f"{metric.title} (ms)" if metric.kind == TIME else metric.title for metric in shown]
-    return TextTable("Robots on one server", ("cell", "source", "N", *titles, "limit"), rows, 2)
+    groups = [
+        [
+            (cell, source, str(row["robots"]), row["verdict"], *(_entry(metric, row) for metric in shown))
+            for row in rows
+            if (row["cell"], row["source"]) == (cell, source)
+        ]
+        for cell, source in dict.fromkeys((row["cell"], row["source"]) for row in rows)
+    ]
+    header = ("cell", "source", "N", "limit", *titles)
+    return TextTable.grouped("Robots on one server", header, groups, 2, once=2, cells=[row["cell"] for row in rows])
 
 
-def _entry(metric: Metric, value: float | None) -> str:
+def _entry(metric: Metric, row: dict[str, Any]) -> str:
+    if metric.name != "stalled" or row["stalled"] is None:
+        return _value(metric, row[metric.column])
+    low, high = (_value(metric, row[f"stalled_{end}"]) for end in ("low", "high"))
+    return f"{_value(metric, row['stalled'])} [{low}, {high}]"
+
+
+def _value(metric: Metric, value: float | None) -> str:
     if value is None:
         return ABSENT
     return number(value / 1e6 if metric.kind == TIME else value * 100 if metric.kind == SHARE else value)
 
 
-def _cells(run: StoredRun) -> Iterator[dict[str, Any]]:
-    for row in _rows(run, FLEETS):
-        yield present(CapacityCell(**row))
+def build_capacity(run: StoredRun) -> Figure:
+    """Draw latency, stalled share and age over the number of robots, with the knee and its interval."""
+    rows = [row for row in _fleets(run) if row["source"] != "twin"]
+    cells = list(dict.fromkeys(row["cell"] for row in rows))[: len(COLOURS)]
+    panels = {name: label for name, label in PANELS.items() if any(row[f"{_column(name)}"] is not None for row in rows)}
+    notes = (
+        "Thick: median, thin: 99th percentile; bars: 95 % intervals. Solid: measured, dashed: predicted.",
+        "Vertical: the largest fleet within the limit; shaded: its interval.",
+    )
+    height_in = 0.7 + 1.2 * len(panels) + 0.15 * len(cells)
+    figure = new_figure(height_in, ("How many robots one server carries", *notes))
+    every = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (name, label) in zip(every, panels.items(), strict=True):
+        for cell, colour in zip(cells, COLOURS, strict=False):
+            for source, style in (("measured", "-"), (PREDICTED, "--")):
+                mine = [row for row in rows if (row["cell"], row["source"]) == (cell, source)]
+                _draw(axes, name, mine, colour, style)
+        axes.set_ylim(bottom=0)
+        axes.set_ylabel(label)
+    for knee in _rows(run, KNEES):
+        if knee["cell"] in cells:
+            _draw_knee(list(every), knee, COLOURS[cells.index(knee["cell"])])
+    last = every[-1]
+    last.set_xlabel("robots, N")
+    last.xaxis.get_major_locator().set_params(integer=True)
+    handles = [last.plot([], [], color=colour, label=cell)[0] for cell, colour in zip(cells, COLOURS, strict=False)]
+    figure.legend(handles=handles, loc="outside lower center")
+    return figure
 
 
-def _rows(run: StoredRun, table: Table[Any]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a table, None for a missing value."""
-    for row in run.table(table).drop(columns=PROVENANCE).to_dict("records"):
-        yield {str(name): None if value is None or value != value else value for name, value in row.items()}  # noqa: PLR0124
+def _column(panel: str) -> str:
+    return panel if panel == "stalled" else f"{panel}_p50_ns"
+
+
+def _draw(axes: Axes, name: str, rows: Sequence[dict[str, Any]], colour: str, style: str) -> None:
+    if not rows or rows[0][_column(name)] is None:
+        return
+    robots = [row["robots"] for row in rows]
+
+    def values(column: str, factor: float) -> np.ndarray:
+        return np.array([np.nan if row[column] is None else row[column] * factor for row in rows])
+
+    line: dict[str, Any] = {"color": colour, "linestyle": style, "marker": ".", "markersize": 4}
+    if name != "stalled":
+        axes.plot(robots, values(f"{name}_p50_ns", 1e-6), **line)
+        axes.plot(robots, values(f"{name}_p99_ns", 1e-6), **line | {"linewidth": 0.6, "marker": ""})
+        return
+    share, low, high = (values(column, 100) for column in ("stalled", "stalled_low", "stalled_high"))
+    ends = None if style == "--" else [np.maximum(share - low, 0), np.maximum(high - share, 0)]
+    axes.errorbar(robots, share, ends, elinewidth=0.6, capsize=1.5, **line)
+
+
+def _draw_knee(every: Sequence[Axes], knee: dict[str, Any], colour: str) -> None:
+    for axes in every:
+        axes.axvline(
+            knee["robots"], color=colour, linewidth=0.6, linestyle="--" if knee["source"] == PREDICTED else "-"
+        )
+        if knee["source"] != PREDICTED and knee["high"] is not None:
+            axes.axvspan(knee["low"], max(knee["high"], knee["low"]), color=colour, alpha=0.12, linewidth=0)
+
+
+def _subjects(run: StoredRun) -> list[Subject]:
+    """Return the knee of each cell, and each of its fleets with a row a robot and episode."""
+    settings = {name: str(run.manifest["configuration"][name]) for name in ("control_hz", "horizon", "limit", "load")}
+    knees = [
+        Subject(
+            f"{knee['cell']}, {knee['source']}",
+            settings,
+            1,
+            0,
+            lambda name, robots=knee["robots"]: [np.array([float(robots)])] if name == KNEE.name else [],  # type: ignore[misc]
+            exact=knee["source"] == PREDICTED,
+        )
+        for knee in _rows(run, KNEES)
+    ]
+    robots = run.table(ROBOTS)
+    measured = robots[robots["source"] == "measured"]
+
+    def values(table: Any, name: str) -> list[np.ndarray]:
+        if name not in METRICS:
+            return []
+        metric = METRICS[name]
+        found = table[metric.column].dropna().to_numpy(dtype="float64")
+        return list((found / 1e9 if metric.kind == TIME else found)[:, None])
+
+    return knees + [
+        Subject(f"{cell}, {number} robots", settings, len(table), 0, partial(values, table))
+        for (cell, number), table in measured.groupby(["cell", "robots"])
+    ]
+
+
+COMPARED: Final = Comparable(
+    metrics={KNEE.name: KNEE, **METRICS},
+    subjects=_subjects,
+    origin=lambda run: (run.origins.line,),
+    shown=(KNEE.name, "stalled", "latency_p50_s", "age_p99_s"),
+)
+
+
+def _fleets(run: StoredRun) -> list[dict[str, Any]]:
+    """Return the fleets, those of a cell together, by their number of robots."""
+    rows = _rows(run, FLEETS)
+    cells = list(dict.fromkeys((row["cell"], row["source"]) for row in rows))
+    return sorted(rows, key=lambda row: (cells.index((row["cell"], row["source"])), row["robots"]))
+
+
+def _rows(run: StoredRun, table: Table[Any]) -> list[dict[str, Any]]:
+    """Return the rows of a table, None for a missing value."""
+    return [
+        {str(name): None if value is None or value != value else value for name, value in row.items()}  # noqa: PLR0124
+        for row in run.table(table).drop(columns=PROVENANCE).to_dict("records")
+    ]

@@ -1,0 +1,85 @@
+"""The sentences, table, figure, JSON and comparison of capacity runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from s2a_bench.experiments.capacity import EXPERIMENT
+from s2a_bench.experiments.capacity.config import CapacityConfig
+from s2a_bench.experiments.capacity.predict import run_predicted
+from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, ROBOTS
+from s2a_bench.report.compare.comparison import compare, metrics_of, open_comparison
+from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.testing import NullProgress
+from s2a_bench.writers.style import paper_column
+
+
+def predicted(tmp_path: Path, service_ms: int, **options: Any) -> StoredRun:
+    config = CapacityConfig(predict=str(service_ms), robots="1..64", seconds=10, **options)
+    return read_run(run_predicted(config, tmp_path, NullProgress()))
+
+
+def measured(tmp_path: Path, service_ms: int, robots: int) -> StoredRun:
+    """Return a predicted run, beside which its fleets are also measured ones with the same values but one."""
+    run = predicted(tmp_path, service_ms)
+    fleets, knees = run.table(FLEETS), run.table(KNEES)
+    own = fleets.assign(source="measured")
+    own.loc[own["robots"] == robots, ["stalled_low", "stalled_high"]] = 0.9, 1.0
+    twin = fleets.iloc[:1].assign(source="twin")
+    run.tables[FLEETS.name] = type(fleets)(own.to_dict("records") + fleets.to_dict("records") + twin.to_dict("records"))
+    run.tables[KNEES.name] = type(knees)(
+        knees.assign(source="measured", driven=16, low=7).to_dict("records") + knees.to_dict("records")
+    )
+    robot = fleets.drop(columns=["seconds", "looks", "verdict", "within", "clean"])
+    run.tables[ROBOTS.name] = robot.assign(source="measured", robot=0)
+    return run
+
+
+def test_the_sentence_names_the_knee_its_interval_and_what_it_holds_for(tmp_path: Path) -> None:
+    shown = EXPERIMENT.show(measured(tmp_path, 40, robots=9))
+    assert list(shown.sentences) == [
+        "8 robots [7, 8] at 50 Hz, H 16, 40, queue?trigger=8, with at most 1 % stalled ticks.",
+        "predicted: 8 robots [8, 8] at 50 Hz, H 16, 40, queue?trigger=8, with at most 1 % stalled ticks.",
+        "40, queue?trigger=8: the predicted share of stalls leaves the measured interval at 9 robots.",
+    ]
+
+
+def test_fleets_stand_by_their_number_of_robots_however_they_were_searched(tmp_path: Path) -> None:
+    shown = EXPERIMENT.show(measured(tmp_path, 40, robots=9))
+    table = shown.tables["capacity"]
+    robots = [int(row[2]) for row in table.rows]
+    assert robots == [1, 2, 4, 8, 9, 10, 12, 16] * 2 + [1]
+    stalled = [row[table.header.index("stalled, %")] for row in table.rows]
+    assert stalled[0].startswith("0.000 [0.000, ")
+    found = shown.json()
+    assert [cell["robots"] for cell in found["cells"]] == robots
+    assert [knee["robots"] for knee in found["knees"]] == [8, 8]
+    json.dumps(found)
+
+
+@pytest.mark.parametrize(
+    ("options", "panels"),
+    [
+        ({}, ["latency (ms)", "stalled (%)", "age of action (ms)"]),
+        ({"closed_loop": True, "limit": "latency_p99=300ms"}, ["latency (ms)"]),
+    ],
+)
+def test_a_figure_has_a_panel_for_what_its_robots_have(
+    tmp_path: Path, options: dict[str, Any], panels: list[str]
+) -> None:
+    with paper_column():
+        figure = EXPERIMENT.show(predicted(tmp_path, 40, **options)).figures["capacity"]()
+    assert [axes.get_ylabel() for axes in figure.axes] == panels
+
+
+def test_knees_of_two_runs_are_compared(tmp_path: Path) -> None:
+    runs = measured(tmp_path / "a", 40, robots=9), predicted(tmp_path / "b", 40, modes=("queue?trigger=8", "sync"))
+    compared = open_comparison(runs[:1], runs[1:], unlike=True, least=0.05)
+    found = compare(compared, metrics_of(compared, ["knee"])).comparisons
+    assert [(each.pair.name, each.change.baseline, each.change.other) for each in found] == [
+        ("40, queue?trigger=8, predicted", 8, 8)
+    ]
