@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -18,7 +19,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments.capacity.metrics import measures
 from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, FleetRow, KneeRow
 from s2a_bench.experiments.capacity.search import Tried, judge, knee, search
-from s2a_bench.experiments.capacity.simulate import UNKNOWN, Fleet, ServiceTime, simulate
+from s2a_bench.experiments.capacity.simulate import UNKNOWN, ServiceTime, VirtualFleet, simulate
 from s2a_bench.experiments.latencies import Source, sources
 from s2a_bench.machine import environment
 from s2a_bench.provenance import Origins
@@ -36,7 +37,6 @@ SEEDS: Final = 5
 LEVEL: Final = 0.95
 MOST: Final = 20_000_000
 """Ticks, or requests without a control clock, of a fleet in virtual time."""
-MOST_BATCH: Final = 4096
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,19 +49,17 @@ class Service:
 
     @staticmethod
     def read(written: str) -> Service:
-        """Read one source as users write it; raises S2AError naming the field."""
+        """Read one source as users write it; raises S2AError naming the field.
+
+        Of measured requests it takes the engine's times; service times that are given have no first piece.
+        """
         with _named("predict"):
-            found = list(sources(written, 1))
-        source = found[0]
-        if len(found) > 1:
-            raise UsageError(f"`predict`: {written} has several cells; name one of {', '.join(s.name for s in found)}")
+            source, *others = sources(written, 1)
+        if others:
+            names = ", ".join(each.name for each in (source, *others))
+            raise UsageError(f"`predict`: {written} has several cells; name one of {names}")
         if source.profile:
             raise UsageError(f"`predict`: {written} is a profile of tokens; give service times, or a run folder")
-        return Service.of(source)
-
-    @staticmethod
-    def of(source: Source) -> Service:
-        """Take the engine's times of measured requests; those that are given have no first piece."""
         recorded_ns = source.service_ns
         if recorded_ns is None and (given_ns := source.recorded_ns) is not None:
             recorded_ns = np.stack([np.full_like(given_ns, UNKNOWN), given_ns, np.zeros_like(given_ns)], 1)
@@ -97,12 +95,9 @@ def read_batches(path: Path) -> Sequence[float]:
         latency_ns = read_delays(path)
     with path.open(encoding="utf-8-sig", newline="") as file:
         written = [row.get("batch") or "" for row in csv.DictReader(file)]
-    sizes = [int(each) for each in written if each.isdecimal() and 1 <= int(each) <= MOST_BATCH]
+    sizes = [int(each) for each in written if re.fullmatch("[1-9][0-9]{0,3}", each)]
     if len(sizes) < len(written) or sizes[0] != 1 or sorted({*sizes}) != sizes or not latency_ns.all():
-        raise UsageError(
-            f"`batch`: {path} needs a column batch with 1 and larger sizes, ascending, up to {MOST_BATCH}, "
-            "and times above 0"
-        )
+        raise UsageError(f"`batch`: {path} needs a column batch, 1 and larger sizes up to 9999, and times above 0")
     found: list[float] = (np.interp(np.arange(1, sizes[-1] + 1), sizes, latency_ns) / latency_ns[0]).tolist()
     return found
 
@@ -176,7 +171,7 @@ class Prediction:
     def _fleet(self, seed: int, robots: int) -> tuple[dict[str, Any], Verdict, bool]:
         config, mode = self.config, self.config.made.get(self.mode)
         closed = mode is None and config.load == "closed"
-        fleet = Fleet(
+        fleet = VirtualFleet(
             config.setting,
             round(config.seconds * 1e9) + (0 if config.episodes_s else config.settle_ns),
             mode,
@@ -192,7 +187,7 @@ class Prediction:
         alone = self.alone or 0.0 if mode is not None and mode.blocks else 0.0
         return row, *judge(config.limited, row, traces, config.settle_ns, LEVEL, alone=alone)
 
-    def _check(self, fleet: Fleet, robots: int) -> None:
+    def _check(self, fleet: VirtualFleet, robots: int) -> None:
         """Raise UsageError for more ticks or requests than are kept in memory."""
         if fleet.mode is None:
             rate = self.config.servers * len(self.slower) / self.slower[-1] / self.service.mean_ns
@@ -201,7 +196,7 @@ class Prediction:
         if rate * fleet.span_ns > MOST:
             raise UsageError(
                 f"`seconds`: {robots} robots for {fleet.span_ns / 1e9:g} s are over {MOST:.0e} ticks or requests, "
-                "which are held in memory; take fewer `seconds`, or fewer `robots`"
+                "which are held in memory; take fewer"
             )
 
 

@@ -22,7 +22,6 @@ from s2a_bench.policy.chunks.cycles import drive
 if TYPE_CHECKING:
     from s2a_bench.policy.chunks import ControlSetting, Mode, Pace
 
-
 UNKNOWN: Final = -1
 
 
@@ -49,7 +48,7 @@ Robot: TypeAlias = "Generator[int, Answer, RobotTrace]"
 
 
 @dataclass(frozen=True, slots=True)
-class Fleet:
+class VirtualFleet:
     """What the robots of a fleet have in common: a mode of acting, a plan every ``every_ns``, or a closed loop."""
 
     setting: ControlSetting
@@ -75,7 +74,7 @@ class Fleet:
 
 
 def simulate(
-    fleet: Fleet,
+    fleet: VirtualFleet,
     robots: int,
     times: Iterator[ServiceTime],
     rng: np.random.Generator,
@@ -128,36 +127,25 @@ def serve(
 
 
 def _acting(robot: int, mode: Mode, setting: ControlSetting, start_ns: int, most: int) -> Robot:
-    """Act for ``most`` ticks."""
+    """Act for ``most`` ticks, with the mode's stepper where it has no pace."""
     times: list[tuple[int, int, int]] = []
     pace = mode.pace(setting)
-    steps = _stepped(mode, setting, most) if pace is None else _paced(pace, mode, setting, most)
+    steps: Any = drive(mode, setting, most) if pace is None else _paced(pace, mode, setting, most)
+    before_ns = np.arange(setting.horizon)[::-1] * mode.gap_ns
     try:
         tick = next(steps)
         while True:
             leave_ns = start_ns + tick * setting.period_ns
             answer = yield leave_ns
-            times.append((leave_ns, answer.first_ns, answer.whole_ns))
-            tick = steps.send(answer.whole_ns - leave_ns)
+            times.append((leave_ns, *answer))
+            latency_ns = answer.whole_ns - leave_ns
+            tick = steps.send(latency_ns if pace is not None else np.maximum(0, latency_ns - before_ns))
     except StopIteration as end:
-        return _trace(robot, start_ns, start_ns + most * setting.period_ns, times, ticks=end.value)
+        return _trace(robot, start_ns, start_ns + most * setting.period_ns, times, ticks=end.value[-1])
 
 
-def _stepped(mode: Mode, setting: ControlSetting, most: int) -> Generator[int, int, Ticks]:
-    """Yield the tick of each request, to be sent its latency in ns, with the mode's stepper."""
-    steps, before_ns = drive(mode, setting, most), np.arange(setting.horizon)[::-1] * mode.gap_ns
-    try:
-        tick = next(steps)
-        while True:
-            latency_ns = yield tick
-            tick = steps.send(np.maximum(0, latency_ns - before_ns))
-    except StopIteration as end:
-        ticks: Ticks = end.value[1]
-        return ticks
-
-
-def _paced(pace: Pace, mode: Mode, setting: ControlSetting, most: int) -> Generator[int, int, Ticks]:
-    """Do what `_stepped` does, without the stepper."""
+def _paced(pace: Pace, mode: Mode, setting: ControlSetting, most: int) -> Generator[int, int, tuple[Ticks]]:
+    """Yield the tick of each request, to be sent its latency in ns."""
     latencies: list[int] = []
     tick, _ = next(pace)
     while tick < most:
@@ -167,7 +155,7 @@ def _paced(pace: Pace, mode: Mode, setting: ControlSetting, most: int) -> Genera
         tick, _ = pace.send((latency_ns // setting.period_ns if setting.rounding == "floor" else known, known))
     done = mode.ticks(np.array(latencies, np.int64), setting)
     chunk, index, age = (each[:most].copy() for each in (done.chunk, done.index, done.age))
-    return Ticks(chunk, index, age, done.stalled[:most].copy())
+    return (Ticks(chunk, index, age, done.stalled[:most].copy()),)
 
 
 def _asking(robot: int, every_ns: int, think_ns: int, start_ns: int, end_ns: int) -> Robot:

@@ -63,7 +63,7 @@ def test_a_batch_takes_the_time_between_those_of_its_neighbours(tmp_path: Path) 
 def test_batches_that_make_no_sense_are_one_line(tmp_path: Path, text: str) -> None:
     file = tmp_path / "batch.csv"
     file.write_text(text)
-    with pytest.raises(S2AError, match=r"^`batch`: .*batch\.csv needs a column batch with 1 and larger sizes"):
+    with pytest.raises(S2AError, match=r"^`batch`: .*batch\.csv needs a column batch, 1 and larger sizes"):
         read_batches(file)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.experiments.capacity.metrics import measures
-from s2a_bench.experiments.capacity.simulate import Fleet, ServiceTime, serve, simulate
+from s2a_bench.experiments.capacity.simulate import ServiceTime, VirtualFleet, serve, simulate
 from s2a_bench.policy.chunks import ControlSetting, Mode, mode
 
 MS = 1_000_000
@@ -28,13 +28,20 @@ def exponential(mean_ns: float, seed: int = 0) -> Iterator[ServiceTime]:
         yield ServiceTime(each, each)
 
 
-def fleet(written: str = "", seconds: float = 60, horizon: int = 16, rounding: Any = "floor", **given: Any) -> Fleet:
+def fleet(
+    written: str = "", seconds: float = 60, horizon: int = 16, rounding: Any = "floor", **given: Any
+) -> VirtualFleet:
     setting = ControlSetting(given.pop("period_ns", DT), horizon, rounding)
-    return Fleet(setting, round(seconds * 1e9), mode(written) if written else None, **given)
+    return VirtualFleet(setting, round(seconds * 1e9), mode(written) if written else None, **given)
 
 
 def measured(
-    fleet: Fleet, robots: int, times: Iterator[ServiceTime], settle_s: float = 30, servers: int = 1, batch: Any = PLAIN
+    fleet: VirtualFleet,
+    robots: int,
+    times: Iterator[ServiceTime],
+    settle_s: float = 30,
+    servers: int = 1,
+    batch: Any = PLAIN,
 ) -> dict[str, Any]:
     traces = simulate(fleet, robots, times, np.random.default_rng(1), servers, batch)
     return measures(traces, fleet.setting, round(settle_s * 1e9))
@@ -107,7 +114,7 @@ def test_a_fleet_does_what_its_steppers_do_tick_by_tick(
         rng = np.random.default_rng(seed)
         starts = [0, 0, *rng.integers(0, 12 * DT, 4).tolist()]
         drawn = [ServiceTime(each, each) for each in rng.integers(1, 4 * DT, 2000).tolist()]
-        robots = [Fleet(setting, most * DT, made).robot(*each, most * DT) for each in enumerate(starts)]
+        robots = [VirtualFleet(setting, most * DT, made).robot(*each, most * DT) for each in enumerate(starts)]
         traces = serve(robots, iter(drawn), servers, slower)
         plainly = TickByTick(made, setting, starts, iter(drawn), slower)
         plainly.run(servers, most)
