@@ -54,6 +54,7 @@ CAMERA_AGE_MS = Fact("camera_age_ms", "ms", "start of inference less reception, 
 CAMERA_SIM_AGE_MS = Fact("camera_sim_age_ms", "ms", "the time on /clock less its header's stamp: `use_sim_time`")
 CAMERA_STAMP_AGE_MS = Fact("camera_stamp_age_ms", "ms", "start of inference less its header's stamp, by wall clock")
 STALE_FRAMES = Fact("stale_frames", "frames", "1 where it was too old to be used, so that the request failed")
+CAMERA_FACTS = (CAMERA_FRAMES, CAMERA_AGE_MS, CAMERA_STAMP_AGE_MS, CAMERA_SIM_AGE_MS, STALE_FRAMES)
 FRAMES_PUBLISHED = Fact("frames_published", "frames", "camera frames sent, up to the one that the answer is about")
 FRAMES_LOST = Fact("frames_lost", "frames", "`frames_published` less `camera_frames`")
 HEADERS_OFF_MS = Fact("headers_off_ms", "ms", "response headers to first token, less `prompt_ms`")

@@ -40,8 +40,6 @@ EXTENSION: Final = "s2a"
 """Key that no observation has."""
 FILE_LETTERS, VALUES, DEPTH, CAMERAS = 1 << 16, 1024, 16, 64
 """The most of a template: bytes, values, nested dictionaries and lists, pictures."""
-STATE: Final = 10**6
-"""More numbers than a placeholder of the state can need."""
 WHOLE: Final = range(-(1 << 63), 1 << 64)
 
 _PLACE = re.compile(
@@ -128,19 +126,10 @@ class Template:
 
     def check_request(self, cameras: int, state: int) -> dict[str, Any]:
         """Return the observation of a request with so many pictures, and numbers of the state; raises UsageError."""
-        why = f"has places for {self.pictures}" if cameras > self.pictures else ""
-        pictures = [np.zeros((1, 1, 3), np.uint8)] * cameras
         try:
-            self._make(_Values(pictures, np.zeros(STATE, np.float32), ""))
-        except _Missing:
-            why = f"wants {self.pictures}"
-        if why:
-            other = f"use `cameras` {self.pictures}, or another template" if self.pictures else "use another template"
-            raise UsageError(f"`cameras`: {cameras} a request, and `template` {self.name} {why}; {other}")
-        try:
-            return self._make(_Values(pictures, np.zeros(state, np.float32), ""))  # type: ignore[no-any-return]
-        except _Missing as missing:
-            raise UsageError(f"`state`: `template` {self.name}: {missing}") from None
+            return self.fill([np.zeros((1, 1, 3), np.uint8)] * cameras, [0.0] * state, "")
+        except RequestFailed as error:
+            raise UsageError(f"{error}; see `cameras` and `state`") from error
 
     def check_server(self, transport: str, reads: Sequence[str]) -> None:
         """Refuse a description of the server of which ``transport`` does not read all, only the keys ``reads``."""
@@ -235,7 +224,7 @@ class Template:
 
         def make(values: _Values) -> Any:
             if index >= len(values.pictures):
-                raise _Missing(f"{path} wants picture {index}, and the request has {len(values.pictures)}")
+                raise _Missing(f"{path} wants {index + 1} pictures, and the request has {len(values.pictures)}")
             picture = values.pictures[index]
             if form is None:
                 return picture

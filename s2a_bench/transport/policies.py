@@ -14,17 +14,23 @@ from s2a_bench.transport.listening import UrlOptions, read_key
 from s2a_bench.transport.observation import DEFAULT, TemplateName, names, template_of
 
 
-class PolicyOptions(UrlOptions):
-    """Options of a policy server's client, with the template of its observations."""
+class TemplateOptions(UrlOptions):
+    """Options of a client that makes its observations from a template."""
 
-    template: TemplateName = option(DEFAULT, "the observation: a template's name, or a TOML or JSON file", names=names)
+    USUAL_TEMPLATE: ClassVar[str] = DEFAULT
+
+    template: TemplateName = option(
+        "",
+        "the observation: a template's name, or a TOML or JSON file [default: that of the transport or dialect]",
+        names=names,
+    )
 
     @property
     def template_name(self) -> str:
-        return self.template or str(type(self).model_fields["template"].default)
+        return self.template or self.USUAL_TEMPLATE
 
 
-P = TypeVar("P", bound=PolicyOptions)
+P = TypeVar("P", bound=TemplateOptions)
 
 
 class PolicyTransport(Transport[P]):

@@ -66,13 +66,16 @@ WRONG = {
         ("--url http://127.0.0.1:9 --transport http", "nothing answers at http://127.0.0.1:9", 1),
         (
             "--url ws://h:1 --transport websocket --template droid --state 8",
-            "--template droid wants 2; use --cameras 2",
+            "wants 2 pictures, and the request has 1; see --cameras",
         ),
         ("--transport websocket --template nope", "--template: 'nope' is none of aloha, droid"),
         ("--transport http,ros --template openvla-oft", "--template is about a server that runs already"),
         ("--transport grpc", "--transport grpc/lerobot is a client alone: name its --url, grpc://HOST:PORT"),
         ("--transport grpc --url ws://h:1", "is a client alone: name its --url, grpc://HOST:PORT"),
-        ("--url grpc://h:1 --policy-type act --pretrained x", "--state: --template lerobot: state wants"),
+        (
+            "--url grpc://h:1 --policy-type act --pretrained x",
+            "--template lerobot: state wants the state's numbers (all), and the request has 0",
+        ),
         ("--output /dev/null", "/dev/null is not a folder; name another one", 1),
         ("--profile rtx-4080", "--profile needs --engine replay; --engine llama answers at its own speed"),
         ("--engine replay --profile rtx-4080 --gaps trace", "profile rtx-4080 holds no recording"),

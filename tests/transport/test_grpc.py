@@ -244,7 +244,11 @@ MISUSES = {
     "no policy": ({"url": "grpc://a:1", "policy_type": "act"}, 1, "give `policy_type` and `pretrained`"),
     "no type": ({"url": "grpc://a:1", "pretrained": "x"}, 1, "give `policy_type` and `pretrained`"),
     "cameras": ({"url": "grpc://a:1", "pretrained": "x", "policy_type": "act"}, 5, "has places for 4"),
-    "state": ({"url": "grpc://a:1", "pretrained": "x", "policy_type": "act"}, 1, "`state`: .*and the request has 0"),
+    "state": (
+        {"url": "grpc://a:1", "pretrained": "x", "policy_type": "act"},
+        1,
+        "the request has 0; see `cameras` and `state`",
+    ),
 }
 
 

@@ -84,7 +84,7 @@ def test_a_key_with_a_question_mark_is_left_out_where_the_request_lacks_it() -> 
 @pytest.mark.parametrize(
     ("content", "says"),
     [
-        ({"a": {"b": "{image:2}"}}, "a.b wants picture 2, and the request has 2"),
+        ({"a": {"b": "{image:2}"}}, "a.b wants 3 pictures, and the request has 2"),
         ({"a": ["{image:1}"], "s": "{state:7:9}"}, r"s wants the state's numbers \(7:9\), and the request has 8"),
         ({"a": "{image}", "t": "{prompt}"}, "places for 1 pictures, not 2"),
         ({"a": "{image:1}"}, "no place for the robot's state"),

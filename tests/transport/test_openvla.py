@@ -209,7 +209,7 @@ def test_an_answer_that_is_no_chunk_is_a_failure(template: str, body: str, messa
         (
             {"dialect": "openvla", "template": "openvla-oft"},
             4,
-            "4 a request, and `template` openvla-oft has places for 3",
+            "`template` openvla-oft has places for 3 pictures, not 4",
         ),
         ({"dialect": "openvla", "template": "vllm-omni"}, 1, "vllm-omni: openvla does not read s2a.idle_s"),
         ({"dialect": "vllm", "template": "x-vla"}, 1, "the dialect 'vllm' takes none"),

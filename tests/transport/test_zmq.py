@@ -408,7 +408,7 @@ class TestBlackBox:
         frames = (yuyv_frame(seed=1), yuyv_frame(seed=2))
         with policy(answers) as url, robot("", url=url, layout="n1.6", template="gr00t-so100") as client:
             ask(client, Request("a", "go", frames, state=(1, 2, 3, 4, 5, 6)))
-            with pytest.raises(RequestFailed, match=r"video\.wrist.* wants picture 1"):
+            with pytest.raises(RequestFailed, match=r"video\.wrist.* wants 2 pictures"):
                 ask(client, Request("a", "go", frames[:1], state=(1, 2, 3, 4, 5, 6)))
         assert {key: value.shape for key, value in requests[0]["state"].items()} == {
             "single_arm": (1, 1, 5),

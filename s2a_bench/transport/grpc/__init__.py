@@ -13,24 +13,24 @@ from s2a_bench.facts import GET_ACTIONS_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import option
 from s2a_bench.transport import Choice, Urls
 from s2a_bench.transport.grpc.pickles import observation_of
-from s2a_bench.transport.observation import TemplateName, names, template_of
-from s2a_bench.transport.policies import PolicyOptions, PolicyTransport
+from s2a_bench.transport.observation import template_of
+from s2a_bench.transport.policies import PolicyTransport, TemplateOptions
 
 LEROBOT = "lerobot"
 PAYLOAD_DOWN_BYTES = Fact("payload_down_bytes", "bytes", "what the chunk weighs on the wire")
 
 
-class GrpcOptions(PolicyOptions):
+class GrpcOptions(TemplateOptions):
     """The options of the client of lerobot's policy server."""
 
     SCHEMES: ClassVar[tuple[str, ...]] = ("grpc",)
     ENDS_WITH_PORT: ClassVar[bool] = True
+    USUAL_TEMPLATE: ClassVar[str] = LEROBOT
 
     policy_type: str = option("", "the policy that the server loads: act, smolvla, diffusion, pi0, pi05, groot, ...")
     pretrained: str = option("", "its checkpoint: a path on the server's machine, or a name on its hub")
     device: str = option("cpu", "the server's device for the policy: cpu, cuda, mps")
     actions_per_chunk: int = option(50, "most actions of a chunk that the server returns", ge=1, le=500)
-    template: TemplateName = option(LEROBOT, "the observation: a template's name, or a TOML or JSON file", names=names)
 
 
 class Grpc(PolicyTransport[GrpcOptions]):

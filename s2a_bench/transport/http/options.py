@@ -15,7 +15,7 @@ from s2a_bench.secrets import LONG, keep, secrets_in
 from s2a_bench.transport import PROGRAM, SERVING, Program
 from s2a_bench.transport.access import WebOptions
 from s2a_bench.transport.http.dialects import DIALECTS
-from s2a_bench.transport.observation import TemplateName, names
+from s2a_bench.transport.policies import TemplateOptions
 
 WHEEL = Path("xllamacpp")
 """Stands for llama.cpp's server in the wheel of that name."""
@@ -56,7 +56,7 @@ def merged(target: Any, patch: Any) -> Any:
     return result
 
 
-class HttpOptions(WebOptions):
+class HttpOptions(WebOptions, TemplateOptions):
     SCHEMES: ClassVar[tuple[str, ...]] = ("http", "https")
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 8080}
     NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = ("api_docs",)
@@ -67,11 +67,6 @@ class HttpOptions(WebOptions):
     served_model: str = option("", "the model's name at the url [default: the first that it lists]")
     dialect: Annotated[str, one_of(lambda: ("", *DIALECTS))] = option(
         "", f"the url's dialect: {', '.join(DIALECTS)} [default: detected]"
-    )
-    template: TemplateName = option(
-        "",
-        "the observation: a template's name, or a TOML or JSON file [default: that of the transport or dialect]",
-        names=names,
     )
     api_docs: bool = option(False, "also serve /openapi.json, /docs and /redoc", side=SERVING)
     extra_body: TextOrFile = option("", "JSON, or @FILE, merged into every request to the url (RFC 7396)")

@@ -8,15 +8,7 @@ from dataclasses import replace
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
-from s2a_bench.facts import (
-    CAMERA_AGE_MS,
-    CAMERA_FRAMES,
-    CAMERA_SIM_AGE_MS,
-    CAMERA_STAMP_AGE_MS,
-    PAYLOAD_BYTES,
-    STALE_FRAMES,
-    Fact,
-)
+from s2a_bench.facts import CAMERA_FACTS, PAYLOAD_BYTES, Fact
 from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Client, Handler, Server, Transport, Urls, Wiring
 from s2a_bench.transport.ros.options import RosOptions
 
@@ -40,10 +32,7 @@ class Ros(Transport[RosOptions]):
         "accept": "network",  # an action's goal is accepted before work starts
         "cdr_parse": "parse",
     }
-    facts = (
-        *(PAYLOAD_BYTES, CAMERA_FRAMES, CAMERA_AGE_MS, CAMERA_STAMP_AGE_MS, CAMERA_SIM_AGE_MS, STALE_FRAMES),
-        UNREADABLE_N,
-    )
+    facts = (PAYLOAD_BYTES, *CAMERA_FACTS, UNREADABLE_N)
     order = 20
     style = {TOPIC: ("#0072B2", "-"), ACTION: ("#56B4E9", "--")}
     packages = ("cyclonedds", "eclipse-zenoh", "rosbags")

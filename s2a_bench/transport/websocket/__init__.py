@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.transport import Urls, Wiring
 from s2a_bench.transport.access import WebOptions
-from s2a_bench.transport.policies import PolicyOptions, PolicyTransport
+from s2a_bench.transport.policies import PolicyTransport, TemplateOptions
 
 VARIANTS = ("openpi", "openpi-stream")
 OPENPI, STREAM = VARIANTS
@@ -26,7 +26,7 @@ TIMING = {str(fact): fact for fact in (INFER_MS, PREV_TOTAL_MS)}
 """The keys of ``server_timing`` that are facts."""
 
 
-class WebsocketOptions(WebOptions, PolicyOptions):
+class WebsocketOptions(WebOptions, TemplateOptions):
     SCHEMES: ClassVar[tuple[str, ...]] = ("ws", "wss")
 
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 8000}

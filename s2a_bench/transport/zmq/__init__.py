@@ -15,15 +15,14 @@ from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.options import option
 from s2a_bench.transport import SERVER, Urls, Wiring
 from s2a_bench.transport.listening import ListeningOptions
-from s2a_bench.transport.observation import TemplateName, names
-from s2a_bench.transport.policies import PolicyOptions, PolicyTransport
+from s2a_bench.transport.policies import PolicyTransport, TemplateOptions
 
 GR00T = "gr00t"
 PACKAGES = ("msgpack", "zmq")
 """What the extra of its name brings, by the names under which they are imported."""
 
 
-class ZmqOptions(ListeningOptions, PolicyOptions):
+class ZmqOptions(ListeningOptions, TemplateOptions):
     SCHEMES: ClassVar[tuple[str, ...]] = ("tcp",)
     ENDS_WITH_PORT: ClassVar[bool] = True
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 5555}
@@ -32,11 +31,6 @@ class ZmqOptions(ListeningOptions, PolicyOptions):
         "auto",
         "GR00T's form of observations and arrays: n1.7, n1.6, n1.5; auto: by the marks of the server's configurations",
         side=SERVER,
-    )
-    template: TemplateName = option(
-        "",
-        "the observation: a template's name, or a TOML or JSON file [default: that of the layout]",
-        names=names,
     )
 
     @property
