@@ -38,8 +38,10 @@ from dataclasses import dataclass, fields
 from functools import cache
 from math import inf
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar
 
+from s2a_bench import extras
 from s2a_bench import options as base
 from s2a_bench.errors import UsageError
 from s2a_bench.registry import Registry
@@ -303,12 +305,26 @@ class Transport(Generic[O]):
     crosses_links: ClassVar[bool] = True
     """Whether its client reaches its server through the network, which can be emulated."""
     urls: ClassVar[Urls] = Urls()
+    client_class: ClassVar[str] = ""
+    server_class: ClassVar[str] = ""
+    """``module:class`` of client and server, where `client` and `server` are not overridden."""
+    needs: ClassVar[tuple[str, ...]] = ()
+    """The extra of both, and its modules."""
 
     def client(self, wiring: Wiring[O], alive: Callable[[], bool]) -> Client:
-        raise NotImplementedError
+        self.check_machine()
+        opened: Client = resolve_name(self.client_class)(wiring, alive)
+        return opened
 
     def server(self, wiring: Wiring[O], handler: Handler) -> Server:
-        raise NotImplementedError
+        self.check_machine()
+        bound: Server = resolve_name(self.server_class)(wiring, handler)
+        return bound
+
+    def check_machine(self) -> None:
+        """Raise MissingExtra, or UsageError for a system that it cannot run on."""
+        if self.needs:
+            extras.need(*self.needs)
 
     def measured(self, choice: Choice[O]) -> Sequence[str]:  # noqa: ARG002 - for those whose variants depend on it
         return self.variants[:1] or ("",)
@@ -316,8 +332,9 @@ class Transport(Generic[O]):
     def capabilities(self, choice: Choice[O]) -> Capabilities[O]:
         return Capabilities(choice.options, self.payloads, self.answer_kinds, self.accepts_state, self.facts)
 
-    def require(self, choice: Choice[O]) -> None:
+    def require(self, choice: Choice[O]) -> None:  # noqa: ARG002 - for those that depend on it
         """Raise UsageError for options that conflict with the rest of a choice, or with this machine."""
+        self.check_machine()
 
     def ready(self, wiring: Wiring[O]) -> str:
         """Return the line that `serve` prints once the server is bound at ``wiring.address``."""

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from pkgutil import resolve_name
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, TypeVar
 
-from s2a_bench import extras
 from s2a_bench.options import option
-from s2a_bench.transport import ACTIONS, Capabilities, Choice, Client, Handler, Server, Transport, Wiring
+from s2a_bench.transport import ACTIONS, Capabilities, Choice, Transport
 from s2a_bench.transport.defaults import BESIDE
 from s2a_bench.transport.listening import UrlOptions, read_key
 from s2a_bench.transport.observation import DEFAULT, TemplateName, names, template_of
@@ -42,24 +40,6 @@ class PolicyTransport(Transport[P]):
     compared_with = BESIDE
     reads_server: ClassVar[Sequence[str]] = ()
     """The keys of `ExternalServer` by which a template may describe the server."""
-    extra: ClassVar[str]
-    modules: ClassVar[tuple[str, ...]]
-    """Modules that the extra installs."""
-    client_class: ClassVar[str]
-    """``module:class`` of its `PolicyClient`."""
-    server_class: ClassVar[str]
-
-    def client(self, wiring: Wiring[P], alive: Callable[[], bool]) -> Client:
-        """Prepare to ask the server at ``wiring.address``, a URL."""
-        extras.need(self.extra, *self.modules)
-        opened: Client = resolve_name(self.client_class)(wiring, alive)
-        return opened
-
-    def server(self, wiring: Wiring[P], handler: Handler) -> Server:
-        """Bind ``host:port``; raises PortInUse."""
-        extras.need(self.extra, *self.modules)
-        bound: Server = resolve_name(self.server_class)(wiring, handler)
-        return bound
 
     def capabilities(self, choice: Choice[P]) -> Capabilities[P]:
         options, template = choice.options, template_of(choice.options.template_name)
@@ -69,7 +49,7 @@ class PolicyTransport(Transport[P]):
 
     def require(self, choice: Choice[P]) -> None:
         """Refuse a template that does not fit the requests or the server; raises MissingExtra too."""
-        extras.need(self.extra, *self.modules)
+        super().require(choice)
         template = template_of(choice.options.template_name)
         template.check_request(choice.cameras, choice.state)
         template.check_server(self.name, self.reads_server)

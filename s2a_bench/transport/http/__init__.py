@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,18 +11,7 @@ from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import need_program
-from s2a_bench.transport import (
-    ACTIONS,
-    TOKENS,
-    Capabilities,
-    Choice,
-    Client,
-    Handler,
-    Server,
-    Transport,
-    Urls,
-    Wiring,
-)
+from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Handler, Server, Transport, Urls, Wiring
 from s2a_bench.transport.defaults import BESIDE
 from s2a_bench.transport.http.options import WHEEL, HttpOptions
 from s2a_bench.transport.listening import read_key
@@ -69,16 +58,12 @@ class Http(Transport[HttpOptions]):
     packages = (
         *("fastapi", "httptools", "httpx", "json-numpy", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"),
     )
+    client_class = "s2a_bench.transport.http.client:HttpClient"
     urls = Urls(
         HttpOptions.SCHEMES,
         examine="s2a_bench.transport.http.risks:examine",
         cache_hits="s2a_bench.transport.http.detect:cache_hits",
     )
-
-    def client(self, wiring: Wiring[HttpOptions], alive: Callable[[], bool]) -> Client:
-        from s2a_bench.transport.http.client import HttpClient
-
-        return HttpClient(wiring, alive)
 
     def server(self, wiring: Wiring[HttpOptions], handler: Handler) -> Server:
         if wiring.variant in FAST:

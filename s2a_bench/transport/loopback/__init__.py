@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, Server, Transport, TransportOptions, Wiring
+from s2a_bench.transport import ACTIONS, TOKENS, Transport, TransportOptions
 
 
 class Loopback(Transport[TransportOptions]):
@@ -20,16 +18,8 @@ class Loopback(Transport[TransportOptions]):
     compared_with = ()
     in_process = True
     crosses_links = False
-
-    def client(self, wiring: Wiring[TransportOptions], alive: Callable[[], bool]) -> Client:
-        from s2a_bench.transport.loopback.in_process import LoopbackClient
-
-        return LoopbackClient(wiring, alive)
-
-    def server(self, wiring: Wiring[TransportOptions], handler: Handler) -> Server:
-        from s2a_bench.transport.loopback.in_process import LoopbackServer
-
-        return LoopbackServer(wiring, handler)
+    client_class = "s2a_bench.transport.loopback.in_process:LoopbackClient"
+    server_class = "s2a_bench.transport.loopback.in_process:LoopbackServer"
 
 
 LOOPBACK = Loopback()

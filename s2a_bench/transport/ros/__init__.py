@@ -9,7 +9,7 @@ from dataclasses import replace
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CAMERA_FACTS, PAYLOAD_BYTES, Fact
-from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Client, Handler, Server, Transport, Urls, Wiring
+from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Client, Transport, Urls, Wiring
 from s2a_bench.transport.ros.options import RosOptions
 
 TOPIC, ACTION = VARIANTS = ("topic", "action")
@@ -46,6 +46,7 @@ class Ros(Transport[RosOptions]):
     }
     udp_checks = ("rmem-max",)
     urls = Urls(("ros",))
+    server_class = "s2a_bench.transport.ros.server:RosServer"
 
     def client(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> Client:
         if wiring.variant == ACTION:
@@ -55,11 +56,6 @@ class Ros(Transport[RosOptions]):
         from s2a_bench.transport.ros.topic import TopicClient
 
         return TopicClient(wiring, alive)
-
-    def server(self, wiring: Wiring[RosOptions], handler: Handler) -> Server:
-        from s2a_bench.transport.ros.server import RosServer
-
-        return RosServer(wiring, handler)
 
     def measured(self, choice: Choice[RosOptions]) -> Sequence[str]:
         """Return `action` for an external node, else the default."""

@@ -5,25 +5,14 @@ from __future__ import annotations
 import os
 import socket
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.options import option
-from s2a_bench.transport import (
-    ACTIONS,
-    SERVER,
-    TOKENS,
-    Choice,
-    Client,
-    Handler,
-    Server,
-    Transport,
-    TransportOptions,
-    Wiring,
-)
+from s2a_bench.transport import ACTIONS, SERVER, TOKENS, Transport, TransportOptions, Wiring
 
 
 class ShmOptions(TransportOptions):
@@ -49,22 +38,12 @@ class Shm(Transport[ShmOptions]):
     crosses_links = False
     style: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#6A3D9A", "--")}
     checks: ClassVar[Mapping[str, str]] = {"shared-memory": "s2a_bench.transport.shm:shared_memory"}
+    client_class = "s2a_bench.transport.shm.client:ShmClient"
+    server_class = "s2a_bench.transport.shm.server:ShmServer"
 
-    def client(self, wiring: Wiring[ShmOptions], alive: Callable[[], bool]) -> Client:
-        _check_system()
-        from s2a_bench.transport.shm.client import ShmClient
-
-        return ShmClient(wiring, alive)
-
-    def server(self, wiring: Wiring[ShmOptions], handler: Handler) -> Server:
-        _check_system()
-        from s2a_bench.transport.shm.server import ShmServer
-
-        return ShmServer(wiring, handler)
-
-    def require(self, choice: Choice[ShmOptions]) -> None:
-        super().require(choice)
-        _check_system()
+    def check_machine(self) -> None:
+        if why := unavailable():
+            raise UsageError(f"`transport` shm: {why}; take another")
 
     def ready(self, wiring: Wiring[ShmOptions]) -> str:
         return f"serving shared memory at {wiring.address} for this user alone"
@@ -85,11 +64,6 @@ def shared_memory(machine: Machine) -> Finding | None:  # noqa: ARG001 - the sys
         except OSError as error:
             why = f"memfd_create: {error.strerror}"
     return Finding("shared-memory", "advice", f"--transport shm cannot run: {why}", "leave it out") if why else None
-
-
-def _check_system() -> None:
-    if why := unavailable():
-        raise UsageError(f"`transport` shm: {why}; take another")
 
 
 SHM = Shm()

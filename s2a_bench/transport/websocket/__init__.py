@@ -37,8 +37,7 @@ class Websocket(PolicyTransport[WebsocketOptions]):
     options = WebsocketOptions
     variants = VARIANTS
     urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.transport.websocket.risks:examine")
-    extra = "websocket"
-    modules = PACKAGES
+    needs = ("websocket", *PACKAGES)
     client_class = "s2a_bench.transport.websocket.client:WebsocketClient"
     server_class = "s2a_bench.transport.websocket.server:WebsocketServer"
     reads_server = ("path", "greets", "text_keys", "answer", "reset", "idle_s")

@@ -43,8 +43,7 @@ class Zmq(PolicyTransport[ZmqOptions]):
     options = ZmqOptions
     variants = (GR00T,)
     urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.transport.zmq.risks:examine")
-    extra = "zmq"
-    modules = PACKAGES
+    needs = ("zmq", *PACKAGES)
     client_class = "s2a_bench.transport.zmq.client:ZmqClient"
     server_class = "s2a_bench.transport.zmq.server:ZmqServer"
     facts = (PAYLOAD_BYTES, RECONNECTS)
