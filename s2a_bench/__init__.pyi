@@ -69,6 +69,16 @@ class _CapacityChunksLatencyThroughputTimeline(TypedDict, total=False):
     url: str
     warmup: int
 
+class _LatencyThroughput(TypedDict, total=False):
+    clock: Literal["", "chrony", "ptp"]
+    fps: float
+    grammar: str
+    launches: int
+    link: str
+    mode: Literal["request", "stream"]
+    quick: bool
+    record: str | Path | None
+
 class _Boundary(_Run, total=False):
     jitter: str
     most_tokens: int
@@ -192,48 +202,34 @@ class _Chunks(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThro
     slowest: float
     tokens_per_action: int
 
-class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
+class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, _LatencyThroughput, total=False):
     action_dim: int
     answer: Literal["auto", "tokens", "actions"]
     context: int
     engine: str
     flash_attention: str
-    fps: float
     gpu_layers: int
-    grammar: str
     horizon: int
     latency: str | float
-    launches: int
-    link: str
     max_tokens: int
     mmproj: str | Path | None
-    mode: Literal["request", "stream"]
     model: str | Path | None
     profile: str
-    quick: bool
-    record: str | Path | None
     requests: int
     seed: int
     threads: int
 
-class _Throughput(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
+class _Throughput(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, _LatencyThroughput, total=False):
     batch: int
     context: int
     engine: str
     flash_attention: str
-    fps: float
     gpu_layers: int
-    grammar: str
     kv_type: str
-    launches: int
-    link: str
     max_tokens: int
     mmproj: str | Path | None
-    mode: Literal["request", "stream"]
     model: str | Path | None
     profile: str
-    quick: bool
-    record: str | Path | None
     reference: str | Path | None
     requests: int
     sampling: str

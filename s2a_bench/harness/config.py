@@ -115,6 +115,12 @@ class RequestsConfig(Options):
         panel=TRANSPORT,
         names=published,
     )
+    clock: Literal["", "chrony", "ptp"] = option(
+        "",
+        "with a server of ours on another host: chrony, ptp also bound the clocks' offset, if they run on both hosts "
+        "[default: exchanges alone]",
+        panel=TRANSPORT,
+    )
     engine: EngineConfig = group(EngineConfig)
     requests: int = option(50, "requests a pipeline [default: 50, quick: 10]", ge=1, le=10**9, first=True)
     warmup: int = option(5, "warm-ups a pipeline, kept and marked [default: 5, quick: 2]", ge=0, le=10**9)
@@ -279,6 +285,8 @@ class RequestsConfig(Options):
             raise UsageError(f"`latency` is about our own servers; leave out `{self.foreign}`")
         self._check_unused()
         running = next((each.options.external for each in self.pipelines if each.options.external_address), "")
+        if self.clock and not running:
+            raise UsageError("`clock` is about a server of ours on another host; name it with `url`")
         if self.link_profile and running:
             raise UsageError(f"`link`: a server that runs already is not behind it; leave out `{running}`")
         if self.link_profile and (local := [each.name for each in self.pipelines if not each.transport.crosses_links]):

@@ -69,6 +69,8 @@ class RequestPlan:
     size: str
     stages: Mapping[str, str]
     """Stage -> group of all transports, in the order of the path."""
+    clock: str = ""
+    """What bounds the wall clocks of two hosts, one of `machine.clocks.COMMANDS`, or nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +129,7 @@ def resolve(config: RequestsConfig) -> RunPlan:
         blocks=BlocksPlan(config.requests, config.warmup, config.launches, seed),
         feed=FeedPlan(config.source, config.size, config.fps, seed, nonce, stream, config.cameras, config.resize),
         request=RequestPlan(
-            config.sent_prompt, config.grammar, max_pieces, seed, config.state, config.mode, size, stages
+            config.sent_prompt, config.grammar, max_pieces, seed, config.state, config.mode, size, stages, config.clock
         ),
         link=config.link_profile,
         engine=engine,

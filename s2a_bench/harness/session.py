@@ -127,7 +127,7 @@ class Session:
         self._recorder = recorder
         self._sampler = sampler or ResourceSampler({}, 1)
         self._frames: dict[int, StreamedFrame] = {}
-        self._clock = RemoteClock(self._exchange, {} if offsets is None else offsets)
+        self._clock = RemoteClock(self._exchange, {} if offsets is None else offsets, request.clock)
         self._pictures = 0
         """Of the last request."""
         self.busy = False
@@ -190,11 +190,12 @@ class Session:
         source = open_source("synthetic", *SMALL, fps=30, seed=0)
         return RequestFeed(source, preencoded=self.cell.payload == "jpeg-preencoded", cameras=self._pictures)
 
-    def _exchange(self) -> Trace:
-        """Make a request that our server answers without its engine."""
+    def _exchange(self, system: str) -> Trace:
+        """Make a request that our server answers without its engine, with its wall clock by a ``system`` if named."""
         trace, plan = Trace(), self.request
         self._small.get_ready()
-        frames, prompt = self._small.capture(trace), CLOCK_PROMPT + self.cell.capabilities.answer_kinds[0]
+        frames, kind = self._small.capture(trace), self.cell.capabilities.answer_kinds[0]
+        prompt = f"{CLOCK_PROMPT}{kind} {system}".rstrip()
         for _ in self.client.request(Request("clock", prompt, frames, 1, state=(0.0,) * plan.state), trace):
             pass
         return trace

@@ -15,6 +15,7 @@ from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.inference import EngineConfig, need_engine
 from s2a_bench.transport import http
+from s2a_bench.transport.ros.joining import namespace_of
 
 PROGRAM = Path(sys.executable)
 URL = {"http": {"url": "http://x"}}
@@ -200,6 +201,12 @@ def test_what_cannot_carry_the_usual_payload_keeps_its_own() -> None:
     assert [cell.payload for cell in cells] == ["jpeg", "raw", ""]
 
 
+def test_a_namespace_in_a_url_names_our_server_there() -> None:
+    (cell,) = RequestsConfig(url="ros:///robot/llama", clock="ptp").pipelines
+    assert (cell.transport.name, cell.variant, cell.options.external_address) == ("ros", "topic", "/robot/llama")
+    assert namespace_of(cell.wiring(cell.options.external_address)) == "/robot/llama"
+
+
 def test_a_foreign_action_is_the_only_ros_cell() -> None:
     options = {"ros": {"action": "/llama/generate_response"}}
     config = RequestsConfig(transports="ros", options=options)
@@ -282,6 +289,9 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
             {"options": {"http": {"llama_server": PROGRAM}}, "engine": EngineConfig(name="echo")},
             "`llama_server` runs a model",
         ),
+        ({"url": "ros://llama"}, "'ros://llama' should look like ros:///llama"),
+        ({"options": {"ros": {"url": "ros:///a", "action": "/b"}}}, "`url` and `action` name two servers"),
+        ({"clock": "chrony"}, "`clock` is about a server of ours on another host; name it with `url`"),
         ({"mode": "stream", "payload": "jpeg-preencoded"}, "jpeg-preencoded has no meaning in `mode` stream"),
     ],
 )

@@ -12,19 +12,21 @@ import pytest
 from s2a_bench.clock import SystemClock, VirtualClock, clock_id
 from s2a_bench.errors import ClockMoved
 from s2a_bench.frames import open_source
+from s2a_bench.harness.clocks import Bounded, Exchange, Offset
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import back_off
 from s2a_bench.harness.servers import ServerSet
-from s2a_bench.harness.session import Place, Session, inference_start_ns
+from s2a_bench.harness.session import Measured, Place, Session, inference_start_ns
+from s2a_bench.machine.clocks import WallClock
 from s2a_bench.provenance import Provenance
 from s2a_bench.store.requests import samples_table
 from s2a_bench.trace import STAGES as COMMON
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import open_client
 from s2a_bench.transport.pipeline import one_pipeline
-from s2a_bench.transport.serving import CLOCK_PROMPT
+from s2a_bench.transport.serving import CLOCK_PROMPT, REALTIME_ERROR_MS, REALTIME_MS
 from s2a_bench.types import Request, Token
 from tests.servers.sockets import head, serving
 from tests.servers.speakers import Cloud
@@ -123,6 +125,7 @@ class ElsewhereClient:
     def __init__(self) -> None:
         self.ahead_ns = 10**12
         self.prompts: list[str] = []
+        self.facts: dict[str, float] = {}
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         self.prompts.append(request.prompt)
@@ -135,7 +138,7 @@ class ElsewhereClient:
         if not request.prompt.startswith(CLOCK_PROMPT):
             self.true = came_ns - sent_ns, trace.marks[-1][1] - left_ns
         marks = [("network", came_ns + self.ahead_ns), ("inference", left_ns + self.ahead_ns)]
-        trace.receive(Remote(ELSEWHERE, marks, [left_ns + self.ahead_ns]))
+        trace.receive(Remote(ELSEWHERE, marks, [left_ns + self.ahead_ns], facts=self.facts))
 
 
 @pytest.fixture
@@ -185,3 +188,43 @@ def test_a_server_elsewhere_without_marks_cannot_be_joined(monkeypatch: pytest.M
     measured = Session(one_pipeline("http/as-deployed"), client, feed, plan).measure(Place(0, 0, warmup=False))
     source.close()
     assert "the server reported no marks" in measured.sample.error
+
+
+def with_wall_clocks(
+    client: ElsewhereClient, monkeypatch: pytest.MonkeyPatch, *, off_ms: float = 0, tells: bool = True
+) -> Measured:
+    """Measure where both wall clocks are known to 20 us, the server's after all off by ``off_ms``."""
+    ours = WallClock(17 * 10**17, 20_000, 0)
+    monkeypatch.setattr("s2a_bench.harness.clocks.remote.wall_clock", lambda _: ours)
+    theirs_ms = (ours.offset_ns - client.ahead_ns) / 1e6 + off_ms
+    client.facts = {REALTIME_MS: theirs_ms, REALTIME_ERROR_MS: ours.error_ns / 1e6} if tells else {}
+    source, plan = open_source("synthetic", 64, 48, fps=30.0, seed=0), resolve(RequestsConfig()).request
+    feed = RequestFeed(source, preencoded=False)
+    session = Session(one_pipeline("http/as-deployed"), client, feed, replace(plan, clock="chrony"))
+    measured = session.measure(Place(0, 0, warmup=False))
+    source.close()
+    return measured
+
+
+def test_bounds_of_the_wall_clocks_narrow_the_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    client = ElsewhereClient()
+    measured = with_wall_clocks(client, monkeypatch)
+    assert not measured.sample.error
+    assert client.prompts[-1] == f"{CLOCK_PROMPT}tokens chrony"
+    offset = Offset()
+    offset.add(Exchange(0, 5_000_000, 5_000_000, 2_000_000))
+    exchanged = offset.over(2_000_000)
+    offset.add(Bounded(1_000_000, 2_000_000, middle_ns=4_000_000, error_ns=50_000))
+    both = offset.over(2_000_000)
+    assert (both.lo_ns, both.hi_ns) == (pytest.approx(3_950_000, abs=2), pytest.approx(4_050_000, abs=2))
+    assert both.hi_ns - both.lo_ns < exchanged.hi_ns - exchanged.lo_ns
+
+
+def test_wall_clocks_that_contradict_the_exchanges_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = with_wall_clocks(ElsewhereClient(), monkeypatch, off_ms=60_000)
+    assert isinstance(measured.fatal, ClockMoved)
+
+
+def test_a_server_that_does_not_tell_its_wall_clock_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = with_wall_clocks(ElsewhereClient(), monkeypatch, tells=False)
+    assert "the server does not tell its wall clock" in measured.sample.error

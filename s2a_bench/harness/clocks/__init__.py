@@ -65,6 +65,24 @@ class Exchange:
 
 
 @dataclass(frozen=True, slots=True)
+class Bounded:
+    """The offset at one instant as both hosts' wall clocks and the bounds of their errors give it."""
+
+    sent_ns: int
+    seen_ns: int
+    middle_ns: int
+    error_ns: int
+
+    @property
+    def upper(self) -> Point:
+        return self.seen_ns, self.middle_ns + self.error_ns
+
+    @property
+    def lower(self) -> Point:
+        return self.seen_ns, self.middle_ns - self.error_ns
+
+
+@dataclass(frozen=True, slots=True)
 class Interval:
     """An offset lies within it, both ends included."""
 
@@ -88,10 +106,10 @@ class Offset:
     """The offset of another clock from this host's, the other minus this one."""
 
     def __init__(self) -> None:
-        self._exchanges: deque[Exchange] = deque(maxlen=KEPT)
+        self._exchanges: deque[Exchange | Bounded] = deque(maxlen=KEPT)
 
-    def add(self, exchange: Exchange) -> None:
-        """Add an exchange, on any thread."""
+    def add(self, exchange: Exchange | Bounded) -> None:
+        """Add an exchange, or what the wall clocks say, on any thread."""
         self._exchanges.append(exchange)
 
     def over(self, *times_ns: int) -> Interval:
@@ -108,7 +126,7 @@ class Offset:
         return interval_at(at_ns, near)
 
 
-def interval_at(at_ns: int, exchanges: Sequence[Exchange]) -> Interval:
+def interval_at(at_ns: int, exchanges: Sequence[Exchange | Bounded]) -> Interval:
     """Return the interval of the offset at an instant; raises ClockMoved if no line passes between the exchanges.
 
     The least and the greatest value are those of vertices of the polygon: of lines through two of the bounds, or
@@ -132,7 +150,7 @@ def interval_at(at_ns: int, exchanges: Sequence[Exchange]) -> Interval:
         raise ClockMoved(
             f"the clocks of the two hosts moved against each other by about {2 * beyond.min() / 1e6:.2g} ms within "
             f"{WINDOW_NS // 10**9} s: one was stepped or slewed, and one-way times cannot be told; wait until NTP has "
-            "settled (chronyc waitsync), or stop it for the run"
+            "settled (chronyc waitsync), or stop it for the run, and leave `clock` out"
         )
     possible = at[beyond <= ROUNDING_NS / 2]
     return Interval(base_ns + floor(possible.min()) - ROUNDING_NS, base_ns + ceil(possible.max()) + ROUNDING_NS)

@@ -8,15 +8,21 @@ from dataclasses import dataclass
 from typing import Final
 
 from s2a_bench.clock import SystemClock, now_ns
-from s2a_bench.errors import S2AError
-from s2a_bench.harness.clocks import Exchange, Offset
+from s2a_bench.errors import RequestFailed, S2AError
+from s2a_bench.harness.clocks import Bounded, Exchange, Offset
+from s2a_bench.machine.clocks import FRESH_NS, wall_clock
 from s2a_bench.trace import Trace
+from s2a_bench.transport.serving import REALTIME_ERROR_MS, REALTIME_MS
 
 FIRST: Final = 20
 """Exchanges when the clock is met."""
 FIRST_PAUSE_NS: Final = 50_000_000
 """Time between these: a second together, which bounds the clocks' rate."""
 BURST: Final = 5
+FLOAT_NS: Final = 1000
+"""What a wall clock loses as a float of ms."""
+WANDER: Final = 1e-5
+"""Rate at which a disciplined wall clock may leave its bound while a reading is fresh."""
 PERIOD_NS: Final = 10**9
 """Between requests, one burst of exchanges in this time at most."""
 
@@ -35,12 +41,13 @@ class Joined:
 class RemoteClock:
     """The offset of one server's clock; nothing is exchanged before `join` has met it."""
 
-    def __init__(self, exchange: Callable[[], Trace], offsets: dict[str, Offset]) -> None:
+    def __init__(self, exchange: Callable[[str], Trace], offsets: dict[str, Offset], system: str = "") -> None:
         """``exchange`` makes a request for its marks alone; ``offsets``, by clock, are those that others estimate too.
 
-        ``exchange`` raises S2AError.
+        ``exchange`` raises S2AError; its argument is ``system``, one of `machine.clocks.COMMANDS` or "", where the
+        server's wall clock is wanted.
         """
-        self._exchange, self._offsets = exchange, offsets
+        self._exchange, self._offsets, self._system = exchange, offsets, system
         self._id = ""
         self._last_ns = 0
 
@@ -63,6 +70,8 @@ class RemoteClock:
             self.refresh()
         else:
             self._burst(FIRST, FIRST_PAUSE_NS)
+            if self._system:
+                self._compare_wall_clocks()
         early_ns = min((stamp - own.upper[1] for _, stamp in remote.frame_marks), default=own.sent_ns)
         near = offset.over(own.sent_ns, own.seen_ns)
         whole = near | offset.over(min(early_ns, own.sent_ns), last_ns)
@@ -71,8 +80,21 @@ class RemoteClock:
 
     def _burst(self, count: int, pause_ns: int) -> None:
         clock = SystemClock()
+        offset = self._offsets[self._id]
         with suppress(S2AError):  # the next request meets what is wrong, and reports it
             for _ in range(count):
-                self._offsets[self._id].add(Exchange.of(self._exchange()))
+                offset.add(Exchange.of(self._exchange("")))
                 clock.sleep_until_ns(now_ns() + pause_ns)
+            if self._system and count == BURST:
+                self._compare_wall_clocks()
         self._last_ns = now_ns()
+
+    def _compare_wall_clocks(self) -> None:
+        """Bound the offset by what both hosts know of their wall clocks' errors; raises S2AError."""
+        trace, ours = self._exchange(self._system), wall_clock(self._system)
+        if not trace.facts.keys() >= {REALTIME_MS, REALTIME_ERROR_MS}:
+            raise RequestFailed(f"`clock` {self._system}: the server does not tell its wall clock; leave it out")
+        theirs_ns, error_ns = (round(trace.facts[name] * 1e6) for name in (REALTIME_MS, REALTIME_ERROR_MS))
+        sent_ns, seen_ns = Exchange.of(trace).sent_ns, now_ns()
+        error_ns += ours.error_ns + FLOAT_NS + round(2 * FRESH_NS * WANDER)
+        self._offsets[self._id].add(Bounded(sent_ns, seen_ns, ours.offset_ns - theirs_ns, error_ns))
