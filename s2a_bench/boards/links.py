@@ -17,7 +17,7 @@ from pathlib import Path
 from random import Random
 from typing import Annotated, Any, Final
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from s2a_bench.boards.profile import SHIPPED
 from s2a_bench.errors import UsageError
@@ -68,27 +68,13 @@ class Direction:
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any]) -> Direction:
         """Read plain data, in which an infinite rate may be None."""
-        values: dict[str, Any] = {name: math.inf if value is None else value for name, value in facts.items()}
-        return cls(**values | {"steps": tuple(Step(**step) for step in facts["steps"])})
+        finite: dict[str, Any] = {name: math.inf if value is None else value for name, value in facts.items()}
+        return cls(**{**finite, "steps": tuple(Step(**step) for step in facts["steps"])})
 
     def least_s(self, size: float) -> float:
         """Return the least time in s that so many bytes take."""
         fast = min(size, self.burst_bytes)
         return self.delay_ms / 1e3 + fast * 8e-6 / self.burst_mbps + (size - fast) * 8e-6 / self.mbps
-
-    def mean_mbps(self, start_s: float, end_s: float) -> float:
-        """Return the mean rate between two times since the link's start."""
-        if not self.steps:
-            return self.mbps
-        return (self._megabits(end_s) - self._megabits(start_s)) / (end_s - start_s)
-
-    def _megabits(self, until_s: float) -> float:
-        ends = (*(step.start_s for step in self.steps[1:]), self.period_s)
-        periods, rest_s = divmod(until_s, self.period_s)
-        lasting = [(step, end - step.start_s) for step, end in zip(self.steps, ends, strict=True)]
-        whole = sum(step.mbps * lasts for step, lasts in lasting)
-        rest = sum(step.mbps * min(max(rest_s - step.start_s, 0), lasts) for step, lasts in lasting)
-        return periods * whole + rest
 
 
 class LinkProfile(TomlTable):
@@ -119,24 +105,16 @@ class LinkProfile(TomlTable):
     down_trace: str = ""
     source: Line = "the user's"
 
-    @field_validator("outage_s")
-    @classmethod
-    def _in_order(cls, outage_s: list[float]) -> list[float]:
-        if outage_s[0] > outage_s[1]:
-            raise ValueError("should be the shortest and the longest")
-        return outage_s
-
     @property
     def about(self) -> str:
         return f"{self.name} ({self.source})"
 
     def directions(self) -> tuple[Direction, Direction]:
         """Return up and down, their traces read; raises UsageError naming file and line."""
-        ways = ("up", self.up_mbps, self.up_trace), ("down", self.down_mbps, self.down_trace)
-        up, down = (self._direction(*way) for way in ways)
-        return up, down
+        return self._direction("up"), self._direction("down")
 
-    def _direction(self, name: str, mbps: float | None, mahimahi: str) -> Direction:
+    def _direction(self, name: str) -> Direction:
+        mbps, mahimahi = getattr(self, f"{name}_mbps"), getattr(self, f"{name}_trace")
         rate, seed = mbps or math.inf, 2 * self.seed + (name == "down")
         steps: list[Step] = []
         period_s = 0.0
@@ -170,7 +148,9 @@ def bound_s(link: tuple[Direction, Direction], bytes_up: float, bytes_first_down
 def published() -> dict[str, LinkProfile]:
     """Return the shipped profiles by name."""
     tables = loads(PUBLISHED.read_text(encoding="utf-8"), str(PUBLISHED))
-    return {name: _made({**table, "name": name}, f"{PUBLISHED}: {name}") for name, table in tables.items()}
+    return {
+        name: checked(LinkProfile, {"name": name} | table, f"{PUBLISHED}: {name}") for name, table in tables.items()
+    }
 
 
 def load_link(text: str) -> LinkProfile:
@@ -196,7 +176,7 @@ def load_link(text: str) -> LinkProfile:
         raise UsageError(f"`link`: {none_of(first, known, ', and no file (.toml, .csv) and no KEY=VALUE')}")
     for pair in pairs:
         values |= _pair(pair)
-    return _made({**values, "name": text if pairs or not values.get("name") else values["name"]}, "`link`")
+    return checked(LinkProfile, {"name": text, **values, **({"name": text} if pairs else {})}, "`link`")
 
 
 def _pair(text: str) -> dict[str, Any]:
@@ -214,13 +194,9 @@ def _pair(text: str) -> dict[str, Any]:
     return {KEYS.get(key, key): int(number) if key == "seed" else number}
 
 
-def _made(values: Mapping[str, Any], where: str) -> LinkProfile:
-    return checked(LinkProfile, values, where)
-
-
 def _csv_steps(path: str, column: str, profile: LinkProfile) -> tuple[list[Step], float]:
-    def value(row: Mapping[str, str], name: str, default: float, most: float) -> float:
-        number = float(row[name]) if row.get(name) else default
+    def value(row: Mapping[str, str], name: str, most: float, default: float = math.nan) -> float:
+        number = float(row.get(name) or default)
         if not 0 <= number <= most:
             raise ValueError(f"{name} {number:g} should be 0 to {most:g}")
         return number
@@ -232,9 +208,9 @@ def _csv_steps(path: str, column: str, profile: LinkProfile) -> tuple[list[Step]
         raise UsageError(f"{where}: the first line should name the column {', '.join(sorted(missing))}")
     for row in reader:
         try:
-            start_s = value(row, "t_s", math.nan, 1e9)
-            delay_ms, loss = value(row, "delay_ms", profile.delay_ms, 6e4), value(row, "loss", profile.loss, 1)
-            steps.append(Step(start_s, value(row, column, math.nan, 1e6), delay_ms, loss))
+            start_s, mbps = value(row, "t_s", 1e9), value(row, column, 1e6)
+            delay_ms, loss = value(row, "delay_ms", 6e4, profile.delay_ms), value(row, "loss", 1, profile.loss)
+            steps.append(Step(start_s, mbps, delay_ms, loss))
         except (TypeError, ValueError) as error:
             raise UsageError(f"{where}, line {reader.line_num}: {error}") from None
     last_s = steps[-1].start_s - steps[-2].start_s if len(steps) > 1 else 1.0

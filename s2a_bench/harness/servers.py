@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from pkgutil import resolve_name
@@ -13,7 +13,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from s2a_bench.errors import ServerDied
-from s2a_bench.harness.links import EmulatedLink, server_side
+from s2a_bench.harness.links import EmulatedLink
 from s2a_bench.harness.plan import RunPlan
 from s2a_bench.harness.processes import OwnServer, ServerProcess, start_program
 from s2a_bench.harness.serving import ServerJob, engine_handler
@@ -74,7 +74,7 @@ class ServerSet:
 
     def start(self) -> dict[str, Any]:
         """Start all servers and wait until they are ready; return the facts that each reports."""
-        with server_side(self._link):
+        with self._link.server_side() if self._link else nullcontext():
             for pipeline in self._cells:
                 if pipeline.server not in self._servers:
                     self._servers[pipeline.server] = self._launch(pipeline)

@@ -15,9 +15,8 @@ import os
 import socket
 import struct
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
-from errno import EPERM
 from pathlib import Path
 from typing import Any, Final
 
@@ -47,11 +46,6 @@ class EmulatedLink:
         self.directions: tuple[Direction, Direction] = profile.directions()
         self._server, self._client, self._relay = server, client, relay
 
-    @property
-    def started_ns(self) -> int:
-        """When the link's traces started."""
-        return int(self._relay.facts["started_ns"])
-
     @contextmanager
     def server_side(self) -> Iterator[None]:
         """Make programs and sockets on the server's side."""
@@ -71,11 +65,6 @@ class EmulatedLink:
         return self._relay.ask()
 
 
-def server_side(link: EmulatedLink | None) -> Any:
-    """Return a context in which programs are servers of a run, on a link or without one."""
-    return link.server_side() if link else nullcontext()
-
-
 @contextmanager
 def emulated(profile: LinkProfile) -> Iterator[EmulatedLink]:
     """Put this thread on the client's side of a link; its old namespace and environment return at the end.
@@ -91,9 +80,14 @@ def emulated(profile: LinkProfile) -> Iterator[EmulatedLink]:
         for own, peer in ((SERVER, CLIENT), (CLIENT, SERVER)):
             _new_namespace()
             sides.append(_opened(stack))
-            devices.append(_tun())
-            stack.callback(os.close, devices[-1])
-            _configure(own, peer)
+            try:
+                devices.append(os.open("/dev/net/tun", os.O_RDWR | os.O_CLOEXEC))
+                stack.callback(os.close, devices[-1])
+                _configure(devices[-1], own, peer)
+            except OSError as error:
+                raise UsageError(
+                    f"`link` needs a TUN device: {error}; `modprobe tun`, or in a container --device /dev/net/tun"
+                ) from None
         job = json.dumps({"devices": devices[::-1], "directions": directions})
         relay = OwnProcess("relay", "s2a_bench.harness.links.relay", job, None, devices)
         stack.enter_context(relay)
@@ -126,28 +120,15 @@ def _join(namespace: int) -> None:
 def _new_namespace() -> None:
     if not _libc.unshare(CLONE_NEWNET):
         return
-    number = ctypes.get_errno()
-    if number == EPERM:
-        raise NotPermitted(
-            "`link` needs network namespaces: run it as root, or allow user namespaces until `unshare -Urn true` works"
-        )
-    raise UsageError(f"`link` needs network namespaces: {os.strerror(number)}")
+    raise NotPermitted(
+        f"`link` needs network namespaces ({os.strerror(ctypes.get_errno())}): run it as root, or allow user "
+        "namespaces until `unshare -Urn true` works"
+    )
 
 
-def _tun() -> int:
-    """Return the descriptor of a new TUN device in this thread's namespace."""
-    try:
-        device = os.open("/dev/net/tun", os.O_RDWR | os.O_CLOEXEC)
-    except OSError as error:
-        raise UsageError(
-            f"`link` needs /dev/net/tun: {error.strerror}; `modprobe tun`, or in a container --device /dev/net/tun"
-        ) from None
-    fcntl.ioctl(device, TUNSETIFF, struct.pack("16sH22x", DEVICE, IFF_TUN | IFF_NO_PI))
-    return device
-
-
-def _configure(own: str, peer: str) -> None:
-    """Give the device a loopback address in place of ``lo``, so that servers bind where they always do."""
+def _configure(tun: int, own: str, peer: str) -> None:
+    """Give a new device a loopback address in place of ``lo``, so that servers bind where they always do."""
+    fcntl.ioctl(tun, TUNSETIFF, struct.pack("16sH22x", DEVICE, IFF_TUN | IFF_NO_PI))
     conf = Path("/proc/sys/net")
     (conf / "ipv4/conf/link/route_localnet").write_text("1")
     with suppress(OSError):  # a kernel without IPv6

@@ -6,7 +6,7 @@ import math
 import socket
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from select import select
 from statistics import median
 from typing import Any, Final
@@ -39,8 +39,6 @@ STRAY: Final = 0.002
 """Share of packets that a busy machine may lose."""
 SO_RCVBUFFORCE: Final = 33
 BUFFER_BYTES: Final = 16 << 20
-POINTS: Final = 40
-"""Of a curve in the manifest."""
 AT_ONCE: Final = 32
 """Packets sent before the receiver is read."""
 
@@ -64,7 +62,7 @@ class Found:
 
 
 def probed(link: EmulatedLink) -> dict[str, Any]:
-    """Measure a link, again if it does not match its profile, and return the manifest's entry.
+    """Measure a link, again if it does not match its profile, and return the manifest's entry; a trace is not checked.
 
     Raises UsageError if the last attempt is off as well.
     """
@@ -72,51 +70,43 @@ def probed(link: EmulatedLink) -> dict[str, Any]:
     while off and attempts < ATTEMPTS:
         attempts += 1
         with ExitStack() as stack:
-            probe = _Probe(link, stack)
-            found = list(probe.measure())
+            found = list(_Probe(link, stack).measure())
         off = [str(each) for each in found if each.off]
     if off:
         raise UsageError(
             f"`link`: this machine does not carry {link.profile.name} within {TOLERANCE:.0%}: {'; '.join(off)}; "
             "stop other programs, or choose a slower link"
         )
-    quantities = [
-        {"what": each.what, "unit": each.unit, "profile": each.profile, "measured": each.measured} for each in found
-    ]
-    return {"probe": {"attempts": attempts, "quantities": quantities, "curves": probe.curves, "rtt_ms": probe.rtt_ms}}
+    return {"probe": {"attempts": attempts, "quantities": [asdict(each) for each in found]}}
 
 
 class _Probe:
     """One attempt."""
 
     def __init__(self, link: EmulatedLink, stack: ExitStack) -> None:
-        self._link = link
         with link.server_side():
             self._server, self._beside = (_socket(SERVER, stack) for _ in range(2))
         self._client = _socket(CLIENT, stack)
-        up, down = link.directions
-        slowest_ms = sum(way.delay_ms + way.jitter_ms for way in (up, down))
-        self._round_s = max(slowest_ms, *(step.delay_ms * 2 for step in (*up.steps, *down.steps)), 0.0) / 1e3
-        self.curves: dict[str, list[tuple[float, float]]] = {}
-        """Megabytes that had arrived by a time in s."""
-        self.rtt_ms: list[float] = []
+        self._directions = up, down = link.directions
+        self._round_s = sum(way.delay_ms + way.jitter_ms for way in (up, down)) / 1e3
 
     def measure(self) -> Iterator[Found]:
-        up, down = self._link.directions
+        up, down = self._directions
+        if up.steps or down.steps:
+            return
         ways = ("up", up, self._client, self._server), ("down", down, self._server, self._client)
-        self.rtt_ms = self._round_trips(self._client, self._server)
+        there_ms = self._round_trips(self._client, self._server)
         here_ms = self._round_trips(self._beside, self._server)
-        if self.rtt_ms and not (up.steps or down.steps):
+        if there_ms:
             usual_ms = sum(way.delay_ms + way.jitter_ms / 2 + 8e-3 * SMALL_BYTES / way.mbps for way in (up, down)) / 2
-            added_ms = (median(self.rtt_ms) - median(here_ms)) / 2
+            added_ms = (median(there_ms) - median(here_ms)) / 2
             yield Found("added one-way delay", "ms", usual_ms, added_ms, DELAY_MS + TOLERANCE * usual_ms)
         for name, way, sender, receiver in ways:
-            if not way.steps:
-                yield self._loss(name, way, sender, receiver)
+            yield self._loss(name, way, sender, receiver)
             if way.burst_bytes and math.isfinite(way.burst_mbps):
                 yield self._burst(name, way, sender, receiver)
             if math.isfinite(way.mbps):
-                yield from self._rate(name, way, sender, receiver)
+                yield self._rate(name, way, sender, receiver)
 
     def _round_trips(self, sender: socket.socket, receiver: socket.socket) -> list[float]:
         """Return round trips in ms, each after idle, without those that lost a packet."""
@@ -146,23 +136,11 @@ class _Probe:
         measured = _mbps(arrivals, PACKET_BYTES)
         return Found(f"burst {name}", "Mbit/s", way.burst_mbps, measured, TOLERANCE * way.burst_mbps)
 
-    def _rate(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Iterator[Found]:
-        loss = max((step.loss for step in way.steps), default=way.loss)
-        mbps, size = way.mbps * OFFERED / (1 - min(loss, 0.9)), PACKET_BYTES * (1 if loss else FRAGMENTS)
+    def _rate(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Found:
+        mbps, size = way.mbps * OFFERED / (1 - way.loss), PACKET_BYTES * (1 if way.loss else FRAGMENTS)
         count = math.ceil(RATE_S * mbps * 125e3 / size)
         arrivals = self._train(sender, receiver, count, size, mbps)[math.ceil(way.burst_bytes / size) :]
-        started_ns = self._link.started_ns
-        if len(arrivals) < 10:  # noqa: PLR2004 - an outage: not verified
-            return
-        each = max(len(arrivals) // POINTS, 1)
-        self.curves[name] = [
-            (round((at_ns - arrivals[0]) / 1e9, 6), number * size / 1e6)
-            for number, at_ns in enumerate(arrivals)
-            if not number % each
-        ]
-        window_s = [(at_ns - started_ns - way.delay_ms * 1e6) / 1e9 for at_ns in (arrivals[0], arrivals[-1])]
-        expected = way.mean_mbps(window_s[0], window_s[1])
-        yield Found(f"rate {name}", "Mbit/s", expected, _mbps(arrivals, size), TOLERANCE * expected)
+        return Found(f"rate {name}", "Mbit/s", way.mbps, _mbps(arrivals, size), TOLERANCE * way.mbps)
 
     def _train(self, sender: socket.socket, receiver: socket.socket, count: int, size: int, mbps: float) -> list[int]:
         """Send packets at a rate; return when each that was not lost arrived, in ns."""

@@ -15,10 +15,12 @@ import math
 import os
 import sys
 from bisect import bisect_right
+from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from random import Random
 from select import select
+from statistics import median
 from typing import Any, Final
 
 from s2a_bench.boards.links import Direction, Step
@@ -30,8 +32,8 @@ AT_ONCE: Final = 64
 MOST_HELD: Final = 200_000
 """Packets of about 300 MB."""
 PR_SET_TIMERSLACK: Final = 29
-BIN_S, BINS = 1e-5, 2000
-"""Of the histogram of lateness; its last bin holds everything later."""
+LAST: Final = 100_000
+"""Packets whose lateness is kept."""
 IPV4: Final = 4
 
 
@@ -90,25 +92,6 @@ class Shaper:
         return self._way.steps[index], end_s - at_s
 
 
-class Lateness:
-    """A histogram of how long after its time each packet left."""
-
-    def __init__(self) -> None:
-        self._counts = [0] * BINS
-
-    def add(self, late_s: float) -> None:
-        self._counts[min(int(late_s / BIN_S), BINS - 1)] += 1
-
-    def quantile_ms(self, share: float) -> float | None:
-        """Return the upper edge of the quantile's bin; None without packets."""
-        left = share * sum(self._counts)
-        for number, count in enumerate(self._counts):
-            left -= count
-            if count and left <= 0:
-                return (number + 1) * BIN_S * 1e3
-        return None
-
-
 class Relay:
     """Moves packets between the client's device and the server's."""
 
@@ -118,18 +101,19 @@ class Relay:
         self._ways = {client: (self._shapers[0], server), server: (self._shapers[1], client)}
         self._held: list[tuple[float, int, int, bytes]] = []
         self._number = 0
-        self._late = Lateness()
-        self.started_ns = now_ns()
+        self._late_s = deque[float](maxlen=LAST)
+        self._started_ns = now_ns()
 
     def _now_s(self) -> float:
-        return (now_ns() - self.started_ns) / 1e9
+        return (now_ns() - self._started_ns) / 1e9
 
     def facts(self) -> dict[str, Any]:
+        late_ms = [1e3 * late_s for late_s in sorted(self._late_s)] or [0.0]
         return {
             "packets": self._number,
             "lost": sum(shaper.lost for shaper in self._shapers),
             "dropped": sum(shaper.dropped for shaper in self._shapers),
-            "late_ms": {"median": self._late.quantile_ms(0.5), "p99": self._late.quantile_ms(0.99)},
+            "late_ms": {"median": median(late_ms), "p99": late_ms[int(0.99 * len(late_ms))]},
             "cpu_s": sum(os.times()[:2]),
         }
 
@@ -151,7 +135,7 @@ class Relay:
             due_s, _, device, packet = heapq.heappop(self._held)
             with suppress(OSError):  # its receive queue is full
                 os.write(device, packet)
-            self._late.add(now_s - due_s)
+            self._late_s.append(now_s - due_s)
 
     def _take(self, device: int) -> None:
         shaper, target = self._ways[device]
@@ -183,7 +167,7 @@ def main() -> None:
     for device in job["devices"]:
         os.set_blocking(device, False)
     relay = Relay(job["devices"], job["directions"])
-    answer({"address": "", "started_ns": relay.started_ns})
+    answer({"address": ""})
     relay.run_until(number)
     while control.readline():
         answer(relay.facts())

@@ -62,6 +62,8 @@ class FittedPipeline:
     """By MB of pixels a request."""
     medians: list[tuple[float, float]]
     """(MB, median in ms) of each launch."""
+    bounds: list[tuple[float, float]]
+    """(MB, median bound in ms) of each run on a link, by size."""
     line: Line | None
     wire_share: float | None
     """Bytes on the wire for each byte of the pixels; None in process, or if unknown."""
@@ -79,7 +81,9 @@ def against_bytes(runs: Split) -> list[FittedPipeline]:
         for cell in cells:
             if cell.values_ms(METRIC).size:
                 for payload in [cell.payload] if cell.payload else payloads or [""]:  # in process: beside each payload
-                    found.setdefault((cell.label, payload), []).append((place, pixels, cell))
+                    link = run.manifest["configuration"].get("link")
+                    name = f"{cell.label} over {link}" if link else cell.label
+                    found.setdefault((name, payload), []).append((place, pixels, cell))
     lines = [_pipeline(name, payload, sized) for (name, payload), sized in found.items()]
     order = sorted(
         lines, key=lambda each: (each.payload != "raw", each.payload, declared_transport(each.path[0]).order, each.name)
@@ -94,12 +98,17 @@ def _pipeline(name: str, payload: str, cells: Sequence[tuple[int, int, RequestCe
         for launch, blocks in cell.by_launch(METRIC).items():
             sizes.setdefault(pixels / MB, {})[run, launch] = blocks
             medians.append((pixels / MB, float(np.median(np.concatenate([*blocks.values()])))))
+    bounds = sorted(
+        (pixels / MB, float(np.median(of))) for _, pixels, cell in cells if (of := cell.values_ms("bound")).size
+    )
     shares = [
         float(sent.median()) / pixels for _, pixels, cell in cells if (sent := cell.good["payload_bytes"].dropna()).size
     ]
     wire_share = float(np.median(shares)) if shares else None
     first = cells[0][2]
-    return FittedPipeline(name, payload, first.path, sizes, medians, fit_line(medians), wire_share, first.has_ingest)
+    return FittedPipeline(
+        name, payload, first.path, sizes, medians, bounds, fit_line(medians), wire_share, first.has_ingest
+    )
 
 
 def _pixels(run: StoredRun) -> int:
@@ -194,6 +203,10 @@ def _draw(axes: Axes, pipelines: Sequence[FittedPipeline], styles: Mapping[str, 
         colour, style = styles[each.name]
         sizes, medians = np.array(each.medians).T
         axes.scatter(sizes, medians, s=7, color=colour, linewidths=0)
+        if each.bounds:
+            axes.plot(
+                *zip(*each.bounds, strict=True), color=colour, linewidth=0.5, marker="_", label=f"{each.name}: bound"
+            )
         if each.line:
             along = np.geomspace(sizes.min(), sizes.max(), 60)
             axes.plot(along, [each.line.at(x) for x in along], color=colour, linestyle=style, label=each.name)

@@ -118,6 +118,21 @@ def build_latency_distribution(run: StoredRun) -> Figure:
     return build_distribution(_caption(run, cells, "Distribution", metric), lines, "samples", _axis_label(metric))
 
 
+def build_link(run: StoredRun) -> Figure:
+    """Draw what a probe measured of the emulated link, as a share of its profile, with the tolerance."""
+    link = run.manifest["link"]
+    bars, others = [], []
+    for found in link["probe"]["quantities"]:
+        what, profile, measured = found["what"], found["profile"], found["measured"]
+        if found["unit"] == "Mbit/s":
+            band = tuple(100 * (1 + sign * found["tolerance"] / profile) for sign in (-1, 1))
+            bars.append(Bar(what, 100 * measured / profile, band, f"{number(measured)} Mbit/s"))
+        else:
+            others.append(f"{what}: {number(measured)} of {number(profile)} {found['unit']}".rstrip())
+    notes = (f"The line is what the probe allows. {'; '.join(others)}.", link["profile"]["source"])
+    return build_bars((f"Emulated link {link['profile']['name']}, probed before the run", *notes), bars, "share (%)")
+
+
 def latency_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
     if not _shown(run)[0]:
         return {}
@@ -125,6 +140,7 @@ def latency_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str,
         "latency_bars": lambda: build_latency_bars(run, against_paper=against_paper),
         "stages": lambda: build_stage_breakdown(run),
         "distribution": lambda: build_latency_distribution(run),
+        **({"link": lambda: build_link(run)} if (run.manifest.get("link") or {}).get("probe") else {}),
     }
 
 

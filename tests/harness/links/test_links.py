@@ -1,0 +1,121 @@
+"""Emulated links: they carry what their profiles say, and nothing is left of them."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from select import select
+from typing import Any
+
+import pytest
+
+import s2a_bench as s2a
+from s2a_bench.boards.links import load_link
+from s2a_bench.errors import NotPermitted, UsageError
+from s2a_bench.harness.config import RequestsConfig
+from s2a_bench.harness.links import CLIENT, SERVER, EmulatedLink, emulated
+from s2a_bench.harness.links.probe import Found, probed
+
+
+def on_link(link: str, use: Callable[[EmulatedLink], Any]) -> Any:
+    """Use a link; a machine where none can be made, or that is too busy for it, skips the test with its reason."""
+    try:
+        with emulated(load_link(link)) as made:
+            return use(made)
+    except (NotPermitted, UsageError) as refused:
+        pytest.skip(str(refused))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("link", ["rate=20/40,delay=5", "rate=30,loss=10%", "rate=20,burst_kib=150,burst_mbps=60"])
+def test_a_link_carries_what_its_profile_says(link: str) -> None:
+    found = on_link(link, probed)["probe"]["quantities"]
+    names = {each["what"] for each in found}
+    assert {"added one-way delay", "loss up", "loss down", "rate up", "rate down"} <= names
+    assert ("burst up" in names) == ("burst" in link)
+
+
+def test_a_probe_that_is_off_names_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = [Found("rate up", "Mbit/s", 100, 96, 5), Found("rate down", "Mbit/s", 100, 90, 5)]
+    monkeypatch.setattr("s2a_bench.harness.links.probe._Probe.__init__", lambda *_: None)
+    monkeypatch.setattr("s2a_bench.harness.links.probe._Probe.measure", lambda _: iter(found))
+    with pytest.raises(UsageError, match=r"does not carry 4g within 5%: rate down 90 instead of 100 Mbit/s;"):
+        probed(type("Link", (), {"profile": load_link("4g")})())  # type: ignore[arg-type]
+
+
+def test_the_servers_side_has_the_usual_address_and_the_thread_returns_home() -> None:
+    home = str(Path("/proc/thread-self/ns/net").readlink())
+    seen: dict[str, Any] = {}
+
+    def use(link: EmulatedLink) -> None:
+        seen["inside"] = str(Path("/proc/thread-self/ns/net").readlink())
+        with link.server_side():
+            server = socket.create_server((SERVER, 0))
+        with server, socket.create_connection(server.getsockname()) as client:
+            seen["client"] = client.getsockname()[0]
+        assert os.environ["ROS_STATIC_PEERS"] == "127.0.0.1;127.0.0.2"
+        assert link.statistics()["packets"] > 0
+
+    on_link("delay=1", use)
+    assert seen["client"] == CLIENT
+    assert seen["inside"] != home == str(Path("/proc/thread-self/ns/net").readlink())
+    assert "ROS_STATIC_PEERS" not in os.environ
+
+
+HOLD = """
+import sys
+import s2a_bench as s2a
+from s2a_bench.boards.links import load_link
+from s2a_bench.harness.links import emulated
+with emulated(load_link("delay=1")) as link:
+    print(link._relay.pid, flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_nothing_is_left_after_a_kill() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as holder:
+        assert holder.stdout is not None
+        assert holder.stderr is not None
+        line = holder.stdout.readline()
+        if not line:
+            pytest.skip(holder.stderr.read().decode()[-200:])
+        relay = os.pidfd_open(int(line))
+        holder.kill()
+    assert select([relay], [], [], 60)[0]
+    os.close(relay)
+
+
+@pytest.mark.parametrize("transport", ["shm", "loopback"])
+def test_a_transport_without_a_network_is_refused(transport: str) -> None:
+    with pytest.raises(UsageError, match=f"{transport} sends nothing over a network"):
+        RequestsConfig(link="4g", transports=transport, engine={"name": "echo"})
+
+
+def test_a_server_that_runs_already_is_refused() -> None:
+    with pytest.raises(UsageError, match="is not behind it; leave out `url`"):
+        RequestsConfig(link="4g", url="http://localhost:1")
+
+
+@pytest.mark.slow
+def test_a_run_over_a_link_is_labelled_and_bounded(tmp_path: Path) -> None:
+    link = "rate=40,delay=10"
+    try:
+        run = s2a.latency(
+            output=tmp_path, transports="http/binary", link=link, engine="echo", quick=True, requests=3, warmup=1
+        )
+    except (NotPermitted, UsageError) as refused:
+        pytest.skip(str(refused))
+    (origin,) = (each for each in run._run.origins.every if each.known)
+    assert (origin.link, origin.link_profile) == ("emulated", f"{link} (the user's)")
+    assert "link EMULATED after rate=40,delay=10" in run._run.origins.line
+    shown = run.table("summary").set_index("metric")
+    assert shown.loc["bound_ms", "median"] == pytest.approx(640 * 480 * 3 * 8 / 40e3 + 20, rel=0.02)
+    assert shown.loc["bound_ratio", "median"] >= 1
+    assert run.manifest["link"]["relay"]["packets"] > 1000
