@@ -81,11 +81,3 @@ def test_a_body_without_the_key_is_not_read(variant: str) -> None:
         with socket.create_connection((host, int(port)), timeout=20) as connection:
             connection.sendall(f"POST {CHAT} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 60000000\r\n\r\n".encode())
             assert connection.recv(100).startswith(b"HTTP/1.1 401")
-
-
-@pytest.mark.parametrize("path", ["/openapi.json", "/docs", "/redoc"])
-def test_the_description_of_the_interface_is_off_unless_asked_for(path: str) -> None:
-    with serving() as url:
-        assert httpx.get(url + path).status_code == 404
-    with serving(api_docs=True) as url:
-        assert httpx.get(url + path).status_code == 200

@@ -9,13 +9,12 @@ from contextlib import closing
 import httpx
 import pytest
 
-from s2a_bench.errors import BadRequest, Overdue, RequestFailed
+from s2a_bench.errors import BadRequest, RequestFailed
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.transport import open_client
 from s2a_bench.transport.http.native import PATHS
 from s2a_bench.transport.limits import Limits
-from s2a_bench.transport.serving import Turns
 from s2a_bench.types import Request, Token
 from tests.hostile.test_queue import body, serving
 
@@ -53,13 +52,6 @@ def test_an_answer_that_is_not_streamed_is_504(variant: str) -> None:
         answer = httpx.post(url + PATHS[variant], json=body("for ever", stream=False, max_tokens=60_000), timeout=30)
         assert answer.status_code == 504
         assert REASON in answer.json()["error"]["message"]
-
-
-def test_a_request_waits_no_longer_than_to_its_deadline() -> None:
-    turns = Turns(Limits(answer_s=0.05))
-    turns.join()
-    with pytest.raises(Overdue, match="is still waiting for the engine"):
-        turns.join().wait()
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import random
 import socket
 import time
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from threading import Event, Lock, Thread
+from threading import Event
 from typing import Any
 
 import httpx
@@ -16,10 +15,9 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, EngineError
-from s2a_bench.harness.serving import engine_handler
-from s2a_bench.testing.transport import ask, served, wiring_of
-from s2a_bench.trace import Trace, budget
-from s2a_bench.transport import Handler, open_client
+from s2a_bench.testing.transport import served, wiring_of
+from s2a_bench.trace import Trace
+from s2a_bench.transport import Handler
 from s2a_bench.transport.http.native import PATHS
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.serving import Queued, Turn, Turns
@@ -117,79 +115,6 @@ class TestTurns:
         assert queued.turns.join().has_started
 
 
-class Slow:
-    """An engine that answers with as many tokens as the prompt says, and notes when requests end."""
-
-    def __init__(self) -> None:
-        self.facts: dict[str, float] = {}
-        self.ended: list[str] = []
-
-    def generate(self, request: Request) -> Iterator[Token]:
-        for index in range(int(request.prompt)):
-            time.sleep(0.0005)
-            yield Token(index, "a")
-        self.ended.append(request.id)
-
-    def describe(self) -> dict[str, str | int | float | bool]:
-        return {}
-
-    def close(self) -> None:
-        pass
-
-
-class Accepting(Queued):
-    """A queue that notes in which order requests joined it."""
-
-    def __init__(self, inner: Queued) -> None:
-        super().__init__(inner.answer)
-        self.accepted: list[int] = []
-        join, lock = self.turns.join, Lock()
-        self.of: dict[str, int] = {}
-
-        def noting() -> Turn:
-            with lock:
-                turn = join()
-                self.accepted.append(id(turn))
-                self.kept.append(turn)
-                return turn
-
-        self.kept: list[Turn] = []
-        self.turns.join = noting  # type: ignore[method-assign]
-
-    def answer(self, request: Request, trace: Trace, turn: Turn) -> Generator[Token, None, None]:
-        self.of[request.id] = id(turn)
-        yield from super().answer(request, trace, turn)
-
-
-@pytest.mark.parametrize("name", ["http/as-deployed", "http/binary", "ros/topic", "ros/action", "shm"])
-def test_requests_end_in_the_order_of_their_acceptance(name: str) -> None:
-    engine = Slow()
-    accepting = Accepting(engine_handler(engine, pixels=False))
-    queued = []
-
-    def many(number: int, address: str) -> None:
-        client = open_client(wiring_of(name, address))
-        lengths = random.Random(number)
-        try:
-            for turn in range(10):
-                length = lengths.randint(1, 40)
-                tokens, trace = ask(client, Request(f"{number}-{turn}", str(length), max_tokens=40))
-                assert len(tokens) == length
-                queued.append("queue" in budget(trace.chain()).stages_ns)
-        finally:
-            client.close()
-
-    with serving(accepting, name) as address:
-        threads = [Thread(target=many, args=(number, address)) for number in range(5)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(60)
-    assert len(engine.ended) == 50
-    assert [accepting.of[name] for name in engine.ended] == accepting.accepted
-    assert any(queued)
-
-
 def ask_and_go(url: str, *, stream: bool, request_id: str, path: str = CHAT) -> socket.socket:
     """Send a request over a socket of its own, and do not read."""
     import json
@@ -200,28 +125,6 @@ def ask_and_go(url: str, *, stream: bool, request_id: str, path: str = CHAT) -> 
     connection = socket.create_connection((host, int(port)))
     connection.sendall(head.encode() + data)
     return connection
-
-
-@paths
-@pytest.mark.parametrize("stream", [True, False])
-def test_an_answer_whose_client_has_gone_stops_and_a_waiter_who_has_gone_never_begins(stream: bool, path: str) -> None:
-    gate = Gate()
-    queued = Queued.around(gate)
-    with serving(queued, SERVERS[path]) as url:
-        first = ask_and_go(url, stream=stream, request_id="first", path=path)
-        until(lambda: gate.began == ["first"])
-        waiting = ask_and_go(url, stream=stream, request_id="waiting", path=path)
-        until(lambda: queued.turns.waiting == 1)
-        last = ask_and_go(url, stream=stream, request_id="last", path=path)
-        until(lambda: queued.turns.waiting == 2)
-        waiting.close()
-        until(lambda: queued.turns.waiting == 1)
-        gate.go.set()
-        first.close()
-        until(lambda: gate.began == ["first", "last"])
-        assert gate.ended == ["first"]
-        last.close()
-        until(lambda: gate.ended == ["first", "last"])
 
 
 @paths

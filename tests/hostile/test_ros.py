@@ -16,7 +16,7 @@ import pytest
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Rejected, Result, Subscription, open_middleware
+from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Result, Subscription, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import STATUS_ARRAY, Status
 from s2a_bench.ros.config import domain_id
@@ -30,7 +30,6 @@ from s2a_bench.transport.ros.joining import join
 from s2a_bench.transport.ros.wire import READER_QOS, REQUEST_QOS, TOKEN_QOS, request_message, token_message
 from s2a_bench.transport.serving import Queued
 from s2a_bench.types import Request, Token
-from tests.hostile.test_deadline import Endless
 from tests.hostile.test_queue import Gate, serving
 from tests.hostile.wires.http import bomb, png_of_zeros
 from tests.waiting import until
@@ -65,29 +64,6 @@ def goals(stranger: Middleware) -> Callable[[], Any]:
         return client
 
     return connect
-
-
-def test_a_goal_too_many_is_rejected_at_once(goals: Callable[[], Any], caplog: pytest.LogCaptureFixture) -> None:
-    gate = Gate()
-    queued = Queued.around(gate, Limits(waiting=1))
-    with serving(queued, "ros/action"):
-        client = goals()
-        packed = client.pack(generate_goal("go", []))
-        first, second = client.send(packed), None
-        until(lambda: gate.began == [first.hex()])
-        second = client.send(client.pack(generate_goal("go", [])))
-        until(lambda: queued.turns.waiting == 1)
-        third = client.send(client.pack(generate_goal("go", [])))
-        assert next_of(client, Rejected).goal_id == third
-        lines = [line for line in caplog.messages if "are waiting for the engine already" in line]
-        assert lines == [
-            f"goal {third.hex()} rejected: 1 requests are waiting for the engine already; come again later"
-        ]
-        gate.go.set()
-        for goal_id in (first, second):
-            client.cancel(goal_id)
-        assert {next_of(client, Result).goal_id for _ in range(2)} == {first, second}
-        until(lambda: queued.turns.silent_s() == 0)
 
 
 def test_goals_of_five_clients_wait_as_accepted_and_end_in_the_order_of_their_acceptance(stranger: Middleware) -> None:
@@ -156,18 +132,6 @@ def test_a_goal_cancelled_while_it_waits_leaves_the_queue(goals: Callable[[], An
         client.cancel(first)
         assert next_of(client, Result).goal_id == first
         assert gate.began == [first.hex()]
-
-
-def test_a_request_whose_client_has_gone_lives_to_its_deadline_only() -> None:
-    engine, soon = Endless(), Limits(answer_s=4.0)  # enough for the short one on a machine at work
-    queued = engine_handler(engine, pixels=False, limits=soon)
-    with serving(queued, "ros/topic", soon) as address:
-        leaver, other = (open_client(wiring_of("ros/topic", address)) for _ in range(2))
-        next(iter(leaver.request(Request("a", "for ever", max_tokens=60_000), Trace())))
-        leaver.close()
-        until(lambda: engine.closed == 1)
-        assert len(ask(other, Request("b", "short", max_tokens=2))[0]) == 2
-        other.close()
 
 
 @pytest.mark.parametrize("variant", ["topic", "action"])

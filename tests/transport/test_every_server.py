@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from threading import Event, Thread
+from typing import Protocol
 
 import numpy as np
 import pytest
@@ -59,18 +60,19 @@ def recorder(name: str, pieces: int = 3) -> RecordingHandler:
     return RecordingHandler([[place / 8] for place in range(pieces)] if name in POLICIES else ["go "] * pieces)
 
 
-Connect = Callable[[], Client]
+class Connect(Protocol):
+    def __call__(self, timeout_s: float = 20) -> Client: ...
 
 
 @contextmanager
 def serving(name: str, handler: Handler, **limits: float) -> Iterator[Connect]:
-    """Serve within limits; yields what connects another client, which is closed in the end."""
+    """Serve within limits; yields what connects another client, of this patience, which is closed in the end."""
     wiring = replace(wiring_of(name), limits=Limits(**limits))
     with served(wiring, handler) as (server, _):
         clients: list[Client] = []
 
-        def connect() -> Client:
-            clients.append(open_client(wiring_of(name, server.address)))
+        def connect(timeout_s: float = 20) -> Client:
+            clients.append(open_client(wiring_of(name, server.address, timeout_s=timeout_s)))
             return clients[-1]
 
         try:
@@ -134,7 +136,7 @@ def test_a_client_that_compares_clocks_is_answered_in_its_turn_without_the_engin
 
 
 @every
-def test_one_too_many_is_refused_at_once(name: str) -> None:
+def test_one_too_many_is_refused_at_once(name: str, caplog: pytest.LogCaptureFixture) -> None:
     gate = Gate(name)
     with serving(name, gate, waiting=0) as connect:
         first = Asking(connect(), "first")
@@ -145,6 +147,26 @@ def test_one_too_many_is_refused_at_once(name: str) -> None:
         gate.go.set()
         assert len(first.end().pieces) == 2
     assert gate.began == ["first"]
+    logged = [line for line in caplog.messages if "0 requests are waiting for the engine already" in line]
+    assert len(logged) == name.startswith("ros/")  # where a rejected goal hears no reason
+
+
+@pytest.mark.parametrize("name", [name for name in EVERY if name not in {"ros/topic", "ros/action"}])
+def test_one_that_goes_while_it_waits_gives_its_place_up_and_never_begins(name: str) -> None:
+    gate = Gate(name)
+    queued = Queued.around(gate, Limits(waiting=1))
+    with serving(name, queued) as connect:
+        first = Asking(connect(), "first")
+        until(lambda: gate.began)
+        for _ in range(3):
+            gone = connect(timeout_s=0.5)
+            assert Asking(gone, "gone").end().error
+            gone.close()
+            until(lambda: queued.turns.waiting == 0)
+        gate.go.set()
+        assert len(first.end().pieces) == 2
+        assert len(ask(connect(), Request("b", "last"))[0]) == 2
+    assert gate.began == ["first", "last"]
 
 
 @every

@@ -267,12 +267,3 @@ def test_both_codecs_write_the_same_wire(codec: native.Codec) -> None:
     assert codec.from_base64(codec.to_base64(data)) == bytes(range(256))
     assert codec.loads(codec.dumps({"a": ["ü", 1, None]})) == {"a": ["ü", 1, None]}
     assert codec.dumps({"a": ["ü", 1]}) == '{"a":["ü",1]}'.encode()
-
-
-def test_marks_survive_the_wire() -> None:
-    trace = Trace()
-    trace.mark("network")
-    trace.facts["prompt_n"] = 5.0
-    trace.token_ns.append(17)
-    remote = trace.to_remote()
-    assert Remote.of_json(json.loads(json.dumps(remote.to_json()))) == remote

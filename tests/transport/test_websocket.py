@@ -306,19 +306,6 @@ def test_a_message_that_does_not_end_is_given_up() -> None:
     assert code == 1008
 
 
-def test_those_that_wait_are_answered_in_turn_and_one_that_goes_gives_its_place_up() -> None:
-    handler = Slow()
-    with serving(handler) as server, ExitStack() as stack:
-        sockets = [stack.enter_context(robot(server.address))[0] for _ in "abc"]
-        for socket in sockets:
-            socket.send(packb({"prompt": "go"}))
-        assert handler.began.wait(20)
-        sockets[1].close()
-        handler.go.set()
-        for socket in (sockets[0], sockets[2]):
-            assert unpackb(socket.recv(timeout=20))["actions"].shape == (4, 3)
-
-
 def test_one_that_goes_with_bytes_unread_behind_its_request_does_not_keep_the_engine() -> None:
     ended = Event()
 

@@ -309,27 +309,6 @@ class TestServer:
             asking.join()
         np.testing.assert_array_equal(answers[0]["action.robot"], CHUNK[:1])
 
-    def test_who_goes_leaves_the_queue(self) -> None:
-        held = Held()
-        with serving(held, Limits(waiting=1)) as server, ExitStack() as stack:
-            turns = server._core.queued.turns  # type: ignore[attr-defined]
-            first, last = (stack.enter_context(plain(server.address)) for _ in range(2))
-            asking = Thread(target=lambda: first("get_action", flat(), s2a={"id": "first"}))
-            asking.start()
-            assert held.begun.wait(20)
-            for _ in range(5):  # each has the one place, until it goes
-                context = zmq.Context()
-                gone = context.socket(zmq.REQ)
-                gone.connect(server.address)
-                gone.send(msgpack.packb({"data": flat(), "s2a": {"id": "gone"}}, default=encoded))
-                until(lambda: turns.waiting == 1)
-                context.destroy(0)
-                until(lambda: turns.waiting == 0)
-            held.let.set()
-            asking.join()
-            assert "action.robot" in last("get_action", flat(), s2a={"id": "last"})
-        assert held.ids == ["first", "last"]
-
     def test_without_its_key_nothing_is_told(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("ROBOT_KEY", KEY)
         handler = RecordingHandler(list(CHUNK))
