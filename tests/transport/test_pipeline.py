@@ -58,7 +58,7 @@ def test_options_hold_for_every_variant_that_is_meant() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("ros/topic?wire=bgr", "ros has no option 'wire'; it has payload, action, namespace"),
+        ("ros/topic?wire=bgr", "ros has no option 'wire'; it has payload, action, url, namespace"),
         ("ros?payload", "'ros?payload' should look like ros?option=value"),
         ("http?port=x", "`port`: 'x' should be a valid integer"),
         ("ros?router=7447", "'7447' should look like tcp/127.0.0.1:7447"),
