@@ -58,7 +58,6 @@ class Profile:
 
     @property
     def dummy(self) -> bool:
-        """Whether it was captured from a model with dummy weights."""
         return self.facts.get("model", {}).get("dummy") is True
 
     @property
@@ -170,7 +169,6 @@ def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def search_path() -> list[Path]:
-    """Return the folders that are searched for a name, in their order."""
     config = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
     return [Path("profiles"), config / "s2a-bench" / "profiles", SHIPPED]
 

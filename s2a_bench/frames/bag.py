@@ -33,11 +33,7 @@ MOST_QUOTED = 300
 class Recording(NumberedSource):
     """A recorded image topic as a camera, in the recorded encoding; CompressedImage is decoded to ``bgr8``.
 
-    ``where`` is the recording's path, then ``?topic=/name`` for another topic than its first with images. Pictures of
-    another size are scaled; YUYV, which cannot be scaled, is then converted to ``bgr8``. After the last picture it
-    starts over. read() reads the file step by step and never waits for the recorded rate; ``fps`` and ``seed`` have no
-    effect. Stamps are those of reading, as from any camera. Raises SourceError for a recording that is missing,
-    damaged, or without such a topic.
+    YUYV, which cannot be scaled, is converted to ``bgr8`` for another size. Stamps are those of reading.
     """
 
     where: ClassVar[str] = "FILE[?topic=/NAME]"

@@ -14,12 +14,7 @@ from s2a_bench.types import Encoding, Pixels
 
 
 class VideoFile(NumberedSource):
-    """A video file as a camera: (h, w, 3) ``bgr8``, resized if the file's size differs.
-
-    After the last frame it starts over, so pictures repeat. read() decodes on one thread and never waits for the
-    file's frame rate: unlike with a camera, capture includes decoding. ``fps`` and ``seed`` have no effect.
-    Raises SourceError for a missing file, or one that is no video.
-    """
+    """A video file as a camera: (h, w, 3) ``bgr8``; unlike with a camera, capture includes decoding."""
 
     where: ClassVar[str] = "FILE"
     encoding: Encoding = "bgr8"
@@ -61,12 +56,10 @@ LIMIT_BYTES = 2**30
 
 
 class ImageFolder(NumberedSource):
-    """A folder of pictures as a camera: (h, w, 3) ``bgr8``, resized if a picture's size differs.
+    """A folder of pictures as a camera: (h, w, 3) ``bgr8``.
 
-    All pictures are decoded when the source opens, so that an unreadable one fails at once and capture costs a copy,
-    as from a camera. Files of other kinds and subfolders are skipped. After the last picture it starts over. ``fps``
-    and ``seed`` have no effect. Raises SourceError for a folder that is missing, empty, too large to hold decoded, or
-    has an unreadable picture.
+    All are decoded when the source opens, so that an unreadable one fails at once and capture costs a copy, as from a
+    camera.
     """
 
     where: ClassVar[str] = "FOLDER"

@@ -30,9 +30,8 @@ PERIODS_S = (11.0, 7.0)
 class SyntheticCamera(NumberedSource):
     """A window moving over a rendered scene: (h, w, 2) ``yuv422_yuy2``.
 
-    The same size, ``fps`` and ``seed`` give the same frames. ``fps`` sets how far the window moves between two
-    frames; read() never waits. The noise moves with the scene, unlike a sensor's, which is new in every frame.
-    Raises UsageError for an odd or tiny size.
+    ``fps`` sets how far the window moves between two frames. The noise moves with the scene, unlike a sensor's, which
+    is new in every frame.
     """
 
     where: ClassVar[str] = ""

@@ -29,9 +29,7 @@ class V4L2Camera(NumberedSource):
     """A V4L2 capture device: (h, w, 2) ``yuv422_yuy2``, not converted.
 
     ``stamp_ns`` is the driver's time of capture if it stamps with CLOCK_MONOTONIC, as USB cameras do, else the time of
-    arrival. read() skips frames that grew old in the driver's queue. ``where`` is ``/dev/video0`` or ``0``; ``fps`` is
-    the requested rate, ``self.fps`` the one that the camera reports.
-    Raises UsageError for an odd width, SourceError if the device cannot be used or offers no such frames.
+    arrival. read() skips frames that grew old in the driver's queue. ``self.fps`` is the rate that the camera reports.
     """
 
     where: ClassVar[str] = "DEVICE"

@@ -94,13 +94,7 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
 
 
 class LlamaCppEngine(Engine):
-    """A GGUF model on this machine. ``facts`` holds numbers of the last request, under llama-server's names.
-
-    ``prompt_n`` is llama.cpp's count of evaluated tokens, pictures included; ``prompt_ms`` is the time from the request
-    to the first token's logits, of which ``preprocess_ms`` passed before the model (slicing, resizing, tokenising),
-    ``vision_encode_ms`` in the vision tower and ``prompt_eval_ms`` in the language model. ``predicted_n`` tokens took
-    ``predicted_ms`` from there to the last, ``first_decode_ms`` of it from the first to the second.
-    """
+    """A GGUF model on this machine. ``facts`` holds numbers of the last request, under llama-server's names."""
 
     def __init__(self, config: EngineConfig) -> None:
         """Load both files; raises UsageError for layers on a GPU that this build cannot use, ModelError."""

@@ -82,11 +82,7 @@ def give_back_memory() -> None:
 
 
 def limit_threads() -> None:
-    """Limit OpenCV and numeric libraries to one thread each, unless the user set it; llama.cpp has its own flag.
-
-    A conversion of a picture takes a fraction of a millisecond: OpenCV's worker threads save little of it and compete
-    with the model and the middleware for cores, which disturbs the measurement.
-    """
+    """Limit OpenCV and numeric libraries to one thread each, unless the user set it: more would compete for cores."""
     if _undo is None:
         return
     for name in set(SINGLE_THREADED) - set(os.environ):

@@ -469,7 +469,6 @@ class ServedAction(Generic[Caller]):
                 self._get_result.respond(packed, caller)
 
     def _pack_result(self, status: Status, result: Any) -> bytearray:
-        """Serialise a result reply once for all callers."""
         response = ros.typestore(self.version).types[self._get_result.reply_type]
         return self._get_result.pack(response(status=int(status), result=result))
 

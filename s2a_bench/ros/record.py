@@ -80,9 +80,8 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
     def write(self, topic: str, type_name: str, cdr_or_message: Any, stamp_ns: int) -> None:
         """Note one message of ROS type ``pkg/msg/Name`` on the absolute topic ``/x``, from any thread, in microseconds.
 
-        ``cdr_or_message`` is CDR with its header (bytes, bytearray or memoryview) or a message of
-        `s2a_bench.ros.messages`, serialised when it is written down. It is not copied: leave it as it is afterwards.
-        ``stamp_ns`` is ROS time, ns since 1970. Raises StoreError once closed, or when writing has failed.
+        ``cdr_or_message`` is CDR with its header, or a message, serialised when it is written down. It is not copied:
+        leave it as it is afterwards. ``stamp_ns`` is ROS time. Raises StoreError once closed, or when writing failed.
         """
         if self._closed:
             raise StoreError(f"`record`: {self.path} is closed")

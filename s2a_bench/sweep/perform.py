@@ -43,7 +43,6 @@ def perform(cell: SweepCell, folder: Path, entry: str) -> Outcome:
 
 
 def run_folder(folder: Path) -> Path | None:
-    """Return the run folder in a cell's folder, None if there is none."""
     return next((path.parent for path in folder.glob(f"*/{manifests.NAME}")), None)
 
 
@@ -114,7 +113,6 @@ class LocalWorkers(CellWorkers):
         return self._pools[virtual]
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Close the pools; after an exception end their processes."""
         for pool in self._pools.values():
             pool.shutdown(wait=kind is None, cancel_futures=True)
         if kind is not None:

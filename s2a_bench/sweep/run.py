@@ -204,7 +204,6 @@ def facts_of(environment: dict[str, Any], names: tuple[str, ...] = IDENTITY) -> 
 
 
 def difference(now: dict[str, Any], then: dict[str, Any]) -> str:
-    """Return a text of the facts that differ, "" if none does."""
     names = [name for name in IDENTITY if now.get(name) != then.get(name)]
     return ", ".join(f"{name} is {_plain(now.get(name))}, was {_plain(then.get(name))}" for name in names)
 

@@ -107,11 +107,10 @@ def pipelines(
 ) -> list[Pipeline]:
     """Return the pipelines that names stand for, each once; raises UsageError.
 
-    ``options`` (transport -> option -> value) come from flags; options in a name take precedence. A name without a
-    payload stands for a pipeline with each of the ``payloads`` that it can carry in the ``mode``; if it can carry none
-    of them it gets the first if ``strict``, which `require_payload` refuses, else its default. A name without a variant
-    stands for ``every`` variant that is measured by default, which may depend on the ``engine``, or for the first of
-    them. ``of_engine`` are options of the engine that names may hold as well.
+    Options in a name take precedence over ``options`` (transport -> option -> value). A name without a payload stands
+    for each of the ``payloads`` that it can carry in the ``mode``; if it can carry none it gets the first if
+    ``strict``, which `require_payload` refuses, else its default. A name without a variant stands for ``every`` variant
+    that is measured by default, or for the first. ``of_engine`` are options of the engine that names may hold as well.
     """
     given = {name: dict(values) for name, values in (options or {}).items()}
     found: dict[str, Pipeline] = {}

@@ -65,7 +65,6 @@ def is_local(host: str) -> bool:
 
 
 def plain_text(address: SplitResult) -> Finding:
-    """Return whether others can read and change pictures, keys and actions on the network."""
     host, port = address.hostname or "", address.port or "PORT"
     if address.scheme in ENCRYPTED:
         return Finding("plain-text", "state", f"the connection to {host} is encrypted")

@@ -46,7 +46,6 @@ def _applies(requirement: Requirement, extra: str = "") -> bool:
 
 
 def installed(package: str) -> str:
-    """Return a package's version, "" if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

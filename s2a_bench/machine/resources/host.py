@@ -22,8 +22,6 @@ def cpu_clock(pid: int) -> int:
 
 
 class CpuTimes:
-    """CPU time of this process (``client``) and of all servers together."""
-
     cheap = True
 
     def __init__(self, pids: Sequence[int]) -> None:
@@ -47,8 +45,6 @@ class CpuTimes:
 
 
 class HostMemory:
-    """Resident memory, and how busy all CPUs are, as /proc says."""
-
     cheap = False
 
     def __init__(self, pids: Sequence[int], root: Path = PROC) -> None:

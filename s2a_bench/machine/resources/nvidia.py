@@ -118,7 +118,6 @@ class Tegrastats:
     cheap = False
 
     def __init__(self, pids: Sequence[int] = ()) -> None:  # noqa: ARG002 - the whole board's
-        """Start the program; raises Unreadable if it is not installed."""
         program = shutil.which("tegrastats")
         if program is None:
             raise Unreadable("no tegrastats: this is no Jetson, or the program is not in the container")
