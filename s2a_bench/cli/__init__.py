@@ -37,6 +37,11 @@ class TopCommands(Commands):
         name: (f"s2a_bench.cli.{where}", about)
         for name, where, about in (
             (
+                "advise",
+                "report:advise",
+                "Advise on a transport for a link, from a sweep of transports: what is fastest.",
+            ),
+            (
                 "compare",
                 "report:compare",
                 "Compare run B with run A: effect sizes with intervals, one test, gates for CI.",

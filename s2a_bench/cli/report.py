@@ -1,14 +1,23 @@
-"""`compare`: changes between runs, and gates on them; `report`: runs as one page, or as files for a paper."""
+"""`compare`: changes between runs, and gates; `report`: a page or files of runs; `advise`: a transport for a link."""
 
 from __future__ import annotations
+
+import statistics
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from s2a_bench.cli.adapter import command
 from s2a_bench.cli.output import Json, print_error, print_json, print_line, print_table
 from s2a_bench.errors import TRIPPED, UNDECIDED
+from s2a_bench.report.advise import CHECKED, AdviseConfig
 from s2a_bench.report.compare import CompareConfig
 from s2a_bench.report.page import ReportConfig
+
+if TYPE_CHECKING:
+    from s2a_bench.progress import Progress
 
 
 def _compare(config: CompareConfig, *, json_: Json = False) -> None:
@@ -66,3 +75,51 @@ def _report(config: ReportConfig) -> None:
 
 
 report = command(_report, ReportConfig)
+
+
+def _advise(
+    config: AdviseConfig,
+    *,
+    output: Annotated[Path, typer.Option(help="folder for the runs of --check")] = Path("results"),
+    json_: Json = False,
+) -> None:
+    from s2a_bench.cli.progress import RunProgress
+    from s2a_bench.report.advise import advice_json, advice_table, advise, sentence
+
+    found, profile, origin = advise(config)
+    if config.measure:
+        with RunProgress("samples") as progress:
+            found[:CHECKED] = [
+                replace(each, measured_ms=_measured_ms(config, each.name, output, progress)) for each in found[:CHECKED]
+            ]
+    if json_:
+        print_json(advice_json(found, config, profile, origin))
+        return
+    print_table(table := advice_table(found, config, profile, origin))
+    for line in (*table.notes, sentence(found, config, profile)):
+        print_line(line)
+
+
+def _measured_ms(config: AdviseConfig, name: str, output: Path, progress: Progress) -> float:
+    """Return the median of a pipeline's e2e without inference on the emulated link, in ms."""
+    from s2a_bench.experiments.latency.config import LatencyConfig
+    from s2a_bench.experiments.latency.run import run_latency
+    from s2a_bench.experiments.latency.view.against_bytes import METRIC
+    from s2a_bench.experiments.requests import cells_of
+    from s2a_bench.inference import STAND_IN, EngineConfig
+    from s2a_bench.store.run import read_run
+
+    requests = LatencyConfig(
+        transports=(name,),
+        link=config.link,
+        engine=EngineConfig(name=STAND_IN, answer="actions"),
+        size=config.size,
+        cameras=config.cameras,
+        state=14,
+        requests=30,
+    )
+    (cell,) = cells_of(read_run(run_latency(requests, output, progress)))
+    return float(statistics.median(cell.values_ms(METRIC)))
+
+
+advise = command(_advise, AdviseConfig)

@@ -7,6 +7,7 @@ a line, so the intervals, Student's t of the distances, hold both.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -23,14 +24,28 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """``y = fixed + slope x``; ``off`` is the root mean square of its distances from the points, as shares of them."""
+    """``y = fixed + slope x``; ``off`` is the root mean square of its distances from the points, as shares of them.
+
+    ``spread`` is half of a point's 95 % interval around the true line, as a share of it, and ``covariance`` what it
+    adds for the line's own, both with Student's t; None for two points.
+    """
 
     fixed: Estimate
     slope: Estimate
     off: float
+    spread: float | None = None
+    covariance: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of fixed and fixed, fixed and slope, slope and slope."""
 
     def at(self, x: float) -> float:
         return self.fixed.value + self.slope.value * x
+
+    def reach(self, x: float) -> float | None:
+        """Return half of the 95 % interval of a new point at ``x``; None for a line of two points."""
+        if self.spread is None:
+            return None
+        first, both, second = self.covariance
+        return self.spread * math.sqrt(self.at(x) ** 2 + first + 2 * both * x + second * x * x)
 
 
 def fit_line(launches: Iterable[tuple[float, float]]) -> Line | None:
@@ -56,4 +71,6 @@ def fit_line(launches: Iterable[tuple[float, float]]) -> Line | None:
         reach = float(stats.t.ppf(0.975, freedom) * np.sqrt(covariance[place, place] * squares / freedom))
         return Estimate(value, (value - reach, value + reach))
 
-    return Line(estimate(0), estimate(1), float(np.sqrt(squares / len(points))))
+    spread = float(stats.t.ppf(0.975, freedom) * np.sqrt(squares / freedom)) if freedom else None
+    of = (float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1]))
+    return Line(estimate(0), estimate(1), float(np.sqrt(squares / len(points))), spread, of)

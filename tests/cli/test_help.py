@@ -85,7 +85,7 @@ def test_the_version_is_printed() -> None:
     ("line", "offered"),
     [
         ("thr", "throughput"),
-        ("model ", "dummy fetch info"),
+        ("model ", "dummy fetch"),
         ("latency --fl", "--flash-attention"),
         ("latency --transport http,ros", "http,ros http,ros/topic http,ros/action"),
         ("serve http/b", "http/best-effort http/binary"),
@@ -95,7 +95,7 @@ def test_the_version_is_printed() -> None:
         ("ccrb --profile j", "jetson-agx-orin jetson-orin-nano"),
         ("timeline --policy naive,s2a", "naive,s2a-clairvoyant naive,s2a-mean"),
         ("chunks --modes q", "queue"),
-        ("sweep ", "paper quick transports"),
+        ("sweep ", "links paper quick transports"),
         ("profile show r", "rtx-4080"),
     ],
 )

@@ -68,3 +68,19 @@ def test_what_is_no_line_says_so() -> None:
     line = fit_line([(x, 1 + x**2) for x in SIZES])
     assert line is not None
     assert line.off > 0.3
+
+
+@pytest.mark.parametrize("spread", [0.05, 0.13])
+def test_a_new_point_lies_within_reach_of_the_line(spread: float) -> None:
+    held, at = 0, 1.5
+    for seed in range(400):
+        line = fit_line(measured(seed, spread=spread, launches=1))
+        assert line is not None
+        reach = line.reach(at)
+        assert reach is not None
+        new = (0.3 + 0.7 * at) * np.random.default_rng(seed + 1000).lognormal(0, spread)
+        held += abs(new - line.at(at)) <= reach
+    assert abs(held / 400 - 0.95) < 0.035
+    two_points = fit_line([(1, 1.0), (2, 1.5)])
+    assert two_points is not None
+    assert two_points.reach(1) is None

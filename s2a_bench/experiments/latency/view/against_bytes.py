@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 METRIC = "e2e_without_inference"
+CODING = ("encode", "decode")
 MB = 1e6
 FITTED = (
     "e2e without inference = fixed + ms a MB x MB of the pictures as pixels (width x height x 3 x cameras), fitted by "
@@ -65,6 +66,8 @@ class FittedPipeline:
     bounds: list[tuple[float, float]]
     """(MB, median bound in ms) of each run on a link, by size."""
     line: Line | None
+    coding: Line | None
+    """Of encoding and decoding alone."""
     wire_share: float | None
     """Bytes on the wire for each byte of the pixels; None in process, or if unknown."""
     has_ingest: bool
@@ -106,9 +109,14 @@ def _pipeline(name: str, payload: str, cells: Sequence[tuple[int, int, RequestCe
     ]
     wire_share = float(np.median(shares)) if shares else None
     first = cells[0][2]
-    return FittedPipeline(
-        name, payload, first.path, sizes, medians, bounds, fit_line(medians), wire_share, first.has_ingest
-    )
+    coding = [
+        (pixels / MB, ms)
+        for _, pixels, cell in cells
+        if (ms := sum(float(np.median(of)) for group in CODING if (of := cell.group_ms(group)).size))
+    ]
+    line = fit_line(medians)
+    path, ingest = first.path, first.has_ingest
+    return FittedPipeline(name, payload, path, sizes, medians, bounds, line, fit_line(coding), wire_share, ingest)
 
 
 def _pixels(run: StoredRun) -> int:
