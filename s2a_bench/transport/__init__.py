@@ -14,14 +14,8 @@ To add a transport, write a package with a module like this and register its ins
         payloads = ("raw",)                         # the first is the default where raw is not possible
         stages = {"frame_length": "pack"}           # marked by its client or server, in addition to trace.STAGES
         facts = (PAYLOAD_BYTES,)                    # numbers beside the marks; new ones as facts.Fact(...)
-
-        def client(self, wiring, alive):
-            from toy.client import ToyClient        # heavy imports belong here
-            return ToyClient(wiring, alive)
-
-        def server(self, wiring, handler):
-            from toy.server import ToyServer        # enforces wiring.limits
-            return ToyServer(wiring, handler)
+        client_class = "toy.client:ToyClient"       # loaded when it is needed; made of wiring and alive
+        server_class = "toy.server:ToyServer"       # made of wiring and handler; enforces wiring.limits
 
     TOY = Toy()
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 from s2a_bench.facts import PAYLOAD_BYTES, Fact
 from s2a_bench.options import option
-from s2a_bench.transport import SERVER, Client, Handler, TransportOptions, Server, Transport, Wiring
-
+from s2a_bench.transport import SERVER, TransportOptions, Transport
 
 TOY_MESSAGES = Fact("toy_messages", "messages", "messages of the answer")
 
@@ -32,18 +31,8 @@ class Toy(Transport[ToyOptions]):
     facts = (PAYLOAD_BYTES, TOY_MESSAGES)
     stages: ClassVar[Mapping[str, str]] = {"toy_frame": "pack", "toy_unframe": "parse"}
     style: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#8C564B", "-")}
-
-    def client(self, wiring: Wiring[ToyOptions], alive: Callable[[], bool]) -> Client:
-        """Connect to the server at ``wiring.address``."""
-        from s2a_toy.wire import ToyClient
-
-        return ToyClient(wiring, alive)
-
-    def server(self, wiring: Wiring[ToyOptions], handler: Handler) -> Server:
-        """Bind a server."""
-        from s2a_toy.wire import ToyServer
-
-        return ToyServer(wiring, handler)
+    client_class = "s2a_toy.wire:ToyClient"
+    server_class = "s2a_toy.wire:ToyServer"
 
 
 TOY = Toy()
