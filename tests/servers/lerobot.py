@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import pickle
 import struct
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -164,3 +165,15 @@ def grpc_server(handlers: Sequence[Any] = (), port: int = 0) -> Iterator[str]:
         yield f"grpc://127.0.0.1:{port}"
     finally:
         server.stop(0).wait(20)
+
+
+def main() -> None:
+    """Serve chunks of 16 x 7 at once, at the port of the command line, until it ends."""
+    rows = np.zeros((16, 7), np.float32)
+    server = PolicyServer(lambda observation: chunk(observation.timestamp, rows))
+    with grpc_server([server.handlers()], int(sys.argv[1])):
+        Event().wait()
+
+
+if __name__ == "__main__":
+    main()
