@@ -178,6 +178,7 @@ def test_the_log_has_each_reason_once_whatever_their_order(robot: Robot, caplog:
     good = ros.image_message(Frame(0, 0, 4, 4, "mono8", np.zeros((4, 4), np.uint8)), 1, "c")
     encodings = [{"encoding": each} for each in ("16UC1", "32FC1", "yuv9", "", "bgr8")]
     bad = [*encodings, {"width": 0}, {"height": 0}, {"height": 5}]
+    until(lambda: publisher.matched() == 1)
     for changes in (*bad, *bad, {}):  # each is taken before the next is sent
         count = cache._count
         publisher.send(publisher.pack(replace(good, **changes)))
@@ -193,6 +194,7 @@ def test_ages_by_stamps_are_in_the_time_of_clock(
     options = wiring.options.but(use_sim_time=True, max_frame_age=60)
     robot = Robot(stack, replace(wiring, options=options))
     client, publisher, cache = robot.client(), robot.camera(), robot.server._cache
+    until(lambda: publisher.matched() == 1)
     publisher.send(publisher.pack(ros.image_message(yuyv_frame(), 2_000_000_000, "camera")))
     until(lambda: cache._newest is not None)
     ages = {"camera_stamp_age_ms", "camera_sim_age_ms"}
