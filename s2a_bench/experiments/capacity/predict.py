@@ -119,6 +119,7 @@ def run_predicted(config: CapacityConfig, output: Path, progress: Progress) -> P
     }
     with RunWriter.create(output, "capacity", manifest, (FLEETS, KNEES)) as writer:
         progress.opened(writer.path)
+        progress.say(f"service times: {service.about}")
         for mode in config.made if config.load == "chunks" else ("",):
             name = f"{service.source.name}, {mode}" if mode else service.source.name
             prediction = Prediction(config, name, mode, service, slower, progress)
