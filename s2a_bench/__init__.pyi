@@ -202,7 +202,9 @@ class _Chunks(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThro
     slowest: float
     tokens_per_action: int
 
-class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, _LatencyThroughput, total=False):
+class _Latency(
+    _Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, _LatencyThroughput, total=False
+):
     action_dim: int
     answer: Literal["auto", "tokens", "actions"]
     context: int
@@ -219,7 +221,9 @@ class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThr
     seed: int
     threads: int
 
-class _Throughput(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, _LatencyThroughput, total=False):
+class _Throughput(
+    _Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, _LatencyThroughput, total=False
+):
     batch: int
     context: int
     engine: str
