@@ -231,7 +231,9 @@ def test_runs_of_two_commands_are_never_compared(launch: Launch, tmp_path: Path)
     with RunWriter.create(tmp_path, "boundary", MANIFEST) as other:
         pass
     computed = read_run(other.path)
-    with pytest.raises(UsageError, match="runs of boundary cannot be compared, only those of latency, throughput"):
+    with pytest.raises(
+        UsageError, match="runs of boundary cannot be compared, only those of capacity, latency, throughput"
+    ):
         opened(computed, computed)
 
 

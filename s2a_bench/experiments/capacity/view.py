@@ -40,7 +40,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
         sentences=[*_knee_sentences(run), *_parted(run)],
         tables={"capacity": _table(run, MAIN), "robots": _table(run, REST)},
         main=["capacity"],
-        csvs={"capacity.csv": CsvTable.of_frame(run.table(FLEETS))},
+        csvs={"capacity.csv": CsvTable.of_frame(run.table(FLEETS).drop(columns=PROVENANCE))},
         figures={"capacity": partial(build_capacity, run)} if len(_fleets(run)) else {},
         json=lambda: frame(run, [present(CapacityCell(**row)) for row in _fleets(run)], [], knees=_rows(run, KNEES)),
     )

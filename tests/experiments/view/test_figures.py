@@ -23,7 +23,7 @@ from s2a_bench.writers.style import paper_column
 Make = Callable[[Path, Any], StoredRun]
 FIGURES = {
     "boundary": ("boundary",),
-    "capacity": (),
+    "capacity": ("capacity",),
     "ccrb": ("scenario", "phase"),
     "chunks": ("lanes", "stability", "triggers", "reactions", "smoothness"),
     "latency": ("latency_bars", "stages", "distribution"),
@@ -47,11 +47,7 @@ def measured(name: str, _: Path, make_run: Any) -> StoredRun:
 
 RUNS: dict[str, Make] = {
     "boundary": partial(computed, "boundary", BoundaryConfig(points=5, most_tokens=3)),
-    "capacity": partial(
-        computed,
-        "capacity",
-        CapacityConfig(robots="1", seconds=0.2, settle_s=0, looks=1, requests={"transports": ("loopback",)}),
-    ),
+    "capacity": partial(computed, "capacity", CapacityConfig(predict="40", robots="1..2", seconds=1)),
     "ccrb": partial(computed, "ccrb", CcrbConfig(phase=True, phase_points=(3, 2))),
     "chunks": partial(computed, "chunks", ChunksConfig(cycles=50)),
     "latency": partial(measured, "latency"),
