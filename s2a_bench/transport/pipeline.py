@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, TypeVar
 from urllib.parse import parse_qsl, quote
 
@@ -34,7 +35,7 @@ from s2a_bench.transport import (
 O = TypeVar("O", bound=TransportOptions)  # noqa: E741 - the one type variable here
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Pipeline:
     name: str
     """The name of its cell: canonical, unless a command chooses another."""
@@ -52,11 +53,11 @@ class Pipeline:
     def black_box(self) -> bool:
         return bool(self.options.external)
 
-    @property
+    @cached_property
     def capabilities(self) -> Capabilities[Any]:
         return self.transport.capabilities(Choice(self.options, self.variant))
 
-    @property
+    @cached_property
     def server(self) -> tuple[object, ...]:
         """The key of a server: cells that have it in common share one."""
         kind = "" if self.black_box else self.capabilities.server
