@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import AfterValidator
 
-from s2a_bench.boards.links import LinkProfile, bound_s, load_link, published
+from s2a_bench.boards.links import Direction, LinkProfile, bound_s, load_link, published
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.view.against_bytes import FittedPipeline, against_bytes
 from s2a_bench.experiments.requests import split
@@ -25,11 +25,14 @@ from s2a_bench.stats.line import Line
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.store.sweep import is_sweep, read_sweep
 from s2a_bench.transport import declared_transport
+from s2a_bench.transport.pipeline import pipelines
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
 REFERENCE: Final = Path(__file__).resolve().parents[2] / "results" / "reference" / "transports"
 HEADERS: Final = 1500 / 1448
 """Bytes of IP packets for each byte of a body over TCP: Ethernet's 1,500 with time stamps."""
+BBR_GAIN: Final = 2.89
+"""Of the rate at which BBR's start sends, over the rate that it has seen (Cardwell et al., 2016): 2 / ln 2."""
 RATE_OFF, DELAY_OFF_MS = 0.05, 0.3
 """By how much a link may be off its profile: a share of its rate, and in one direction."""
 CHECKED: Final = 2
@@ -37,7 +40,8 @@ CHECKED: Final = 2
 MB: Final = 1e6
 PREDICTION: Final = (
     "End to end without inference: the sweep's line at this size of pictures, and the link. Intervals: 95 % (Student's "
-    "t) of a launch around the line, and the 5 % and 0.3 ms a way by which a link may be off its profile."
+    "t) of a launch around the line, the 5 % and 0.3 ms a way by which a link may be off its profile, and half of what "
+    "jitter and the pacing of this host's TCP (BBR) add."
 )
 BOUND: Final = (
     "Bound: the link alone, with the bytes that the pipeline sends. Pictures are the sweep's: others are coded to more "
@@ -158,11 +162,13 @@ def _advice(pipeline: FittedPipeline, line: Line, profile: LinkProfile, config: 
     up, down = link = profile.directions()
     size = (pipeline.wire_share or 0.0) * config.pixels_mb * MB
     jitter_ms = up.jitter_ms + down.jitter_ms  # a uniform share of it each way
-    link_ms = bound_s(link, size * HEADERS) * 1e3 + jitter_ms / 2
+    least_ms = bound_s(link, size * HEADERS) * 1e3
+    paced_ms = max(0.0, _pacing_ms(pipeline, link) - (least_ms - bound_s(link, 0) * 1e3))
+    link_ms = least_ms + paced_ms + jitter_ms / 2
     work_ms = line.at(config.pixels_mb)
     reach_ms = line.reach(config.pixels_mb)
     e2e_ms = work_ms + link_ms
-    off_ms = 2 * DELAY_OFF_MS + RATE_OFF * (link_ms - bound_s(link, 0) * 1e3) + jitter_ms / 2
+    off_ms = 2 * DELAY_OFF_MS + RATE_OFF * (least_ms - bound_s(link, 0) * 1e3) + (jitter_ms + paced_ms) / 2
     ends_ms = None if reach_ms is None else (max(0.0, e2e_ms - reach_ms - off_ms), e2e_ms + reach_ms + off_ms)
     load = size * HEADERS * 8e-6 * config.rate / up.mbps
     low, high = ends_ms or (e2e_ms, e2e_ms)
@@ -170,6 +176,24 @@ def _advice(pipeline: FittedPipeline, line: Line, profile: LinkProfile, config: 
     coding_ms = 0.0 if pipeline.coding is None else pipeline.coding.at(config.pixels_mb)
     bound_ms = bound_s(link, size) * 1e3
     return Advice(pipeline.name, pipeline.payload, e2e_ms, ends_ms, link_ms, coding_ms, bound_ms, load, meets)
+
+
+def _pacing_ms(pipeline: FittedPipeline, link: tuple[Direction, Direction]) -> float:
+    """Return the least time of a body over this host's TCP if that is BBR; 0 for other TCP, and over UDP.
+
+    BBR paces a body at `BBR_GAIN` times the rate that it has seen, and has seen one body a round trip. So a body takes
+    t = (RTT + t) / `BBR_GAIN`, whatever its size, if the link is faster than that.
+    """
+    if _congestion_control() != "bbr" or pipelines([pipeline.name])[0].options.datagrams:
+        return 0.0
+    return (link[0].delay_ms + link[1].delay_ms) / (BBR_GAIN - 1)
+
+
+def _congestion_control() -> str:
+    try:
+        return Path("/proc/sys/net/ipv4/tcp_congestion_control").read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
 
 
 def advice_table(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile, provenance: str) -> TextTable:

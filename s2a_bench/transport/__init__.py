@@ -119,6 +119,11 @@ class TransportOptions(base.Options):
         return True
 
     @property
+    def datagrams(self) -> bool:
+        """Whether requests travel as UDP datagrams rather than over TCP."""
+        return False
+
+    @property
     def against_loss(self) -> str:
         return "check the network"
 

@@ -27,6 +27,7 @@ def read_once() -> Iterator[None]:
     """Read the reference sweep once: some 20 runs."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(room, "fitted", cache(room.fitted))
+        patch.setattr(room, "_congestion_control", lambda: "cubic")
         yield
 
 
@@ -47,6 +48,19 @@ def test_a_prediction_is_the_line_and_what_the_link_takes(over_wifi: Any) -> Non
     assert raw.limit == "link"
     assert "PREDICTED" in origin
     assert profile.name == LINK
+
+
+def test_bbr_paces_what_is_smaller_than_the_link_carries_in_a_round_trip(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = AdviseConfig(link="rate=1000,delay=20")
+    plain = {each.name: each for each in advise(config)[0]}
+    monkeypatch.setattr(room, "_congestion_control", lambda: "bbr")
+    paced = {each.name: each for each in advise(config)[0]}
+    tcp, udp = "websocket/openpi?payload=raw", "ros/topic?payload=raw"
+    size_ms = plain[tcp].link_ms - 40
+    assert paced[tcp].link_ms == pytest.approx(40 + 40 / 1.89)
+    assert paced[tcp].ends_ms[1] - plain[tcp].ends_ms[1] == pytest.approx(1.5 * (40 / 1.89 - size_ms))
+    assert paced[udp] == plain[udp]
+    assert paced["ros/topic?middleware=zenoh&payload=raw"].link_ms == pytest.approx(40 + 40 / 1.89)
 
 
 def test_the_quickest_comes_first_and_pictures_that_the_rate_does_not_carry_last() -> None:

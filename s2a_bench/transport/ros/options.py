@@ -146,6 +146,12 @@ class RosOptions(TransportOptions):
         return self.dds_tuning == "tuned"
 
     @property
+    def datagrams(self) -> bool:
+        from s2a_bench.transport.ros.buffers import dds_of
+
+        return "zenoh" not in dds_of(self.middleware, os.environ)
+
+    @property
     def against_loss(self) -> str:
         from s2a_bench.transport.ros.buffers import against_loss
 
