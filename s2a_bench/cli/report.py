@@ -89,9 +89,8 @@ def _advise(
     found, profile, origin = advise(config)
     if config.measure:
         with RunProgress("samples") as progress:
-            found[:CHECKED] = [
-                replace(each, measured_ms=_measured_ms(config, each.name, output, progress)) for each in found[:CHECKED]
-            ]
+            times_ms = _measured_ms(config, [each.name for each in found[:CHECKED]], output, progress)
+        found[:CHECKED] = [replace(each, measured_ms=ms) for each, ms in zip(found, times_ms, strict=False)]
     if json_:
         print_json(advice_json(found, config, profile, origin))
         return
@@ -100,8 +99,8 @@ def _advise(
         print_line(line)
 
 
-def _measured_ms(config: AdviseConfig, name: str, output: Path, progress: Progress) -> float:
-    """Return the median of a pipeline's e2e without inference on the emulated link, in ms."""
+def _measured_ms(config: AdviseConfig, names: list[str], output: Path, progress: Progress) -> list[float]:
+    """Return the medians of pipelines' e2e without inference on the emulated link, in ms, of one run."""
     from s2a_bench.experiments.latency.config import LatencyConfig
     from s2a_bench.experiments.latency.run import run_latency
     from s2a_bench.experiments.latency.view.against_bytes import METRIC
@@ -110,7 +109,7 @@ def _measured_ms(config: AdviseConfig, name: str, output: Path, progress: Progre
     from s2a_bench.store.run import read_run
 
     requests = LatencyConfig(
-        transports=(name,),
+        transports=tuple(names),
         link=config.link,
         engine=EngineConfig(name=STAND_IN, answer="actions"),
         size=config.size,
@@ -118,8 +117,8 @@ def _measured_ms(config: AdviseConfig, name: str, output: Path, progress: Progre
         state=14,
         requests=30,
     )
-    (cell,) = cells_of(read_run(run_latency(requests, output, progress)))
-    return float(statistics.median(cell.values_ms(METRIC)))
+    cells = {cell.name: cell for cell in cells_of(read_run(run_latency(requests, output, progress)))}
+    return [float(statistics.median(cells[each.name].values_ms(METRIC))) for each in requests.pipelines]
 
 
 advise = command(_advise, AdviseConfig)
