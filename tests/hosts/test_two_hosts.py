@@ -89,7 +89,8 @@ def measured(folder: Path, serve: str, measure: str) -> Path:
         ),
         pytest.param(
             "ros --middleware cyclonedds --namespace /llama",
-            "--url ros:///llama --transport ros/topic,ros/action --middleware cyclonedds --mode stream --fps 5",
+            "--url ros:///llama --transport ros/topic,ros/action --middleware cyclonedds --mode stream --fps 5 "
+            "--size 160x120",
             marks=pytest.mark.slow,
         ),
     ],
