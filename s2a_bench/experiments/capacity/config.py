@@ -184,6 +184,12 @@ class CapacityConfig(Options):
         except ValueError as error:
             raise UsageError(f"`limit`: {error}") from error
 
+    def limit_text(self, mode: str) -> str:
+        """Return the limit in words, as it is for a mode, or for "" for robots without one."""
+        text = "" if self.limited is None else self.limited.text
+        blocks = mode and self.made[mode].blocks and self.limited is not None and self.limited.column == "stalled"
+        return f"{text} beyond those of one robot alone" if blocks else text
+
     @property
     def setting(self) -> ControlSetting:
         from s2a_bench.policy.chunks import ControlSetting

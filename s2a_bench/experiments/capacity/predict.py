@@ -159,7 +159,15 @@ class Prediction:
         if limit is None:
             return None
         high = max(found) if max(found) < numbers[-1] else None
-        return KneeRow(self.cell, "predicted", limit.text, sorted(found)[len(found) // 2], min(found), high, None)
+        return KneeRow(
+            self.cell,
+            "predicted",
+            self.config.limit_text(self.mode),
+            sorted(found)[len(found) // 2],
+            min(found),
+            high,
+            None,
+        )
 
     def _attempt(self, seed: int, tried: list[Tried], robots: int) -> bool:
         row, verdict, within = self._fleet(seed, robots)

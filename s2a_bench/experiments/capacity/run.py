@@ -191,11 +191,11 @@ class _Cell:
 
     def _conclude(self) -> None:
         """Write the knee of the fleets so far, and a warning about those that the generator did not drive."""
-        limit, tried, name = self.config.limited, self.tried.values(), cell_name(self.session, self.mode)
+        tried, name, limit = self.tried.values(), cell_name(self.session, self.mode), self.config.limit_text(self.mode)
         driven = max((each.robots for each in tried if each.clean), default=0)
         found = knee(tried)
-        if limit is not None and found is not None:
-            row = KneeRow(name, "measured", limit.text, found.robots, found.low, found.high, driven)
+        if limit and found is not None:
+            row = KneeRow(name, "measured", limit, found.robots, found.low, found.high, driven)
             self.launch.writer.append(KNEES, [row])
         if late := sorted(each.robots for each in tried if not each.clean):
             self.launch.warnings.append(

@@ -99,6 +99,7 @@ def test_the_limit_of_sync_is_on_what_is_beyond_one_robot_alone(tmp_path: Path) 
     assert fleets["stalled_alone"][40] == fleets["stalled"][1] == pytest.approx(1 / 17, abs=0.01)
     assert fleets["within"].tolist() == [True, True, False]
     assert run.table(KNEES)["robots"].tolist() == [2]
+    assert run.table(KNEES)["limit"].tolist() == ["at most 1 % stalled ticks beyond those of one robot alone"]
 
 
 def test_clients_without_a_clock_and_plans_are_predicted(tmp_path: Path) -> None:
