@@ -261,7 +261,7 @@ def test_the_papers_sweep_is_36_timelines(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('command = "fly"', "command: 'fly' is none of boundary, ccrb, chunks, latency"),
+        ('command = "fly"', "command: 'fly' is none of boundary, capacity, ccrb, chunks, latency"),
         (
             'command = "timeline"\n[settings]\npolicies = "naive"',
             "'policies' is no flag of s2a-bench timeline; did you mean policy?",
