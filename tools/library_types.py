@@ -27,6 +27,8 @@ from s2a_bench.options import Options, group_of
 STUB = Path(__file__).parent.parent / "s2a_bench/__init__.pyi"
 NOT_GIVEN = {"name"}
 """What `library.run` calls the experiment: an engine's name has its flag's."""
+WIDTH = 121
+"""Longest line, its end included: as ruff formats the file."""
 TOGETHER = 8
 """So many keywords that the same commands have stand once, in a class named after these commands."""
 HEAD = '''# ruff: noqa: PYI021 - editors show what a function does
@@ -113,7 +115,9 @@ def _named(commands: Iterable[str]) -> str:
 
 def _class(commands: Iterable[str], bases: Iterable[str], found: Iterable[tuple[str, str]]) -> str:
     fields = "".join(f"    {name}: {kind}\n" for name, kind in sorted(found))
-    return f"class {_named(commands)}({', '.join(bases)}, total=False):\n{fields}"
+    inside = f"{', '.join(bases)}, total=False"
+    head = f"class {_named(commands)}({inside}):\n"
+    return (head if len(head) <= WIDTH else f"class {_named(commands)}(\n    {inside}\n):\n") + fields
 
 
 def _function(command: str) -> str:
