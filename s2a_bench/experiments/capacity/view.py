@@ -49,7 +49,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
 def _knee_sentences(run: StoredRun) -> Iterator[str]:
     settings = run.manifest["configuration"]
     clock = f" at {settings['control_hz']:g} Hz, H {settings['horizon']}" if settings["load"] == "chunks" else ""
-    for knee in _rows(run, KNEES):
+    for knee in sorted(_rows(run, KNEES), key=lambda row: row["source"] == PREDICTED):
         sure = f"[{knee['low']}, {'...' if knee['high'] is None else int(knee['high'])}]"
         robots = f"{knee['robots']} robot{'s' * (knee['robots'] != 1)} {sure}" if knee["robots"] else "no robot"
         robots = robots if knee["source"] == "measured" else f"{knee['source']}: {robots}"
