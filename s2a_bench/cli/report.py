@@ -5,6 +5,7 @@ from __future__ import annotations
 import statistics
 from dataclasses import replace
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -12,9 +13,13 @@ import typer
 from s2a_bench.cli.adapter import command
 from s2a_bench.cli.output import Json, print_error, print_json, print_line, print_table
 from s2a_bench.errors import TRIPPED, UNDECIDED
+from s2a_bench.experiments import EXPERIMENTS
+from s2a_bench.inference import STAND_IN
 from s2a_bench.report.advise import CHECKED, AdviseConfig
 from s2a_bench.report.compare import CompareConfig
 from s2a_bench.report.page import ReportConfig
+from s2a_bench.store.run import read_run
+from s2a_bench.transport import ACTIONS
 
 if TYPE_CHECKING:
     from s2a_bench.progress import Progress
@@ -84,7 +89,7 @@ def _advise(
     json_: Json = False,
 ) -> None:
     from s2a_bench.cli.progress import RunProgress
-    from s2a_bench.report.advise import advice_json, advice_table, advise, sentence
+    from s2a_bench.report.advise.prediction import advice_json, advice_table, advise, sentence
 
     found, profile, origin = advise(config)
     if config.measure:
@@ -101,23 +106,20 @@ def _advise(
 
 def _measured_ms(config: AdviseConfig, names: list[str], output: Path, progress: Progress) -> list[float]:
     """Return the medians of pipelines' e2e without inference on the emulated link, in ms, of one run."""
-    from s2a_bench.experiments.latency.config import LatencyConfig
-    from s2a_bench.experiments.latency.run import run_latency
     from s2a_bench.experiments.latency.view.against_bytes import METRIC
     from s2a_bench.experiments.requests import cells_of
-    from s2a_bench.inference import STAND_IN, EngineConfig
-    from s2a_bench.store.run import read_run
 
-    requests = LatencyConfig(
+    latency = EXPERIMENTS["latency"]
+    requests = resolve_name(latency.config)(
         transports=tuple(names),
         link=config.link,
-        engine=EngineConfig(name=STAND_IN, answer="actions"),
+        engine={"name": STAND_IN, "answer": ACTIONS},
         size=config.size,
         cameras=config.cameras,
         state=14,
         requests=30,
     )
-    cells = {cell.name: cell for cell in cells_of(read_run(run_latency(requests, output, progress)))}
+    cells = {cell.name: cell for cell in cells_of(read_run(latency.run_with(requests, output, progress)))}
     return [float(statistics.median(cells[each.name].values_ms(METRIC))) for each in requests.pipelines]
 
 

@@ -13,8 +13,9 @@ from typing import Any
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.report import advise as room
-from s2a_bench.report.advise import AdviseConfig, advice_json, advice_table, advise, sentence
+from s2a_bench.report.advise import AdviseConfig
+from s2a_bench.report.advise import prediction as room
+from s2a_bench.report.advise.prediction import advice_json, advice_table, advise, sentence
 from s2a_bench.writers.tables import ABSENT
 from tests.cli.program import called
 

@@ -11,6 +11,7 @@ import numpy as np
 from websockets.frames import Frame, Opcode
 from websockets.utils import accept_key
 
+from s2a_bench.transport.websocket.codec import OURS
 from tests.hostile.suite import FAILED, Attack, Case, Trap
 from tests.hostile.tcp import CLIENTS as ANY_CLIENT
 from tests.hostile.tcp import NOISE, Block, answers, crowd, sends, sends_made, servers
@@ -152,8 +153,8 @@ def _answers(*pieces: Block, **more: Any) -> Trap:
 
 
 def _greets(*pieces: Block, **more: Any) -> Trap:
-    """Return a server that shakes hands, greets, and then says what it says."""
-    return _answers(accepted, tells({}), *pieces, **more)
+    """Return a server that shakes hands, greets as ours does, and then says what it says."""
+    return _answers(accepted, tells({"server": OURS}), *pieces, **more)
 
 
 CHUNK = {"actions": array(np.zeros(6, np.float32).tobytes(), shape=(2, 3))}

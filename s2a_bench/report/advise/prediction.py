@@ -6,21 +6,17 @@ time in which its rate carries the bytes that the pipeline sends. Both are the m
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
-from pydantic import AfterValidator
-
-from s2a_bench.boards.links import Direction, LinkProfile, bound_s, load_link, published
+from s2a_bench.boards.links import Direction, LinkProfile, bound_s, load_link
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.view.against_bytes import FittedPipeline, against_bytes
 from s2a_bench.experiments.requests import split
-from s2a_bench.options import Options, Size, option
 from s2a_bench.provenance import joined
+from s2a_bench.report.advise import MB, AdviseConfig
 from s2a_bench.stats.line import Line
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.store.sweep import is_sweep, read_sweep
@@ -28,16 +24,12 @@ from s2a_bench.transport import declared_transport
 from s2a_bench.transport.pipeline import pipelines
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
-REFERENCE: Final = Path(__file__).resolve().parents[2] / "results" / "reference" / "transports"
 HEADERS: Final = 1500 / 1448
 """Bytes of IP packets for each byte of a body over TCP: Ethernet's 1,500 with time stamps."""
 BBR_GAIN: Final = 2.89
 """Of the rate at which BBR's start sends, over the rate that it has seen (Cardwell et al., 2016): 2 / ln 2."""
 RATE_OFF, DELAY_OFF_MS = 0.05, 0.3
 """By how much a link may be off its profile: a share of its rate, and in one direction."""
-CHECKED: Final = 2
-"""Pipelines that `check` measures."""
-MB: Final = 1e6
 PREDICTION: Final = (
     "End to end without inference: the sweep's line at this size of pictures, and the link. Intervals: 95 % (Student's "
     "t) of a launch around the line, the 5 % and 0.3 ms a way by which a link may be off its profile, and half of what "
@@ -47,45 +39,6 @@ BOUND: Final = (
     "Bound: the link alone, with the bytes that the pipeline sends. Pictures are the sweep's: others are coded to more "
     "or fewer bytes."
 )
-_DURATION: Final = re.compile(r"(\d+\.?\d*)(ms|s)")
-
-
-def _duration(text: str) -> str:
-    if text and not _DURATION.fullmatch(text):
-        raise ValueError(f"'{text}' should be a time, as 100ms or 0.5s")
-    return text
-
-
-class AdviseConfig(Options):
-    """The link, and the requests that should go over it."""
-
-    link: str = option(
-        ..., f"{', '.join(published())}, a FILE, or rate=UP/DOWN,delay=MS, as in latency", names=published, first=True
-    )
-    rate: float = option(0.0, "requests a second that the link should carry; 0: one at a time", ge=0, le=10_000)
-    deadline: Annotated[str, AfterValidator(_duration)] = option(
-        "", "longest end to end without inference, as 100ms or 0.5s [default: none]"
-    )
-    size: Size = option((640, 480), "WIDTHxHEIGHT of the pictures [default: 640x480]")
-    cameras: int = option(1, "pictures a request", ge=1, le=16)
-    runs: list[Path] = option(
-        (REFERENCE,),
-        "folders of a `sweep transports` or of its runs, of the machine that is asked about "
-        "[default: the reference run of the project, of another machine]",
-    )
-    measure: bool = option(
-        False, f"also measure the first {CHECKED} on the emulated link, beside the prediction", flag="check"
-    )
-
-    @property
-    def deadline_ms(self) -> float:
-        """The deadline, infinite for none."""
-        found = _DURATION.fullmatch(self.deadline)
-        return float(found[1]) * (1 if found[2] == "ms" else 1e3) if found else math.inf
-
-    @property
-    def pixels_mb(self) -> float:
-        return self.size[0] * self.size[1] * 3 * self.cameras / MB
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,57 @@
+"""Advice on a transport for a link: its options."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Annotated, Final
+
+from pydantic import AfterValidator
+
+from s2a_bench.boards.links import published
+from s2a_bench.options import Options, Size, option
+
+REFERENCE: Final = Path(__file__).resolve().parents[3] / "results" / "reference" / "transports"
+CHECKED: Final = 2
+"""Pipelines that `check` measures."""
+MB: Final = 1e6
+_DURATION: Final = re.compile(r"(\d+\.?\d*)(ms|s)")
+
+
+def _duration(text: str) -> str:
+    if text and not _DURATION.fullmatch(text):
+        raise ValueError(f"'{text}' should be a time, as 100ms or 0.5s")
+    return text
+
+
+class AdviseConfig(Options):
+    """The link, and the requests that should go over it."""
+
+    link: str = option(
+        ..., f"{', '.join(published())}, a FILE, or rate=UP/DOWN,delay=MS, as in latency", names=published, first=True
+    )
+    rate: float = option(0.0, "requests a second that the link should carry; 0: one at a time", ge=0, le=10_000)
+    deadline: Annotated[str, AfterValidator(_duration)] = option(
+        "", "longest end to end without inference, as 100ms or 0.5s [default: none]"
+    )
+    size: Size = option((640, 480), "WIDTHxHEIGHT of the pictures [default: 640x480]")
+    cameras: int = option(1, "pictures a request", ge=1, le=16)
+    runs: list[Path] = option(
+        (REFERENCE,),
+        "folders of a `sweep transports` or of its runs, of the machine that is asked about "
+        "[default: the reference run of the project, of another machine]",
+    )
+    measure: bool = option(
+        False, f"also measure the first {CHECKED} on the emulated link, beside the prediction", flag="check"
+    )
+
+    @property
+    def deadline_ms(self) -> float:
+        """The deadline, infinite for none."""
+        found = _DURATION.fullmatch(self.deadline)
+        return float(found[1]) * (1 if found[2] == "ms" else 1e3) if found else math.inf
+
+    @property
+    def pixels_mb(self) -> float:
+        return self.size[0] * self.size[1] * 3 * self.cameras / MB
