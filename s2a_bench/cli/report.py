@@ -14,6 +14,7 @@ from s2a_bench.cli.adapter import command
 from s2a_bench.cli.output import Json, print_error, print_json, print_line, print_table
 from s2a_bench.errors import TRIPPED, UNDECIDED
 from s2a_bench.experiments import EXPERIMENTS
+from s2a_bench.experiments.requests import cells_of
 from s2a_bench.inference import STAND_IN
 from s2a_bench.report.advise import CHECKED, AdviseConfig
 from s2a_bench.report.compare import CompareConfig
@@ -107,7 +108,6 @@ def _advise(
 def _measured_ms(config: AdviseConfig, names: list[str], output: Path, progress: Progress) -> list[float]:
     """Return the medians of pipelines' e2e without inference on the emulated link, in ms, of one run."""
     from s2a_bench.experiments.latency.view.against_bytes import METRIC
-    from s2a_bench.experiments.requests import cells_of
 
     latency = EXPERIMENTS["latency"]
     requests = resolve_name(latency.config)(
