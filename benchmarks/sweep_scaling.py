@@ -92,7 +92,7 @@ def measure(timelines: int, seed: int, workers: Sequence[int], *, ray: bool) -> 
 
 def _on_ray(blocks: list[tuple[np.random.SeedSequence, int]], count: int) -> Line:
     """Compute the blocks on a local cluster of ``count`` cores."""
-    from s2a_bench.sweep.on_ray import LOCAL, connect
+    from s2a_bench.machine.cluster import LOCAL, connect
 
     connect(LOCAL, count)
     import ray

@@ -8,8 +8,6 @@ on another one, or waits until a node has the board.
 from __future__ import annotations
 
 import io
-import os
-import socket
 import tarfile
 from collections.abc import Mapping
 from concurrent.futures import Future
@@ -17,21 +15,17 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Final, TypeAlias
 
-from s2a_bench import extras
 from s2a_bench.errors import UsageError
+from s2a_bench.machine.cluster import connect
 from s2a_bench.machine.environment import collect
 from s2a_bench.store.manifest import utc_now
 from s2a_bench.sweep import CellWorkers, Outcome, SweepCell
 from s2a_bench.sweep.perform import perform
 from s2a_bench.sweep.plan import SweepPlan
 
-LOCAL: Final = "local"
 RETRIES: Final = 5
 AHEAD: Final = 2
 """Virtual cells submitted for each core: one runs, one waits."""
-PROBE_S: Final = 5.0
-OBJECT_STORE_BYTES: Final = 256 << 20
-"""For a local cluster: run folders are small."""
 
 Packed: TypeAlias = tuple[Outcome, bytes]
 
@@ -74,24 +68,6 @@ class RayWorkers(CellWorkers):
         for ref in list(self._refs):
             self._ray.cancel(ref, force=True)
         self._ray.shutdown()
-
-
-def connect(address: str, jobs: int) -> Any:
-    """Join the cluster at an address, or make one of ``jobs`` cores for "local", and return Ray; raises S2AError."""
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # no usage statistics
-    ray = extras.require("ray", "ray")
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR"}
-    if address == LOCAL:
-        ray.init(num_cpus=jobs, include_dashboard=False, object_store_memory=OBJECT_STORE_BYTES, address=LOCAL, **quiet)
-        return ray
-    try:
-        host, colon, port = address.rpartition(":")
-        if colon and port.isdecimal():  # Ray itself tries for minutes
-            socket.create_connection((host.rpartition("/")[2], int(port)), PROBE_S).close()
-        ray.init(address=address, **quiet)
-    except (OSError, ValueError, RuntimeError) as error:
-        raise UsageError(f"`ray`: no Ray cluster answers at {address}: {str(error).splitlines()[0]}") from error
-    return ray
 
 
 def _check(plan: SweepPlan, resources: Mapping[str, float]) -> None:
