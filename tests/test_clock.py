@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 import uuid
+
+import pytest
 
 from s2a_bench.clock import SystemClock, VirtualClock, clock_id, now_ns, realtime_offset_ns
 
@@ -16,6 +20,18 @@ def test_now_is_clock_monotonic() -> None:
 
 def test_the_clock_has_the_kernels_boot_id() -> None:
     assert uuid.UUID(clock_id())
+
+
+def test_a_time_namespace_has_another_clock() -> None:
+    line = "from s2a_bench.clock import clock_id, now_ns; print(clock_id(), now_ns())"
+    command = ["unshare", "--user", "--map-root-user", "--time", "--monotonic", "100000", "--fork"]
+    try:
+        done = subprocess.run([*command, sys.executable, "-c", line], capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"no time namespaces here: {error}")
+    name, at_ns = done.stdout.split()
+    assert name == f"{clock_id()}+100000s0ns"
+    assert int(at_ns) > now_ns() + 10**13
 
 
 def test_the_system_clock_never_wakes_early() -> None:
