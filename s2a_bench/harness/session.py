@@ -117,7 +117,7 @@ class Session:
     ) -> None:
         """Measure ``cell`` with an open client. ``origin`` is replaced by the provenance that an answer carries.
 
-        ``offsets`` of other hosts' clocks are shared by sessions.
+        ``offsets`` of other hosts' clocks are shared by sessions; see `RemoteClock` for none.
         """
         self.origin = origin
         self.cell = cell
@@ -127,7 +127,7 @@ class Session:
         self._recorder = recorder
         self._sampler = sampler or ResourceSampler({}, 1)
         self._frames: dict[int, StreamedFrame] = {}
-        self._clock = RemoteClock(self._exchange, {} if offsets is None else offsets, request.clock)
+        self._clock = RemoteClock(self._exchange, offsets, request.clock)
         self._pictures = 0
         """Of the last request."""
         self.busy = False

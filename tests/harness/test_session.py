@@ -145,7 +145,7 @@ class ElsewhereClient:
 def elsewhere() -> Iterator[tuple[ElsewhereClient, Session]]:
     source, client = open_source("synthetic", 64, 48, fps=30.0, seed=0), ElsewhereClient()
     feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request
-    yield client, Session(one_pipeline("http/as-deployed"), client, feed, plan)
+    yield client, Session(one_pipeline("http/as-deployed"), client, feed, plan, offsets={})
     source.close()
 
 
@@ -171,6 +171,16 @@ def test_one_way_times_to_another_host_are_intervals_that_hold_the_truth(
     assert asked[:21] == [False, *[True] * 20]
 
 
+def test_without_exchanges_each_request_alone_bounds_the_offset(elsewhere: tuple[ElsewhereClient, Session]) -> None:
+    client, shared = elsewhere
+    session = Session(shared.cell, client, shared.feed, shared.request)
+    for block in range(3):
+        sample = session.measure(Place(block, 0, warmup=False)).sample
+        assert not sample.error
+        assert sample.clock_error_ns >= (sum(client.true) - 1) // 2  # type: ignore[operator]
+    assert len(client.prompts) == 3
+
+
 def test_a_clock_that_is_set_ends_the_run_with_one_line(elsewhere: tuple[ElsewhereClient, Session]) -> None:
     client, session = elsewhere
     session.measure(Place(0, 0, warmup=True))
@@ -185,7 +195,9 @@ def test_a_server_elsewhere_without_marks_cannot_be_joined(monkeypatch: pytest.M
     source, client = open_source("synthetic", 64, 48, fps=30.0, seed=0), ElsewhereClient()
     monkeypatch.setattr(Trace, "receive", lambda trace, remote: setattr(trace, "remote", replace(remote, marks=[])))
     feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request
-    measured = Session(one_pipeline("http/as-deployed"), client, feed, plan).measure(Place(0, 0, warmup=False))
+    measured = Session(one_pipeline("http/as-deployed"), client, feed, plan, offsets={}).measure(
+        Place(0, 0, warmup=False)
+    )
     source.close()
     assert "the server reported no marks" in measured.sample.error
 
@@ -200,7 +212,7 @@ def with_wall_clocks(
     client.facts = {REALTIME_MS: theirs_ms, REALTIME_ERROR_MS: ours.error_ns / 1e6} if tells else {}
     source, plan = open_source("synthetic", 64, 48, fps=30.0, seed=0), resolve(RequestsConfig()).request
     feed = RequestFeed(source, preencoded=False)
-    session = Session(one_pipeline("http/as-deployed"), client, feed, replace(plan, clock="chrony"))
+    session = Session(one_pipeline("http/as-deployed"), client, feed, replace(plan, clock="chrony"), offsets={})
     measured = session.measure(Place(0, 0, warmup=False))
     source.close()
     return measured

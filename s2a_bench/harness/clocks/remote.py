@@ -41,19 +41,23 @@ class Joined:
 class RemoteClock:
     """The offset of one server's clock; nothing is exchanged before `join` has met it."""
 
-    def __init__(self, exchange: Callable[[str], Trace], offsets: dict[str, Offset], system: str = "") -> None:
+    def __init__(self, exchange: Callable[[str], Trace], offsets: dict[str, Offset] | None, system: str = "") -> None:
         """``exchange`` makes a request for its marks alone; ``offsets``, by clock, are those that others estimate too.
+
+        Without ``offsets`` nothing is exchanged, and the requests alone bound the offset, more widely.
 
         ``exchange`` raises S2AError; its argument is ``system``, one of `machine.clocks.COMMANDS` or "", where the
         server's wall clock is wanted.
         """
-        self._exchange, self._offsets, self._system = exchange, offsets, system
+        self._exchange, self._system = exchange, system
+        self._exchanges = offsets is not None
+        self._offsets = {} if offsets is None else offsets
         self._id = ""
         self._last_ns = 0
 
     def refresh(self) -> None:
         """Exchange time stamps, if the server's clock is another and a second has passed since the last time."""
-        if self._id and now_ns() - self._last_ns > PERIOD_NS:
+        if self._exchanges and self._id and now_ns() - self._last_ns > PERIOD_NS:
             self._burst(BURST, 0)
 
     def join(self, trace: Trace, last_ns: int) -> Joined:
@@ -68,7 +72,7 @@ class RemoteClock:
         offset.add(own)
         if met:
             self.refresh()
-        else:
+        elif self._exchanges:
             self._burst(FIRST, FIRST_PAUSE_NS)
             if self._system:
                 self._compare_wall_clocks()
