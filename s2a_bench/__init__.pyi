@@ -120,6 +120,7 @@ class _Capacity(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyTh
     predict: str
     processes: int
     profile: str
+    ray: str
     robots: str | int
     rounding: Literal["floor", "ceil"]
     sampling: str

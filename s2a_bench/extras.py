@@ -22,7 +22,7 @@ EXTRAS: Final = {
     "ccrb": "the embedded simulator and pictures of the road",
     "nvidia": "load, memory and power of NVIDIA GPUs",
     "openvla": "the openvla dialect",
-    "ray": "sweeps on a Ray cluster",
+    "ray": "sweeps, and fleets of robots, on a Ray cluster",
     "lerobot": "policies over gRPC, as lerobot serves them",
     "websocket": "policies over WebSocket, as openpi serves them",
     "zmq": "policies over ZeroMQ, as GR00T serves them",

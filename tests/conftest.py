@@ -8,6 +8,8 @@ import signal
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pytest
@@ -38,6 +40,29 @@ def from_pypi(request: pytest.FixtureRequest) -> str:
     """Each middleware that comes from PyPI."""
     pytest.importorskip(request.param, reason=f"{request.param} is not installed")
     return str(request.param)
+
+
+RAY_NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
+
+
+@pytest.fixture
+def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """Where the nodes keep what is temporary: Ray makes sockets there, whose paths must be short."""
+    with TemporaryDirectory(prefix="s2a-", dir="/tmp", ignore_cleanup_errors=True) as place:
+        monkeypatch.setenv("TMPDIR", place)
+        yield Path(place)
+
+
+@pytest.fixture
+def cluster(nodes: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:  # noqa: ARG001
+    """A Ray cluster of two nodes: a workstation, and a board called orin."""
+    utilities = pytest.importorskip("ray.cluster_utils", reason="the extra 'ray' is not installed")
+
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+    made = utilities.Cluster(initialize_head=True, head_node_args={**RAY_NODE, "include_dashboard": False})
+    made.orin = made.add_node(**RAY_NODE, resources={"board:orin": 1})
+    yield made
+    made.shutdown()
 
 
 @pytest.hookimpl(optionalhook=True)

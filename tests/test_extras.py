@@ -190,7 +190,7 @@ def test_every_extra_is_described_and_in_all() -> None:
         (
             {"numpy": "2", "gguf": "1"},
             "state",
-            "2 requirements, all met; without the extras ray (sweeps on a Ray cluster)",
+            "2 requirements, all met; without the extras ray (sweeps, and fleets of robots, on a Ray cluster)",
             "pip install '.[ray]' in the clone of s2a-bench",
         ),
         ({"numpy": "2", "gguf": "0.1", "ray": "2"}, "error", "gguf is 0.1, not >=1", "make setup"),

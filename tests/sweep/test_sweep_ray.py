@@ -5,9 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import pandas as pd
@@ -17,12 +15,12 @@ from benchmarks.sweep_scaling import measure, part, work
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.sweep import Sweep, read_sweep
+from tests.conftest import RAY_NODE
 
 ray = pytest.importorskip("ray", reason="the extra 'ray' is not installed")
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # what Ray warns of is Ray's
 
 WAIT_S = 240
-NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
 
 VIRTUAL = """
 command = "timeline"
@@ -48,26 +46,6 @@ policy = "naive"
 board = ["orin"]
 n-skills = [8, 7]
 """
-
-
-@pytest.fixture
-def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Where the nodes keep what is temporary: Ray makes sockets there, whose paths must be short."""
-    with TemporaryDirectory(prefix="s2a-", dir="/tmp", ignore_cleanup_errors=True) as place:
-        monkeypatch.setenv("TMPDIR", place)
-        yield Path(place)
-
-
-@pytest.fixture
-def cluster(nodes: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:  # noqa: ARG001
-    """Two nodes: a workstation, and a board called orin."""
-    from ray.cluster_utils import Cluster
-
-    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
-    made = Cluster(initialize_head=True, head_node_args={**NODE, "include_dashboard": False})
-    made.orin = made.add_node(**NODE, resources={"board:orin": 1})
-    yield made
-    made.shutdown()
 
 
 def begin(text: str, folder: Path, *arguments: str) -> subprocess.Popen[str]:
@@ -116,7 +94,7 @@ def test_the_cell_of_a_lost_node_runs_again_where_the_board_is_then(cluster: Any
         assert process.poll() is None, process.communicate()
         time.sleep(0.05)
     cluster.remove_node(cluster.orin, allow_graceful=False)
-    cluster.add_node(**NODE, resources={"board:orin": 1})
+    cluster.add_node(**RAY_NODE, resources={"board:orin": 1})
     end(process)
     found = only(tmp_path)
     assert list(found.cells["state"]) == ["finished", "finished"]

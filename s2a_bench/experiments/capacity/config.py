@@ -135,6 +135,7 @@ class CapacityConfig(Options):
         le=3600,
     )
     processes: int = option(1, "processes over which the robots are spread", ge=1, le=256)
+    ray: str = option("", "spread the processes over a Ray cluster: its ADDRESS, auto, or local; needs --url")
     latency: Annotated[str, BeforeValidator(str, json_schema_input_type=str | float)] = option(
         "", "how long echo takes to answer: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: no time]", first=True
     )
@@ -250,14 +251,24 @@ class CapacityConfig(Options):
             raise UsageError(f"`episodes`: {self.episodes_s:g} s need a control clock, and two of its ticks")
         _ = self.made
         if self.predict:
-            if alone := next(self.requests.given(), ""):
+            given = {"processes", "ray"} & self.model_fields_set
+            if alone := next(iter((*sorted(given), *self.requests.given())), ""):
                 raise UsageError(f"`{alone}` is for a measured run; leave it out with `predict`")
         else:
-            for name in ("servers", "batch"):
-                if name in self.model_fields_set:
-                    raise UsageError(f"`{name}` needs `predict`")
-            _ = self.live_requests
+            self._check_measured()
         self._check_load()
+
+    def _check_measured(self) -> None:
+        for name in ("servers", "batch"):
+            if name in self.model_fields_set:
+                raise UsageError(f"`{name}` needs `predict`")
+        _ = self.live_requests
+        if several := [name for name, each in self.made.items() if each.several]:
+            raise UsageError(
+                f"`modes`: {several[0]} has several requests under way, and a robot one connection; take it with `predict`"
+            )
+        if self.ray and not all(each.options.external_address for each in self.requests.pipelines):
+            raise UsageError("`ray`: robots on other hosts need a server that they reach; name it with `url`")
 
     def _check_load(self) -> None:
         limit, given = self.limited, self.model_fields_set

@@ -1,7 +1,7 @@
-"""The load generator: the robots of one process, or of a further one, each with its connection and thread.
+"""The load generator: the robots of this process, of others, or of other hosts, each with its connection and thread.
 
-One thread runs the ticks of all robots; each robot's own thread makes one blocking request at a time. Latencies count
-from the intended time of a request, whatever delays it here. Processes of one host share the clock.
+One thread runs the ticks of all robots of a process; each robot's own thread makes one blocking request at a time.
+Latencies count from the intended time of a request, whatever delays it here, and need one clock only, the robot's.
 """
 
 from __future__ import annotations
@@ -10,9 +10,12 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
 from itertools import count
 from multiprocessing import get_context
+from pathlib import Path
 from queue import Empty, SimpleQueue
+from tempfile import TemporaryDirectory
 from threading import Event, Lock, Thread
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Final
@@ -21,12 +24,14 @@ import numpy as np
 
 from s2a_bench.act.control import ControlLoop, RobotTicks
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import S2AError, ServerDied
+from s2a_bench.errors import S2AError, ServerDied, UsageError
 from s2a_bench.experiments.capacity.metrics import RobotTrace
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.requester import MOST_WAIT_S, SEEDS, ChunkRequester, Job
+from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Measured, Place, RequestContext, Session
+from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import allowed, end_with_parent, keep_large_blocks, limit_threads
 from s2a_bench.policy.chunks import ControlSetting, mode
 from s2a_bench.policy.chunks.cycles import gather
@@ -37,7 +42,7 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
     from s2a_bench.frames import FrameSource
-    from s2a_bench.harness.plan import FeedPlan, RequestPlan
+    from s2a_bench.harness.plan import FeedPlan, RequestPlan, RunPlan
     from s2a_bench.types import Frame, Piece
 
 STRIDE: Final = 1 << 20
@@ -45,6 +50,8 @@ STRIDE: Final = 1 << 20
 ENDLESS: Final = 2**62
 PATIENCE_S: Final = 2.0
 """For answers under way when a fleet is stopped by an error."""
+FREE_CORE_S: Final = 60.0
+"""How long a process waits for a core of the cluster."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +71,8 @@ class FleetPlan:
     every_ns: int = 0
     """Between the plans of a robot; 0 and no mode: closed loop."""
     think_ns: int = 0
+    own: RunPlan | None = None
+    """Of the server that each process starts for its robots alone; None: `wiring` leads to one that all share."""
 
 
 class ChunkRobot:
@@ -216,17 +225,20 @@ class Fleet:
 
     def __init__(self, plan: FleetPlan) -> None:
         self._plan = plan
-        self._wiring = wiring = Wiring.from_json(plan.wiring)
-        self._cell = Pipeline(plan.cell, TRANSPORTS[wiring.transport], wiring.variant, wiring.options)
         self._stack = ExitStack()
-        self._source = plan.feed.open()
-        self._stack.callback(self._source.close)
         self._reads = Lock()
         self._sessions: dict[int, tuple[Session, count[int]]] = {}
         self._done: SimpleQueue[tuple[Session, Measured]] = SimpleQueue()
         self._robots: dict[int, ChunkRobot | PlainRobot] = {}
         self._threads: list[Thread] = []
         self._loop: ControlLoop | None = None
+        self._start_ns = 0
+        self._stack.enter_context(allowed(plan.tuned))
+        limit_threads()
+        keep_large_blocks()
+
+    def machine(self) -> dict[str, Any]:
+        return environment.collect()
 
     def connect(self, robots: Iterable[int]) -> None:
         """Open the connections of robots that have none; raises S2AError."""
@@ -234,8 +246,9 @@ class Fleet:
             if robot not in self._sessions:
                 self._sessions[robot] = self._session(robot), count(STRIDE + robot, STRIDE)
 
-    def start(self, phases_ns: Mapping[int, int], start_ns: int) -> None:
-        """Start connected robots, each its phase after ``start_ns``."""
+    def start(self, phases_ns: Mapping[int, int], in_ns: int) -> None:
+        """Start connected robots in ``in_ns``, each its phase later."""
+        self._start_ns = start_ns = now_ns() + in_ns
         made: type[ChunkRobot | PlainRobot] = ChunkRobot if self._plan.mode else PlainRobot
         begin_ns = 0 if self._plan.mode else start_ns
         self._robots = {
@@ -250,10 +263,10 @@ class Fleet:
         if self._loop is not None:
             self._loop.start(start_ns)
 
-    def traces(self) -> list[RobotTrace]:
-        """Return what each robot did so far; raises what ended one."""
-        end_ns = now_ns()
-        return [robot.trace(number, end_ns) for number, robot in self._robots.items()]
+    def traces(self, start_ns: int) -> list[RobotTrace]:
+        """Return what each robot did so far, as if it had started at ``start_ns``; raises what ended one."""
+        end_ns, by_ns = now_ns(), start_ns - self._start_ns
+        return [robot.trace(number, end_ns).shifted(by_ns) for number, robot in self._robots.items()]
 
     def measured(self) -> list[Measured]:
         """Return the requests since the last call."""
@@ -283,9 +296,26 @@ class Fleet:
         self.stop(PATIENCE_S)
         self._stack.close()
 
+    @cached_property
+    def _wiring(self) -> Wiring[Any]:
+        own = self._plan.own
+        if own is None:
+            return Wiring.from_json(self._plan.wiring)
+        folder = self._stack.enter_context(TemporaryDirectory(prefix="s2a-bench-"))
+        servers = ServerSet(own, self._stack, Path(folder))
+        servers.start()
+        return servers.wiring(own.cells[0])
+
+    @cached_property
+    def _source(self) -> FrameSource:
+        source = self._plan.feed.open()
+        self._stack.callback(source.close)
+        return source
+
     def _session(self, robot: int) -> Session:
-        plan, cell = self._plan, self._cell
-        client = open_client(self._wiring)
+        plan, wiring = self._plan, self._wiring
+        cell = Pipeline(plan.cell, TRANSPORTS[wiring.transport], wiring.variant, wiring.options)
+        client = open_client(wiring)
         source = _Shared(self._source, f"{plan.feed.nonce}/{cell.name} {robot}", self._reads)
         preencoded = cell.payload == "jpeg-preencoded"
         feed = RequestFeed(source, preencoded=preencoded, cameras=plan.feed.cameras, size=plan.feed.resize)
@@ -294,8 +324,19 @@ class Fleet:
         return session
 
 
-class FleetProcess:
-    """A fleet in a process of its own, with the methods of `Fleet`."""
+class RemoteFleet:
+    """A fleet in another process, with the methods of `Fleet`."""
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        """Return a method of that fleet; it raises what that raises, ServerDied if the process has ended."""
+        return partial(self._call, name)
+
+    def _call(self, name: str, *given: Any) -> Any:
+        raise NotImplementedError
+
+
+class FleetProcess(RemoteFleet):
+    """A fleet in a process of this host."""
 
     def __init__(self, plan: FleetPlan) -> None:
         context = get_context("spawn")
@@ -304,27 +345,22 @@ class FleetProcess:
         self._process.start()
         theirs.close()
 
-    def __getattr__(self, name: str) -> Callable[..., Any]:
-        """Call a method of the process's fleet; raises what that raises, ServerDied if the process has ended."""
-
-        def call(*given: Any) -> Any:
-            try:
-                self._pipe.send((name, given))
-                found = self._pipe.recv()
-            except (EOFError, OSError) as error:
-                raise ServerDied(f"a process of robots (pid {self._process.pid}) died; take fewer robots") from error
-            if isinstance(found, BaseException):
-                raise found
-            return found
-
-        return call
-
     def close(self) -> None:
         with suppress(S2AError):
-            self.__getattr__("close")()
+            self._call("close")
         self._pipe.close()
         self._process.join(PATIENCE_S)
         self._process.kill()
+
+    def _call(self, name: str, *given: Any) -> Any:
+        try:
+            self._pipe.send((name, given))
+            found = self._pipe.recv()
+        except (EOFError, OSError) as error:
+            raise ServerDied(f"a process of robots (pid {self._process.pid}) died; take fewer robots") from error
+        if isinstance(found, BaseException):
+            raise found
+        return found
 
 
 def _serve(plan: FleetPlan, pipe: Connection) -> None:
@@ -333,16 +369,45 @@ def _serve(plan: FleetPlan, pipe: Connection) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run handles Ctrl-C
     end_with_parent()
-    with allowed(plan.tuned), suppress(EOFError):
-        limit_threads()
-        keep_large_blocks()
-        fleet: Fleet | None = None
-        name = ""
+    fleet, name = Fleet(plan), ""
+    with suppress(EOFError):
         while name != "close":
             name, given = pipe.recv()
             try:
-                fleet = fleet or Fleet(plan)
                 found = getattr(fleet, name)(*given)
             except Exception as error:  # noqa: BLE001 - raised again by the caller
                 found = error
             pipe.send(found)
+
+
+class FleetOnRay(RemoteFleet):
+    """A fleet in a process of a Ray cluster, which spreads them over its nodes."""
+
+    def __init__(self, plan: FleetPlan, ray: Any) -> None:
+        self._ray = ray
+        self._fleet = ray.remote(num_cpus=1, scheduling_strategy="SPREAD")(Fleet).remote(plan)
+
+    def machine(self) -> dict[str, Any]:
+        """Return what the process runs on; raises UsageError if no core of the cluster comes free."""
+        found = self._fleet.machine.remote()
+        if not self._ray.wait([found], timeout=FREE_CORE_S)[0]:
+            raise UsageError(f"`processes`: no core of the cluster came free within {FREE_CORE_S:g} s; take fewer")
+        facts: dict[str, Any] = self._result(found)
+        return facts
+
+    def close(self) -> None:
+        with suppress(S2AError):
+            self._call("close")
+        self._ray.kill(self._fleet)
+
+    def _call(self, name: str, *given: Any) -> Any:
+        return self._result(getattr(self._fleet, name).remote(*given))
+
+    def _result(self, reference: Any) -> Any:
+        errors = self._ray.exceptions
+        try:
+            return self._ray.get(reference)
+        except errors.RayTaskError as error:
+            raise error.cause from error
+        except errors.RayError as error:
+            raise ServerDied(f"a process of robots on Ray died: {str(error).splitlines()[0]}") from error

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -80,6 +80,10 @@ class RobotTrace:
     """Lateness of each tick, or of each request without a clock; None in virtual time."""
     plan_stalled: Flags | None = None
     """Whether each plan stalls: shape (R,)."""
+
+    def shifted(self, by_ns: int) -> RobotTrace:
+        start_ns, end_ns, request_ns = self.start_ns + by_ns, self.end_ns + by_ns, self.request_ns + by_ns
+        return replace(self, start_ns=start_ns, end_ns=end_ns, request_ns=request_ns)
 
 
 def measures(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.capacity.generator import STRIDE, Fleet, FleetPlan, FleetProcess
+from s2a_bench.experiments.capacity.generator import STRIDE, Fleet, FleetOnRay, FleetPlan, FleetProcess
 from s2a_bench.experiments.capacity.metrics import measures
 from s2a_bench.experiments.capacity.predict import Prediction, Service, run_predicted
 from s2a_bench.experiments.capacity.rows import (
@@ -30,6 +30,7 @@ from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Place
 from s2a_bench.inference import STAND_IN
+from s2a_bench.machine.cluster import connect
 from s2a_bench.machine.resources import POWER_W
 from s2a_bench.stats.seeds import generator
 from s2a_bench.store.manifest import RunWarning
@@ -67,8 +68,12 @@ def run_capacity(config: CapacityConfig, output: Path, progress: Progress) -> Pa
     }
     plan = plan.with_manifest(configuration=settings, cadence=cadence[config.load])
     plan = replace(plan, cells=(*plan.cells, *(twin(cell) for cell in plan.cells)))
-    task = Task("capacity", drive=partial(_drive, config), tables=(FLEETS, KNEES))
-    return run_requests(task, plan, output, progress)
+    with ExitStack() as stack:
+        ray = connect(config.ray, config.processes) if config.ray else None
+        if ray is not None:
+            stack.callback(ray.shutdown)
+        task = Task("capacity", drive=partial(_drive, config, ray), tables=(FLEETS, KNEES))
+        return run_requests(task, plan, output, progress)
 
 
 def twin(cell: Pipeline) -> Pipeline:
@@ -88,7 +93,7 @@ def cell_name(session: Session, mode: str) -> str:
     return f"{session.cell.name}, {mode}" if mode else session.cell.name
 
 
-def _drive(config: CapacityConfig, launch: RunningLaunch) -> None:
+def _drive(config: CapacityConfig, ray: Any, launch: RunningLaunch) -> None:
     half = len(launch.sessions) // 2
     for position, session in enumerate(launch.sessions):
         launch.progress.stage(f"warming up: {session.cell.name}")
@@ -99,7 +104,7 @@ def _drive(config: CapacityConfig, launch: RunningLaunch) -> None:
     for session, instant in zip(launch.sessions[:half], launch.sessions[half:], strict=True):
         service: Service | None = None
         for mode in modes:
-            cell = _Cell(config, launch, session, instant, mode, service)
+            cell = _Cell(config, ray, launch, session, instant, mode, service)
             cell.run()
             service = cell.service
 
@@ -109,6 +114,8 @@ class _Cell:
     """The fleets of one pipeline and mode."""
 
     config: CapacityConfig
+    ray: Any
+    """None: the robots are on this host."""
     launch: RunningLaunch
     session: Session
     instant: Session
@@ -122,11 +129,11 @@ class _Cell:
     def run(self) -> None:
         config = self.config
         try:
-            with _Robots(config, self.launch, self.session, self.mode) as robots:
+            with _Robots(config, self.ray, self.launch, self.session, self.mode) as robots:
                 attempt = partial(self._attempt, robots)
                 if config.load != "chunks" or attempt(1) or not config.searches:
                     search(config.numbers, attempt, bisects=config.searches)
-            with _Robots(config, self.launch, self.instant, self.mode) as robots:
+            with _Robots(config, self.ray, self.launch, self.instant, self.mode) as robots:
                 for number in sorted(self.tried, reverse=True):
                     if self.tried[number].clean and self._fleet(robots, number, "twin").driven:
                         break
@@ -174,7 +181,8 @@ class _Cell:
         launch.writer.append(FLEETS, [fleet])
         for trace in traces:
             self._write(launch.writer, {**about, "robot": trace.robot}, trace)
-        launch.progress.advance()
+        if source == "measured":
+            launch.progress.advance()
         return Tried(number, verdict, within, clean)
 
     def _write(self, writer: RunWriter, about: Mapping[str, Any], trace: RobotTrace) -> None:
@@ -208,9 +216,9 @@ class _Cell:
 
 
 class _Robots(ExitStack):
-    """The robots of one cell, spread over processes; a context manager that closes their connections."""
+    """The robots of one cell, spread over processes and hosts; a context manager that closes their connections."""
 
-    def __init__(self, config: CapacityConfig, launch: RunningLaunch, session: Session, mode: str) -> None:
+    def __init__(self, config: CapacityConfig, ray: Any, launch: RunningLaunch, session: Session, mode: str) -> None:
         super().__init__()
         self._config, self._launch, self.session = config, launch, session
         self.name = cell_name(session, mode)
@@ -226,11 +234,20 @@ class _Robots(ExitStack):
             every_ns=config.plan_ns if config.load == "plans" else 0,
             think_ns=round(config.think_s * 1e9),
         )
-        many = config.processes > 1 and not session.cell.transport.in_process
-        self._fleets: list[Any] = []
-        for _ in range(config.processes if many else 1):
-            self._fleets.append(FleetProcess(plan) if many else Fleet(plan))
-            self.callback(self._fleets[-1].close)
+        self._fleets: list[Any]
+        if ray is not None:
+            if not session.cell.options.external_address:
+                plan = replace(plan, own=replace(launch.plan, cells=(session.cell,)))
+            self._fleets = [FleetOnRay(plan, ray) for _ in range(config.processes)]
+        elif config.processes > 1 and not session.cell.transport.in_process:
+            self._fleets = [FleetProcess(plan) for _ in range(config.processes)]
+        else:
+            self._fleets = [Fleet(plan)]
+        for fleet in self._fleets:
+            self.callback(fleet.close)
+        if ray is not None:
+            machines = [fleet.machine() for fleet in self._fleets]
+            launch.writer.update(machines={machine["host"]: machine for machine in machines})
 
     def looks(self, number: int) -> Iterator[tuple[list[RobotTrace], dict[str, Any]]]:
         """Act with ``number`` robots, and yield what they did since the start, and what that used, look by look.
@@ -273,7 +290,7 @@ class _Robots(ExitStack):
             fleet.connect([*share])
         start_ns = now_ns() + round(HEAD_START_S * 1e9)
         for fleet, share in zip(fleets, shares, strict=True):
-            fleet.start(share, start_ns)
+            fleet.start(share, start_ns - now_ns())
         return start_ns
 
     def _until(self, start_ns: int, settle_ns: int, end_ns: int) -> tuple[list[RobotTrace], dict[str, Any]]:
@@ -285,7 +302,7 @@ class _Robots(ExitStack):
         after_ns = now_ns()
         spent = launch.sampler.window(before_ns, after_ns)
         server_ns = spent.get("server_cpu_ns")
-        traces = [trace for fleet in self._fleets for trace in fleet.traces()]
+        traces = [trace for fleet in self._fleets for trace in fleet.traces(start_ns)]
         self._keep()
         return traces, {
             "generator_cpu": (self._cpu_s() - before_s) / (after_ns - before_ns) * 1e9,

@@ -48,6 +48,9 @@ def test_a_limit_is_a_share_of_values_that_may_be_above_it(written: str, limit: 
         ({"modes": "queue?execute=20"}, "`modes`: queue: a chunk has 16 actions"),
         ({"episodes_s": 0.01}, "`episodes`: 0.01 s need a control clock"),
         ({"servers": 2}, "`servers` needs `predict`"),
+        ({"predict": "20", "ray": "auto"}, "`ray` is for a measured run"),
+        ({"ray": "auto"}, "`ray`: robots on other hosts need a server that they reach; name it with `url`"),
+        ({"modes": "replace?under_way=many"}, "`modes`: replace?under_way=many has several requests under way"),
         ({"predict": "20", "requests": {"timeout_s": 3}}, "`timeout_s` is for a measured run"),
     ],
 )

@@ -15,7 +15,7 @@ import s2a_bench as s2a
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import ServerDied
 from s2a_bench.experiments.capacity import generator
-from s2a_bench.experiments.capacity.generator import FleetPlan, PlainRobot
+from s2a_bench.experiments.capacity.generator import Fleet, FleetPlan, PlainRobot
 from s2a_bench.experiments.capacity.metrics import RobotTrace
 from s2a_bench.experiments.capacity.rows import FLEETS, REQUESTS, ROBOTS
 from s2a_bench.experiments.capacity.run import twin
@@ -111,6 +111,18 @@ def test_a_plan_stalls_if_its_safe_start_is_after_the_next_is_due(
 def test_a_robot_goes_on_after_an_answer_that_breaks_and_ends_with_its_server(monkeypatch: pytest.MonkeyPatch) -> None:
     trace = robot_of(monkeypatch, ["broken", [10], "fatal", [10]], think_ns=100 * MS)
     assert [each >= 0 for each in trace.arrival_ns] == [False, True, False]
+
+
+def test_a_fleet_acts_on_its_own_clock_and_reports_on_that_of_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = VirtualClock(10**15)
+    monkeypatch.setattr(generator, "now_ns", clock.now_ns)
+    fleet = Fleet(FleetPlan("c", {}, cast("Any", None), REQUEST, False, ControlSetting(20 * MS, 16), "", 0, 10**15))
+    fleet._sessions = {robot: (cast("Session", None), count()) for robot in range(2)}
+    fleet.start({0: 0, 1: 7 * MS}, 100 * MS)
+    clock.sleep_until_ns(10**15 + 300 * MS)
+    traces = fleet.traces(5 * MS)
+    assert [(each.start_ns // MS, each.end_ns // MS) for each in traces] == [(5, 205), (12, 205)]
+    fleet.stop()
 
 
 @pytest.mark.parametrize(
