@@ -265,7 +265,7 @@ class CapacityConfig(Options):
         _ = self.live_requests
         if several := [name for name, each in self.made.items() if each.several]:
             raise UsageError(
-                f"`modes`: {several[0]} has several requests under way, and a robot one connection; take it with `predict`"
+                f"`modes`: {several[0]} has several requests under way, a robot one connection; `predict` it instead"
             )
         if self.ray and not all(each.options.external_address for each in self.requests.pipelines):
             raise UsageError("`ray`: robots on other hosts need a server that they reach; name it with `url`")
