@@ -208,6 +208,9 @@ class Disconnected(Exception):
 class Exchange:
     """One request and its answer, as a transport frames them; all is called on the thread of `Core.answer`."""
 
+    parse_stage = RESIDUAL
+    """The stage of what `request` does after its last mark."""
+
     def __init__(self, trace: Trace | None = None) -> None:
         """Keep the trace, or start one: the framing marks it from the last received byte on."""
         self.trace = trace or Trace()
@@ -317,6 +320,7 @@ class Core:
             try:
                 with self._reading:
                     request = exchange.request()
+                exchange.trace.mark(exchange.parse_stage)
                 turn = turn or self.join(exchange)
                 self._answer(exchange, request, turn)
             finally:

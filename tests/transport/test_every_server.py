@@ -15,9 +15,10 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import PortInUse, RequestFailed, TransportError, UsageError
 from s2a_bench.harness.clocks import Exchange
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
-from s2a_bench.trace import Trace, budget
+from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, open_client, open_server
 from s2a_bench.transport.limits import Limits
+from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.serving import CLOCK_PROMPT, Queued
 from s2a_bench.types import Action, Piece, Request, Token
 from tests.waiting import until
@@ -133,6 +134,16 @@ def test_a_client_that_compares_clocks_is_answered_in_its_turn_without_the_engin
     assert not handler.requests
     exchange = Exchange.of(trace)
     assert exchange.sent_ns <= exchange.received_ns <= exchange.answered_ns <= exchange.seen_ns
+
+
+@every
+def test_what_is_parsed_after_the_pictures_is_of_the_stage_of_parsing(name: str) -> None:
+    with serving(name, recorder(name)) as connect:
+        _, trace = ask(connect(), Request("a", "plan", (yuyv_frame(),), max_tokens=3, state=(0.5,) * 6))
+    assert trace.remote is not None
+    stages = [stage for stage, _ in trace.remote.marks if stage != "accept"]  # a goal's, once it is read
+    *_, last, _ = stages[: len(stages) - stages[::-1].index(RESIDUAL)]
+    assert one_pipeline(name).transport.stages[last] == "parse"
 
 
 @every

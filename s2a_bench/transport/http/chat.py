@@ -96,6 +96,7 @@ def _request(fields: dict[str, Any], prompt: str, images: tuple[Frame, ...], lim
 class ChatExchange(Exchange):
     """One chat completion; a server's framing adds `read`, `write` and `whole`."""
 
+    parse_stage = "json_parse"
     takes_blocks = False
     """Whether the client reads actions as `blocks`."""
 

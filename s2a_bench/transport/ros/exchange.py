@@ -35,6 +35,8 @@ class Shared:
 class RosExchange(Exchange):
     """One request of a front; subclasses read it, send its pieces and finish it."""
 
+    parse_stage = "cdr_parse"
+
     def __init__(self, shared: Shared, trace: Trace) -> None:
         super().__init__(trace)
         self._shared = shared

@@ -133,6 +133,8 @@ class Writer:
 
 
 class ShmExchange(Exchange):
+    parse_stage = "header_parse"
+
     def __init__(
         self,
         wire: Wire,

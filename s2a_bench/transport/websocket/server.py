@@ -42,6 +42,8 @@ class WebsocketServer(WebServer):
 
 
 class WebsocketExchange(Exchange):
+    parse_stage = "msgpack_parse"
+
     def __init__(self, connection: PolicyConnection, message: bytes) -> None:
         super().__init__()
         self.trace.mark("network")
@@ -54,9 +56,7 @@ class WebsocketExchange(Exchange):
         observation, self._message = unpackb(self._message), b""
         self.trace.mark("msgpack_parse")
         extension = observed.take_extension(observation) if self._connection.native else None
-        request = observed.request_of(observation, extension, self.trace, self._connection.core.limits)
-        self.trace.mark("msgpack_parse")
-        return request
+        return observed.request_of(observation, extension, self.trace, self._connection.core.limits)
 
     def begin(self, request: Request) -> Request:
         self._started_ns = now_ns()

@@ -233,6 +233,8 @@ class ReplyAddress:
 class ActionExchange(Exchange):
     """One request for actions; the chunk goes back whole."""
 
+    parse_stage = "msgpack_parse"
+
     def __init__(
         self,
         client: ReplyAddress,
@@ -252,9 +254,7 @@ class ActionExchange(Exchange):
 
     def request(self) -> Request:
         self._observation, self._layout = layouts.observation_in(self._data)
-        request = observed.request_of(self._observation, self._extension, self.trace, self._core.limits)
-        self.trace.mark("msgpack_parse")
-        return request
+        return observed.request_of(self._observation, self._extension, self.trace, self._core.limits)
 
     def send(self, piece: Piece) -> bool:
         self._pieces.append(piece)
