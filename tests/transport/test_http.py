@@ -129,7 +129,13 @@ def test_the_stream_is_what_openai_clients_expect(url: str) -> None:
     assert [event["choices"][0]["delta"] for event in events[:-1]] == [{"content": "go"}, {"content": "_to"}, {}]
     assert events[-2]["choices"][0]["finish_reason"] == "stop"
     assert events[-1]["choices"] == []
-    assert [stage for stage, _ in events[-1]["s2a"]["marks"]] == ["network", "json_parse", "json_parse", "", "inference"]
+    assert [stage for stage, _ in events[-1]["s2a"]["marks"]] == [
+        "network",
+        "json_parse",
+        "json_parse",
+        "",
+        "inference",
+    ]
 
 
 def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: RecordingHandler) -> None:

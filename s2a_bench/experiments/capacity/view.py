@@ -58,11 +58,12 @@ def _knee_sentences(run: StoredRun) -> Iterator[str]:
 
 def _parted(run: StoredRun) -> Iterator[str]:
     """Yield for each measured cell from which fleet on the prediction leaves the interval of the stalled share."""
-    fleets = {(row["cell"], row["source"], row["robots"]): row for row in _fleets(run)}
-    for cell in dict.fromkeys(row["cell"] for row in _fleets(run)):
+    rows = [row for row in _fleets(run) if row["clean"]]
+    fleets = {(row["cell"], row["source"], row["robots"]): row for row in rows}
+    for cell in dict.fromkeys(row["cell"] for row in rows):
         both = [
             (mine, fleets[cell, PREDICTED, mine["robots"]])
-            for mine in _fleets(run)
+            for mine in rows
             if mine["cell"] == cell and mine["source"] == "measured" and (cell, PREDICTED, mine["robots"]) in fleets
         ]
         pairs = [(mine, other) for mine, other in both if None not in (mine["stalled"], other["stalled"])]
@@ -92,14 +93,22 @@ def _table(run: StoredRun, names: Sequence[str]) -> TextTable:
     titles = [f"{metric.title} (ms)" if metric.kind == TIME else metric.title for metric in shown]
     groups = [
         [
-            (cell, source, str(row["robots"]), row["verdict"], *(_entry(metric, row) for metric in shown))
+            (
+                cell,
+                source,
+                str(row["robots"]),
+                row["verdict"] if row["clean"] else "late",
+                *(_entry(metric, row) for metric in shown),
+            )
             for row in rows
             if (row["cell"], row["source"]) == (cell, source)
         ]
         for cell, source in dict.fromkeys((row["cell"], row["source"]) for row in rows)
     ]
     header = ("cell", "source", "N", "limit", *titles)
-    return TextTable.grouped("Robots on one server", header, groups, 2, once=2, cells=[row["cell"] for row in rows])
+    notes = ("late: no measurement, as the generator's own ticks were late",) * any(not row["clean"] for row in rows)
+    of_rows = [row["cell"] for row in rows]
+    return TextTable.grouped("Robots on one server", header, groups, 2, once=2, cells=of_rows, notes=notes)
 
 
 def _entry(metric: Metric, row: dict[str, Any]) -> str:
@@ -117,7 +126,7 @@ def _value(metric: Metric, value: float | None) -> str:
 
 def build_capacity(run: StoredRun) -> Figure:
     """Draw latency, stalled share and age over the number of robots, with the knee and its interval."""
-    rows = [row for row in _fleets(run) if row["source"] != "twin"]
+    rows = [row for row in _fleets(run) if row["source"] != "twin" and row["clean"]]
     cells = list(dict.fromkeys(row["cell"] for row in rows))[: len(COLOURS)]
     panels = {name: label for name, label in PANELS.items() if any(row[f"{_column(name)}"] is not None for row in rows)}
     notes = (

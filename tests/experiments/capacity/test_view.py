@@ -61,6 +61,17 @@ def test_fleets_stand_by_their_number_of_robots_however_they_were_searched(tmp_p
     json.dumps(found)
 
 
+def test_a_fleet_whose_generator_was_late_is_no_measurement_in_table_and_sentence(tmp_path: Path) -> None:
+    run = measured(tmp_path, 40, robots=9)
+    fleets = run.table(FLEETS)
+    run.tables[FLEETS.name] = fleets.assign(clean=(fleets["robots"] != 9) | (fleets["source"] != "measured"))
+    shown = EXPERIMENT.show(run)
+    table = shown.tables["capacity"]
+    assert [row[2] for row in table.rows if row[3] == "late"] == ["9"]
+    assert table.notes == ("late: no measurement, as the generator's own ticks were late",)
+    assert list(shown.sentences)[2].endswith("lies in the measured interval at every number of robots.")
+
+
 @pytest.mark.parametrize(
     ("options", "panels"),
     [
