@@ -1,16 +1,14 @@
-"""Events of an executor, the feed that makes them from a stream's tokens, and inboxes on a live or a virtual clock."""
+"""Events of an executor, the feed that makes them from a stream's tokens, and their inbox."""
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import count
 from queue import Empty, SimpleQueue
 from typing import Literal, Protocol, TypeAlias
 
-from s2a_bench.clock import VirtualClock, now_ns
+from s2a_bench.clock import now_ns
 from s2a_bench.plan import Call, Parser, SkillParsed
 from s2a_bench.plan import Event as PlanEvent
 
@@ -138,31 +136,4 @@ class LiveInbox:
                 found.append(self._events.get(timeout=None if until_ns is None else max(until_ns - now_ns(), 0) / 1e9))
         while not self._events.empty():  # this is the only reader
             found.append(self._events.get())
-        return found
-
-
-class ScriptedInbox:
-    """An inbox with a script of events, ordered by time and then by position; waiting moves a virtual clock."""
-
-    def __init__(self, clock: VirtualClock, script: Iterable[Event] = ()) -> None:
-        self._clock = clock
-        self._order = count()
-        self._events: list[tuple[int, int, Event]] = []
-        for event in script:
-            self.put(event)
-
-    def put(self, event: Event) -> None:
-        heapq.heappush(self._events, (event.at_ns, next(self._order), event))
-
-    def wait(self, until_ns: int | None) -> list[Event]:
-        """Jump to the next event, or to ``until_ns``; raises RuntimeError without either."""
-        if not self._events and until_ns is None:
-            raise RuntimeError("nothing will ever happen: the executor would wait for ever")
-        if not self._events or (until_ns is not None and until_ns < self._events[0][0]):
-            self._clock.sleep_until_ns(until_ns or 0)
-            return []
-        self._clock.sleep_until_ns(self._events[0][0])
-        found = []
-        while self._events and self._events[0][0] <= self._clock.now_ns():
-            found.append(heapq.heappop(self._events)[2])
         return found

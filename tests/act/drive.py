@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import heapq
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import count
 
 from s2a_bench.act import Report, Running, SkillRobot
-from s2a_bench.act.events import Event, Requested, ScriptedInbox, SkillArrived, SkillOver, StreamEnded, TokenArrived
+from s2a_bench.act.events import Event, Requested, SkillArrived, SkillOver, StreamEnded, TokenArrived
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record
 from s2a_bench.clock import VirtualClock
@@ -84,6 +86,33 @@ class Task:
 
     def abort(self) -> None:
         self.robot.say("abort")
+
+
+class ScriptedInbox:
+    """An inbox with a script of events, ordered by time and then by position; waiting moves a virtual clock."""
+
+    def __init__(self, clock: VirtualClock, script: Iterable[Event] = ()) -> None:
+        self._clock = clock
+        self._order = count()
+        self._events: list[tuple[int, int, Event]] = []
+        for event in script:
+            self.put(event)
+
+    def put(self, event: Event) -> None:
+        heapq.heappush(self._events, (event.at_ns, next(self._order), event))
+
+    def wait(self, until_ns: int | None) -> list[Event]:
+        """Jump to the next event, or to ``until_ns``; raises RuntimeError without either."""
+        if not self._events and until_ns is None:
+            raise RuntimeError("nothing will ever happen: the executor would wait for ever")
+        if not self._events or (until_ns is not None and until_ns < self._events[0][0]):
+            self._clock.sleep_until_ns(until_ns or 0)
+            return []
+        self._clock.sleep_until_ns(self._events[0][0])
+        found = []
+        while self._events and self._events[0][0] <= self._clock.now_ns():
+            found.append(heapq.heappop(self._events)[2])
+        return found
 
 
 @dataclass

@@ -10,9 +10,9 @@ import pytest
 
 from s2a_bench.act import ROBOTS, events
 from s2a_bench.act.call import SkillMotion
-from s2a_bench.act.events import ScriptedInbox
 from s2a_bench.clock import VirtualClock, now_ns
 from s2a_bench.plan import load_skills
+from tests.act.drive import ScriptedInbox
 
 PAGE = (Path(__file__).parent.parent.parent / "docs" / "executor.md").read_text()
 ARM, PROGRAM = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)

@@ -7,13 +7,13 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.act.events import Event, PlanFeed, ScriptedInbox
+from s2a_bench.act.events import Event, PlanFeed
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record
 from s2a_bench.clock import VirtualClock
 from s2a_bench.plan import Parser, load_skills, paper_format
 from s2a_bench.policy import policy
-from tests.act.drive import Obedient, ns, shape, starts
+from tests.act.drive import Obedient, ScriptedInbox, ns, shape, starts
 
 HOUSEHOLD = load_skills("household")
 PLAN = "1. go_to(kitchen)\n2. pick(cup)\n3. place(cup, table)\n"
