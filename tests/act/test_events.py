@@ -6,8 +6,9 @@ from threading import Timer
 
 import pytest
 
-from s2a_bench.act.events import Event, LiveInbox, ScriptedInbox, StreamEnded, TokenArrived
+from s2a_bench.act.events import Event, LiveInbox, StreamEnded, TokenArrived
 from s2a_bench.clock import VirtualClock, now_ns
+from tests.act.drive import ScriptedInbox
 
 FIRST, SECOND = TokenArrived(5), StreamEnded(5)
 
