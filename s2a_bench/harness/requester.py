@@ -24,6 +24,7 @@ OnActions: TypeAlias = "Callable[[int, Sequence[Vector], int], None]"
 SEEDS: Final = 2**31
 GRACE_S: Final = 1.0
 """For answers in progress when a run ends early."""
+LEAST_WAIT_S: Final = 0.1
 MOST_WAIT_S: Final = 5.0
 """The longest wait for a server that names a time to retry."""
 
@@ -124,8 +125,13 @@ class ChunkRequester:
                 check(session, len(actions), self.horizon)
             if not measured.sample.error or len(chunk) == self.horizon:
                 return
-            if measured.fatal is not None or self.over.wait(min(measured.retry_after_s, MOST_WAIT_S)):
+            if measured.fatal is not None or self.over.wait(wait_s(measured)):
                 return
+
+
+def wait_s(measured: Measured) -> float:
+    """Return how long a robot waits before it repeats a failed request."""
+    return min(max(measured.retry_after_s, LEAST_WAIT_S), MOST_WAIT_S)
 
 
 def check(session: Session, actions: int, horizon: int) -> None:

@@ -39,7 +39,7 @@ from s2a_bench.transport import Client, Wiring
 from s2a_bench.transport.pipeline import Pipeline
 
 GIVE_UP_AFTER = 5
-"""Failures of one cell in a row, after which the run ends."""
+"""Failures in a row, of every client of a cell, after which the run ends."""
 LONGEST_WAIT_S = 60.0
 """Limit on a server's ``retry_after_s``; a server that needs longer refuses again and soon ends the run."""
 
@@ -58,8 +58,8 @@ class RunningLaunch:
     writer: RunWriter
     sessions: Sequence[Session]
     """In the order of the cells, `Task.clients` of each cell one after the other."""
-    keep: Callable[[Session, Measured], None]
-    """Writes a request, and raises what makes the next one useless; not thread-safe."""
+    keep: Callable[..., None]
+    """Writes a request, as `_Run.keep`; not thread-safe."""
     progress: Progress
     warnings: list[RunWarning]
     """Warnings of the run besides those about its requests."""
@@ -203,7 +203,7 @@ class _Run:
         origins = {session.cell.name: session.origin for session in sessions}
         writer.update(asked=described, provenance=Origins(Provenance.of_engine(model), origins).to_manifest())
         hits = servers.cache_hits()
-        keep = partial(self._keep, servers, sampler)
+        keep = partial(self.keep, servers, sampler)
         try:
             launch = RunningLaunch(
                 number, self.plan, writer, sessions, keep, self.progress, self.warnings, servers.wiring, sampler
@@ -250,7 +250,16 @@ class _Run:
             made.append(Session(cell, client, feed, *about))
             yield made[0]
 
-    def _keep(self, servers: ServerSet, sampler: ResourceSampler, session: Session, measured: Measured) -> None:
+    def keep(
+        self,
+        servers: ServerSet,
+        sampler: ResourceSampler,
+        session: Session,
+        measured: Measured,
+        client: int = 0,
+        clients: int = 1,
+    ) -> None:
+        """Write a request of one of the ``clients`` of a cell, and raise what makes the next one useless."""
         name, sample, writer = session.cell.name, measured.sample, self.writer
         keep_origin(writer, name, session.origin)
         writer.sample(sample)
@@ -258,9 +267,9 @@ class _Run:
         sampler.flush(writer)
         for row in session.frames():
             writer.frame(row)
-        self.guard.see(sample, measured.fingerprint, measured.odd)
-        servers.raise_if_over(session.cell, measured)
-        if self.guard.in_a_row[name] >= GIVE_UP_AFTER:
+        self.guard.see(sample, measured.fingerprint, measured.odd, client)
+        servers.raise_if_over(session.cell, measured, suspect=bool(sample.error) and clients == 1)
+        if sum(failures >= GIVE_UP_AFTER for failures in self.guard.in_a_row[name].values()) >= clients:
             raise TransportError(f"{name} failed {GIVE_UP_AFTER} times in a row, at last with {sample.error}")
         back_off(name, measured.retry_after_s, SystemClock(), self.progress.stage)
 

@@ -168,11 +168,11 @@ class ServerSet:
         if process is not None and process.ends_within(LAST_MOMENT_S if suspect else 0):
             raise process.death()
 
-    def raise_if_over(self, pipeline: Pipeline, measured: Measured) -> None:
+    def raise_if_over(self, pipeline: Pipeline, measured: Measured, *, suspect: bool) -> None:
         """Raise what makes the next request useless: Ctrl-C, the server's end, an error that will repeat."""
         if isinstance(measured.fatal, KeyboardInterrupt):
             raise measured.fatal
-        self.raise_if_dead(pipeline, suspect=bool(measured.sample.error))
+        self.raise_if_dead(pipeline, suspect=suspect)
         if measured.fatal is not None:
             raise measured.fatal
 

@@ -191,8 +191,8 @@ class SampleGuard:
     def __init__(self, against_loss: Mapping[str, str] | None = None) -> None:
         self.succeeded: Counter[str] = Counter()
         """Samples that count, by cell."""
-        self.in_a_row: Counter[str] = Counter()
-        """Failures since the last success, by cell."""
+        self.in_a_row: defaultdict[str, Counter[int]] = defaultdict(Counter)
+        """Failures of each client since the last success of any, by cell."""
         self.last_error: dict[str, str] = {}
         """The last error, by cell."""
         self._against_loss = against_loss or {}
@@ -204,20 +204,21 @@ class SampleGuard:
         self._waits_ms: dict[str, list[float]] = defaultdict(list)
         self._launches: set[int] = set()
 
-    def see(self, row: SampleRow, fingerprint: int, odd: Iterable[str] = ()) -> None:
+    def see(self, row: SampleRow, fingerprint: int, odd: Iterable[str] = (), client: int = 0) -> None:
         cell, counts = row.cell, self._counts
         self._odd[cell].update(odd)  # names of impossible facts
         if self._frames.setdefault((cell, fingerprint), row.request_id) != row.request_id:
             counts[REPEATED][cell] += 1
         if lost := row.facts.get(FRAMES_LOST):
             counts[OVERTAKEN][cell] = int(lost)
-        self.in_a_row[cell] = self.in_a_row[cell] + 1 if row.error else 0
         if row.error:
+            self.in_a_row[cell][client] += 1
             self.last_error[cell] = row.error
             if row.error != INTERRUPTED:
                 failed = LOST if row.error.startswith("MessagesLost") else FAILED
                 counts[STALE if STALE_FRAMES in row.facts else failed][cell] += 1
             return
+        self.in_a_row[cell].clear()
         if row.cache_n:
             counts[CACHED][cell] += 1
             self._cached_share = max(self._cached_share, row.cache_n / (row.cache_n + (row.prompt_n or 0)))

@@ -155,11 +155,11 @@ def test_few_or_other_samples_or_several_launches_are_none(correlation: float, n
     assert codes(*((sample, place) for place, sample in enumerate(series(correlation, n, launches)))) == []
 
 
-def test_failures_in_a_row_end_with_a_success() -> None:
+def test_failures_in_a_row_of_every_client_end_with_a_success_of_any() -> None:
     guard = SampleGuard()
-    for number, error in enumerate(["x", "x", "", "x"]):
-        guard.see(row(str(number), error=error), number)
-    assert guard.in_a_row["ros/topic"] == 1
+    for number, (error, client) in enumerate([("x", 0), ("x", 1), ("", 2), ("x", 0), ("x", 0)]):
+        guard.see(row(str(number), error=error), number, client=client)
+    assert guard.in_a_row["ros/topic"] == {0: 2}
     assert guard.succeeded["ros/topic"] == 1
     assert guard.succeeded["loopback"] == 0
     assert guard.last_error == {"ros/topic": "x"}
