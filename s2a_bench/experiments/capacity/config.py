@@ -31,6 +31,8 @@ MOST_ROBOTS: Final = 10_000
 MOST_CONNECTIONS: Final = 1_000
 """Robots of a measured run, each with a connection and a thread."""
 PLAN_EVERY_S: Final = 2.0
+FEWEST_PLANS: Final = 3
+"""Of a robot, in the time that counts."""
 SETTLE_S: Final = 5.0
 LIMITS: Final = "stalled=1%, latency_p99=300ms, ttft_p99=300ms, age_p99=200ms; p50 as well as p99"
 _LIMIT: Final = re.compile(r"(stalled)=(\d+\.?\d*)%?|((?:latency|ttft|age)_p(50|99))=(\d+\.?\d*)(ms|s)")
@@ -67,7 +69,7 @@ class Limit:
     @property
     def text(self) -> str:
         if self.column == "stalled":
-            return f"at most {self.share * 100:g} % stalled ticks"
+            return f"at most {self.share * 100:g} % stalled"
         return f"{self.column.removesuffix('_ns').replace('_', ' ')} of at most {self.value / 1e6:g} ms"
 
 
@@ -162,13 +164,13 @@ class CapacityConfig(Options):
 
     @property
     def searches(self) -> bool:
-        return ".." in self.robots and bool(self.limit)
+        return ".." in self.robots and self.limited is not None
 
     @property
     def most_fleets(self) -> int:
-        """Return the most fleets of a search."""
+        """Return the most fleets of a search, one robot alone included."""
         bisected = math.ceil(math.log2(self.numbers[-1] / self.numbers[0])) if self.searches else 0
-        return len(self.numbers) + bisected
+        return len({1, *self.numbers}) + bisected
 
     @property
     def confidence(self) -> float:
@@ -187,9 +189,10 @@ class CapacityConfig(Options):
 
     def limit_text(self, mode: str) -> str:
         """Return the limit in words, as it is for a mode, or for "" for robots without one."""
-        text = "" if self.limited is None else self.limited.text
-        blocks = mode and self.made[mode].blocks and self.limited is not None and self.limited.column == "stalled"
-        return f"{text} beyond those of one robot alone" if blocks else text
+        if self.limited is None or self.limited.column != "stalled":
+            return "" if self.limited is None else self.limited.text
+        beyond = " beyond those of one robot alone" if mode and self.made[mode].blocks else ""
+        return f"{self.limited.text} {'ticks' if self.load == 'chunks' else 'plans'}{beyond}"
 
     @property
     def setting(self) -> ControlSetting:
@@ -249,9 +252,11 @@ class CapacityConfig(Options):
             raise UsageError(f"`robots`: {self.numbers[-1]} are more than {most}")
         if self.episodes_s and (self.closed_loop or self.episodes_s * self.control_hz < 2):  # noqa: PLR2004
             raise UsageError(f"`episodes`: {self.episodes_s:g} s need a control clock, and two of its ticks")
+        if self.episodes_s and self.settle_ns >= self.episodes_s * 1e9:
+            raise UsageError(f"`settle`: {self.settle_s:g} s leave nothing of an episode of {self.episodes_s:g} s")
         _ = self.made
         if self.predict:
-            given = {"processes", "ray"} & self.model_fields_set
+            given = {"processes", "ray", "latency"} & self.model_fields_set
             if alone := next(iter((*sorted(given), *self.requests.given())), ""):
                 raise UsageError(f"`{alone}` is for a measured run; leave it out with `predict`")
         else:
@@ -276,6 +281,10 @@ class CapacityConfig(Options):
             raise UsageError("`think` needs `closed_loop`")
         if "modes" in given and self.load != "chunks":
             raise UsageError("`modes` are ways to act on chunks of actions; leave them out without chunks")
+        acts_s, least_s = self.episodes_s or self.seconds, FEWEST_PLANS * self.plan_ns / 1e9
+        if self.load == "plans" and acts_s < least_s:
+            name, every = "episodes" if self.episodes_s else "seconds", f"one plan every {self.plan_ns / 1e9:g} s"
+            raise UsageError(f"`{name}`: {acts_s:g} s are too short for {every}; take {least_s:g} or more")
         if limit is None:
             return
         if limit.column.startswith("age") and self.load != "chunks":
@@ -293,6 +302,7 @@ class CapacityConfig(Options):
             **self.model_dump(mode="json", exclude={"requests"}),
             "modes": list(self.made),
             "load": self.load,
+            **({"plan_every_s": self.plan_ns / 1e9} if self.load == "plans" else {}),
             "period_ns": self.setting.period_ns,
             "settle_ns": self.settle_ns,
         }

@@ -24,11 +24,11 @@ import numpy as np
 
 from s2a_bench.act.control import ControlLoop, RobotTicks
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import S2AError, ServerDied, UsageError
+from s2a_bench.errors import ServerDied, UsageError
 from s2a_bench.experiments.capacity.metrics import RobotTrace
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.requester import MOST_WAIT_S, SEEDS, ChunkRequester, Job
+from s2a_bench.harness.requester import SEEDS, ChunkRequester, Job, wait_s
 from s2a_bench.harness.servers import ServerSet
 from s2a_bench.harness.session import Measured, Place, RequestContext, Session
 from s2a_bench.machine import environment
@@ -84,7 +84,7 @@ class ChunkRobot:
         self._requester = ChunkRequester(
             [session], plan.setting.horizon, plan.seed, chosen.streams, self._arrived, blocks, done=done
         )
-        self.ticks = RobotTicks(chosen, plan.setting, lambda *_: None, self._ask, ENDLESS, phase_ns)
+        self.ticks = RobotTicks(chosen, plan.setting, lambda *_: None, self._request, ENDLESS, phase_ns)
         self.over = self._requester.over
 
     def work(self) -> None:
@@ -115,7 +115,7 @@ class ChunkRobot:
     def _arrived(self, request: int, actions: Sequence[Any], at_ns: int) -> None:
         self.ticks.arrived(request, actions, at_ns)
 
-    def _ask(self, request: int, tick: int) -> None:
+    def _request(self, request: int, tick: int) -> None:
         self._requester.jobs.put(Job(request, tick, ()))
 
 
@@ -125,7 +125,7 @@ class Timed:
 
     intended_ns: int
     late_ns: int
-    """Of the generator: after its intended time, or the answer before it."""
+    """Of the generator: after its intended time, or the answer before it; -1: not requested."""
     at_ns: list[int] = field(default_factory=list)
     """Times of its pieces."""
     whole_ns: int = -1
@@ -170,7 +170,7 @@ class PlainRobot:
         timed, every_ns = self._timed[:], self._plan.every_ns
         if every_ns:  # plans that are due wait for the answers before them
             due_ns = timed[-1].intended_ns + every_ns if timed else self._begin_ns
-            timed += [Timed(each, 0) for each in range(due_ns, end_ns, every_ns)]
+            timed += [Timed(each, -1) for each in range(due_ns, end_ns, every_ns)]
             timed = [each for each in timed if each.whole_ns >= 0 or each.intended_ns + every_ns <= end_ns]
         return RobotTrace(
             robot,
@@ -203,7 +203,7 @@ class PlainRobot:
         if not measured.sample.error:
             timed.whole_ns = timed.at_ns[-1]
         elif measured.fatal is None:
-            self.over.wait(min(measured.retry_after_s, MOST_WAIT_S))
+            self.over.wait(wait_s(measured))
         else:
             self.over.set()
 
@@ -346,11 +346,11 @@ class FleetProcess(RemoteFleet):
         theirs.close()
 
     def close(self) -> None:
-        with suppress(S2AError):
-            self._call("close")
-        self._pipe.close()
-        self._process.join(PATIENCE_S)
+        with suppress(OSError):
+            self._pipe.send(("close", ()))
+        self._process.join(2 * PATIENCE_S)
         self._process.kill()
+        self._pipe.close()
 
     def _call(self, name: str, *given: Any) -> Any:
         try:
@@ -370,7 +370,7 @@ def _serve(plan: FleetPlan, pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run handles Ctrl-C
     end_with_parent()
     fleet, name = Fleet(plan), ""
-    with suppress(EOFError):
+    with suppress(EOFError, OSError):
         while name != "close":
             name, given = pipe.recv()
             try:
@@ -396,8 +396,7 @@ class FleetOnRay(RemoteFleet):
         return facts
 
     def close(self) -> None:
-        with suppress(S2AError):
-            self._call("close")
+        self._ray.wait([self._fleet.close.remote()], timeout=2 * PATIENCE_S)
         self._ray.kill(self._fleet)
 
     def _call(self, name: str, *given: Any) -> Any:

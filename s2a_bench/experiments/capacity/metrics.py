@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments import COUNT, SHARE, TIME, Metric, by_name
+from s2a_bench.experiments import SHARE, TIME, Metric, by_name
 from s2a_bench.policy.conformal import upper_bound
 from s2a_bench.stats.batches import BATCHES, FEWEST_ROWS
 
@@ -48,7 +48,6 @@ METRICS: Final[Mapping[str, Metric]] = by_name(
         _time("age_p50", "age p50", "Of the observation behind an executed action, the median."),
         _time("age_p99", "p99", "Its 99th percentile."),
         _number("unfair", "", "worst/mean", "The greatest mean latency of a robot over that of all.", "lower"),
-        _number("unanswered", "", "unanswered", "Requests without a complete answer.", "lower", kind=COUNT),
         _time("late_p99", "late", "Measured: lateness of the generator's own ticks, 99th percentile."),
         _number("generator_cpu", "cores", "generator", "Measured: CPU time of the generator a second."),
         _number("server_cpu", "cores", "server", "Measured: CPU time of the server a second."),
@@ -77,7 +76,7 @@ class RobotTrace:
     first_ns: Ints | None = None
     """First piece of the answer after the intended time, where it streams: shape (R,), -1 for none."""
     late_ns: Ints | None = None
-    """Lateness of each tick, or of each request without a clock; None in virtual time."""
+    """Lateness of each tick, or of each request without a clock, -1 where it was not made; None in virtual time."""
     plan_stalled: Flags | None = None
     """Whether each plan stalls: shape (R,)."""
 
@@ -102,7 +101,11 @@ def measures(
     first_ns = _joined(np.full_like(each.arrival_ns, -1) if each.first_ns is None else each.first_ns for each in traces)
     skipped = -(-settle_ns // setting.period_ns)
     late_ns = _joined(
-        trace.late_ns[skipped if trace.ticks is not None else 0 :] for trace in traces if trace.late_ns is not None
+        trace.late_ns[skipped:]
+        if trace.ticks is not None
+        else trace.late_ns[trace.request_ns - trace.start_ns >= settle_ns]
+        for trace in traces
+        if trace.late_ns is not None
     )
     age = _joined(trace.ticks.age[skipped:] for trace in traces if trace.ticks is not None)
     found: dict[str, Any] = {
@@ -114,8 +117,7 @@ def measures(
         **_quantiles("age", age[age >= 0] * setting.period_ns),
         **_stalls(traces, setting, settle_ns, confidence),
         "unfair": float(means.max() / latency_ns[answered].mean()) if means.any() else None,
-        "unanswered": int((counts & (latency_ns < 0)).sum()),
-        **_quantiles("late", late_ns),
+        **_quantiles("late", late_ns[late_ns >= 0]),
     }
     values = {metric: found.get(metric.column) for metric in METRICS.values()}
     return {

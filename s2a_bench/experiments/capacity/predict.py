@@ -28,7 +28,6 @@ from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.capacity.config import CapacityConfig
-    from s2a_bench.experiments.capacity.rows import Verdict
     from s2a_bench.policy.chunks import Ints
     from s2a_bench.progress import Progress
 
@@ -144,40 +143,25 @@ class Prediction:
     rows: list[Any] = field(default_factory=list)
     """The fleets of the first seed."""
     alone: float | None = None
+    """Share of stalled ticks of one robot alone, by the same seed."""
 
     def run(self, numbers: Sequence[int], *, bisects: bool) -> KneeRow | None:
-        """Try fleets as `search`; return the median knee of `SEEDS` seeds, with the least and the greatest."""
-        limit, first = self.config.limited, self.config.seed
-        if self.mode:
-            self.alone = self._fleet(first, 1)[0]["stalled"]
-        found = []
-        for seed in range(first, first + (SEEDS if bisects else 1)):
+        """Try one robot, then fleets as `search`; return the median knee of `SEEDS` seeds, and its range over these."""
+        first, found = self.config.seed, []
+        for seed in range(first, first + (1 if self.config.limited is None else SEEDS)):
             self.progress.stage(f"{self.cell}: in virtual time, seed {seed}")
-            tried: list[Tried] = []
-            search(numbers, partial(self._attempt, seed, tried), bisects=bisects)
-            found += [each.robots for each in (knee(tried),) if each is not None]
-        if limit is None:
+            tried: dict[int, Tried] = {}
+            search(numbers, partial(self._attempt, seed), tried, bisects=bisects)
+            if (one := knee(tried.values())) is not None:
+                found.append(one)
+        if self.config.limited is None:
             return None
-        high = max(found) if max(found) < numbers[-1] else None
-        return KneeRow(
-            self.cell,
-            "predicted",
-            self.config.limit_text(self.mode),
-            sorted(found)[len(found) // 2],
-            min(found),
-            high,
-            None,
-        )
+        text, robots = self.config.limit_text(self.mode), sorted(each.robots for each in found)
+        highs = [each.high for each in found if each.high is not None]
+        high = max(highs) if len(highs) == len(found) else None
+        return KneeRow(self.cell, "predicted", text, robots[len(robots) // 2], robots[0], high, None)
 
-    def _attempt(self, seed: int, tried: list[Tried], robots: int) -> bool:
-        row, verdict, within = self._fleet(seed, robots)
-        tried.append(Tried(robots, verdict, within))
-        if seed == self.config.seed:
-            about = {"cell": self.cell, "source": "predicted", "robots": robots, "seconds": self.config.seconds}
-            self.rows.append(FleetRow(**about, looks=1, verdict=verdict, within=within, clean=True, **row))
-        return within
-
-    def _fleet(self, seed: int, robots: int) -> tuple[dict[str, Any], Verdict, bool]:
+    def _attempt(self, seed: int, robots: int) -> Tried:
         config, mode = self.config, self.config.made.get(self.mode)
         closed = mode is None and config.load == "closed"
         fleet = VirtualFleet(
@@ -192,9 +176,16 @@ class Prediction:
         rng = generator(seed, "capacity service", str(robots))
         times = self.service.times(rng)
         traces = simulate(fleet, robots, times, generator(seed, "capacity phases"), config.servers, self.slower)
-        row = measures(traces, config.setting, config.settle_ns) | {"stalled_alone": self.alone}
+        row = measures(traces, config.setting, config.settle_ns)
+        if robots == 1:
+            self.alone = row["stalled"]
+        row["stalled_alone"] = self.alone
         alone = self.alone or 0.0 if mode is not None and mode.blocks else 0.0
-        return row, *judge(config.limited, row, traces, config.settle_ns, LEVEL, alone=alone)
+        verdict, within = judge(config.limited, row, traces, config.settle_ns, LEVEL, alone=alone)
+        if seed == config.seed:
+            about = {"cell": self.cell, "source": "predicted", "robots": robots, "seconds": config.seconds}
+            self.rows.append(FleetRow(**about, looks=1, verdict=verdict, within=within, clean=True, **row))
+        return Tried(robots, "below" if within else "above", within)
 
     def _check(self, fleet: VirtualFleet, robots: int) -> None:
         """Raise UsageError for more ticks or requests than are kept in memory."""

@@ -9,6 +9,8 @@ from s2a_bench.experiments import columns
 from s2a_bench.experiments.capacity.metrics import METRICS
 from s2a_bench.store.schema import Count, Many, NonNegative, Table, about, with_fields
 
+TWIN: Final = ", instant"
+"""After the name of a pipeline: its instant server."""
 Source = Literal["measured", "predicted", "twin"]
 Verdict = Literal["below", "above", "undecided", "none"]
 

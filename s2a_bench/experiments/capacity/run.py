@@ -19,6 +19,7 @@ from s2a_bench.experiments.capacity.rows import (
     KNEES,
     REQUESTS,
     ROBOTS,
+    TWIN,
     FleetRow,
     KneeRow,
     RequestRow,
@@ -50,7 +51,6 @@ KEEP_S: Final = 0.2
 HEAD_START_S: Final = 0.2
 LATEST: Final = 0.05
 """Lateness of the generator's ticks at p99, as a share of a tick, above which a fleet is no measurement."""
-INSTANT: Final = "instant"
 ECHO: Final = (("name", STAND_IN), ("latency", ""), ("pace", None), ("profile", ""), ("gaps", ""))
 ECHO_OF_MODEL: Final = (("model", None), ("mmproj", None), ("gpu_layers", 0))
 
@@ -85,7 +85,7 @@ def twin(cell: Pipeline) -> Pipeline:
         own.transport.require(Choice(own.options, own.variant))
     except UsageError:
         own = pipelines([LOOPBACK])[0]
-    return replace(own, name=f"{cell.name}, {INSTANT}", engine=(*ECHO, *ECHO_OF_MODEL))  # type: ignore[arg-type]
+    return replace(own, name=cell.name + TWIN, engine=(*ECHO, *ECHO_OF_MODEL))  # type: ignore[arg-type]
 
 
 def cell_name(session: Session, mode: str) -> str:
@@ -130,10 +130,9 @@ class _Cell:
         config = self.config
         try:
             with _Robots(config, self.ray, self.launch, self.session, self.mode) as robots:
-                attempt = partial(self._attempt, robots)
-                if config.load != "chunks" or attempt(1) or not config.searches:
-                    search(config.numbers, attempt, bisects=config.searches)
-            with _Robots(config, self.ray, self.launch, self.instant, self.mode) as robots:
+                attempt = partial(self._fleet, robots, source="measured")
+                search(config.numbers, attempt, self.tried, bisects=config.searches)
+            with _Robots(config, self.ray, self.launch, self.instant, self.mode, twin=True) as robots:
                 for number in sorted(self.tried, reverse=True):
                     if self.tried[number].clean and self._fleet(robots, number, "twin").driven:
                         break
@@ -142,33 +141,33 @@ class _Cell:
         finally:
             self._conclude()
 
-    def _attempt(self, robots: _Robots, number: int) -> bool:
-        if number not in self.tried:
-            self.tried[number] = self._fleet(robots, number, "measured")
-        return self.tried[number].within
-
     def _predict(self) -> None:
         """Write what one robot's service times predict of the fleets."""
         if self.service is None:
             return
         config, name, writer = self.config, cell_name(self.session, self.mode), self.launch.writer
         prediction = Prediction(config, name, self.mode, self.service, (1.0,), self.launch.progress)
-        found = prediction.run(config.numbers, bisects=config.searches)
+        try:
+            found = prediction.run(config.numbers, bisects=config.searches)
+        except UsageError as error:  # what was measured stands without it
+            self.launch.progress.say(f"{name}: no prediction: {error}")
+            return
         writer.append(FLEETS, prediction.rows)
         writer.append(KNEES, [found] if found else [])
 
     def _fleet(self, robots: _Robots, number: int, source: Source) -> Tried:
         config, launch = self.config, self.launch
         launch.progress.stage(f"{robots.name}: {number} robot{'s' * (number > 1)}")
+        blocks = bool(self.mode) and config.made[self.mode].blocks
         for looks, (traces, used) in enumerate(robots.looks(number), 1):  # noqa: B007 - their number is kept
             row = measures(traces, config.setting, config.settle_ns, confidence=config.confidence) | used
             if source == "measured" and number == 1:
                 self.alone = row["stalled"]
             row["stalled_alone"] = self.alone
-            alone = (self.alone or 0.0) if self.mode and config.made[self.mode].blocks else 0.0
+            alone = (self.alone or 0.0) if blocks else 0.0
             verdict, within = judge(config.limited, row, traces, config.settle_ns, config.confidence, alone=alone)
-            if verdict != "undecided" or source == "twin":
-                break
+            if source == "twin" or (verdict != "undecided" and not (blocks and number == 1)):
+                break  # that one robot alone has all looks, as the others are judged by it
         robots.stop()
         if source == "measured" and number == 1 and not self.service and row["latency_p50_ns"] and not self.tried:
             self.service = Service.read(f"{launch.writer.path}#{self.session.cell.name}")
@@ -218,9 +217,19 @@ class _Cell:
 class _Robots(ExitStack):
     """The robots of one cell, spread over processes and hosts; a context manager that closes their connections."""
 
-    def __init__(self, config: CapacityConfig, ray: Any, launch: RunningLaunch, session: Session, mode: str) -> None:
+    def __init__(
+        self,
+        config: CapacityConfig,
+        ray: Any,
+        launch: RunningLaunch,
+        session: Session,
+        mode: str,
+        *,
+        twin: bool = False,
+    ) -> None:
         super().__init__()
         self._config, self._launch, self.session = config, launch, session
+        self._number, self._error = 1, ""
         self.name = cell_name(session, mode)
         plan = self._plan = FleetPlan(
             session.cell.name,
@@ -235,11 +244,12 @@ class _Robots(ExitStack):
             think_ns=round(config.think_s * 1e9),
         )
         self._fleets: list[Any]
+        in_process = session.cell.transport.in_process
+        if twin and (ray is not None or (in_process and config.processes > 1)):
+            plan = replace(plan, own=replace(launch.plan, cells=(session.cell,)))
         if ray is not None:
-            if not session.cell.options.external_address:
-                plan = replace(plan, own=replace(launch.plan, cells=(session.cell,)))
             self._fleets = [FleetOnRay(plan, ray) for _ in range(config.processes)]
-        elif config.processes > 1 and not session.cell.transport.in_process:
+        elif config.processes > 1 and (twin or not in_process):
             self._fleets = [FleetProcess(plan) for _ in range(config.processes)]
         else:
             self._fleets = [Fleet(plan)]
@@ -255,18 +265,22 @@ class _Robots(ExitStack):
         They act on until `stop`.
         """
         config = self._config
+        self._number = number
         seconds_ns = round(config.seconds * 1e9)
         if not config.episodes_s:
             start_ns = self._start(self._phases(number))
+            self._wait(start_ns + config.settle_ns)
+            since = self._clocks()
             for look in range(1, config.looks + 1):
-                yield self._until(start_ns, config.settle_ns, config.settle_ns + look * seconds_ns)
+                yield self._until(start_ns, config.settle_ns + look * seconds_ns, since)
             return
         done: list[RobotTrace] = []
+        since = self._clocks()
         episode_ns = round(config.episodes_s * 1e9)
         for _ in range(config.looks):
             for _ in range(max(1, -(-seconds_ns // episode_ns))):
                 start_ns = self._start(dict.fromkeys(range(number), 0))
-                traces, used = self._until(start_ns, config.settle_ns, episode_ns)
+                traces, used = self._until(start_ns, episode_ns, since)
                 self.stop()
                 done += traces
             yield done, used
@@ -293,28 +307,27 @@ class _Robots(ExitStack):
             fleet.start(share, start_ns - now_ns())
         return start_ns
 
-    def _until(self, start_ns: int, settle_ns: int, end_ns: int) -> tuple[list[RobotTrace], dict[str, Any]]:
-        """Wait until ``end_ns`` after the start; return traces, and the CPU and power used since the last settling."""
-        clock, launch = SystemClock(), self._launch
-        self._wait(clock, start_ns + settle_ns)
-        before_ns, before_s = now_ns(), self._cpu_s()
-        self._wait(clock, start_ns + end_ns)
-        after_ns = now_ns()
-        spent = launch.sampler.window(before_ns, after_ns)
+    def _until(self, start_ns: int, end_ns: int, since: tuple[int, float]) -> tuple[list[RobotTrace], dict[str, Any]]:
+        """Wait until ``end_ns`` after the start; return traces, and the CPU and power used ``since`` some `_clocks`."""
+        self._wait(start_ns + end_ns)
+        (before_ns, before_s), (after_ns, after_s) = since, self._clocks()
+        spent = self._launch.sampler.window(before_ns, after_ns)
         server_ns = spent.get("server_cpu_ns")
         traces = [trace for fleet in self._fleets for trace in fleet.traces(start_ns)]
         self._keep()
         return traces, {
-            "generator_cpu": (self._cpu_s() - before_s) / (after_ns - before_ns) * 1e9,
+            "generator_cpu": (after_s - before_s) / (after_ns - before_ns) * 1e9,
             "server_cpu": None if server_ns is None else server_ns / (after_ns - before_ns),
             "gpu": spent.get("gpu_busy"),
             "watts": spent.get(POWER_W),
         }
 
-    def _cpu_s(self) -> float:
-        return float(sum(fleet.cpu_s() for fleet in self._fleets))
+    def _clocks(self) -> tuple[int, float]:
+        """Return the time, and the CPU time of the robots in seconds."""
+        return now_ns(), sum(fleet.cpu_s() for fleet in self._fleets)
 
-    def _wait(self, clock: SystemClock, until_ns: int) -> None:
+    def _wait(self, until_ns: int) -> None:
+        clock = SystemClock()
         while (left_ns := until_ns - now_ns()) > 0:
             clock.sleep_until_ns(now_ns() + min(left_ns, round(KEEP_S * 1e9)))
             self._keep()
@@ -323,10 +336,12 @@ class _Robots(ExitStack):
         """Write the requests since the last call; raises what makes further ones useless."""
         for fleet in self._fleets:
             for measured in fleet.measured():
-                sample = measured.sample
-                if sample.error:
-                    self._launch.progress.say(f"robot {sample.block % STRIDE} of {sample.cell}: {sample.error}")
-                self._launch.keep(self.session, replace(measured, retry_after_s=0.0))  # its robot waits
+                sample, robot = measured.sample, measured.sample.block % STRIDE
+                if sample.error not in ("", self._error):
+                    self._error = sample.error
+                    self._launch.progress.say(f"robot {robot} of {sample.cell}: {sample.error}")
+                kept = replace(measured, retry_after_s=0.0)  # its robot waits
+                self._launch.keep(self.session, kept, robot, self._number)
 
     def stop(self) -> None:
         """Stop the robots when their answers under way have come."""

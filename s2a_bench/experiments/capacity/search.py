@@ -45,14 +45,23 @@ class Knee:
     high: int | None
 
 
-def search(numbers: Sequence[int], attempt: Callable[[int], bool], *, bisects: bool) -> None:
-    """Try fleets of ``numbers`` robots, ascending; ``attempt`` returns whether one keeps to the limit.
+def search(numbers: Sequence[int], attempt: Callable[[int], Tried], tried: dict[int, Tried], *, bisects: bool) -> None:
+    """Try one robot, then fleets of ``numbers`` robots, ascending, each once; ``tried`` gets them as they are tried.
 
-    With ``bisects`` the first that does not ends that, and the numbers between it and the one before are bisected.
+    With ``bisects`` the first that exceeds the limit ends that, and the numbers between it and the one before are
+    bisected.
     """
+
+    def fits(number: int) -> bool:
+        if number not in tried:
+            tried[number] = attempt(number)
+        return tried[number].within
+
+    if not fits(1) and bisects:
+        return
     good = numbers[0] - 1
     for number in numbers:
-        if attempt(number):
+        if fits(number):
             good = number
         elif bisects:
             bad = number
@@ -61,7 +70,7 @@ def search(numbers: Sequence[int], attempt: Callable[[int], bool], *, bisects: b
         return
     while bad - good > 1:
         middle = (good + bad) // 2
-        good, bad = (middle, bad) if attempt(middle) else (good, middle)
+        good, bad = (middle, bad) if fits(middle) else (good, middle)
 
 
 def knee(tried: Iterable[Tried]) -> Knee | None:
@@ -91,10 +100,13 @@ def judge(
 ) -> tuple[Verdict, bool]:
     """Return where a fleet's interval lies against a limit, and whether its value keeps to it.
 
-    ``alone`` is the share of stalled ticks that one robot alone has, in a mode that blocks.
+    ``alone`` is the share of stalled ticks that one robot alone has, in a mode that blocks, taken as known. Where that
+    leaves no room for the limit, every fleet is above it.
     """
     if limit is None:
         return "none", True
+    if limit.share + alone >= 1:
+        return "above", False
     if limit.column == "stalled":
         share, low, high = (row["stalled"], row["stalled_low"], row["stalled_high"])
         if share is None:

@@ -1,4 +1,4 @@
-"""A fleet in virtual time: the robots' own steppers ask a server that answers in order of arrival.
+"""A fleet in virtual time: the robots' own steppers send requests to a server that answers in order of arrival.
 
 A robot has one request under way. A request waits until one of the servers is free, then takes its service time; what
 is spent beside the server (network, client) delays its answer and occupies no server. A free server takes as many
@@ -70,7 +70,7 @@ class VirtualFleet:
     def robot(self, number: int, start_ns: int, span_ns: int) -> Robot:
         if self.mode is not None:
             return _acting(number, self.mode, self.setting, start_ns, max(1, span_ns // self.setting.period_ns))
-        return _asking(number, self.every_ns, self.think_ns, start_ns, start_ns + span_ns)
+        return _requesting(number, self.every_ns, self.think_ns, start_ns, start_ns + span_ns)
 
 
 def simulate(
@@ -158,8 +158,8 @@ def _paced(pace: Pace, mode: Mode, setting: ControlSetting, most: int) -> Genera
     return (Ticks(chunk, index, age, done.stalled[:most].copy()),)
 
 
-def _asking(robot: int, every_ns: int, think_ns: int, start_ns: int, end_ns: int) -> Robot:
-    """Ask for a plan every ``every_ns``, after the one before it; without it, again when it has the answer.
+def _requesting(robot: int, every_ns: int, think_ns: int, start_ns: int, end_ns: int) -> Robot:
+    """Request a plan every ``every_ns``, after the one before it; without it, again when it has the answer.
 
     A plan lasts until the next one is due, its pieces are even. It stalls if no start within that time is safe.
     """

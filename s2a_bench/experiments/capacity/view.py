@@ -10,7 +10,7 @@ import numpy as np
 
 from s2a_bench.experiments import SHARE, TIME, Comparable, Metric, Shown, Subject
 from s2a_bench.experiments.capacity.metrics import METRICS
-from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, ROBOTS, FleetRow
+from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, ROBOTS, TWIN, FleetRow
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import PROVENANCE, Table
 from s2a_bench.writers.csv_text import CsvTable
@@ -25,10 +25,11 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 MAIN: Final = ("stalled", "requests_per_s", "latency_p50_s", "latency_p99_s", "ttft_p99_s", "age_p50_s", "age_p99_s")
-REST: Final = ("in_time", "stalled_worst", "unfair", "unanswered", "late_p99_s", "generator_cpu", "server_cpu")
+REST: Final = ("in_time", "stalled_worst", "unfair", "late_p99_s", "generator_cpu", "server_cpu")
 PANELS: Final = {"latency": "latency (ms)", "stalled": "stalled (%)", "age": "age of action (ms)"}
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00")
 PREDICTED: Final = "predicted"
+LATE: Final = "late: no measurement, as the generator was late, or too slow for the limit with an instant server, too"
 KNEE: Final = Metric("knee", "robots", "higher", "knee", "mean", "The largest fleet within the limit.")
 
 CapacityCell = cell_of_row("CapacityCell", "N robots on one server.", FleetRow, without=())
@@ -36,22 +37,27 @@ CapacityCell = cell_of_row("CapacityCell", "N robots on one server.", FleetRow, 
 
 def show(run: StoredRun, **_: Any) -> Shown:
     """Return what a capacity run shows."""
+    fleets = _fleets(run)
     return Shown(
         sentences=[*_knee_sentences(run), *_parted(run)],
         tables={"capacity": _table(run, MAIN), "robots": _table(run, REST)},
         main=["capacity"],
-        csvs={"capacity.csv": CsvTable.of_frame(run.table(FLEETS).drop(columns=PROVENANCE))},
-        figures={"capacity": partial(build_capacity, run)} if len(_fleets(run)) else {},
-        json=lambda: frame(run, [present(CapacityCell(**row)) for row in _fleets(run)], [], knees=_rows(run, KNEES)),
+        csvs={"capacity.csv": CsvTable.of(fleets[0] if fleets else (), (tuple(row.values()) for row in fleets))},
+        figures={"capacity": partial(build_capacity, run)} if _panels(fleets) else {},
+        json=lambda: frame(run, [present(CapacityCell(**row)) for row in fleets], [], knees=_rows(run, KNEES)),
     )
 
 
 def _knee_sentences(run: StoredRun) -> Iterator[str]:
     settings = run.manifest["configuration"]
-    clock = f" at {settings['control_hz']:g} Hz, H {settings['horizon']}" if settings["load"] == "chunks" else ""
+    clock = {
+        "chunks": f" at {settings['control_hz']:g} Hz, H {settings['horizon']}",
+        "plans": f" with a plan every {settings['plan_every_s'] or 0:g} s",
+        "closed": "",
+    }[settings["load"]]
     for knee in sorted(_rows(run, KNEES), key=lambda row: row["source"] == PREDICTED):
         sure = f"[{knee['low']}, {'...' if knee['high'] is None else int(knee['high'])}]"
-        robots = f"{knee['robots']} robot{'s' * (knee['robots'] != 1)} {sure}" if knee["robots"] else "no robot"
+        robots = f"{knee['robots']} robot{'s' * (knee['robots'] != 1)} {sure}" if knee["high"] != 0 else "no robot"
         robots = robots if knee["source"] == "measured" else f"{knee['source']}: {robots}"
         yield f"{robots}{clock}, {knee['cell']}, with {knee['limit']}."
 
@@ -106,7 +112,7 @@ def _table(run: StoredRun, names: Sequence[str]) -> TextTable:
         for cell, source in dict.fromkeys((row["cell"], row["source"]) for row in rows)
     ]
     header = ("cell", "source", "N", "limit", *titles)
-    notes = ("late: no measurement, as the generator's own ticks were late",) * any(not row["clean"] for row in rows)
+    notes = (LATE,) * any(not row["clean"] for row in rows)
     of_rows = [row["cell"] for row in rows]
     return TextTable.grouped("Robots on one server", header, groups, 2, once=2, cells=of_rows, notes=notes)
 
@@ -126,11 +132,12 @@ def _value(metric: Metric, value: float | None) -> str:
 
 def build_capacity(run: StoredRun) -> Figure:
     """Draw latency, stalled share and age over the number of robots, with the knee and its interval."""
-    rows = [row for row in _fleets(run) if row["source"] != "twin" and row["clean"]]
+    rows = [row for row in _fleets(run) if _drawn(row)]
     cells = list(dict.fromkeys(row["cell"] for row in rows))[: len(COLOURS)]
-    panels = {name: label for name, label in PANELS.items() if any(row[f"{_column(name)}"] is not None for row in rows)}
+    panels = _panels(rows)
     notes = (
-        "Thick: median, thin: 99th percentile; bars: 95 % intervals. Solid: measured, dashed: predicted.",
+        "Thick: median, thin: 99th percentile; bars: their intervals, right together with 95 %.",
+        "Solid: measured, dashed: predicted.",
         "Vertical: the largest fleet within the limit; shaded: its interval.",
     )
     height_in = 0.7 + 1.2 * len(panels) + 0.15 * len(cells)
@@ -152,6 +159,16 @@ def build_capacity(run: StoredRun) -> Figure:
     handles = [last.plot([], [], color=colour, label=cell)[0] for cell, colour in zip(cells, COLOURS, strict=False)]
     figure.legend(handles=handles, loc="outside lower center")
     return figure
+
+
+def _drawn(row: dict[str, Any]) -> bool:
+    return row["source"] != "twin" and bool(row["clean"])
+
+
+def _panels(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
+    """Return the labels of the panels for which drawn fleets have values."""
+    drawn = [row for row in rows if _drawn(row)]
+    return {name: label for name, label in PANELS.items() if any(row[_column(name)] is not None for row in drawn)}
 
 
 def _column(panel: str) -> str:
@@ -200,7 +217,9 @@ def _subjects(run: StoredRun) -> list[Subject]:
         for knee in _rows(run, KNEES)
     ]
     robots = run.table(ROBOTS)
-    measured = robots[robots["source"] == "measured"]
+    clean = {(row["cell"], row["robots"]) for row in _fleets(run) if row["source"] == "measured" and row["clean"]}
+    drawn = [each in clean for each in zip(robots["cell"], robots["robots"], strict=True)]
+    measured = robots[np.array(drawn, bool)]
 
     def values(table: Any, name: str) -> list[np.ndarray]:
         if name not in METRICS:
@@ -224,8 +243,19 @@ COMPARED: Final = Comparable(
 
 
 def _fleets(run: StoredRun) -> list[dict[str, Any]]:
-    """Return the fleets, those of a cell together, by their number of robots."""
+    """Return the fleets, those of a cell together, by their number of robots.
+
+    A measured fleet is not ``clean`` either if the generator does not drive it, by its twin.
+    """
     rows = _rows(run, FLEETS)
+    driven: dict[str, int] = {}
+    for row in rows:
+        if row["source"] == "twin":
+            cell = row["cell"].replace(TWIN, "", 1)
+            driven[cell] = max(driven.get(cell, 0), row["robots"] if row["clean"] and row["within"] else 0)
+    for row in rows:
+        if row["source"] == "measured":
+            row["clean"] = row["clean"] and row["robots"] <= driven.get(row["cell"], row["robots"])
     cells = list(dict.fromkeys((row["cell"], row["source"]) for row in rows))
     return sorted(rows, key=lambda row: (cells.index((row["cell"], row["source"])), row["robots"]))
 

@@ -47,6 +47,10 @@ def test_a_limit_is_a_share_of_values_that_may_be_above_it(written: str, limit: 
         ({"modes": "sync", "closed_loop": True}, "`modes` are ways to act on chunks"),
         ({"modes": "queue?execute=20"}, "`modes`: queue: a chunk has 16 actions"),
         ({"episodes_s": 0.01}, "`episodes`: 0.01 s need a control clock"),
+        ({"episodes_s": 2, "settle_s": 5}, "`settle`: 5 s leave nothing of an episode of 2 s"),
+        ({"predict": "20", "plan_every_s": 60}, "`seconds`: 10 s are too short for one plan every 60 s; take 180"),
+        ({"predict": "20", "plan_every_s": 2, "episodes_s": 5}, "`episodes`: 5 s are too short for one plan every 2 s"),
+        ({"predict": "20", "latency": "5"}, "`latency` is for a measured run"),
         ({"servers": 2}, "`servers` needs `predict`"),
         ({"predict": "20", "ray": "auto"}, "`ray` is for a measured run"),
         ({"ray": "auto"}, "`ray`: robots on other hosts need a server that they reach; name it with `url`"),
@@ -59,6 +63,20 @@ def test_what_makes_no_sense_is_refused_in_a_line(given: dict[str, Any], message
         CapacityConfig(**given)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("given", "mode", "text"),
+    [
+        ({}, "queue?trigger=8", "at most 1 % stalled ticks"),
+        ({"modes": "sync"}, "sync", "at most 1 % stalled ticks beyond those of one robot alone"),
+        ({"plan_every_s": 1}, "", "at most 1 % stalled plans"),
+        ({"limit": "latency_p99=0.3s"}, "queue?trigger=8", "latency p99 of at most 300 ms"),
+        ({"limit": ""}, "queue?trigger=8", ""),
+    ],
+)
+def test_a_limit_in_words_names_what_stalls(given: dict[str, Any], mode: str, text: str) -> None:
+    assert CapacityConfig(predict="20", **given).limit_text(mode) == text
 
 
 @pytest.mark.parametrize(

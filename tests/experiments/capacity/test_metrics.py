@@ -34,7 +34,6 @@ def test_a_fleet_by_hand() -> None:
     assert found["requests_per_s"] == pytest.approx(4 / 0.16)
     assert found["latency_mean_ns"] == 45 * MS
     assert found["latency_p50_ns"] == 37.5 * MS
-    assert found["unanswered"] == 2
     assert found["unfair"] == pytest.approx(67.5 / 45)
     assert found["stalled"] == 5 / 16, "before the first action, too"
     assert found["stalled_worst"] == 3 / 8
@@ -47,9 +46,14 @@ def test_what_comes_before_a_fleet_has_settled_is_left_out() -> None:
     found = measures([trace(), trace(1)], SETTING, settle_ns=80 * MS)
     assert found["stalled"] == 0
     assert found["in_time"] == 0.5, "the chunk that ends a stall came late"
-    assert found["unanswered"] == 2
     assert found["latency_mean_ns"] is None
     assert found["requests_per_s"] == pytest.approx(2 / 0.08), "asked before, answered after"
+
+
+def test_requests_before_a_fleet_has_settled_or_never_made_say_nothing_of_the_generator() -> None:
+    request_ns, late_ns = np.arange(10) * 100 * MS, np.array([50, 50, 1, 1, 1, 1, 1, -1, -1, -1]) * MS
+    plain = RobotTrace(0, 0, 10**9, request_ns, np.full(10, 60 * MS), late_ns=late_ns)
+    assert measures([plain], SETTING, settle_ns=200 * MS)["late_p99_ns"] == MS
 
 
 def test_every_episode_has_its_own_start() -> None:

@@ -98,8 +98,16 @@ def test_the_limit_of_sync_is_on_what_is_beyond_one_robot_alone(tmp_path: Path) 
     fleets = run.table(FLEETS).set_index("robots")
     assert fleets["stalled_alone"][40] == fleets["stalled"][1] == pytest.approx(1 / 17, abs=0.01)
     assert fleets["within"].tolist() == [True, True, False]
-    assert run.table(KNEES)["robots"].tolist() == [2]
-    assert run.table(KNEES)["limit"].tolist() == ["at most 1 % stalled ticks beyond those of one robot alone"]
+    (knee,) = run.table(KNEES).to_dict("records")
+    assert (knee["robots"], knee["low"], knee["high"]) == (2, 2, 39)
+    assert knee["limit"] == "at most 1 % stalled ticks beyond those of one robot alone"
+
+
+def test_one_robot_is_tried_before_a_range_that_begins_with_more(tmp_path: Path) -> None:
+    run = predicted(tmp_path, predict="25", robots="16..32")
+    assert run.table(FLEETS)["robots"].tolist() == [1, 16]
+    (knee,) = run.table(KNEES).to_dict("records")
+    assert (knee["robots"], knee["low"], knee["high"]) == (1, 1, 15)
 
 
 def test_clients_without_a_clock_and_plans_are_predicted(tmp_path: Path) -> None:

@@ -20,23 +20,26 @@ SETTING = ControlSetting(20 * MS, 16)
 def test_the_search_finds_every_knee_in_as_many_fleets_as_it_says(robots: str) -> None:
     config = CapacityConfig(robots=robots)
     for largest in range(70):
-        tried: list[Tried] = []
+        attempts: list[int] = []
 
-        def attempt(number: int, tried: list[Tried] = tried, largest: int = largest) -> bool:
-            tried.append(Tried(number, "below" if number <= largest else "above", number <= largest))
-            return number <= largest
+        def attempt(number: int, attempts: list[int] = attempts, largest: int = largest) -> Tried:
+            attempts.append(number)
+            return Tried(number, "below" if number <= largest else "above", number <= largest)
 
-        search(config.numbers, attempt, bisects=True)
+        tried: dict[int, Tried] = {}
+        search(config.numbers, attempt, tried, bisects=True)
         first, last = config.numbers[0], config.numbers[-1]
-        found = 0 if largest < first else min(largest, last)
-        assert knee(tried) == Knee(found, found, None if largest >= last else max(found, 0) if found else first - 1)
-        assert len(tried) == len({each.robots for each in tried}) <= config.most_fleets
+        found = min(1, largest) if largest < first else min(largest, last)
+        high = None if largest >= last else first - 1 if found == 1 < first else found
+        assert knee(tried.values()) == Knee(found, found, high)
+        assert attempts == [*tried]
+        assert len(attempts) <= config.most_fleets
 
 
-def test_a_list_is_tried_to_its_end() -> None:
-    tried: list[int] = []
-    search([1, 2, 4], lambda number: tried.append(number) is not None, bisects=False)
-    assert tried == [1, 2, 4]
+def test_a_list_is_tried_to_its_end_after_one_robot_alone() -> None:
+    tried: dict[int, Tried] = {}
+    search([2, 4], lambda number: Tried(number, "above", within=False), tried, bisects=False)
+    assert [*tried] == [1, 2, 4]
 
 
 B, U, A = "below", "undecided", "above"
@@ -124,6 +127,12 @@ def test_a_request_without_an_answer_is_above_the_limit_once_it_waits_for_longer
     _, robots, above = above_limit(Limit.read("latency_p99=1500ms"), [trace(3, [False] * 1000, latency_ms)], 5000 * MS)
     assert above.tolist() == [False] * 13 + [True]
     assert set(robots.tolist()) == {3}
+
+
+def test_what_one_robot_alone_stalls_may_leave_no_room_for_the_limit() -> None:
+    traces = fleet(0.99)
+    row = measures(traces, SETTING)
+    assert judge(Limit.read("stalled=20%"), row, traces, 0, 0.95, alone=0.98) == ("above", False)
 
 
 def test_without_values_nothing_is_decided() -> None:

@@ -23,13 +23,13 @@ def predicted(tmp_path: Path, service_ms: int, **options: Any) -> StoredRun:
     return read_run(run_predicted(config, tmp_path, NullProgress()))
 
 
-def measured(tmp_path: Path, service_ms: int, robots: int) -> StoredRun:
+def measured(tmp_path: Path, service_ms: int, robots: int, driven: int = 16) -> StoredRun:
     """Return a predicted run, beside which its fleets are also measured ones with the same values but one."""
     run = predicted(tmp_path, service_ms)
     fleets, knees = run.table(FLEETS), run.table(KNEES)
     own = fleets.assign(source="measured")
     own.loc[own["robots"] == robots, ["stalled_low", "stalled_high"]] = 0.9, 1.0
-    twin = fleets.iloc[:1].assign(source="twin")
+    twin = fleets.iloc[:1].assign(cell=f"{service_ms}, instant, queue?trigger=8", source="twin", robots=driven)
     run.tables[FLEETS.name] = type(fleets)(own.to_dict("records") + fleets.to_dict("records") + twin.to_dict("records"))
     run.tables[KNEES.name] = type(knees)(
         knees.assign(source="measured", driven=16, low=7).to_dict("records") + knees.to_dict("records")
@@ -52,7 +52,7 @@ def test_fleets_stand_by_their_number_of_robots_however_they_were_searched(tmp_p
     shown = EXPERIMENT.show(measured(tmp_path, 40, robots=9))
     table = shown.tables["capacity"]
     robots = [int(row[2]) for row in table.rows]
-    assert robots == [1, 2, 4, 8, 9, 10, 12, 16] * 2 + [1]
+    assert robots == [1, 2, 4, 8, 9, 10, 12, 16] * 2 + [16]
     stalled = [row[table.header.index("stalled, %")] for row in table.rows]
     assert stalled[0].startswith("0.000 [0.000, ")
     found = shown.json()
@@ -68,8 +68,52 @@ def test_a_fleet_whose_generator_was_late_is_no_measurement_in_table_and_sentenc
     shown = EXPERIMENT.show(run)
     table = shown.tables["capacity"]
     assert [row[2] for row in table.rows if row[3] == "late"] == ["9"]
-    assert table.notes == ("late: no measurement, as the generator's own ticks were late",)
+    assert table.notes[0].startswith("late: no measurement")
     assert list(shown.sentences)[2].endswith("lies in the measured interval at every number of robots.")
+
+
+def test_a_fleet_that_the_generator_does_not_drive_by_its_twin_is_no_measurement_anywhere(tmp_path: Path) -> None:
+    run = measured(tmp_path, 40, robots=9, driven=8)
+    shown = EXPERIMENT.show(run)
+    late = [(row[1], int(row[2])) for row in shown.tables["capacity"].rows if row[3] == "late"]
+    assert late == [("", robots) for robots in (9, 10, 12, 16)]
+    assert [cell["clean"] for cell in shown.json()["cells"][:8]] == [True] * 4 + [False] * 4
+    (csv,) = shown.csvs.values()
+    assert [row[csv.header.index("clean")] for row in csv.rows[:8]] == [True] * 4 + [False] * 4
+    with paper_column():
+        stalled = shown.figures["capacity"]().axes[1]
+    drawn = [max(line.get_xdata()) for line in stalled.lines if line.get_marker() == "." and len(line.get_xdata())]
+    assert drawn == [8, 16], "measured, predicted"
+    compared = open_comparison([run], [run], unlike=True, least=0.05)
+    names = [each.pair.name for each in compare(compared, metrics_of(compared, ["stalled"])).comparisons]
+    assert names == [f"40, queue?trigger=8, {robots} robots" for robots in (1, 2, 4, 8)]
+
+
+def test_without_a_fleet_that_was_driven_there_is_no_figure(tmp_path: Path) -> None:
+    run = measured(tmp_path, 40, robots=9)
+    run.tables[FLEETS.name] = run.table(FLEETS).assign(clean=False)
+    assert EXPERIMENT.show(run).figures == {}
+
+
+@pytest.mark.parametrize(
+    ("knee", "sentence"),
+    [
+        ({"robots": 0, "low": 0, "high": 0}, "no robot at"),
+        ({"robots": 0, "low": 0, "high": None}, "0 robots [0, ...] at"),
+        ({"robots": 1, "low": 0, "high": 3}, "1 robot [0, 3] at"),
+    ],
+)
+def test_no_robot_is_said_where_one_was_too_many(tmp_path: Path, knee: dict[str, Any], sentence: str) -> None:
+    run = measured(tmp_path, 40, robots=9)
+    run.tables[KNEES.name] = run.table(KNEES).iloc[:1].assign(**knee)
+    assert list(EXPERIMENT.show(run).sentences)[0].startswith(sentence)
+
+
+def test_the_sentence_about_plans_names_how_often_they_are_wanted(tmp_path: Path) -> None:
+    run = predicted(tmp_path, 250, plan_every_s=1.0)
+    assert list(EXPERIMENT.show(run).sentences) == [
+        "predicted: 4 robots [4, 4] with a plan every 1 s, 250, with at most 1 % stalled plans."
+    ]
 
 
 @pytest.mark.parametrize(
