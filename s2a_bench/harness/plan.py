@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -103,6 +103,12 @@ class RunPlan:
     def with_manifest(self, **facts: Any) -> RunPlan:
         return replace(self, manifest={**self.manifest, **facts})
 
+    def with_cells(self, cells: Sequence[Pipeline]) -> RunPlan:
+        """Return the plan with further cells."""
+        every = (*self.cells, *cells)
+        stages = path_of(cell.transport.stages for cell in every)
+        return replace(self, cells=every, request=replace(self.request, stages=stages)).with_manifest(stages=stages)
+
 
 def resolve(config: RequestsConfig) -> RunPlan:
     """Decide what follows from a configuration; opens and starts nothing.
@@ -114,10 +120,10 @@ def resolve(config: RequestsConfig) -> RunPlan:
     if config.starts_program:
         extras.need("model", "gguf")
     cells = tuple(config.pipelines)
-    used = list({cell.transport.name: cell.transport for cell in cells}.values())
+    used = {cell.transport.name: cell.transport for cell in cells}.values()
     engine, stream = config.served_engine, config.mode == "stream"
     large = config.size[0] * config.size[1] > LARGE_PICTURE
-    stages = path_of(transport.stages for transport in used)
+    stages = path_of(cell.transport.stages for cell in cells)
     facts = [fact for cell in cells for fact in cell.capabilities.facts]
     facts += engine.kind.facts_for(engine) if config.serves_engine else ()
     facts += (FRAMES_PUBLISHED, FRAMES_LOST) if stream else ()

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -67,7 +68,8 @@ def run_capacity(config: CapacityConfig, output: Path, progress: Progress) -> Pa
         "closed": f"closed loop, {config.think_s:g} s from an answer to the next request",
     }
     plan = plan.with_manifest(configuration=settings, cadence=cadence[config.load])
-    plan = replace(plan, cells=(*plan.cells, *(twin(cell) for cell in plan.cells)))
+    if config.load != "closed":  # an instant server would get requests without a pause
+        plan = plan.with_cells([twin(cell) for cell in plan.cells])
     with ExitStack() as stack:
         ray = connect(config.ray, config.processes) if config.ray else None
         if ray is not None:
@@ -94,14 +96,14 @@ def cell_name(session: Session, mode: str) -> str:
 
 
 def _drive(config: CapacityConfig, ray: Any, launch: RunningLaunch) -> None:
-    half = len(launch.sessions) // 2
+    count = len(config.requests.pipelines)
     for position, session in enumerate(launch.sessions):
         launch.progress.stage(f"warming up: {session.cell.name}")
         for block in range(max(1, launch.plan.blocks.warmup)):
-            launch.keep(session, session.measure(Place(block, position, warmup=position < half)))
+            launch.keep(session, session.measure(Place(block, position, warmup=position < count)))
     modes = [*config.made] if config.load == "chunks" else [""]
-    launch.progress.expect(half * len(modes) * config.most_fleets)
-    for session, instant in zip(launch.sessions[:half], launch.sessions[half:], strict=True):
+    launch.progress.expect(count * len(modes) * config.most_fleets)
+    for session, instant in zip_longest(launch.sessions[:count], launch.sessions[count:]):
         service: Service | None = None
         for mode in modes:
             cell = _Cell(config, ray, launch, session, instant, mode, service)
@@ -118,7 +120,8 @@ class _Cell:
     """None: the robots are on this host."""
     launch: RunningLaunch
     session: Session
-    instant: Session
+    instant: Session | None
+    """Of a server that takes no time, with which the generator is checked."""
     mode: str
     service: Service | None = None
     """Of the requests of one robot alone, before any other fleet."""
@@ -132,11 +135,12 @@ class _Cell:
             with _Robots(config, self.ray, self.launch, self.session, self.mode) as robots:
                 attempt = partial(self._fleet, robots, source="measured")
                 search(config.numbers, attempt, self.tried, bisects=config.searches)
-            with _Robots(config, self.ray, self.launch, self.instant, self.mode, twin=True) as robots:
-                for number in sorted(self.tried, reverse=True):
-                    if self.tried[number].clean and self._fleet(robots, number, "twin").driven:
-                        break
-                    self.tried[number] = replace(self.tried[number], clean=False)
+            if self.instant is not None:
+                with _Robots(config, self.ray, self.launch, self.instant, self.mode, twin=True) as robots:
+                    for number in sorted(self.tried, reverse=True):
+                        if self.tried[number].clean and self._fleet(robots, number, "twin").driven:
+                            break
+                        self.tried[number] = replace(self.tried[number], clean=False)
             self._predict()
         finally:
             self._conclude()

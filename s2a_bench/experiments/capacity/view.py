@@ -63,7 +63,7 @@ def _knee_sentences(run: StoredRun) -> Iterator[str]:
 
 
 def _parted(run: StoredRun) -> Iterator[str]:
-    """Yield for each measured cell from which fleet on the prediction leaves the interval of the stalled share."""
+    """Yield for each measured cell at which fleets its stalled share and the predicted one have intervals apart."""
     rows = [row for row in _fleets(run) if row["clean"]]
     fleets = {(row["cell"], row["source"], row["robots"]): row for row in rows}
     for cell in dict.fromkeys(row["cell"] for row in rows):
@@ -74,18 +74,14 @@ def _parted(run: StoredRun) -> Iterator[str]:
         ]
         pairs = [(mine, other) for mine, other in both if None not in (mine["stalled"], other["stalled"])]
         off = [
-            mine["robots"]
+            str(mine["robots"])
             for mine, other in pairs
-            if not mine["stalled_low"] <= other["stalled"] <= mine["stalled_high"]
+            if mine["stalled_high"] < other["stalled_low"] or other["stalled_high"] < mine["stalled_low"]
         ]
         if off:
-            yield f"{cell}: the predicted share of stalls leaves the measured interval at {_listed(off)} robots."
+            yield f"{cell}: measured and predicted share of stalls have intervals apart at {', '.join(off)} robots."
         elif pairs:
-            yield f"{cell}: the predicted share of stalls lies in the measured interval at every number of robots."
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    return ", ".join(map(str, numbers))
+            yield f"{cell}: measured and predicted share of stalls agree at every number of robots."
 
 
 def _table(run: StoredRun, names: Sequence[str]) -> TextTable:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Callable
 from itertools import count
 from queue import SimpleQueue
@@ -23,8 +27,9 @@ from s2a_bench.harness.config import LiveRequests, RequestsConfig
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.session import Measured, Place, RequestContext, Session
 from s2a_bench.policy.chunks import ControlSetting
-from s2a_bench.store.run import read_run
+from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.types import Token
+from tests.cli.test_provenance import serving
 
 MS = 1_000_000
 REQUEST = resolve(RequestsConfig(transports="loopback")).request
@@ -142,21 +147,66 @@ def test_the_twin_is_an_instant_server_of_ours_on_the_same_wire(written: str, op
     assert dict(found.engine)["name"] == "echo"
 
 
+def small(output: Any, **options: Any) -> StoredRun:
+    """Return a run of short fleets that send small pictures."""
+    settings = {"size": "64x48", "seconds": 1.5, "settle": 0.5, "looks": 1, **options}
+    return read_run(s2a.capacity(output=output, **settings).path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("processes", [1, 2])
+def test_a_server_of_another_kind_is_checked_against_a_call_within_each_process(tmp_path: Any, processes: int) -> None:
+    options = {"dialect": "openai", "max_tokens": 4, "plan_every": 0.4, "limit": "stalled=50%", "processes": processes}
+    with serving("http", "--engine", "echo", "--latency", "20", "--port", "0") as line:
+        run = small(tmp_path, url=line.split()[2].rstrip(";"), robots="3", **options)
+    fleets = run.table(FLEETS).set_index(["source", "robots"])
+    assert {*fleets.index} == {(source, robots) for source in ("measured", "predicted") for robots in (1, 3)} | {
+        ("twin", 3)
+    }
+    latency_ns = fleets["latency_p50_ns"]
+    assert latency_ns["twin", 3] < 20 * MS <= latency_ns["measured", 1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("processes", ["1", "2"])
+def test_ctrl_c_ends_the_search_in_a_line_and_what_was_measured_stays(tmp_path: Any, processes: str) -> None:
+    command = [sys.executable, "-m", "s2a_bench", "capacity", "--transport", "http/binary", "--size", "64x48"]
+    command += ["--latency", "400", "--modes", "sync", "--robots", "1,8", "--limit", "", "--processes", processes]
+    command += ["--seconds", "2", "--settle", "0", "--looks", "1", "--output", str(tmp_path)]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    next(line for line in cast("Any", process.stderr) if "8 robots" in line)
+    time.sleep(1)  # answers are under way
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    (folder,) = tmp_path.iterdir()
+    assert read_run(folder).table(FLEETS)["robots"].tolist() == [1]
+
+
+def test_clients_without_a_clock_need_no_instant_server(tmp_path: Any) -> None:
+    run = small(tmp_path, transports="http/binary", latency=30, closed_loop=True, robots="3")
+    assert {*run.table(FLEETS)["source"]} == {"measured", "predicted"}
+    assert [*run.manifest["servers"]] == ["http"]
+
+
+@pytest.mark.slow
+def test_a_fleet_that_its_server_refuses_in_part_is_measured(tmp_path: Any) -> None:
+    options = ("--answer", "actions", "--latency", "100", "--max-waiting", "1", "--port", "0")
+    with serving("websocket", "--engine", "echo", *options) as line:
+        url = line.split("at ")[1].split(",")[0]
+        run = small(tmp_path, url=url, modes="sync", limit="", robots="6", seconds=2.5)
+    fleets = run.table(FLEETS).set_index(["source", "robots"])
+    assert (run.samples["error"] != "").sum() > 5
+    assert fleets["requests_per_s"]["measured", 6] > 5
+    assert fleets["stalled_worst"]["measured", 6] > fleets["stalled"]["measured", 1] + 0.2
+
+
 @pytest.mark.parametrize("processes", [1, 2])
 def test_robots_act_at_their_clock_and_are_served_in_turn(tmp_path: Any, processes: int) -> None:
-    path = s2a.capacity(
-        output=tmp_path,
-        transports="http/binary",
-        size="64x48",
-        latency=30,
-        modes="queue?trigger=8",
-        robots="3",
-        seconds=1.5,
-        settle=0.5,
-        looks=1,
-        processes=processes,
-    ).path
-    run = read_run(path)
+    run = small(
+        tmp_path, transports="http/binary", latency=30, modes="queue?trigger=8", robots="3", processes=processes
+    )
     fleets, robots, requests = (run.table(each) for each in (FLEETS, ROBOTS, REQUESTS))
     measured = fleets[fleets["source"] == "measured"]
     assert measured["robots"].tolist() == [1, 3]

@@ -44,7 +44,7 @@ def test_the_sentence_names_the_knee_its_interval_and_what_it_holds_for(tmp_path
     assert list(shown.sentences) == [
         "8 robots [7, 8] at 50 Hz, H 16, 40, queue?trigger=8, with at most 1 % stalled ticks.",
         "predicted: 8 robots [8, 8] at 50 Hz, H 16, 40, queue?trigger=8, with at most 1 % stalled ticks.",
-        "40, queue?trigger=8: the predicted share of stalls leaves the measured interval at 9 robots.",
+        "40, queue?trigger=8: measured and predicted share of stalls have intervals apart at 9 robots.",
     ]
 
 
@@ -69,7 +69,7 @@ def test_a_fleet_whose_generator_was_late_is_no_measurement_in_table_and_sentenc
     table = shown.tables["capacity"]
     assert [row[2] for row in table.rows if row[3] == "late"] == ["9"]
     assert table.notes[0].startswith("late: no measurement")
-    assert list(shown.sentences)[2].endswith("lies in the measured interval at every number of robots.")
+    assert list(shown.sentences)[2].endswith("measured and predicted share of stalls agree at every number of robots.")
 
 
 def test_a_fleet_that_the_generator_does_not_drive_by_its_twin_is_no_measurement_anywhere(tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_without_a_fleet_that_was_driven_there_is_no_figure(tmp_path: Path) -> N
 def test_no_robot_is_said_where_one_was_too_many(tmp_path: Path, knee: dict[str, Any], sentence: str) -> None:
     run = measured(tmp_path, 40, robots=9)
     run.tables[KNEES.name] = run.table(KNEES).iloc[:1].assign(**knee)
-    assert list(EXPERIMENT.show(run).sentences)[0].startswith(sentence)
+    assert next(iter(EXPERIMENT.show(run).sentences)).startswith(sentence)
 
 
 def test_the_sentence_about_plans_names_how_often_they_are_wanted(tmp_path: Path) -> None:
