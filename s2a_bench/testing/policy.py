@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.policy import POLICIES, Plans, PlanShape, Policy, Timing, stepping
+from s2a_bench.policy.conformal import take
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import least_end, safe_start
 from s2a_bench.policy.stepping import Stream, follow, step
@@ -38,16 +39,7 @@ def draw(seed: int, n_skills: int, tokens_per_skill: int, rho: float, plans: int
 
 
 def one(plans: Plans, column: int) -> Plans:
-    cut = slice(column, column + 1)
-    assert plans.token_s is not None
-    return replace(
-        plans,
-        arrival_s=plans.arrival_s[:, cut],
-        nominal_s=plans.nominal_s[:, cut],
-        least_s=plans.least_s[:, cut],
-        most_s=plans.most_s[:, cut],
-        token_s=plans.token_s[:, cut],
-    )
+    return take(plans, np.array([column]))
 
 
 seeded = st.builds(
