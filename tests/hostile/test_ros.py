@@ -21,13 +21,14 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import STATUS_ARRAY, Status
 from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
+from s2a_bench.ros.service import READER_QOS
 from s2a_bench.testing.transport import RecordingHandler, ask, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Client, open_client
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.ros.camera import picture_of
 from s2a_bench.transport.ros.joining import join
-from s2a_bench.transport.ros.wire import READER_QOS, REQUEST_QOS, TOKEN_QOS, request_message, token_message
+from s2a_bench.transport.ros.wire import REQUEST_QOS, TOKEN_QOS, request_message, token_message
 from s2a_bench.transport.serving import Queued
 from s2a_bench.types import Request, Token
 from tests.hostile.test_queue import Gate, serving

@@ -17,6 +17,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, TransportError
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
+from s2a_bench.ros.service import READER_QOS
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import Client, Handler, Wiring, open_client, open_server
@@ -24,7 +25,7 @@ from s2a_bench.transport.limits import LIMITS
 from s2a_bench.transport.ros import topic
 from s2a_bench.transport.ros.camera import CAMERA
 from s2a_bench.transport.ros.joining import join
-from s2a_bench.transport.ros.wire import READER_QOS, REQUEST_QOS, request_message
+from s2a_bench.transport.ros.wire import REQUEST_QOS, request_message
 from s2a_bench.transport.serving import Queued
 from s2a_bench.types import Frame, Request, Token
 from tests.waiting import until

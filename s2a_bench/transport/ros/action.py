@@ -17,13 +17,14 @@ from s2a_bench.ros import ActionClient, ActionEvent, Feedback, QoS, Rejected, Re
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
+from s2a_bench.ros.service import READER_QOS
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.ros.camera import POLL_S, picture_message
 from s2a_bench.transport.ros.joining import RosClient, join, namespace_of, place_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
-from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, READER_QOS, provenance_of, readable, remote_of
+from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, provenance_of, readable, remote_of
 from s2a_bench.types import Request, Token
 
 ACTION = "/generate_response"

@@ -10,7 +10,7 @@ from s2a_bench.errors import MessagesLost, RequestFailed, ServerDied, TransportE
 from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.ros import Middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.service import REACH_S, REMEMBERED_CLIENTS, appeared
+from s2a_bench.ros.service import REACH_S, READER_QOS, REMEMBERED_CLIENTS, appeared
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.chunks import state_of
@@ -20,7 +20,6 @@ from s2a_bench.transport.ros.exchange import RosExchange, Shared
 from s2a_bench.transport.ros.joining import RosClient, namespace_of, place_of, wait_until
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.wire import (
-    READER_QOS,
     REQUEST_QOS,
     TOKEN_QOS,
     marks_message,

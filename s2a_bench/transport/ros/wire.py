@@ -16,16 +16,8 @@ from s2a_bench.transport.ros import UNREADABLE_N
 from s2a_bench.types import Action, Piece, Request, Token
 
 REQUEST_QOS = QoS(depth=10)
-
-
-READER_QOS = QoS(depth=0)
-"""Our readers keep all: history is local, and a burst of tokens overruns ROS's default of 10."""
-
-
 TOKEN_QOS = QoS(depth=1000)
 """Our writers keep the last: one that keeps all blocks for as long as a reader does not read."""
-
-
 PROVENANCE_TOPIC: Final = "/provenance"
 """Below the namespace: the server's provenance, latched for late subscribers."""
 

@@ -14,11 +14,12 @@ from s2a_bench.clock import now_ns
 from s2a_bench.ros import QoS, Rejected, Result
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
+from s2a_bench.ros.service import READER_QOS
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.ros.action import ACTION
 from s2a_bench.transport.ros.camera import CAMERA, POLL_S
 from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
-from s2a_bench.transport.ros.wire import READER_QOS, request_message
+from s2a_bench.transport.ros.wire import request_message
 from s2a_bench.types import Frame, Request
 from tests.hostile.suite import Attack, Case
 from tests.hostile.tcp import NOISE

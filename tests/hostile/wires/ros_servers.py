@@ -13,11 +13,12 @@ from s2a_bench.errors import TransportError
 from s2a_bench.ros import Middleware, ServerGoal
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.llama import GENERATE_RESPONSE, text_result, token_feedback
+from s2a_bench.ros.service import READER_QOS
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.ros.action import ACTION, MARKS
 from s2a_bench.transport.ros.camera import POLL_S
 from s2a_bench.transport.ros.joining import AT, join, settled
-from s2a_bench.transport.ros.wire import READER_QOS, TOKEN_QOS, token_message
+from s2a_bench.transport.ros.wire import TOKEN_QOS, token_message
 from s2a_bench.types import Token
 from tests.hostile.suite import FAILED, Case, Trap
 from tests.hostile.tcp import NOISE
