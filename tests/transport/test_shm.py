@@ -32,8 +32,7 @@ from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.shm import shared_memory, unix_socket
 from s2a_bench.transport.shm.memory import ANSWER_BYTES, HELLO, MAGIC, PLACE, STEP_BYTES, SharedMemory, accept, offer
 from s2a_bench.transport.shm.pieces import packed, unpacked
-from s2a_bench.transport.shm.reading import HEADER_BYTES, request_at, size_of
-from s2a_bench.transport.shm.server import Writer
+from s2a_bench.transport.shm.server import HEADER_BYTES, Writer, request_at, size_of
 from s2a_bench.types import Action, Frame, Request, Token
 from tests.hostile.asking import usage
 from tests.waiting import until

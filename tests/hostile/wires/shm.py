@@ -19,7 +19,7 @@ from s2a_bench.trace import Remote
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.shm.memory import ANSWER_BYTES, HELLO, MAGIC, PLACE, REFUSED
 from s2a_bench.transport.shm.pieces import HEAD, packed, unpacked
-from s2a_bench.transport.shm.reading import HEADER_BYTES
+from s2a_bench.transport.shm.server import HEADER_BYTES
 from s2a_bench.types import Action, Token
 from tests.hostile.suite import FAILED, Attack, Case, Trap
 from tests.hostile.wires.http import png_of_zeros
