@@ -16,7 +16,7 @@ from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NotYet
 from contextlib import ExitStack, suppress
 from functools import partial
-from threading import Event, Lock
+from threading import Event, Lock, Semaphore
 from typing import Any, Final
 
 import zmq
@@ -60,7 +60,7 @@ class ZmqServer:
         self._layout: str = options.layout
         self._core = Core(handler, limits)
         self._marks = Marks()
-        self._under_way = 0
+        self._room = Semaphore(limits.waiting + READING)
         self._stopped = Event()
         self._wake, self._woken = socket.socketpair()
         self._wake.setblocking(False)
@@ -139,19 +139,13 @@ class ZmqServer:
         with ExitStack() as held:
             try:
                 held.enter_context(self._core.in_flight.counted())(len(frames[-1]))
-                if self._under_way >= self._core.limits.waiting + READING:
+                if not self._room.acquire(blocking=False):
                     raise Busy("too many requests are under way; come again later", retry_after_s=RETRY_AFTER_S)
             except RequestFailed as error:
                 client.say(_error(error))
                 return None
-            with self._lock:
-                self._under_way += 1
-            held.callback(self._ended)
+            held.callback(self._room.release)
             return partial(self._serve, client, frames[-1], trace, held.pop_all())
-
-    def _ended(self) -> None:
-        with self._lock:
-            self._under_way -= 1
 
     def _serve(self, client: ReplyAddress, frame: Any, trace: Trace, held: ExitStack) -> None:
         with held:
