@@ -6,6 +6,7 @@ the page's own name as `Host`.
 
 from __future__ import annotations
 
+import hmac
 import re
 from collections.abc import Iterable
 from http import HTTPStatus
@@ -14,7 +15,7 @@ from typing import Any, Final
 
 from s2a_bench.options import option
 from s2a_bench.transport import SERVING, Handler, Wiring
-from s2a_bench.transport.listening import ListeningOptions, bound_socket, has_key
+from s2a_bench.transport.listening import ListeningOptions, bound_socket
 from s2a_bench.transport.serving import Core
 
 LOCAL: Final = "localhost"
@@ -60,7 +61,9 @@ class Access:
             return False
 
     def _has_key(self, value: str) -> bool:
-        return has_key(value.encode(errors="replace"), self._scheme, self._key)
+        """Return True if an Authorization header has the key, compared in constant time (RFC 6750, 2.1)."""
+        name, _, token = value.encode(errors="replace").partition(b" ")
+        return name.lower() == self._scheme.lower().encode() and hmac.compare_digest(token.strip(), self._key)
 
 
 class WebServer:

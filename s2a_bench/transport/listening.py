@@ -7,7 +7,6 @@ flag, and never shown; a URL must hold no secret, because results keep it.
 from __future__ import annotations
 
 import errno
-import hmac
 import os
 import re
 import socket
@@ -155,9 +154,3 @@ def key_for(host: str, variable: str, *, no_auth: bool) -> str:
             "`api_key_env`, or serve every client with `no_auth`"
         )
     return key
-
-
-def has_key(header: bytes, scheme: str, key: bytes) -> bool:
-    """Return True if an Authorization header has the key, compared in constant time (RFC 6750, 2.1)."""
-    name, _, token = header.partition(b" ")
-    return name.lower() == scheme.lower().encode() and hmac.compare_digest(token.strip(), key)
