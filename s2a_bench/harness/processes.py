@@ -163,8 +163,7 @@ class OwnProcess(ServerProcess):
                 raise self.no_start(NOT_READY)
         line = stdout.readline()
         if not line:
-            with suppress(subprocess.TimeoutExpired):  # dumping core, perhaps
-                self._process.wait(STOP_TIMEOUT_S)
+            self.ends_within(STOP_TIMEOUT_S)  # dumping core, perhaps
             self._process.kill()
             self._process.wait()
             raise self.no_start()

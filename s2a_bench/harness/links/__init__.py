@@ -92,17 +92,11 @@ def emulated(profile: LinkProfile) -> Iterator[EmulatedLink]:
         relay = OwnProcess("relay", "s2a_bench.harness.links.relay", job, None, devices)
         stack.enter_context(relay)
         relay.wait_ready()
-        before = {name: os.environ.get(name) for name in PEERS}
-        stack.callback(_restore, before)
+        stack.callback(os.environ.update, {name: os.environ[name] for name in PEERS if name in os.environ})
+        for name in PEERS:
+            stack.callback(os.environ.pop, name, None)
         os.environ.update(PEERS)
         yield EmulatedLink(profile, sides[0], sides[1], relay)
-
-
-def _restore(environ: dict[str, str | None]) -> None:
-    for name, value in environ.items():
-        os.environ.pop(name, None)
-        if value is not None:
-            os.environ[name] = value
 
 
 def _opened(stack: ExitStack) -> int:
