@@ -124,13 +124,8 @@ def models(queued: Queued) -> dict[str, Any]:
     return {"object": "list", "data": [model]}
 
 
-def data_uri(media_type: str, encoded: str) -> str:
-    """Join a data URI (RFC 2397)."""
-    return f"data:{media_type};base64,{encoded}"
-
-
 def split_data_uri(uri: str) -> tuple[str, str]:
-    """Return the media type and the Base64 text of a data URI; ValueError for anything else."""
+    """Return the media type and the Base64 text of a data URI (RFC 2397); ValueError for anything else."""
     head, comma, encoded = uri.partition(",")
     if not (comma and head.startswith("data:") and head.endswith(";base64")):
         raise ValueError(f"image_url.url should be a data:...;base64,... URI, not '{uri[:40]}...'")

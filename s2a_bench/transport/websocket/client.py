@@ -135,18 +135,14 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             if isinstance(answer, str):
                 raise self._failed(answer)
 
-    def _actions_in(self, answer: Any) -> list[Action]:
-        """Return the actions of a message, from where the server puts them."""
-        self._check(answer)
-        return actions_of(self._server.actions_in(answer))
-
     def _actions(self, message: bytes, packed_ns: int, trace: Trace) -> Iterator[Action]:
         """Yield the actions of an answer; after the last, complete the trace."""
         assert self._link  # noqa: S101 - for mypy
         count, first_ns = 0, 0
         while True:
             answer = unpackb(message)
-            actions = self._actions_in(answer)
+            self._check(answer)
+            actions = actions_of(self._server.actions_in(answer))
             last = not self._streams or _kind(answer) != codec.PARTIAL
             if not last:
                 actions = [Action(count + index, action.values) for index, action in enumerate(actions)]
@@ -160,14 +156,11 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             if last:
                 break
             message = self._message(self._link)
-        self._learn(answer.get(codec.TIMING) if isinstance(answer, dict) else None, trace)
+        if isinstance(answer, dict) and isinstance(timing := answer.get(codec.TIMING), dict):
+            trace.learn({TIMING[name]: _plain(value) for name, value in timing.items() if name in TIMING})
         if self._native:
             trace.receive(observed.remote_of(unpackb(self._message(self._link))))
         self._mark(trace, packed_ns, first_ns)
-
-    def _learn(self, timing: Any, trace: Trace) -> None:
-        if isinstance(timing, dict):
-            trace.learn({TIMING[name]: _plain(value) for name, value in timing.items() if name in TIMING})
 
     def _mark(self, trace: Trace, packed_ns: int, first_ns: int) -> None:
         if trace.remote is not None:

@@ -151,16 +151,13 @@ class PolicyConnection:
             while self._open and (data := self._received()):
                 self._take(data)
         except _Refused as error:
-            self._forget()
+            self._message.clear()
+            self._protocol.reader.discard()
+            self._held.close()
             self._refuse(error.code, str(error))
         if not self._open:
             self.wire.linger()
             self.wire.hang_up()
-
-    def _forget(self) -> None:
-        self._message.clear()
-        self._protocol.reader.discard()
-        self._held.close()
 
     def _received(self) -> bytes:
         """Return what came, none at the end."""

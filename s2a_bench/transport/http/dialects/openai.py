@@ -67,7 +67,7 @@ class OpenAI(Dialect):
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
         extra = self._extra(request)
-        uris = [native.data_uri(picture.media_type, picture.base64) for picture in pictures]
+        uris = [f"data:{picture.media_type};base64,{picture.base64}" for picture in pictures]
         return {**native.parameters(request, model), **extra, "messages": native.messages(request.prompt, uris)}
 
     def _extra(self, request: Request) -> dict[str, Any]:  # noqa: ARG002 - for subclasses
