@@ -33,7 +33,7 @@ from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.risks import examine
 from s2a_bench.transport.serving import Queued
-from s2a_bench.transport.websocket import connection
+from s2a_bench.transport.websocket import server as websocket_server
 from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.types import Action, Piece, Request
 from tests.waiting import until
@@ -330,7 +330,7 @@ def test_one_that_goes_with_bytes_unread_behind_its_request_does_not_keep_the_en
 def test_keepalive_pings_and_more_than_a_thousand_of_them_over_time_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     began = now_ns()
     pings = iter(range(10**6))
-    monkeypatch.setattr(connection, "now_ns", lambda: began + next(pings) * 100_000_000)
+    monkeypatch.setattr(websocket_server, "now_ns", lambda: began + next(pings) * 100_000_000)
     with serving(RecordingHandler(list(CHUNK))) as server, robot(server.address) as (socket, _):
         for _ in range(3000):
             assert socket.ping().wait(20)
