@@ -30,8 +30,7 @@ from s2a_bench.facts import (
     PROMPT_N,
 )
 from s2a_bench.frames import open_source
-from s2a_bench.harness.clocks import Offset
-from s2a_bench.harness.clocks.remote import Joined, RemoteClock
+from s2a_bench.harness.clocks import Joined, Offset, RemoteClock
 from s2a_bench.harness.feed import Feed, RequestFeed, StreamedFrame, StreamFeed
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint, together
 from s2a_bench.harness.plan import RequestPlan

@@ -207,7 +207,7 @@ def with_wall_clocks(
 ) -> Measured:
     """Measure where both wall clocks are known to 20 us, the server's after all off by ``off_ms``."""
     ours = WallClock(17 * 10**17, 20_000, 0)
-    monkeypatch.setattr("s2a_bench.harness.clocks.remote.wall_clock", lambda _: ours)
+    monkeypatch.setattr("s2a_bench.harness.clocks.wall_clock", lambda _: ours)
     theirs_ms = (ours.offset_ns - client.ahead_ns) / 1e6 + off_ms
     client.facts = {REALTIME_MS: theirs_ms, REALTIME_ERROR_MS: ours.error_ns / 1e6} if tells else {}
     source, plan = open_source("synthetic", 64, 48, fps=30.0, seed=0), resolve(RequestsConfig()).request
