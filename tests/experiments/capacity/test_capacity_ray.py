@@ -49,7 +49,7 @@ def test_robots_on_two_nodes_are_served_by_one_server_and_checked_against_their_
     fleets, robots = run.table(FLEETS), run.table(ROBOTS)
     assert fleets.groupby("source")["robots"].apply(list).to_dict() == {
         "measured": [1, 3],
-        "predicted": [3],
+        "predicted": [1, 3],
         "twin": [3],
     }
     assert sorted(robots[(robots["robots"] == 3) & (robots["source"] == "measured")]["robot"]) == [0, 1, 2]
