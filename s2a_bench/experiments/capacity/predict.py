@@ -142,8 +142,8 @@ class Prediction:
     progress: Progress
     rows: list[Any] = field(default_factory=list)
     """The fleets of the first seed."""
-    alone: float | None = None
-    """Share of stalled ticks of one robot alone, by the same seed."""
+    alone: dict[str, Any] = field(default_factory=dict)
+    """The row of one robot alone, by the same seed."""
 
     def run(self, numbers: Sequence[int], *, bisects: bool) -> KneeRow | None:
         """Try one robot, then fleets as `search`; return the median knee of `SEEDS` seeds, and its range over these."""
@@ -178,9 +178,9 @@ class Prediction:
         traces = simulate(fleet, robots, times, generator(seed, "capacity phases"), config.servers, self.slower)
         row = measures(traces, config.setting, config.settle_ns)
         if robots == 1:
-            self.alone = row["stalled"]
-        row["stalled_alone"] = self.alone
-        alone = self.alone or 0.0 if mode is not None and mode.blocks else 0.0
+            self.alone = row
+        row["stalled_alone"] = self.alone["stalled"]
+        alone = self.alone if mode is not None and mode.blocks else None
         verdict, within = judge(config.limited, row, traces, config.settle_ns, LEVEL, alone=alone)
         if seed == config.seed:
             about = {"cell": self.cell, "source": "predicted", "robots": robots, "seconds": config.seconds}

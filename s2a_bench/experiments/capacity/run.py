@@ -126,8 +126,8 @@ class _Cell:
     service: Service | None = None
     """Of the requests of one robot alone, before any other fleet."""
     tried: dict[int, Tried] = field(default_factory=dict)
-    alone: float | None = None
-    """Share of stalled ticks of one robot alone."""
+    alone: dict[str, Any] = field(default_factory=dict)
+    """The row of one robot alone."""
 
     def run(self) -> None:
         config = self.config
@@ -138,8 +138,10 @@ class _Cell:
             if self.instant is not None:
                 with _Robots(config, self.ray, self.launch, self.instant, self.mode, twin=True) as robots:
                     for number in sorted(self.tried, reverse=True):
-                        if self.tried[number].clean and self._fleet(robots, number, "twin").driven:
-                            break
+                        if self.tried[number].clean:
+                            found = self._fleet(robots, number, "twin")
+                            if found.clean and found.within:
+                                break
                         self.tried[number] = replace(self.tried[number], clean=False)
             self._predict()
         finally:
@@ -166,9 +168,9 @@ class _Cell:
         for looks, (traces, used) in enumerate(robots.looks(number), 1):  # noqa: B007 - their number is kept
             row = measures(traces, config.setting, config.settle_ns, confidence=config.confidence) | used
             if source == "measured" and number == 1:
-                self.alone = row["stalled"]
-            row["stalled_alone"] = self.alone
-            alone = (self.alone or 0.0) if blocks else 0.0
+                self.alone = row
+            row["stalled_alone"] = self.alone["stalled"]
+            alone = self.alone if blocks else None
             verdict, within = judge(config.limited, row, traces, config.settle_ns, config.confidence, alone=alone)
             if source == "twin" or (verdict != "undecided" and not (blocks and number == 1)):
                 break  # that one robot alone has all looks, as the others are judged by it
@@ -331,9 +333,8 @@ class _Robots(ExitStack):
         return now_ns(), sum(fleet.cpu_s() for fleet in self._fleets)
 
     def _wait(self, until_ns: int) -> None:
-        clock = SystemClock()
         while (left_ns := until_ns - now_ns()) > 0:
-            clock.sleep_until_ns(now_ns() + min(left_ns, round(KEEP_S * 1e9)))
+            SystemClock().sleep_until_ns(now_ns() + min(left_ns, round(KEEP_S * 1e9)))
             self._keep()
 
     def _keep(self) -> None:

@@ -30,11 +30,6 @@ class Tried:
     clean: bool = True
     """Whether the generator was in time; if not, it is no measurement."""
 
-    @property
-    def driven(self) -> bool:
-        """Whether the generator alone, with a server that takes no time, keeps to the limit."""
-        return self.clean and self.within
-
 
 @dataclass(frozen=True, slots=True)
 class Knee:
@@ -96,22 +91,24 @@ def judge(
     settle_ns: int,
     confidence: float,
     *,
-    alone: float = 0.0,
+    alone: Mapping[str, Any] | None = None,
 ) -> tuple[Verdict, bool]:
     """Return where a fleet's interval lies against a limit, and whether its value keeps to it.
 
-    ``alone`` is the share of stalled ticks that one robot alone has, in a mode that blocks, taken as known. Where that
-    leaves no room for the limit, every fleet is above it.
+    ``alone`` is the row of one robot alone (or ``row``) in a mode that blocks, its share taken as known. If it leaves
+    no room for the limit, every fleet is above it.
     """
     if limit is None:
         return "none", True
-    if limit.share + alone >= 1:
-        return "above", False
     if limit.column == "stalled":
-        share, low, high = (row["stalled"], row["stalled_low"], row["stalled_high"])
+        share, low, high = row["stalled"], row["stalled_low"], row["stalled_high"]
         if share is None:
             return "undecided", False
-        low, high, share = low - alone, high - alone, share - alone
+        if alone is not None:
+            known = alone["stalled"] or 0.0
+            if limit.share + known >= 1:
+                return "above", False
+            low, high, share = (0.0,) * 3 if alone is row else (low - known, high - known, share - known)
     else:
         at_ns, robots, above = above_limit(limit, traces, settle_ns)
         if not above.size:

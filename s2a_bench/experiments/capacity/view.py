@@ -58,8 +58,8 @@ def _knee_sentences(run: StoredRun) -> Iterator[str]:
     for knee in sorted(_rows(run, KNEES), key=lambda row: row["source"] == PREDICTED):
         sure = f"[{knee['low']}, {'...' if knee['high'] is None else int(knee['high'])}]"
         robots = f"{knee['robots']} robot{'s' * (knee['robots'] != 1)} {sure}" if knee["high"] != 0 else "no robot"
-        robots = robots if knee["source"] == "measured" else f"{knee['source']}: {robots}"
-        yield f"{robots}{clock}, {knee['cell']}, with {knee['limit']}."
+        source = "" if knee["source"] == "measured" else f"{knee['source']}: "
+        yield f"{source}{robots}{clock}, {knee['cell']}, with {knee['limit']}."
 
 
 def _parted(run: StoredRun) -> Iterator[str]:

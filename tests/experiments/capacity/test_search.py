@@ -88,7 +88,7 @@ def test_stalls_are_judged_by_their_interval_less_what_one_robot_has_alone(
 ) -> None:
     traces = fleet(share)
     row = measures(traces, SETTING)
-    assert judge(Limit.read("stalled=1%"), row, traces, 0, 0.95, alone=alone)[0] == verdict
+    assert judge(Limit.read("stalled=1%"), row, traces, 0, 0.95, alone={"stalled": alone})[0] == verdict
 
 
 @pytest.mark.parametrize(
@@ -109,8 +109,8 @@ def test_stalls_that_come_back_every_cycle_are_decided() -> None:
     cycle = np.arange(1000) % 19 < 3  # sync: 3 of 19 ticks
     traces = [trace(robot, np.roll(cycle, robot * 5), [50] * 20) for robot in range(8)]
     row = measures(traces, SETTING)
-    assert judge(Limit.read("stalled=1.5%"), row, traces, 0, 0.99, alone=3 / 19)[0] == "below"
-    assert judge(Limit.read("stalled=1.5%"), row, traces, 0, 0.99, alone=2 / 18)[0] == "above"
+    assert judge(Limit.read("stalled=1.5%"), row, traces, 0, 0.99, alone={"stalled": 3 / 19})[0] == "below"
+    assert judge(Limit.read("stalled=1.5%"), row, traces, 0, 0.99, alone={"stalled": 2 / 18})[0] == "above"
 
 
 def test_one_long_stall_is_one_event() -> None:
@@ -129,10 +129,16 @@ def test_a_request_without_an_answer_is_above_the_limit_once_it_waits_for_longer
     assert set(robots.tolist()) == {3}
 
 
+def test_one_robot_alone_has_no_stalls_beyond_its_own() -> None:
+    traces = fleet(0.2)[:1]
+    row = measures(traces, SETTING)
+    assert judge(Limit.read("stalled=0.1%"), row, traces, 0, 0.95, alone=row) == ("below", True)
+
+
 def test_what_one_robot_alone_stalls_may_leave_no_room_for_the_limit() -> None:
     traces = fleet(0.99)
     row = measures(traces, SETTING)
-    assert judge(Limit.read("stalled=20%"), row, traces, 0, 0.95, alone=0.98) == ("above", False)
+    assert judge(Limit.read("stalled=20%"), row, traces, 0, 0.95, alone={"stalled": 0.98}) == ("above", False)
 
 
 def test_without_values_nothing_is_decided() -> None:
