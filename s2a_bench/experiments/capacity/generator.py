@@ -71,6 +71,8 @@ class FleetPlan:
     every_ns: int = 0
     """Between the plans of a robot; 0 and no mode: closed loop."""
     think_ns: int = 0
+    first: int = 0
+    """Place in the run before those of its requests."""
     own: RunPlan | None = None
     """Of the server that each process starts for its robots alone; None: `wiring` leads to one that all share."""
 
@@ -244,7 +246,7 @@ class Fleet:
         """Open the connections of robots that have none; raises S2AError."""
         for robot in robots:
             if robot not in self._sessions:
-                self._sessions[robot] = self._session(robot), count(STRIDE + robot, STRIDE)
+                self._sessions[robot] = self._session(robot), count(self._plan.first + STRIDE + robot, STRIDE)
 
     def start(self, phases_ns: Mapping[int, int], in_ns: int) -> None:
         """Start connected robots in ``in_ns``, each its phase later."""
@@ -316,7 +318,7 @@ class Fleet:
         plan, wiring = self._plan, self._wiring
         cell = Pipeline(plan.cell, TRANSPORTS[wiring.transport], wiring.variant, wiring.options)
         client = open_client(wiring)
-        source = _Shared(self._source, f"{plan.feed.nonce}/{cell.name} {robot}", self._reads)
+        source = _Shared(self._source, f"{plan.feed.nonce}/{cell.name} {plan.mode} {robot}", self._reads)
         preencoded = cell.payload == "jpeg-preencoded"
         feed = RequestFeed(source, preencoded=preencoded, cameras=plan.feed.cameras, size=plan.feed.resize)
         session = Session(cell, client, feed, plan.request)

@@ -246,6 +246,7 @@ class _Robots(ExitStack):
             config.setting,
             mode,
             config.seed,
+            first=STRIDE * STRIDE * [*config.made].index(mode) if mode else 0,
             every_ns=config.plan_ns if config.load == "plans" else 0,
             think_ns=round(config.think_s * 1e9),
         )

@@ -43,7 +43,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
         tables={"capacity": _table(run, MAIN), "robots": _table(run, REST)},
         main=["capacity"],
         csvs={"capacity.csv": CsvTable.of(fleets[0] if fleets else (), (tuple(row.values()) for row in fleets))},
-        figures={"capacity": partial(build_capacity, run)} if _panels(fleets) else {},
+        figures={"capacity": partial(build_capacity, run)} if _panels(_drawn(fleets)) else {},
         json=lambda: frame(run, [present(CapacityCell(**row)) for row in fleets], [], knees=_rows(run, KNEES)),
     )
 
@@ -128,7 +128,7 @@ def _value(metric: Metric, value: float | None) -> str:
 
 def build_capacity(run: StoredRun) -> Figure:
     """Draw latency, stalled share and age over the number of robots, with the knee and its interval."""
-    rows = [row for row in _fleets(run) if _drawn(row)]
+    rows = _drawn(_fleets(run))
     cells = list(dict.fromkeys(row["cell"] for row in rows))[: len(COLOURS)]
     panels = _panels(rows)
     notes = (
@@ -157,14 +157,13 @@ def build_capacity(run: StoredRun) -> Figure:
     return figure
 
 
-def _drawn(row: dict[str, Any]) -> bool:
-    return row["source"] != "twin" and bool(row["clean"])
+def _drawn(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [row for row in rows if row["source"] != "twin" and row["clean"]]
 
 
 def _panels(rows: Sequence[dict[str, Any]]) -> dict[str, str]:
-    """Return the labels of the panels for which drawn fleets have values."""
-    drawn = [row for row in rows if _drawn(row)]
-    return {name: label for name, label in PANELS.items() if any(row[_column(name)] is not None for row in drawn)}
+    """Return the labels of the panels for which fleets have values."""
+    return {name: label for name, label in PANELS.items() if any(row[_column(name)] is not None for row in rows)}
 
 
 def _column(panel: str) -> str:

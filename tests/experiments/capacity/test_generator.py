@@ -184,6 +184,12 @@ def test_ctrl_c_ends_the_search_in_a_line_and_what_was_measured_stays(tmp_path: 
     assert read_run(folder).table(FLEETS)["robots"].tolist() == [1]
 
 
+def test_no_mode_has_the_names_or_the_pictures_of_another(tmp_path: Any) -> None:
+    run = small(tmp_path, transports="loopback", modes="sync,queue", limit="", robots="2", seconds=0.5, settle=0)
+    assert run.samples["request_id"].is_unique
+    assert "duplicate-frames" not in {warning["code"] for warning in run.manifest["warnings"]}
+
+
 def test_clients_without_a_clock_need_no_instant_server(tmp_path: Any) -> None:
     run = small(tmp_path, transports="http/binary", latency=30, closed_loop=True, robots="3")
     assert {*run.table(FLEETS)["source"]} == {"measured", "predicted"}
