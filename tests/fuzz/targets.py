@@ -45,8 +45,7 @@ from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
 from s2a_bench.transport.http.dialects.decoder import Decoder
 from s2a_bench.transport.http.fast import Head
 from s2a_bench.transport.http.native import PARAMETERS_HEADER, PATHS, Refused
-from s2a_bench.transport.http.protocol import Protocol
-from s2a_bench.transport.http.server import application
+from s2a_bench.transport.http.server import Protocol, application
 from s2a_bench.transport.limits import LIMITS
 from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pictures import decoded
