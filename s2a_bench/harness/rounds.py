@@ -9,7 +9,7 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 from random import Random
-from typing import Any, TypeAlias
+from typing import Any, Protocol, TypeAlias
 
 from s2a_bench import extras
 from s2a_bench.clock import Clock, SystemClock
@@ -48,6 +48,14 @@ Slot: TypeAlias = Callable[[Place], None]
 """Measures once and writes the result; called once per block."""
 
 
+class Keep(Protocol):
+    def __call__(self, session: Session, measured: Measured, client: int = 0, clients: int = 1) -> None:
+        """Write a request of one of the ``clients`` of a cell, and raise what makes the next one useless.
+
+        Not thread-safe.
+        """
+
+
 @dataclass(frozen=True, slots=True)
 class RunningLaunch:
     """One running set of servers, and their clients."""
@@ -58,8 +66,8 @@ class RunningLaunch:
     writer: RunWriter
     sessions: Sequence[Session]
     """In the order of the cells, `Task.clients` of each cell one after the other."""
-    keep: Callable[..., None]
-    """Writes a request, as `_Run.keep`; not thread-safe."""
+    keep: Keep
+    guard: SampleGuard
     progress: Progress
     warnings: list[RunWarning]
     """Warnings of the run besides those about its requests."""
@@ -206,7 +214,16 @@ class _Run:
         keep = partial(self.keep, servers, sampler)
         try:
             launch = RunningLaunch(
-                number, self.plan, writer, sessions, keep, self.progress, self.warnings, servers.wiring, sampler
+                number,
+                self.plan,
+                writer,
+                sessions,
+                keep,
+                self.guard,
+                self.progress,
+                self.warnings,
+                servers.wiring,
+                sampler,
             )
             self.task.drive(launch)
             self.guard.see_hits(hits, servers.cache_hits())
@@ -259,7 +276,6 @@ class _Run:
         client: int = 0,
         clients: int = 1,
     ) -> None:
-        """Write a request of one of the ``clients`` of a cell, and raise what makes the next one useless."""
         name, sample, writer = session.cell.name, measured.sample, self.writer
         keep_origin(writer, name, session.origin)
         writer.sample(sample)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 from pydantic import BeforeValidator
 
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.capacity.search import Judge
 from s2a_bench.harness.config import LiveRequests
 from s2a_bench.inference import STAND_IN, EngineConfig
 from s2a_bench.options import Names, Options, group, option
@@ -191,8 +192,13 @@ class CapacityConfig(Options):
         """Return the limit in words, as it is for a mode, or for "" for robots without one."""
         if self.limited is None or self.limited.column != "stalled":
             return "" if self.limited is None else self.limited.text
-        beyond = " beyond those of one robot alone" if mode and self.made[mode].blocks else ""
+        beyond = " beyond those of one robot alone" if self.judge(mode, 0).beyond else ""
         return f"{self.limited.text} {'ticks' if self.load == 'chunks' else 'plans'}{beyond}"
+
+    def judge(self, mode: str, confidence: float) -> Judge:
+        limit = self.limited
+        blocks = bool(mode) and self.made[mode].blocks and limit is not None and limit.column == "stalled"
+        return Judge(limit, blocks, self.settle_ns, confidence)
 
     @property
     def setting(self) -> ControlSetting:
@@ -281,7 +287,8 @@ class CapacityConfig(Options):
             raise UsageError("`think` needs `closed_loop`")
         if "modes" in given and self.load != "chunks":
             raise UsageError("`modes` are ways to act on chunks of actions; leave them out without chunks")
-        acts_s, least_s = self.episodes_s or self.seconds, FEWEST_PLANS * self.plan_ns / 1e9
+        least_s = FEWEST_PLANS * self.plan_ns / 1e9
+        acts_s = self.episodes_s - self.settle_ns / 1e9 if self.episodes_s else self.seconds
         if self.load == "plans" and acts_s < least_s:
             name, every = "episodes" if self.episodes_s else "seconds", f"one plan every {self.plan_ns / 1e9:g} s"
             raise UsageError(f"`{name}`: {acts_s:g} s are too short for {every}; take {least_s:g} or more")

@@ -18,7 +18,7 @@ from s2a_bench.boards.latency import STRETCH, read_delays
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.capacity.metrics import measures
 from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, FleetRow, KneeRow
-from s2a_bench.experiments.capacity.search import Tried, judge, knee, search
+from s2a_bench.experiments.capacity.search import Judge, Tried, knee, search
 from s2a_bench.experiments.capacity.simulate import UNKNOWN, ServiceTime, VirtualFleet, simulate
 from s2a_bench.experiments.latencies import Source, sources
 from s2a_bench.machine import environment
@@ -142,8 +142,6 @@ class Prediction:
     progress: Progress
     rows: list[Any] = field(default_factory=list)
     """The fleets of the first seed."""
-    alone: dict[str, Any] = field(default_factory=dict)
-    """The row of one robot alone, by the same seed."""
 
     def run(self, numbers: Sequence[int], *, bisects: bool) -> KneeRow | None:
         """Try one robot, then fleets as `search`; return the median knee of `SEEDS` seeds, and its range over these."""
@@ -151,9 +149,9 @@ class Prediction:
         for seed in range(first, first + (1 if self.config.limited is None else SEEDS)):
             self.progress.stage(f"{self.cell}: in virtual time, seed {seed}")
             tried: dict[int, Tried] = {}
-            search(numbers, partial(self._attempt, seed), tried, bisects=bisects)
-            if (one := knee(tried.values())) is not None:
-                found.append(one)
+            attempt = partial(self._attempt, self.config.judge(self.mode, LEVEL), seed)
+            search(numbers, attempt, tried, bisects=bisects)
+            found += [each for each in (knee(tried.values()),) if each]
         if self.config.limited is None:
             return None
         text, robots = self.config.limit_text(self.mode), sorted(each.robots for each in found)
@@ -161,7 +159,7 @@ class Prediction:
         high = max(highs) if len(highs) == len(found) else None
         return KneeRow(self.cell, "predicted", text, robots[len(robots) // 2], robots[0], high, None)
 
-    def _attempt(self, seed: int, robots: int) -> Tried:
+    def _attempt(self, judge: Judge, seed: int, robots: int) -> Tried:
         config, mode = self.config, self.config.made.get(self.mode)
         closed = mode is None and config.load == "closed"
         fleet = VirtualFleet(
@@ -177,15 +175,13 @@ class Prediction:
         times = self.service.times(rng)
         traces = simulate(fleet, robots, times, generator(seed, "capacity phases"), config.servers, self.slower)
         row = measures(traces, config.setting, config.settle_ns)
-        if robots == 1:
-            self.alone = row
-        row["stalled_alone"] = self.alone["stalled"]
-        alone = self.alone if mode is not None and mode.blocks else None
-        verdict, within = judge(config.limited, row, traces, config.settle_ns, LEVEL, alone=alone)
+        verdict, within = judge(row, traces, first=robots == 1)
         if seed == config.seed:
             about = {"cell": self.cell, "source": "predicted", "robots": robots, "seconds": config.seconds}
             self.rows.append(FleetRow(**about, looks=1, verdict=verdict, within=within, clean=True, **row))
-        return Tried(robots, "below" if within else "above", within)
+        if judge.limit and row[judge.limit.column] is not None:  # what is computed is taken as sure
+            verdict = "below" if within else "above"
+        return Tried(robots, verdict, within)
 
     def _check(self, fleet: VirtualFleet, robots: int) -> None:
         """Raise UsageError for more ticks or requests than are kept in memory."""

@@ -26,7 +26,10 @@ class AboutFleet:
     looks: Annotated[Count, about("After how many looks it was decided, or given up.")]
     verdict: Annotated[Verdict, about("Where the interval lies against the limit; none: no limit.")]
     within: Annotated[bool, about("Whether the value itself keeps to the limit.")]
-    clean: Annotated[bool, about("Whether the generator was in time: its own ticks at p99 within 5 % of one.")]
+    clean: Annotated[
+        bool,
+        about("Whether its own ticks at p99 were within 5 % of one; in JSON and CSV also its twin within the limit."),
+    ]
 
 
 FleetRow: Final[Any] = with_fields(

@@ -27,7 +27,7 @@ from s2a_bench.experiments.capacity.rows import (
     RobotRow,
     Source,
 )
-from s2a_bench.experiments.capacity.search import Tried, judge, knee, search
+from s2a_bench.experiments.capacity.search import Judge, Tried, knee, search
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Place
@@ -106,7 +106,8 @@ def _drive(config: CapacityConfig, ray: Any, launch: RunningLaunch) -> None:
     for session, instant in zip_longest(launch.sessions[:count], launch.sessions[count:]):
         service: Service | None = None
         for mode in modes:
-            cell = _Cell(config, ray, launch, session, instant, mode, service)
+            judge = config.judge(mode, config.confidence)
+            cell = _Cell(config, ray, launch, session, instant, mode, judge, service)
             cell.run()
             service = cell.service
 
@@ -123,11 +124,10 @@ class _Cell:
     instant: Session | None
     """Of a server that takes no time, with which the generator is checked."""
     mode: str
+    judge: Judge
     service: Service | None = None
     """Of the requests of one robot alone, before any other fleet."""
     tried: dict[int, Tried] = field(default_factory=dict)
-    alone: dict[str, Any] = field(default_factory=dict)
-    """The row of one robot alone."""
 
     def run(self) -> None:
         config = self.config
@@ -164,18 +164,14 @@ class _Cell:
     def _fleet(self, robots: _Robots, number: int, source: Source) -> Tried:
         config, launch = self.config, self.launch
         launch.progress.stage(f"{robots.name}: {number} robot{'s' * (number > 1)}")
-        blocks = bool(self.mode) and config.made[self.mode].blocks
+        first = source == "measured" and number == 1
         for looks, (traces, used) in enumerate(robots.looks(number), 1):  # noqa: B007 - their number is kept
             row = measures(traces, config.setting, config.settle_ns, confidence=config.confidence) | used
-            if source == "measured" and number == 1:
-                self.alone = row
-            row["stalled_alone"] = self.alone["stalled"]
-            alone = self.alone if blocks else None
-            verdict, within = judge(config.limited, row, traces, config.settle_ns, config.confidence, alone=alone)
-            if source == "twin" or (verdict != "undecided" and not (blocks and number == 1)):
-                break  # that one robot alone has all looks, as the others are judged by it
+            verdict, within = self.judge(row, traces, first=first)
+            if source == "twin" or (verdict != "undecided" and not (first and self.judge.beyond)):
+                break  # one robot alone has all looks where the others are judged by it
         robots.stop()
-        if source == "measured" and number == 1 and not self.service and row["latency_p50_ns"] and not self.tried:
+        if first and not self.service and row["latency_p50_ns"] and not self.tried:
             self.service = Service.read(f"{launch.writer.path}#{self.session.cell.name}")
         tick_ns = config.setting.period_ns if self.mode else row["latency_p50_ns"] if source == "measured" else None
         clean = tick_ns is None or (row["late_p99_ns"] or 0) <= LATEST * tick_ns
@@ -196,28 +192,21 @@ class _Cell:
         writer.append(ROBOTS, [RobotRow(**about, **measures([trace], self.config.setting, settle_ns))])
         since_ns = (trace.request_ns - trace.start_ns).tolist()
         latency_ns = [each if each >= 0 else None for each in trace.arrival_ns.tolist()]
-        rows = zip(since_ns, latency_ns, strict=True)
-        writer.append(
-            REQUESTS,
-            (RequestRow(**about, intended_ns=at, latency_ns=each, settling=at < settle_ns) for at, each in rows),
-        )
+        times = zip(since_ns, latency_ns, strict=True)
+        rows = (RequestRow(**about, intended_ns=at, latency_ns=each, settling=at < settle_ns) for at, each in times)
+        writer.append(REQUESTS, rows)
 
     def _conclude(self) -> None:
         """Write the knee of the fleets so far, and a warning about those that the generator did not drive."""
         tried, name, limit = self.tried.values(), cell_name(self.session, self.mode), self.config.limit_text(self.mode)
         driven = max((each.robots for each in tried if each.clean), default=0)
-        found = knee(tried)
-        if limit and found is not None:
+        if limit and (found := knee(tried)) is not None:
             row = KneeRow(name, "measured", limit, found.robots, found.low, found.high, driven)
             self.launch.writer.append(KNEES, [row])
         if late := sorted(each.robots for each in tried if not each.clean):
-            self.launch.warnings.append(
-                RunWarning(
-                    "generator-late",
-                    f"{name}: {', '.join(map(str, late))} robots are no measurement, as the generator was late",
-                    "spread the robots with --processes, send smaller pictures (--size), or quiet the machine",
-                )
-            )
+            what = f"{name}: {', '.join(map(str, late))} robots are no measurement: the generator was late or too slow"
+            advice = "spread the robots with --processes, send smaller pictures (--size), or quiet the machine"
+            self.launch.warnings.append(RunWarning("generator-late", what, advice))
 
 
 class _Robots(ExitStack):
@@ -273,6 +262,7 @@ class _Robots(ExitStack):
         """
         config = self._config
         self._number = number
+        self._launch.guard.in_a_row.clear()
         seconds_ns = round(config.seconds * 1e9)
         if not config.episodes_s:
             start_ns = self._start(self._phases(number))

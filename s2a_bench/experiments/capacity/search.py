@@ -11,8 +11,6 @@ import numpy as np
 from s2a_bench.experiments.capacity.metrics import share_interval
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from s2a_bench.experiments.capacity.config import Limit
     from s2a_bench.experiments.capacity.metrics import RobotTrace
     from s2a_bench.experiments.capacity.rows import Verdict
@@ -84,39 +82,46 @@ def knee(tried: Iterable[Tried]) -> Knee | None:
     return Knee(found, min(low, found), None if above is None else max(above - 1, found))
 
 
-def judge(
-    limit: Limit | None,
-    row: Mapping[str, Any],
-    traces: Sequence[RobotTrace],
-    settle_ns: int,
-    confidence: float,
-    *,
-    alone: Mapping[str, Any] | None = None,
-) -> tuple[Verdict, bool]:
-    """Return where a fleet's interval lies against a limit, and whether its value keeps to it.
+@dataclass(slots=True)
+class Judge:
+    """Judges the fleets of a cell by a limit, one robot alone first."""
 
-    ``alone`` is the row of one robot alone (or ``row``) in a mode that blocks, its share taken as known. If it leaves
-    no room for the limit, every fleet is above it.
-    """
-    if limit is None:
-        return "none", True
-    if limit.column == "stalled":
-        share, low, high = row["stalled"], row["stalled_low"], row["stalled_high"]
-        if share is None:
-            return "undecided", False
-        if alone is not None:
-            known = alone["stalled"] or 0.0
-            if limit.share + known >= 1:
-                return "above", False
-            low, high, share = (0.0,) * 3 if alone is row else (low - known, high - known, share - known)
-    else:
-        at_ns, robots, above = above_limit(limit, traces, settle_ns)
-        if not above.size:
-            return "undecided", False
-        low, high = share_interval(above, at_ns, robots, confidence)
-        share = float(above.mean())
-    verdict: Verdict = "below" if high <= limit.share else "above" if low > limit.share else "undecided"
-    return verdict, share <= limit.share
+    limit: Limit | None
+    beyond: bool
+    """Whether only stalls beyond those of one robot alone count, as in a mode that blocks."""
+    settle_ns: int
+    confidence: float
+    alone: float | None = None
+    """Share of stalled ticks of one robot alone, taken as known."""
+
+    def __call__(
+        self, row: dict[str, Any], traces: Sequence[RobotTrace], *, first: bool = False
+    ) -> tuple[Verdict, bool]:
+        """Return where a fleet's interval lies against the limit, and whether its value keeps to it.
+
+        The ``first`` is one robot alone. It stalls no more than itself, but may leave no room for the limit.
+        """
+        if first:
+            self.alone = row["stalled"]
+        row["stalled_alone"], limit = self.alone, self.limit
+        if limit is None:
+            return "none", True
+        if limit.column == "stalled":
+            share, low, high = row["stalled"], row["stalled_low"], row["stalled_high"]
+            if share is None:
+                return "undecided", False
+            if self.beyond and first:
+                return ("below", True) if limit.share + share < 1 else ("above", False)
+            known = (self.alone or 0.0) if self.beyond else 0.0
+            low, high, share = low - known, high - known, share - known
+        else:
+            at_ns, robots, above = above_limit(limit, traces, self.settle_ns)
+            if not above.size:
+                return "undecided", False
+            low, high = share_interval(above, at_ns, robots, self.confidence)
+            share = float(above.mean())
+        verdict: Verdict = "below" if high <= limit.share else "above" if low > limit.share else "undecided"
+        return verdict, share <= limit.share
 
 
 def above_limit(limit: Limit, traces: Sequence[RobotTrace], settle_ns: int) -> tuple[Ints, Ints, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -29,7 +30,9 @@ REST: Final = ("in_time", "stalled_worst", "unfair", "late_p99_s", "generator_cp
 PANELS: Final = {"latency": "latency (ms)", "stalled": "stalled (%)", "age": "age of action (ms)"}
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#000000", "#E69F00")
 PREDICTED: Final = "predicted"
-LATE: Final = "late: no measurement, as the generator was late, or too slow for the limit with an instant server, too"
+LATE: Final = (
+    "late: no measurement, as the generator missed its ticks, or exceeds the limit even with an instant server"
+)
 KNEE: Final = Metric("knee", "robots", "higher", "knee", "mean", "The largest fleet within the limit.")
 
 CapacityCell = cell_of_row("CapacityCell", "N robots on one server.", FleetRow, without=())
@@ -64,24 +67,17 @@ def _knee_sentences(run: StoredRun) -> Iterator[str]:
 
 def _parted(run: StoredRun) -> Iterator[str]:
     """Yield for each measured cell at which fleets its stalled share and the predicted one have intervals apart."""
-    rows = [row for row in _fleets(run) if row["clean"]]
-    fleets = {(row["cell"], row["source"], row["robots"]): row for row in rows}
-    for cell in dict.fromkeys(row["cell"] for row in rows):
-        both = [
-            (mine, fleets[cell, PREDICTED, mine["robots"]])
-            for mine in rows
-            if mine["cell"] == cell and mine["source"] == "measured" and (cell, PREDICTED, mine["robots"]) in fleets
-        ]
-        pairs = [(mine, other) for mine, other in both if None not in (mine["stalled"], other["stalled"])]
-        off = [
-            str(mine["robots"])
-            for mine, other in pairs
-            if mine["stalled_high"] < other["stalled_low"] or other["stalled_high"] < mine["stalled_low"]
-        ]
-        if off:
-            yield f"{cell}: measured and predicted share of stalls have intervals apart at {', '.join(off)} robots."
-        elif pairs:
-            yield f"{cell}: measured and predicted share of stalls agree at every number of robots."
+    rows = [row for row in _fleets(run) if row["clean"] and row["stalled"] is not None]
+    predicted = {(row["cell"], row["robots"]): row for row in rows if row["source"] == PREDICTED}
+    apart: dict[str, dict[int, bool]] = {}
+    for row in rows:
+        if row["source"] == "measured" and (other := predicted.get((row["cell"], row["robots"]))):
+            off = row["stalled_high"] < other["stalled_low"] or other["stalled_high"] < row["stalled_low"]
+            apart.setdefault(row["cell"], {})[row["robots"]] = off
+    for cell, fleets in apart.items():
+        how = "intervals apart" if any(fleets.values()) else "overlapping intervals"
+        named = ", ".join(str(robots) for robots, off in fleets.items() if off or not any(fleets.values()))
+        yield f"{cell}: measured and predicted share of stalls have {how} at {named} robots."
 
 
 def _table(run: StoredRun, names: Sequence[str]) -> TextTable:
@@ -240,17 +236,14 @@ COMPARED: Final = Comparable(
 def _fleets(run: StoredRun) -> list[dict[str, Any]]:
     """Return the fleets, those of a cell together, by their number of robots.
 
-    A measured fleet is not ``clean`` either if the generator does not drive it, by its twin.
+    A measured fleet is not ``clean`` either if the generator does not drive it, by its twin or that of a smaller one.
     """
     rows = _rows(run, FLEETS)
-    driven: dict[str, int] = {}
-    for row in rows:
-        if row["source"] == "twin":
-            cell = row["cell"].replace(TWIN, "", 1)
-            driven[cell] = max(driven.get(cell, 0), row["robots"] if row["clean"] and row["within"] else 0)
+    slow = [row for row in rows if row["source"] == "twin" and not (row["clean"] and row["within"])]
     for row in rows:
         if row["source"] == "measured":
-            row["clean"] = row["clean"] and row["robots"] <= driven.get(row["cell"], row["robots"])
+            twins = (each["robots"] for each in slow if each["cell"].replace(TWIN, "", 1) == row["cell"])
+            row["clean"] = row["clean"] and row["robots"] < min(twins, default=math.inf)
     cells = list(dict.fromkeys((row["cell"], row["source"]) for row in rows))
     return sorted(rows, key=lambda row: (cells.index((row["cell"], row["source"])), row["robots"]))
 

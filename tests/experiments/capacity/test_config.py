@@ -50,6 +50,10 @@ def test_a_limit_is_a_share_of_values_that_may_be_above_it(written: str, limit: 
         ({"episodes_s": 2, "settle_s": 5}, "`settle`: 5 s leave nothing of an episode of 2 s"),
         ({"predict": "20", "plan_every_s": 60}, "`seconds`: 10 s are too short for one plan every 60 s; take 180"),
         ({"predict": "20", "plan_every_s": 2, "episodes_s": 5}, "`episodes`: 5 s are too short for one plan every 2 s"),
+        (
+            {"predict": "20", "plan_every_s": 2, "episodes_s": 7, "settle_s": 5},
+            "`episodes`: 2 s are too short for one plan every 2 s",
+        ),
         ({"predict": "20", "latency": "5"}, "`latency` is for a measured run"),
         ({"servers": 2}, "`servers` needs `predict`"),
         ({"predict": "20", "ray": "auto"}, "`ray` is for a measured run"),

@@ -21,7 +21,7 @@ from s2a_bench.errors import ServerDied
 from s2a_bench.experiments.capacity import generator
 from s2a_bench.experiments.capacity.generator import Fleet, FleetPlan, PlainRobot
 from s2a_bench.experiments.capacity.metrics import RobotTrace
-from s2a_bench.experiments.capacity.rows import FLEETS, REQUESTS, ROBOTS
+from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, REQUESTS, ROBOTS
 from s2a_bench.experiments.capacity.run import twin
 from s2a_bench.harness.config import LiveRequests, RequestsConfig
 from s2a_bench.harness.plan import resolve
@@ -194,6 +194,15 @@ def test_clients_without_a_clock_need_no_instant_server(tmp_path: Any) -> None:
     run = small(tmp_path, transports="http/binary", latency=30, closed_loop=True, robots="3")
     assert {*run.table(FLEETS)["source"]} == {"measured", "predicted"}
     assert [*run.manifest["servers"]] == ["http"]
+
+
+@pytest.mark.slow
+def test_a_robot_that_leaves_no_room_for_the_limit_is_no_matter_of_the_generator(tmp_path: Any) -> None:
+    run = small(
+        tmp_path, transports="http/binary", latency=700, modes="sync", robots="1..4", limit="stalled=50%", seconds=3
+    )
+    assert run.table(KNEES)["high"].tolist() == [0, 0], "measured, predicted"
+    assert "generator-late" not in {warning["code"] for warning in run.manifest["warnings"]}
 
 
 @pytest.mark.slow

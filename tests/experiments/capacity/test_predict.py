@@ -103,6 +103,15 @@ def test_the_limit_of_sync_is_on_what_is_beyond_one_robot_alone(tmp_path: Path) 
     assert knee["limit"] == "at most 1 % stalled ticks beyond those of one robot alone"
 
 
+def test_no_robot_is_predicted_where_one_leaves_no_room_and_nothing_where_nothing_is_known(tmp_path: Path) -> None:
+    full = predicted(tmp_path / "full", predict="700", modes="sync", robots="1..8", limit="stalled=50%")
+    (knee,) = full.table(KNEES).to_dict("records")
+    assert (knee["robots"], knee["low"], knee["high"]) == (0, 0, 0)
+    slow = predicted(tmp_path / "slow", predict="20000", modes="sync", robots="1..8", limit="latency_p99=30s")
+    assert slow.table(KNEES)["robots"].tolist() == [0]
+    assert slow.table(KNEES)["high"].isna().all()
+
+
 def test_one_robot_is_tried_before_a_range_that_begins_with_more(tmp_path: Path) -> None:
     run = predicted(tmp_path, predict="25", robots="16..32")
     assert run.table(FLEETS)["robots"].tolist() == [1, 16]

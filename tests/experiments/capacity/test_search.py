@@ -9,7 +9,7 @@ import pytest
 
 from s2a_bench.experiments.capacity.config import CapacityConfig, Limit
 from s2a_bench.experiments.capacity.metrics import RobotTrace, measures
-from s2a_bench.experiments.capacity.search import Knee, Tried, above_limit, judge, knee, search
+from s2a_bench.experiments.capacity.search import Judge, Knee, Tried, above_limit, knee, search
 from s2a_bench.policy.chunks import ControlSetting, Ticks
 
 MS = 1_000_000
@@ -88,7 +88,7 @@ def test_stalls_are_judged_by_their_interval_less_what_one_robot_has_alone(
 ) -> None:
     traces = fleet(share)
     row = measures(traces, SETTING)
-    assert judge(Limit.read("stalled=1%"), row, traces, 0, 0.95, alone={"stalled": alone})[0] == verdict
+    assert Judge(Limit.read("stalled=1%"), True, 0, 0.95, alone)(row, traces)[0] == verdict
 
 
 @pytest.mark.parametrize(
@@ -102,15 +102,15 @@ def test_stalls_are_judged_by_their_interval_less_what_one_robot_has_alone(
 )
 def test_a_percentile_is_judged_by_the_share_of_values_above_it(limit: str, verdict: str) -> None:
     traces = fleet(0)
-    assert judge(Limit.read(limit), measures(traces, SETTING), traces, 0, 0.95)[0] == verdict
+    assert Judge(Limit.read(limit), False, 0, 0.95)(measures(traces, SETTING), traces)[0] == verdict
 
 
 def test_stalls_that_come_back_every_cycle_are_decided() -> None:
     cycle = np.arange(1000) % 19 < 3  # sync: 3 of 19 ticks
     traces = [trace(robot, np.roll(cycle, robot * 5), [50] * 20) for robot in range(8)]
     row = measures(traces, SETTING)
-    assert judge(Limit.read("stalled=1.5%"), row, traces, 0, 0.99, alone={"stalled": 3 / 19})[0] == "below"
-    assert judge(Limit.read("stalled=1.5%"), row, traces, 0, 0.99, alone={"stalled": 2 / 18})[0] == "above"
+    assert Judge(Limit.read("stalled=1.5%"), True, 0, 0.99, 3 / 19)(row, traces)[0] == "below"
+    assert Judge(Limit.read("stalled=1.5%"), True, 0, 0.99, 2 / 18)(row, traces)[0] == "above"
 
 
 def test_one_long_stall_is_one_event() -> None:
@@ -119,7 +119,7 @@ def test_one_long_stall_is_one_event() -> None:
     ]
     row = measures(traces, SETTING)
     assert row["stalled"] == 0.005
-    assert judge(Limit.read("stalled=1%"), row, traces, 0, 0.95)[0] == "undecided"
+    assert Judge(Limit.read("stalled=1%"), False, 0, 0.95)(row, traces)[0] == "undecided"
 
 
 def test_a_request_without_an_answer_is_above_the_limit_once_it_waits_for_longer() -> None:
@@ -129,20 +129,15 @@ def test_a_request_without_an_answer_is_above_the_limit_once_it_waits_for_longer
     assert set(robots.tolist()) == {3}
 
 
-def test_one_robot_alone_has_no_stalls_beyond_its_own() -> None:
-    traces = fleet(0.2)[:1]
-    row = measures(traces, SETTING)
-    assert judge(Limit.read("stalled=0.1%"), row, traces, 0, 0.95, alone=row) == ("below", True)
-
-
-def test_what_one_robot_alone_stalls_may_leave_no_room_for_the_limit() -> None:
-    traces = fleet(0.99)
-    row = measures(traces, SETTING)
-    assert judge(Limit.read("stalled=20%"), row, traces, 0, 0.95, alone={"stalled": 0.98}) == ("above", False)
+@pytest.mark.parametrize(("stalled", "found"), [(0.2, ("below", True)), (0.8, ("above", False))])
+def test_one_robot_alone_has_no_stalls_beyond_its_own_but_may_leave_no_room(stalled: float, found: Any) -> None:
+    judge, traces = Judge(Limit.read("stalled=25%"), True, 0, 0.95), fleet(stalled)[:1]
+    assert judge(measures(traces, SETTING), traces, first=True) == found
+    assert judge.alone == pytest.approx(stalled, abs=0.05)
 
 
 def test_without_values_nothing_is_decided() -> None:
     row = {"stalled": None, "stalled_low": None, "stalled_high": None}
-    assert judge(Limit.read("stalled=1%"), row, [], 0, 0.95) == ("undecided", False)
-    assert judge(Limit.read("ttft_p99=1s"), row, [], 0, 0.95) == ("undecided", False)
-    assert judge(None, row, [], 0, 0.95) == ("none", True)
+    assert Judge(Limit.read("stalled=1%"), False, 0, 0.95)(row, []) == ("undecided", False)
+    assert Judge(Limit.read("ttft_p99=1s"), False, 0, 0.95)(row, []) == ("undecided", False)
+    assert Judge(None, False, 0, 0.95)(row, []) == ("none", True)

@@ -29,7 +29,8 @@ def measured(tmp_path: Path, service_ms: int, robots: int, driven: int = 16) -> 
     fleets, knees = run.table(FLEETS), run.table(KNEES)
     own = fleets.assign(source="measured")
     own.loc[own["robots"] == robots, ["stalled_low", "stalled_high"]] = 0.9, 1.0
-    twin = fleets.iloc[:1].assign(cell=f"{service_ms}, instant, queue?trigger=8", source="twin", robots=driven)
+    twin = fleets.assign(cell=f"{service_ms}, instant, queue?trigger=8", source="twin")
+    twin = twin[twin["robots"] >= driven].assign(within=twin["robots"] <= driven)
     run.tables[FLEETS.name] = type(fleets)(own.to_dict("records") + fleets.to_dict("records") + twin.to_dict("records"))
     run.tables[KNEES.name] = type(knees)(
         knees.assign(source="measured", driven=16, low=7).to_dict("records") + knees.to_dict("records")
@@ -69,7 +70,7 @@ def test_a_fleet_whose_generator_was_late_is_no_measurement_in_table_and_sentenc
     table = shown.tables["capacity"]
     assert [row[2] for row in table.rows if row[3] == "late"] == ["9"]
     assert table.notes[0].startswith("late: no measurement")
-    assert list(shown.sentences)[2].endswith("measured and predicted share of stalls agree at every number of robots.")
+    assert list(shown.sentences)[2].endswith("have overlapping intervals at 1, 2, 4, 8, 10, 12, 16 robots.")
 
 
 def test_a_fleet_that_the_generator_does_not_drive_by_its_twin_is_no_measurement_anywhere(tmp_path: Path) -> None:
