@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
 from pydantic import BeforeValidator
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.capacity.search import Judge
 from s2a_bench.harness.config import LiveRequests
 from s2a_bench.inference import STAND_IN, EngineConfig
 from s2a_bench.options import Names, Options, group, option
@@ -192,13 +191,12 @@ class CapacityConfig(Options):
         """Return the limit in words, as it is for a mode, or for "" for robots without one."""
         if self.limited is None or self.limited.column != "stalled":
             return "" if self.limited is None else self.limited.text
-        beyond = " beyond those of one robot alone" if self.judge(mode, 0).beyond else ""
+        beyond = " beyond those of one robot alone" if self.beyond_alone(mode) else ""
         return f"{self.limited.text} {'ticks' if self.load == 'chunks' else 'plans'}{beyond}"
 
-    def judge(self, mode: str, confidence: float) -> Judge:
-        limit = self.limited
-        blocks = bool(mode) and self.made[mode].blocks and limit is not None and limit.column == "stalled"
-        return Judge(limit, blocks, self.settle_ns, confidence)
+    def beyond_alone(self, mode: str) -> bool:
+        """Return True if only stalls beyond those of one robot alone count, as in a mode that blocks."""
+        return bool(mode) and self.made[mode].blocks and self.limited is not None and self.limited.column == "stalled"
 
     @property
     def setting(self) -> ControlSetting:

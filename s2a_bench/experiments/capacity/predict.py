@@ -149,8 +149,8 @@ class Prediction:
         for seed in range(first, first + (1 if self.config.limited is None else SEEDS)):
             self.progress.stage(f"{self.cell}: in virtual time, seed {seed}")
             tried: dict[int, Tried] = {}
-            attempt = partial(self._attempt, self.config.judge(self.mode, LEVEL), seed)
-            search(numbers, attempt, tried, bisects=bisects)
+            judge = Judge(self.config.limited, self.config.beyond_alone(self.mode), self.config.settle_ns, LEVEL)
+            search(numbers, partial(self._attempt, judge, seed), tried, bisects=bisects)
             found += [each for each in (knee(tried.values()),) if each]
         if self.config.limited is None:
             return None

@@ -106,7 +106,7 @@ def _drive(config: CapacityConfig, ray: Any, launch: RunningLaunch) -> None:
     for session, instant in zip_longest(launch.sessions[:count], launch.sessions[count:]):
         service: Service | None = None
         for mode in modes:
-            judge = config.judge(mode, config.confidence)
+            judge = Judge(config.limited, config.beyond_alone(mode), config.settle_ns, config.confidence)
             cell = _Cell(config, ray, launch, session, instant, mode, judge, service)
             cell.run()
             service = cell.service

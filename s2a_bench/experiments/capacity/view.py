@@ -75,8 +75,8 @@ def _parted(run: StoredRun) -> Iterator[str]:
             off = row["stalled_high"] < other["stalled_low"] or other["stalled_high"] < row["stalled_low"]
             apart.setdefault(row["cell"], {})[row["robots"]] = off
     for cell, fleets in apart.items():
-        how = "intervals apart" if any(fleets.values()) else "overlapping intervals"
-        named = ", ".join(str(robots) for robots, off in fleets.items() if off or not any(fleets.values()))
+        parted = [robots for robots, off in fleets.items() if off]
+        how, named = "intervals apart" if parted else "overlapping intervals", ", ".join(map(str, parted or fleets))
         yield f"{cell}: measured and predicted share of stalls have {how} at {named} robots."
 
 
