@@ -220,6 +220,8 @@ class _Latency(
     profile: str
     requests: int
     seed: int
+    think: float
+    think_s: float
     threads: int
 
 class _Throughput(

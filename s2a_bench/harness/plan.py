@@ -32,6 +32,8 @@ class BlocksPlan:
     warmup: int
     launches: int
     seed: int
+    think_s: float = 0.0
+    """Least time from a cell's answer to its next request."""
 
 
 @dataclass(frozen=True, slots=True)

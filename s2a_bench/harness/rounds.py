@@ -297,7 +297,12 @@ def _close_idle(client: Client, sessions: Sequence[Session]) -> None:
 
 
 def run_blocks(
-    slots: Sequence[Slot], others: Sequence[Slot], plan: BlocksPlan, progress: Progress, launch: int = 0
+    slots: Sequence[Slot],
+    others: Sequence[Slot],
+    plan: BlocksPlan,
+    progress: Progress,
+    launch: int = 0,
+    clock: Clock = SystemClock(),  # noqa: B008 - it has no state
 ) -> None:
     """Run every slot once a block, in a new random order each time; in a launch's first block the others come last.
 
@@ -305,6 +310,7 @@ def run_blocks(
     """
     both = [*slots, *others]
     blocks = plan.warmup + plan.requests
+    due_ns: dict[Slot, int] = {}
     progress.expect(len(both) * blocks * plan.launches)
     random = Random(plan.seed + launch)  # noqa: S311 - an order, not a secret
     which = f", launch {launch + 1} of {plan.launches}" if plan.launches > 1 else ""
@@ -312,7 +318,9 @@ def run_blocks(
         progress.stage(f"{'warming up' if block < plan.warmup else 'measuring'}{which}")
         order = random.sample(both, len(both))
         for position, slot in enumerate(order if block else sorted(order, key=lambda slot: slot in others)):
+            clock.sleep_until_ns(due_ns.get(slot, 0))
             slot(Place(launch * blocks + block, position, block < plan.warmup, launch))
+            due_ns[slot] = clock.now_ns() + round(plan.think_s * 1e9)
             progress.advance()
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
+import pytest
+
+from s2a_bench.clock import VirtualClock
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
-from s2a_bench.harness.plan import BlocksPlan
-from s2a_bench.harness.rounds import run_blocks
+from s2a_bench.harness.plan import BlocksPlan, RunPlan
+from s2a_bench.harness.rounds import Slot, run_blocks
 from s2a_bench.harness.session import Place
 from s2a_bench.inference import EngineConfig
 from s2a_bench.store.run import read_run
@@ -49,6 +53,37 @@ def test_the_order_differs_from_block_to_block_and_launch_to_launch_and_the_tota
     assert seen[0] != seen[1]
     assert len({tuple(launch[at : at + 4]) for launch in seen for at in range(0, 32, 4)}) > 4
     assert progress.expected == progress.done == 64
+
+
+def test_a_cell_thinks_from_its_own_answer_while_others_are_measured() -> None:
+    clock, log = VirtualClock(), dict[str, list[tuple[int, int]]]()
+
+    def slot(name: str, takes_ns: int) -> Slot:
+        def measure(_: Place) -> None:
+            started_ns = clock.now_ns()
+            clock.sleep_until_ns(started_ns + takes_ns)
+            log.setdefault(name, []).append((started_ns, clock.now_ns()))
+
+        return measure
+
+    plan = BlocksPlan(20, 0, 1, 0, think_s=1e-6)
+    run_blocks([slot("quick", 100), slot("slow", 400)], [], plan, NullProgress(), clock=clock)
+    for times in log.values():
+        pauses_ns = [start - end for (_, end), (start, _) in pairwise(times)]
+        assert min(pauses_ns) == 1000
+        assert max(pauses_ns) < 2 * 1000 + 2 * 400  # at most two pauses of the other cell lie between
+
+
+def test_a_pause_stands_in_configuration_and_cadence(monkeypatch: pytest.MonkeyPatch) -> None:
+    plans: list[RunPlan] = []
+    monkeypatch.setattr("s2a_bench.experiments.latency.run.run_requests", lambda _, plan, *__: plans.append(plan))
+    for think_s in (0, 2):
+        run_latency(ECHO.but(think_s=think_s), Path(), NullProgress())
+    without, paused = plans
+    assert (without.blocks.think_s, paused.blocks.think_s) == (0, 2)
+    assert paused.manifest["configuration"]["think_s"] == 2
+    said = "closed loop, the next request when the last is done"
+    assert [plan.manifest["cadence"] for plan in plans] == [said, f"{said}, and 2 s after its cell's last answer"]
 
 
 def test_blocks_count_on_over_launches() -> None:

@@ -29,6 +29,8 @@ class LatencyConfig(RequestsConfig):
         ),
     )
 
+    think_s: float = option(0.0, "from an answer to its cell's next request, in seconds", flag="think", ge=0, le=3600)
+
     @property
     def usual_payloads(self) -> tuple[str, ...]:
         """Raw; and JPEG, unless the run is quick or streams, or a pipeline names its payload."""
