@@ -30,6 +30,8 @@ OPPORTUNITY_BYTES: Final = 1500
 MOST_STEPS: Final = 1_000_000
 STEP_S, MEMORY_S, SYNTHETIC_S = 0.1, 1.0, 600.0
 """Of a synthetic rate: its step, the time in which it forgets, and its period."""
+OFF, DELAY_OFF_MS = 0.05, 0.3
+"""By how much an emulated link may be off its profile: a share of its rate and delay, and in ms of each delay."""
 KEYS: Final = {"delay": "delay_ms", "jitter": "jitter_ms", "up": "up_mbps", "down": "down_mbps"}
 """Short names of keys in text."""
 
@@ -70,6 +72,11 @@ class Direction:
         """Read plain data, in which an infinite rate may be None."""
         finite: dict[str, Any] = {name: math.inf if value is None else value for name, value in facts.items()}
         return cls(**{**finite, "steps": tuple(Step(**step) for step in facts["steps"])})
+
+    @property
+    def usual_ms(self) -> float:
+        """The mean delay: a uniform share of the jitter is added."""
+        return self.delay_ms + self.jitter_ms / 2
 
     def least_s(self, size: float) -> float:
         """Return the least time in s that so many bytes take."""

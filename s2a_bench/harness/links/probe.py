@@ -11,16 +11,12 @@ from select import select
 from statistics import median
 from typing import Any, Final
 
-from s2a_bench.boards.links import Direction
+from s2a_bench.boards.links import DELAY_OFF_MS, OFF, Direction
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.links import CLIENT, SERVER, EmulatedLink
 
 ATTEMPTS: Final = 3
-TOLERANCE: Final = 0.05
-"""Share by which a rate may be off."""
-DELAY_MS: Final = 0.3
-"""By which the median added one-way delay may be off, besides `TOLERANCE` of it."""
 RATE_S: Final = 1.0
 OFFERED: Final = 1.15
 """Offered load over the rate."""
@@ -74,7 +70,7 @@ def probed(link: EmulatedLink) -> dict[str, Any]:
         off = [str(each) for each in found if each.off]
     if off:
         raise UsageError(
-            f"`link`: this machine does not carry {link.profile.name} within {TOLERANCE:.0%}: {'; '.join(off)}; "
+            f"`link`: this machine does not carry {link.profile.name} within {OFF:.0%}: {'; '.join(off)}; "
             "stop other programs, or choose a slower link"
         )
     return {"probe": {"attempts": attempts, "quantities": [asdict(each) for each in found]}}
@@ -98,9 +94,9 @@ class _Probe:
         there_ms = self._round_trips(self._client, self._server)
         here_ms = self._round_trips(self._beside, self._server)
         if there_ms:
-            usual_ms = sum(way.delay_ms + way.jitter_ms / 2 + 8e-3 * SMALL_BYTES / way.mbps for way in (up, down)) / 2
+            usual_ms = sum(way.usual_ms + 8e-3 * SMALL_BYTES / way.mbps for way in (up, down)) / 2
             added_ms = (median(there_ms) - median(here_ms)) / 2
-            yield Found("added one-way delay", "ms", usual_ms, added_ms, DELAY_MS + TOLERANCE * usual_ms)
+            yield Found("added one-way delay", "ms", usual_ms, added_ms, DELAY_OFF_MS + OFF * usual_ms)
         for name, way, sender, receiver in ways:
             yield self._loss(name, way, sender, receiver)
             if way.burst_bytes and math.isfinite(way.burst_mbps):
@@ -134,13 +130,13 @@ class _Probe:
         SystemClock().sleep_until_ns(now_ns() + round(way.burst_bytes * 8e3 / way.mbps))  # until the credit is full
         arrivals = self._train(sender, receiver, int(way.burst_bytes // PACKET_BYTES), PACKET_BYTES, math.inf)
         measured = _mbps(arrivals, PACKET_BYTES)
-        return Found(f"burst {name}", "Mbit/s", way.burst_mbps, measured, TOLERANCE * way.burst_mbps)
+        return Found(f"burst {name}", "Mbit/s", way.burst_mbps, measured, OFF * way.burst_mbps)
 
     def _rate(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Found:
         mbps, size = way.mbps * OFFERED / (1 - way.loss), PACKET_BYTES * (1 if way.loss else FRAGMENTS)
         count = math.ceil(RATE_S * mbps * 125e3 / size)
         arrivals = self._train(sender, receiver, count, size, mbps)[math.ceil(way.burst_bytes / size) :]
-        return Found(f"rate {name}", "Mbit/s", way.mbps, _mbps(arrivals, size), TOLERANCE * way.mbps)
+        return Found(f"rate {name}", "Mbit/s", way.mbps, _mbps(arrivals, size), OFF * way.mbps)
 
     def _train(self, sender: socket.socket, receiver: socket.socket, count: int, size: int, mbps: float) -> list[int]:
         """Send packets at a rate; return when each that was not lost arrived, in ns."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from statistics import mean
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from s2a_bench.boards.links import Direction, Step
 from s2a_bench.harness.links.relay import Shaper
@@ -21,6 +23,27 @@ def test_a_burst_after_idle_is_fast_and_its_credit_grows_at_the_rate() -> None:
     assert [shaper.due_s(0.0, 1500) for _ in range(3)] == pytest.approx([0.0001, 0.0002, 0.0012])
     assert shaper.due_s(0.0022, 1500) == pytest.approx(0.0023)  # idle for 1 ms: one packet's credit
     assert shaper.due_s(0.0023, 1500) == pytest.approx(0.0033)
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from([0] * 20 + [30_000]), st.integers(500, 1500)), min_size=2, max_size=80),
+    st.integers(1500, 9000),
+)
+def test_a_link_is_a_token_bucket(packets: list[tuple[int, int]], burst: int) -> None:
+    """However long it was idle: between any two packets arrive no more bytes than the burst and what the rate gives."""
+    way = Direction(12.0, delay_ms=3, burst_bytes=burst, burst_mbps=1e6, queue_ms=60_000)
+    shaper, now_s, arrived = Shaper(way), 0.0, list[tuple[float, int]]()
+    for idle_us, size in packets:
+        now_s += idle_us / 1e6
+        due_s = shaper.due_s(now_s, size)
+        assert due_s is not None
+        assert due_s - now_s >= way.least_s(size) - 1e-9
+        arrived.append((due_s, size))
+    for first, (start_s, _) in enumerate(arrived):
+        total = 0
+        for due_s, size in arrived[first:]:
+            total += size
+            assert total <= burst + (due_s - start_s) * 12e6 / 8 + 1500
 
 
 def test_what_waits_longer_than_the_queue_is_dropped() -> None:
@@ -44,6 +67,7 @@ def test_jitter_is_added_and_packets_keep_their_order() -> None:
     assert 0.01 <= min(spaced) < 0.0101
     assert 0.0139 < max(spaced) <= 0.01401
     assert mean(spaced) == pytest.approx(0.012, abs=0.0002)
+    assert Direction(1e6, delay_ms=10, jitter_ms=4).usual_ms == 12
     dues = [shaper.due_s(2000 + number / 1e4, 100) or 0 for number in range(1000)]
     assert dues == sorted(dues)
 
