@@ -23,7 +23,10 @@ from s2a_bench.store.run import read_run
 from s2a_bench.transport import ACTIONS
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from s2a_bench.progress import Progress
+    from s2a_bench.report.advise.prediction import Advice
 
 
 def _compare(config: CompareConfig, *, json_: Json = False) -> None:
@@ -95,7 +98,7 @@ def _advise(
     found, profile, origin = advise(config)
     if config.measure:
         with RunProgress("samples") as progress:
-            times_ms = _measured_ms(config, [each.name for each in found[:CHECKED]], output, progress)
+            times_ms = _measured_ms(config, found[:CHECKED], output, progress)
         found[:CHECKED] = [replace(each, measured_ms=ms) for each, ms in zip(found, times_ms, strict=False)]
     if json_:
         print_json(advice_json(found, config, profile, origin))
@@ -105,19 +108,20 @@ def _advise(
         print_line(line)
 
 
-def _measured_ms(config: AdviseConfig, names: list[str], output: Path, progress: Progress) -> list[float]:
-    """Return the medians of pipelines' e2e without inference on the emulated link, in ms, of one run."""
+def _measured_ms(config: AdviseConfig, found: Sequence[Advice], output: Path, progress: Progress) -> list[float]:
+    """Return the medians of pipelines' e2e without inference on the emulated link, in ms, of one run at the rate."""
     from s2a_bench.experiments.latency.view.against_bytes import METRIC
 
     latency = EXPERIMENTS["latency"]
     requests = resolve_name(latency.config)(
-        transports=tuple(names),
+        transports=tuple(each.name for each in found),
         link=config.link,
         engine={"name": STAND_IN, "answer": ACTIONS},
         size=config.size,
         cameras=config.cameras,
         state=14,
         requests=30,
+        think_s=max(0.0, config.period_ms - max(each.e2e_ms for each in found)) / 1e3,
     )
     cells = {cell.name: cell for cell in cells_of(read_run(latency.run_with(requests, output, progress)))}
     return [float(statistics.median(cells[each.name].values_ms(METRIC))) for each in requests.pipelines]

@@ -31,7 +31,7 @@ class AdviseConfig(Options):
     link: str = option(
         ..., f"{', '.join(published())}, a FILE, or rate=UP/DOWN,delay=MS, as in latency", names=published, first=True
     )
-    rate: float = option(0.0, "requests a second that the link should carry; 0: one at a time", ge=0, le=10_000)
+    rate: float = option(0.0, "requests a second that the link should carry; 0: without a pause", ge=0, le=10_000)
     deadline: Annotated[str, AfterValidator(_duration)] = option(
         "", "longest end to end without inference, as 100ms or 0.5s [default: none]"
     )
@@ -51,6 +51,11 @@ class AdviseConfig(Options):
         """The deadline, infinite for none."""
         found = _DURATION.fullmatch(self.deadline)
         return float(found[1]) * (1 if found[2] == "ms" else 1e3) if found else math.inf
+
+    @property
+    def period_ms(self) -> float:
+        """From one request to the next; 0 for one after another."""
+        return 1e3 / self.rate if self.rate else 0.0
 
     @property
     def pixels_mb(self) -> float:

@@ -2,16 +2,18 @@
 
 The sweep ran without a link, on one machine: its lines hold the work of both ends. The link adds its delays, and the
 time in which its rate carries the bytes that the pipeline sends. Both are the median's; losses are not predicted.
+TCP adds its pacing (BBR), or its slow start after idle (others); requests of other robots add a wait.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from s2a_bench.boards.links import Direction, LinkProfile, bound_s, load_link
+from s2a_bench.boards.links import DELAY_OFF_MS, OFF, Direction, LinkProfile, bound_s, load_link
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.view.against_bytes import FittedPipeline, against_bytes
 from s2a_bench.experiments.requests import split
@@ -28,12 +30,22 @@ HEADERS: Final = 1500 / 1448
 """Bytes of IP packets for each byte of a body over TCP: Ethernet's 1,500 with time stamps."""
 BBR_GAIN: Final = 2.89
 """Of the rate at which BBR's start sends, over the rate that it has seen (Cardwell et al., 2016): 2 / ln 2."""
-RATE_OFF, DELAY_OFF_MS = 0.05, 0.3
-"""By how much a link may be off its profile: a share of its rate, and in one direction."""
+PACKET_BYTES, INITIAL_WINDOW, RTO_MS = 1500, 10, 200.0
+"""Linux: bytes and packets of the first window (RFC 6928), and the timeout over the round trip (`tcp_rto_min`)."""
+MOST_HALVINGS: Final = 30
+"""Of a window, after which it is the initial one."""
+WAITS: Final = 0.05
+"""Share of requests that wait longer than `Advice.wait_ms`."""
+HALF: Final = 0.5
+"""Of the rate: above it a link without a deadline is *unclear*."""
 PREDICTION: Final = (
     "End to end without inference: the sweep's line at this size of pictures, and the link. Intervals: 95 % (Student's "
-    "t) of a launch around the line, the 5 % and 0.3 ms a way by which a link may be off its profile, and half of what "
-    "jitter and the pacing of this host's TCP (BBR) add."
+    f"t) of a launch around the line, the {OFF:.0%} and {DELAY_OFF_MS} ms a way by which a link may be off, "
+    "half of the jitter, and the least and most that this host's TCP adds."
+)
+WAIT: Final = (
+    "Wait: in the queue behind other robots' requests, if all come at random (M/D/1); 95 % wait less. A deadline is "
+    "met only with it. One robot that waits for its answers has none."
 )
 BOUND: Final = (
     "Bound: the link alone, with the bytes that the pipeline sends. Pictures are the sweep's: others are coded to more "
@@ -55,8 +67,10 @@ class Advice:
     bound_ms: float
     load: float
     """Share of the link's rate that the requests take."""
+    wait_ms: float | None
+    """What 95 % of requests wait less than, if those of many robots share the rate; None: there is no limit."""
     meets: bool | None
-    """Whether it meets the deadline; None if the interval has it inside."""
+    """Whether it meets deadline and rate, in 95 % of requests; None if only perhaps."""
     measured_ms: float | None = None
 
     @property
@@ -115,38 +129,92 @@ def _advice(pipeline: FittedPipeline, line: Line, profile: LinkProfile, config: 
     up, down = link = profile.directions()
     size = (pipeline.wire_share or 0.0) * config.pixels_mb * MB
     jitter_ms = up.jitter_ms + down.jitter_ms  # a uniform share of it each way
-    least_ms = bound_s(link, size * HEADERS) * 1e3
-    paced_ms = max(0.0, _pacing_ms(pipeline, link) - (least_ms - bound_s(link, 0) * 1e3))
-    link_ms = least_ms + paced_ms + jitter_ms / 2
+    sent_ms = bound_s(link, size * HEADERS) * 1e3 - up.delay_ms - down.delay_ms
+    udp = pipelines([pipeline.name])[0].options.datagrams
+    least_ms, most_ms = (0.0, 0.0) if udp else tcp_adds_ms(size, link, config.period_ms, host_tcp())
+    link_ms = sent_ms + up.usual_ms + down.usual_ms + (least_ms + most_ms) / 2
     work_ms = line.at(config.pixels_mb)
     reach_ms = line.reach(config.pixels_mb)
     e2e_ms = work_ms + link_ms
-    off_ms = 2 * DELAY_OFF_MS + RATE_OFF * (least_ms - bound_s(link, 0) * 1e3) + (jitter_ms + paced_ms) / 2
+    off_ms = 2 * DELAY_OFF_MS + OFF * link_ms + (jitter_ms + most_ms - least_ms) / 2
     ends_ms = None if reach_ms is None else (max(0.0, e2e_ms - reach_ms - off_ms), e2e_ms + reach_ms + off_ms)
     load = size * HEADERS * 8e-6 * config.rate / up.mbps
+    wait_ms = waiting_ms(load, load * config.period_ms)
     low, high = ends_ms or (e2e_ms, e2e_ms)
-    meets = False if load > 1 or low > config.deadline_ms else True if high <= config.deadline_ms else None
+    surely = load <= HALF if math.isinf(config.deadline_ms) else high + (wait_ms or 0.0) <= config.deadline_ms
+    meets = False if load > 1 or low > config.deadline_ms else True if surely and wait_ms is not None else None
     coding_ms = 0.0 if pipeline.coding is None else pipeline.coding.at(config.pixels_mb)
     bound_ms = bound_s(link, size) * 1e3
-    return Advice(pipeline.name, pipeline.payload, e2e_ms, ends_ms, link_ms, coding_ms, bound_ms, load, meets)
+    return Advice(pipeline.name, pipeline.payload, e2e_ms, ends_ms, link_ms, coding_ms, bound_ms, load, wait_ms, meets)
 
 
-def _pacing_ms(pipeline: FittedPipeline, link: tuple[Direction, Direction]) -> float:
-    """Return the least time of a body over this host's TCP if that is BBR; 0 for other TCP, and over UDP.
+@dataclass(frozen=True, slots=True)
+class Tcp:
+    """A host's TCP, as Linux's settings ``net.ipv4.tcp_*`` name it."""
+
+    congestion_control: str
+    slow_start_after_idle: bool
+
+    def __str__(self) -> str:
+        return f"{self.congestion_control}, slow start after idle {'on' if self.slow_start_after_idle else 'off'}"
+
+
+def host_tcp() -> Tcp:
+    """Return this host's TCP; Linux's usual one where there are no settings."""
+    net = Path("/proc/sys/net/ipv4")
+    try:
+        name, slow = ((net / f"tcp_{key}").read_text().strip() for key in Tcp.__slots__)
+    except OSError:
+        return Tcp("cubic", slow_start_after_idle=True)
+    return Tcp(name, slow == "1")
+
+
+def tcp_adds_ms(size: float, link: tuple[Direction, Direction], period_ms: float, tcp: Tcp) -> tuple[float, float]:
+    """Return the least and the most that TCP adds to the time of a body which is sent each ``period_ms``.
 
     BBR paces a body at `BBR_GAIN` times the rate that it has seen, and has seen one body a round trip. So a body takes
-    t = (RTT + t) / `BBR_GAIN`, whatever its size, if the link is faster than that.
+    t = (RTT + t) / `BBR_GAIN`, whatever its size, if the link is faster than that; half of that either way.
+
+    Other TCP halves its window for each timeout of idle, down to `INITIAL_WINDOW` (Linux's tcp_cwnd_restart), and then
+    doubles it each round trip, in which it waits while the link takes less than that for the window. The most: the
+    window held the body, or what the link holds, and the idle time is the whole period. The least: the window had
+    grown by the body, and what is added shortens the idle time.
     """
-    if _congestion_control() != "bbr" or pipelines([pipeline.name])[0].options.datagrams:
-        return 0.0
-    return (link[0].delay_ms + link[1].delay_ms) / (BBR_GAIN - 1)
+    up, down = link
+    round_ms = up.delay_ms + down.delay_ms
+    sent_ms = (up.least_s(size * HEADERS) - up.least_s(0)) * 1e3
+    if tcp.congestion_control == "bbr":
+        paced_ms = max(0.0, round_ms / (BBR_GAIN - 1) - sent_ms)
+        return paced_ms / 2, paced_ms * 1.5
+    packets = math.ceil(size * HEADERS / PACKET_BYTES)
+    held = int(min(packets, round_ms * up.mbps * 125 / PACKET_BYTES))
+
+    def added_ms(window: int) -> float:
+        left, total_ms, window = packets, 0.0, max(INITIAL_WINDOW, window)
+        while left > window and (waits_ms := round_ms - (up.least_s(window * PACKET_BYTES) - up.least_s(0)) * 1e3) > 0:
+            left, window, total_ms = left - window, 2 * window, total_ms + waits_ms
+        return total_ms
+
+    def halvings(idle_ms: float) -> int:
+        return min(MOST_HALVINGS, math.ceil(idle_ms / (round_ms + RTO_MS)) - 1)
+
+    most = halvings(period_ms - sent_ms) if tcp.slow_start_after_idle else 0
+    grown_ms = ((count, added_ms(math.ceil(packets / (2**count - 1)))) for count in range(most, 0, -1))
+    least_ms = next((ms for count, ms in grown_ms if halvings(period_ms - sent_ms - ms) >= count), 0.0)
+    return least_ms, added_ms(held >> most) if most > 0 else 0.0
 
 
-def _congestion_control() -> str:
-    try:
-        return Path("/proc/sys/net/ipv4/tcp_congestion_control").read_text(encoding="ascii").strip()
-    except OSError:
-        return ""
+def waiting_ms(load: float, service_ms: float) -> float | None:
+    """Return what all but `WAITS` of random (Poisson) requests wait less than, for a link so loaded; None: no limit.
+
+    Kingman's bound (1964): P(wait > t) <= exp(-x t / service), with load (exp(x) - 1) = x for equal requests (M/D/1).
+    """
+    from scipy.special import lambertw
+
+    if not 0 < load < 1:
+        return 0.0 if load <= 0 else None
+    decay = -load - float(lambertw(-load * math.exp(-load), -1).real)
+    return -math.log(WAITS) / decay * service_ms
 
 
 def advice_table(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile, provenance: str) -> TextTable:
@@ -160,21 +228,27 @@ def advice_table(found: Sequence[Advice], config: AdviseConfig, profile: LinkPro
             *([_measured(each)] if checked else []),
             number(each.bound_ms),
             each.limit,
-            *([f"{each.load:.0%}"] if config.rate else []),
+            *([f"{each.load:.0%}", ABSENT if each.wait_ms is None else number(each.wait_ms)] if config.rate else []),
             *([{True: "yes", False: "no", None: "unclear"}[each.meets]] if config.deadline or config.rate else []),
         )
         for each in found
     ]
     header = ("pipeline", "payload", "predicted ms", *(["measured ms"] if checked else []), "bound ms", "limited by")
-    header += ("of the rate",) if config.rate else ()
+    header += ("of the rate", "wait ms") if config.rate else ()
     header += ("meets it",) if config.deadline or config.rate else ()
     notes = (
         PREDICTION,
+        f"TCP: {host_tcp()}, as this host's; requests {_pause(config)}.",
+        *([WAIT] if config.rate else []),
         BOUND,
         *(["Losses are not predicted: the times hold for requests without one."] if profile.loss else []),
     )
     title = f"{config.cameras} x {config.size[0]}x{config.size[1]} over {profile.about}, predicted"
     return TextTable(title, header, rows, 2, notes=notes, provenance=provenance)
+
+
+def _pause(config: AdviseConfig) -> str:
+    return f"come each {config.period_ms:g} ms" if config.rate else "follow one another without a pause"
 
 
 def _measured(advice: Advice) -> str:
@@ -193,7 +267,7 @@ def sentence(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile
     if config.deadline:
         meet = sum(each.meets is True for each in found)
         text += f"; {meet} of {len(found)} surely meet {config.deadline_ms:g} ms"
-    return f"{text}; the {best.limit} takes the most of it."
+    return f"{text}; the {best.limit} takes the most of it, if TCP is {host_tcp()} and requests {_pause(config)}."
 
 
 def advice_json(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile, provenance: str) -> dict[str, Any]:
@@ -203,6 +277,7 @@ def advice_json(found: Sequence[Advice], config: AdviseConfig, profile: LinkProf
         "command": "advise",
         "link": profile.model_dump(mode="json", exclude_defaults=True),
         "provenance": provenance,
+        "tcp": asdict(host_tcp()),
         "cells": [{**asdict(each), "limit": each.limit, "inside": each.inside} for each in found],
         "sentence": sentence(found, config, profile),
     }

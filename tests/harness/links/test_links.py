@@ -9,16 +9,19 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from select import select
+from threading import Thread
 from typing import Any
 
 import pytest
 
 import s2a_bench as s2a
-from s2a_bench.boards.links import load_link
+from s2a_bench.boards.links import bound_s, load_link
+from s2a_bench.clock import SystemClock
 from s2a_bench.errors import NotPermitted, UsageError
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.links import CLIENT, SERVER, EmulatedLink, emulated
 from s2a_bench.harness.links.probe import Found, probed
+from s2a_bench.report.advise.prediction import HEADERS, Tcp, tcp_adds_ms
 
 
 def on_link(link: str, use: Callable[[EmulatedLink], Any]) -> Any:
@@ -31,12 +34,58 @@ def on_link(link: str, use: Callable[[EmulatedLink], Any]) -> Any:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("link", ["rate=20/40,delay=5", "rate=30,loss=10%", "rate=20,burst_kib=150,burst_mbps=60"])
+@pytest.mark.parametrize(
+    "link", ["rate=20/40,delay=5", "rate=30,loss=10%", "rate=20,burst_kib=150,burst_mbps=60", "delay=9,jitter=8"]
+)
 def test_a_link_carries_what_its_profile_says(link: str) -> None:
     found = on_link(link, probed)["probe"]["quantities"]
     names = {each["what"] for each in found}
-    assert {"added one-way delay", "loss up", "loss down", "rate up", "rate down"} <= names
+    assert {"added one-way delay", "loss up", "loss down"} <= names
+    assert ({"rate up", "rate down"} <= names) == ("rate" in link)
     assert ("burst up" in names) == ("burst" in link)
+
+
+def _echo(listener: socket.socket, size: int) -> None:
+    peer, _ = listener.accept()
+    with peer:
+        while peer.recv(size, socket.MSG_WAITALL):
+            peer.send(b"x")
+
+
+def _requests_ms(link: EmulatedLink, tcp: Tcp, size: int, period_ms: float) -> list[float]:
+    """Return the times of bodies of ``size`` bytes until their answers, each sent ``period_ms`` after the last."""
+    clock, times_ms = SystemClock(), []
+    with link.server_side():
+        listener = socket.create_server((SERVER, 0))
+    with listener, socket.socket() as client:
+        Thread(target=_echo, args=(listener, size), daemon=True).start()
+        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_CONGESTION, tcp.congestion_control.encode())
+        client.connect(listener.getsockname())
+        for _ in range(8):
+            started_ns = clock.now_ns()
+            client.sendall(bytes(size))
+            client.recv(1)
+            times_ms.append((clock.now_ns() - started_ns) / 1e6)
+            clock.sleep_until_ns(started_ns + round(period_ms * 1e6))
+    return times_ms[3:]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cubic", "reno"])
+def test_the_kernel_starts_slowly_after_idle_as_advice_predicts(name: str) -> None:
+    if name not in Path("/proc/sys/net/ipv4/tcp_available_congestion_control").read_text().split():
+        pytest.skip(f"this kernel has no {name}")
+    tcp, size = Tcp(name, slow_start_after_idle=True), 70_000
+
+    def use(link: EmulatedLink) -> None:
+        plain_ms = bound_s(link.directions, size * HEADERS) * 1e3
+        least_ms, most_ms = tcp_adds_ms(size, link.directions, 1000, tcp)
+        assert least_ms == most_ms > 0.7 * plain_ms
+        busy_ms, idle_ms = (min(_requests_ms(link, tcp, size, period_ms)) for period_ms in (0, 1000))
+        assert 0.9 < busy_ms / plain_ms < 1.4
+        assert 0.9 < idle_ms / (plain_ms + least_ms) < 1.4
+
+    on_link("rate=30,delay=30", use)
 
 
 def test_a_probe_that_is_off_names_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
