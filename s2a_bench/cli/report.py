@@ -16,7 +16,7 @@ from s2a_bench.errors import TRIPPED, UNDECIDED
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.requests import cells_of
 from s2a_bench.inference import STAND_IN
-from s2a_bench.report.advise import CHECKED, AdviseConfig
+from s2a_bench.report.advise import CHECKED, LONGEST_PAUSE_S, AdviseConfig
 from s2a_bench.report.compare import CompareConfig
 from s2a_bench.report.page import ReportConfig
 from s2a_bench.store.run import read_run
@@ -121,7 +121,7 @@ def _measured_ms(config: AdviseConfig, found: Sequence[Advice], output: Path, pr
         cameras=config.cameras,
         state=14,
         requests=30,
-        think_s=max(0.0, config.period_ms - max(each.e2e_ms for each in found)) / 1e3,
+        think_s=min(LONGEST_PAUSE_S, max(0.0, config.period_ms - max(each.e2e_ms for each in found)) / 1e3),
     )
     cells = {cell.name: cell for cell in cells_of(read_run(latency.run_with(requests, output, progress)))}
     return [float(statistics.median(cells[each.name].values_ms(METRIC))) for each in requests.pipelines]

@@ -132,7 +132,7 @@ def test_at_most_a_share_of_random_requests_waits_longer(load: float) -> None:
 
 
 def test_without_a_load_nothing_waits_and_at_the_rate_there_is_no_limit() -> None:
-    assert (waiting_ms(0, 10), waiting_ms(1, 10), waiting_ms(3, 10)) == (0, None, None)
+    assert [waiting_ms(load, 10) for load in (0, 0.05, 1, 3)] == [0, 0, None, None]
 
 
 @pytest.mark.parametrize(("load", "meets"), [(0.49, True), (0.51, None), (0.99, None), (1.01, False)])

@@ -15,6 +15,8 @@ from s2a_bench.options import Options, Size, option
 REFERENCE: Final = Path(__file__).resolve().parents[3] / "results" / "reference" / "transports"
 CHECKED: Final = 2
 """Pipelines that `check` measures."""
+LONGEST_PAUSE_S: Final = 5.0
+"""Between its requests: TCP's window has fallen to its first by then."""
 MB: Final = 1e6
 _DURATION: Final = re.compile(r"(\d+\.?\d*)(ms|s)")
 

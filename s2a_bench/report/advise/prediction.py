@@ -37,7 +37,7 @@ MOST_HALVINGS: Final = 30
 WAITS: Final = 0.05
 """Share of requests that wait longer than `Advice.wait_ms`."""
 HALF: Final = 0.5
-"""Of the rate: above it a link without a deadline is *unclear*."""
+"""Of the rate: from it on a link without a deadline is *unclear*."""
 PREDICTION: Final = (
     "End to end without inference: the sweep's line at this size of pictures, and the link. Intervals: 95 % (Student's "
     f"t) of a launch around the line, the {OFF:.0%} and {DELAY_OFF_MS} ms a way by which a link may be off, "
@@ -141,7 +141,7 @@ def _advice(pipeline: FittedPipeline, line: Line, profile: LinkProfile, config: 
     load = size * HEADERS * 8e-6 * config.rate / up.mbps
     wait_ms = waiting_ms(load, load * config.period_ms)
     low, high = ends_ms or (e2e_ms, e2e_ms)
-    surely = load <= HALF if math.isinf(config.deadline_ms) else high + (wait_ms or 0.0) <= config.deadline_ms
+    surely = load < HALF if math.isinf(config.deadline_ms) else high + (wait_ms or 0.0) <= config.deadline_ms
     meets = False if load > 1 or low > config.deadline_ms else True if surely and wait_ms is not None else None
     coding_ms = 0.0 if pipeline.coding is None else pipeline.coding.at(config.pixels_mb)
     bound_ms = bound_s(link, size) * 1e3
@@ -211,8 +211,10 @@ def waiting_ms(load: float, service_ms: float) -> float | None:
     """
     from scipy.special import lambertw
 
-    if not 0 < load < 1:
-        return 0.0 if load <= 0 else None
+    if load <= WAITS:  # the others find the link free
+        return 0.0
+    if load >= 1:
+        return None
     decay = -load - float(lambertw(-load * math.exp(-load), -1).real)
     return -math.log(WAITS) / decay * service_ms
 
