@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from s2a_bench.experiments.capacity.metrics import share_interval
+from s2a_bench.experiments.capacity.metrics import cycle_ns, share_interval
 
 if TYPE_CHECKING:
     from s2a_bench.experiments.capacity.config import Limit
@@ -118,7 +118,7 @@ class Judge:
             at_ns, robots, above = above_limit(limit, traces, self.settle_ns)
             if not above.size:
                 return "undecided", False
-            low, high = share_interval(above, at_ns, robots, self.confidence)
+            low, high = share_interval(above, at_ns, robots, cycle_ns(traces), self.confidence)
             share = float(above.mean())
         verdict: Verdict = "below" if high <= limit.share else "above" if low > limit.share else "undecided"
         return verdict, share <= limit.share

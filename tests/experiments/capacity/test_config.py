@@ -97,3 +97,11 @@ def test_what_robots_do_follows_from_what_the_server_answers(given: dict[str, An
     config = CapacityConfig(**given)
     assert config.load == load
     assert (config.live_requests.engine.answer == "tokens") == (load == "plans")
+
+
+def test_all_looks_at_all_fleets_of_a_search_are_right_with_95_percent() -> None:
+    """One of 1 to 64 robots: seven fleets that double, six of the bisection, four looks each."""
+    search, alone = CapacityConfig(robots="1..64", looks=4), CapacityConfig(robots="1", looks=1)
+    assert (search.most_fleets, alone.most_fleets) == (13, 1)
+    assert 1 - search.confidence == pytest.approx(0.05 / (13 * 4))
+    assert alone.confidence == pytest.approx(0.95)

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
-from s2a_bench.experiments.capacity.metrics import RobotTrace, measures, share_interval
+from s2a_bench.experiments.capacity.metrics import RobotTrace, cycle_ns, measures, share_interval
 from s2a_bench.policy.chunks import ControlSetting, Ticks
 
 MS = 1_000_000
@@ -62,6 +63,11 @@ def test_every_episode_has_its_own_start() -> None:
     assert measures(episodes, SETTING, settle_ns=80 * MS)["stalled"] == 0
 
 
+def test_answers_a_second_are_those_while_all_robots_act() -> None:
+    """From 80 ms, the start of the second, to 160 ms, the end of the first: at 90 and 95 ms, of 15, 90, 95 and 170."""
+    assert measures([trace(), trace(1, 80 * MS)], SETTING)["requests_per_s"] == pytest.approx(2 / 0.08)
+
+
 def test_robots_without_a_clock_have_neither_ticks_nor_ages() -> None:
     request_ns = np.arange(10) * 100 * MS
     plain = RobotTrace(0, 0, 10**9, request_ns, np.full(10, 60 * MS))
@@ -72,15 +78,49 @@ def test_robots_without_a_clock_have_neither_ticks_nor_ages() -> None:
     assert measures([plans], SETTING)["stalled"] == 0.3
 
 
-def interval(stalled: Any, robots: int = 1) -> tuple[float, float]:
+def interval(stalled: Any, robots: int = 1, cycle: float = 1, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the interval of flags, a tick each ns; robots have a row each."""
     flags = np.asarray(stalled, bool).reshape(robots, -1)
     at_ns = np.broadcast_to(np.arange(flags.shape[1]), flags.shape).ravel()
-    return share_interval(flags.ravel(), at_ns, np.repeat(np.arange(robots), flags.shape[1]))
+    return share_interval(flags.ravel(), at_ns, np.repeat(np.arange(robots), flags.shape[1]), cycle, confidence)
 
 
-def test_the_interval_of_independent_ticks_is_that_of_clopper_and_pearson() -> None:
-    assert interval(np.zeros(1000)) == pytest.approx((0, 0.00368), abs=1e-5)
-    assert interval(np.ones(1000))[1] == 1
+@pytest.mark.parametrize(
+    ("robots", "cycle", "unseen"),
+    [(1, 1, 2.5), (1, 16, 2.5), (1, 160, 25), (8, 16, 20)],
+    ids=["one value", "a sixteenth is one value", "a sixteenth of a cycle", "of each robot"],
+)
+def test_without_a_stall_the_share_is_below_that_of_events_that_were_not_seen(
+    robots: int, cycle: float, unseen: float
+) -> None:
+    """No event is seen of -ln(0.025) that are expected in one run of forty."""
+    high = -np.log(0.025) * unseen / (1000 * robots)
+    assert interval(np.zeros(1000 * robots), robots, cycle) == pytest.approx((0, high))
+    assert interval(np.ones(1000 * robots), robots, cycle) == pytest.approx((1 - high, 1))
+
+
+def test_four_times_have_the_interval_of_a_sum_of_events_of_unlike_size() -> None:
+    """Fay and Feuer's, by chi-square as they write it: events of 2 and 1 are seen, and one of 5 is not."""
+    flags = np.zeros((4, 20), bool)
+    flags[:2, 0] = flags[3, 10] = True
+    at_ns, robots = np.tile(np.arange(20) // 5, 4), np.repeat(np.arange(4), 20)
+    low = 5 / (2 * 3) * stats.chi2.ppf(0.025, 2 * 3**2 / 5)
+    high = (5 + 25) / (2 * 8) * stats.chi2.ppf(0.975, 2 * 8**2 / 30)
+    assert share_interval(flags.ravel(), at_ns, robots, 1) == pytest.approx((low / 80, high / 80))
+
+
+def test_what_is_within_a_cycle_is_one_event() -> None:
+    """One event of 4 has one degree of freedom; four of 1 a cycle apart have three, and the next may be of 2.5."""
+    together, apart = np.zeros(1000), np.zeros(1000)
+    together[500:504] = 1
+    apart[[100, 300, 500, 700]] = 1
+    for flags, freedom, unseen in ((together, 1, 10), (apart, 3, 2.5)):
+        blocks = flags.reshape(5, 200).sum(axis=1)
+        variance = 5 * blocks.var(ddof=1) * (stats.t.ppf(0.975, freedom) / stats.norm.ppf(0.975)) ** 2
+        low = variance / 8 * stats.chi2.ppf(0.025, 2 * 4**2 / variance)
+        mean, variance = 4 + unseen, variance + unseen**2
+        high = variance / (2 * mean) * stats.chi2.ppf(0.975, 2 * mean**2 / variance)
+        assert interval(flags, cycle=4) == pytest.approx((low / 1000, high / 1000))
 
 
 def test_stalls_that_come_together_and_robots_that_differ_widen_the_interval() -> None:
@@ -93,11 +133,23 @@ def test_stalls_that_come_together_and_robots_that_differ_widen_the_interval() -
     assert min(widths[1:]) > 0.06
 
 
-def test_the_interval_covers_the_share_of_correlated_stalls() -> None:
-    rng = np.random.default_rng(1)
-    covered = 0
-    for _ in range(200):
-        stalled = np.repeat(rng.random((8, 100)) < 0.05, 20, axis=1)
-        low, high = interval(stalled, 8)
-        covered += low <= 0.05 <= high
-    assert covered >= 180
+@pytest.mark.parametrize("expected", [0.3, 1, 3, 10, 40])
+@pytest.mark.parametrize("confidence", [0.95, 0.99])
+def test_the_interval_holds_the_share_of_few_events_of_unlike_size(expected: float, confidence: float) -> None:
+    """Events of 1 to 40 ticks of eight robots, as a queue makes them: 20 s, and a request each 0.32 s."""
+    rng, runs, sizes = np.random.default_rng(1), 300, np.array([1, 2, 4, 8, 16, 40])
+    chances = np.array([0.3, 0.25, 0.2, 0.12, 0.1, 0.03])
+    share = expected * float(sizes @ chances) / 8000
+    held = 0
+    for _ in range(runs):
+        stalled = np.zeros((1000, 8), bool)
+        for size in rng.choice(sizes, rng.poisson(expected), p=chances):
+            stalled.reshape(-1)[(start := 8 * rng.integers(0, 994)) : start + size] = True
+        low, high = interval(stalled.T, 8, cycle=16, confidence=confidence)
+        held += low <= share <= high
+    assert held >= runs * (confidence - 0.03)
+
+
+def test_a_cycle_is_the_time_between_two_requests_of_a_robot() -> None:
+    assert cycle_ns([trace(), trace(1, arrival_ms=(15,))]) == 320 * MS / 4
+    assert cycle_ns([trace(arrival_ms=())]) == 160 * MS
