@@ -28,7 +28,10 @@ class AboutFleet:
     within: Annotated[bool, about("Whether the value itself keeps to the limit.")]
     clean: Annotated[
         bool,
-        about("Whether its own ticks at p99 were within 5 % of one; in JSON and CSV also its twin within the limit."),
+        about(
+            "Whether its own ticks at p99 were within 5 % of one, true of twins; in JSON and CSV also its twin within "
+            "the limit."
+        ),
     ]
 
 

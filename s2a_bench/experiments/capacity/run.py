@@ -138,10 +138,8 @@ class _Cell:
             if self.instant is not None:
                 with _Robots(config, self.ray, self.launch, self.instant, self.mode, twin=True) as robots:
                     for number in sorted(self.tried, reverse=True):
-                        if self.tried[number].clean:
-                            found = self._fleet(robots, number, "twin")
-                            if found.clean and found.within:
-                                break
+                        if self.tried[number].clean and self._fleet(robots, number, "twin").within:
+                            break
                         self.tried[number] = replace(self.tried[number], clean=False)
             self._predict()
         finally:
@@ -173,8 +171,8 @@ class _Cell:
         robots.stop()
         if first and not self.service and row["latency_p50_ns"] and not self.tried:
             self.service = Service.read(f"{launch.writer.path}#{self.session.cell.name}")
-        tick_ns = config.setting.period_ns if self.mode else row["latency_p50_ns"] if source == "measured" else None
-        clean = tick_ns is None or (row["late_p99_ns"] or 0) <= LATEST * tick_ns
+        tick_ns = config.setting.period_ns if self.mode else row["latency_p50_ns"]
+        clean = source == "twin" or tick_ns is None or (row["late_p99_ns"] or 0) <= LATEST * tick_ns
         seconds = sum(max(0, each.end_ns - each.start_ns - config.settle_ns) for each in traces) / number / 1e9
         about = {"cell": robots.name, "source": source, "robots": number}
         fleet = FleetRow(**about, seconds=seconds, looks=looks, verdict=verdict, within=within, clean=clean, **row)

@@ -236,10 +236,10 @@ COMPARED: Final = Comparable(
 def _fleets(run: StoredRun) -> list[dict[str, Any]]:
     """Return the fleets, those of a cell together, by their number of robots.
 
-    A measured fleet is not ``clean`` either if the generator does not drive it, by its twin or that of a smaller one.
+    A measured fleet is not ``clean`` either if its twin, or that of a smaller one, exceeds the limit.
     """
     rows = _rows(run, FLEETS)
-    slow = [row for row in rows if row["source"] == "twin" and not (row["clean"] and row["within"])]
+    slow = [row for row in rows if row["source"] == "twin" and not row["within"]]
     for row in rows:
         if row["source"] == "measured":
             twins = (each["robots"] for each in slow if each["cell"].replace(TWIN, "", 1) == row["cell"])
