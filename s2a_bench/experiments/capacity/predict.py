@@ -34,6 +34,10 @@ if TYPE_CHECKING:
 SEEDS: Final = 5
 """Of a predicted knee."""
 LEVEL: Final = 0.95
+BIASED: Final = (
+    "the whole latency of one robot, as the server sends no marks: what is spent beside it counts too, which predicts "
+    "more stalls and fewer robots than there are"
+)
 MOST: Final = 20_000_000
 """Ticks, or requests without a control clock, of a fleet in virtual time."""
 
@@ -73,7 +77,7 @@ class Service:
         if not self.source.requests:
             return "as given"
         if self.source.requests[0]["server_out_ns"] is None:
-            return "the whole latency of one robot: the server sends no marks, so what is spent beside it counts too"
+            return BIASED
         return "from the engine's start to its last piece"
 
     def times(self, rng: np.random.Generator) -> Iterator[ServiceTime]:
@@ -113,7 +117,6 @@ def run_predicted(config: CapacityConfig, output: Path, progress: Progress) -> P
         "configuration": config.to_manifest(),
         "environment": environment.collect(),
         "seeds": {"fleets": config.seed},
-        "service": service.about,
         "provenance": Origins(service.source.provenance, {}).to_manifest(),
     }
     with RunWriter.create(output, "capacity", manifest, (FLEETS, KNEES)) as writer:
@@ -123,6 +126,7 @@ def run_predicted(config: CapacityConfig, output: Path, progress: Progress) -> P
             name = f"{service.source.name}, {mode}" if mode else service.source.name
             prediction = Prediction(config, name, mode, service, slower, progress)
             knee = prediction.run(config.numbers, bisects=config.searches)
+            writer.update(service={name: service.about})
             writer.append(FLEETS, prediction.rows)
             writer.append(KNEES, [] if knee is None else [knee])
         return writer.path
@@ -144,7 +148,10 @@ class Prediction:
     """The fleets of the first seed."""
 
     def run(self, numbers: Sequence[int], *, bisects: bool) -> KneeRow | None:
-        """Try one robot, then fleets as `search`; return the median knee of `SEEDS` seeds, and its range over these."""
+        """Try one robot, then fleets as `search`; return the median knee of `SEEDS` seeds.
+
+        It has no interval: how rare service times are is not seen in those of one robot.
+        """
         first, found = self.config.seed, []
         for seed in range(first, first + (1 if self.config.limited is None else SEEDS)):
             self.progress.stage(f"{self.cell}: in virtual time, seed {seed}")
@@ -154,10 +161,9 @@ class Prediction:
             found += [each for each in (knee(tried.values()),) if each]
         if self.config.limited is None:
             return None
-        text, robots = self.config.limit_text(self.mode), sorted(each.robots for each in found)
-        highs = [each.high for each in found if each.high is not None]
-        high = max(highs) if len(highs) == len(found) else None
-        return KneeRow(self.cell, "predicted", text, robots[len(robots) // 2], robots[0], high, None)
+        median = sorted(found, key=lambda each: each.robots)[len(found) // 2]
+        text = self.config.limit_text(self.mode)
+        return KneeRow(self.cell, "predicted", text, median.robots, median.robots, median.high, None)
 
     def _attempt(self, judge: Judge, seed: int, robots: int) -> Tried:
         config, mode = self.config, self.config.made.get(self.mode)

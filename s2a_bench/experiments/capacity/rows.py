@@ -73,6 +73,7 @@ class RequestRow:
 class KneeRow:
     """How many robots a server carries, and from where to where that is sure; ``high`` null: no fleet was too large.
 
+    Predicted, it has no interval: ``low`` is ``robots``, ``high`` is less than the next fleet that was tried.
     ``driven`` is the largest fleet that the generator drives; null in virtual time.
     """
 

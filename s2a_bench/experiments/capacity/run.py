@@ -156,6 +156,7 @@ class _Cell:
         except UsageError as error:  # what was measured stands without it
             self.launch.progress.say(f"{name}: no prediction: {error}")
             return
+        writer.update(service={name: self.service.about})
         writer.append(FLEETS, prediction.rows)
         writer.append(KNEES, [found] if found else [])
 

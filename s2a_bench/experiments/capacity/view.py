@@ -52,17 +52,26 @@ def show(run: StoredRun, **_: Any) -> Shown:
 
 
 def _knee_sentences(run: StoredRun) -> Iterator[str]:
-    settings = run.manifest["configuration"]
+    settings, services = run.manifest["configuration"], run.manifest.get("service", {})
     clock = {
         "chunks": f" at {settings['control_hz']:g} Hz, H {settings['horizon']}",
         "plans": f" with a plan every {settings['plan_every_s'] or 0:g} s",
         "closed": "",
     }[settings["load"]]
     for knee in sorted(_rows(run, KNEES), key=lambda row: row["source"] == PREDICTED):
-        sure = f"[{knee['low']}, {'...' if knee['high'] is None else int(knee['high'])}]"
-        robots = f"{knee['robots']} robot{'s' * (knee['robots'] != 1)} {sure}" if knee["high"] != 0 else "no robot"
-        source = "" if knee["source"] == "measured" else f"{knee['source']}: "
-        yield f"{source}{robots}{clock}, {knee['cell']}, with {knee['limit']}."
+        high = None if knee["high"] is None else int(knee["high"])
+        robots = f"{knee['robots']} robot{'s' * (knee['robots'] != 1)}"
+        if high == 0:
+            robots = "no robot"
+        elif knee["source"] != PREDICTED:
+            robots += f" [{knee['low']}, {'...' if high is None else high}]"
+        elif high != knee["robots"]:
+            robots += " or more" if high is None else f", fewer than {high + 1},"
+        sentence = f"{robots}{clock}, {knee['cell']}, with {knee['limit']}"
+        if knee["source"] == PREDICTED:
+            service = services if isinstance(services, str) else services.get(knee["cell"])  # one, in runs of before
+            sentence = f"predicted: {sentence}" + (f"; service times: {service}" if service else "")
+        yield f"{sentence}."
 
 
 def _parted(run: StoredRun) -> Iterator[str]:
@@ -130,7 +139,7 @@ def build_capacity(run: StoredRun) -> Figure:
     notes = (
         "Thick: median, thin: 99th percentile; bars: their intervals, right together with 95 %.",
         "Solid: measured, dashed: predicted.",
-        "Vertical: the largest fleet within the limit; shaded: its interval.",
+        "Vertical: the largest fleet within the limit; shaded: its interval, if measured.",
     )
     height_in = 0.7 + 1.2 * len(panels) + 0.15 * len(cells)
     figure = new_figure(height_in, ("How many robots one server carries", *notes))

@@ -11,6 +11,7 @@ import pytest
 
 import s2a_bench as s2a
 from s2a_bench.errors import S2AError
+from s2a_bench.experiments.capacity import predict
 from s2a_bench.experiments.capacity.predict import Service, read_batches
 from s2a_bench.experiments.capacity.rows import FLEETS, KNEES
 from s2a_bench.store.run import StoredRun, read_run
@@ -35,6 +36,7 @@ def test_the_engine_s_time_of_a_run_is_the_service_and_the_queue_is_no_part_of_i
     theirs = Service.read(f"{run.path}#theirs")
     assert first(theirs) == [(302_500_000, 306_500_000, 0)] * 3
     assert "the server sends no marks" in theirs.about
+    assert "predicts more stalls and fewer robots than there are" in theirs.about
     with pytest.raises(S2AError, match=r"`predict`: .* has several cells; name one of .*#ours, .*#theirs"):
         Service.read(str(run.path))
 
@@ -91,6 +93,15 @@ def test_the_knee_of_a_queue_is_exact(tmp_path: Path) -> None:
     assert fleets["stalled"][16] == 0
     assert fleets["stalled"][17] == pytest.approx(1 / 17, abs=0.01)
     assert [*fleets.index] == [1, 2, 4, 8, 16, 32, 24, 20, 18, 17]
+
+
+def test_the_predicted_knee_is_the_median_of_five_seeds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    options: Any = {"predict": "lognormal:mean_ms=20,cv=1", "robots": "1..64", "modes": "queue?trigger=8"}
+    (median,) = predicted(tmp_path / "all", **options, seed=7).table(KNEES).to_dict("records")
+    monkeypatch.setattr(predict, "SEEDS", 1)
+    alone = [predicted(tmp_path / str(seed), **options, seed=seed).table(KNEES)["robots"][0] for seed in range(7, 12)]
+    assert len({*alone}) > 2, alone
+    assert median["robots"] == median["low"] == sorted(alone)[2]
 
 
 def test_the_limit_of_sync_is_on_what_is_beyond_one_robot_alone(tmp_path: Path) -> None:

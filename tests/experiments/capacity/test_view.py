@@ -17,6 +17,8 @@ from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.style import paper_column
 
+STALLED = "at most 1 % stalled ticks"
+
 
 def predicted(tmp_path: Path, service_ms: int, **options: Any) -> StoredRun:
     config = CapacityConfig(predict=str(service_ms), robots="1..64", seconds=10, **options)
@@ -43,8 +45,8 @@ def measured(tmp_path: Path, service_ms: int, robots: int, driven: int = 16) -> 
 def test_the_sentence_names_the_knee_its_interval_and_what_it_holds_for(tmp_path: Path) -> None:
     shown = EXPERIMENT.show(measured(tmp_path, 40, robots=9))
     assert list(shown.sentences) == [
-        "8 robots [7, 8] at 50 Hz, H 16, 40, queue?trigger=8, with at most 1 % stalled ticks.",
-        "predicted: 8 robots [8, 8] at 50 Hz, H 16, 40, queue?trigger=8, with at most 1 % stalled ticks.",
+        f"8 robots [7, 8] at 50 Hz, H 16, 40, queue?trigger=8, with {STALLED}.",
+        f"predicted: 8 robots at 50 Hz, H 16, 40, queue?trigger=8, with {STALLED}; service times: as given.",
         "40, queue?trigger=8: measured and predicted share of stalls have intervals apart at 9 robots.",
     ]
 
@@ -104,6 +106,9 @@ def test_without_a_fleet_that_was_driven_there_is_no_figure(tmp_path: Path) -> N
         ({"robots": 0, "low": 0, "high": 0}, "no robot at"),
         ({"robots": 0, "low": 0, "high": None}, "0 robots [0, ...] at"),
         ({"robots": 1, "low": 0, "high": 3}, "1 robot [0, 3] at"),
+        ({"source": "predicted", "robots": 0, "low": 0, "high": 0}, "predicted: no robot at"),
+        ({"source": "predicted", "robots": 1, "low": 1, "high": 3}, "predicted: 1 robot, fewer than 4, at"),
+        ({"source": "predicted", "robots": 8, "low": 8, "high": None}, "predicted: 8 robots or more at"),
     ],
 )
 def test_no_robot_is_said_where_one_was_too_many(tmp_path: Path, knee: dict[str, Any], sentence: str) -> None:
@@ -115,8 +120,17 @@ def test_no_robot_is_said_where_one_was_too_many(tmp_path: Path, knee: dict[str,
 def test_the_sentence_about_plans_names_how_often_they_are_wanted(tmp_path: Path) -> None:
     run = predicted(tmp_path, 250, plan_every_s=1.0)
     assert list(EXPERIMENT.show(run).sentences) == [
-        "predicted: 4 robots [4, 4] with a plan every 1 s, 250, with at most 1 % stalled plans."
+        "predicted: 4 robots with a plan every 1 s, 250, with at most 1 % stalled plans; service times: as given."
     ]
+
+
+@pytest.mark.parametrize("service", [None, "as given"])
+def test_runs_of_before_have_one_service_for_all_cells_or_none(tmp_path: Path, service: str | None) -> None:
+    run = predicted(tmp_path, 40)
+    del run.manifest["service"]
+    run.manifest.update({"service": service} if service else {})
+    (sentence,) = EXPERIMENT.show(run).sentences
+    assert sentence.endswith("stalled ticks; service times: as given." if service else "stalled ticks.")
 
 
 @pytest.mark.parametrize(
