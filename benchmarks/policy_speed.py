@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.timing import turns_s
 from s2a_bench.boards.gaps import Lognormal
-from s2a_bench.policy import Plans, policy
+from s2a_bench.policy import TOLERANCE_S, Plans, policy
 from s2a_bench.policy.arrivals import fragments, tokens
 from s2a_bench.policy.evaluate import evaluate
 from s2a_bench.policy.schedule import BLOCK, elastic
@@ -79,7 +79,7 @@ def _plain(arrival_s: list[float], duration_s: list[float]) -> tuple[float, floa
         if stall_s > 0:
             safe_s += stall_s
             longest_s = max(longest_s, stall_s)
-            stalls += stall_s > 0.02  # noqa: PLR2004 - the tolerance of `evaluate`
+            stalls += stall_s > TOLERANCE_S
     work_s += duration_s[-1]
     return safe_s, safe_s + work_s, arrival_s[-1] + work_s, stalls, safe_s - arrival_s[0], longest_s
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from s2a_bench.policy import Plans
-from s2a_bench.policy.conformal import TOLERANCE_S, Tracker, choose, scores, take
+from s2a_bench.policy.conformal import ANY_STALL_S, Tracker, choose, scores, take
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import PlanMetrics, measure
 from s2a_bench.policy.stream_to_act import StreamToAct
@@ -86,7 +86,7 @@ def follow(calibration: Plans, plans: Plans, epsilon: float, arm: str) -> tuple[
     if arm == "fixed":
         fixed = choose(score, epsilon).caution
         schedule = replace(policy, caution=fixed).schedule(plans)
-        return np.full(count, fixed), measure(plans, schedule, tolerance_s=TOLERANCE_S)
+        return np.full(count, fixed), measure(plans, schedule, tolerance_s=ANY_STALL_S)
     tracked = TrackedPolicy(policy, Tracker(score, epsilon))
     window, seen = calibration.arrival_s.shape[1], calibration.token_s
     chosen, parts = [], []
@@ -94,7 +94,7 @@ def follow(calibration: Plans, plans: Plans, epsilon: float, arm: str) -> tuple[
         part = take(plans, places)
         caution, schedule = tracked.follow(part)
         chosen.append(caution)
-        parts.append(measure(part, schedule, tolerance_s=TOLERANCE_S))
+        parts.append(measure(part, schedule, tolerance_s=ANY_STALL_S))
         if arm == "refitted":
             assert part.token_s is not None  # noqa: S101
             seen = np.concatenate([seen, part.token_s], axis=1)[:, -window:]

@@ -10,7 +10,7 @@ import numpy as np
 
 from s2a_bench.boards.gaps import FAMILIES
 from s2a_bench.policy import Plans, Policy
-from s2a_bench.policy.conformal import TOLERANCE_S, upper_bound
+from s2a_bench.policy.conformal import ANY_STALL_S, upper_bound
 from s2a_bench.policy.metrics import PlanMetrics, measure
 from s2a_bench.store.schema import Table
 from studies.worlds import World
@@ -76,7 +76,7 @@ def study_row(
     condition: str = "",
 ) -> StudyRow:
     """Let a policy decide the plans and describe the outcome."""
-    found = measure(plans, policy.schedule(plans), tolerance_s=TOLERANCE_S)
+    found = measure(plans, policy.schedule(plans), tolerance_s=ANY_STALL_S)
     return row_of(
         study,
         world,
@@ -132,7 +132,7 @@ def row_of(
         end_regret_elastic=_mean(found.end_regret_elastic),
         speed_distortion=_mean(found.speed_distortion),
         stalls=float(found.stalls.mean()),
-        p_too_early=float(np.mean(found.too_early_s > TOLERANCE_S)),
+        p_too_early=float(np.mean(found.too_early_s > ANY_STALL_S)),
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from s2a_bench.boards.gaps import Gaps, Lognormal, Markov
 from s2a_bench.policy import Plans
-from s2a_bench.policy.conformal import TOLERANCE_S, Tracker, choose, scores
+from s2a_bench.policy.conformal import ANY_STALL_S, Tracker, choose, scores
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import measure
 from s2a_bench.policy.stream_to_act import StreamToAct
@@ -132,7 +132,7 @@ def cell(config: StudyConfig, world: World, shift: str) -> list[StudyRow]:
                 config.name,
                 world,
                 policy.name,
-                measure(plans, decided, tolerance_s=TOLERANCE_S),
+                measure(plans, decided, tolerance_s=ANY_STALL_S),
                 caution=each,
                 calibration_plans=config.calibration_plans,
                 condition=f"{shift}, {arm}",

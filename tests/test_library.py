@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -31,6 +32,12 @@ def test_the_names_are_those_that_it_says() -> None:
     assert all(getattr(s2a, name) is not None for name in s2a.__all__)
     with pytest.raises(AttributeError, match="no attribute 'teleport'"):
         _ = s2a.teleport
+
+
+def test_its_page_names_all_of_them() -> None:
+    page = (Path(__file__).parent.parent / "docs" / "library.md").read_text(encoding="utf-8")
+    cells = re.findall(r"^\| (.*?) \|", page, re.MULTILINE)
+    assert set(s2a.__all__) <= set(re.findall(r"`(\w+)", " ".join(cells)))
 
 
 def test_importing_it_is_light() -> None:

@@ -10,7 +10,6 @@ gap behaviour is published on ``<namespace>/gap`` as std_msgs/msg/String: stop, 
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -36,7 +35,6 @@ from s2a_bench.ros import (
 )
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
-from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.router import ROUTER, Router, endpoint_of
 from s2a_bench.ros.service import appeared
 from s2a_bench.text import none_of
@@ -109,7 +107,7 @@ class RosRobot(SkillKind, ActionKind):
     def _join(self, node_name: str, opened: Callable[[Middleware], _T]) -> _T:
         middleware = open_middleware(
             self.middleware,
-            domain_id=domain_id(os.environ) if self.domain_id is None else self.domain_id,
+            domain_id=self.domain_id,
             node_name=node_name,
             router=Router(self.router),
         )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import resource
+import select
 import signal
 import subprocess
 import sys
@@ -126,8 +127,8 @@ def main() -> None:
     except (KeyboardInterrupt, typer.Abort):
         print_error("interrupted")
         code = INTERRUPTED
-    except BrokenPipeError:  # the reader of the output has ended, as `| head` does
-        sys.stderr.close()
+    except BrokenPipeError as error:
+        _print_broken(error)
         code = 1
     except (OSError, MemoryError, RuntimeError, ImportError) as error:
         if (line := shortage(error)) is None:
@@ -135,6 +136,17 @@ def main() -> None:
         print_error(f"error: {line}")
         code = 1
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _print_broken(error: BrokenPipeError) -> None:
+    """Print the error, but end quietly if the reader of standard output or error has ended, as `| head` does."""
+    outputs = select.poll()
+    for number in (1, 2):
+        outputs.register(number, 0)  # errors only
+    if outputs.poll(0):
+        sys.stderr.close()
+    else:
+        print_error(f"error: another program ended while it was written to: {error}")
 
 
 def _enter_user_namespace() -> None:

@@ -133,12 +133,14 @@ class OwnProcess(ServerProcess):
     def __init__(self, name: str, module: str, job: str, log: Path | None, pass_fds: Sequence[int] = ()) -> None:
         super().__init__(name, [sys.executable, "-m", module], log, pass_fds)
         assert self._process.stdin is not None  # noqa: S101 - opened as a pipe above
-        self._process.stdin.write(job.encode() + b"\n")
-        self._process.stdin.flush()
+        with suppress(BrokenPipeError):  # it has ended: `wait_ready` says how
+            self._process.stdin.write(job.encode() + b"\n")
+            self._process.stdin.flush()
 
     def _ask_to_stop(self) -> None:
         if self._process.stdin is not None:
-            self._process.stdin.close()
+            with suppress(BrokenPipeError):  # it never read its job
+                self._process.stdin.close()
 
     def ask(self) -> dict[str, Any]:
         """Send an empty line, and return the JSON line that a relay answers with; raises ServerDied."""
@@ -162,7 +164,7 @@ class OwnProcess(ServerProcess):
             if not selector.select(READY_TIMEOUT_S):
                 raise self.no_start(NOT_READY)
         line = stdout.readline()
-        if not line:
+        if not line.endswith(b"\n"):
             self.ends_within(STOP_TIMEOUT_S)  # dumping core, perhaps
             self._process.kill()
             self._process.wait()

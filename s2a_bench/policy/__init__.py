@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from s2a_bench.policy.estimator import GapPrior
 
 Floats: TypeAlias = "NDArray[np.float64]"
+TOLERANCE_S: Final = 0.02
+"""Longer stalls make the robot stop and go; shorter ones are the machine's, not the policy's."""
 
 
 @dataclass(frozen=True, slots=True)

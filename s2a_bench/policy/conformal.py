@@ -41,8 +41,8 @@ EPSILON: Final = 0.01
 """Share of plans that may stall."""
 PLANS: Final = 400
 """Recommended number of plans; from 342 on the second bound holds for epsilon = 1 %."""
-TOLERANCE_S: Final = 1e-6
-"""Any longer gap between skills is a stall."""
+ANY_STALL_S: Final = 1e-6
+"""Any longer gap between skills is a stall, a robot noticing it or not; shorter ones are rounding."""
 CEILING: Final = 2.0
 """Bound on the true share of stalls for one calibration, over epsilon ..."""
 CONFIDENCE: Final = 0.999
@@ -281,7 +281,7 @@ def stalled(policy: Policy, plans: Plans) -> NDArray[np.bool_]:
 
     from s2a_bench.policy.metrics import stalls
 
-    return np.asarray((stalls(policy.schedule(plans)) > TOLERANCE_S).any(axis=0))
+    return np.asarray((stalls(policy.schedule(plans)) > ANY_STALL_S).any(axis=0))
 
 
 def take(plans: Plans, columns: NDArray[np.intp]) -> Plans:

@@ -14,15 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench.boards.gaps import Gaps
-from s2a_bench.policy import Floats
+from s2a_bench.policy import TOLERANCE_S, Floats
 from s2a_bench.policy.arrivals import fragments, tokens
 from s2a_bench.policy.schedule import align, blocks
 
 Counts: TypeAlias = NDArray[np.int32]
 Flags: TypeAlias = NDArray[np.bool_]
-
-TOLERANCE_S = 0.02
-"""Longer stalls make the robot stop and go."""
 
 
 @dataclass(frozen=True, slots=True)

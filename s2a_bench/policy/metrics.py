@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from s2a_bench.policy import Floats, Plans, Schedule
-from s2a_bench.policy.evaluate import TOLERANCE_S, Counts
+from s2a_bench.policy import TOLERANCE_S, Floats, Plans, Schedule
+from s2a_bench.policy.evaluate import Counts
 from s2a_bench.policy.schedule import align, least_end, safe_start
 
 RAMP_S = 0.3

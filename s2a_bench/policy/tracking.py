@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Floats, Plans, Policy, Schedule
-from s2a_bench.policy.conformal import EPSILON, GRID, TOLERANCE_S, Tracker, scores, take
+from s2a_bench.policy.conformal import ANY_STALL_S, EPSILON, GRID, Tracker, scores, take
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import stalls as stalls_of
 
@@ -53,7 +53,7 @@ class TrackedPolicy:
         count = plans.arrival_s.shape[1]
         for places in np.array_split(np.arange(count), -(-count // AT_ONCE)):
             every = self.made.schedules(take(plans, places), CAUTIONS)
-            stalls = np.asarray((stalls_of(every) > TOLERANCE_S).any(axis=0))
+            stalls = np.asarray((stalls_of(every) > ANY_STALL_S).any(axis=0))
             ranks = np.empty(places.size, dtype=np.intp)
             for place, score in enumerate(_least(stalls)):
                 ranks[place] = CAUTIONS.index(self.tracker.caution)

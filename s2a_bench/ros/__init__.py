@@ -15,6 +15,7 @@ from typing import Any, Literal, Protocol, TypeAlias
 
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.extras import how_to_install
+from s2a_bench.ros import config
 from s2a_bench.ros.router import Router
 from s2a_bench.text import none_of
 
@@ -280,14 +281,16 @@ def default_middleware(environ: Mapping[str, str]) -> str:
 def open_middleware(
     name: str = "",
     *,
-    domain_id: int = 0,
+    domain_id: int | None = None,
     tuning: Tuning = "tuned",
     node_name: str = "/s2a_bench",
     router: Router | None = None,
 ) -> Middleware:
     """Join a ROS 2 domain as the node ``node_name``, its namespace included; `default_middleware` without a name.
 
-    Raises UsageError for an unknown name, TransportError when the domain cannot be joined.
+    Without ``domain_id`` the domain is ROS_DOMAIN_ID, else 0.
+
+    Raises UsageError for an unknown name or domain, TransportError when the domain cannot be joined.
     """
     name = name or default_middleware(os.environ)
     if name not in MIDDLEWARES:
@@ -297,5 +300,5 @@ def open_middleware(
     except ModuleNotFoundError as error:
         raise TransportError(f"middleware {name} is not installed ({error}); {WAYS_OUT[name]}") from error
     more = (router or Router(),) if name in ROUTED else ()
-    middleware: Middleware = implementation(domain_id, tuning, node_name, *more)
+    middleware: Middleware = implementation(config.domain_id(os.environ, domain_id), tuning, node_name, *more)
     return middleware

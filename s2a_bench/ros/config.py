@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 from xml.sax.saxutils import quoteattr
 
 from s2a_bench.errors import UsageError
-from s2a_bench.ros import Tuning
 from s2a_bench.text import none_of
+
+if TYPE_CHECKING:
+    from s2a_bench.ros import Tuning
 
 PEER = re.compile(r"[A-Za-z0-9._:%-]+")
 RANGES = ("OFF", "LOCALHOST", "SUBNET", "SYSTEM_DEFAULT")
@@ -33,8 +36,10 @@ PATIENT = "<InitialLocatorPruneDelay>inf</InitialLocatorPruneDelay>"
 multicast alone, as Fast DDS does on a subnet, and starts later than that would never be met on loopback."""
 
 
-def domain_id(environ: Mapping[str, str]) -> int:
-    """Return the DDS domain ROS_DOMAIN_ID names, 0 without it; raises UsageError for what is no domain."""
+def domain_id(environ: Mapping[str, str], chosen: int | None = None) -> int:
+    """Return the chosen DDS domain, else that of ROS_DOMAIN_ID, else 0; raises UsageError for what is no domain."""
+    if chosen is not None:
+        return chosen
     text = environ.get("ROS_DOMAIN_ID") or "0"
     if not text.isdecimal() or not 0 <= int(text) <= 232:  # noqa: PLR2004 - the last domain with valid ports
         raise UsageError(f"ROS_DOMAIN_ID: '{text}' is not a number from 0 to 232; unset it or choose one")

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import errno
+import os
 import resource
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
+from s2a_bench import cli
 from s2a_bench.cli import shortage
 from s2a_bench.store.run import read_run
+from tests.cli.program import refused
 
 LATENCY = ["latency", "--engine", "echo", "--transport", "http,loopback", "--size", "64x48", "--data-only"]
 
@@ -73,3 +77,16 @@ def test_what_there_is_too_little_of_is_named(error: Exception, line: str) -> No
 @pytest.mark.parametrize("error", [RuntimeError("x"), ImportError("no module"), OSError(errno.ENOENT, "x")])
 def test_other_errors_are_not_taken_for_a_shortage(error: Exception) -> None:
     assert shortage(error) is None
+
+
+def test_a_broken_pipe_is_quiet_only_where_the_reader_of_the_output_has_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w") as unread:
+        command = [sys.executable, "-m", "s2a_bench", "profile", "list"]
+        done = subprocess.run(command, stdout=unread, stderr=subprocess.PIPE, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "")
+
+    broken = Mock(info=cli.app.info, side_effect=BrokenPipeError(errno.EPIPE, "Broken pipe"))
+    monkeypatch.setattr(cli, "app", broken)
+    assert "error: another program ended while it was written to: [Errno 32]" in refused("doctor", code=1)

@@ -5,17 +5,21 @@ from __future__ import annotations
 import os
 import re
 import signal
+import subprocess
 import sys
 import threading
 from pathlib import Path
 from threading import Timer
+from typing import Any
 
 import pytest
 
 from s2a_bench.errors import ServerDied
+from s2a_bench.harness import processes
 from s2a_bench.harness.processes import LlamaServerProcess, OwnProcess, OwnServer, ServerProcess, keep_serving
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
+from s2a_bench.machine.tuning import start_child
 from s2a_bench.sweep.perform import _outside
 from s2a_bench.testing.transport import wiring_of
 
@@ -53,6 +57,37 @@ def test_a_server_that_does_not_start_says_its_last_lines_and_where_its_log_is(t
     assert lines[-1] == "No module named s2a_bench.nothing"
     assert where == f"its log is {log}"
     assert lines[-1] in log.read_text()
+
+
+ENDS = {
+    "os.kill(os.getpid(), 9)": "killed by signal 9",
+    "os.abort()": "killed by signal 6",
+    "os._exit(3)": "exit code 3",
+    "os.write(1, b'{'); os._exit(3)": "exit code 3",
+}
+
+
+@pytest.mark.parametrize("hour", ["before", "after"])
+@pytest.mark.parametrize("end", ENDS)
+def test_a_server_that_ends_before_its_first_line_says_how(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, hour: str
+) -> None:
+    """It ends before its job is written, or after it has read it."""
+    read = "sys.stdin.readline(); " if hour == "after" else ""
+    (tmp_path / "dies.py").write_text(f"import os, sys; {read}{end}\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+
+    def start_late(*command: Any, **options: Any) -> subprocess.Popen[bytes]:
+        child = start_child(*command, **options)
+        if hour == "before":
+            os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+        return child
+
+    monkeypatch.setattr(processes, "start_child", start_late)
+    log = tmp_path / "log"
+    with pytest.raises(ServerDied) as error, OwnProcess("http", "dies", "{}", log) as server:
+        server.wait_ready()
+    assert str(error.value) == f"the http server did not start, {ENDS[end]}; its log is {log}"
 
 
 def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same() -> None:

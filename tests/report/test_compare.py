@@ -165,6 +165,16 @@ def test_cells_without_a_partner_are_listed_and_not_compared(launch: Launch) -> 
         opened(launch(1, cells=("loopback",)), launch(2, cells=("ros/topic",)))
 
 
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_run_without_a_complete_cell_is_named(launch: Launch, place: int) -> None:
+    runs = [launch(1, n=6), launch(2, n=6)]
+    runs[place] = empty = launch(3, n=0)
+    with pytest.raises(UnlikeRuns) as caught:
+        opened(*runs)
+    state = empty.manifest["state"]
+    assert str(caught.value) == f"{empty.path} has no complete cell, its state is {state}: measure it again"
+
+
 @pytest.mark.parametrize(
     ("part", "facts", "message"),
     [

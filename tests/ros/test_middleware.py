@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import pytest
 
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros import MIDDLEWARES, QoS, default_middleware, open_middleware
 from s2a_bench.ros.messages import type_hash
-from tests.ros.middleware_suite import MiddlewareSuite
+from tests.ros.middleware_suite import STRING, MiddlewareSuite, wait_matched
 
 cyclonedds = pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
@@ -37,6 +39,17 @@ def test_a_domain_takes_one_configuration_per_process(dds_domain: int) -> None:
     open_middleware("cyclonedds", domain_id=dds_domain).close()
     with pytest.raises(TransportError, match="already configured otherwise"):
         open_middleware("cyclonedds", domain_id=dds_domain, tuning="default")
+
+
+def test_without_a_domain_that_of_the_environment_is_joined(dds_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As the command line does, so that a program's node and a measurement meet."""
+    named = open_middleware("cyclonedds", domain_id=dds_domain)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(dds_domain))
+    with closing(named), closing(open_middleware("cyclonedds")) as node:
+        wait_matched(named.publisher("/test/word", STRING, QoS()), node.subscription("/test/word", STRING, QoS()))
+    monkeypatch.setenv("ROS_DOMAIN_ID", "233")
+    with pytest.raises(UsageError, match="ROS_DOMAIN_ID: '233' is not a number from 0 to 232"):
+        open_middleware("cyclonedds")
 
 
 def test_an_unknown_middleware_is_named() -> None:

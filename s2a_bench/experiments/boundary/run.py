@@ -10,7 +10,7 @@ from s2a_bench.boards.tokens import gaps_of
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
 from s2a_bench.machine import environment
-from s2a_bench.policy.conformal import TOLERANCE_S
+from s2a_bench.policy.conformal import ANY_STALL_S
 from s2a_bench.policy.evaluate import Grid, analytic, simulate
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.stats.seeds import generator
@@ -55,7 +55,7 @@ def rows(config: BoundaryConfig, duration: str, grid: Grid, board: str = "") -> 
         duration_s=duration_s,
         plans=config.plans_a_point,
         rng=generator(config.seed, "boundary", board),
-        tolerance_s=TOLERANCE_S,
+        tolerance_s=ANY_STALL_S,
     )
     for row, tokens in enumerate(grid.tokens_per_skill):
         for column, rate in enumerate(grid.tokens_per_s):

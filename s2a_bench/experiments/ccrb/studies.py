@@ -23,7 +23,7 @@ from s2a_bench.experiments.ccrb.rows import (
 )
 from s2a_bench.harness.timelines.rows import to_ns
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.policy import COMPARED, Plans, Schedule, policy
+from s2a_bench.policy import COMPARED, TOLERANCE_S, Plans, Schedule, policy
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.metrics import peak_jerk, rms_jerk, sparc, stalls
 from s2a_bench.scenario import EGO, ROLES
@@ -37,9 +37,6 @@ from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
     pass
-
-_TOLERANCE_S = 0.02
-"""Shorter stalls are not counted (POLICY section 1)."""
 
 
 def rollout_rows(
@@ -58,7 +55,7 @@ def rollout_rows(
             **{name: value[place].item() for name, value in each.items()},
             start_ns=to_ns(schedule.start_s[0, place]),
             end_ns=to_ns(end_s[place]),
-            stalls=int((stall_s[:, place] > _TOLERANCE_S).sum()),
+            stalls=int((stall_s[:, place] > TOLERANCE_S).sum()),
             stall_ns=to_ns(stall_s[:, place].sum()),
             outcome=outcomes.name(place),
             **metrics,

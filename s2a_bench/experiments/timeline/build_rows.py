@@ -12,7 +12,7 @@ from s2a_bench.experiments.timeline.rows import METRICS, PlanRow, TimelineRow
 from s2a_bench.harness.timelines.config import PlanSetting
 from s2a_bench.harness.timelines.rows import KEPT_PLANS
 from s2a_bench.policy import Plans, Schedule
-from s2a_bench.policy.conformal import TOLERANCE_S
+from s2a_bench.policy.conformal import ANY_STALL_S
 from s2a_bench.policy.metrics import measure, peak_jerk, rms_jerk, sparc, speed_profile
 from s2a_bench.policy.schedule import align, least_end, safe_start
 
@@ -38,7 +38,7 @@ def timeline_rows(
     first_plan: int = 0,
     requested_ns: Sequence[int] | None = None,
     caution: float | Sequence[float | None] | None = None,
-    tolerance_s: float = TOLERANCE_S,
+    tolerance_s: float = ANY_STALL_S,
 ) -> list[PlanRow]:
     """Return the rows of M timelines; gaps up to ``tolerance_s`` are no stall for ``any_stall``.
 

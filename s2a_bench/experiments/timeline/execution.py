@@ -21,8 +21,7 @@ from s2a_bench.harness.timelines.config import PlanSetting
 from s2a_bench.harness.timelines.policies import finite
 from s2a_bench.harness.timelines.rows import skill_rows
 from s2a_bench.plan import Gap
-from s2a_bench.policy import Plans, PlanShape, Policy, Schedule
-from s2a_bench.policy.evaluate import TOLERANCE_S
+from s2a_bench.policy import TOLERANCE_S, Plans, PlanShape, Policy, Schedule
 from s2a_bench.stats import summarise
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SKILLS

@@ -10,6 +10,7 @@ from rich.console import Group
 from rich.text import Text
 
 from s2a_bench.clock import now_ns
+from s2a_bench.policy import TOLERANCE_S
 
 if TYPE_CHECKING:
     from s2a_bench.act.record import Record
@@ -19,8 +20,6 @@ LEAST_LANE = 20
 NARROW = 90
 """Terminals with fewer columns get short texts beside the lanes."""
 COLOURS = ("blue", "yellow", "green", "cyan", "magenta")
-STALL_S = 0.02
-"""Shorter stalls are the machine's, not the policy's: POLICY section 1."""
 WAITING, SKILL, STALL, TOKEN, COMPLETE, NOW, SAFE = "─█╱·┃│┊"  # noqa: RUF001 - a hatch, not a slash
 
 
@@ -112,7 +111,7 @@ def _lane(record: Record, axis: _Axis, now_s: float, safe_s: float | None, colou
         cells[column] = (WAITING, "dim")
     until = [*starts[1:], now_s if record.outcome is None else 0.0]
     for start_s, end_s, next_s, skill in zip(starts, ends, until, skills, strict=False):
-        if next_s - end_s > STALL_S:
+        if next_s - end_s > TOLERANCE_S:
             for column in axis.cells(end_s, next_s):
                 cells[column] = (STALL, "red")
         for column in axis.cells(start_s, end_s):
@@ -134,7 +133,7 @@ def _status(record: Record, n_skills: int, *, short: bool) -> str:
 
 
 def _stalls_s(record: Record) -> list[float]:
-    return [stall / 1e9 for stall in record.stalls_ns if stall > STALL_S * 1e9]
+    return [stall / 1e9 for stall in record.stalls_ns if stall > TOLERANCE_S * 1e9]
 
 
 def _scale(axis: _Axis, safe_s: float | None, known: bool) -> Text:

@@ -13,11 +13,10 @@ from s2a_bench.act.record import Record, observed
 from s2a_bench.boards.tokens import Board
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.timelines.config import MOST_CV, PlanSetting, TimelineConfig
-from s2a_bench.policy import CAUTION, ONLINE, Floats, Plans, PlanShape, Policy
+from s2a_bench.policy import CAUTION, ONLINE, TOLERANCE_S, Floats, Plans, PlanShape, Policy
 from s2a_bench.policy.arrivals import recorded_plans, with_skills
 from s2a_bench.policy.conformal import PLANS, Calibration, Guarantee, Tracker, choose, scores
 from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
-from s2a_bench.policy.evaluate import TOLERANCE_S
 from s2a_bench.policy.parameters import canonical
 from s2a_bench.policy.tracking import TrackedPolicy
 from s2a_bench.stats.seeds import generator

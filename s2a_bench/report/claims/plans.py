@@ -25,7 +25,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
 from s2a_bench.experiments.paper import PaperThroughput, paper_throughput
 from s2a_bench.experiments.timeline.view.cells import Timelines, timelines_of
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.policy import Floats, Plans
+from s2a_bench.policy import TOLERANCE_S, Floats, Plans
 from s2a_bench.policy.schedule import elastic, safe_start, work_conserving
 from s2a_bench.provenance import UNKNOWN
 from s2a_bench.report.claims import Check, Met, Need, RunPart, Trial
@@ -47,7 +47,6 @@ PLANS: Final = {"n_skills": 8, "t_nom_s": 1.0, "t_min": 0.8, "t_max": 1.5, "t_no
 """The defaults of `s2a-bench timeline` that decide its claims; a test compares them. The paper gives none of them."""
 _UNMODELLED: Final = {"t_nom_cv": 0.0, "prompt_s": None, "jitter": "none"}
 """The settings that a live run does not have."""
-VISIBLE_S: Final = 0.02
 
 
 def listed(name: str, *values: str) -> Need:
@@ -138,8 +137,8 @@ def _stall_s(cell: Timelines) -> float:
 
 SETTINGS: Final = _chosen("settings", PLANS, f"jitter none or {NAMED_JITTER}")
 EVEN, UNEVEN = (one_of("times", times) for times in (EXACT, VARYING))
-SEVERAL: Final = Need("L", "two or more", lambda found: ", " in found), more("stall of naive in s", VISIBLE_S)
-WAITS: Final = more("S0 after the first arrival in s", VISIBLE_S)
+SEVERAL: Final = Need("L", "two or more", lambda found: ", " in found), more("stall of naive in s", TOLERANCE_S)
+WAITS: Final = more("S0 after the first arrival in s", TOLERANCE_S)
 STRETCHABLE: Final = more("T_max / T_nom", 1)
 
 
@@ -201,7 +200,7 @@ def stalled_gaps(part: RunPart) -> tuple[list[Ratio], str]:
 def growth(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure the increase of naive's stall time at each larger L, from the first that stalls."""
     cells = [of_length[NAIVE] for _, of_length in sorted(part.cells.items())]
-    steps = [pair for pair in pairwise(cells) if max(map(_stall_s, pair)) > VISIBLE_S]
+    steps = [pair for pair in pairwise(cells) if max(map(_stall_s, pair)) > TOLERANCE_S]
     text = f"{', '.join(f'{_stall_s(cell):.2f}' for cell in cells)} s at L = {', '.join(map(str, sorted(part.cells)))}"
     return [_compared(part, more, less, "stall_s").difference for less, more in steps], text
 

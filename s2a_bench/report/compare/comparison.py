@@ -105,7 +105,7 @@ def open_comparison(
         raise UsageError(f"these are runs of {' and '.join(commands)}: name runs of one command")
     by = _comparable(commands[0])
     with fits(*runs):
-        sides = [[launch for run in side for launch in _launches(by.subjects(run))] for side in (baseline, other)]
+        sides = [[launch for run in side for launch in _launches(run, by.subjects(run))] for side in (baseline, other)]
         found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
         metrics = {**by.metrics, **by_name(metric for run in runs for metric in by.run_metrics(run))}
     if (len(sides[0]) > 1) != (len(sides[1]) > 1):
@@ -124,12 +124,14 @@ def open_comparison(
     return ComparedRuns(tuple(baseline), tuple(other), by, metrics, (*settings, *found), tuple(pairs), only, least)
 
 
-def _launches(subjects: Iterable[Subject]) -> list[dict[str, Subject]]:
-    """Return name -> cell of a run, for each launch."""
+def _launches(run: StoredRun, subjects: Iterable[Subject]) -> list[dict[str, Subject]]:
+    """Return name -> cell of a run, for each launch; raises UnlikeRuns if it has none."""
     found: dict[int, dict[str, Subject]] = {}
     for subject in subjects:
         found.setdefault(subject.launch, {})[subject.name] = subject
-    return list(found.values()) or [{}]
+    if not found:
+        raise UnlikeRuns(f"{run.path} has no complete cell, its state is {run.manifest['state']}: measure it again")
+    return list(found.values())
 
 
 def _comparable(command: str) -> Comparable:

@@ -38,8 +38,7 @@ def namespace_of(wiring: Wiring[RosOptions]) -> str:
 
 def domain_of(wiring: Wiring[RosOptions]) -> int:
     """Return the DDS domain; raises UsageError for a ROS_DOMAIN_ID that is none."""
-    chosen = wiring.options.domain_id
-    return domain_id(os.environ) if chosen is None else chosen
+    return domain_id(os.environ, wiring.options.domain_id)
 
 
 def is_routed(options: RosOptions) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from pathlib import Path
 from typing import Any, Final
 
 import orjson
@@ -19,7 +20,7 @@ from s2a_bench.transport.pictures import bgr_of, encoded
 from s2a_bench.transport.shm import ShmOptions
 from s2a_bench.transport.shm.memory import ANSWER_BYTES, PLACE, STEP_BYTES, SharedMemory, accept, in_steps, offer
 from s2a_bench.transport.shm.pieces import AnswerPart, unpacked
-from s2a_bench.transport.shm.unix_socket import connect
+from s2a_bench.transport.shm.unix_socket import connect, remove_if_dead
 from s2a_bench.types import Action, Frame, Piece, Request, Token
 
 NEARER_S: Final = 0.1
@@ -64,10 +65,12 @@ class ShmClient:
         return {}
 
     def close(self) -> None:
-        """Close the link; the memory goes with its last user."""
+        """Close the link; the memory goes with its last user, the socket of a server that was killed is removed."""
         if self._link is not None:
             self._link.close()
         self._link = None
+        if not self._alive():
+            remove_if_dead(Path(self._path))
 
     def _connect(self, size: int) -> ShmConnection:
         self.close()

@@ -34,7 +34,7 @@ def listen(path: str) -> tuple[socket.socket, str]:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     try:
         for left in [Path(path)] if path else folder.glob("*.sock"):
-            _remove_if_dead(left)
+            remove_if_dead(left)
         path = path or str(folder / f"{os.urandom(6).hex()}.sock")
         os.fchmod(listener.fileno(), 0o600)  # which the file will have
         listener.bind(str(bound))
@@ -87,7 +87,8 @@ def _folder() -> Path:
     return folder
 
 
-def _remove_if_dead(path: Path) -> None:
+def remove_if_dead(path: Path) -> None:
+    """Remove a socket at which no server listens any more, and nothing else."""
     with suppress(OSError):
         if stat.S_ISSOCK(path.lstat().st_mode):
             with closing(socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)) as probe:
