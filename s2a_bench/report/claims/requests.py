@@ -178,7 +178,7 @@ def _others(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
 
 
 def _external(cell: RequestCell) -> list[str]:
-    return declared_transport(cell.pipeline).options.of_sides(EXTERNAL, PROGRAM)
+    return [*declared_transport(cell.pipeline).options.of_sides(EXTERNAL, PROGRAM)]
 
 
 REQUESTS: Final = one_of("mode", "request")
