@@ -38,7 +38,7 @@ from s2a_bench.report.compare.shown import (
     write_comparison,
 )
 from s2a_bench.stats.batches import STATISTICS
-from s2a_bench.stats.change import change_between
+from s2a_bench.stats.change import Noise, change_between
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from tests.made_runs import STAGES as GROUPS
@@ -453,6 +453,22 @@ def test_a_drift_is_no_change_where_the_sides_take_turns(launch: Launch) -> None
     assert false_alarms(lambda: "ABBA" * 5) < 0.05
     assert false_alarms(drawn) < 0.08
     assert false_alarms(lambda: "A" * 10 + "B" * 10) > 0.3
+
+
+@pytest.mark.parametrize(("rows", "rises", "falls"), [(1, 0.1503, 0.1307), (4, 0.1817, 0.1538)])
+def test_a_gate_passes_from_the_limit_on_that_it_would_have_seen(
+    launch: Launch, rows: int, rises: float, falls: float
+) -> None:
+    """With a known error of 5 % that is exp((z + 0.8416) 0.05) - 1, z the normal quantile of 1 - 0.025 / rows."""
+    first, second = (launch(seed, n=10, cells=[*CELLS][:rows]) for seed in (1, 2))
+    found = compared(first, second, "e2e")
+    quiet = [replace(one, p_holm=1.0, change=replace(one.change, noise=Noise(0.05, 1e5))) for one in found.comparisons]
+    same = replace(found, comparisons=tuple(quiet))
+    for gate, least in (("e2e>{}%", rises), ("e2e<-{}%", falls)):
+        for share, outcome in ((0.98, "undecided"), (1.02, "passed")):
+            one = judge(same, [read_gate(gate.format(round(100 * least * share, 3)))], one_launch=True)[0]
+            assert one.outcome == outcome
+            assert one.detectable == pytest.approx(least, rel=0.002)
 
 
 def test_a_gate_that_too_few_values_feed_is_undecided_not_passed(launch: Launch) -> None:
