@@ -15,6 +15,7 @@ import numpy as np
 from scipy import stats
 from scipy.signal import lfilter
 
+from s2a_bench.report.compare.comparison import LEVEL
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.batches import RowCorrelation
 from s2a_bench.stats.change import Noise, ratio_of_launches
@@ -76,6 +77,36 @@ def detectable(launches: int, launch_sd: float) -> str:
     return f"{noise.detectable(0.05):5.0%} in 80 of 100 repeats; 10 % in {noise.power(0.1, 0.05):.0%}"
 
 
+TURNS = ("AB", "ABBA", "AABB", "random", "blocks")
+DRIFTS = ("trend", "walk", "swing", "halves")
+
+
+def false_alarms(launches: int, turns: str, drift: str, trials: int) -> float:
+    """Return how often Welch's test, as `compare` has it, calls so many launches a side of one thing different.
+
+    Half of a launch's variance is its own, half is the machine's at its time: a trend, a random walk, a swing of one
+    period, or a level for each half of the time.
+    """
+    rng, n = np.random.default_rng(17), 2 * launches
+    at = np.linspace(-1, 1, n)
+    slow = {
+        "trend": np.broadcast_to(at, (trials, n)),
+        "walk": np.cumsum(rng.standard_normal((trials, n)), axis=1),
+        "swing": np.sin(np.pi * at + rng.uniform(0, 2 * np.pi, (trials, 1))),
+        "halves": np.repeat(rng.standard_normal((trials, 2)), launches, axis=1),
+    }[drift]
+    slow = slow - slow.mean(axis=1, keepdims=True)
+    values = slow / math.sqrt((slow**2).mean()) + rng.standard_normal((trials, n))
+    order = "A" * launches + "B" * launches if turns in {"random", "blocks"} else (turns * n)[:n]
+    if order.count("A") > launches:
+        order = order[:-1] + "B"
+    is_b = np.broadcast_to(np.array(list(order)) == "B", (trials, n))
+    if turns == "random":
+        is_b = rng.permuted(is_b, axis=1)
+    below, above = (values[chosen].reshape(trials, launches) for chosen in (~is_b, is_b))
+    return float((stats.ttest_ind(below, above, axis=1, equal_var=False).pvalue < LEVEL).mean())
+
+
 def lines(trials: int) -> Iterator[str]:
     """Yield the study, a line a setting."""
     yield f"95 % intervals of ratios that hold the truth, {trials} trials, {REQUESTS} requests a cell in all"
@@ -90,6 +121,11 @@ def lines(trials: int) -> Iterator[str]:
     for launches in (3, 5, 10, 20):
         for spread in LAUNCH_SDS:
             yield f"  {launches:2} launches a side, launch sd {spread:4.0%}: {detectable(launches, spread)}"
+    yield f"the same thing called different, half of the variance between launches a drift ({', '.join(DRIFTS)})"
+    for launches in (3, 5, 10, 20):
+        for turns in TURNS:
+            found = [false_alarms(launches, turns, drift, 2 * trials) for drift in DRIFTS]
+            yield f"  {launches:2} launches a side, {turns}: {', '.join(f'{each:.1%}' for each in found)}"
 
 
 def main() -> None:

@@ -33,4 +33,4 @@ def test_every_setting_is_printed(capsys: pytest.CaptureFixture[str], monkeypatc
     ratio_coverage.main()
     printed = capsys.readouterr().out.splitlines()
     assert len([line for line in printed if "--launches" in line]) == 9
-    assert len([line for line in printed if "a side" in line]) == 12
+    assert len([line for line in printed if "a side" in line]) == 12 + 20

@@ -78,7 +78,8 @@ def test_a_gate_that_cannot_be_judged_is_an_error_unless_it_is_strict() -> None:
 
 def test_a_gate_on_one_launch_a_side_is_undecided_and_names_the_way_out() -> None:
     done = run(ECHO, RAW, "--unlike", "--fail-if", "http/as-*:e2e.median>5%", "--json", code=4)
-    way_out = "1 of the 3 launches that a side needs: measure both with --launches 3, or --one-launch"
+    in_turn = "measure A and B in turn, a launch each, three times or more, and name the folders with commas"
+    way_out = f"1 of the 3 launches that a side needs: {in_turn}, or --one-launch"
     (gate,) = json.loads(done.stdout)["gates"]
     assert (gate["outcome"], gate["reason"]) == ("undecided", way_out)
     assert "undecided in http/as-deployed: +126 % [" in done.stderr

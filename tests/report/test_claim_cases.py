@@ -228,6 +228,16 @@ NO_EVIDENCE: dict[str, tuple[Made, str, str]] = {
         "engine unknown",
     ),
     "two sizes": (lambda kit: kit.sizes(), "HTTP/JSON takes longer", "size 640x480 and 1280x720"),
+    "a new client for each request beside a kept connection": (
+        lambda kit: kit.latency(options={"http/as-deployed": {"connection": "client-per-request"}}),
+        "HTTP/JSON takes longer",
+        "both sides: http/as-deployed with connection client-per-request (needs",
+    ),
+    "DDS as it comes": (
+        lambda kit: kit.latency(options={"ros/topic": {"payload": "raw", "dds_tuning": "default"}}),
+        "6.57 times",
+        "both sides: ros/topic with dds_tuning default (needs",
+    ),
     "a server at a URL, maybe a proxy to another machine": (
         lambda kit: kit.latency(options={"http/as-deployed": {"url": "http://10.0.0.2:8080"}}),
         "HTTP/JSON takes longer",
@@ -355,6 +365,12 @@ EVIDENCE: dict[str, tuple[Made, dict[str, str]]] = {
             "HTTP/JSON takes longer end to end than ROS 2-native": SUPPORTED,
             "101.8 against 15.5 ms: 6.57 times as long, on a Jetson AGX Orin": SUPPORTED,
         },
+    ),
+    "the paper's ratio, payloads named": (
+        lambda kit: kit.latency(
+            options={"http/as-deployed": {"payload": "jpeg-preencoded"}, "ros/topic": {"payload": "raw"}}
+        ),
+        {"HTTP/JSON takes longer end to end than ROS 2-native": SUPPORTED},
     ),
     "the paper's ratio, replayed on both sides": (
         lambda kit: kit.latency(manifest={"provenance": Origins(REPLAY).to_manifest()}),

@@ -38,6 +38,7 @@ from s2a_bench.report.compare.shown import (
     write_comparison,
 )
 from s2a_bench.stats.batches import STATISTICS
+from s2a_bench.stats.change import Noise, change_between
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from tests.made_runs import STAGES as GROUPS
@@ -383,16 +384,101 @@ def test_launches_of_one_folder_count_as_launches(launch: Launch) -> None:
     assert [len(side) for side in (both.pairs[0].baseline, both.pairs[0].other)] == [3, 3]
 
 
-@pytest.mark.parametrize(("launches", "judges"), [(1, False), (2, False), (3, True)])
-def test_a_gate_needs_three_launches_a_side_or_the_users_word(launch: Launch, launches: int, judges: bool) -> None:
-    found = opened(*(launch(each, n=150, launches=launches, factor=1 + each) for each in (0, 1)))
+def measured_in(order: str, launch: Launch, *, launches: int = 1, factor: float = 2.0) -> ComparedRuns:
+    """Compare runs of A and of B, ``factor`` times as long, that started in this order."""
+    sides: dict[str, list[StoredRun]] = {"A": [], "B": []}
+    for place, side in enumerate(order):
+        run = launch(place, n=30, launches=launches, factor=factor if side == "B" else 1, cells=("loopback",))
+        dated = {**run.manifest, "started": f"2026-01-01T00:{place:02}:00+00:00"}
+        sides[side].append(replace(run, manifest=dated))
+    return open_comparison(sides["A"], sides["B"], unlike=False, least=0.05)
+
+
+@pytest.mark.parametrize(("order", "judges"), [("AB", False), ("ABBA", False), ("ABBAAB", True)])
+def test_a_gate_needs_three_launches_a_side_or_the_users_word(launch: Launch, order: str, judges: bool) -> None:
+    found = measured_in(order, launch)
     for gate, outcome in (("e2e>5%", "tripped"), ("e2e<-5%", "passed")):
         assert outcomes(found, gate) == {outcome}
         assert outcomes(found, gate, one_launch=False) == {outcome if judges else "undecided"}
         assert outcomes(found, gate, one_launch=False, strict=True) == {outcome}
     reasons = {one.reason for one in judged(found, "e2e>5%", one_launch=False)}
-    way_out = "launches that a side needs: measure both with --launches 3, or --one-launch"
-    assert reasons == {"" if judges else f"{launches} of the 3 {way_out}"}
+    way_out = "launches that a side needs: measure A and B in turn, a launch each, three times or more, and name the "
+    assert reasons == {"" if judges else f"{len(order) // 2} of the 3 {way_out}folders with commas, or --one-launch"}
+
+
+def test_a_gate_on_sides_that_did_not_take_turns_is_undecided_and_a_note_says_why(launch: Launch) -> None:
+    found = measured_in("AAABBB", launch)
+    for one_launch in (False, True):
+        (one,) = judged(found, "e2e>5%", one_launch=one_launch)
+        assert one.outcome == "undecided"
+        assert "not measured in turn (6 launches, changes of side: 1)" in one.reason
+        assert one.reason.endswith("three times or more, and name the folders with commas, or --strict")
+    assert outcomes(found, "e2e>5%", strict=True) == {"tripped"}
+    notes = {warning.code: warning.message for warning in warnings_of(compare(found, metrics_of(found, ["e2e"])))}
+    assert notes["turns"] in one.reason
+    assert not measured_in("ABABAB", launch).out_of_turn
+    assert measured_in("ABAB", launch, launches=3).out_of_turn  # the launches of a folder are a block
+    undated = replace(found, started=(("", "", ""), found.started[1]))
+    assert "a manifest has no `started`" in judged(undated, "e2e>5%")[0].reason
+
+
+def dated(order: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    first, second = (tuple(f"{place:03}" for place, each in enumerate(order) if each == side) for side in "AB")
+    return first, second
+
+
+@pytest.mark.parametrize("n", [3, 5, 10, 20])
+def test_turns_of_two_launches_are_turns_and_blocks_of_three_are_none(launch: Launch, n: int) -> None:
+    found = opened(launch(1, n=2), launch(2, n=2))
+    turns = ("AB" * n, ("ABBA" * n)[: 2 * n] if n % 2 == 0 else ("ABBA" * n)[: 2 * n - 2] + "AB", "A" + "BBAA" * n)
+    blocks = ("A" * n + "B" * n, ("AAABBB" * n)[: n // 3 * 6], "B" * 7 + "A" * n + "B" * 7)
+    for orders, passes in ((turns, True), (blocks, False)):
+        for order in orders:
+            assert bool(replace(found, started=dated(order)).out_of_turn) != passes, order
+    rng = np.random.default_rng(n)
+    drawn = [dated("".join(rng.permutation(list("AB" * n)))) for _ in range(400)]
+    assert np.mean([not replace(found, started=each).out_of_turn for each in drawn]) > 0.78
+
+
+def test_a_drift_is_no_change_where_the_sides_take_turns(launch: Launch) -> None:
+    """Half of the variance of a launch is its hour's: a random walk over twenty launches."""
+    found, rng = opened(launch(1, n=2), launch(2, n=2)), np.random.default_rng(0)
+
+    def drawn() -> str:
+        texts = iter(lambda: "".join(rng.permutation(list("AB" * 10))), "")
+        return next(text for text in texts if not replace(found, started=dated(text)).out_of_turn)
+
+    def false_alarms(order: Callable[[], str]) -> float:
+        alarms = 0
+        for _ in range(300):
+            drift, text = np.cumsum(rng.standard_normal(20)), order()
+            values = np.exp(0.08 * (rng.standard_normal(20) + (drift - drift.mean()) / 1.8))
+            first, second = (
+                [[one] for one, of in zip(values[:, None], text, strict=True) if of == side] for side in "AB"
+            )
+            alarms += (change_between(first, second, "median", seed=0).p or 1) < 0.05
+        return alarms / 300
+
+    assert false_alarms(lambda: "AB" * 10) < 0.05
+    assert false_alarms(lambda: "ABBA" * 5) < 0.05
+    assert false_alarms(drawn) < 0.08
+    assert false_alarms(lambda: "A" * 10 + "B" * 10) > 0.3
+
+
+@pytest.mark.parametrize(("rows", "rises", "falls"), [(1, 0.1503, 0.1307), (4, 0.1817, 0.1538)])
+def test_a_gate_passes_from_the_limit_on_that_it_would_have_seen(
+    launch: Launch, rows: int, rises: float, falls: float
+) -> None:
+    """With a known error of 5 % that is exp((z + 0.8416) 0.05) - 1, z the normal quantile of 1 - 0.025 / rows."""
+    first, second = (launch(seed, n=10, cells=[*CELLS][:rows]) for seed in (1, 2))
+    found = compared(first, second, "e2e")
+    quiet = [replace(one, p_holm=1.0, change=replace(one.change, noise=Noise(0.05, 1e5))) for one in found.comparisons]
+    same = replace(found, comparisons=tuple(quiet))
+    for gate, least in (("e2e>{}%", rises), ("e2e<-{}%", falls)):
+        for share, outcome in ((0.98, "undecided"), (1.02, "passed")):
+            one = judge(same, [read_gate(gate.format(round(100 * least * share, 3)))], one_launch=True)[0]
+            assert one.outcome == outcome
+            assert one.detectable == pytest.approx(least, rel=0.002)
 
 
 def test_a_gate_that_too_few_values_feed_is_undecided_not_passed(launch: Launch) -> None:

@@ -114,7 +114,7 @@ def pairs(run: StoredRun) -> Iterator[RunPart]:
     https = [cell for cell in cells if "/".join(cell.path) in {_HTTP, _LLAMA_SERVER}]
     for pair in product(https, [cell for cell in cells if cell.pipeline == _ROS]):
         facts = {
-            "both sides": _unlike(run, pair) or "alike",
+            "both sides": ", ".join([*_unlike(run, pair), *_asked(run, pair)]) or "alike",
             "servers": _others(run, pair) or "started by the run",
             "launches": sum(map(bool, _blocks(pair)[0].values())),
             "stages": "".join(f"hidden by {cell.name}" for cell in pair if cell.has_ingest) or "seen",
@@ -144,27 +144,41 @@ def _launches(*cells: RequestCell) -> int:
     return min(int(cell.good["launch"].nunique()) for cell in cells)
 
 
-def _unlike(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
+def _unlike(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> list[str]:
     """Return the differences of frames and engines; llama-server and llama on the same file are equal."""
     http, ros = (run.origins.of(cell.name).to_dict() | {"size": cell.about["size"]} for cell in pair)
     engines = http["engine"], ros["engine"]
     same_file = engines == ("llama-server", "llama") and http["model_sha256"] == ros["model_sha256"] != ""
     both = {name: dict.fromkeys((http[name] or NONE, value or NONE)) for name, value in ros.items()}
-    return ", ".join(
+    return [
         f"{name} {' and '.join(found)}"
         for name, found in both.items()
         if (len(found) > 1 or UNKNOWN in found) and not (same_file and name in _NAMES)
-    )
+    ]
+
+
+def _asked(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> list[str]:
+    """Return the options that are not the defaults; payload and external servers have needs of their own."""
+    pipelines = run.manifest.get("configuration", {}).get("pipelines", {})
+    return [
+        f"{cell.name} with {name} {value}"
+        for cell in pair
+        for name, value in pipelines.get(cell.name, {}).items()
+        if name not in {"payload", *_external(cell)}
+    ]
 
 
 def _others(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
     pipelines = run.manifest.get("configuration", {}).get("pipelines", {})
     found = [f"{cell.name} {UNKNOWN}" for cell in pair if cell.name not in pipelines]
     for cell in pair:
-        external = declared_transport(cell.pipeline).options.of_sides(EXTERNAL, PROGRAM)
-        named = {name for name in external if pipelines.get(cell.name, {}).get(name)}
+        named = {name for name in _external(cell) if pipelines.get(cell.name, {}).get(name)}
         found += [f"{cell.name} by {name}" for name in sorted(named - {"llama_server"})]
     return ", ".join(found)
+
+
+def _external(cell: RequestCell) -> list[str]:
+    return [*declared_transport(cell.pipeline).options.of_sides(EXTERNAL, PROGRAM)]
 
 
 REQUESTS: Final = one_of("mode", "request")
@@ -172,7 +186,11 @@ COMPARED: Final = (
     REQUESTS,
     one_of("payload", "jpeg-preencoded and raw", "jpeg-preencoded and yuyv"),
     one_of("link", "real"),
-    Need("both sides", "alike: engine, model, size; llama-server and llama are, on the same file", "alike".__eq__),
+    Need(
+        "both sides",
+        "alike: engine, model, size, default options; llama-server and llama are, on the same file",
+        "alike".__eq__,
+    ),
     one_of("servers", "started by the run"),
     Need("launches", f"{FEWEST_LAUNCHES} or more", lambda found: found >= FEWEST_LAUNCHES),
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 
 LEVEL: Final = 0.05
 """The probability of any false difference, over all comparisons together."""
+
+IN_TURN: Final = "measure A and B in turn, a launch each, three times or more, and name the folders with commas"
+_UNDATED: Final = "may not have been measured in turn (a manifest has no `started`)"
 
 SAME, UNCLEAR, TOO_FEW = "same", "unclear", "too few"
 
@@ -60,7 +64,10 @@ class CellComparison:
 
 @dataclass(frozen=True, slots=True)
 class ComparedRuns:
-    """Two sides, their pairs of cells, and the comparisons; ``only`` has the cells of each side without a partner."""
+    """Two sides, their pairs of cells, and the comparisons; ``only`` has the cells of each side without a partner.
+
+    ``started`` has the time at which the run of each launch started, empty if unknown.
+    """
 
     baseline: tuple[StoredRun, ...]
     other: tuple[StoredRun, ...]
@@ -70,6 +77,7 @@ class ComparedRuns:
     pairs: tuple[CellPair, ...]
     only: tuple[tuple[str, ...], tuple[str, ...]]
     least: float
+    started: tuple[tuple[str, ...], ...]
     comparisons: tuple[CellComparison, ...] = ()
 
     @property
@@ -79,8 +87,27 @@ class ComparedRuns:
 
     def launches_below(self, fewest: int) -> bool:
         """Return True if a side has fewer launches; False for computed runs, which do not vary between launches."""
-        measured = any(pair.baseline[0].setting.get("mode") != "virtual" for pair in self.pairs)
-        return measured and self.launches < fewest
+        return self._measured and self.launches < fewest
+
+    @property
+    def _measured(self) -> bool:
+        return any(pair.baseline[0].setting.get("mode") != "virtual" for pair in self.pairs)
+
+    @property
+    def out_of_turn(self) -> str:
+        """Return how the sides do not take turns, so that a drift of the machine looks like a change; else empty.
+
+        They do if the side changes two thirds as often as in a random order, in the mean 2ab / (a + b) times (Wald and
+        Wolfowitz 1940): turns of one or two launches do, blocks of three do not.
+        """
+        a, b = map(len, self.started)
+        order = sorted((when, side) for side, launches in enumerate(self.started) for when in launches)
+        known = all(when for when, _ in order)
+        changes = sum(one != two for (_, one), (_, two) in pairwise(order)) if known else 1
+        if not self._measured or 3 * changes * (a + b) >= 4 * a * b:
+            return ""
+        turns = f"were not measured in turn ({a + b} launches, changes of side: {changes})"
+        return f"A and B {turns if known else _UNDATED}, so a drift of the machine looks like a change"
 
     @property
     def origins(self) -> Origins:
@@ -105,7 +132,15 @@ def open_comparison(
         raise UsageError(f"these are runs of {' and '.join(commands)}: name runs of one command")
     by = _comparable(commands[0])
     with fits(*runs):
-        sides = [[launch for run in side for launch in _launches(run, by.subjects(run))] for side in (baseline, other)]
+        dated = [
+            [
+                (str(run.manifest.get("started") or ""), each)
+                for run in side
+                for each in _launches(run, by.subjects(run))
+            ]
+            for side in (baseline, other)
+        ]
+        sides = [[launch for _, launch in side] for side in dated]
         found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
         metrics = {**by.metrics, **by_name(metric for run in runs for metric in by.run_metrics(run))}
     if (len(sides[0]) > 1) != (len(sides[1]) > 1):
@@ -121,7 +156,9 @@ def open_comparison(
         raise UnlikeRuns(f"cells of one name differ: {as_line(settings)}; `unlike` compares them anyway")
     if not pairs:
         raise UnlikeRuns(f"no cell is in every run: {', '.join(only[0])} against {', '.join(only[1])}")
-    return ComparedRuns(tuple(baseline), tuple(other), by, metrics, (*settings, *found), tuple(pairs), only, least)
+    started = tuple(tuple(when for when, _ in side) for side in dated)
+    differ = (*settings, *found)
+    return ComparedRuns(tuple(baseline), tuple(other), by, metrics, differ, tuple(pairs), only, least, started)
 
 
 def _launches(run: StoredRun, subjects: Iterable[Subject]) -> list[dict[str, Subject]]:
@@ -273,11 +310,9 @@ def _of_runs(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
         if codes := sorted({warning["code"] for warning in run.manifest.get("warnings", [])}):
             yield "warnings", f"{run.path} has warnings: {', '.join(codes)}", "read them in its manifest"
     if compared.launches_below(2):
-        yield (
-            "one-launch",
-            "one launch a side: the intervals do not include the variation between launches",
-            "measure both with --launches 5, or repeat the launches, A and B in turn, and name them with commas",
-        )
+        yield "one-launch", "one launch a side: the intervals do not include the variation between launches", IN_TURN
+    if out_of_turn := compared.out_of_turn:
+        yield "turns", out_of_turn, IN_TURN
 
 
 def _of_cells(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:

@@ -14,7 +14,7 @@ from typing import Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments import Metric
-from s2a_bench.report.compare.comparison import LEVEL, CellComparison, ComparedRuns, detectable, metric_of
+from s2a_bench.report.compare.comparison import IN_TURN, LEVEL, CellComparison, ComparedRuns, detectable, metric_of
 from s2a_bench.stats.change import FEWEST_LAUNCHES
 
 _FLAG: Final = "`fail_if`"
@@ -76,14 +76,12 @@ def judge(
     A gate trips if the change is past the limit *and* its p-value, corrected for all comparisons, is below `LEVEL`. It
     passes if the test finds a change of the limit's size, or found one in the other direction; else it is undecided.
     Below `FEWEST_LAUNCHES` a side it is undecided unless ``one_launch`` is true, as one does not show how launches
-    differ. With ``strict`` the change alone decides. Raises UsageError for an unknown cell.
+    differ; so it is where the sides do not take turns in time. With ``strict`` the change alone decides. Raises
+    UsageError for an unknown cell.
     """
-    too_few = (
-        f"{compared.launches} of the {FEWEST_LAUNCHES} launches that a side needs: measure both with --launches "
-        f"{FEWEST_LAUNCHES}, or --one-launch"
-        if compared.launches_below(FEWEST_LAUNCHES) and not one_launch
-        else ""
-    )
+    lacking = f"{out}: {IN_TURN}, or --strict" if (out := compared.out_of_turn) else ""
+    if compared.launches_below(FEWEST_LAUNCHES) and not one_launch:
+        lacking = f"{compared.launches} of the {FEWEST_LAUNCHES} launches that a side needs: {IN_TURN}, or --one-launch"
     judged = []
     for gate, wanted in zip(gates, concerned(compared, gates), strict=True):
         every = [one for one in compared.comparisons if (one.metric, one.statistic) == wanted]
@@ -93,24 +91,24 @@ def judge(
             raise UsageError(f"{_FLAG}: no cell with {wanted[0].name} is called '{gate.cells}'; there are {names}")
         for one in found:
             least = detectable(one.change, len(compared.comparisons), falls=not gate.rises)
-            outcome, reason = _outcome(gate, one, least, strict=strict, too_few=too_few)
+            outcome, reason = _outcome(gate, one, least, strict=strict, lacking=lacking)
             judged.append(Judgement(gate, one, outcome, reason, least))
     return judged
 
 
-def _outcome(gate: Gate, one: CellComparison, least: float | None, *, strict: bool, too_few: str) -> tuple[str, str]:
-    """Return outcome and reason; ``least`` is the smallest detectable change, ``too_few`` what launches lack."""
+def _outcome(gate: Gate, one: CellComparison, least: float | None, *, strict: bool, lacking: str) -> tuple[str, str]:
+    """Return outcome and reason; ``least`` is the smallest detectable change, ``lacking`` what the launches lack."""
     change, p_holm = one.change, one.p_holm
     rises = change.other > change.baseline
     past = gate.beyond(change.relative, rises)
     if strict:
         return TRIPPED if past else PASSED, ""
-    if too_few:
-        return UNDECIDED, too_few
+    if lacking:
+        return UNDECIDED, lacking
     significant = p_holm is not None and p_holm < LEVEL
     if past and significant:
         return TRIPPED, ""
     if (significant and rises != gate.rises) or (least is not None and least <= abs(gate.limit)):
         return PASSED, ""
     hidden = "too few values for a test" if least is None else "the noise may hide a change beyond the limit"
-    return UNDECIDED, f"{hidden}: measure more launches (--launches), compare less (--metric), or --strict"
+    return UNDECIDED, f"{hidden}: measure more launches in turn, compare less (--metric), or --strict"
