@@ -96,23 +96,40 @@ def test_a_probe_that_is_off_names_what_was_measured(monkeypatch: pytest.MonkeyP
         probed(type("Link", (), {"profile": load_link("4g")})())  # type: ignore[arg-type]
 
 
-def test_the_servers_side_has_the_usual_address_and_the_thread_returns_home() -> None:
+def test_the_manifest_has_both_directions_without_their_steps() -> None:
+    profile = load_link("rate=9,rate_cv=0.3,delay=4,seed=5")
+    facts = EmulatedLink(profile, 0, 0, None).facts()  # type: ignore[arg-type]
+    up, down = facts["directions"]
+    assert (up["steps"], down["steps"]) == ((), ())
+    assert (up["delay_ms"], up["seed"], down["seed"]) == (4, 10, 11)
+    assert facts["profile"]["rate_cv"] == 0.3
+
+
+def test_the_servers_side_has_the_usual_address_and_the_thread_returns_home(monkeypatch: pytest.MonkeyPatch) -> None:
     home = str(Path("/proc/thread-self/ns/net").readlink())
     seen: dict[str, Any] = {}
+
+    monkeypatch.setenv("ROS_STATIC_PEERS", "mine")
+    monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
 
     def use(link: EmulatedLink) -> None:
         seen["inside"] = str(Path("/proc/thread-self/ns/net").readlink())
         with link.server_side():
+            seen["server"] = str(Path("/proc/thread-self/ns/net").readlink())
             server = socket.create_server((SERVER, 0))
+        assert seen["inside"] == str(Path("/proc/thread-self/ns/net").readlink())
         with server, socket.create_connection(server.getsockname()) as client:
             seen["client"] = client.getsockname()[0]
         assert os.environ["ROS_STATIC_PEERS"] == "127.0.0.1;127.0.0.2"
+        assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
         assert link.statistics()["packets"] > 0
 
     on_link("delay=1", use)
     assert seen["client"] == CLIENT
     assert seen["inside"] != home == str(Path("/proc/thread-self/ns/net").readlink())
-    assert "ROS_STATIC_PEERS" not in os.environ
+    assert seen["server"] not in {seen["inside"], home}
+    assert os.environ["ROS_STATIC_PEERS"] == "mine"
+    assert "ROS_AUTOMATIC_DISCOVERY_RANGE" not in os.environ
 
 
 HOLD = """
