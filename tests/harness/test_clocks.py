@@ -237,6 +237,7 @@ class Elsewhere:
     wall_off_ns: int = 0
     """By how much its wall clock is off, and how much it says it may be."""
     wall_error_ns: int = 0
+    busy_ns: int = 2 * MS_NS
     asked: list[tuple[int, str]] = field(default_factory=list)
     fails: bool = False
 
@@ -252,7 +253,9 @@ class Elsewhere:
         self.asked.append((sent_ns, system))
         if self.fails:
             raise RequestFailed("gone")
-        came_ns, left_ns, seen_ns = sent_ns + 8 * MS_NS, sent_ns + 10 * MS_NS, sent_ns + 11 * MS_NS
+        came_ns = sent_ns + 8 * MS_NS
+        left_ns = came_ns + self.busy_ns
+        seen_ns = left_ns + MS_NS
         self.clock.sleep_until_ns(seen_ns)
         marks = [(stage, self.there(at)) for stage, at in (("network", came_ns), ("inference", left_ns))]
         frames = [] if frame_ns is None else [("", self.there(frame_ns)), ("decode", self.there(frame_ns + MS_NS))]
@@ -299,6 +302,20 @@ def test_a_report_on_this_hosts_clock_is_off_by_no_more_than_it_says(
         assert joined.error_ns > 4.49 * MS_NS  # half of both delays, which no exchange tells
         assert joined.error_ns < (5.5 if number else 8) * MS_NS
         assert min(joined.early_ns, joined.late_ns) >= joined.error_ns - 1
+
+
+@pytest.mark.parametrize("drift", [-0.09, 0.09])
+def test_a_request_alone_bounds_the_offset_from_its_first_to_its_last_stamp(
+    virtual: VirtualClock, drift: float
+) -> None:
+    """Its server is busy for so long that the clocks drift apart by more than both delays."""
+    server = Elsewhere(virtual, 10**12, drift, busy_ns=2 * SECOND_NS)
+    for _ in range(2):
+        sent_ns, trace = virtual.now_ns(), server.exchange()
+        joined = RemoteClock(server.exchange, None).join(trace, virtual.now_ns())
+        came_ns = sent_ns + 8 * MS_NS
+        for (_, stamp), true_ns in zip(trace.remote.marks, (came_ns, came_ns + 2 * SECOND_NS), strict=True):  # type: ignore[union-attr]
+            assert abs(stamp - true_ns) <= joined.error_ns
 
 
 @pytest.mark.parametrize("off", [-1, 0, 1])
