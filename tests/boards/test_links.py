@@ -130,6 +130,7 @@ def test_a_bound_is_the_delay_the_burst_and_the_rest_at_the_rate(up: Direction, 
 
 def test_a_link_has_only_what_its_profile_names_and_every_key_reaches_its_direction() -> None:
     assert LinkProfile().directions() == (Direction(math.inf, seed=0), Direction(math.inf, seed=1))
+    assert load_link("rate=5").directions() == (Direction(5, seed=0), Direction(5, seed=1))
     pairs = "up=3,down=9,delay=4,jitter=6,loss=2%,burst_kib=10,burst_mbps=50,queue_ms=70,seed=8"
     up, down = load_link(pairs).directions()
     assert up == Direction(3, 4, 6, 0.02, 10 * 1024, 50, 70, 16)
@@ -182,7 +183,7 @@ def test_a_trace_without_delay_and_loss_has_the_profiles_and_its_last_step_lasts
     assert (up.period_s, up.mbps, up.delay_ms) == (7, 30, 3)
     path.write_text("t_s,up_mbps,down_mbps,loss\n0,10,20,1\n")
     assert load_link(str(path)).directions()[0].period_s == 1
-    for row in ("0,1,1\n1,1,1\n1,1,1", "1e10,1,1", "0,1000001,1", "0,1"):
+    for row in ("0,1,1\n1,1,1\n1,1,1", "0,1,1\\n1000000000.5,1,1", "0,1000000.5,1", "0,1"):
         path.write_text(f"t_s,up_mbps,down_mbps\n{row}\n")
         with pytest.raises(UsageError, match="link trace"):
             load_link(str(path)).directions()

@@ -100,6 +100,7 @@ PACKET = 1500 / room.HEADERS
         (80, 12, 249 + 80, 0, 0),  # idle for no more than the timeout: 200 ms and a round trip
         (80, 12, 251 + 80, 0, 50 - 25),  # halved: of 80 packets the link holds 50
         (80, 12, 501 + 80, 0, (50 - 12) + (50 - 24)),  # halved twice, if what this adds left it that idle
+        (3000, 240, 251 + 150, 0, 50 - 25),  # the link holds 1,000 of them
         (80, 12, 600 + 80, 50 - 27, (50 - 12) + (50 - 24)),  # a quarter of 80 and 27
     ],
 )
@@ -107,7 +108,7 @@ def test_after_idle_a_body_waits_for_the_rest_of_each_round_trip_that_its_window
     packets: int, mbps: float, period_ms: float, least_ms: float, most_ms: float
 ) -> None:
     link, size = (Direction(mbps, 25), Direction(mbps, 25)), (packets - 0.001) * PACKET
-    assert tcp_adds_ms(size, link, period_ms, CUBIC) == pytest.approx((least_ms, most_ms), abs=0.1)
+    assert tcp_adds_ms(size, link, period_ms, CUBIC) == pytest.approx((least_ms, most_ms), abs=1e-6)
     assert tcp_adds_ms(size, link, period_ms, replace(CUBIC, slow_start_after_idle=False)) == (0, 0)
     assert tcp_adds_ms(size, link, 0, CUBIC) == (0, 0)
     assert tcp_adds_ms(size, link, period_ms, BBR) == tcp_adds_ms(size, link, 0, BBR)
@@ -331,9 +332,9 @@ def test_a_prediction_by_hand(monkeypatch: pytest.MonkeyPatch) -> None:
     with_lines(monkeypatch, pipeline, tcp=replace(CUBIC, slow_start_after_idle=False))
     config = AdviseConfig(link="rate=4/8,delay=3,jitter=2", rate=20, size=(100, 100), cameras=2)
     (one,), *_ = advise(config)
-    link_ms = 10 * room.HEADERS + 2 * 3 + 2 * 1
+    link_ms = 10 * 1500 / 1448 + 2 * 3 + 2 * 1
     assert (one.bound_ms, one.link_ms) == (pytest.approx(16), pytest.approx(link_ms))
-    assert one.load == pytest.approx(0.2 * room.HEADERS)
+    assert one.load == pytest.approx(0.2 * 1500 / 1448)
     assert one.wait_ms == pytest.approx(waiting_ms(one.load, 10 * room.HEADERS))
     assert one.e2e_ms == pytest.approx(4.6 + link_ms)
     reach_ms = 0.1 * math.sqrt(4.6**2 + 0.5 + 2 * 0.25 * 0.06 + 0.06**2)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import socket
+import struct
 import subprocess
 import sys
 from collections.abc import Callable
@@ -25,6 +27,7 @@ from s2a_bench.harness.links import CLIENT, SERVER, EmulatedLink, emulated
 from s2a_bench.harness.links.probe import Found, probed
 from s2a_bench.report.advise.prediction import HEADERS, Tcp, tcp_adds_ms
 
+SIOCGIFTXQLEN = 0x8942
 MAKE = """
 import fcntl, os, struct
 fcntl.ioctl(os.open("/dev/net/tun", os.O_RDWR), 0x400454CA, struct.pack("16sH22x", b"tried", 0x1001))
@@ -135,6 +138,11 @@ def test_the_servers_side_has_the_usual_address_and_the_thread_returns_home(monk
             seen["server"] = str(Path("/proc/thread-self/ns/net").readlink())
             server = socket.create_server((SERVER, 0))
         assert seen["inside"] == str(Path("/proc/thread-self/ns/net").readlink())
+        with socket.socket() as any_socket:
+            asked = fcntl.ioctl(any_socket, SIOCGIFTXQLEN, struct.pack("16si20x", b"link", 0))
+        seen["queue"] = struct.unpack("16si20x", asked)[1]
+        ipv6 = Path("/proc/sys/net/ipv6/conf/all/disable_ipv6")
+        assert not ipv6.exists() or ipv6.read_text().strip() == "1"
         with server, socket.create_connection(server.getsockname()) as client:
             seen["client"] = client.getsockname()[0]
         assert os.environ["ROS_STATIC_PEERS"] == "127.0.0.1;127.0.0.2"
@@ -144,6 +152,7 @@ def test_the_servers_side_has_the_usual_address_and_the_thread_returns_home(monk
     on_link("delay=1", use)
     assert seen["client"] == CLIENT
     assert seen["inside"] != home == str(Path("/proc/thread-self/ns/net").readlink())
+    assert seen["queue"] == 10_000
     assert seen["server"] not in {seen["inside"], home}
     assert os.environ["ROS_STATIC_PEERS"] == "mine"
     assert "ROS_AUTOMATIC_DISCOVERY_RANGE" not in os.environ

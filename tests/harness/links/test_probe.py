@@ -196,6 +196,7 @@ def test_the_rate_is_offered_for_a_second_and_a_burst_after_its_credit_has_grown
     probe = room._Probe(link, None)  # type: ignore[arg-type]
     probe._rate("up", ways[0], sender, receiver)  # type: ignore[arg-type]
     bytes_sent = sum(size for _, _, size in net.sent)
+    assert {size for _, _, size in net.sent} == {15_000}
     spent_ns = net.sent[-1][1] - net.sent[0][1]
     assert bytes_sent == pytest.approx(1.15 * 20 * 125e3, rel=0.01)
     assert spent_ns == pytest.approx(1e9, rel=0.02)
