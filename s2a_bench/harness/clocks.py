@@ -137,10 +137,13 @@ class Offset:
         return reduce(Interval.__or__, map(self._at, times_ns))
 
     def _at(self, at_ns: int) -> Interval:
-        end_ns = min(at_ns + WINDOW_NS // 2, self._exchanges[-1].seen_ns)
-        first_ns = end_ns - WINDOW_NS
-        near = [each for each in [*self._exchanges] if each.seen_ns >= first_ns and each.sent_ns <= end_ns]
-        return interval_at(at_ns, near)
+        last_ns = self._exchanges[-1].seen_ns
+        near = self._until(min(at_ns + WINDOW_NS // 2, last_ns))
+        return interval_at(at_ns, near or self._until(last_ns))  # a frame may be far older than all exchanges
+
+    def _until(self, end_ns: int) -> list[Exchange | Bounded]:
+        """Return the exchanges within `WINDOW_NS` before a time."""
+        return [e for e in [*self._exchanges] if e.seen_ns >= end_ns - WINDOW_NS and e.sent_ns <= end_ns]
 
 
 def interval_at(at_ns: int, exchanges: Sequence[Exchange | Bounded]) -> Interval:

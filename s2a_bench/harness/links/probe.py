@@ -94,7 +94,7 @@ class _Probe:
         there_ms = self._round_trips(self._client, self._server)
         here_ms = self._round_trips(self._beside, self._server)
         if there_ms:
-            usual_ms = sum(way.usual_ms + 8e-3 * SMALL_BYTES / way.mbps for way in (up, down)) / 2
+            usual_ms = sum(1e3 * way.least_s(SMALL_BYTES) + way.jitter_ms / 2 for way in (up, down)) / 2
             added_ms = (median(there_ms) - median(here_ms)) / 2
             yield Found("added one-way delay", "ms", usual_ms, added_ms, DELAY_OFF_MS + OFF * usual_ms)
         for name, way, sender, receiver in ways:

@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import asdict
+from random import Random
 from statistics import mean
 
 import pytest
@@ -9,7 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.boards.links import Direction, Step
-from s2a_bench.harness.links.relay import Shaper
+from s2a_bench.harness.links import relay as room
+from s2a_bench.harness.links.relay import Relay, Shaper
 
 
 def test_packets_queue_for_the_rate_and_then_take_the_delay() -> None:
@@ -83,3 +92,158 @@ def test_a_trace_repeats_waits_out_its_outages_and_has_its_own_delay_and_loss() 
     assert [shaper.due_s(0.0, 1500) for _ in range(3)] == pytest.approx([0.001, 0.002, 0.0035], abs=1e-6)
     assert shaper.due_s(0.0135, 1500) == pytest.approx(0.015, abs=1e-6)
     assert shaper.due_s(0.0195, 1500) is None
+
+
+def test_a_trace_carries_the_bytes_of_its_steps_and_asks_for_nothing_in_an_outage() -> None:
+    """Counted by hand over two periods: 1,500 bytes a ms for 2.2 ms, an outage until 5 ms, then 3,000 bytes a ms."""
+    steps = (Step(0.0, 12.0, 2.0, 0.0), Step(0.0022, 0.0, 1.0, 0.0), Step(0.005, 24.0, 0.0, 0.0))
+    shaper = Shaper(Direction(24.0, steps=steps, period_s=0.01, queue_ms=1e6))
+    left_ms = [1, 2, *(5.4 + each / 2 for each in range(10)), 10.8, 11.8, *(15.3 + each / 2 for each in range(10))]
+    dues_ms = [1e3 * (shaper.due_s(0.0, 1500) or 0) for _ in left_ms]
+    assert dues_ms == pytest.approx([each + 2 for each in left_ms], abs=1e-4)
+    late = Shaper(Direction(24.0, steps=steps, period_s=0.01, queue_ms=1e6))
+    assert late.due_s(0.0025, 3000) == pytest.approx(0.006 + 0.001, abs=1e-6)
+    assert late.due_s(1.008, 1500) == pytest.approx(1.0085, abs=1e-6)
+
+
+def test_packets_that_are_lost_or_dropped_are_counted_apart() -> None:
+    shaper = Shaper(Direction(12.0, loss=0.5, seed=3, queue_ms=4))
+    random = Random(3)
+    lost = 0
+    for _ in range(40):
+        chance = random.random() < 0.5
+        due_s = shaper.due_s(0.0, 1500)
+        lost += chance
+        assert due_s is None or not chance
+    assert (shaper.lost, shaper.dropped) == (lost, 40 - lost - 5)
+
+
+class Devices:
+    """Pairs of sockets as a relay's two devices, in virtual time; ``sends`` are (ms, sending side, packet)."""
+
+    def __init__(self, stack: ExitStack, patch: pytest.MonkeyPatch, sends: list[tuple[float, int, bytes]]) -> None:
+        pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(3)]
+        for each in (each for pair in pairs for each in pair):
+            stack.enter_context(each).setblocking(False)
+        (self.client, client), (self.server, server), (self.control, control) = pairs
+        self.ns, self._sends, self._end = 10**9, sorted(sends), control.fileno()
+        self.seen: list[tuple[float, str, bytes]] = []
+        patch.setattr(room, "now_ns", lambda: self.ns)
+        patch.setattr(room, "select", self.select)
+        self.devices = [client.fileno(), server.fileno()]
+
+    def select(
+        self, readers: list[int], _: object, __: object, wait_s: float | None
+    ) -> tuple[list[int], list[int], list[int]]:
+        """Keep what was delivered, then go to the next packet that is sent, or is due."""
+        assert readers == [*self.devices, self._end]
+        for name, end in (("client", self.client), ("server", self.server)):
+            while True:
+                try:
+                    self.seen.append(((self.ns - 10**9) / 1e6, name, end.recv(4096)))
+                except BlockingIOError:
+                    break
+        next_ns = 10**9 + round(1e6 * self._sends[0][0]) if self._sends else None
+        if wait_s is not None and (next_ns is None or self.ns + wait_s * 1e9 < next_ns):
+            self.ns += max(1, round(wait_s * 1e9))
+            return [], [], []
+        if next_ns is None:
+            return [self._end], [], []
+        self.ns = next_ns
+        at_ms, side, _ = self._sends[0]
+        while self._sends and self._sends[0][:2] == (at_ms, side):
+            (self.client, self.server)[side].send(self._sends.pop(0)[2])
+        return [self.devices[side]], [], []
+
+
+def packet(number: int, size: int = 1500, version: int = 4) -> bytes:
+    return bytes([version << 4 | 5, number]) + bytes(size - 2)
+
+
+@pytest.fixture
+def stack() -> Iterator[ExitStack]:
+    with ExitStack() as made:
+        yield made
+
+
+def test_the_relay_delivers_each_packet_to_the_other_side_when_it_is_due(
+    stack: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sends = [(0.0, 0, packet(1)), (0.0, 0, packet(2)), (0.5, 1, packet(3)), (1.0, 1, packet(4, version=6))]
+    sends += [(30.0, 0, packet(5, 750))]
+    made = Devices(stack, monkeypatch, sends)
+    up, down = Direction(12.0, delay_ms=5), Direction(24.0, delay_ms=1)
+    relay = Relay(made.devices, [asdict(up), asdict(down)])
+    assert relay.facts()["late_ms"] == {"median": 0.0, "p99": 0.0}
+    relay.run_until(made._end)
+    assert [(name, data[1]) for _, name, data in made.seen] == [
+        ("client", 3),
+        ("server", 1),
+        ("server", 2),
+        ("server", 5),
+    ]
+    assert [at_ms for at_ms, _, _ in made.seen] == pytest.approx([2, 6, 7, 35.5], abs=1e-4)
+    assert [len(data) for _, _, data in made.seen] == [1500, 1500, 1500, 750]
+    facts = relay.facts()
+    assert (facts["packets"], facts["lost"], facts["dropped"]) == (4, 0, 0)
+    assert 0 <= facts["late_ms"]["median"] <= facts["late_ms"]["p99"] < 1e-3
+
+
+def test_the_relay_counts_what_was_lost_dropped_and_late(stack: ExitStack, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Devices(stack, monkeypatch, [(0.0, 0, packet(each)) for each in range(9)])
+    relay = Relay(made.devices, [asdict(Direction(12.0, queue_ms=3.5)), asdict(Direction(12.0, loss=0.999))])
+    made._sends += [(1.0, 1, packet(9))]
+    relay.run_until(made._end)
+    assert [data[1] for _, _, data in made.seen] == [0, 1, 2, 3]
+    facts = relay.facts()
+    assert (facts["packets"], facts["lost"], facts["dropped"]) == (4, 1, 5)
+    relay._late_s.extend([0.001] * 94 + [0.5])
+    assert relay.facts()["late_ms"] == {"median": 1, "p99": 500}
+    held = Relay(made.devices, [asdict(Direction(12.0)), asdict(Direction(12.0))])
+    monkeypatch.setattr(room, "MOST_HELD", 2)
+    made._sends, made.seen = [(9.0, 0, packet(each)) for each in range(4)], []
+    held.run_until(made._end)
+    assert [data[1] for _, _, data in made.seen] == [0, 1]
+
+
+def test_one_device_has_its_turn_while_the_other_sends_without_end(
+    stack: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At most some packets are read at once, then what is due is delivered."""
+    made = Devices(stack, monkeypatch, [])
+    relay = Relay(made.devices, [asdict(Direction(float("inf")))] * 2)
+    for each in range(room.AT_ONCE + 6):
+        made.client.send(packet(each))
+    relay._take(made.devices[0])
+    assert relay.facts()["packets"] == room.AT_ONCE
+    relay._take(made.devices[0])
+    assert relay.facts()["packets"] == room.AT_ONCE + 6
+
+
+def test_the_program_carries_packets_in_its_order_and_ends_with_its_input() -> None:
+    pairs = [socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET) for _ in range(2)]
+    (client, one), (server, two) = pairs
+    ways = [asdict(Direction(float("inf"), delay_ms=3)), asdict(Direction(float("inf"), delay_ms=2))]
+    with client, server, one, two:
+        devices = [one.fileno(), two.fileno()]
+        with subprocess.Popen(
+            [sys.executable, "-m", "s2a_bench.harness.links.relay"],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=devices, text=True,
+        ) as program:  # fmt: skip
+            assert program.stdin
+            assert program.stdout
+            program.stdin.write(json.dumps({"devices": devices, "directions": ways}) + "\n")
+            program.stdin.flush()
+            assert json.loads(program.stdout.readline()) == {"address": ""}
+            for way in ((client, server), (server, client)):
+                for each in (1, 2):
+                    way[0].send(packet(each))
+                assert [way[1].recv(2048)[1] for _ in range(2)] == [1, 2]
+            for _ in range(2):
+                program.stdin.write("\n")
+                program.stdin.flush()
+                facts = json.loads(program.stdout.readline())
+                assert (facts["packets"], facts["lost"], facts["dropped"]) == (4, 0, 0)
+                assert facts["late_ms"]["median"] >= 0
+            program.stdin.close()
+            assert program.wait(60) == 0
