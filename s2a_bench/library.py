@@ -14,7 +14,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
-from s2a_bench.errors import UsageError
+from s2a_bench.errors import S2AError, UsageError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, experiment_of, write_shown
 from s2a_bench.machine import tuning
 from s2a_bench.options import Options, placed
@@ -110,13 +110,15 @@ class Run:
         return self._shown.json()
 
     def save(self) -> Path:
-        """Write tables and figures into the run folder, as the command does, and return its path."""
+        """Write tables and figures into the run folder, as the command does; raises S2AError for those that fail."""
         write_shown(self._run, self._shown)
+        if failures := self._shown.failures:
+            raise S2AError(f"all but this is written: {'; '.join(dict.fromkeys(failures))}")
         return self.path
 
     def _one(self, known: Mapping[str, Known], kind: str, name: str) -> Known:
         if name not in known:
-            names = ", ".join(known) or "none"
+            names = "; ".join((", ".join(known) or "none", *self._shown.failures))
             raise UsageError(f"a {self.manifest['command']} run has no {kind} '{name}', only {names}")
         return known[name]
 

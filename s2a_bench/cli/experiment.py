@@ -14,7 +14,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from s2a_bench.cli import output as terminal
 from s2a_bench.cli.adapter import HELP_ALL, build, command, flags_named
-from s2a_bench.cli.output import Json, print_json, print_line
+from s2a_bench.cli.output import Json, print_failures, print_json, print_line
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, write_shown
 from s2a_bench.text import like
@@ -151,13 +151,15 @@ def command_of(experiment: Experiment) -> Callable[..., None]:
             for warning in kept.manifest["warnings"]:
                 progress.say(f"warning [{warning['code']}]: {warning['message']}; {warning['advice']}")
             if json_:
-                print_json(shown.json())
+                with shown.noted("--json"):
+                    print_json(shown.json())
             else:
                 present(kept, shown, verbose=verbose)
         except (S2AError, KeyboardInterrupt):
             if progress.folder is not None and progress.folder.exists():
                 progress.say(f"{experiment.unit} so far: {progress.folder}")
             raise
+        print_failures((kept.path, shown.failures))
 
     return command(run, *options_of(experiment), about=experiment.about)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -52,3 +54,12 @@ def print_line(line: str, to: Console | None = None) -> None:
 
 def print_error(line: str) -> None:
     print(shown(line), file=sys.stderr)  # noqa: T201 - the command line's own output
+
+
+def print_failures(*runs: tuple[Path, Sequence[str]]) -> None:
+    """Print what of these run folders could not be built; the exit code is 1 if there is anything."""
+    for folder, failures in runs:
+        for failure in failures:
+            print_error(f"error: {failure}; all else is written; once it is fixed, s2a-bench report {folder} shows it")
+    if any(failures for _, failures in runs):
+        raise typer.Exit(1)

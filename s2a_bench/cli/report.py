@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from s2a_bench.cli.adapter import command
-from s2a_bench.cli.output import Json, print_error, print_json, print_line, print_table
+from s2a_bench.cli.output import Json, print_error, print_failures, print_json, print_line, print_table
 from s2a_bench.errors import TRIPPED, UNDECIDED
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.requests import cells_of
@@ -81,6 +81,8 @@ def _report(config: ReportConfig) -> None:
             inside = sum(path in (each, *each.parents) for each in written)
             count = f", {inside} files" if inside > 1 else ""
             print_line(f"{what}: {path}{count}")
+    whole = [chapter for chapter in found.chapters if chapter.manifest.get("state") == "finished"]
+    print_failures(*((chapter.run.path, chapter.content.failures) for chapter in whole))
 
 
 report = command(_report, ReportConfig)

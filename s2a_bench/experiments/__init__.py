@@ -16,13 +16,15 @@ packages offer experiments as entry points of the group ``s2a_bench.experiments`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, TypeVar
 
+from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.registry import Registry
 from s2a_bench.store.schema import Facts
 
@@ -41,6 +43,8 @@ TIME, COUNT, FLAG, SHARE, NUMBER = "time", "count", "flag", "share", "number"
 Better: TypeAlias = Literal["lower", "higher", "neither"]
 Rows: TypeAlias = "list[NDArray[np.float64]]"
 """The values of a metric: one array a request or plan, in the order in which they were made."""
+Tables: TypeAlias = "dict[str, Callable[[], TextTable | None]]"
+"""What builds the tables of a run, by their names; None is no table."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +127,29 @@ class Shown:
     figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     json: Callable[[], dict[str, Any]] = dict
     lanes: Sequence[Any] = ()
+    failures: list[str] = field(default_factory=list)
+    """What could not be built, each with its error; a figure that cannot be drawn adds its own."""
+
+    @contextmanager
+    def noted(self, what: str) -> Iterator[None]:
+        """Keep an error in the block as a failure; wrong usage, a damaged store and a closed output are raised."""
+        try:
+            yield
+        except (UsageError, StoreError, BrokenPipeError):
+            raise
+        except Exception as error:  # noqa: BLE001 - no table or figure loses the others
+            self.failures.append(f"{what}: {type(error).__name__}: {error}")
+
+    @classmethod
+    def build(cls, tables: Tables, main: Sequence[str], *, json: Callable[[], Any] = dict, **others: Any) -> Shown:
+        """Call what builds each table and each of the ``others``, so that an error in one leaves the rest."""
+        shown = cls(json=json)
+        found: dict[str, Any] = {}
+        for name, build in {**{f"table {name}": build for name, build in tables.items()}, **others}.items():
+            with shown.noted(name):
+                found[name] = build()
+        texts = {name: table for name in tables if (table := found.pop(f"table {name}", None))}
+        return replace(shown, tables=texts, main=[name for name in main if name in texts], **found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +201,9 @@ class Experiment:
         """Return what one of its runs shows; every table and figure names the origin of its numbers."""
         from s2a_bench.writers.figures import marked
 
-        shown: Shown = resolve_name(self.view)(run, **options)
+        shown: Shown = Shown()
+        with shown.noted("tables and figures"):
+            shown = resolve_name(self.view)(run, **options)
         line = run.origins.line
         tables = {name: replace(table, provenance=table.provenance or line) for name, table in shown.tables.items()}
         figures = {name: partial(marked, build, run) for name, build in shown.figures.items()}
@@ -212,7 +241,7 @@ def write_shown(run: StoredRun, shown: Shown) -> None:
     if shown.figures:
         from s2a_bench.writers.figures import save
 
-        save(run.path / "figures", shown.figures)
+        save(run.path / "figures", shown.figures, shown.noted)
 
 
 def experiment_of(command: str) -> Experiment | None:

@@ -7,9 +7,10 @@ A figure has a caption, a title and notes in plain text, that is not drawn: the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from s2a_bench.errors import StoreError
 from s2a_bench.provenance import joined
@@ -185,20 +186,18 @@ def marked(build: Callable[[], Figure], *runs: StoredRun) -> Figure:
     return figure
 
 
-def save(folder: Path, builders: Mapping[str, Callable[[], Figure]]) -> list[Path]:
+def save(folder: Path, builders: Mapping[str, Callable[[], Figure]], noted: Callable[[str], Any] = nullcontext) -> None:
     """Write each figure as .png and .pdf, and ``captions.md``; raises StoreError, ValueError for one not `marked`."""
-    written, captions = [], []
+    captions = []
     try:
         folder.mkdir(exist_ok=True)
         for name, build in builders.items():
-            with paper_column():
+            with noted(f"figure {name}"), paper_column():
                 figure = build()
                 required(name, figure.get_suptitle())
                 captions.append(f"**{name}**: {markdown_caption(figure)}\n")
                 for suffix in ("png", "pdf"):
-                    written.append(folder / f"{name}.{suffix}")
-                    figure.savefig(written[-1])
+                    figure.savefig(folder / f"{name}.{suffix}")
         (folder / "captions.md").write_text("\n".join(captions), encoding="utf-8")
     except OSError as error:
         raise StoreError(f"cannot write {folder}: {why(error, folder)}; the samples are kept") from error
-    return written

@@ -69,3 +69,38 @@ def test_wrong_use_is_one_line(timeline: Path, tmp_path: Path, arguments: list[s
     filled = [each.format(here=tmp_path, run=timeline) for each in arguments]
     assert message.format(here=tmp_path) in refused("report", *filled, code=code)
     assert (tmp_path / "mine.html").read_text() == "mine"
+
+
+SHOWN = "s2a_bench.experiments.timeline.view"
+
+
+@pytest.mark.parametrize(
+    ("broken", "what", "kept"),
+    [
+        (f"{SHOWN}.tables.skill_table", "table skills", "tables/motion.md"),
+        (f"{SHOWN}.tables.timeline_csv", "csvs", "tables/motion.md"),
+        (f"{SHOWN}.figures.new_figure", "figure timeline", "tables/motion.md"),
+        (f"{SHOWN}.tables.timelines_json", "--json", "figures/timeline.png"),
+    ],
+)
+def test_what_cannot_be_shown_is_one_line_and_the_rest_is_written(
+    broken: str, what: str, kept: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise KeyError("source")
+
+    monkeypatch.setattr(broken, fails)
+    small = ("--profile", "jetson-agx-orin", "--tokens-per-skill", "6", "--output", "runs")
+    done = called("timeline", *small, *(["--json"] if what == "--json" else []), code=1)
+    (run,) = Path("runs").iterdir()
+    line = f"error: {what}: KeyError: 'source'; all else is written; once it is fixed, s2a-bench report {run} shows it"
+    assert done.stderr.splitlines()[-1] == line
+    assert (run / kept).exists()
+    if what == "--json":
+        return
+    done = called("report", run, "--output", "page.html", "--csv", "csv", code=1)
+    assert done.stderr == line.replace(str(run), str(run.resolve())) + "\n"
+    page = Path("page.html").read_text()
+    assert "Waiting" in page
+    assert ("queue wait<" in page) == (what != "table skills")
+    assert Path("csv").exists() == (what != "csvs")

@@ -23,7 +23,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     scenes_of,
     share_of,
 )
-from s2a_bench.experiments.ccrb.view.tables import ccrb_json, ccrb_tables, findings, show
+from s2a_bench.experiments.ccrb.view.tables import ccrb_json, findings, show
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.labels import MARK, NO_SCORE
 from s2a_bench.scenario.ccrb.options import CcrbOptions
@@ -90,7 +90,7 @@ def test_a_rear_outcome_behind_which_no_ego_is_safe_says_nothing(
 ) -> None:
     run = made(scenario=CcrbOptions(follower=follower))
     assert all(cell["follower_survives"] is passes for cell in cells_of(run))
-    table = ccrb_tables(run)["outcomes"]
+    table = show(run).tables["outcomes"]
     marked = [row[1] for row in table.rows if MARK in row[1]]
     assert marked == ([] if passes else [f"hit from behind {MARK}"] * 2)
     assert any("rear outcomes say nothing" in note for note in table.notes) is not passes
@@ -104,7 +104,7 @@ def test_the_diagram_says_where_the_follower_passes_its_check(made: Callable[...
     )
     assert hybrid < 0.3
     assert careful > 0.7
-    rows = {row[0]: row[1] for row in ccrb_tables(made(scenario=CcrbOptions(follower="careful"), **GRID))["phase"].rows}
+    rows = {row[0]: row[1] for row in show(made(scenario=CcrbOptions(follower="careful"), **GRID)).tables["phase"].rows}
     assert rows["follower survives fast tokens"] == f"{careful:.1%}"
 
 
@@ -180,7 +180,7 @@ def test_the_metrics_are_keys_of_the_cells_and_columns_of_the_tables(made: Calla
     run = made()
     keys = {key for cell in ccrb_json(run)["cells"] for key in cell}
     assert {metric.name for metric in METRICS} <= keys
-    tables = ccrb_tables(run)
+    tables = show(run).tables
     assert tables["outcomes"].header[2:4] == ("start s", "stalls")
     assert tables["margins"].header[4] == "RMS jerk m/s\N{SUPERSCRIPT THREE}"
     assert tables["outcomes"].rows[0][:4] == ("naive", "hit from behind", "1.75", "4")

@@ -41,7 +41,7 @@ def run(tmp_path: Path, make_row: Callable[..., SampleRow]) -> StoredRun:
 def test_a_metric_is_added_in_one_place_and_is_nowhere_without_it(run: StoredRun) -> None:
     assert "token_late" not in compared().metrics
     assert "token_late_ms" not in latency_json(run)["cells"][0]
-    assert "late median" not in latency_tables(run)["tokens"].header
+    assert "late median" not in latency_tables(run)["tokens"]().header
     metrics = (*METRICS, LATE)
     (subject,) = compared(metrics).subjects(run)
     assert [row.tolist() for row in subject.rows("token_late")] == [[2.0] * 3, [4.0] * 3]
@@ -51,5 +51,5 @@ def test_a_metric_is_added_in_one_place_and_is_nowhere_without_it(run: StoredRun
     assert "token_late_ms" in {field.name for field in fields(latency_cell(metrics))}
     rows = {str(row[1]): row for row in latency_csv(run, metrics)["summary.csv"].rows}
     assert rows["token_late_ms"][4:6] == (6, 3.0)
-    table = latency_tables(run, metrics)["tokens"]
+    table = latency_tables(run, metrics)["tokens"]()
     assert (table.header[-1], table.rows[0][-1]) == ("late median", "3.00")

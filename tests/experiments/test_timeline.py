@@ -21,7 +21,7 @@ from s2a_bench.experiments.timeline.build_rows import timeline_rows
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import recordings, run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
-from s2a_bench.experiments.timeline.view.tables import timeline_tables
+from s2a_bench.experiments.timeline.view.tables import show
 from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, settings
 from s2a_bench.harness.timelines.policies import draw, learn
 from s2a_bench.harness.timelines.rows import KEPT_PLANS
@@ -235,7 +235,7 @@ def test_recorded_answers_calibrate(tmp_path: Path, slower: int) -> None:
     assert found["plans"] == 120
     assert run.manifest["configuration"]["calibrate"] == str(folder)
     codes = [each["code"] for each in run.manifest["warnings"]]
-    notes = " ".join(timeline_tables(run)["timelines"].notes)
+    notes = " ".join(show(run).tables["timelines"].notes)
     assert ("not-exchangeable" in codes) == ("No promise about stalls" in notes) == bool(slower)
     assert ("of the plans stall on average" in notes) == (not slower)
 
@@ -326,7 +326,7 @@ def test_a_guarantee_is_kept_with_the_calibration_and_said(tmp_path: Path) -> No
     for guarantee in ("high-confidence", "expected"):
         run = ran(JITTERY.but(guarantee=guarantee, plans=20), tmp_path / guarantee)
         (found[guarantee],) = run.manifest["calibrations"].values()
-        notes = " ".join(timeline_tables(run)["timelines"].notes)
+        notes = " ".join(show(run).tables["timelines"].notes)
         assert f"--guarantee {guarantee}" in notes
         assert f"{found[guarantee]['expected_risk']:.2%} of the plans stall on average" in notes
     assert found["expected"]["expected_risk"] == 4 / 401

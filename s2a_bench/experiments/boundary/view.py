@@ -35,12 +35,12 @@ _TRIALS: Final[dict[str, dict[str, Any]]] = {
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
-    return Shown(
-        sentences=_boundary_sentences(run),
-        tables={"boundary": line_table(run), "boards": board_table(run)},
+    return Shown.build(
+        sentences=partial(_boundary_sentences, run),
+        tables={"boundary": partial(line_table, run), "boards": partial(board_table, run)},
         main=["boards"],
-        csvs=boundary_csv(run),
-        figures={"boundary": partial(build_boundary, run)},
+        csvs=partial(boundary_csv, run),
+        figures=lambda: {"boundary": partial(build_boundary, run)},
         json=lambda: frame(run, list(_cells(run)), []),
     )
 

@@ -41,12 +41,12 @@ CapacityCell = cell_of_row("CapacityCell", "N robots on one server.", FleetRow, 
 def show(run: StoredRun, **_: Any) -> Shown:
     """Return what a capacity run shows."""
     fleets = _fleets(run)
-    return Shown(
-        sentences=[*_knee_sentences(run), *_parted(run)],
-        tables={"capacity": _table(run, MAIN), "robots": _table(run, REST)},
+    return Shown.build(
+        sentences=lambda: [*_knee_sentences(run), *_parted(run)],
+        tables={"capacity": partial(_table, run, MAIN), "robots": partial(_table, run, REST)},
         main=["capacity"],
-        csvs={"capacity.csv": CsvTable.of(fleets[0] if fleets else (), (tuple(row.values()) for row in fleets))},
-        figures={"capacity": partial(build_capacity, run)} if _panels(_drawn(fleets)) else {},
+        csvs=lambda: {"capacity.csv": CsvTable.of(fleets[0] if fleets else (), (row.values() for row in fleets))},
+        figures=lambda: {"capacity": partial(build_capacity, run)} if _panels(_drawn(fleets)) else {},
         json=lambda: frame(run, [present(CapacityCell(**row)) for row in fleets], [], knees=_rows(run, KNEES)),
     )
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments import Shown
+from s2a_bench.experiments import Shown, Tables
 from s2a_bench.experiments.paper import paper_throughput
 from s2a_bench.experiments.requests import (
     OF_ANSWERS,
@@ -47,12 +47,12 @@ _REFERENCE_FILL: Final = "#FFFFFF"
 
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
-    return Shown(
-        sentences=throughput_sentences(run),
+    return Shown.build(
+        sentences=lambda: throughput_sentences(run),
         tables=throughput_tables(run),
         main=["throughput", "prompt"],
-        csvs=throughput_csv(run),
-        figures=throughput_figures(run, against_paper=against == "paper"),
+        csvs=lambda: throughput_csv(run),
+        figures=lambda: throughput_figures(run, against_paper=against == "paper"),
         json=lambda: throughput_json(run),
     )
 
@@ -72,11 +72,13 @@ def throughput_sentences(run: StoredRun) -> list[str]:
     return sentences or ["No request was answered; samples.csv says why."]
 
 
-def throughput_tables(run: StoredRun) -> dict[str, TextTable]:
-    tables = {"throughput": speed_table(run), "prompt": _prompt_table(run), "gaps": _gap_table(run)}
-    if positions := position_table(run):
-        tables["positions"] = positions
-    return tables
+def throughput_tables(run: StoredRun) -> Tables:
+    return {
+        "throughput": lambda: speed_table(run),
+        "prompt": lambda: _prompt_table(run),
+        "gaps": lambda: _gap_table(run),
+        "positions": lambda: position_table(run),
+    }
 
 
 def speed_table(run: StoredRun) -> TextTable:

@@ -58,7 +58,7 @@ class EmulatedLink:
     def facts(self) -> dict[str, Any]:
         """Return what the manifest records of the profile."""
         directions = [asdict(replace(way, steps=())) for way in self.directions]
-        return {"profile": self.profile.model_dump(exclude_defaults=True), "directions": directions}
+        return {"profile": self.profile.model_dump(exclude_none=True), "directions": directions}
 
     def statistics(self) -> dict[str, Any]:
         """Return what the relay carried and lost, and how late it was."""

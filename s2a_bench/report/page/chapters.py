@@ -88,6 +88,7 @@ def _chapter(run: StoredRun, title: str, against_paper: bool, **more: Any) -> Ch
     try:
         with fits(run):
             content = content_of(run, against_paper=against_paper)
+        caveats += [f"Not shown: {failure}." for failure in content.failures if caveats]
     except StoreError:
         if not caveats:
             raise

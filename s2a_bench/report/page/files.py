@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from s2a_bench.errors import StoreError
+from s2a_bench.experiments import Shown
 from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.claims import Judged, claim_table
 from s2a_bench.report.claims.table import judge_claims
@@ -42,14 +43,15 @@ class DrawnFigure:
     pdf: bytes | None
 
 
-def draw(name: str, builders: Mapping[str, Callable[[], Figure]], *, pdf: bool) -> dict[str, DrawnFigure]:
+def draw(name: str, content: Shown, *, pdf: bool) -> dict[str, DrawnFigure]:
     """Build each figure once; ``name`` makes its ids differ from those of other figures."""
     import matplotlib as mpl
 
     found = {}
-    for place, (figure_name, build) in enumerate(builders.items()):
+    for place, (figure_name, build) in enumerate(content.figures.items()):
         prefix = f"{re.sub(r'[^A-Za-z0-9]', '-', name)}-{place}-"
-        with paper_column(), mpl.rc_context({"svg.fonttype": "path", "svg.hashsalt": prefix}):
+        style: Any = {"svg.fonttype": "path", "svg.hashsalt": prefix}
+        with content.noted(f"figure {figure_name}"), paper_column(), mpl.rc_context(style):
             figure = build()
             title, *notes = caption_of(figure)
             svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
@@ -106,7 +108,7 @@ def make_report(chapters: Sequence[Chapter], *, against_paper: bool) -> Report:
 def write_report(report: Report, config: ReportConfig) -> list[Path]:
     """Write the outputs and return their files; raises StoreError."""
     drawn = {
-        chapter.name: draw(chapter.name, chapter.content.figures, pdf=config.latex is not None)
+        chapter.name: draw(chapter.name, chapter.content, pdf=config.latex is not None)
         for chapter in report.chapters
         if config.page or config.latex
     }

@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.experiments import Shown
+from s2a_bench.experiments import Shown, Tables
 from s2a_bench.experiments.latency.view import against_bytes
 from s2a_bench.experiments.requests import RequestCell, metric_phrase, split, stand_ins
 from s2a_bench.experiments.timeline.rows import TIMELINES
@@ -43,17 +43,15 @@ def overview(sweep: Sweep, runs: Runs) -> Shown:
         sentences.append(
             f"{failed} failed; the table of cells has the errors, --resume --retry-failed runs them again."
         )
-    tables = {"cells": cell_table(sweep)}
     cells = split(run for _, run in runs)
-    if measured := measured_table([settings for settings, _ in runs], cells):
-        tables = {"overview": measured, **tables}
     lines, figures = against_bytes.shown(cells)
+    measured = partial(measured_table, [settings for settings, _ in runs], cells)
+    builders: Tables = {**lines, "overview": measured, "cells": partial(cell_table, sweep)}
+    shown = Shown.build(builders, [*lines, "overview"], csvs=lambda: {"cells.csv": CsvTable.of_frame(sweep.cells)})
     line = sweep.origins.line
-    tables = {name: replace(table, provenance=line) for name, table in (lines | tables).items()}
-    csvs = {"cells.csv": CsvTable.of_frame(sweep.cells)}
+    tables = {name: replace(table, provenance=line) for name, table in shown.tables.items()}
     drawn = {name: partial(marked, build, *(run for _, run in runs)) for name, build in figures.items()}
-    main = [*lines, *(["overview"] if measured else [])]
-    return Shown(sentences, tables, main, csvs=csvs, figures=drawn)
+    return replace(shown, sentences=sentences, tables=tables, figures=drawn)
 
 
 def cell_table(sweep: Sweep) -> TextTable:

@@ -16,8 +16,7 @@ from s2a_bench.experiments.chunks.cells import cells, draw
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.rows import CHUNKS, METRICS, REQUESTS, TICKS
 from s2a_bench.experiments.chunks.run import run_chunks
-from s2a_bench.experiments.chunks.view import chunk_sentences
-from s2a_bench.experiments.chunks.view.tables import chunk_tables
+from s2a_bench.experiments.chunks.view import chunk_sentences, show
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 
@@ -166,7 +165,7 @@ def test_what_is_promised_of_a_recording_depends_on_its_order(
     assert [each["code"] for each in found.manifest["warnings"]] == ([code] if code else [])
     (known,) = found.manifest["calibrations"].values()
     assert known["plans"] == 600
-    notes = " ".join(chunk_tables(found)["chunks"].notes)
+    notes = " ".join(show(found).tables["chunks"].notes)
     assert ("lets at most" in notes) == (why is None)
     assert "<=" not in notes + " ".join(chunk_sentences(found))
     assert f"No promise about stalls, because the delays are not exchangeable: {file} {why}" in notes or why is None
@@ -181,7 +180,7 @@ def test_a_guarantee_chooses_how_many_cycles_of_the_calibration_may_stall(tmp_pa
     careful_m, expected_m = (row(each, "queue", latency, "calibrated")["trigger"] for each in (careful, expected))
     assert careful_m > expected_m
     assert "--guarantee expected: the calibrated trigger lets at most 1.00% of the cycles" in " ".join(
-        chunk_tables(expected)["chunks"].notes
+        show(expected).tables["chunks"].notes
     )
 
 

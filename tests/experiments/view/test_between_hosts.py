@@ -9,7 +9,7 @@ import pytest
 
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.metrics import latency_csv, latency_json
-from s2a_bench.experiments.latency.view import latency_tables
+from s2a_bench.experiments.latency.view import show
 from s2a_bench.experiments.latency.view.figures import build_stage_breakdown
 from s2a_bench.report.compare.comparison import metrics_of, open_comparison
 from s2a_bench.store.run import StoredRun
@@ -47,7 +47,7 @@ def test_csv_and_tables_have_both_ends(run: StoredRun) -> None:
     assert "network" not in rows
     summary = {row[1]: row[5] for row in latency_csv(run)["summary.csv"].rows}
     assert (summary["frame_age_lo_ms"], summary["frame_age_hi_ms"]) == (5, 6)
-    table = latency_tables(run)["stages"]
+    table = show(run).tables["stages"]
     entries = {row[1]: row[2] for row in table.rows}
     assert (entries["network"], entries["return"]) == ("[2.50, 3.50]", "[0.000, 0.750]")
     assert entries["round trip"].startswith("3.25 ")

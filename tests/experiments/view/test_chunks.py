@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from s2a_bench.experiments.chunks import EXPERIMENT
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
-from s2a_bench.experiments.chunks.view import chunk_sentences
+from s2a_bench.experiments.chunks.view import chunk_sentences, show
 from s2a_bench.experiments.chunks.view.figures import (
     build_lanes,
     build_reactions,
@@ -20,9 +20,6 @@ from s2a_bench.experiments.chunks.view.figures import (
     build_triggers,
     lanes_of,
     short,
-)
-from s2a_bench.experiments.chunks.view.tables import (
-    chunk_tables,
 )
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
@@ -42,7 +39,7 @@ def drawn(run: StoredRun, build: object) -> Figure:
 
 
 def test_tables_number_the_sources_and_name_the_convention(run: StoredRun) -> None:
-    tables = chunk_tables(run)
+    tables = show(run).tables
     stalls, actions, delays = tables["chunks"], tables["actions"], tables["delays"]
     assert stalls.header[:3] == ("L", "mode", "rule")
     assert [row[0] for row in stalls.rows] == ["1"] * 9 + ["2"] * 9
@@ -122,7 +119,7 @@ def test_reactions_have_the_closed_form_drawn_over_them(run: StoredRun) -> None:
 
 
 def test_smoothness_stands_beside_the_ideal(run: StoredRun) -> None:
-    table = chunk_tables(run)["smoothness"]
+    table = show(run).tables["smoothness"]
     assert table.header[3:] == ("tracking", "ideal", "jerk", "ideal", "jump", "p99", "step")
     tracking, ideal = (float(text) for text in table.rows[0][3:5])
     assert tracking > ideal > 0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from s2a_bench.experiments.latency.view import latency_tables
+from s2a_bench.experiments.latency.view import show
 from s2a_bench.store.requests import FrameRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.trace import Mark
@@ -31,7 +31,7 @@ def run(tmp_path: Path) -> StoredRun:
 
 
 def test_only_frames_of_counted_samples_count(run: StoredRun) -> None:
-    assert latency_tables(run)["frames"].rows == [
+    assert show(run).tables["frames"].rows == [
         ("capture", "capture", "1.00"),
         ("encode", "convert", "2.00"),
         ("network", "network", "3.00"),
@@ -45,4 +45,4 @@ def test_only_frames_of_counted_samples_count(run: StoredRun) -> None:
 def test_a_run_without_a_stream_has_no_such_table(tmp_path: Path) -> None:
     with RunWriter.create(tmp_path, "latency", {"stages": STAGES}) as writer:
         writer.sample(SAMPLE)
-    assert "frames" not in latency_tables(read_run(writer.path))
+    assert "frames" not in show(read_run(writer.path)).tables

@@ -36,10 +36,10 @@ from s2a_bench.experiments.throughput.view import (
     build_rate_by_position,
     build_throughput_bars,
     position_table,
+    show,
     speed_table,
     throughput_figures,
     throughput_sentences,
-    throughput_tables,
 )
 from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
@@ -120,7 +120,7 @@ def test_the_parts_of_the_prompt_stand_side_by_side(make: Make) -> None:
     parts = {"preprocess_ms": 10.0, "vision_encode_ms": 130.0, "prompt_eval_ms": 50.0, "first_decode_ms": 21.0}
     run = make({"in-process": [20] * 4}, facts={"in-process": {"prompt_ms": 200.0, "prompt_n": 30.0, **parts}})
     assert {name: list(only(run).values(name)) for name in parts} == {name: [ms] * 3 for name, ms in parts.items()}
-    table = throughput_tables(run)["prompt"]
+    table = show(run).tables["prompt"]
     assert table.rows == [("in-process", "30.0", "10.0", "130", "50.0", "200", "150", "21.0", "100", "100")]
     (cell,) = throughput_json(run)["cells"]
     assert {name: cell[name]["median"] for name in parts} == parts
@@ -232,7 +232,7 @@ def test_the_tables_fit_a_terminal(make: Make) -> None:
     gaps = {name: [10.0] * 69 for name in ("in-process", "http/as-deployed", "http/best-effort", "ros/topic")}
     run = make(gaps, reference=[900.0, 1000.0, 1000.0, 1000.0], model={"dummy": True})
     console = Console(width=100, record=True, file=io.StringIO())
-    tables = throughput_tables(run)
+    tables = show(run).tables
     assert list(tables) == ["throughput", "prompt", "gaps", "positions"]
     for table in tables.values():
         console.print(lay_out(table, 100))

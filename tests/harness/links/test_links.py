@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
+import shutil
 import socket
 import struct
 import subprocess
@@ -26,6 +28,7 @@ from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.links import CLIENT, SERVER, EmulatedLink, emulated
 from s2a_bench.harness.links.probe import Found, probed
 from s2a_bench.report.advise.prediction import HEADERS, Tcp, tcp_adds_ms
+from tests.cli.program import called
 
 SIOCGIFTXQLEN = 0x8942
 MAKE = """
@@ -211,3 +214,33 @@ def test_a_run_over_a_link_is_labelled_and_bounded(tmp_path: Path) -> None:
     assert shown.loc["bound_ms", "median"] == pytest.approx(640 * 480 * 3 * 8 / 40e3 + 20, rel=0.02)
     assert shown.loc["bound_ratio", "median"] >= 1
     assert run.manifest["link"]["relay"]["packets"] > 1000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("link", ["rate=54,delay=3", "mine.toml", "ride.csv", "4g", "delay=3"])
+def test_a_run_over_every_form_of_link_is_shown_everywhere(
+    link: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.toml").write_text("up_mbps = 54\ndown_mbps = 54\ndelay_ms = 3\n")
+    Path("ride.csv").write_text("t_s,up_mbps,down_mbps,delay_ms\n0,54,54,3\n1,40,40,4\n")
+    small = "latency --engine echo --quick --size 64x48 --requests 2 --warmup 1 --max-tokens 2 --transport http/binary"
+    arguments = [sys.executable, "-m", "s2a_bench", *small.split(), "--link", link, "--output", "runs", "--json"]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False, timeout=120)
+    if not Path("runs").exists() and "link" in done.stderr:
+        pytest.skip(done.stderr)
+    assert (done.returncode, json.loads(done.stdout)["command"]) == (0, "latency"), done.stderr
+    (folder,) = Path("runs").iterdir()
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["link"]["profile"]["source"]
+    older = Path(shutil.copytree(folder, "older"))
+    manifest["link"]["profile"] = load_link(link).model_dump(exclude_defaults=True)
+    (older / "manifest.json").write_text(json.dumps(manifest))
+    probed = link != "ride.csv"  # nothing of a link that changes is probed
+    assert (folder / "figures" / "link.png").exists() == probed
+    assert (folder / "tables" / "summary.csv").exists()
+    for run in (folder, older):
+        called("report", run, "--output", "page.html", "--csv", "csv", "--latex", "tex", "--markdown", "all.md")
+        assert ("Emulated link" in Path("page.html").read_text()) == probed
+        assert ("link" in s2a.Run(run).figures()) == probed
+    assert "e2e" in called("compare", folder, older).stdout

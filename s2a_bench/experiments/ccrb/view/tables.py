@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from s2a_bench.experiments import TIME, Shown
+from s2a_bench.experiments import TIME, Shown, Tables
 from s2a_bench.experiments.ccrb.rows import (
     IMPACTS,
     MARGINS,
@@ -49,13 +49,12 @@ if TYPE_CHECKING:
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
-    tables = ccrb_tables(run)
-    return Shown(
-        sentences=_ccrb_sentences(run),
-        tables=tables,
-        main=[name for name in ("outcomes", "phase", "random") if name in tables],
-        csvs=_ccrb_csv(run),
-        figures=ccrb_figures(run),
+    return Shown.build(
+        sentences=lambda: _ccrb_sentences(run),
+        tables=ccrb_tables(run),
+        main=["outcomes", "phase", "random"],
+        csvs=lambda: _ccrb_csv(run),
+        figures=lambda: ccrb_figures(run),
         json=lambda: ccrb_json(run),
     )
 
@@ -201,13 +200,13 @@ def _share_rows(run: StoredRun, study: str, written: Callable[[Share], str]) -> 
     return [(text, *(written(share_of(scenes[gap], name)) for gap in GAPS)) for name, text in counted.items()]
 
 
-def ccrb_tables(run: StoredRun) -> dict[str, TextTable]:
-    tables = {}
-    if has(run, "random"):
-        tables["random"] = _random_table(run)
-    if has(run, "phase"):
-        tables["phase"] = _phase_table(run)
-    return {**tables, "margins": _margin_table(run), "outcomes": _outcome_table(run)}
+def ccrb_tables(run: StoredRun) -> Tables:
+    return {
+        "random": lambda: _random_table(run) if has(run, "random") else None,
+        "phase": lambda: _phase_table(run) if has(run, "phase") else None,
+        "margins": lambda: _margin_table(run),
+        "outcomes": lambda: _outcome_table(run),
+    }
 
 
 def _ccrb_csv(run: StoredRun) -> dict[str, CsvTable]:

@@ -24,15 +24,14 @@ if TYPE_CHECKING:
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
-    tables = chunk_tables(run)
-    return Shown(
-        sentences=chunk_sentences(run),
-        tables=tables,
-        main=[name for name in ("chunks", "loop") if name in tables],
-        csvs=chunk_csv(run),
-        figures=chunk_figures(run),
+    return Shown.build(
+        sentences=lambda: chunk_sentences(run),
+        tables=chunk_tables(run),
+        main=["chunks", "loop"],
+        csvs=lambda: chunk_csv(run),
+        figures=lambda: chunk_figures(run),
         json=lambda: chunk_json(run),
-        lanes=lanes_of(run),
+        lanes=lambda: lanes_of(run),
     )
 
 

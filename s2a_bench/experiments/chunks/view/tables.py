@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from s2a_bench.experiments import SHARE
+from s2a_bench.experiments import SHARE, Tables
 from s2a_bench.experiments.chunks.rows import CHUNKS, METRICS, ChunkRow
 from s2a_bench.policy.conformal import promise
 from s2a_bench.store.manifest import present
@@ -84,8 +84,10 @@ def live(run: StoredRun) -> bool:
     return bool(run.manifest["configuration"].get("live"))
 
 
-def smoothness_table(run: StoredRun) -> TextTable:
+def smoothness_table(run: StoredRun) -> TextTable | None:
     """Return the table of the plant's smoothness under each mode; in virtual time, also of its tracking error."""
+    if all(row.get("jerk_rms") is None for row in rows_of(run)):
+        return None
     robot = run.manifest["configuration"]["robot"]
     jump = "jump: from one action to the next across a boundary, step: within a chunk."
     if live(run):
@@ -98,16 +100,14 @@ def smoothness_table(run: StoredRun) -> TextTable:
     return _table(run, "Smoothness", _FOLLOWING, (_convention(run), note, _EMULATED))
 
 
-def chunk_tables(run: StoredRun) -> dict[str, TextTable]:
-    found = {
-        "chunks": _table(run, "Stalls", _STALLS),
-        "actions": _table(run, "Actions: ages in ticks", _ACTIONS),
-        "delays": delay_table(run),
+def chunk_tables(run: StoredRun) -> Tables:
+    return {
+        "chunks": lambda: _table(run, "Stalls", _STALLS),
+        "actions": lambda: _table(run, "Actions: ages in ticks", _ACTIONS),
+        "delays": lambda: delay_table(run),
+        "loop": lambda: _table(run, "Control loop", _LOOP, (_convention(run), _LOOP_NOTE)) if live(run) else None,
+        "smoothness": lambda: smoothness_table(run),
     }
-    if live(run):
-        found["loop"] = _table(run, "Control loop", _LOOP, (_convention(run), _LOOP_NOTE))
-    smooth = any(row.get("jerk_rms") is not None for row in rows_of(run))
-    return found | ({"smoothness": smoothness_table(run)} if smooth else {})
 
 
 def delay_table(run: StoredRun) -> TextTable:

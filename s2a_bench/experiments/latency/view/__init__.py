@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.experiments import Shown
+from s2a_bench.experiments import Shown, Tables
 from s2a_bench.experiments.latency.metrics import METRICS, latency_csv, latency_json
 from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.requests import (
@@ -49,13 +49,12 @@ _MOST = 6
 
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
-    tables = latency_tables(run)
-    return Shown(
-        sentences=_latency_sentences(run),
-        tables=tables,
-        main=[name for name in ("stages", "summary", "summary-model") if name in tables],
-        csvs=latency_csv(run),
-        figures=latency_figures(run, against_paper=against == "paper"),
+    return Shown.build(
+        sentences=lambda: _latency_sentences(run),
+        tables=latency_tables(run),
+        main=["stages", "summary", "summary-model"],
+        csvs=lambda: latency_csv(run),
+        figures=lambda: latency_figures(run, against_paper=against == "paper"),
         json=lambda: latency_json(run),
     )
 
@@ -304,14 +303,14 @@ def _frame_entry(frames: pd.DataFrame, column: str) -> str:
     return _entry(exact, Ends(lo, hi))
 
 
-def latency_tables(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, TextTable]:
-    tables = {"stages": stage_table(run), "summary": summary_table(run), "summary-e2e": summary_table(run, "e2e")}
-    if any(cell.values_ms("e2e_without_model").size for cell in cells_of(run)):
-        tables["summary-model"] = summary_table(run, "e2e_without_model")
-    if tokens := _token_table(run, metrics):
-        tables["tokens"] = tokens
-    if frames := _frame_table(run):
-        tables["frames"] = frames
-    if facts := fact_table(run):
-        tables["facts"] = facts
-    return tables
+def latency_tables(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> Tables:
+    modelled = any(cell.values_ms("e2e_without_model").size for cell in cells_of(run))
+    return {
+        "stages": lambda: stage_table(run),
+        "summary": lambda: summary_table(run),
+        "summary-e2e": lambda: summary_table(run, "e2e"),
+        "summary-model": lambda: summary_table(run, "e2e_without_model") if modelled else None,
+        "tokens": lambda: _token_table(run, metrics),
+        "frames": lambda: _frame_table(run),
+        "facts": lambda: fact_table(run),
+    }

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from s2a_bench.experiments import Tables
 from s2a_bench.experiments.requests import RequestCell, payloads_of, stand_ins
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.change import FEWEST_LAUNCHES, Blocks, ratio_of_launches
@@ -226,13 +227,14 @@ def _draw(axes: Axes, pipelines: Sequence[FittedPipeline], styles: Mapping[str, 
     axes.grid(visible=True, linewidth=0.3, color="#DDDDDD")
 
 
-def shown(runs: Split) -> tuple[dict[str, TextTable], dict[str, Callable[[], Figure]]]:
-    """Return the tables and the figure of runs with pictures of different sizes, by their files' names."""
+def shown(runs: Split) -> tuple[Tables, dict[str, Callable[[], Figure]]]:
+    """Return what builds the tables and the figure of runs with pictures of different sizes, by their files' names."""
     pipelines = against_bytes(runs)
     if not pipelines:
         return {}, {}
     answered = stand_ins(runs)
-    tables = {"bytes": line_table(pipelines, answered)}
-    if changes := _order_table(pipelines, answered):
-        tables["crossings"] = changes
+    tables: Tables = {
+        "bytes": lambda: line_table(pipelines, answered),
+        "crossings": lambda: _order_table(pipelines, answered),
+    }
     return tables, {"time_against_bytes": lambda: _build_lines(pipelines, answered)}

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Shown
+from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Shown, Tables
 from s2a_bench.experiments.timeline.rows import METRICS, TimelineMetric
 from s2a_bench.experiments.timeline.view.cells import (
     Timelines,
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
-    return Shown(
-        sentences=_timeline_sentences(run),
+    return Shown.build(
+        sentences=lambda: _timeline_sentences(run),
         tables=timeline_tables(run),
         main=["timelines"],
-        csvs=timeline_csv(run),
-        figures=timeline_figures(run),
+        csvs=lambda: timeline_csv(run),
+        figures=lambda: timeline_figures(run),
         json=lambda: timelines_json(run),
-        lanes=[cell for cell in timelines_of(run) if len(cell.skills)],
+        lanes=lambda: [cell for cell in timelines_of(run) if len(cell.skills)],
     )
 
 
@@ -124,14 +124,14 @@ def skill_table(cells: Sequence[Timelines]) -> TextTable:
     return TextTable.grouped(f"Skills{_common(cells)}: {plan}", header, groups, 4, once=3, cells=names)
 
 
-def timeline_tables(run: StoredRun) -> dict[str, TextTable]:
+def timeline_tables(run: StoredRun) -> Tables:
     cells = timelines_of(run)
     shape = _common(cells)
     return {
-        "skills": skill_table(cells),
-        "motion": _table(cells, f"Motion{shape}", _MOTION, _MOTION_NOTES),
-        "waiting": _table(cells, f"Waiting and age{shape}: times in s", _WAITING, _WAITING_NOTES),
-        "timelines": execution_table(run),
+        "skills": lambda: skill_table(cells),
+        "motion": lambda: _table(cells, f"Motion{shape}", _MOTION, _MOTION_NOTES),
+        "waiting": lambda: _table(cells, f"Waiting and age{shape}: times in s", _WAITING, _WAITING_NOTES),
+        "timelines": lambda: execution_table(run),
     }
 
 
