@@ -11,12 +11,12 @@ import pytest
 
 from s2a_bench import registry
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.metrics import latency_json
 from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.experiments.latency.view import stage_table, summary_table
 from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.requests import cells_of
-from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import option
 from s2a_bench.store.run import StoredRun, read_run
@@ -97,7 +97,7 @@ class TestToy(TransportSuite):
 def run(toy: None, tmp_path: Path) -> StoredRun:  # noqa: ARG001 - what is measured
     names = ("loopback", "toy", "toy?greeting=servus", "toy?number=2")
     few: dict[str, Any] = {"requests": 3, "warmup": 1, "max_tokens": 3, "sample_resources_hz": 0}
-    config = RequestsConfig(transports=names, engine=EngineConfig(name="echo"), size=(64, 48), **few)
+    config = LatencyConfig(transports=names, payload=("raw",), engine=EngineConfig(name="echo"), size=(64, 48), **few)
     return read_run(run_latency(config, tmp_path, NullProgress()))
 
 
@@ -132,7 +132,9 @@ def test_a_stage_that_nobody_declares_makes_the_sample_an_error(
 ) -> None:
     monkeypatch.setattr(Toy, "stages", {})
     engine = EngineConfig(name="echo")
-    config = RequestsConfig(transports=("toy", "loopback"), engine=engine, size=(64, 48), requests=2, warmup=0)
+    config = LatencyConfig(
+        transports=("toy", "loopback"), payload=("raw",), engine=engine, size=(64, 48), requests=2, warmup=0
+    )
     with pytest.raises(Exception, match="toy does not declare the stage greet"):
         run_latency(config, tmp_path, NullProgress())
 
@@ -140,4 +142,4 @@ def test_a_stage_that_nobody_declares_makes_the_sample_an_error(
 @pytest.mark.usefixtures("toy")
 def test_its_options_are_checked_like_any_other() -> None:
     with pytest.raises(UsageError, match="toy has no option 'colour'; it has payload, number, greeting"):
-        RequestsConfig(transports="toy?colour=red")
+        LatencyConfig(transports="toy?colour=red")
