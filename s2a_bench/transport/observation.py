@@ -76,8 +76,10 @@ class ExternalServer(toml_file.TomlTable):
     """Whether the keys of an array's map are texts, not bytes."""
     arrays_as_text: bool = False
     """Whether each array is a text that is JSON, within the JSON of the observation."""
+    arrays_as_lists: bool = False
+    """Whether each array is a list of lists of numbers in the JSON of the observation."""
     answer: Annotated[str, Field(max_length=200)] = "actions"
-    """Keys that lead to the actions of an answer, joined by dots; empty if the answer is the actions."""
+    """Keys, and places in lists, that lead to the actions of an answer, joined by dots; empty if it is the actions."""
     reset: dict[str, Any] | None = None
     """Message that begins a session: sent on each connection before the first observation, and answered by one."""
     idle_s: Annotated[float, Field(ge=1, le=3600)] | None = None
@@ -87,9 +89,11 @@ class ExternalServer(toml_file.TomlTable):
         """Return the actions of an answer, as the server has them; raises RequestFailed for an answer without."""
         found = answer
         for key in filter(None, self.answer.split(".")):
-            if not isinstance(found, dict) or key not in found:
+            inner = dict(enumerate(found)) if isinstance(found, list) and key.isdecimal() else found
+            place = int(key) if inner is not found else key
+            if not isinstance(inner, dict) or place not in inner:
                 raise RequestFailed(f"an answer without {self.answer}: {_keys(found)}")
-            found = found[key]
+            found = inner[place]
         return found
 
 
