@@ -40,6 +40,8 @@ EXTENSION: Final = "s2a"
 """Key that no observation has."""
 FILE_LETTERS, VALUES, DEPTH, CAMERAS = 1 << 16, 1024, 16, 64
 """The most of a template: bytes, values, nested dictionaries and lists, pictures."""
+PICTURE_ROOTS: Final = "", "images.", "observation.images.", "input.images.", "input.observation.images."
+"""What may stand before the names of pictures that a server lists (SGLang)."""
 WHOLE: Final = range(-(1 << 63), 1 << 64)
 
 _PLACE = re.compile(
@@ -103,6 +105,7 @@ class Template:
         self._session = uuid4().hex
         self.pictures = 0
         """Number of pictures that it has placeholders for."""
+        self._keys: list[tuple[int, str]] = []
         self.accepts_state = False
         self.encoded = False
         """Whether pictures are the bytes of a file, as JPEG."""
@@ -134,6 +137,14 @@ class Template:
             return self.fill([np.zeros((1, 1, 3), np.uint8)] * cameras, [0.0] * state, "")
         except RequestFailed as error:
             raise UsageError(f"{error}; see `cameras` and `state`") from error
+
+    def check_pictures(self, cameras: int, listed: Sequence[str]) -> None:
+        """Raise UsageError if the server, which reads the pictures ``listed``, ignores one of so many."""
+        read = {root + key for root in PICTURE_ROOTS for key in listed}
+        for index, path in self._keys:
+            if index < cameras and path not in read:
+                known, cure = ", ".join(map(repr, listed)), "take a template with these keys, or write one"
+                raise UsageError(f"`template` {self.name}: the server ignores '{path}', it reads {known}; {cure}")
 
     def check_server(self, transport: str, reads: Sequence[str]) -> None:
         """Refuse a description of the server of which ``transport`` does not read all, only the keys ``reads``."""
@@ -225,6 +236,7 @@ class Template:
             self._refuse(path, f"wants picture {index} as {form}; there are up to {CAMERAS}, as CHW or bytes")
         self.pictures = max(self.pictures, index + 1)
         self.encoded |= form == "bytes"
+        self._keys.append((index, path))
 
         def make(values: _Values) -> Any:
             if index >= len(values.pictures):
