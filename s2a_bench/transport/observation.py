@@ -40,6 +40,8 @@ EXTENSION: Final = "s2a"
 """Key that no observation has."""
 FILE_LETTERS, VALUES, DEPTH, CAMERAS = 1 << 16, 1024, 16, 64
 """The most of a template: bytes, values, nested dictionaries and lists, pictures."""
+PICTURE_ROOTS: Final = "", "images.", "observation.images.", "input.images.", "input.observation.images."
+"""What may stand before the names of pictures that a server lists (SGLang)."""
 WHOLE: Final = range(-(1 << 63), 1 << 64)
 
 _PLACE = re.compile(
@@ -76,8 +78,10 @@ class ExternalServer(toml_file.TomlTable):
     """Whether the keys of an array's map are texts, not bytes."""
     arrays_as_text: bool = False
     """Whether each array is a text that is JSON, within the JSON of the observation."""
+    arrays_as_lists: bool = False
+    """Whether each array is a list of lists of numbers in the JSON of the observation."""
     answer: Annotated[str, Field(max_length=200)] = "actions"
-    """Keys that lead to the actions of an answer, joined by dots; empty if the answer is the actions."""
+    """Keys, and places in lists, that lead to the actions of an answer, joined by dots; empty if it is the actions."""
     reset: dict[str, Any] | None = None
     """Message that begins a session: sent on each connection before the first observation, and answered by one."""
     idle_s: Annotated[float, Field(ge=1, le=3600)] | None = None
@@ -87,9 +91,11 @@ class ExternalServer(toml_file.TomlTable):
         """Return the actions of an answer, as the server has them; raises RequestFailed for an answer without."""
         found = answer
         for key in filter(None, self.answer.split(".")):
-            if not isinstance(found, dict) or key not in found:
+            inner = dict(enumerate(found)) if isinstance(found, list) and key.isdecimal() else found
+            place = int(key) if inner is not found else key
+            if not isinstance(inner, dict) or place not in inner:
                 raise RequestFailed(f"an answer without {self.answer}: {_keys(found)}")
-            found = found[key]
+            found = inner[place]
         return found
 
 
@@ -99,6 +105,7 @@ class Template:
         self._session = uuid4().hex
         self.pictures = 0
         """Number of pictures that it has placeholders for."""
+        self._keys: list[tuple[int, str]] = []
         self.accepts_state = False
         self.encoded = False
         """Whether pictures are the bytes of a file, as JPEG."""
@@ -130,6 +137,14 @@ class Template:
             return self.fill([np.zeros((1, 1, 3), np.uint8)] * cameras, [0.0] * state, "")
         except RequestFailed as error:
             raise UsageError(f"{error}; see `cameras` and `state`") from error
+
+    def check_pictures(self, cameras: int, listed: Sequence[str]) -> None:
+        """Raise UsageError if the server, which reads the pictures ``listed``, ignores one of so many."""
+        read = {root + key for root in PICTURE_ROOTS for key in listed}
+        for index, path in self._keys:
+            if index < cameras and path not in read:
+                known, cure = ", ".join(map(repr, listed)), "take a template with these keys, or write one"
+                raise UsageError(f"`template` {self.name}: the server ignores '{path}', it reads {known}; {cure}")
 
     def check_server(self, transport: str, reads: Sequence[str]) -> None:
         """Refuse a description of the server of which ``transport`` does not read all, only the keys ``reads``."""
@@ -221,6 +236,7 @@ class Template:
             self._refuse(path, f"wants picture {index} as {form}; there are up to {CAMERAS}, as CHW or bytes")
         self.pictures = max(self.pictures, index + 1)
         self.encoded |= form == "bytes"
+        self._keys.append((index, path))
 
         def make(values: _Values) -> Any:
             if index >= len(values.pictures):

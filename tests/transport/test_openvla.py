@@ -171,6 +171,25 @@ def test_x_vla_is_sent_arrays_as_texts_and_answers_an_object() -> None:
     np.testing.assert_array_equal([action.values for action in actions], CHUNK)
 
 
+def test_sglang_is_sent_lists_and_answers_an_envelope() -> None:
+    seen: list[Received] = []
+
+    def generations(received: Received) -> list[bytes]:
+        """sgl-project/sglang 0350f48f, action/protocol.py: action_generation_response, as JSON."""
+        seen.append(received)
+        action = {"type": "continuous", "dtype": "float32", "shape": [2, 3], "values": CHUNK}
+        answer = {"object": "action.generation", "data": [{"index": 0, "input_index": 0, "action": action}]}
+        return [json_head(json.dumps(answer).encode())]
+
+    actions, _ = chunk(generations, "sglang-http", 2, STATE)
+    given = seen[0].json["input"]
+    assert (seen[0].path, given["task"]) == ("/v1/actions/generations", "pick up the cup")
+    assert list(given["observation"]["images"]) == ["base_0_rgb", "left_wrist_0_rgb"]
+    assert given["observation"]["images"]["left_wrist_0_rgb"] == yuyv_to_rgb(PICTURES[1].data).tolist()
+    assert given["observation"]["state"] == list(STATE)
+    np.testing.assert_array_equal([action.values for action in actions], CHUNK)
+
+
 def test_the_file_of_a_picture_is_an_array_of_its_bytes(tmp_path: Path) -> None:
     seen: list[Received] = []
     mine = tmp_path / "mine.toml"
@@ -211,7 +230,11 @@ def test_an_answer_that_is_no_chunk_is_a_failure(template: str, body: str, messa
             4,
             "`template` openvla-oft has places for 3 pictures, not 4",
         ),
-        ({"dialect": "openvla", "template": "vllm-omni"}, 1, "vllm-omni: openvla does not read s2a.idle_s"),
+        (
+            {"dialect": "openvla", "template": "vllm-omni-openvla"},
+            1,
+            "vllm-omni-openvla: openvla does not read s2a.idle_s",
+        ),
         ({"dialect": "vllm", "template": "x-vla"}, 1, "the dialect 'vllm' takes none"),
         ({"template": "x-vla"}, 1, "the dialect 'openai' takes none; .*`dialect` openvla"),
     ],

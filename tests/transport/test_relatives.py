@@ -16,6 +16,7 @@ from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import budget
 from s2a_bench.transport import TRANSPORTS, Choice, Client, open_client
+from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.risks import examine
 from s2a_bench.transport.websocket import risks
 from s2a_bench.transport.websocket.codec import packb, unpackb
@@ -26,8 +27,36 @@ CHUNK = np.arange(12, dtype=np.float32).reshape(4, 3) / 8
 REQUEST = Request("a", "go", (yuyv_frame(64, 48, 1), yuyv_frame(64, 48, 2)), state=(0.5, 1.0))
 
 
+PLAIN = {"model": "pi0"}
+CAMERAS = {
+    "sglang": ["base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb"],
+    "sglang-libero": ["image", "image2", "empty_camera_0"],
+}
+"""What a greeting of SGLang lists as ``input.image_keys`` for lerobot/pi05_base and lerobot/pi05_libero_base."""
+
+
+def sglang(*, cameras: str = "sglang") -> dict[str, Any]:
+    """The greeting of SGLang (sgl-project/sglang 0350f48f, action/protocol.py: action_metadata)."""
+    return {
+        "object": "action.metadata",
+        "model": "policy",
+        "policy_family": "pi05",
+        "input": {"image_keys": CAMERAS[cameras], "image_size": [224, 224], "state_dim": 32},
+        "output": {"action_type": "continuous", "action_horizon": 4, "action_dim": 3, "dtype": "float32"},
+    }
+
+
+def envelope(values: Any) -> dict[str, Any]:
+    """SGLang's answer on /v1/actions (the same file: action_generation_response)."""
+    action = {"type": "continuous", "dtype": "float32", "shape": [4, 3], "values": values}
+    entry = {"index": 0, "input_index": 0, "candidate_index": 0, "action": action}
+    return {"id": "act_1", "object": "action.generation", "data": [entry], "usage": {"batch_size": 1}}
+
+
 @contextmanager
-def relative(answer: Callable[[Any], Any], *, greets: bool = True, **packing: bool) -> Iterator[tuple[str, list[Any]]]:
+def relative(
+    answer: Callable[[Any], Any], *, greets: bool = True, greeting: Any = PLAIN, **packing: bool
+) -> Iterator[tuple[str, list[Any]]]:
     """A server that answers each message by a function: its address, and the paths and messages that came.
 
     An empty message has no answer.
@@ -37,11 +66,12 @@ def relative(answer: Callable[[Any], Any], *, greets: bool = True, **packing: bo
     def handle(socket: Any) -> None:
         heard.append(socket.request.path)
         if greets:
-            socket.send(packb({"model": "pi0"}))
+            socket.send(packb(greeting))
         for message in socket:
             heard.append(unpackb(message) if message else b"")
             if message:
-                socket.send(packb(answer(heard[-1]), **packing))
+                said = answer(heard[-1])
+                socket.send(said if isinstance(said, str) else packb(said, **packing))
 
     with serve(handle, "127.0.0.1", 0, compression=None, max_size=None) as server:
         thread = Thread(target=server.serve_forever)
@@ -69,15 +99,92 @@ def asked(address: str, template: str, name: str = "websocket") -> np.ndarray[An
     return np.stack([action.values for action in actions])
 
 
-@pytest.mark.parametrize("answer", [CHUNK, CHUNK[np.newaxis], {"arm": CHUNK[:, :2], "gripper": CHUNK[:, 2:]}])
-def test_vllm_omni_answers_with_an_array_or_a_map_of_them_after_a_reset(answer: Any) -> None:
-    with relative(lambda message: {"status": "reset"} if "endpoint" in message else answer) as (address, heard):
+def asked_with(address: str, template: str, cameras: int, state: int) -> np.ndarray[Any, Any]:
+    frames = tuple(yuyv_frame(64, 48, index) for index in range(cameras))
+    with robot(address, template) as client:
+        actions, _ = ask(client, Request("a", "go", frames, state=tuple(np.arange(state) / 8)))
+    return np.stack([action.values for action in actions])
+
+
+PICTURE, TWICE = (48, 64, 3), (1, 2, 48, 64, 3)
+READ = {
+    "pi0": (
+        # 26f24af7, models/pi0/processor_pi0.py; deploy/pi0.yaml: image_feature_keys
+        {
+            "observation.images.base_0_rgb": PICTURE,
+            "observation.images.left_wrist_0_rgb": PICTURE,
+            "observation.images.right_wrist_0_rgb": PICTURE,
+            "state": (32,),
+        },
+        CHUNK,
+    ),
+    "dreamzero": (
+        # b0de493a, models/dreamzero/transform/roboarena.py; the state as in droid.py beside it
+        {
+            "observation/exterior_image_0_left": PICTURE,
+            "observation/exterior_image_1_left": PICTURE,
+            "observation/wrist_image_left": PICTURE,
+            "observation/joint_position": (7,),
+            "observation/gripper_position": (1,),
+        },
+        CHUNK[np.newaxis],
+    ),
+    "gr00t": (
+        # 0739042f, models/gr00t/pipeline_gr00t.py: _normalize_observation; shapes as its tests have them
+        {
+            "video": {"exterior_image_1_left": TWICE, "wrist_image_left": TWICE},
+            "state": {"eef_9d": (1, 1, 9), "gripper_position": (1, 1, 1), "joint_position": (1, 1, 7)},
+        },
+        {"eef_9d": CHUNK[np.newaxis, :, :2], "gripper_position": CHUNK[np.newaxis, :, 2:]},
+    ),
+    "openvla": ({"image": PICTURE}, CHUNK),  # be0ce8e7, models/openvla/robot_adapter.py: _IMAGE_KEYS
+}
+"""Policy of vLLM-Omni (vllm-project/vllm-omni) -> the shapes of all that it reads, and an answer."""
+
+
+def shapes(value: Any) -> Any:
+    return {key: shapes(each) for key, each in value.items()} if isinstance(value, dict) else value.shape
+
+
+@pytest.mark.parametrize("ready", [{"status": "reset successful"}, "reset successful"])  # 0.30, and before
+@pytest.mark.parametrize(
+    ("policy", "cameras", "state"), [("pi0", 3, 32), ("dreamzero", 3, 8), ("gr00t", 2, 17), ("openvla", 1, 0)]
+)
+def test_vllm_omni_is_asked_by_the_keys_that_its_policy_reads_after_a_reset(
+    policy: str, cameras: int, state: int, ready: Any
+) -> None:
+    read, answer = READ[policy]
+    with relative(lambda message: ready if "endpoint" in message else answer) as (address, heard):
         for _ in "ab":
-            np.testing.assert_array_equal(asked(address, "vllm-omni"), CHUNK)
+            np.testing.assert_array_equal(asked_with(address, f"vllm-omni-{policy}", cameras, state), CHUNK)
     path, reset, observation, *again = heard
     assert (path, reset) == ("/v1/realtime/robot/openpi", {"endpoint": "reset"})
-    assert observation["observation/wrist_image"].shape == (48, 64, 3)
-    assert again[2]["session_id"] != observation["session_id"]
+    session = observation.pop("session_id")
+    assert again[2]["session_id"] != session
+    assert observation.pop("prompt") == "go"
+    assert shapes(observation) == read
+
+
+def test_a_policy_that_would_see_zeros_without_a_state_is_not_asked() -> None:
+    with (
+        relative(lambda _: {"status": "reset successful"}) as (address, _),
+        pytest.raises(RequestFailed, match=r"vllm-omni-pi0: state wants the state's numbers \(all\)"),
+    ):
+        asked_with(address, "vllm-omni-pi0", 1, 0)
+
+
+def test_a_traceback_as_the_answer_to_a_reset_is_an_error() -> None:
+    with (
+        relative(lambda _: "Traceback (most recent call last):\n  ...\nKeyError: 'x'\n") as (address, heard),
+        pytest.raises(RequestFailed, match=r"KeyError: 'x'$"),
+    ):
+        asked(address, "vllm-omni-pi0")
+    assert len(heard) == 2
+
+
+def test_the_name_that_had_keys_of_no_policy_is_answered_with_the_names_of_those_that_have() -> None:
+    with pytest.raises(UsageError, match=r"^`template`: 'vllm-omni' is none of .*vllm-omni-dreamzero, .*vllm-omni-pi0"):
+        template_of("vllm-omni")
 
 
 def test_an_empty_message_keeps_a_connection_open_that_would_be_cut(tmp_path: Path) -> None:
@@ -93,11 +200,53 @@ def test_an_empty_message_keeps_a_connection_open_that_would_be_cut(tmp_path: Pa
     assert len([each for each in heard if each == "/"]) == 1
 
 
-def test_sglang_answers_as_openpi_does_at_a_path_of_its_own() -> None:
-    with relative(lambda _: {"actions": CHUNK, "server_timing": {"infer_ms": 1e-4}}) as (address, heard):
-        np.testing.assert_array_equal(asked(address, "sglang"), CHUNK)
-        np.testing.assert_array_equal(asked(address + "/v1/actions/realtime", "sglang"), CHUNK)
-    assert [each for each in heard if isinstance(each, str)] == ["/openpi/policy", "/v1/actions/realtime"]
+@pytest.mark.parametrize("template", ["sglang", "sglang-libero", "sglang-realtime"])
+def test_sglang_is_asked_by_the_keys_that_it_reads(template: str) -> None:
+    keys = CAMERAS["sglang-libero" if template == "sglang-libero" else "sglang"]
+    said = {"actions": CHUNK, "server_timing": {"infer_ms": 1e-4}}
+    answer = {**envelope(CHUNK), "server_timing": {"infer_ms": 1e-4}} if template == "sglang-realtime" else said
+    greeting = sglang(cameras="sglang-libero" if template == "sglang-libero" else "sglang")
+    with relative(lambda _: answer, greeting=greeting) as (address, heard):
+        np.testing.assert_array_equal(asked(address, template), CHUNK)
+    path, observation = heard
+    assert path == ("/v1/actions/realtime" if template == "sglang-realtime" else "/openpi/policy")
+    assert observation.pop("task") == "go"
+    images = {f"observation.images.{key}": PICTURE for key in keys[:2]}
+    assert shapes(observation) == {**images, "observation.state": (2,)}
+
+
+@pytest.mark.parametrize(
+    ("key", "ignored"),
+    [
+        ('"observation.images.image2"', ""),
+        ("images.image2", ""),
+        ("image2", ""),
+        ("images.base_0_rgb", "images.base_0_rgb"),
+        ("observation.image2", "observation.image2"),
+    ],
+)
+def test_a_picture_that_the_server_does_not_list_is_an_error(tmp_path: Path, key: str, ignored: str) -> None:
+    file = tmp_path / "mine.toml"
+    file.write_text(f'{key} = "{{image:1}}"\nimage = "{{image:0}}"\nprompt = "{{prompt}}"\nstate = "{{state}}"\n')
+    with (
+        relative(lambda _: {"actions": CHUNK}, greeting=sglang(cameras="sglang-libero")) as (address, heard),
+        robot(address, str(file)) as client,
+    ):
+        client.describe()
+        if not ignored:
+            ask(client, REQUEST)
+            return
+        says = f"mine.toml: the server ignores '{ignored}', it reads 'image', 'image2', 'empty_camera_0'; "
+        for _ in "ab":
+            with pytest.raises(UsageError, match=says):
+                ask(client, REQUEST)
+        assert not [each for each in heard if isinstance(each, dict)]
+
+
+def test_a_camera_that_the_request_lacks_is_not_looked_for_in_the_servers_list() -> None:
+    greeting = {"input": {"image_keys": ["base_0_rgb"]}}
+    with relative(lambda _: {"actions": CHUNK}, greeting=greeting) as (address, _):
+        np.testing.assert_array_equal(asked_with(address, "sglang", 1, 2), CHUNK)
 
 
 def test_starvla_has_an_envelope_in_both_directions() -> None:
@@ -127,19 +276,21 @@ def test_vla_eval_is_greeted_and_has_texts_as_the_keys_of_an_array() -> None:
 @pytest.mark.parametrize(
     ("template", "answer", "says"),
     [
-        ("vllm-omni", {"type": "error", "message": "Internal inference error"}, "Internal inference error"),
+        ("vllm-omni-pi0", {"type": "error", "message": "Internal inference error"}, "Internal inference error"),
         ("sglang", {"error": "no 'state'\nin it"}, "no 'state' in it"),
         ("starvla", {"status": "error", "error": {"message": "no examples"}}, "no examples"),
         ("openpi", {"type": "error", "payload": {"error": "step failed"}}, "step failed"),
         ("openpi", {"type": "error"}, "an error without words"),
         ("openpi", [1], "an answer without actions: list"),
         ("starvla", {"data": {"action": 1}}, "an answer without data.actions: action"),
-        ("vllm-omni", {"arm": CHUNK, "hand": CHUNK[1:]}, r"of one length: there are arm \(4, 3\), hand \(3, 3\)"),
-        ("vllm-omni", np.zeros((2, 4, 3)), r"actions: shape \(2, 4, 3\) .*"),
+        ("sglang-realtime", {"data": []}, "an answer without data.0.action.values: list"),
+        ("sglang-realtime", {"data": {"0": 1}}, "an answer without data.0.action.values: int"),
+        ("vllm-omni-pi0", {"arm": CHUNK, "hand": CHUNK[1:]}, r"of one length: there are arm \(4, 3\), hand \(3, 3\)"),
+        ("vllm-omni-pi0", np.zeros((2, 4, 3)), r"actions: shape \(2, 4, 3\) .*"),
     ],
 )
 def test_an_error_in_a_binary_message_is_quoted(template: str, answer: Any, says: str) -> None:
-    replies = [{"status": "reset"}] if template == "vllm-omni" else []
+    replies = [{"status": "reset"}] if template == "vllm-omni-pi0" else []
     with relative(lambda _: replies.pop() if replies else answer) as (address, _), robot(address, template) as client:
         with pytest.raises(RequestFailed, match=rf"{says}$") as failed:
             ask(client, REQUEST)
@@ -157,14 +308,14 @@ def test_what_is_called_an_error_and_is_none_is_not_read(name: str, more: Any) -
 
 def test_a_connection_whose_reset_fails_is_not_used() -> None:
     refused = {"type": "error", "message": "no session"}
-    with relative(lambda _: refused) as (address, heard), robot(address, "vllm-omni") as client:
+    with relative(lambda _: refused) as (address, heard), robot(address, "vllm-omni-pi0") as client:
         for _ in "ab":
             with pytest.raises(RequestFailed, match=r"no session$"):
                 client.describe()
     assert [each for each in heard if isinstance(each, dict)] == [{"endpoint": "reset"}] * 2
 
 
-@pytest.mark.parametrize("template", ["vllm-omni", "sglang", "starvla", "vla-eval"])
+@pytest.mark.parametrize("template", ["vllm-omni-pi0", "sglang", "starvla", "vla-eval"])
 def test_our_own_server_is_asked_as_always(template: str) -> None:
     handler = RecordingHandler(list(CHUNK))
     wiring = wiring_of("websocket", template=template, payload="raw")

@@ -25,7 +25,7 @@ from s2a_bench.transport import Wiring, observed
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.observation import EXTENSION, ExternalServer
+from s2a_bench.transport.observation import CAMERAS, EXTENSION, ExternalServer
 from s2a_bench.transport.policy_client import PolicyClient
 from s2a_bench.transport.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
 from s2a_bench.transport.websocket.codec import packb, unpackb
@@ -49,12 +49,13 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         self._headers[codec.MARKS_HEADER] = "1"
         self._link: BoundedConnection | None = None
         self._metadata: dict[str, str] = {}
+        self._listed: list[str] = []
         self._provenance: dict[str, str] = {}
 
     def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:
         body = self._pack(request, trace)
         try:
-            message, packed_ns = self._sent(body, bounds, trace)
+            message, packed_ns = self._sent(body, len(request.images), bounds, trace)
             trace.provenance = self._provenance
             yield from self._actions(message, packed_ns, trace)
         except Broken as error:
@@ -77,17 +78,17 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         trace.facts[PAYLOAD_BYTES] = len(body)
         return body
 
-    def _sent(self, body: bytes, bounds: Bounds, trace: Trace) -> tuple[bytes, int]:
+    def _sent(self, body: bytes, cameras: int, bounds: Bounds, trace: Trace) -> tuple[bytes, int]:
         """Send, once more if the server had just closed the kept connection; return the answer's first message."""
         if self._link is not None:
             if self._link.alive(bounds):
                 with suppress(Broken):
-                    return self._exchanged(self._link, body, trace)
+                    return self._exchanged(self._link, body, cameras, trace)
             trace.facts[RECONNECTS] = 1.0
             self._link.close()
         link = self._connected(bounds)
         trace.mark("connect")
-        return self._exchanged(link, body, trace)
+        return self._exchanged(link, body, cameras, trace)
 
     def _connected(self, bounds: Bounds) -> BoundedConnection:
         self._link = None
@@ -97,14 +98,16 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
                 self._greeted(link)
             if self._server.reset is not None:
                 link.send(packb(self._server.reset))
-                self._check(unpackb(self._message(link)))
+                self._ready(link.receive())
         except BaseException:
             link.close()
             raise
         self._link = link
         return link
 
-    def _exchanged(self, link: BoundedConnection, body: bytes, trace: Trace) -> tuple[bytes, int]:
+    def _exchanged(self, link: BoundedConnection, body: bytes, cameras: int, trace: Trace) -> tuple[bytes, int]:
+        if self._listed:
+            self._template.check_pictures(cameras, self._listed)
         packed_ns = trace.marks[-1][1]
         link.send(body)
         return self._message(link), packed_ns
@@ -118,6 +121,16 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         self._native = metadata.get("server") == codec.OURS
         plain = {name: value for name, value in metadata.items() if isinstance(value, (str, int, float, bool))}
         self._metadata = {str(name)[:64]: struck(str(value))[:64] for name, value in list(plain.items())[:32]}
+        described = metadata.get("input")
+        listed = described.get("image_keys") if isinstance(described, dict) else None
+        self._listed = [struck(str(key))[:64] for key in listed[:CAMERAS]] if isinstance(listed, list) else []
+
+    def _ready(self, answer: bytes | str) -> None:
+        """Read the answer to a reset, a message or, as DreamZero has it, a text; a traceback is an error."""
+        if not isinstance(answer, str):
+            self._check(unpackb(answer))
+        elif answer.lstrip().startswith("Traceback"):
+            raise self._failed(answer)
 
     def _message(self, link: BoundedConnection) -> bytes:
         """Return the next binary message; a text is an error."""

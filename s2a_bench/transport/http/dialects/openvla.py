@@ -56,7 +56,7 @@ class OpenVla(Dialect):
 
     def describe(self, template: str) -> None:
         self._template = made = template_of(template)
-        made.check_server(self.name, ("path", "answer", "arrays_as_text"))
+        made.check_server(self.name, ("path", "answer", "arrays_as_text", "arrays_as_lists"))
         self.path = made.server.path or self.path
         self.answer_kinds, self.accepts_state = (ACTIONS,), made.accepts_state
         self.payloads = PolicyTransport.payloads[1:] if made.encoded else self.payloads
@@ -78,7 +78,7 @@ class OpenVla(Dialect):
     ) -> dict[str, Any]:
         if self._template is None:
             return super().fields(request, payload, model, to_base64, trace)
-        as_text = self._template.server.arrays_as_text
+        as_text, as_lists = self._template.server.arrays_as_text, self._template.server.arrays_as_lists
         pictures = [policy_picture(frame, payload, trace) for frame in request.images]
 
         def sendable(value: Any) -> Any:
@@ -90,6 +90,8 @@ class OpenVla(Dialect):
                 value = np.frombuffer(value, np.uint8)
             if not isinstance(value, np.ndarray):
                 return value
+            if as_lists:
+                return value.tolist()
             data = np.ascontiguousarray(value).reshape(-1).view(np.uint8)
             array = {ARRAY: to_base64(data), "dtype": value.dtype.str, "shape": value.shape}
             return json.dumps(array) if as_text else array
