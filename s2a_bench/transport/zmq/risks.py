@@ -64,7 +64,7 @@ def _unpickles_all() -> Finding:
 
 
 def _may_unpickle(marks: set[str]) -> Finding:
-    if layouts.N1_6 in marks:
+    if marks & {layouts.N1_5, layouts.N1_6}:
         return Finding("pickle", "state", "its configurations are marked as N1.5's or N1.6's: they unpickle nothing")
     which = "its configurations are marked as GR00T N1.7's" if marks else "no answer tells which GR00T it is"
     return Finding(
