@@ -23,16 +23,29 @@ PINGING = "websockets/", "uvicorn"
 
 
 def examine(parts: SplitResult) -> Iterator[Finding]:
-    """Shake hands without a key, and once more as a web page in a browser does."""
+    """Shake hands without a key, at templates' paths if that is refused, and once more as a page in a browser does."""
     extras.need("websocket", *PACKAGES)
-    url = urlunsplit(parts)
-    try:
-        greeting, headers = _greeting(url, {})
-    except ServerDied as error:
-        raise OSError(str(error).rpartition(": ")[2]) from error
-    except S2AError as error:
-        yield Finding("server", "state", f"it answers, and lets no client in without a key: {error}")
+    from s2a_bench.transport.websocket.link import WRONG_PATH
+
+    greeting = why = ""
+    paths = dict.fromkeys((parts.path, *(path for name in names() if (path := template_of(name).server.path))))
+    for path in paths:
+        parts = parts._replace(path=path)
+        try:
+            greeting, headers = _greeting(urlunsplit(parts), {})
+        except ServerDied as error:
+            raise OSError(str(error).rpartition(": ")[2]) from error
+        except S2AError as error:
+            why = why or str(error)
+            if WRONG_PATH in why:
+                continue
+        break
+    if not greeting:
+        key = f" (nor at the paths of templates, {', '.join([*paths][1:])})" if WRONG_PATH in why else " without a key"
+        yield Finding("server", "state", f"it answers, and lets no client in{key}: {why}")
         return
+    if why:
+        yield Finding("path", "advice", f"{why}; it lets clients in at {parts.path}", f"name {urlunsplit(parts)}")
     yield from _slow(parts, headers)
     yield no_key(
         parts,
@@ -40,7 +53,7 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
         "let it listen on 127.0.0.1 alone and reach it by ssh -L, or put a proxy that wants a key before it",
     )
     try:
-        _greeting(url, {"Origin": PAGE})
+        _greeting(urlunsplit(parts), {"Origin": PAGE})
     except S2AError:
         return
     yield Finding(
