@@ -29,12 +29,8 @@ FRAME_BYTES: Final = 64
 """What a frame costs beside its data."""
 CLOSING_S: Final = 1.0
 QUOTED: Final = 200
-WRONG_PATH: Final = "; refused: a wrong path"
-ADVICE: Final = {
-    401: "; see `api_key_env`",
-    403: f"{WRONG_PATH} or a key; see `url` and `api_key_env`",  # of an unknown path too, as Starlette has it
-    404: f"{WRONG_PATH}; see `url`",
-}
+REFUSED: Final = "; refused: a wrong path or a key; see `url` and `api_key_env`"
+"""Of 403 too, with which Starlette answers an unknown path."""
 
 
 class Broken(RequestFailed):
@@ -152,7 +148,7 @@ class BoundedConnection:
         if isinstance(error, InvalidStatus):
             response = error.response
             body = " ".join(struck(bytes(response.body or b"").decode(errors="replace"))[:QUOTED].split())
-            advice = ADVICE.get(response.status_code, "")
+            advice = {401: "; see `api_key_env`", 403: REFUSED, 404: REFUSED}.get(response.status_code, "")
             return RequestFailed(f"{self._url} answered {response.status_code}: {body or 'nothing'}{advice}")
         if isinstance(error, ConnectionClosed) or isinstance(why, (EOFError, OSError)):
             closed = error.rcvd if isinstance(error, ConnectionClosed) else None

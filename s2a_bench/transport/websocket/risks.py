@@ -25,35 +25,31 @@ PINGING = "websockets/", "uvicorn"
 def examine(parts: SplitResult) -> Iterator[Finding]:
     """Shake hands without a key, at templates' paths if that is refused, and once more as a page in a browser does."""
     extras.need("websocket", *PACKAGES)
-    from s2a_bench.transport.websocket.link import WRONG_PATH
+    from s2a_bench.transport.websocket.link import REFUSED
 
-    greeting = why = ""
-    paths = dict.fromkeys((parts.path, *(path for name in names() if (path := template_of(name).server.path))))
+    why, paths = "", [parts.path, *sorted({template_of(name).server.path for name in names()} - {parts.path})]
     for path in paths:
-        parts = parts._replace(path=path)
+        url = urlunsplit(parts._replace(path=path))
         try:
-            greeting, headers = _greeting(urlunsplit(parts), {})
+            greeting, headers = _greeting(url, {})
+            break
         except ServerDied as error:
             raise OSError(str(error).rpartition(": ")[2]) from error
         except S2AError as error:
             why = why or str(error)
-            if WRONG_PATH in why:
-                continue
-        break
-    if not greeting:
-        key = f" (nor at the paths of templates, {', '.join([*paths][1:])})" if WRONG_PATH in why else " without a key"
-        yield Finding("server", "state", f"it answers, and lets no client in{key}: {why}")
-        return
+            if REFUSED not in why or path == paths[-1]:
+                yield Finding("server", "state", f"it answers, and refuses a client without a key: {why}")
+                return
     if why:
-        yield Finding("path", "advice", f"{why}; it lets clients in at {parts.path}", f"name {urlunsplit(parts)}")
-    yield from _slow(parts, headers)
+        yield Finding("path", "advice", f"{why}; it lets clients in at {path}", f"name {url}")
+    yield from _slow(parts._replace(path=path), headers)
     yield no_key(
         parts,
         f"it lets every client in (and greets with: {greeting}), so it answers every client too",
         "let it listen on 127.0.0.1 alone and reach it by ssh -L, or put a proxy that wants a key before it",
     )
     try:
-        _greeting(urlunsplit(parts), {"Origin": PAGE})
+        _greeting(url, {"Origin": PAGE})
     except S2AError:
         return
     yield Finding(

@@ -29,7 +29,6 @@ OURS: Final = "s2a-bench"
 """Key of our server's configurations, which their readers ignore."""
 CONFIG_MARKS: Final = {N1_6: "__ModalityConfig_class__", N1_7: "__ModalityConfig__"}
 """Layout -> the key that marks a modality's configuration; N1.5's is N1.6's, with the configuration as text."""
-CONFIG: Final = "as_json"
 OBSERVATION: Final = "observation"
 NAMES: Final = {
     "video": "ego_view",
@@ -87,7 +86,7 @@ def modalities(layout: str) -> dict[str, Any]:
         if layout != N1_5:
             config |= dict.fromkeys(("sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"))
         content = json.dumps(config) if layout == N1_5 else config
-        configs[modality] = {**dict.fromkeys((*marks, OURS), True), CONFIG: content}
+        configs[modality] = {**dict.fromkeys((*marks, OURS), True), "as_json": content}
     return configs
 
 

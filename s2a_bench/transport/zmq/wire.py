@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.transport.messagepack import array_in, unpacked
-from s2a_bench.transport.zmq.layouts import CONFIG, CONFIG_MARKS, N1_5, N1_6, N1_7, OURS
+from s2a_bench.transport.zmq.layouts import CONFIG_MARKS, N1_5, N1_6, N1_7, OURS
 from s2a_bench.transport.zmq.npy import PictureFile, array_of, file_of
 
 ARRAY, FILE = "__ndarray_class__", "as_npy"
@@ -73,7 +73,7 @@ def read(data: Any) -> tuple[Any, set[str]]:
                 return _array_in(fields)
         for layout, mark in (*CONFIG_MARKS.items(), (OURS, OURS)):
             if mark in value:
-                marks.add(N1_5 if layout == N1_6 and isinstance(value.get(CONFIG), str) else layout)
+                marks.add(N1_5 if layout == N1_6 and isinstance(value.get("as_json"), str) else layout)
         return value
 
     return unpacked(data, plain), marks
