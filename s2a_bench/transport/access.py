@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from s2a_bench.options import option
 from s2a_bench.transport import SERVING, Handler, Wiring
-from s2a_bench.transport.listening import ListeningOptions, bound_socket
+from s2a_bench.transport.listening import ListeningOptions, bound_socket, in_url
 from s2a_bench.transport.serving import Core
 
 LOCAL: Final = "localhost"
@@ -72,7 +72,7 @@ class WebServer:
     def __init__(self, wiring: Wiring[Any], handler: Handler, scheme: str, key_scheme: str) -> None:
         """Bind ``host:port`` of ``wiring.address`` or what `address` was; `bound_socket` says what it raises."""
         self._listener, key = bound_socket(wiring.address, scheme, wiring.options)
-        host, port = self._listener.getsockname()
-        self.address = f"{scheme}://{host}:{port}"
+        host, port = self._listener.getsockname()[:2]
+        self.address = f"{scheme}://{in_url(host)}:{port}"
         self._core = Core(handler, wiring.limits)
         self._access = Access(wiring.options, host, key, key_scheme)

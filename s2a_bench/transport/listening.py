@@ -73,7 +73,12 @@ class ListeningOptions(UrlOptions):
 def split_address(address: str, scheme: str) -> tuple[str, str]:
     """Return host and port of ``host:port`` or of a server's `address`; 127.0.0.1 and 0 for an empty one."""
     host, _, port = (address.removeprefix(f"{scheme}://") or ANY).rpartition(":")
-    return host or "127.0.0.1", port
+    return host.strip("[]") or "127.0.0.1", port
+
+
+def in_url(host: str) -> str:
+    """Return a host as URLs have it: an address of IPv6 in brackets."""
+    return f"[{host}]" if ":" in host else host
 
 
 def bound_socket(address: str, scheme: str, options: ListeningOptions) -> tuple[socket.socket, str]:
@@ -82,7 +87,7 @@ def bound_socket(address: str, scheme: str, options: ListeningOptions) -> tuple[
     Raises PortInUse, and UsageError if other hosts could connect without a key and `no_auth` is not set.
     """
     host, port = split_address(address, scheme)
-    bound = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    bound = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
     bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         bound.bind((host, int(port)))
@@ -100,7 +105,8 @@ def bound_socket(address: str, scheme: str, options: ListeningOptions) -> tuple[
 def cannot_bind(host: str, port: str, number: int | None, why: str | None) -> PortInUse:
     if number == errno.EADDRINUSE:
         return PortInUse(f"`port`: {port} is in use on {host}; choose another, or 0 for any free one")
-    return PortInUse(f"`port`: cannot bind {host}:{port}: {why}")
+    blamed = "port" if number == errno.EACCES else "host"
+    return PortInUse(f"`{blamed}`: cannot bind {in_url(host)}:{port}: {why}")
 
 
 def checked_url(url: str, schemes: Collection[str]) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import socket
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -16,7 +18,7 @@ from s2a_bench.errors import PortInUse, RequestFailed, TransportError, UsageErro
 from s2a_bench.harness.clocks import Exchange
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
-from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, open_client, open_server
+from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, open_client, open_server, risks
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.serving import CLOCK_PROMPT, Queued
@@ -332,6 +334,36 @@ def test_a_key_is_sent_and_who_has_none_is_refused(name: str, monkeypatch: pytes
             ask(stranger, Request("b", "go"))
         assert "s3cret" not in str(refused.value)
     assert len(handler.requests) == 1
+
+
+def has_ipv6() -> bool:
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.skipif(not has_ipv6(), reason="no IPv6 here")
+@on_ports
+def test_ipv6s_loopback_needs_no_key_and_has_brackets_in_urls(name: str) -> None:
+    with served(wiring_of(name, f"::1:{wiring_of(name).options.port}"), recorder(name)) as (server, _):
+        assert re.fullmatch(r"\w+://\[::1\]:[1-9]\d*", server.address)
+        with closing(open_client(wiring_of(name, server.address))) as client:
+            assert len(ask(client, Request("a", "go"))[0]) == 3
+        found = {finding.code: finding.level for finding in risks.examine(server.address)}
+        assert (found["plain-text"], found["no-key"]) == ("state", "advice")
+        with pytest.raises(PortInUse, match=r"`port`: \d+ is in use on ::1"):
+            open_server(wiring_of(name, server.address.partition("//")[2]), recorder(name))
+    with pytest.raises(UsageError, match="`host`: others reach ::; "):
+        open_server(wiring_of(name, ":::0"), recorder(name))
+
+
+@on_ports
+def test_an_address_that_is_not_this_machines_is_blamed_on_the_host(name: str) -> None:
+    for host in ("192.0.2.1", "no.such.host.invalid"):
+        with pytest.raises(TransportError, match=rf"`host`: .*{host}"):
+            open_server(wiring_of(name, f"{host}:0", no_auth=True), recorder(name))
 
 
 @on_ports

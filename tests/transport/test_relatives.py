@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from threading import Thread
 from typing import Any
 
 import numpy as np
 import pytest
+import uvicorn
+from fastapi import FastAPI, WebSocket
 from websockets.sync.server import serve
 
 from s2a_bench.errors import RequestFailed, UsageError
@@ -80,6 +83,32 @@ def relative(
             yield "ws://{}:{}".format(*server.socket.getsockname()[:2]), heard
         finally:
             server.shutdown()
+            thread.join()
+
+
+@contextmanager
+def fastapi(path: str, key: str = "") -> Iterator[str]:
+    """A server as SGLang's and vLLM-Omni's: FastAPI's, which answers an unknown path with 403."""
+    app = FastAPI()
+
+    @app.websocket(path)
+    async def policy(client: WebSocket) -> None:
+        if key and client.headers.get("authorization") != key:
+            await client.close()
+            return
+        await client.accept()
+        await client.send_bytes(packb({"model": "pi0"}))
+        await client.receive()
+
+    with closing(socket.create_server(("127.0.0.1", 0))) as listener:
+        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", lifespan="off", timeout_graceful_shutdown=1))
+        thread = Thread(target=server.run, args=([listener],))
+        thread.start()
+        until(lambda: server.started)
+        try:
+            yield "ws://{}:{}".format(*listener.getsockname())
+        finally:
+            server.should_exit = True
             thread.join()
 
 
@@ -247,6 +276,21 @@ def test_a_camera_that_the_request_lacks_is_not_looked_for_in_the_servers_list()
     greeting = {"input": {"image_keys": ["base_0_rgb"]}}
     with relative(lambda _: {"actions": CHUNK}, greeting=greeting) as (address, _):
         np.testing.assert_array_equal(asked_with(address, "sglang", 1, 2), CHUNK)
+
+
+def test_a_path_that_fastapi_refuses_is_not_taken_for_a_key() -> None:
+    with fastapi("/openpi/policy") as address:
+        found = {finding.code: finding for finding in examine(address)}
+        assert found["path"].message.endswith("lets clients in at /openpi/policy")
+        assert found["path"].fix == f"name {address}/openpi/policy"
+        assert "greets with: model" in found["no-key"].message
+        assert "path" not in {finding.code for finding in examine(address + "/openpi/policy")}
+        with pytest.raises(RequestFailed, match=r"403.*refused: a wrong path or a key; see `url` and `api_key_env`"):
+            asked(address, "openpi")
+    with fastapi("/openpi/policy", key="Api-Key k") as address:
+        found = {finding.code: finding for finding in examine(address)}
+    assert set(found) == {"plain-text", "server"}
+    assert "refused: a wrong path or a key" in found["server"].message
 
 
 def test_starvla_has_an_envelope_in_both_directions() -> None:

@@ -15,6 +15,7 @@ from s2a_bench.testing.transport import RecordingHandler, served, wiring_of
 from s2a_bench.transport import risks
 from s2a_bench.transport.grpc.risks import PREFACE
 from s2a_bench.transport.risks import examine, printable
+from tests.servers.sockets import Received, head, serving
 
 SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
 
@@ -72,6 +73,37 @@ def test_off_this_machine_both_are_warnings(monkeypatch: pytest.MonkeyPatch) -> 
     assert [findings[code].level for code in ("plain-text", "no-key")] == ["warning", "warning"]
     assert findings["plain-text"].fix.startswith("ssh -L ")
     assert findings["no-key"].message.isprintable()
+
+
+@pytest.mark.parametrize(
+    ("replies", "is_open"),
+    [
+        ([("200 OK", '"error"')], True),
+        ([("500 Internal Server Error", '{"error": "image"}')], True),
+        ([("401 Unauthorized", "{}")], False),
+        ([("422 Unprocessable Entity", '{"detail": [{"loc": ["header", "authorization"]}]}')], False),  # as FastAPI
+        ([], False),
+    ],
+)
+def test_an_act_that_answers_anyone_is_told_of(replies: list[tuple[str, str]], is_open: bool) -> None:
+    """As vla-scripts/deploy.py of TRI-ML/prismatic-vlms at c43b6366: POST alone, and an error in words."""
+    posted: list[bytes] = []
+
+    def deploy(received: Received) -> list[bytes]:
+        status, body = "404 Not Found", "{}"
+        if received.path == "/act" and replies:
+            status = "405 Method Not Allowed"
+            if received.method == "POST":
+                posted.append(received.body)
+                ((status, body),) = replies
+        return [head(status, kind="application/json") + body.encode()]
+
+    with serving(deploy) as url:
+        for each in (url, f"{url}/act"):
+            findings = found(each)
+            assert ("no-key" in findings) == is_open
+            assert ("server" in findings) == (not is_open)
+    assert posted == [b"{}"] * 2 * len(replies)
 
 
 def test_an_http_server_that_closes_idle_connections_is_told_of() -> None:

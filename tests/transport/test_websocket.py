@@ -397,7 +397,7 @@ def test_the_doctor_tells_of_a_server_with_a_key(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setenv("ROBOT_KEY", "open sesame")
     with serving(RecordingHandler(list(CHUNK)), api_key_env="ROBOT_KEY") as server:
         found = {finding.code: finding for finding in examine(server.address)}
-    assert "lets no client in without a key" in found["server"].message
+    assert "refuses a client without a key" in found["server"].message
     assert {finding.level for finding in examine("ws://127.0.0.1:9")} == {"state", "error"}
 
 

@@ -528,6 +528,32 @@ class TestLayoutOfAServer:
             ask(client, Request("a", "go", (yuyv_frame(),)))
         assert answers.endpoints == ["get_modality_config", "get_action"]
 
+    def test_n1_5s_configurations_are_text_and_its_observations_flat(self, tmp_path: Path) -> None:
+        keys = {"video": ["video.front"], "state": ["state.single_arm", "state.gripper"], "language": [TASK]}
+        template = tmp_path / "arm.json"
+        parts = {"state.single_arm": ["{state:0:2}"], "state.gripper": ["{state:2:3}"]}
+        template.write_text(json.dumps({"video.front": ["{image}"], **parts, TASK: ["{prompt}"]}))
+
+        def answers(request: Any) -> Any:
+            """As gr00t/eval/service.py of NVIDIA/Isaac-GR00T at 0a015f63 and model/policy.py at 16c4f7b3."""
+            if request["endpoint"] == "get_modality_config":
+                told = {name: {"delta_indices": [0], "modality_keys": each} for name, each in keys.items()}
+                return {name: {"__ModalityConfig_class__": True, "as_json": json.dumps(told[name])} for name in told}
+            if request["endpoint"] == "ping":
+                return {"status": "ok", "message": "Server is running"}
+            for key in (key for each in keys.values() for key in each if key not in request["data"]):
+                return {"error": str(KeyError(key))}
+            assert request["data"]["video.front"].shape == (1, 48, 64, 3)
+            return {"action.single_arm": CHUNK[:, :2], "action.gripper": CHUNK[:, 2]}
+
+        with policy(answers) as url:
+            with robot("", url=url) as client:
+                assert client.describe() == {"url": url, "template": "gr00t-n1.5", "layout": "n1.5"}
+            with robot("", url=url, template=str(template)) as client:
+                actions, _ = ask(client, Request("a", "go", (yuyv_frame(),), state=(1, 2, 3)))
+            assert {each.code: each.level for each in examine(url)}["pickle"] == "state"
+        np.testing.assert_array_equal(np.stack([action.values for action in actions]), CHUNK)  # type: ignore[union-attr]
+
     def test_the_key_goes_with_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("ROBOT_KEY", KEY)
         answers = Policy({})
@@ -548,7 +574,9 @@ class TestLayoutOfAServer:
             ):
                 pass
 
-    @pytest.mark.parametrize(("layout", "found"), [("auto", "n1.6"), ("n1.6", "n1.6"), ("n1.7", "n1.7")])
+    @pytest.mark.parametrize(
+        ("layout", "found"), [("auto", "n1.6"), ("n1.5", "n1.5"), ("n1.6", "n1.6"), ("n1.7", "n1.7")]
+    )
     def test_our_own_server_tells_its_layout(self, layout: str, found: str) -> None:
         handler = RecordingHandler(list(CHUNK))
         with serving(handler, layout=layout) as server, robot("", url=server.address) as client:

@@ -171,6 +171,7 @@ def test_the_marks_of_a_message_are_those_of_its_arrays_and_configurations() -> 
         ({"a": array}, False, {"n1.6"}),
         ({"a": array}, True, {"n1.7"}),
         ({"a": {"__ModalityConfig_class__": True, "as_json": {}}}, False, {"n1.6"}),
+        ({"a": {"__ModalityConfig_class__": True, "as_json": "{}"}}, False, {"n1.5"}),
         ({"a": {"__ModalityConfig__": True, "as_json": {}}}, False, {"n1.7"}),
         ({"a": "n1.7"}, False, set()),
     ):

@@ -70,6 +70,8 @@ def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) ->
     images: list[Frame] = []
     texts: list[str] = []
     try:
+        if not fields["messages"]:
+            raise ValueError("there should be one at least")
         for message in fields["messages"]:
             content = message["content"]
             items: list[dict[str, Any]] = [{"type": "text", "text": content}] if isinstance(content, str) else content

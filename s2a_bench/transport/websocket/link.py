@@ -29,6 +29,8 @@ FRAME_BYTES: Final = 64
 """What a frame costs beside its data."""
 CLOSING_S: Final = 1.0
 QUOTED: Final = 200
+REFUSED: Final = "; refused: a wrong path or a key; see `url` and `api_key_env`"
+"""Of 403 too, with which Starlette answers an unknown path."""
 
 
 class Broken(RequestFailed):
@@ -146,7 +148,7 @@ class BoundedConnection:
         if isinstance(error, InvalidStatus):
             response = error.response
             body = " ".join(struck(bytes(response.body or b"").decode(errors="replace"))[:QUOTED].split())
-            advice = "; see `api_key_env`" if response.status_code in {401, 403} else ""
+            advice = {401: "; see `api_key_env`", 403: REFUSED, 404: REFUSED}.get(response.status_code, "")
             return RequestFailed(f"{self._url} answered {response.status_code}: {body or 'nothing'}{advice}")
         if isinstance(error, ConnectionClosed) or isinstance(why, (EOFError, OSError)):
             closed = error.rcvd if isinstance(error, ConnectionClosed) else None

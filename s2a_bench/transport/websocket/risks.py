@@ -23,17 +23,26 @@ PINGING = "websockets/", "uvicorn"
 
 
 def examine(parts: SplitResult) -> Iterator[Finding]:
-    """Shake hands without a key, and once more as a web page in a browser does."""
+    """Shake hands without a key, at templates' paths if that is refused, and once more as a page in a browser does."""
     extras.need("websocket", *PACKAGES)
-    url = urlunsplit(parts)
-    try:
-        greeting, headers = _greeting(url, {})
-    except ServerDied as error:
-        raise OSError(str(error).rpartition(": ")[2]) from error
-    except S2AError as error:
-        yield Finding("server", "state", f"it answers, and lets no client in without a key: {error}")
-        return
-    yield from _slow(parts, headers)
+    from s2a_bench.transport.websocket.link import REFUSED
+
+    why, paths = "", [parts.path, *sorted({template_of(name).server.path for name in names()} - {parts.path})]
+    for path in paths:
+        url = urlunsplit(parts._replace(path=path))
+        try:
+            greeting, headers = _greeting(url, {})
+            break
+        except ServerDied as error:
+            raise OSError(str(error).rpartition(": ")[2]) from error
+        except S2AError as error:
+            why = why or str(error)
+            if REFUSED not in why or path == paths[-1]:
+                yield Finding("server", "state", f"it answers, and refuses a client without a key: {why}")
+                return
+    if why:
+        yield Finding("path", "advice", f"{why}; it lets clients in at {path}", f"name {url}")
+    yield from _slow(parts._replace(path=path), headers)
     yield no_key(
         parts,
         f"it lets every client in (and greets with: {greeting}), so it answers every client too",

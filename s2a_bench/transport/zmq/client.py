@@ -22,7 +22,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring, observed
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.observation import EXTENSION
+from s2a_bench.transport.observation import EXTENSION, template_of
 from s2a_bench.transport.policy_client import PolicyClient
 from s2a_bench.transport.zmq import ZmqOptions, layouts
 from s2a_bench.transport.zmq.npy import PictureFile
@@ -56,6 +56,7 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         if self._layout == layouts.AUTO:
             marks = set() if self._native else self._server_marks()
             self._native, self._layout = self._native or layouts.OURS in marks, layouts.marked(marks)
+            self._template = template_of(wiring.options.but(layout=self._layout).template_name)
 
     def _server_marks(self) -> set[str]:
         """Return the marks of the server's modality configurations: its layout, and whether it is ours."""

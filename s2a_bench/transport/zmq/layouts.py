@@ -28,7 +28,7 @@ AUTO, N1_5, N1_6, N1_7 = "auto", "n1.5", "n1.6", "n1.7"
 OURS: Final = "s2a-bench"
 """Key of our server's configurations, which their readers ignore."""
 CONFIG_MARKS: Final = {N1_6: "__ModalityConfig_class__", N1_7: "__ModalityConfig__"}
-"""Layout -> the key that marks a modality's configuration; N1.5's is N1.6's."""
+"""Layout -> the key that marks a modality's configuration; N1.5's is N1.6's, with the configuration as text."""
 OBSERVATION: Final = "observation"
 NAMES: Final = {
     "video": "ego_view",
@@ -42,8 +42,9 @@ STATE_AXES, PICTURE_AXES = 2, 4
 
 
 def marked(marks: set[str]) -> str:
-    """Return the layout of what the marks of a message say, see `wire.read`; N1.6's where they say nothing."""
-    return N1_7 if marks - {OURS} == {N1_7} else N1_6
+    """Return the layout of what the marks of a message say, see `wire.read`; N1.6's where they say none or several."""
+    said = marks - {OURS}
+    return said.pop() if len(said) == 1 else N1_6
 
 
 def data_of(layout: str, observation: dict[str, Any]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from s2a_bench import extras
 from s2a_bench.errors import RequestFailed
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.transport.limits import Bounds
+from s2a_bench.transport.listening import in_url
 from s2a_bench.transport.risks import PATIENCE_S, no_key, printable
 from s2a_bench.transport.zmq import PACKAGES, layouts
 
@@ -25,7 +26,7 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
     from s2a_bench.transport.zmq.client import ReqSocket
     from s2a_bench.transport.zmq.wire import pack, read
 
-    url = urlunsplit((parts.scheme, f"{parts.hostname}:{parts.port or PORT}", "", "", ""))
+    url = urlunsplit((parts.scheme, f"{in_url(parts.hostname or '')}:{parts.port or PORT}", "", "", ""))
     bounds = Bounds(url, 3 * PATIENCE_S, 0)
     with closing(ReqSocket(url, PATIENCE_S, lambda: True)) as link:
         link.greet(bounds)
@@ -63,7 +64,7 @@ def _unpickles_all() -> Finding:
 
 
 def _may_unpickle(marks: set[str]) -> Finding:
-    if layouts.N1_6 in marks:
+    if marks & {layouts.N1_5, layouts.N1_6}:
         return Finding("pickle", "state", "its configurations are marked as N1.5's or N1.6's: they unpickle nothing")
     which = "its configurations are marked as GR00T N1.7's" if marks else "no answer tells which GR00T it is"
     return Finding(

@@ -24,7 +24,7 @@ import zmq
 from s2a_bench.errors import Busy, RequestFailed, S2AError, TransportError
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring, observed
-from s2a_bench.transport.listening import cannot_bind, key_for, split_address
+from s2a_bench.transport.listening import cannot_bind, in_url, key_for, split_address
 from s2a_bench.transport.serving import RETRY_AFTER_S, Core, Exchange, SharedSourceWorkers, client_error
 from s2a_bench.transport.zmq import ZmqOptions, layouts
 from s2a_bench.transport.zmq.watch import Connection, ConnectionWatch
@@ -70,11 +70,12 @@ class ZmqServer:
         self._router = self._context.socket(zmq.ROUTER)
         self._router.linger = 0
         self._router.rcvhwm = self._router.sndhwm = QUEUED
+        self._router.ipv6 = ":" in host
         self._router.maxmsgsize = limits.body_bytes
         self._router.handshake_ivl = round(limits.head_s * 1e3)
         self._watch = ConnectionWatch(self._router)
         try:
-            self._router.bind(f"tcp://{host}:{'*' if port == '0' else port}")
+            self._router.bind(f"tcp://{in_url(host)}:{'*' if port == '0' else port}")
         except zmq.ZMQError as error:
             self._close()
             raise cannot_bind(host, port, error.errno, error.strerror) from error
@@ -322,6 +323,6 @@ def _error(error: S2AError) -> memoryview:
 def _resolved(host: str) -> str:
     """Return the address of a host, for libzmq binds no names."""
     try:
-        return socket.gethostbyname(host)
+        return host if ":" in host else socket.gethostbyname(host)
     except OSError as error:
         raise TransportError(f"`host`: '{host}' is no address of this machine: {error}") from error

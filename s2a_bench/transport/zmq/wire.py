@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.transport.messagepack import array_in, unpacked
-from s2a_bench.transport.zmq.layouts import CONFIG_MARKS, N1_6, N1_7, OURS
+from s2a_bench.transport.zmq.layouts import CONFIG_MARKS, N1_5, N1_6, N1_7, OURS
 from s2a_bench.transport.zmq.npy import PictureFile, array_of, file_of
 
 ARRAY, FILE = "__ndarray_class__", "as_npy"
@@ -59,7 +59,7 @@ def unpack(data: Any) -> Any:
 
 
 def read(data: Any) -> tuple[Any, set[str]]:
-    """Return what `unpack` does, and the marks of its arrays and configurations: N1.6, N1.7, `OURS`."""
+    """Return what `unpack` does, and the marks of its arrays and configurations: N1.5 to N1.7, `OURS`."""
     marks: set[str] = set()
 
     def plain(value: dict[Any, Any]) -> Any:
@@ -71,7 +71,9 @@ def read(data: Any) -> tuple[Any, set[str]]:
             if fields.keys() >= {TYPE, BYTES}:
                 marks.add(N1_7)
                 return _array_in(fields)
-        marks.update(layout for layout, mark in (*CONFIG_MARKS.items(), (OURS, OURS)) if mark in value)
+        for layout, mark in (*CONFIG_MARKS.items(), (OURS, OURS)):
+            if mark in value:
+                marks.add(N1_5 if layout == N1_6 and isinstance(value.get("as_json"), str) else layout)
         return value
 
     return unpacked(data, plain), marks
