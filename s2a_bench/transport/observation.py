@@ -76,6 +76,8 @@ class ExternalServer(toml_file.TomlTable):
     """Whether the keys of an array's map are texts, not bytes."""
     arrays_as_text: bool = False
     """Whether each array is a text that is JSON, within the JSON of the observation."""
+    image_maps: bool = False
+    """Whether an encoded picture is a map, as vla-eval has it."""
     answer: Annotated[str, Field(max_length=200)] = "actions"
     """Keys that lead to the actions of an answer, joined by dots; empty if the answer is the actions."""
     reset: dict[str, Any] | None = None
