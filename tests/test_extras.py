@@ -62,9 +62,9 @@ LEROBOT = ("--transport", "grpc", "--policy-type", "act", "--pretrained", "x")
         ("gguf", "model", ("model", "dummy")),
         ("huggingface_hub", "model", ("model", "fetch", "minicpm-v-2.6")),
         ("highway_env", "ccrb", ("ccrb", "--simulator", "embedded")),
-        ("json_numpy", "openvla", (*BLACK_BOX, "--dialect", "openvla", "--payload", "raw")),
+        ("json_numpy", "act", (*BLACK_BOX, "--dialect", "openvla", "--payload", "raw")),
         ("ray", "ray", ("sweep", "paper", "--ray", "local")),
-        ("grpc", "lerobot", ("latency", "--url", "grpc://a:1", *LEROBOT)),
+        ("grpc", "grpc", ("latency", "--url", "grpc://a:1", *LEROBOT)),
     ],
 )
 def test_a_missing_library_is_one_line_with_the_command_and_leaves_nothing(
@@ -176,7 +176,9 @@ def test_the_core_has_22_requirements_at_most_beside_backports(machine: str) -> 
 
 def test_every_extra_is_described_and_in_all() -> None:
     offered = PROJECT["optional-dependencies"]
-    assert offered.keys() == {*extras.EXTRAS, "all", "dev"}
+    older = {"lerobot": "grpc", "openvla": "act"}
+    assert offered.keys() == {*extras.EXTRAS, "all", "dev", *older}
+    assert {name: offered[name] for name in older} == {name: [f"s2a-bench[{new}]"] for name, new in older.items()}
     (everything,) = (Requirement(text).extras for text in offered["all"])
     assert everything | {"model"} == set(extras.EXTRAS)
     (made,) = (Requirement(text).extras for text in offered["dev"] if text.startswith("s2a-bench"))

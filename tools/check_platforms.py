@@ -91,7 +91,7 @@ class Target:
         return flags + [word for tag in tags for word in ("--platform", tag)]
 
 
-BOARD = ("llama", "ccrb", "nvidia", "openvla", "ray")
+BOARD = ("llama", "ccrb", "nvidia", "act", "ray")
 TARGETS = (
     Target("3.10", "x86_64", 35, "Ubuntu 22.04, Humble", ("dev", "ray")),
     Target("3.11", "x86_64", 36, "Debian 12", ("dev", "ray")),

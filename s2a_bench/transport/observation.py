@@ -80,6 +80,8 @@ class ExternalServer(toml_file.TomlTable):
     """Whether each array is a text that is JSON, within the JSON of the observation."""
     arrays_as_lists: bool = False
     """Whether each array is a list of lists of numbers in the JSON of the observation."""
+    image_maps: bool = False
+    """Whether an encoded picture is a map, as vla-eval has it."""
     answer: Annotated[str, Field(max_length=200)] = "actions"
     """Keys, and places in lists, that lead to the actions of an answer, joined by dots; empty if it is the actions."""
     reset: dict[str, Any] | None = None

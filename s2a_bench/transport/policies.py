@@ -43,7 +43,7 @@ class PolicyTransport(Transport[P]):
 
     def capabilities(self, choice: Choice[P]) -> Capabilities[P]:
         options, template = choice.options, template_of(choice.options.template_name)
-        pixels = self.payloads[:1] if options.url else self.payloads
+        pixels = ("raw", "png", "jpeg")[: 3 if template.server.image_maps else 1] if options.url else self.payloads
         payloads = self.payloads[1:] if template.encoded else pixels
         return Capabilities(options, payloads, self.answer_kinds, template.accepts_state, self.facts)
 

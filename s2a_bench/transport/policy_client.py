@@ -33,15 +33,13 @@ class PolicyClient(ABC, Generic[P]):
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         bounds = self._bounds(request.max_tokens)
-        whole = False
         try:
             for piece in self._answer(request, bounds, trace):
                 bounds.count_piece()
                 yield piece
-            whole = True
-        finally:
-            if not whole:
-                self._abandon()
+        except BaseException:
+            self._abandon()
+            raise
 
     @abstractmethod
     def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from io import BytesIO
 from pathlib import Path
 from threading import Thread
 from typing import Any
@@ -13,13 +14,16 @@ import numpy as np
 import pytest
 import uvicorn
 from fastapi import FastAPI, WebSocket
+from PIL import Image
 from websockets.sync.server import serve
 
 from s2a_bench.errors import RequestFailed, UsageError
+from s2a_bench.frames.convert import yuyv_to_rgb
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import budget
 from s2a_bench.transport import TRANSPORTS, Choice, Client, open_client
 from s2a_bench.transport.observation import template_of
+from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.risks import examine
 from s2a_bench.transport.websocket import risks
 from s2a_bench.transport.websocket.codec import packb, unpackb
@@ -315,6 +319,30 @@ def test_vla_eval_is_greeted_and_has_texts_as_the_keys_of_an_array() -> None:
     assert (hello["type"], hello["payload"]) == ("hello", {"protocol_version": 1})
     assert observation["payload"]["images"]["wrist"].shape == (48, 64, 3)
     assert observation["payload"]["task_description"] == "go"
+
+
+@pytest.mark.parametrize("payload", ["png", "jpeg"])
+def test_vla_evals_robots_send_maps_of_encoded_pictures(payload: str) -> None:
+    """Its image_codec.py (allenai/vla-evaluation-harness 5ea6e514): read by the key, opened by Pillow."""
+
+    def answer(message: Any) -> Any:
+        return {**message, "payload": {"actions": CHUNK[0]} if message["type"] == "observation" else {}}
+
+    with relative(answer, greets=False, text_keys=True) as (address, heard):
+        client = open_client(wiring_of("websocket", url=address, template="vla-eval", payload=payload))
+        _, trace = ask(client, REQUEST)
+        client.close()
+    for picture, frame in zip(heard[2]["payload"]["images"].values(), REQUEST.images, strict=True):
+        assert (picture["__image__"], picture["format"], picture["shape"]) == (True, payload, [48, 64, 3])
+        seen = Image.open(BytesIO(picture["data"]))
+        assert (seen.format, seen.size) == (payload.upper(), (64, 48))
+        assert payload == "jpeg" or np.array_equal(np.asarray(seen), yuyv_to_rgb(frame.data))
+    assert [name for name, _ in trace.chain()].count("image_encode") == 2
+
+
+def test_a_picture_is_a_map_for_vla_eval_alone() -> None:
+    for template, payloads in (("vla-eval", ("raw", "png", "jpeg")), ("starvla", ("raw",))):
+        assert one_pipeline("websocket", url="ws://a:1", template=template).capabilities.payloads == payloads
 
 
 @pytest.mark.parametrize(

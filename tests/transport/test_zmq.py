@@ -32,6 +32,7 @@ from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.risks import examine
+from s2a_bench.transport.zmq.layouts import modalities_in, template_of
 from s2a_bench.transport.zmq.watch import ConnectionWatch
 from s2a_bench.types import Action, Piece, Request
 from tests.waiting import until
@@ -603,6 +604,149 @@ class TestLayoutOfAServer:
         }
         assert answers.endpoints == ["get_modality_config", "get_action", "get_action"]
         assert run.samples["error"].isna().all() or set(run.samples["error"]) == {""}
+
+
+def droid(*state: str, steps: int) -> tuple[tuple[str, ...], int, tuple[str, ...], str]:
+    cameras = ("exterior_image_1_left", "wrist_image_left")
+    return cameras, steps, state, "annotation.language.language_instruction"
+
+
+EMBODIMENTS = {
+    "unitree_g1": (
+        ("ego_view",),
+        1,
+        ("left_leg", "right_leg", "waist", "left_arm", "right_arm", "left_hand", "right_hand"),
+        "annotation.human.task_description",
+    ),
+    "libero_panda": (
+        ("image", "wrist_image"),
+        1,
+        ("x", "y", "z", "roll", "pitch", "yaw", "gripper"),
+        "annotation.human.action.task_description",
+    ),
+    "oxe_droid": droid("joint_position", "gripper_position", steps=1),
+    "oxe_droid of N1.7": droid("eef_9d", "gripper_position", "joint_position", steps=2),
+}
+"""Cameras, pictures of each, parts of the state, key of the prompt: NVIDIA/Isaac-GR00T,
+gr00t/configs/data/embodiment_configs.py at d3c0e4d3, examples/DROID at be889e7a."""
+
+
+class Embodied:
+    """A policy server that checks an observation as NVIDIA/Isaac-GR00T does, gr00t/policy/gr00t_policy.py be889e7a."""
+
+    def __init__(self, name: str, layout: str, widths: tuple[int, ...] = ()) -> None:
+        cameras, steps, parts, self.words = EMBODIMENTS[name]
+        self.cameras, self.steps, self.widths = cameras, steps, dict(zip(parts, widths, strict=False))
+        self.seen: Any = None
+        mark = {"n1.6": "__ModalityConfig_class__", "n1.7": "__ModalityConfig__"}[layout]
+        told = {"video": (steps, cameras), "state": (1, parts), "action": (16, parts), "language": (1, [self.words])}
+        rest = dict.fromkeys(("sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"))
+        self.configs = {
+            modality: {mark: True, "as_json": {"delta_indices": [*range(n)], "modality_keys": [*keys], **rest}}
+            for modality, (n, keys) in told.items()
+        }
+
+    def __call__(self, request: Any) -> Any:
+        if request["endpoint"] == "get_modality_config":
+            return self.configs
+        self.seen = seen = request["data"]["observation"]
+        try:
+            assert seen.keys() == {"video", "state", "language"}
+            for key in self.cameras:
+                picture = seen["video"][key]
+                assert picture.dtype == np.uint8
+                assert (picture.ndim, picture.shape[:2], picture.shape[-1]) == (5, (1, self.steps), 3)
+            for key, width in self.widths.items():
+                assert seen["state"][key].dtype == np.float32
+                assert seen["state"][key].shape == (1, 1, width)
+            assert seen["language"][self.words] == [["go"]]
+        except (AssertionError, KeyError) as error:
+            return {"error": f"{type(error).__name__} {error}"}
+        return [{"robot": CHUNK[np.newaxis]}, {}]
+
+
+def numbered(count: int, cameras: int) -> Request:
+    frames = tuple(yuyv_frame(seed=each) for each in range(cameras))
+    return Request("a", "go", frames, state=tuple(map(float, range(count))))
+
+
+class TestEmbodiments:
+    """What a server's configurations tell, without a template."""
+
+    @pytest.mark.parametrize(
+        ("name", "layout", "widths"),
+        [
+            ("unitree_g1", "n1.6", (6, 6, 3, 7, 7, 7, 7)),
+            ("unitree_g1", "n1.7", (6, 6, 3, 7, 7, 1, 1)),
+            ("libero_panda", "n1.6", (1, 1, 1, 1, 1, 1, 2)),
+            ("oxe_droid", "n1.6", (7, 1)),
+            ("oxe_droid of N1.7", "n1.7", (9, 1, 7)),
+        ],
+    )
+    def test_an_embodiment_needs_no_template(self, name: str, layout: str, widths: tuple[int, ...], peer: Any) -> None:
+        server = Embodied(name, layout, widths)
+        request = numbered(sum(widths), len(server.cameras))
+        with policy(server, **mapped(peer) if layout == "n1.7" else FILES) as url, robot("", url=url) as client:
+            assert client.describe()["template"] == "get_modality_config"
+            for _ in "ab":
+                assert len(ask(client, request)[0]) == 4
+        np.testing.assert_array_equal(
+            np.concatenate([part[0, 0] for part in server.seen["state"].values()]), request.state
+        )
+        for picture, frame in zip(server.seen["video"].values(), request.images, strict=True):
+            for each in picture[0]:
+                np.testing.assert_array_equal(each, yuyv_to_rgb(frame.data))
+
+    @pytest.mark.parametrize(
+        ("name", "state", "cameras", "why"),
+        [
+            (
+                "libero_panda",
+                8,
+                1,
+                r"get_modality_config: video\.wrist_image.* wants 2 pictures, and the request has 1$",
+            ),
+            ("libero_panda", 8, 3, "get_modality_config has places for 2 pictures, not 3$"),
+            ("libero_panda", 6, 2, r"x \(1\), .* gripper \(\?\), not 6 numbers; change `state`, or give `template`$"),
+            ("unitree_g1", 44, 1, r"left_leg \(6\), .* right_hand \(\?\), not 44 numbers"),
+            ("oxe_droid", 0, 2, r"joint_position \(\?\), gripper_position \(1\), not 0 numbers"),
+        ],
+    )
+    def test_what_does_not_fit_is_told(self, name: str, state: int, cameras: int, why: str) -> None:
+        with (
+            policy(Embodied(name, "n1.6")) as url,
+            robot("", url=url) as client,
+            pytest.raises(RequestFailed, match=why),
+        ):
+            ask(client, numbered(state, cameras))
+
+    def test_two_parts_of_unknown_width_are_told(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setitem(EMBODIMENTS, "ours", (("front",), 1, ("tail", "x", "wing"), "task"))
+        with (
+            policy(Embodied("ours", "n1.6")) as url,
+            robot("", url=url) as client,
+            pytest.raises(RequestFailed, match=r"state is tail \(\?\), x \(1\), wing \(\?\), not 5 numbers"),
+        ):
+            ask(client, numbered(5, 1))
+
+    def test_a_template_goes_first(self) -> None:
+        with policy(Embodied("unitree_g1", "n1.6")) as url, robot("", url=url, template="gr00t-so100") as client:
+            assert client.describe()["template"] == "gr00t-so100"
+
+    def test_n1_5_is_flat_and_its_configurations_are_text(self) -> None:
+        told = {"video": ["video.front"], "state": ["state.single_arm", "state.gripper"], "language": [TASK]}
+        answer = {
+            modality: {"as_json": json.dumps({"delta_indices": [0], "modality_keys": keys})}
+            for modality, keys in told.items()
+        }
+        picture = np.zeros((4, 4, 3), np.uint8)
+        filled = template_of("n1.5", modalities_in(answer), 6).fill([picture], range(6), "go")
+        assert {key: np.shape(value) for key, value in filled.items()} == {
+            "video.front": (1, 4, 4, 3),
+            "state.single_arm": (1, 5),
+            "state.gripper": (1, 1),
+            TASK: (1,),
+        }
 
 
 class TestDangers:

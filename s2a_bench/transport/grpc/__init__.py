@@ -43,7 +43,7 @@ class Grpc(PolicyTransport[GrpcOptions]):
     payloads = ("raw",)
     stages: ClassVar[dict[str, str]] = {"pickle_pack": "pack", "send": "network", "pickle_parse": "parse"}
     urls = Urls(GrpcOptions.SCHEMES, examine="s2a_bench.transport.grpc.risks:examine")
-    needs = (LEROBOT, "grpc")
+    needs = ("grpc", "grpc")
     client_class = "s2a_bench.transport.grpc.client:GrpcClient"
     facts = (PAYLOAD_BYTES, PAYLOAD_DOWN_BYTES, RECONNECTS, GET_ACTIONS_MS)
     order = 24

@@ -40,7 +40,7 @@ class Websocket(PolicyTransport[WebsocketOptions]):
     needs = ("websocket", *PACKAGES)
     client_class = "s2a_bench.transport.websocket.client:WebsocketClient"
     server_class = "s2a_bench.transport.websocket.server:WebsocketServer"
-    reads_server = ("path", "greets", "text_keys", "answer", "reset", "idle_s")
+    reads_server = ("path", "greets", "text_keys", "answer", "reset", "idle_s", "image_maps")
     facts = (PAYLOAD_BYTES, RECONNECTS, INFER_MS, PREV_TOTAL_MS)
     order = 20
     style = {OPENPI: ("#000000", "-"), STREAM: ("#000000", "--")}

@@ -53,17 +53,19 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         self._link: ReqSocket | None = None
         self._connected = False
         self._layout: str = wiring.options.layout
+        answer: Any = None
         if self._layout == layouts.AUTO:
-            marks = set() if self._native else self._server_marks()
+            answer, marks = (None, set()) if self._native else self._configurations()
             self._native, self._layout = self._native or layouts.OURS in marks, layouts.marked(marks)
             self._template = template_of(wiring.options.but(layout=self._layout).template_name)
+        self._told = {} if self._native or wiring.options.template else layouts.modalities_in(answer)
 
-    def _server_marks(self) -> set[str]:
-        """Return the marks of the server's modality configurations: its layout, and whether it is ours."""
+    def _configurations(self) -> tuple[Any, set[str]]:
+        """Return the server's modality configurations and their marks: its layout, and whether it is ours."""
         bounds = self._bounds(1)
         with closing(ReqSocket(self._url, self._wiring.timeout_s, self._alive)) as link:
             link.greet(bounds)
-            return self._read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))[1]
+            return self._read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))
 
     def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:
         link = self._open(bounds, trace)
@@ -90,7 +92,10 @@ class ZmqClient(PolicyClient[ZmqOptions]):
 
     def _pack(self, request: Request, trace: Trace) -> memoryview:
         """Fill the template and write it as MessagePack, marking each stage."""
-        data = layouts.data_of(self._layout, self._observation(request, trace))
+        if self._told:
+            self._template, self._told = layouts.template_of(self._layout, self._told, len(request.state)), {}
+        seen = self._observation(request, trace)
+        data = seen if self._layout == layouts.N1_5 else {layouts.OBSERVATION: seen, "options": None}
         message: dict[str, Any] = {layouts.ENDPOINT: layouts.GET_ACTION, layouts.DATA: data, **self._token()}
         if self._native:
             message[EXTENSION] = observed.extension_of(request)
@@ -132,7 +137,8 @@ class ZmqClient(PolicyClient[ZmqOptions]):
 
     def describe(self) -> dict[str, str]:
         """Return where the server is, and how requests for it are packed, for the manifest."""
-        return {**super().describe(), "layout": self._layout}
+        told = {"template": layouts.MODALITIES} if self._told else {}
+        return {**super().describe(), **told, "layout": self._layout}
 
     def close(self) -> None:
         if self._link is not None:

@@ -19,6 +19,7 @@ import numpy as np
 
 from s2a_bench.errors import EngineError, RequestFailed
 from s2a_bench.transport.chunks import actions_of
+from s2a_bench.transport.observation import Template
 from s2a_bench.types import Action, Piece
 
 MARKS: Final = "s2a_marks"
@@ -37,6 +38,9 @@ NAMES: Final = {
     "language": "annotation.human.task_description",
 }
 """Modality -> the key that our server tells of; whatever the keys are, it reads them."""
+ONES: Final = ("x", "y", "z", "roll", "pitch", "yaw", "rx", "ry", "rz", "rw", "pad", "gripper_position")
+WIDTHS: Final = {**dict.fromkeys(ONES, 1), "waist": 3, "single_arm": 5, "leg": 6, "arm": 7, "eef_9d": 9}
+"""Part of a robot, left as right -> numbers of its state in GR00T's own embodiments; no server tells of them."""
 STATE_AXES, PICTURE_AXES = 2, 4
 """Of N1.5's arrays without a batch."""
 
@@ -45,10 +49,6 @@ def marked(marks: set[str]) -> str:
     """Return the layout of what the marks of a message say, see `wire.read`; N1.6's where they say none or several."""
     said = marks - {OURS}
     return said.pop() if len(said) == 1 else N1_6
-
-
-def data_of(layout: str, observation: dict[str, Any]) -> dict[str, Any]:
-    return observation if layout == N1_5 else {OBSERVATION: observation, "options": None}
 
 
 def observation_in(data: Any) -> tuple[Any, str]:
@@ -88,6 +88,34 @@ def modalities(layout: str) -> dict[str, Any]:
         content = json.dumps(config) if layout == N1_5 else config
         configs[modality] = {**dict.fromkeys((*marks, OURS), True), "as_json": content}
     return configs
+
+
+def modalities_in(answer: Any) -> dict[str, tuple[list[str], int]]:
+    """Return modality -> keys and time steps, as ``get_modality_config`` was answered; nothing if it was not."""
+    try:
+        told = {name: answer[name]["as_json"] for name in ("video", "state", "language")}
+        told = {name: json.loads(each) if isinstance(each, str) else each for name, each in told.items()}
+        return {name: ([*map(str, each["modality_keys"])], len(each["delta_indices"])) for name, each in told.items()}
+    except (LookupError, TypeError, ValueError, RecursionError):
+        return {}
+
+
+def template_of(layout: str, told: Mapping[str, tuple[Sequence[str], int]], state: int) -> Template:
+    """Return the observation that a server tells of, whose unknown part, or left and right, takes the state's rest."""
+    parts = told["state"][0]
+    kinds = [part.rpartition(".")[2].replace("left_", "").replace("right_", "") for part in parts]
+    unknown = [kind for kind in kinds if kind not in WIDTHS]
+    each, over = divmod(state - sum(WIDTHS.get(kind, 0) for kind in kinds), len(unknown) or 1)
+    if len({*unknown}) > 1 or over or (each < 1 if unknown else each):
+        widths = ", ".join(f"{part} ({WIDTHS.get(kind, '?')})" for part, kind in zip(parts, kinds, strict=True))
+        raise RequestFailed(f"the server's state is {widths}, not {state} numbers; change `state`, or give `template`")
+    ends = np.cumsum([0, *(WIDTHS.get(kind, each) for kind in kinds)])
+    places = {"video": "{{image:{0}}}", "state": "{{state:{1}:{2}}}", "language": "{{prompt}}"}
+    content: dict[str, Any] = {}
+    for modality, (keys, steps) in told.items():
+        rows = {key: [places[modality].format(i, *ends[i : i + 2])] * steps for i, key in enumerate(keys)}
+        content |= rows if layout == N1_5 else {modality: {key: [row] for key, row in rows.items()}}
+    return Template(content, MODALITIES)
 
 
 def _batched(flat: Mapping[Any, Any]) -> bool:

@@ -27,7 +27,7 @@ from s2a_bench.transport.pictures import policy_picture
 from s2a_bench.transport.policies import PolicyTransport
 from s2a_bench.types import Frame, Pixels, Request
 
-json_numpy = extras.require("json_numpy", "openvla")
+json_numpy = extras.require("json_numpy", "act")
 
 FAILED = "error"
 """The body of a failure, with status 200 (``vla-scripts/deploy.py``)."""
