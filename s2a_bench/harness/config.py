@@ -128,9 +128,7 @@ class RequestsConfig(Options):
     mode: Literal["request", "stream"] = option("request", "request (a frame each), stream (a camera runs)")
     fps: float = option(30.0, "rate of the camera in --mode stream", ge=0.1, le=1000)
     max_tokens: int = option(32, "tokens an answer [default: 32, quick: 8]", ge=1, le=2**20)
-    prompt: TextOrFile = option(
-        DEFAULT_PROMPT, "text, or @FILE [default: the paper's prompt; where actions answer, a task]"
-    )
+    prompt: TextOrFile = option(DEFAULT_PROMPT, "text, or @FILE [default: the paper's prompt; of policies, a task]")
     grammar: Grammar = option("", "GBNF file that every answer obeys")
     seed: int = option(0, "seed of the order, the source and the sampling", ge=0, le=2**31 - 1)
     nonce: str = option(
@@ -260,7 +258,8 @@ class RequestsConfig(Options):
     @property
     def sent_prompt(self) -> str:
         """Return the prompt; the default for policies is a task."""
-        return DEFAULT_TASK if self.answer == ACTIONS and "prompt" not in self.model_fields_set else self.prompt
+        acts = self.answer == ACTIONS or any(each.capabilities.takes_task for each in self.pipelines)
+        return DEFAULT_TASK if acts and "prompt" not in self.model_fields_set else self.prompt
 
     @property
     def reads_model(self) -> bool:
