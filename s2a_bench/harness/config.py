@@ -137,6 +137,7 @@ class RequestsConfig(Options):
         pattern="^[0-9A-Za-z_-]{0,64}$",
     )
     timeout_s: float = option(300.0, "longest silence of a server, in seconds", flag="timeout", ge=0.1, le=86_400)
+    wait_for_server: float = option(0.0, "seconds that the server of --url may take to start", ge=0, le=86_400)
     deadline_s: float = option(
         0.0,
         "longest time of a whole answer, in seconds; 0: --timeout and 5 s a token",
@@ -336,6 +337,8 @@ class RequestsConfig(Options):
                 able = [each for each in variants if transport.capabilities(Choice(given, each)).options.external]
                 fit = [f"{name}/{each}" for each in able]
                 raise UsageError(f"`{field}` needs {' or '.join(fit) or name} among `transport`")
+        if self.wait_for_server and not any(each.options.external_address for each in self.pipelines):
+            raise UsageError("`wait_for_server` is about a server that runs already; name it with `url`")
         templates = [each.options for each in self.pipelines if "template" in each.options.model_fields_set]
         if templates and not any(options.template_name for options in templates):
             raise UsageError("`template` is about a server that runs already; name it with `url`")

@@ -30,10 +30,7 @@ SURELY_OFF_MS, SURELY_OFF_SHARE = 20.0, 0.25
 SLEEP_MS, AWAKE_MS = 1e3 / 30, 2.0
 """How long lerobot's server sleeps by default, and how much later its client sees the first of the answers."""
 PILE_MS, PILED = 0.5, 0.1
-"""The width of the pile at the end of a sleep, and the share of answers in it above which the warning is raised.
-
-The times of a policy begin with a tail: they become denser after the first.
-"""
+"""The width of the pile at the end of a sleep, and the share of answers in it that raises the warning."""
 
 
 def before_run(checks: Mapping[str, str] | None = None, machine: Machine | None = None) -> list[RunWarning]:

@@ -52,11 +52,12 @@ def test_every_part_says_what_the_configuration_did() -> None:
 
 
 @pytest.mark.parametrize(("template", "given"), [("", {}), ("openvla-oft", {}), ("", {"prompt": "open the drawer"})])
-def test_a_policy_gets_a_task_not_the_planners_prompt(template: str, given: dict[str, str]) -> None:
+def test_a_policy_gets_a_task_not_the_planners_prompt(template: str, given: dict[str, Any]) -> None:
     pytest.importorskip("json_numpy")
-    http = {"url": "http://127.0.0.1:8000", "dialect": "openvla", **({"template": template} if template else {})}
-    cameras = {"cameras": 3, "state": 14} if template else {}
-    config = LatencyConfig(transports=("http/as-deployed",), options={"http": http}, **cameras, **given)
+    made = {"template": template} if template else {}
+    http: Any = {"http": {"url": "http://127.0.0.1:8000", "dialect": "openvla", **made}}
+    cameras: dict[str, Any] = {"cameras": 3, "state": 14} if template else {}
+    config = LatencyConfig(transports=("http/as-deployed",), options=http, **cameras, **given)
     plan = resolve(config)
     assert plan.request.prompt == plan.manifest["configuration"]["prompt"] == given.get("prompt", DEFAULT_TASK)
 
