@@ -24,6 +24,7 @@ from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.transport.websocket.codec import packb
 from s2a_bench.types import Token
+from tests.servers.lerobot import PolicyServer, chunk, grpc_server
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, LlamaServer, answering
 
@@ -57,7 +58,7 @@ def _no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def measured(output: Path, progress: Waiting, url: str, wait_s: float = 60.0, **more: Any) -> Any:
     small: dict[str, Any] = {"size": (64, 48), "requests": 3, "warmup": 1, "max_tokens": 3, "sample_resources_hz": 0}
-    transport = "websocket/openpi" if url.startswith("ws") else "http/best-effort"
+    transport = {"ws": "websocket/openpi", "grpc": "grpc", "tcp": "zmq"}.get(url.partition(":")[0], "http/best-effort")
     config = LatencyConfig(url=url, transports=(transport,), wait_for_server=wait_s, **{**small, **more})
     return read_run(run_latency(config, output, progress))
 
@@ -128,6 +129,24 @@ def test_a_policy_server_that_refuses_handshakes_is_waited_for(tmp_path: Path) -
         thread.join()
     assert (run.samples["error"] == "").tolist() == [True] * 4
     assert len(progress.waits) == 3
+
+
+def test_a_late_server_of_lerobots_is_waited_for(tmp_path: Path) -> None:
+    port, rows = free_port(), np.zeros((4, 6), np.float32)
+    server = PolicyServer(lambda observation: chunk(observation.timestamp, rows))
+    with ExitStack() as later:
+        progress = Waiting(at_1=lambda: later.enter_context(grpc_server([server.handlers()], port)))
+        options = {"grpc": {"policy_type": "act", "pretrained": "x", "actions_per_chunk": 4}}
+        run = measured(tmp_path, progress, f"grpc://127.0.0.1:{port}", state=6, options=options)
+    assert (run.samples["error"] == "").tolist() == [True] * 4
+    assert "no gRPC server answers" in progress.waits[0]
+
+
+def test_a_zmq_server_that_never_comes_is_told_with_the_time(tmp_path: Path) -> None:
+    progress = Waiting()
+    with pytest.raises(ServerDied, match=r"nothing answers at tcp.*; waited 0.2 s for it"):
+        measured(tmp_path, progress, f"tcp://127.0.0.1:{free_port()}", wait_s=0.2, state=6)
+    assert len(progress.waits) > 1
 
 
 def test_the_last_error_says_how_long_was_waited(tmp_path: Path) -> None:
