@@ -67,6 +67,7 @@ class _CapacityChunksLatencyThroughputTimeline(TypedDict, total=False):
     timeout: float
     timeout_s: float
     url: str
+    wait_for_server: float
     warmup: int
 
 class _LatencyThroughput(TypedDict, total=False):

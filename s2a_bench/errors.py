@@ -69,6 +69,9 @@ class Overdue(EngineError):
 class TransportError(S2AError):
     """A request failed between client and server."""
 
+    starting = False
+    """Whether the server may only be starting, so that it is worth waiting for."""
+
 
 class ClockMoved(TransportError):
     """The clocks of two hosts cannot be joined: one was stepped or slewed."""
@@ -77,9 +80,9 @@ class ClockMoved(TransportError):
 class RequestFailed(TransportError):
     """The server refused or cancelled this request; the next may succeed, perhaps after ``retry_after_s``."""
 
-    def __init__(self, message: str = "", *, retry_after_s: float | None = None) -> None:
+    def __init__(self, message: str = "", *, retry_after_s: float | None = None, starting: bool = False) -> None:
         super().__init__(message)
-        self.retry_after_s = retry_after_s
+        self.retry_after_s, self.starting = retry_after_s, starting
 
 
 class Busy(RequestFailed):
@@ -103,7 +106,9 @@ class PortInUse(TransportError):
 
 
 class ServerDied(TransportError):
-    """The server's process has ended."""
+    """The server's process has ended, or nothing answers at its address."""
+
+    starting = True
 
 
 class RobotError(S2AError):

@@ -128,9 +128,7 @@ class RequestsConfig(Options):
     mode: Literal["request", "stream"] = option("request", "request (a frame each), stream (a camera runs)")
     fps: float = option(30.0, "rate of the camera in --mode stream", ge=0.1, le=1000)
     max_tokens: int = option(32, "tokens an answer [default: 32, quick: 8]", ge=1, le=2**20)
-    prompt: TextOrFile = option(
-        DEFAULT_PROMPT, "text, or @FILE [default: the paper's prompt; where actions answer, a task]"
-    )
+    prompt: TextOrFile = option(DEFAULT_PROMPT, "text, or @FILE [default: the paper's prompt; of policies, a task]")
     grammar: Grammar = option("", "GBNF file that every answer obeys")
     seed: int = option(0, "seed of the order, the source and the sampling", ge=0, le=2**31 - 1)
     nonce: str = option(
@@ -139,6 +137,7 @@ class RequestsConfig(Options):
         pattern="^[0-9A-Za-z_-]{0,64}$",
     )
     timeout_s: float = option(300.0, "longest silence of a server, in seconds", flag="timeout", ge=0.1, le=86_400)
+    wait_for_server: float = option(0.0, "seconds that the server of --url may take to start", ge=0, le=86_400)
     deadline_s: float = option(
         0.0,
         "longest time of a whole answer, in seconds; 0: --timeout and 5 s a token",
@@ -260,7 +259,8 @@ class RequestsConfig(Options):
     @property
     def sent_prompt(self) -> str:
         """Return the prompt; the default for policies is a task."""
-        return DEFAULT_TASK if self.answer == ACTIONS and "prompt" not in self.model_fields_set else self.prompt
+        acts = self.answer == ACTIONS or any(each.capabilities.takes_task for each in self.pipelines)
+        return DEFAULT_TASK if acts and "prompt" not in self.model_fields_set else self.prompt
 
     @property
     def reads_model(self) -> bool:
@@ -337,6 +337,8 @@ class RequestsConfig(Options):
                 able = [each for each in variants if transport.capabilities(Choice(given, each)).options.external]
                 fit = [f"{name}/{each}" for each in able]
                 raise UsageError(f"`{field}` needs {' or '.join(fit) or name} among `transport`")
+        if self.wait_for_server and not any(each.options.external_address for each in self.pipelines):
+            raise UsageError("`wait_for_server` is about a server that runs already; name it with `url`")
         templates = [each.options for each in self.pipelines if "template" in each.options.model_fields_set]
         if templates and not any(options.template_name for options in templates):
             raise UsageError("`template` is about a server that runs already; name it with `url`")

@@ -91,6 +91,8 @@ class RunPlan:
     """Whether this process and the servers keep large blocks of memory for the next picture."""
     timeout_s: float
     deadline_s: float
+    wait_s: float
+    """How long an external server may take to start."""
     finds_model: bool
     """Whether the model's files are yet to be found."""
     sample_resources_hz: float
@@ -144,6 +146,7 @@ def resolve(config: RequestsConfig) -> RunPlan:
         tuned=config.tuned,
         timeout_s=config.timeout_s,
         deadline_s=config.deadline_s,
+        wait_s=config.wait_for_server,
         finds_model=config.reads_model and engine.kind.needs_model,
         sample_resources_hz=config.sample_resources_hz,
         record=config.record,

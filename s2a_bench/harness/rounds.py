@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
+from math import ceil
 from pathlib import Path
 from random import Random
 from typing import Any, Protocol, TypeAlias
 
 from s2a_bench import extras
-from s2a_bench.clock import Clock, SystemClock
+from s2a_bench.clock import Clock, SystemClock, now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
@@ -23,7 +24,7 @@ from s2a_bench.harness.links.probe import probed
 from s2a_bench.harness.plan import BlocksPlan, FeedPlan, RunPlan
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.servers import ServerSet, on_files
-from s2a_bench.harness.session import Measured, Place, Session
+from s2a_bench.harness.session import LONGEST_PAUSE_S, Measured, Place, Session
 from s2a_bench.harness.warnings import Counters, SampleGuard, before_run
 from s2a_bench.machine import environment
 from s2a_bench.machine.doctor import Machine
@@ -34,12 +35,13 @@ from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.schema import Table
-from s2a_bench.trace import mark_cost_ns
+from s2a_bench.trace import Trace, mark_cost_ns
 from s2a_bench.transport import Client, Wiring
 from s2a_bench.transport.pipeline import Pipeline
+from s2a_bench.types import Request
 
 GIVE_UP_AFTER = 5
-"""Failures in a row, of every client of a cell, after which the run ends."""
+"""Failures in a row, of every client of a cell, after which the run ends; more where it waits for a server."""
 LONGEST_WAIT_S = 60.0
 """Limit on a server's ``retry_after_s``; a server that needs longer refuses again and soon ends the run."""
 
@@ -206,6 +208,9 @@ class _Run:
         writer.update(servers=facts, model=model)
         pids = [server["pid"] for server in facts.values()]
         sampler = stack.enter_context(open_sampler(self.plan.sample_resources_hz, pids))
+        for cell in self.plan.cells:
+            if cell.options.external_address and self.plan.wait_s:
+                self._wait_for(servers, cell)
         sessions = list(self._sessions(servers, sampler, stack))
         described = {session.cell.name: facts for session in sessions if (facts := session.client.describe())}
         origins = {session.cell.name: session.origin for session in sessions}
@@ -238,6 +243,26 @@ class _Run:
             writer.update(resources=sampler.describe())
             if self.link:
                 writer.update(link={"relay": self.link.statistics()})
+
+    def _wait_for(self, servers: ServerSet, cell: Pipeline) -> None:
+        """Return when the server answers a request that is not measured, be it with an error that the run meets too."""
+        plan, asked, until_ns = self.plan.feed, self.plan.request, now_ns() + round(self.plan.wait_s * 1e9)
+        source, preencoded = replace(plan, source="synthetic").open(), cell.payload == "jpeg-preencoded"
+        feed = RequestFeed(source, preencoded=preencoded, cameras=plan.cameras, size=plan.resize)
+        while True:
+            trace = Trace()
+            feed.get_ready()
+            frames, state = feed.capture(trace), (0.0,) * asked.state
+            try:
+                with closing(servers.client(cell)) as client:
+                    list(client.request(Request("wait", asked.prompt, frames, asked.max_pieces, state=state), trace))
+                    return
+            except TransportError as error:
+                if not error.starting:
+                    return
+                if now_ns() > until_ns:
+                    raise type(error)(f"{error}; waited {self.plan.wait_s:g} s for it") from error
+                back_off(f"{cell.name}: {error}", 0.5, SystemClock(), self.progress.stage)
 
     def _sessions(self, servers: ServerSet, sampler: ResourceSampler, stack: ExitStack) -> Iterator[Session]:
         plan, recorder = self.plan.feed, self.recorder
@@ -285,8 +310,9 @@ class _Run:
             writer.frame(row)
         self.guard.see(sample, measured.fingerprint, measured.odd, client)
         servers.raise_if_over(session.cell, measured, suspect=bool(sample.error) and clients == 1)
-        if sum(failures >= GIVE_UP_AFTER for failures in self.guard.in_a_row[name].values()) >= clients:
-            raise TransportError(f"{name} failed {GIVE_UP_AFTER} times in a row, at last with {sample.error}")
+        most = GIVE_UP_AFTER + session.answered * ceil(self.plan.wait_s / LONGEST_PAUSE_S)
+        if sum(failures >= most for failures in self.guard.in_a_row[name].values()) >= clients:
+            raise TransportError(f"{name} failed {most} times in a row, at last with {sample.error}")
         back_off(name, measured.retry_after_s, SystemClock(), self.progress.stage)
 
 
@@ -333,5 +359,5 @@ def keep_origin(writer: RunWriter, cell: str, origin: Provenance) -> None:
 def back_off(cell: str, retry_after_s: float, clock: Clock, say: Callable[[str], None]) -> None:
     """Wait ``retry_after_s``, at most `LONGEST_WAIT_S`, before the next request."""
     if wait_s := min(retry_after_s, LONGEST_WAIT_S):
-        say(f"waiting {wait_s:g} s, as the server of {cell} asks")
+        say(f"waiting {wait_s:g} s for the server of {cell}")
         clock.sleep_until_ns(clock.now_ns() + int(wait_s * 1e9))

@@ -67,7 +67,7 @@ class Measured:
     """The rows of one request; ``fingerprint`` identifies its picture.
 
     ``fatal`` ends the run, as a KeyboardInterrupt during the request. ``retry_after_s`` is the wait that a server
-    demands when it refuses.
+    demands when it refuses, or that several failures in a row call for.
     """
 
     sample: SampleRow
@@ -96,6 +96,8 @@ class RequestContext:
 PLAIN = RequestContext()
 UNKNOWN_ORIGIN = Provenance()
 SMALL = (16, 16)
+LONGEST_PAUSE_S = 4.0
+"""Of the pauses between failures in a row, from 1 s before the third on."""
 KEPT_FRAMES = 90
 """Frames that a later answer may name: three seconds at 30 Hz."""
 
@@ -129,6 +131,8 @@ class Session:
         self._clock = RemoteClock(self._exchange, offsets, request.clock)
         self._pictures = 0
         """Of the last request."""
+        self._failures, self.answered = 0, False
+        """Failures since the last answer; whether there was one."""
         self.busy = False
         """Whether a request is under way, so that no other thread may use the client."""
         self.prompt_n = 0
@@ -139,9 +143,15 @@ class Session:
         self.busy = True
         try:
             self._clock.refresh()
-            return self._measure(place, context)
+            measured = self._measure(place, context)
         finally:
             self.busy = False
+        failed, fatal = bool(measured.sample.error), measured.fatal
+        if isinstance(fatal, ServerDied) and self.answered and self.cell.options.external_address:
+            fatal = None  # it may be started again
+        self._failures, self.answered = (self._failures + 1 if failed else 0), self.answered or not failed
+        pause_s = min(2.0 ** (self._failures - 2), LONGEST_PAUSE_S) if self._failures > 1 else 0.0
+        return replace(measured, fatal=fatal, retry_after_s=max(measured.retry_after_s, pause_s))
 
     def _measure(self, place: Place, context: RequestContext) -> Measured:
         self.feed.get_ready()

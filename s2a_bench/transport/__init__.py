@@ -257,6 +257,8 @@ class Capabilities(Generic[O]):
     """Facts that may come, from an external server too."""
     server: str = ""
     """Which of the transport's servers serves the variant."""
+    takes_task: bool = False
+    """Whether the server is a policy, whose prompt is a short task, though its answers count as tokens."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,7 +87,7 @@ def test_a_run_that_is_refused_waits_as_asked_and_ends_with_the_reason(tmp_path:
             output=tmp_path,
             code=1,
         )
-    assert "waiting 0.01 s, as the server of http/best-effort asks" in done.stderr
+    assert "waiting 0.01 s for the server of http/best-effort" in done.stderr
     last = done.stderr.strip().splitlines()[-2:]
     assert any("failed 5 times in a row" in line and "answered 429: slow down" in line for line in last)
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.harness.config import RequestsConfig
+from s2a_bench.experiments.latency.config import LatencyConfig
+from s2a_bench.harness.config import DEFAULT_TASK, RequestsConfig
 from s2a_bench.harness.plan import BlocksPlan, resolve
 from s2a_bench.inference import EngineConfig
 
@@ -48,6 +49,17 @@ def test_every_part_says_what_the_configuration_did() -> None:
     assert {**more.manifest, "cadence": plan.manifest["cadence"]} == plan.manifest
     with pytest.raises(FrozenInstanceError):
         plan.record = Path("run.mcap")  # type: ignore[misc]
+
+
+@pytest.mark.parametrize(("template", "given"), [("", {}), ("openvla-oft", {}), ("", {"prompt": "open the drawer"})])
+def test_a_policy_gets_a_task_not_the_planners_prompt(template: str, given: dict[str, Any]) -> None:
+    pytest.importorskip("json_numpy")
+    made = {"template": template} if template else {}
+    http: Any = {"http": {"url": "http://127.0.0.1:8000", "dialect": "openvla", **made}}
+    cameras: dict[str, Any] = {"cameras": 3, "state": 14} if template else {}
+    config = LatencyConfig(transports=("http/as-deployed",), options=http, **cameras, **given)
+    plan = resolve(config)
+    assert plan.request.prompt == plan.manifest["configuration"]["prompt"] == given.get("prompt", DEFAULT_TASK)
 
 
 def test_every_run_has_a_nonce_of_its_own_unless_told() -> None:

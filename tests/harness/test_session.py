@@ -37,7 +37,7 @@ def test_the_wait_is_what_was_asked_up_to_a_minute(retry_after_s: float, waited_
     clock, lines = VirtualClock(5), []
     back_off("http/as-deployed", retry_after_s, clock, lines.append)
     assert clock.now_ns() - 5 == waited_s * 1e9
-    assert lines == ([f"waiting {waited_s:g} s, as the server of http/as-deployed asks"] if retry_after_s else [])
+    assert lines == ([f"waiting {waited_s:g} s for the server of http/as-deployed"] if retry_after_s else [])
 
 
 @pytest.mark.parametrize(("more", "retry_after_s"), [(["Retry-After: 7"], 7.0), ([], 0.0)])

@@ -73,6 +73,17 @@ def test_headers_at_another_moment_are_told_with_the_half_that_is_too_long(off_m
     assert says in warning.message
 
 
+def padded_ms(least: float, most: float) -> list[float]:
+    """What a client sees of answers that are computed and then held back for 33 ms: a pile at its end."""
+    random = np.random.default_rng(1)
+    return list(np.maximum(1e3 / 30, random.uniform(least, most, 100)) + 0.4 + random.exponential(0.4, 100))
+
+
+def computed_ms(mean: float, deviation: float) -> list[float]:
+    """What a client sees of a policy that takes little more than 33 ms itself."""
+    return list(np.random.default_rng(2).normal(mean, deviation, 100))
+
+
 @pytest.mark.parametrize(
     ("waits_ms", "slept"),
     [
@@ -80,6 +91,12 @@ def test_headers_at_another_moment_are_told_with_the_half_that_is_too_long(off_m
         ([33.5] * 9 + [33.1] * 3, False),  # some came while it would have slept
         ([20.0, *[33.5] * 60], False),
         ([90.0, 33.5] + [80.0] * 60, False),
+        ([34.0] * 60, True),  # as a policy that takes exactly this long would: the text says "may"
+        (padded_ms(5, 30), True),
+        (padded_ms(25, 45), True),
+        (computed_ms(34.0, 0.25), False),
+        (computed_ms(36.0, 0.9), False),
+        ([*np.random.default_rng(3).lognormal(np.log(37), 0.03, 100)], False),
     ],
 )
 def test_a_server_that_sleeps_is_known_by_its_earliest_answers(waits_ms: list[float], slept: bool) -> None:

@@ -49,8 +49,8 @@ def chunk(data: bytes) -> bytes:
 
 
 @contextmanager
-def serving(reply: Reply) -> Iterator[str]:
-    """Serve on a free port of 127.0.0.1; yields the base URL."""
+def serving(reply: Reply, port: int = 0) -> Iterator[str]:
+    """Serve on a port of 127.0.0.1, by default a free one; yields the base URL."""
 
     class Handler(socketserver.StreamRequestHandler):
         def handle(self) -> None:
@@ -68,8 +68,9 @@ def serving(reply: Reply) -> Iterator[str]:
 
     class Server(socketserver.ThreadingTCPServer):
         daemon_threads = True
+        allow_reuse_address = True
 
-    with Server(("127.0.0.1", 0), Handler) as server:
+    with Server(("127.0.0.1", port), Handler) as server:
         thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
         thread.start()
         try:

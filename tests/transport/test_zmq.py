@@ -549,7 +549,7 @@ class TestLayoutOfAServer:
 
         with policy(answers) as url:
             with robot("", url=url) as client:
-                assert client.describe() == {"url": url, "template": "gr00t-n1.5", "layout": "n1.5"}
+                assert client.describe() == {"url": url, "template": "get_modality_config", "layout": "n1.5"}
             with robot("", url=url, template=str(template)) as client:
                 actions, _ = ask(client, Request("a", "go", (yuyv_frame(),), state=(1, 2, 3)))
             assert {each.code: each.level for each in examine(url)}["pickle"] == "state"

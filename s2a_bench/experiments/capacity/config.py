@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 SHOWN: Final = (
     *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
-    *("prompt", "max_tokens", "warmup", "timeout_s", "deadline_s", "sample_resources_hz", "nonce"),
+    *("prompt", "max_tokens", "warmup", "timeout_s", "wait_for_server", "deadline_s", "sample_resources_hz", "nonce"),
 )
 """The options of requests that are flags of `capacity`."""
 MOST_ROBOTS: Final = 10_000

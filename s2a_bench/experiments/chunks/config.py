@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SHOWN: Final = (
     *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
-    *("prompt", "warmup", "timeout_s", "deadline_s", "sample_resources_hz", "nonce"),
+    *("prompt", "warmup", "timeout_s", "wait_for_server", "deadline_s", "sample_resources_hz", "nonce"),
 )
 """The options that are flags of `chunks`."""
 

@@ -168,6 +168,7 @@ class LiveOptions(Options):
     timeout_s: float = option(
         60.0, "--live: seconds without a token after which the robot holds", flag="timeout", ge=0.1, le=86_400
     )
+    wait_for_server: float = option(0.0, "--live: seconds that the server of --url may take to start", ge=0, le=86_400)
 
 
 class TimelineConfig(LiveOptions, Modelled, ComparedOptions):
@@ -297,6 +298,7 @@ def requests_of(config: TimelineConfig) -> RequestsConfig:
         seed=config.seed,
         nonce=config.nonce,
         timeout_s=config.timeout_s,
+        wait_for_server=config.wait_for_server,
         sample_resources_hz=0,
     )
 

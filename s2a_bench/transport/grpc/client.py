@@ -135,7 +135,7 @@ class GrpcClient(PolicyClient[GrpcOptions]):
             grpc.StatusCode.UNIMPLEMENTED: f"is no policy server of lerobot's: {why}",
             grpc.StatusCode.RESOURCE_EXHAUSTED: f"answered with more than 4 MiB (see `actions_per_chunk`): {why}",
         }.get(code, f"refused ({code.name}): {why}")
-        return RequestFailed(f"{self._url} {meaning}")
+        return RequestFailed(f"{self._url} {meaning}", starting=code is grpc.StatusCode.DEADLINE_EXCEEDED)
 
     def close(self) -> None:
         if self._channel is not None:

@@ -38,7 +38,7 @@ def examine(address: SplitResult) -> Iterator[Finding]:
         "sleep",
         "advice",
         "lerobot's policy server answers no sooner than 33 ms after a request, unless it was started otherwise",
-        "start it with --inference_latency=0; `latency` and `chunks --live` recognise the sleep (padded-answers)",
+        "start it with --inference_latency=0; runs warn where answers look like it (padded-answers)",
     )
     yield Finding(
         "filter",

@@ -105,6 +105,7 @@ class Http(Transport[HttpOptions]):
             payloads=jpeg if choice.variant == LLAMA_SERVER else dialects[0].payloads,
             answer_kinds=dialects[0].answer_kinds,
             accepts_state=dialects[0].accepts_state,
+            takes_task=dialects[0].takes_task,
             facts=(*self.facts, *(fact for dialect in dialects for fact in dialect.facts)),
         )
 

@@ -227,11 +227,11 @@ class HttpClient:
         except httpx.ConnectError as error:
             raise ServerDied(f"nothing answers at {url}: {error}") from error
         except httpx.TimeoutException as error:
-            raise RequestFailed(f"{url} was silent for too long: {type(error).__name__}") from error
+            raise RequestFailed(f"{url} was silent for too long: {type(error).__name__}", starting=True) from error
         except httpx.RequestError as error:
             if not self._alive():
                 raise ServerDied(f"the server at {url} has ended: {error}") from error
-            raise RequestFailed(f"{url} broke the connection: {error}") from error
+            raise RequestFailed(f"{url} broke the connection: {error}", starting=True) from error
         except httpx.InvalidURL as error:
             raise TransportError(f"`url`: '{url}' is no URL: {error}") from error
 
@@ -253,7 +253,7 @@ def refusal(url: str, response: HttpResponse, body: str, options: HttpOptions, e
     wait = f"; it asks to wait {wait_s:g} s" if wait_s else ""
     advice = advice_for(response.status_code, message, options, moved=response.headers.get("location", ""))
     line = f"{url} answered {response.status_code}: {' '.join(message.split())}{wait}{'; ' if advice else ''}{advice}"
-    return RequestFailed(line, retry_after_s=wait_s)
+    return RequestFailed(line, retry_after_s=wait_s, starting=response.status_code in {502, 503, 504})
 
 
 def advice_for(status: int, message: str, options: HttpOptions, *, moved: str = "") -> str:

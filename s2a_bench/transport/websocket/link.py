@@ -77,8 +77,10 @@ class BoundedConnection:
         try:
             with self._in_time() as seconds:
                 self._connection.handshake(headers, timeout=seconds)
-        except BaseException:
+        except BaseException as error:
             self.close()
+            if isinstance(error, RequestFailed):  # unless it refused the key, or the path
+                error.starting = getattr(self._connection.response, "status_code", 0) not in {401, 403, 404}
             raise
         if idle_s:
             Thread(target=self._keep_open, args=(idle_s / 3,), daemon=True).start()

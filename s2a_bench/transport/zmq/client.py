@@ -207,14 +207,14 @@ class ReqSocket:
         """Raise what says why waiting has to end."""
         bounds.left_s()
         if now_ns() > ends_ns:
-            raise RequestFailed(f"{self._url} was silent for too long: {self._timeout_s:g} s")
+            raise RequestFailed(f"{self._url} was silent for too long: {self._timeout_s:g} s", starting=True)
         if not self._alive():
             raise ServerDied(f"the server at {self._url} has ended")
 
     def _broke(self, doubt: str = "") -> TransportError:
         if not self._alive():
             return ServerDied(f"the server at {self._url} has ended")
-        return RequestFailed(f"{self._url} broke the connection{doubt}")
+        return RequestFailed(f"{self._url} broke the connection{doubt}", starting=True)
 
     def _patience_ns(self, bounds: Bounds) -> int:
         return now_ns() + round(min(self._timeout_s, bounds.left_s()) * 1e9)

@@ -45,6 +45,7 @@ class Dialect:
     facts: Sequence[Fact] = ()
     answer_kinds: tuple[str, ...] = (TOKENS,)
     accepts_state = False
+    takes_task = False
 
     def describe(self, template: str) -> None:  # noqa: ARG002 - that of a policy server
         """Make requests from a template, by its name; raises UsageError if the dialect takes none."""

@@ -46,6 +46,7 @@ class OpenVla(Dialect):
     name = "openvla"
     path = "/act"
     lists_models = False
+    takes_task = True
     media_type = "application/json"
     payloads: tuple[str, ...] = ("raw",)
     framing = WholeBody
