@@ -52,7 +52,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
 
 
 def _knee_sentences(run: StoredRun) -> Iterator[str]:
-    settings, services = run.manifest["configuration"], run.manifest.get("service", {})
+    settings, services = run.manifest["configuration"], run.manifest.get("service", "")
     clock = {
         "chunks": f" at {settings['control_hz']:g} Hz, H {settings['horizon']}",
         "plans": f" with a plan every {settings['plan_every_s'] or 0:g} s",
@@ -65,28 +65,28 @@ def _knee_sentences(run: StoredRun) -> Iterator[str]:
             robots = "no robot"
         elif knee["source"] != PREDICTED:
             robots += f" [{knee['low']}, {'...' if high is None else high}]"
-        elif high != knee["robots"]:
+        elif high != knee["robots"] and not isinstance(services, str):  # before, high was that of five seeds
             robots += " or more" if high is None else f", fewer than {high + 1},"
         sentence = f"{robots}{clock}, {knee['cell']}, with {knee['limit']}"
         if knee["source"] == PREDICTED:
-            service = services if isinstance(services, str) else services.get(knee["cell"])  # one, in runs of before
+            service = services if isinstance(services, str) else services.get(knee["cell"])
             sentence = f"predicted: {sentence}" + (f"; service times: {service}" if service else "")
         yield f"{sentence}."
 
 
 def _parted(run: StoredRun) -> Iterator[str]:
-    """Yield for each measured cell at which fleets its stalled share and the predicted one have intervals apart."""
+    """Yield for each measured cell in which fleets the interval of its stalled share holds the predicted one."""
     rows = [row for row in _fleets(run) if row["clean"] and row["stalled"] is not None]
     predicted = {(row["cell"], row["robots"]): row for row in rows if row["source"] == PREDICTED}
     apart: dict[str, dict[int, bool]] = {}
     for row in rows:
         if row["source"] == "measured" and (other := predicted.get((row["cell"], row["robots"]))):
-            off = row["stalled_high"] < other["stalled_low"] or other["stalled_high"] < row["stalled_low"]
+            off = not row["stalled_low"] <= other["stalled"] <= row["stalled_high"]
             apart.setdefault(row["cell"], {})[row["robots"]] = off
     for cell, fleets in apart.items():
         parted = [robots for robots, off in fleets.items() if off]
-        how, named = "intervals apart" if parted else "overlapping intervals", ", ".join(map(str, parted or fleets))
-        yield f"{cell}: measured and predicted share of stalls have {how} at {named} robots."
+        how, named = "does not hold" if parted else "holds", ", ".join(map(str, parted or fleets))
+        yield f"{cell}: the interval of the measured share of stalls {how} the predicted one at {named} robots."
 
 
 def _table(run: StoredRun, names: Sequence[str]) -> TextTable:
@@ -119,7 +119,7 @@ def _table(run: StoredRun, names: Sequence[str]) -> TextTable:
 
 
 def _entry(metric: Metric, row: dict[str, Any]) -> str:
-    if metric.name != "stalled" or row["stalled"] is None:
+    if metric.name != "stalled" or row["stalled"] is None or row["source"] == PREDICTED:  # how rare times are is unseen
         return _value(metric, row[metric.column])
     low, high = (_value(metric, row[f"stalled_{end}"]) for end in ("low", "high"))
     return f"{_value(metric, row['stalled'])} [{low}, {high}]"

@@ -47,7 +47,7 @@ def test_the_sentence_names_the_knee_its_interval_and_what_it_holds_for(tmp_path
     assert list(shown.sentences) == [
         f"8 robots [7, 8] at 50 Hz, H 16, 40, queue?trigger=8, with {STALLED}.",
         f"predicted: 8 robots at 50 Hz, H 16, 40, queue?trigger=8, with {STALLED}; service times: as given.",
-        "40, queue?trigger=8: measured and predicted share of stalls have intervals apart at 9 robots.",
+        "40, queue?trigger=8: the interval of the measured share of stalls does not hold the predicted one at 9 robots.",  # noqa: E501
     ]
 
 
@@ -58,6 +58,7 @@ def test_fleets_stand_by_their_number_of_robots_however_they_were_searched(tmp_p
     assert robots == [1, 2, 4, 8, 9, 10, 12, 16] * 2 + [16]
     stalled = [row[table.header.index("stalled, %")] for row in table.rows]
     assert stalled[0].startswith("0.000 [0.000, ")
+    assert stalled[8] == "0.000", "predicted"
     found = shown.json()
     assert [cell["robots"] for cell in found["cells"]] == robots
     assert [knee["robots"] for knee in found["knees"]] == [8, 8]
@@ -74,7 +75,7 @@ def test_a_fleet_whose_generator_was_late_is_no_measurement_in_table_and_sentenc
     assert table.notes == (
         "late: no measurement, as the generator missed its ticks, or exceeds the limit even with an instant server",
     )
-    assert list(shown.sentences)[2].endswith("have overlapping intervals at 1, 2, 4, 8, 10, 12, 16 robots.")
+    assert list(shown.sentences)[2].endswith("stalls holds the predicted one at 1, 2, 4, 8, 10, 12, 16 robots.")
 
 
 def test_a_fleet_that_the_generator_does_not_drive_by_its_twin_is_no_measurement_anywhere(tmp_path: Path) -> None:
