@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from itertools import count
 from queue import SimpleQueue
 from types import SimpleNamespace
@@ -22,16 +21,14 @@ from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import ServerDied
 from s2a_bench.experiments.capacity import generator
 from s2a_bench.experiments.capacity import run as run_module
-from s2a_bench.experiments.capacity.config import CapacityConfig
 from s2a_bench.experiments.capacity.generator import Fleet, FleetPlan, PlainRobot
 from s2a_bench.experiments.capacity.metrics import RobotTrace
 from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, REQUESTS, ROBOTS
 from s2a_bench.experiments.capacity.run import twin
-from s2a_bench.experiments.capacity.search import Judge, Tried
 from s2a_bench.harness.config import LiveRequests, RequestsConfig
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.session import Measured, Place, RequestContext, Session
-from s2a_bench.policy.chunks import ControlSetting, Ticks
+from s2a_bench.policy.chunks import ControlSetting
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.types import Token
 from tests.cli.test_provenance import serving
@@ -163,62 +160,6 @@ def small(output: Any, **options: Any) -> StoredRun:
 def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the generator be late: a machine under load says nothing of what is tested."""
     monkeypatch.setattr(run_module, "LATEST", math.inf)
-
-
-def tried(source: Any, late_ms: float, mode: str = "sync", latency_ms: float = 20) -> tuple[Any, list[Any]]:
-    """Return what is made of a robot whose ticks are late, and its rows."""
-    rows: list[Any] = []
-    acted = np.zeros(100, np.int64)
-    ticks = Ticks(acted, acted, acted, acted < 0) if mode else None
-    late_ns, latency_ns = np.full(100, round(late_ms * MS)), np.full(100, round(latency_ms * MS))
-    trace = RobotTrace(0, 0, 2000 * MS, acted + 19 * MS, latency_ns, ticks, latency_ns, late_ns)
-    config = CapacityConfig(predict="20", modes="sync", settle_s=0, control_hz=50)
-    session: Any = SimpleNamespace(cell=SimpleNamespace(name="c"), origin=SimpleNamespace(to_dict=dict))
-    writer = SimpleNamespace(
-        manifest={"provenance": {"cells": {"c": {}}}}, append=lambda _, found: rows.extend(found), path="run"
-    )
-    progress = SimpleNamespace(stage=lambda _: None, advance=lambda: None)
-    launch: Any = SimpleNamespace(writer=writer, progress=progress)
-    robots: Any = SimpleNamespace(name="c", session=session, stop=lambda: None, looks=lambda _: [([trace], {})])
-    judge = Judge(config.limited, beyond=False, settle_ns=0, confidence=0.95)
-    cell = run_module._Cell(config, None, launch, session, None, mode, judge)
-    return cell._fleet(robots, 2, source), rows
-
-
-@pytest.mark.parametrize(
-    ("source", "late_ms", "mode", "clean"),
-    [
-        ("measured", 0.9, "sync", True),  # of a tick of 20 ms
-        ("measured", 1.1, "sync", False),
-        ("measured", 0.9, "", True),  # of a latency of 20 ms
-        ("measured", 1.1, "", False),
-        ("twin", 1.1, "sync", True),
-    ],
-)
-def test_a_fleet_is_no_measurement_if_its_own_ticks_are_late_by_over_a_twentieth(
-    source: str, late_ms: float, mode: str, clean: bool
-) -> None:
-    found, rows = tried(source, late_ms, mode)
-    assert (found.clean, rows[0].clean, rows[0].late_p99_ns) == (clean, clean, round(late_ms * MS))
-
-
-@pytest.mark.parametrize("within", [True, False])
-def test_a_fleet_is_withdrawn_for_a_twin_that_exceeds_the_limit_and_not_for_one_whose_ticks_are_late(
-    monkeypatch: pytest.MonkeyPatch, within: bool
-) -> None:
-    def fleet(_cell: Any, _robots: Any, number: int, source: str) -> Tried:
-        twin = source == "twin"
-        return Tried(number, "below", within=number < 4 or (twin and within), clean=not twin)
-
-    monkeypatch.setattr(run_module, "_Robots", lambda *_, **__: nullcontext())
-    monkeypatch.setattr(run_module._Cell, "_fleet", fleet)
-    monkeypatch.setattr(run_module._Cell, "_conclude", lambda _: None)
-    config = CapacityConfig(predict="20", modes="sync", robots="1..4")
-    nothing: Any = SimpleNamespace()
-    judge = Judge(config.limited, beyond=False, settle_ns=0, confidence=0.95)
-    cell = run_module._Cell(config, None, nothing, nothing, nothing, "sync", judge)
-    cell.run()
-    assert {number: each.clean for number, each in cell.tried.items()} == {1: True, 2: True, 3: True, 4: within}
 
 
 @pytest.mark.slow

@@ -35,6 +35,7 @@ def test_the_engine_s_time_of_a_run_is_the_service_and_the_queue_is_no_part_of_i
     assert first(ours) == [(20 * MS, 20 * MS, 7 * MS)] * 3, "4 ms more for three tokens"
     theirs = Service.read(f"{run.path}#theirs")
     assert first(theirs) == [(302_500_000, 306_500_000, 0)] * 3
+    assert theirs.mean_ns == 306_500_000
     assert "the server sends no marks" in theirs.about
     assert "predicts more stalls and fewer robots than there are" in theirs.about
     with pytest.raises(S2AError, match=r"`predict`: .* has several cells; name one of .*#ours, .*#theirs"):
