@@ -126,13 +126,13 @@ def test_the_tcp_that_was_assumed_is_named(over_wifi: Any) -> None:
     found, profile, origin = over_wifi
     config = AdviseConfig(link=LINK, rate=2)
     notes = advice_table(found, config, profile, origin).notes
-    assert "TCP: cubic, slow start after idle on, as this host's; requests come each 500 ms." in notes
+    assert "TCP: cubic, slow start after idle on, as this host's; requests come every 500 ms." in notes
     whole = advice_json(found, AdviseConfig(link=LINK), profile, origin)
     assert whole["tcp"] == {"congestion_control": "cubic", "slow_start_after_idle": True}
     assert "if TCP is cubic, slow start after idle on and requests follow one another" in whole["sentence"]
 
 
-@pytest.mark.parametrize("load", [0.02, 0.3, 0.5, 0.92])
+@pytest.mark.parametrize("load", [0.02, 0.06, 0.2, 0.3, 0.5, 0.92])
 def test_at_most_a_share_of_random_requests_waits_longer(load: float) -> None:
     """Poisson arrivals wait by Lindley's recursion, 10 ms a request; those of two robots wait for one request."""
     count, random = 200_000, np.random.default_rng(1)
@@ -140,6 +140,9 @@ def test_at_most_a_share_of_random_requests_waits_longer(load: float) -> None:
     assert wait_ms is not None
     steps = np.cumsum(10 - random.exponential(10 / load, count))
     waits = steps - np.minimum(np.minimum.accumulate(steps), 0)
+    if 0.05 < load < 0.28:  # exact, below the time of one request
+        assert np.mean(waits > wait_ms) == pytest.approx(room.WAITS, abs=0.002)
+        return
     assert np.mean(waits > wait_ms) <= room.WAITS
     if load >= 0.3:
         assert np.mean(waits > 0.6 * wait_ms) > room.WAITS
@@ -428,7 +431,7 @@ def test_the_sentence_counts_those_that_surely_meet_the_deadline() -> None:
     plain = sentence(found, AdviseConfig(link="4g"), profile)
     assert plain == f"{quickest}{tcp}follow one another without a pause."
     asked = sentence(found, AdviseConfig(link="4g", rate=4, deadline="0.1s"), profile)
-    assert asked == f"{quickest}; 1 of 3 surely meet 100 ms{tcp}come each 250 ms."
+    assert asked == f"{quickest}; 1 of 3 surely meet 100 ms{tcp}come every 250 ms."
     assert "4g: 20.0 ms; the link" in sentence([advice(ends_ms=None)], AdviseConfig(link="4g"), profile)
     assert sentence([advice(load=1.0)], AdviseConfig(link="4g", rate=4), profile).startswith("zmq/msgpack")
     none = sentence([advice(load=1.01)], AdviseConfig(link="4g", rate=4), profile)

@@ -156,7 +156,8 @@ class Tcp:
     slow_start_after_idle: bool
 
     def __str__(self) -> str:
-        return f"{self.congestion_control}, slow start after idle {'on' if self.slow_start_after_idle else 'off'}"
+        idle = f", slow start after idle {'on' if self.slow_start_after_idle else 'off'}"
+        return self.congestion_control + idle * (self.congestion_control != "bbr")
 
 
 def host_tcp() -> Tcp:
@@ -207,14 +208,16 @@ def tcp_adds_ms(size: float, link: tuple[Direction, Direction], period_ms: float
 def waiting_ms(load: float, service_ms: float) -> float | None:
     """Return what all but `WAITS` of random (Poisson) requests wait less than, for a link so loaded; None: no limit.
 
-    Kingman's bound (1964): P(wait > t) <= exp(-x t / service), with load (exp(x) - 1) = x for equal requests (M/D/1).
+    For equal requests (M/D/1), below one service time: P(wait > t) = 1 - (1 - load) exp(load t / service). Above it,
+    Kingman's bound (1964): P(wait > t) <= exp(-x t / service), with load (exp(x) - 1) = x.
     """
     from scipy.special import lambertw
 
-    if load <= WAITS:  # the others find the link free
-        return 0.0
     if load >= 1:
         return None
+    exact = math.log((1 - WAITS) / (1 - load)) / load if load > WAITS else 0.0  # most find the link free
+    if exact <= 1:
+        return exact * service_ms
     decay = -load - float(lambertw(-load * math.exp(-load), -1).real)
     return -math.log(WAITS) / decay * service_ms
 
@@ -250,7 +253,7 @@ def advice_table(found: Sequence[Advice], config: AdviseConfig, profile: LinkPro
 
 
 def _pause(config: AdviseConfig) -> str:
-    return f"come each {config.period_ms:g} ms" if config.rate else "follow one another without a pause"
+    return f"come every {config.period_ms:g} ms" if config.rate else "follow one another without a pause"
 
 
 def _measured(advice: Advice) -> str:
