@@ -171,13 +171,14 @@ def test_one_way_times_to_another_host_are_intervals_that_hold_the_truth(
     assert asked[:21] == [False, *[True] * 20]
 
 
-def test_without_exchanges_each_request_alone_bounds_the_offset(elsewhere: tuple[ElsewhereClient, Session]) -> None:
+def test_without_exchanges_the_requests_alone_bound_the_offset(elsewhere: tuple[ElsewhereClient, Session]) -> None:
     client, shared = elsewhere
-    session = Session(shared.cell, client, shared.feed, shared.request)
+    session, least_ns = Session(shared.cell, client, shared.feed, shared.request), 10**9
     for block in range(3):
         sample = session.measure(Place(block, 0, warmup=False)).sample
         assert not sample.error
-        assert sample.clock_error_ns >= (sum(client.true) - 1) // 2  # type: ignore[operator]
+        least_ns = min(least_ns, sum(client.true))  # a request before it may have been faster
+        assert sample.clock_error_ns >= (least_ns - 1) // 2  # type: ignore[operator]
     assert len(client.prompts) == 3
 
 
