@@ -69,10 +69,10 @@ def _report(config: ReportConfig) -> None:
 
     against_paper = bool(config.against)
     found = make_report(read_chapters(config.runs, against_paper=against_paper), against_paper=against_paper)
-    of_chapters = (f"{chapter.title}: {caveat}" for chapter in found.chapters for caveat in chapter.caveats)
+    written = write_report(found, config)
+    of_chapters = (f"{chapter.title}: {caveat}" for chapter in found.chapters for caveat in chapter.every_caveat)
     for caveat in (*found.caveats, *of_chapters):
         print_error(f"warning: {caveat}")
-    written = write_report(found, config)
     if found.judged:
         print_line(f"the paper's claims: {tally(found.judged)}")
     outputs = {"page": config.page, "Markdown": config.markdown, "LaTeX": config.latex, "CSV": config.csv}

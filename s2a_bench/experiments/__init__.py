@@ -132,10 +132,10 @@ class Shown:
 
     @contextmanager
     def noted(self, what: str) -> Iterator[None]:
-        """Keep an error in the block as a failure; wrong usage, a damaged store and a closed output are raised."""
+        """Keep an error in the block as a failure; wrong usage, a damaged store and errors of the system are raised."""
         try:
             yield
-        except (UsageError, StoreError, BrokenPipeError):
+        except (UsageError, StoreError, OSError):
             raise
         except Exception as error:  # noqa: BLE001 - no table or figure loses the others
             self.failures.append(f"{what}: {type(error).__name__}: {error}")
@@ -237,7 +237,8 @@ def write_shown(run: StoredRun, shown: Shown) -> None:
     """Write tables and figures into the run folder; raises StoreError."""
     from s2a_bench.writers.csv_text import write_texts
 
-    write_texts(run, shown.tables, shown.csvs)
+    with shown.noted("the tables' files"):
+        write_texts(run, shown.tables, shown.csvs)
     if shown.figures:
         from s2a_bench.writers.figures import save
 

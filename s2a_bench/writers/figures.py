@@ -195,9 +195,9 @@ def save(folder: Path, builders: Mapping[str, Callable[[], Figure]], noted: Call
             with noted(f"figure {name}"), paper_column():
                 figure = build()
                 required(name, figure.get_suptitle())
-                captions.append(f"**{name}**: {markdown_caption(figure)}\n")
                 for suffix in ("png", "pdf"):
                     figure.savefig(folder / f"{name}.{suffix}")
+                captions.append(f"**{name}**: {markdown_caption(figure)}\n")
         (folder / "captions.md").write_text("\n".join(captions), encoding="utf-8")
     except OSError as error:
         raise StoreError(f"cannot write {folder}: {why(error, folder)}; the samples are kept") from error

@@ -33,6 +33,11 @@ class Chapter:
     attached: Mapping[str, str] = field(default_factory=dict)
 
     @property
+    def every_caveat(self) -> list[str]:
+        """Return the caveats, and what could not be built so far; figures are built last."""
+        return [*self.caveats, *(f"Not shown: {failure}." for failure in self.content.failures)]
+
+    @property
     def manifest(self) -> dict[str, Any]:
         return self.run.manifest
 
@@ -88,7 +93,6 @@ def _chapter(run: StoredRun, title: str, against_paper: bool, **more: Any) -> Ch
     try:
         with fits(run):
             content = content_of(run, against_paper=against_paper)
-        caveats += [f"Not shown: {failure}." for failure in content.failures if caveats]
     except StoreError:
         if not caveats:
             raise

@@ -172,7 +172,7 @@ def _markdown(report: Report) -> str:
         blocks += [f"## The paper's claims\n\n{tally(report.judged)}.", to_markdown(_claims(report))]
     for chapter in report.chapters:
         blocks.append(f"## {markdown_text(chapter.title)}")
-        blocks += [f"> {markdown_text(caveat)}" for caveat in chapter.caveats]
+        blocks += [f"> {markdown_text(caveat)}" for caveat in chapter.every_caveat]
         blocks.append("\n".join(f"- {markdown_text(text)}" for text in chapter.content.sentences))
         blocks.append(f"```sh\n{visible(chapter.command)}\n```")
         blocks += [to_markdown(table) for table in chapter.content.tables.values()]

@@ -84,7 +84,7 @@ def _view(chapter: Chapter, figures: dict[str, DrawnFigure]) -> dict[str, Any]:
         "started": when(manifest),
         "labels": list(dict.fromkeys((*chapter.run.origins.labels, *labels))),
         "summary": content.sentences,
-        "caveats": chapter.caveats,
+        "caveats": chapter.every_caveat,
         "warnings": manifest.get("warnings", []),
         "tables": main,
         "more": [table for name, table in content.tables.items() if name not in content.main],

@@ -126,7 +126,7 @@ def build_link(run: StoredRun) -> Figure:
     bars, others = [], []
     for found in link["probe"]["quantities"]:
         what, profile, measured = found["what"], found["profile"], found["measured"]
-        if profile:
+        if found["tolerance"] < profile:
             band = tuple(100 * (1 + sign * found["tolerance"] / profile) for sign in (-1, 1))
             bars.append(Bar(what, 100 * measured / profile, band, f"{number(measured)} {found['unit']}".rstrip()))
         else:
@@ -143,7 +143,11 @@ def latency_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str,
         "latency_bars": lambda: build_latency_bars(run, against_paper=against_paper),
         "stages": lambda: build_stage_breakdown(run),
         "distribution": lambda: build_latency_distribution(run),
-        **({"link": lambda: build_link(run)} if any(found["profile"] for found in probe.get("quantities", ())) else {}),
+        **(
+            {"link": lambda: build_link(run)}
+            if any(each["tolerance"] < each["profile"] for each in probe.get("quantities", ()))
+            else {}
+        ),
     }
 
 
