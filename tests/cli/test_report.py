@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from html import unescape
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,7 @@ SHOWN = "s2a_bench.experiments.timeline.view"
         (f"{SHOWN}.tables.skill_table", "table skills", "tables/motion.md"),
         (f"{SHOWN}.tables.timeline_csv", "csvs", "tables/motion.md"),
         (f"{SHOWN}.figures.new_figure", "figure timeline", "tables/motion.md"),
+        ("s2a_bench.writers.csv_text.to_latex", "the tables' files", "figures/timeline.png"),
         (f"{SHOWN}.tables.timelines_json", "--json", "figures/timeline.png"),
     ],
 )
@@ -96,11 +98,20 @@ def test_what_cannot_be_shown_is_one_line_and_the_rest_is_written(
     line = f"error: {what}: KeyError: 'source'; all else is written; once it is fixed, s2a-bench report {run} shows it"
     assert done.stderr.splitlines()[-1] == line
     assert (run / kept).exists()
-    if what == "--json":
+    if what in {"--json", "the tables' files"}:
         return
     done = called("report", run, "--output", "page.html", "--csv", "csv", code=1)
-    assert done.stderr == line.replace(str(run), str(run.resolve())) + "\n"
+    not_shown = f"Not shown: {what}: KeyError: 'source'."
+    warning, error = done.stderr.splitlines()
+    assert warning.endswith(not_shown)
+    assert error == line.replace(str(run), str(run.resolve()))
     page = Path("page.html").read_text()
     assert "Waiting" in page
+    assert not_shown in unescape(page)
     assert ("queue wait<" in page) == (what != "table skills")
     assert Path("csv").exists() == (what != "csvs")
+    manifest = run / "manifest.json"  # an unfinished run may lack rows
+    manifest.write_text(manifest.read_text().replace('"state": "finished"', '"state": "failed"'))
+    done = called("report", run, "--output", "page.html", code=0)
+    assert not_shown in done.stderr
+    assert not_shown in unescape(Path("page.html").read_text())
