@@ -193,6 +193,12 @@ def test_a_mahimahi_trace_carries_its_opportunities_in_each_period(tmp_path: Pat
     path = tmp_path / "cell"
     times = [0, 0, 1, 2, 2, 2, 5, 9, 9]
     path.write_text("\n".join(map(str, times)))
+    path.write_text("4\n4\n")
+    assert [(step.start_s, step.mbps) for step in load_link(f"up_trace={path}").directions()[0].steps] == [
+        (0, 0),
+        (0.003, 24),
+    ]
+    path.write_text("\n".join(map(str, times)))
     up, down = load_link(f"down_trace={path},delay=2,loss=0.1").directions()
     assert (up.steps, down.period_s, down.delay_ms) == ((), 0.009, 2)
     ends = [step.start_s for step in down.steps[1:]] + [down.period_s]

@@ -484,3 +484,8 @@ def test_only_pipelines_over_a_network_of_runs_without_a_link_are_fitted(monkeyp
     monkeypatch.setattr(room, "joined", lambda origins: SimpleNamespace(line=f"{[*origins]}"))
     assert FITTED((Path("a"), Path("b"))) == ([RAW], "['', '']")
     assert seen == [runs[""], runs[""]]
+
+
+@pytest.mark.parametrize(("rate", "period_ms"), [(0, 0), (3, 1000 / 3), (30, 1000 / 30)])
+def test_requests_come_as_often_as_the_rate_says(rate: float, period_ms: float) -> None:
+    assert AdviseConfig(link=LINK, rate=rate).period_ms == pytest.approx(period_ms)

@@ -350,6 +350,14 @@ def test_a_gate_trips_beyond_its_limit_only(launch: Launch) -> None:
     }
 
 
+@pytest.mark.parametrize(
+    ("text", "rises", "beyond"),
+    [("a>5%", True, True), ("a>5%", False, False), ("a<-5%", True, False), ("a<-5%", False, True)],
+)
+def test_a_change_from_nothing_is_past_a_limit_of_its_direction(text: str, rises: bool, beyond: bool) -> None:
+    assert read_gate(text).beyond(None, rises) == beyond
+
+
 def test_a_gate_does_not_trip_on_noise_unless_it_is_strict(launch: Launch) -> None:
     found = opened(launch(1, n=10, cells=("loopback",)), launch(2, n=10, cells=("loopback",), factor=1.02))
     (one,) = judged(found, "e2e>0%")

@@ -116,6 +116,11 @@ def test_a_plan_stalls_if_its_safe_start_is_after_the_next_is_due(
     assert bool(cast("Any", trace.plan_stalled)[0]) == stalls
 
 
+def test_what_breaks_in_a_robot_is_raised_where_its_trace_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(IndexError, match="pop from empty list"):
+        robot_of(monkeypatch, [])
+
+
 def test_a_robot_goes_on_after_an_answer_that_breaks_and_ends_with_its_server(monkeypatch: pytest.MonkeyPatch) -> None:
     trace = robot_of(monkeypatch, ["broken", [10], "fatal", [10]], think_ns=100 * MS)
     assert [each >= 0 for each in trace.arrival_ns] == [False, True, False]

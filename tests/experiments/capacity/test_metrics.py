@@ -57,6 +57,26 @@ def test_requests_before_a_fleet_has_settled_or_never_made_say_nothing_of_the_ge
     assert measures([plain], SETTING, settle_ns=200 * MS)["late_p99_ns"] == MS
 
 
+def test_a_fleet_is_the_same_whenever_it_starts_and_its_robots_in_any_order() -> None:
+    late_ns, first_ns = np.arange(8) * MS, np.array([5, 10, -1]) * MS
+    fleet = [
+        trace(0, first_ns=first_ns, late_ns=late_ns),
+        trace(1, 7 * MS, arrival_ms=(45, 90, -1), late_ns=late_ns[::-1]),
+        trace(2, 3 * MS, chunk=[-1, -1, 0, 0, 0, 0, -1, 1]),
+    ]
+    for settle_ns in (0, 50 * MS, 80 * MS):
+        found = measures(fleet, SETTING, settle_ns)
+        moved = [each.shifted(12_345_678_901) for each in (fleet[2], fleet[0], fleet[1])]
+        assert measures(moved, SETTING, settle_ns) == pytest.approx(found, nan_ok=True)
+
+
+def test_robots_without_an_action_are_neither_in_time_nor_late() -> None:
+    idle = trace(0, chunk=[-1] * 8, arrival_ms=())
+    found = measures([idle], SETTING)
+    assert (found["stalled"], found["in_time"], found["age_p50_ns"], found["latency_p50_ns"]) == (1, None, None, None)
+    assert measures([idle, trace(1)], SETTING)["in_time"] == measures([trace(1)], SETTING)["in_time"]
+
+
 def test_every_episode_has_its_own_start() -> None:
     episodes = [trace(robot, start_ns) for start_ns in (0, 10**9) for robot in (0, 1)]
     assert measures(episodes, SETTING)["requests_per_s"] == pytest.approx(8 / 0.32)
@@ -121,6 +141,18 @@ def test_what_is_within_a_cycle_is_one_event() -> None:
         mean, variance = 4 + unseen, variance + unseen**2
         high = variance / (2 * mean) * stats.chi2.ppf(0.975, 2 * mean**2 / variance)
         assert interval(flags, cycle=4) == pytest.approx((low / 1000, high / 1000))
+
+
+def test_robots_that_differ_have_the_variance_between_them() -> None:
+    """Of six one has all stalls, 10, a cycle apart: five degrees of freedom, and the next may be of 3.75."""
+    flags = np.zeros((6, 1000))
+    flags[0, 50::100] = 1
+    variance = 6 / 5 * ((10 - 10 / 6) ** 2 + 5 * (10 / 6) ** 2)
+    variance *= (stats.t.ppf(0.975, 5) / stats.norm.ppf(0.975)) ** 2
+    low = variance / 20 * stats.chi2.ppf(0.025, 2 * 10**2 / variance)
+    mean, variance = 13.75, variance + 3.75**2
+    high = variance / (2 * mean) * stats.chi2.ppf(0.975, 2 * mean**2 / variance)
+    assert interval(flags, 6, cycle=4) == pytest.approx((low / 6000, high / 6000))
 
 
 def test_stalls_that_come_together_and_robots_that_differ_widen_the_interval() -> None:

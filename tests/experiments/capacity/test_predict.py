@@ -137,3 +137,8 @@ def test_clients_without_a_clock_and_plans_are_predicted(tmp_path: Path) -> None
     assert closed.table(KNEES).empty
     plans = predicted(tmp_path, predict="250", plan_every_s=1, robots="1..16", limit="latency_p99=1s")
     assert plans.table(KNEES)["robots"].tolist() == [4]
+
+
+def test_a_predicted_percentile_is_judged_by_its_interval(tmp_path: Path) -> None:
+    run = predicted(tmp_path, predict="20", modes="queue?trigger=8", robots="1,4,40", limit="latency_p50=60ms")
+    assert run.table(FLEETS)["verdict"].tolist() == ["undecided", "below", "above"]

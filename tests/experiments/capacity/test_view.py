@@ -125,6 +125,32 @@ def test_the_sentence_about_plans_names_how_often_they_are_wanted(tmp_path: Path
     ]
 
 
+def test_a_panel_has_the_values_of_its_fleets(tmp_path: Path) -> None:
+    run = predicted(tmp_path, 40)
+    rows = sorted(run.table(FLEETS).to_dict("records"), key=lambda row: row["robots"])
+    with paper_column():
+        latency, stalled, age = EXPERIMENT.show(run).figures["capacity"]().axes
+    for axes, column, factor in (
+        (latency, "latency_p50_ns", 1e-6),
+        (stalled, "stalled", 100),
+        (age, "age_p50_ns", 1e-6),
+    ):
+        line = next(each for each in axes.lines if each.get_marker() == "." and len(each.get_xdata()))
+        assert [*line.get_xdata()] == [row["robots"] for row in rows]
+        assert [*line.get_ydata()] == pytest.approx([row[column] * factor for row in rows])
+    thin = next(each for each in latency.lines if each.get_marker() == "" and len(each.get_xdata()) > 2)
+    assert [*thin.get_ydata()] == pytest.approx([row["latency_p99_ns"] / 1e6 for row in rows])
+
+
+def test_the_time_to_the_first_piece_is_shown_of_answers_that_stream(tmp_path: Path) -> None:
+    for options, shown in (({}, False), ({"plan_every_s": 1.0}, True)):
+        run = predicted(tmp_path, 40, **options)
+        rows = run.table(FLEETS).assign(ttft_p99_ns=5_000_000)
+        run.tables[FLEETS.name] = type(rows)(rows.to_dict("records"))
+        header = EXPERIMENT.show(run).tables["capacity"].header
+        assert any("first" in title.lower() or "ttft" in title.lower() for title in header) == shown
+
+
 @pytest.mark.parametrize("service", [None, "as given"])
 def test_runs_of_before_have_one_service_for_all_cells_or_none(tmp_path: Path, service: str | None) -> None:
     run = predicted(tmp_path, 40)
