@@ -246,7 +246,7 @@ class _Run:
 
     def _wait_for(self, servers: ServerSet, cell: Pipeline) -> None:
         """Return when the server answers a request that is not measured, be it with an error that the run meets too."""
-        plan, asked, until_ns = self.plan.feed, self.plan.request, now_ns() + round(self.plan.wait_s * 1e9)
+        plan, asked, begun_ns = self.plan.feed, self.plan.request, now_ns()
         source, preencoded = replace(plan, source="synthetic").open(), cell.payload == "jpeg-preencoded"
         feed = RequestFeed(source, preencoded=preencoded, cameras=plan.cameras, size=plan.resize)
         while True:
@@ -260,8 +260,8 @@ class _Run:
             except TransportError as error:
                 if not error.starting:
                     return
-                if now_ns() > until_ns:
-                    raise type(error)(f"{error}; waited {self.plan.wait_s:g} s for it") from error
+                if (waited_s := (now_ns() - begun_ns) / 1e9) > self.plan.wait_s:
+                    raise type(error)(f"{error}; waited {waited_s:.1f} s for it") from error
                 back_off(f"{cell.name}: {error}", 0.5, SystemClock(), self.progress.stage)
 
     def _sessions(self, servers: ServerSet, sampler: ResourceSampler, stack: ExitStack) -> Iterator[Session]:

@@ -64,7 +64,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         except Broken as error:
             if not self._alive():
                 raise ServerDied(f"the server has ended: {error}") from error
-            raise RequestFailed(str(error)) from error
+            raise RequestFailed(str(error), starting=error.starting) from error
 
     def _abandon(self) -> None:
         if self._link is not None:
@@ -204,7 +204,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             try:
                 self._connected(self._bounds(1))
             except Broken as error:
-                raise RequestFailed(str(error)) from error
+                raise RequestFailed(str(error), starting=error.starting) from error
         return {**super().describe(), **self._metadata}
 
     def close(self) -> None:

@@ -77,10 +77,8 @@ class BoundedConnection:
         try:
             with self._in_time() as seconds:
                 self._connection.handshake(headers, timeout=seconds)
-        except BaseException as error:
+        except BaseException:
             self.close()
-            if isinstance(error, RequestFailed):  # unless it refused the key, or the path
-                error.starting = getattr(self._connection.response, "status_code", 0) not in {401, 403, 404}
             raise
         if idle_s:
             Thread(target=self._keep_open, args=(idle_s / 3,), daemon=True).start()
@@ -146,16 +144,17 @@ class BoundedConnection:
             return RequestFailed(f"{self._url} does not keep to the protocol: {str(breach)[:QUOTED]}")
         if isinstance(why, TimeoutError):
             self._connection.bounds.left_s()  # tells if it was the deadline
-            return RequestFailed(f"{self._url} was silent for too long, {self._timeout_s:g} s")
+            return RequestFailed(f"{self._url} was silent for too long, {self._timeout_s:g} s", starting=True)
         if isinstance(error, InvalidStatus):
             response = error.response
             body = " ".join(struck(bytes(response.body or b"").decode(errors="replace"))[:QUOTED].split())
             advice = {401: "; see `api_key_env`", 403: REFUSED, 404: REFUSED}.get(response.status_code, "")
-            return RequestFailed(f"{self._url} answered {response.status_code}: {body or 'nothing'}{advice}")
+            line = f"{self._url} answered {response.status_code}: {body or 'nothing'}{advice}"
+            return RequestFailed(line, starting=not advice)
         if isinstance(error, ConnectionClosed) or isinstance(why, (EOFError, OSError)):
             closed = error.rcvd if isinstance(error, ConnectionClosed) else None
             did = f"closed the connection: {closed}" if closed else f"broke the connection: {why or error}"
-            return Broken(f"{self._url} {did[:QUOTED]}")
+            return Broken(f"{self._url} {did[:QUOTED]}", starting=closed is None)
         return RequestFailed(f"{self._url} is no WebSocket: {str(why or error)[:QUOTED]}")
 
     def headers(self) -> Mapping[str, str]:

@@ -27,8 +27,8 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
     extras.need("websocket", *PACKAGES)
     from s2a_bench.transport.websocket.link import REFUSED
 
-    why, paths = "", [parts.path, *sorted({template_of(name).server.path for name in names()} - {parts.path})]
-    for path in paths:
+    given, why, headers = parts.path or "/", "", None
+    for path in (given, *sorted({template_of(name).server.path or "/" for name in names()} - {given})):
         url = urlunsplit(parts._replace(path=path))
         try:
             greeting, headers = _greeting(url, {})
@@ -36,10 +36,12 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
         except ServerDied as error:
             raise OSError(str(error).rpartition(": ")[2]) from error
         except S2AError as error:
-            why = why or str(error)
-            if REFUSED not in why or path == paths[-1]:
-                yield Finding("server", "state", f"it answers, and refuses a client without a key: {why}")
-                return
+            why = str(error) if REFUSED not in str(error) else why or str(error)
+            if REFUSED not in why:
+                break
+    if headers is None:
+        yield Finding("server", "state", f"it answers, and refuses a client without a key: {why}")
+        return
     if why:
         yield Finding("path", "advice", f"{why}; it lets clients in at {path}", f"name {url}")
     yield from _slow(parts._replace(path=path), headers)
