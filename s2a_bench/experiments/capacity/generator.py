@@ -322,6 +322,7 @@ class Fleet:
         preencoded = cell.payload == "jpeg-preencoded"
         feed = RequestFeed(source, preencoded=preencoded, cameras=plan.feed.cameras, size=plan.feed.resize)
         session = Session(cell, client, feed, plan.request)
+        session.answered = True  # its server has answered the warm-up
         self._stack.callback(lambda: None if session.busy else client.close())
         return session
 

@@ -259,6 +259,7 @@ def _accepts_state(config: ChunksConfig, session: Session, robot: ActionRobot) -
 
 def _keep(requester: ChunkRequester, launch: RunningLaunch) -> None:
     while not requester.done.empty():
-        launch.keep(*requester.done.get())
+        session, measured = requester.done.get()
+        launch.keep(session, replace(measured, retry_after_s=0.0))  # its own thread waits
     if requester.failure is not None:
         raise requester.failure
