@@ -85,6 +85,8 @@ def checked(table: type[T], content: Any, where: str) -> T:
 
 
 def _line(error: ErrorDetails, table: type[TomlTable], content: Any) -> str:
+    if not error["loc"]:
+        return "it should be a table of keys"
     *inside, last = error["loc"]
     path = _path(error["loc"], content)
     if error["type"] == "extra_forbidden":

@@ -225,6 +225,7 @@ class Template:
 
     def _pictures(self, path: str) -> _Make:
         self.pictures = CAMERAS
+        self._keys.append((0, path))
 
         def make(values: _Values) -> list[Pixels]:
             if not values.pictures:
@@ -236,6 +237,8 @@ class Template:
     def _picture(self, path: str, index: int, form: str | None) -> _Make:
         if index >= CAMERAS or form not in _FORMS:
             self._refuse(path, f"wants picture {index} as {form}; there are up to {CAMERAS}, as CHW or bytes")
+        if form and self.server.image_maps:
+            self._refuse(path, f"wants {form}, and {EXTENSION}.image_maps has pictures as maps; leave one out")
         self.pictures = max(self.pictures, index + 1)
         self.encoded |= form == "bytes"
         self._keys.append((index, path))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import socket
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
+from http import HTTPStatus
 from io import BytesIO
 from pathlib import Path
 from threading import Thread
@@ -295,6 +297,35 @@ def test_a_path_that_fastapi_refuses_is_not_taken_for_a_key() -> None:
         found = {finding.code: finding for finding in examine(address)}
     assert set(found) == {"plain-text", "server"}
     assert "refused: a wrong path or a key" in found["server"].message
+    with fastapi("/") as address:
+        assert f"name {address}/" in {finding.fix for finding in examine(address + "/wrong")}
+
+
+def test_of_paths_that_are_refused_the_one_that_wants_a_key_is_told() -> None:
+    def gate(connection: Any, request: Any) -> Any:
+        status = HTTPStatus.UNAUTHORIZED if request.path == "/openpi/policy" else HTTPStatus.NOT_FOUND
+        return connection.respond(status, "no\n")
+
+    with serve(lambda _: None, "127.0.0.1", 0, process_request=gate) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        address = f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        found = {finding.code: finding.message for finding in examine(address)}
+        server.shutdown()
+    assert f"{address}/openpi/policy answered 401" in found["server"]
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ('{"a": "{image:0|bytes}", "s2a": {"image_maps": true}}', "a wants bytes, and s2a.image_maps has pictures as"),
+        ('{"a": "{image}", "s2a": [["a"]]}', "s2a: it should be a table of keys"),
+    ],
+)
+def test_a_template_that_makes_no_sense_is_a_line(tmp_path: Path, content: str, says: str) -> None:
+    file = tmp_path / "mine.json"
+    file.write_text(content)
+    with pytest.raises(UsageError, match=re.escape(says)):
+        template_of(str(file))
 
 
 def test_starvla_has_an_envelope_in_both_directions() -> None:

@@ -625,6 +625,7 @@ EMBODIMENTS = {
         "annotation.human.action.task_description",
     ),
     "oxe_droid": droid("joint_position", "gripper_position", steps=1),
+    "two unknown": droid("eef_position", "eef_rotation", steps=1),
     "oxe_droid of N1.7": droid("eef_9d", "gripper_position", "joint_position", steps=2),
 }
 """Cameras, pictures of each, parts of the state, key of the prompt: NVIDIA/Isaac-GR00T,
@@ -697,6 +698,14 @@ class TestEmbodiments:
             for each in picture[0]:
                 np.testing.assert_array_equal(each, yuyv_to_rgb(frame.data))
 
+    @pytest.mark.parametrize("key", ["s2a", "wrist?", "many"])
+    def test_keys_that_no_template_can_have_leave_the_default(self, key: str) -> None:
+        server = Embodied("libero_panda", "n1.6")
+        told = server.configs["video"]["as_json"]
+        told |= {"delta_indices": [*range(2000)]} if key == "many" else {"modality_keys": [key]}
+        with policy(server) as url, robot("", url=url) as client:
+            assert client.describe()["template"] == "gr00t-n1.6"
+
     @pytest.mark.parametrize(
         ("name", "state", "cameras", "why"),
         [
@@ -710,6 +719,7 @@ class TestEmbodiments:
             ("libero_panda", 6, 2, r"x \(1\), .* gripper \(\?\), not 6 numbers; change `state`, or give `template`$"),
             ("unitree_g1", 44, 1, r"left_leg \(6\), .* right_hand \(\?\), not 44 numbers"),
             ("oxe_droid", 0, 2, r"joint_position \(\?\), gripper_position \(1\), not 0 numbers"),
+            ("two unknown", 9, 1, r"eef_position \(\?\), eef_rotation \(\?\), not 9 numbers; give `template`$"),
         ],
     )
     def test_what_does_not_fit_is_told(self, name: str, state: int, cameras: int, why: str) -> None:

@@ -29,9 +29,7 @@ class LatencyConfig(RequestsConfig):
         ),
     )
 
-    think_s: float = option(
-        0.0, "seconds between an answer and its cell's next request", flag="think", ge=0, le=3600
-    )
+    think_s: float = option(0.0, "seconds between an answer and its cell's next request", flag="think", ge=0, le=3600)
 
     @property
     def usual_payloads(self) -> tuple[str, ...]:

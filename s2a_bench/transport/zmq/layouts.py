@@ -19,7 +19,7 @@ import numpy as np
 
 from s2a_bench.errors import EngineError, RequestFailed
 from s2a_bench.transport.chunks import actions_of
-from s2a_bench.transport.observation import Template
+from s2a_bench.transport.observation import EXTENSION, VALUES, Template
 from s2a_bench.types import Action, Piece
 
 MARKS: Final = "s2a_marks"
@@ -95,9 +95,11 @@ def modalities_in(answer: Any) -> dict[str, tuple[list[str], int]]:
     try:
         told = {name: answer[name]["as_json"] for name in ("video", "state", "language")}
         told = {name: json.loads(each) if isinstance(each, str) else each for name, each in told.items()}
-        return {name: ([*map(str, each["modality_keys"])], len(each["delta_indices"])) for name, each in told.items()}
+        found = {name: ([*map(str, each["modality_keys"])], len(each["delta_indices"])) for name, each in told.items()}
     except (LookupError, TypeError, ValueError, RecursionError):
         return {}
+    plain = all(key != EXTENSION and not key.endswith("?") for keys, _ in found.values() for key in keys)
+    return found if plain and sum(len(keys) * steps for keys, steps in found.values()) <= VALUES else {}
 
 
 def template_of(layout: str, told: Mapping[str, tuple[Sequence[str], int]], state: int) -> Template:
@@ -108,7 +110,8 @@ def template_of(layout: str, told: Mapping[str, tuple[Sequence[str], int]], stat
     each, over = divmod(state - sum(WIDTHS.get(kind, 0) for kind in kinds), len(unknown) or 1)
     if len({*unknown}) > 1 or over or (each < 1 if unknown else each):
         widths = ", ".join(f"{part} ({WIDTHS.get(kind, '?')})" for part, kind in zip(parts, kinds, strict=True))
-        raise RequestFailed(f"the server's state is {widths}, not {state} numbers; change `state`, or give `template`")
+        cure = "give `template`" if len({*unknown}) > 1 else "change `state`, or give `template`"
+        raise RequestFailed(f"the server's state is {widths}, not {state} numbers; {cure}")
     ends = np.cumsum([0, *(WIDTHS.get(kind, each) for kind in kinds)])
     places = {"video": "{{image:{0}}}", "state": "{{state:{1}:{2}}}", "language": "{{prompt}}"}
     content: dict[str, Any] = {}
