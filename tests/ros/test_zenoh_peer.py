@@ -33,7 +33,8 @@ NAME = "/robot/node/get_parameter_types"
 @pytest.fixture
 def ours(stack: ExitStack) -> Middleware:
     """Our node, which is the router too."""
-    middleware = open_middleware("zenoh", router=Router(free_endpoint(), host=True), node_name="/robot/ours")
+    router = Router(free_endpoint(), host=True)
+    middleware = open_middleware("zenoh", domain_id=0, router=router, node_name="/robot/ours")  # the SDK's domain
     stack.callback(middleware.close)
     return middleware
 
