@@ -67,7 +67,7 @@ class Measured:
     """The rows of one request; ``fingerprint`` identifies its picture.
 
     ``fatal`` ends the run, as a KeyboardInterrupt during the request. ``retry_after_s`` is the wait that a server
-    demands when it refuses, or that several failures in a row call for.
+    demands when it refuses, or that failures in a row of one that may be starting call for.
     """
 
     sample: SampleRow
@@ -97,7 +97,7 @@ PLAIN = RequestContext()
 UNKNOWN_ORIGIN = Provenance()
 SMALL = (16, 16)
 LONGEST_PAUSE_S = 4.0
-"""Of the pauses between failures in a row, from 1 s before the third on."""
+"""Of the pauses between failures in a row of a server that may be starting, from 1 s before the third on."""
 KEPT_FRAMES = 90
 """Frames that a later answer may name: three seconds at 30 Hz."""
 
@@ -131,8 +131,8 @@ class Session:
         self._clock = RemoteClock(self._exchange, offsets, request.clock)
         self._pictures = 0
         """Of the last request."""
-        self._failures, self.answered = 0, False
-        """Failures since the last answer; whether there was one."""
+        self._absent, self.answered = 0, False
+        """Failures in a row of a server that may be starting; whether it has answered."""
         self.busy = False
         """Whether a request is under way, so that no other thread may use the client."""
         self.prompt_n = 0
@@ -143,15 +143,9 @@ class Session:
         self.busy = True
         try:
             self._clock.refresh()
-            measured = self._measure(place, context)
+            return self._measure(place, context)
         finally:
             self.busy = False
-        failed, fatal = bool(measured.sample.error), measured.fatal
-        if isinstance(fatal, ServerDied) and self.answered and self.cell.options.external_address:
-            fatal = None  # it may be started again
-        self._failures, self.answered = (self._failures + 1 if failed else 0), self.answered or not failed
-        pause_s = min(2.0 ** (self._failures - 2), LONGEST_PAUSE_S) if self._failures > 1 else 0.0
-        return replace(measured, fatal=fatal, retry_after_s=max(measured.retry_after_s, pause_s))
 
     def _measure(self, place: Place, context: RequestContext) -> Measured:
         self.feed.get_ready()
@@ -172,9 +166,7 @@ class Session:
                 seen.append(piece_at)  # noqa: PERF402 - what came before an error is kept
         except S2AError as failure:
             error = f"{type(failure).__name__}: {failure}"
-            fatal = failure if isinstance(failure, FATAL) else None
-            if isinstance(failure, RequestFailed):
-                retry_after_s = failure.retry_after_s or 0.0
+            fatal, retry_after_s = self._failed(failure)
         except KeyboardInterrupt as interrupt:
             error, fatal = INTERRUPTED, interrupt
         self._sampler.edge()
@@ -191,7 +183,17 @@ class Session:
             self._recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
             self._recorder.flush()
         rows = self._rows(place, request_id, frames, trace, seen, error)
+        if not rows.sample.error:
+            self._absent, self.answered = 0, True
         return replace(rows, fatal=fatal or rows.fatal, retry_after_s=retry_after_s)
+
+    def _failed(self, failure: S2AError) -> tuple[S2AError | None, float]:
+        """Return the failure if it ends the run, and how long to wait: as long as the server asks, or may take."""
+        restarts = isinstance(failure, ServerDied) and self.answered and self.cell.options.external_address
+        self._absent = self._absent + 1 if isinstance(failure, TransportError) and failure.starting else 0
+        pause_s = min(2.0 ** (self._absent - 2), LONGEST_PAUSE_S) if self._absent > 1 else 0.0
+        retry_after_s = isinstance(failure, RequestFailed) and failure.retry_after_s
+        return failure if isinstance(failure, FATAL) and not restarts else None, retry_after_s or pause_s
 
     @cached_property
     def _small(self) -> RequestFeed:

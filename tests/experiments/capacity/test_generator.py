@@ -228,7 +228,7 @@ def test_a_fleet_that_its_server_refuses_in_part_is_measured(tmp_path: Any) -> N
         url = line.split("at ")[1].split(",")[0]
         run = small(tmp_path, url=url, modes="sync", limit="", robots="6", seconds=2.5)
     fleets = run.table(FLEETS).set_index(["source", "robots"])
-    assert (run.samples["error"] != "").sum() > 2  # pauses grow
+    assert (run.samples["error"] != "").sum() > 5
     assert fleets["requests_per_s"]["measured", 6] > 5
     assert fleets["stalled_worst"]["measured", 6] > fleets["stalled"]["measured", 1] + 0.2
 
