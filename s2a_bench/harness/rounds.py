@@ -246,16 +246,18 @@ class _Run:
 
     def _wait_for(self, servers: ServerSet, cell: Pipeline) -> None:
         """Return when the server answers a request that is not measured, be it with an error that the run meets too."""
-        plan, asked, begun_ns = self.plan.feed, self.plan.request, now_ns()
+        plan, request, begun_ns = self.plan.feed, self.plan.request, now_ns()
         source, preencoded = replace(plan, source="synthetic").open(), cell.payload == "jpeg-preencoded"
         feed = RequestFeed(source, preencoded=preencoded, cameras=plan.cameras, size=plan.resize)
         while True:
             trace = Trace()
             feed.get_ready()
-            frames, state = feed.capture(trace), (0.0,) * asked.state
+            frames, state = feed.capture(trace), (0.0,) * request.state
             try:
                 with closing(servers.client(cell)) as client:
-                    list(client.request(Request("wait", asked.prompt, frames, asked.max_pieces, state=state), trace))
+                    list(
+                        client.request(Request("wait", request.prompt, frames, request.max_pieces, state=state), trace)
+                    )
                     return
             except TransportError as error:
                 if not error.starting:

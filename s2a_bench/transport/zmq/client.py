@@ -58,7 +58,7 @@ class ZmqClient(PolicyClient[ZmqOptions]):
             answer, marks = (None, set()) if self._native else self._configurations()
             self._native, self._layout = self._native or layouts.OURS in marks, layouts.marked(marks)
             self._template = template_of(wiring.options.but(layout=self._layout).template_name)
-        self._told = {} if self._native or wiring.options.template else layouts.modalities_in(answer)
+        self._modalities = {} if self._native or wiring.options.template else layouts.modalities_in(answer)
 
     def _configurations(self) -> tuple[Any, set[str]]:
         """Return the server's modality configurations and their marks: its layout, and whether it is ours."""
@@ -92,8 +92,11 @@ class ZmqClient(PolicyClient[ZmqOptions]):
 
     def _pack(self, request: Request, trace: Trace) -> memoryview:
         """Fill the template and write it as MessagePack, marking each stage."""
-        if self._told:
-            self._template, self._told = layouts.template_of(self._layout, self._told, len(request.state)), {}
+        if self._modalities:
+            self._template, self._modalities = (
+                layouts.template_of(self._layout, self._modalities, len(request.state)),
+                {},
+            )
         seen = self._observation(request, trace)
         data = seen if self._layout == layouts.N1_5 else {layouts.OBSERVATION: seen, "options": None}
         message: dict[str, Any] = {layouts.ENDPOINT: layouts.GET_ACTION, layouts.DATA: data, **self._token()}
@@ -137,8 +140,8 @@ class ZmqClient(PolicyClient[ZmqOptions]):
 
     def describe(self) -> dict[str, str]:
         """Return where the server is, and how requests for it are packed, for the manifest."""
-        told = {"template": layouts.MODALITIES} if self._told else {}
-        return {**super().describe(), **told, "layout": self._layout}
+        template = {"template": layouts.MODALITIES} if self._modalities else {}
+        return {**super().describe(), **template, "layout": self._layout}
 
     def close(self) -> None:
         if self._link is not None:

@@ -47,8 +47,8 @@ STATE_AXES, PICTURE_AXES = 2, 4
 
 def marked(marks: set[str]) -> str:
     """Return the layout of what the marks of a message say, see `wire.read`; N1.6's where they say none or several."""
-    said = marks - {OURS}
-    return said.pop() if len(said) == 1 else N1_6
+    layouts = marks - {OURS}
+    return layouts.pop() if len(layouts) == 1 else N1_6
 
 
 def observation_in(data: Any) -> tuple[Any, str]:
@@ -93,18 +93,20 @@ def modalities(layout: str) -> dict[str, Any]:
 def modalities_in(answer: Any) -> dict[str, tuple[list[str], int]]:
     """Return modality -> keys and time steps, as ``get_modality_config`` was answered; nothing if it was not."""
     try:
-        told = {name: answer[name]["as_json"] for name in ("video", "state", "language")}
-        told = {name: json.loads(each) if isinstance(each, str) else each for name, each in told.items()}
-        found = {name: ([*map(str, each["modality_keys"])], len(each["delta_indices"])) for name, each in told.items()}
+        configs = {name: answer[name]["as_json"] for name in ("video", "state", "language")}
+        configs = {name: json.loads(each) if isinstance(each, str) else each for name, each in configs.items()}
+        found = {
+            name: ([*map(str, each["modality_keys"])], len(each["delta_indices"])) for name, each in configs.items()
+        }
     except (LookupError, TypeError, ValueError, RecursionError):
         return {}
     plain = all(key != EXTENSION and not key.endswith("?") for keys, _ in found.values() for key in keys)
     return found if plain and sum(len(keys) * steps for keys, steps in found.values()) <= VALUES else {}
 
 
-def template_of(layout: str, told: Mapping[str, tuple[Sequence[str], int]], state: int) -> Template:
+def template_of(layout: str, keys_of: Mapping[str, tuple[Sequence[str], int]], state: int) -> Template:
     """Return the observation that a server tells of, whose unknown part, or left and right, takes the state's rest."""
-    parts = told["state"][0]
+    parts = keys_of["state"][0]
     kinds = [part.rpartition(".")[2].replace("left_", "").replace("right_", "") for part in parts]
     unknown = [kind for kind in kinds if kind not in WIDTHS]
     each, over = divmod(state - sum(WIDTHS.get(kind, 0) for kind in kinds), len(unknown) or 1)
@@ -115,7 +117,7 @@ def template_of(layout: str, told: Mapping[str, tuple[Sequence[str], int]], stat
     ends = np.cumsum([0, *(WIDTHS.get(kind, each) for kind in kinds)])
     places = {"video": "{{image:{0}}}", "state": "{{state:{1}:{2}}}", "language": "{{prompt}}"}
     content: dict[str, Any] = {}
-    for modality, (keys, steps) in told.items():
+    for modality, (keys, steps) in keys_of.items():
         rows = {key: [places[modality].format(i, *ends[i : i + 2])] * steps for i, key in enumerate(keys)}
         content |= rows if layout == N1_5 else {modality: {key: [row] for key, row in rows.items()}}
     return Template(content, MODALITIES)
