@@ -11,9 +11,10 @@ It holds the nested dictionary that the policy expects. These texts in it are pl
 
 A list of arrays becomes one array with one more axis in front: ``[["{image}"]]`` is (1, 1, H, W, 3) and
 ``["{image:0}", "{image:1}"]`` is (2, H, W, 3), while ``[["{prompt}"]]`` stays a list of lists of text. A key that ends
-with ``?`` is optional: it is left out if the request lacks the picture or the numbers of its value. All other values
-are constants. The table `EXTENSION` is no part of the observation: it describes the server, as `ExternalServer`
-reads it. The files in ``templates`` beside this module are known by name.
+with ``?`` is optional: it is left out if the request lacks the picture or the numbers of its value. A key of
+``"{images}"`` that ends with ``*`` stands for one key a picture, with the names that the server's greeting lists. All
+other values are constants. The table `EXTENSION` is no part of the observation: it describes the server, as
+`ExternalServer` reads it. The files in ``templates`` beside this module are known by name.
 """
 
 from __future__ import annotations
@@ -38,6 +39,8 @@ TEMPLATES: Final = Path(__file__).with_name("templates")
 DEFAULT: Final = "openpi"
 EXTENSION: Final = "s2a"
 """Key that no observation has."""
+ANY: Final = "*"
+"""End of a key whose pictures have names from the server's greeting."""
 FILE_LETTERS, VALUES, DEPTH, CAMERAS = 1 << 16, 1024, 16, 64
 """The most of a template: bytes, values, nested dictionaries and lists, pictures."""
 PICTURE_ROOTS: Final = "", "images.", "observation.images.", "input.images.", "input.observation.images."
@@ -62,6 +65,7 @@ class _Values:
     pictures: Sequence[Pixels]
     state: Vector
     prompt: str
+    names: Sequence[str]
 
 
 _Make: TypeAlias = Callable[[_Values], Any]
@@ -108,6 +112,8 @@ class Template:
         self.pictures = 0
         """Number of pictures that it has placeholders for."""
         self._keys: list[tuple[int, str]] = []
+        self.unnamed = False
+        """Whether the server's greeting names the pictures."""
         self.accepts_state = False
         self.encoded = False
         """Whether pictures are the bytes of a file, as JPEG."""
@@ -118,8 +124,12 @@ class Template:
         self.server = toml_file.checked(ExternalServer, server, f"`template` {name}: {EXTENSION}")
         self._make = self._table({key: value for key, value in content.items() if key != EXTENSION}, "", 0)
 
-    def fill(self, pictures: Sequence[Pixels], state: Sequence[float], prompt: str) -> dict[str, Any]:
+    def fill(
+        self, pictures: Sequence[Pixels], state: Sequence[float], prompt: str, names: Sequence[str] = ()
+    ) -> dict[str, Any]:
         """Return the observation, if possible without copies of ``pictures``, uint8 (H, W, 3) or (n,).
+
+        ``names`` are those of the pictures that the server reads, in its order.
 
         Raises RequestFailed for a key without its picture or state, and for a value without a placeholder.
         """
@@ -128,7 +138,7 @@ class Template:
         if len(state) and not self.accepts_state:
             raise RequestFailed(f"`template` {self.name} has no place for the robot's state")
         try:
-            filled: dict[str, Any] = self._make(_Values(pictures, np.asarray(state, np.float32), prompt))
+            filled: dict[str, Any] = self._make(_Values(pictures, np.asarray(state, np.float32), prompt, names))
         except _Missing as missing:
             raise RequestFailed(f"`template` {self.name}: {missing}") from None
         return filled
@@ -144,12 +154,14 @@ class Template:
         """Raise UsageError if the server, which reads the pictures ``listed``, ignores one of so many."""
         read = {root + key for root in PICTURE_ROOTS for key in listed}
         for index, path in self._keys:
-            if index < cameras and path not in read:
+            if index < cameras and path not in read and not path.endswith(ANY):
                 known, cure = ", ".join(map(repr, listed)), "take a template with these keys, or write one"
                 raise UsageError(f"`template` {self.name}: the server ignores '{path}', it reads {known}; {cure}")
 
     def check_server(self, transport: str, reads: Sequence[str]) -> None:
         """Refuse a description of the server of which ``transport`` does not read all, only the keys ``reads``."""
+        if self.unnamed and "greets" not in reads:
+            raise UsageError(f"`template` {self.name}: {transport} has no greeting that names pictures; name them")
         if unread := [f"{EXTENSION}.{key}" for key in self.server.model_fields_set if key not in reads]:
             raise UsageError(f"`template` {self.name}: {transport} does not read {min(unread)}; leave it out")
 
@@ -180,10 +192,10 @@ class Template:
             made[name] = self._value(value, inner, depth + 1), name != key
 
         def make(values: _Values) -> dict[str, Any]:
-            filled = {}
+            filled: dict[str, Any] = {}
             for name, (value, optional) in made.items():
                 try:
-                    filled[name] = value(values)
+                    filled |= _keyed(name, value(values), values.names)
                 except _Missing:
                     if not optional:
                         raise
@@ -225,6 +237,7 @@ class Template:
 
     def _pictures(self, path: str) -> _Make:
         self.pictures = CAMERAS
+        self.unnamed |= path.endswith(ANY)
         self._keys.append((0, path))
 
         def make(values: _Values) -> list[Pixels]:
@@ -304,6 +317,16 @@ def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _keys(answer: Any) -> str:
     keys = ", ".join(str(key)[:40] for key in list(answer)[:8]) if isinstance(answer, dict) else type(answer).__name__
     return keys or "nothing"
+
+
+def _keyed(name: str, value: Any, names: Sequence[str]) -> dict[str, Any]:
+    """Return a value by its key, or pictures by the ``names`` that the server has for them."""
+    if not (names and name.endswith(ANY)):
+        return {name: value}
+    if len(value) > len(names):
+        known = f"{len(names)} pictures ({', '.join(names)})"
+        raise RequestFailed(f"the server reads {known}, not {len(value)}; see `cameras`")
+    return {name.removesuffix(ANY) + key: picture for key, picture in zip(names, value, strict=False)}
 
 
 def _is_text(text: str) -> bool:

@@ -30,6 +30,7 @@ class PolicyClient(ABC, Generic[P]):
         self._native = not wiring.black_box
         self._template = template_of(wiring.options.template_name)
         self._url = wiring.address
+        self._listed: list[str] = []
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         bounds = self._bounds(request.max_tokens)
@@ -55,7 +56,7 @@ class PolicyClient(ABC, Generic[P]):
     def _observation(self, request: Request, trace: Trace) -> dict[str, Any]:
         """Fill the template, marking the stages of each picture."""
         pictures = [self._picture(frame, place, trace) for place, frame in enumerate(request.images)]
-        return self._template.fill(pictures, request.state, request.prompt)
+        return self._template.fill(pictures, request.state, request.prompt, self._listed)
 
     def _picture(self, frame: Frame, place: int, trace: Trace) -> Pixels:  # noqa: ARG002 - for those that keep memory
         return policy_picture(frame, self._wiring.options.payload, trace)

@@ -278,6 +278,53 @@ def test_a_picture_that_the_server_does_not_list_is_an_error(tmp_path: Path, key
         assert not [each for each in heard if isinstance(each, dict)]
 
 
+LIBERO = sglang(cameras="sglang-libero")
+
+
+@pytest.mark.parametrize("described", [True, False])
+def test_pictures_take_the_names_that_the_greeting_lists_in_its_order(*, described: bool) -> None:
+    with (
+        relative(lambda _: {"actions": CHUNK}, greeting=LIBERO) as (address, heard),
+        robot(address, "sglang") as client,
+    ):
+        if described:
+            client.describe()
+        _, first = ask(client, REQUEST)
+        _, again = ask(client, REQUEST)
+    path, *observations = heard
+    assert path == "/openpi/policy"
+    for observation in observations:
+        assert {key for key in observation if "image" in key} == {
+            "observation.images.image",
+            "observation.images.image2",
+        }
+        assert observation["observation.images.image"].mean() != observation["observation.images.image2"].mean()
+    assert ("connect" in dict(first.marks), "connect" in dict(again.marks)) == (not described, False)
+    assert "reconnects" not in first.facts | again.facts
+
+
+@pytest.mark.parametrize(
+    ("greeting", "says"),
+    [
+        (PLAIN, "its greeting lists no pictures; take a template that names them"),
+        ({"input": {"image_keys": ["image"]}}, r"the server reads 1 pictures \(image\), not 2; see `cameras`"),
+    ],
+)
+def test_pictures_without_a_name_from_the_greeting_are_not_sent(greeting: Any, says: str) -> None:
+    with (
+        relative(lambda _: {"actions": CHUNK}, greeting=greeting) as (address, heard),
+        pytest.raises(RequestFailed, match=says),
+    ):
+        asked(address, "sglang")
+    assert heard == ["/openpi/policy"]
+
+
+def test_a_transport_without_a_greeting_refuses_a_template_that_needs_one(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('"images.*" = "{images}"\nprompt = "{prompt}"\n')
+    with pytest.raises(UsageError, match="zmq has no greeting that names pictures; name them"):
+        template_of(str(tmp_path / "mine.toml")).check_server("zmq", ())
+
+
 def test_a_camera_that_the_request_lacks_is_not_looked_for_in_the_servers_list() -> None:
     greeting = {"input": {"image_keys": ["base_0_rgb"]}}
     with relative(lambda _: {"actions": CHUNK}, greeting=greeting) as (address, _):
@@ -394,7 +441,11 @@ def test_a_picture_is_a_map_for_vla_eval_alone() -> None:
 )
 def test_an_error_in_a_binary_message_is_quoted(template: str, answer: Any, says: str) -> None:
     replies = [{"status": "reset"}] if template == "vllm-omni-pi0" else []
-    with relative(lambda _: replies.pop() if replies else answer) as (address, _), robot(address, template) as client:
+    greeting = sglang() if template.startswith("sglang") else PLAIN
+    with (
+        relative(lambda _: replies.pop() if replies else answer, greeting=greeting) as (address, _),
+        robot(address, template) as client,
+    ):
         with pytest.raises(RequestFailed, match=rf"{says}$") as failed:
             ask(client, REQUEST)
         assert str(failed.value).isprintable()

@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from s2a_bench.errors import StoreError
 from s2a_bench.experiments import Shown, experiment_of
 from s2a_bench.report.compare.agreement import SETTING, Difference, differences, differing_names, is_other_machine
 from s2a_bench.report.page.sweeps import overview, pooled, settings_text
@@ -90,13 +89,8 @@ def _chapter(run: StoredRun, title: str, against_paper: bool, **more: Any) -> Ch
     """Make the chapter of a run; an unfinished one may lack the rows of its tables."""
     manifest = run.manifest
     caveats = list(_unfinished(manifest))
-    try:
-        with fits(run):
-            content = content_of(run, against_paper=against_paper)
-    except StoreError:
-        if not caveats:
-            raise
-        content = Shown(("This run has too few rows for its tables; its CSV files have them.",))
+    with fits(run):
+        content = content_of(run, against_paper=against_paper)
     command = more.pop("command", repeat_command(manifest))
     return Chapter(_slug(run.path.name), title, run, content, command, caveats, **more)
 

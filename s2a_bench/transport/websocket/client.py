@@ -52,12 +52,14 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         self._headers[codec.MARKS_HEADER] = "1"
         self._link: BoundedConnection | None = None
         self._metadata: dict[str, str] = {}
-        self._listed: list[str] = []
         self._provenance: dict[str, str] = {}
 
     def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:
-        body = self._pack(request, trace)
         try:
+            if self._template.unnamed and not self._native and self._link is None:
+                self._connected(bounds)
+                trace.mark("connect")
+            body = self._pack(request, trace)
             message, packed_ns = self._sent(body, len(request.images), bounds, trace)
             trace.provenance = self._provenance
             yield from self._actions(message, packed_ns, trace)
@@ -137,6 +139,8 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         described = metadata.get("input")
         listed = described.get("image_keys") if isinstance(described, dict) else None
         self._listed = [struck(str(key))[:64] for key in listed[:CAMERAS]] if isinstance(listed, list) else []
+        if self._template.unnamed and not (self._native or self._listed):
+            raise RequestFailed(f"{self._url}: its greeting lists no pictures; take a template that names them")
 
     def _ready(self, answer: bytes | str) -> None:
         """Read the answer to a reset, a message or, as DreamZero has it, a text; a traceback is an error."""
