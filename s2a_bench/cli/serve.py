@@ -27,7 +27,19 @@ from s2a_bench.transport.pipeline import Pipeline, answer_over, one_pipeline
 if TYPE_CHECKING:
     from s2a_bench.harness.processes import ServerProcess
 
-ENGINE = ("name", "model", "mmproj", "threads", "gpu_layers", "context", "profile", "gaps", "latency", *ANSWERS)
+ENGINE = (
+    "name",
+    "model",
+    "mmproj",
+    "chat_template",
+    "threads",
+    "gpu_layers",
+    "context",
+    "profile",
+    "gaps",
+    "latency",
+    *ANSWERS,
+)
 """The engine's options of a server; ``gaps`` has no flag, only a key of the file."""
 Sorted: TypeAlias = "tuple[dict[str, Any], dict[str, Any], dict[str, Any]]"
 _NUMBER = EngineConfig.model_fields["threads"]

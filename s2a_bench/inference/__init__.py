@@ -105,7 +105,7 @@ PERIOD = 50
 ANSWERS: Final = ("answer", "horizon", "action_dim")
 """The options about the kind of an answer."""
 
-OF_MODEL: Final = ("model", "mmproj", "gpu_layers")
+OF_MODEL: Final = ("model", "mmproj", "chat_template", "gpu_layers")
 """The options that only an engine with a model can honour."""
 
 KV_TYPES = {"f32": 0, "f16": 1, "q8_0": 8, "q4_0": 2}
@@ -157,6 +157,7 @@ class EngineConfig(Options):
     )
     model: Path | None = option(None, "GGUF model [default: the tiny dummy]", first=True)
     mmproj: Path | None = option(None, "GGUF vision tower that goes with --model")
+    chat_template: str = option("", "file of a Jinja template, or none: the raw prompt [default: the model's own]")
     threads: int = option(0, "CPU threads of the model; 0: all", ge=0, le=LARGEST)
     gpu_layers: int = option(0, "model layers on the GPU; -1: all", ge=-1, le=LARGEST)
     context: int = option(4096, "context length in tokens", ge=LEAST_CONTEXT, le=LARGEST)

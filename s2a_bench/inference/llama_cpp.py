@@ -1,4 +1,4 @@
-"""llama.cpp as an engine: llama-cpp-python's MiniCPM-V 2.6 handler, with RGB pixels as input, token by token."""
+"""llama.cpp as an engine: any model that it runs, with RGB pixels as input, token by token."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import codecs
 import ctypes
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import version
 from typing import Any
 
@@ -35,6 +36,7 @@ from s2a_bench.inference import (
     EngineConfig,
     llama_log,
 )
+from s2a_bench.inference.gguf_file import GgufHeader
 from s2a_bench.inference.llama_decode import (
     GrammarSampler,
     TokenBatch,
@@ -43,12 +45,12 @@ from s2a_bench.inference.llama_decode import (
     grammar_error,
 )
 from s2a_bench.inference.llama_pictures import PixelHandler
+from s2a_bench.inference.llama_prompt import ChatTemplate, TextHandler, TooLong
 from s2a_bench.inference.models import ModelFiles, load_headers, sha256
 from s2a_bench.types import Request, Token
 
 llama_cpp = extras.require("llama_cpp", "llama")
 
-_URL = "s2a-bench:image/{:04d}/"
 _MS_NS = 1_000_000
 _DESCRIBED = ("gpu_layers", "context", "batch", "kv_type", "flash_attention", "sampling")
 _GRAMMARS = 64
@@ -93,6 +95,20 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
         return iter(())
 
 
+@contextmanager
+def _refused(what: str, llama: _Prefilled) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        llama.close()
+        raise ModelError(f"{what}: {error}") from error
+
+
+def _tower(mmproj: GgufHeader) -> dict[str, str]:
+    projector = str(mmproj.fields.get("clip.projector_type") or mmproj.fields.get("clip.vision.projector_type", ""))
+    return {"mmproj": str(mmproj.path), "mmproj_sha256": sha256(mmproj.path), "projector": projector}
+
+
 class LlamaCppEngine(Engine):
     """A GGUF model on this machine. ``facts`` holds numbers of the last request, under llama-server's names."""
 
@@ -112,7 +128,9 @@ class LlamaCppEngine(Engine):
         self._llama: _Prefilled | None = None
         llama_log.silence()
         llama_log.reason()
-        self._handler = PixelHandler(str(self._files.mmproj.path), use_gpu=config.gpu_layers != 0)
+        mmproj = self._files.mmproj
+        tower = PixelHandler(str(mmproj.path), use_gpu=config.gpu_layers != 0) if mmproj else None
+        self._handler: PixelHandler | TextHandler = tower or TextHandler()
         self._llama = self._load(self._files)
         self._batch = TokenBatch()
 
@@ -130,18 +148,16 @@ class LlamaCppEngine(Engine):
                 n_gpu_layers=config.gpu_layers,
                 n_threads=self._threads,
                 n_threads_batch=self._threads,
-                chat_handler=self._handler,
                 verbose=llama_log.verbose(),
             )
         except (ValueError, RuntimeError, OSError) as error:
             raise ModelError(f"`model` {files.model.path}: llama.cpp: {llama_log.reason() or error}") from error
         llama_log.silence()  # the library sets its own log level while it loads
-        try:
-            self._handler._init_mtmd_context(llama)  # noqa: SLF001 load now, not within the first request's time
-        except ValueError as error:
-            llama.close()
-            raise ModelError(f"`mmproj` {files.mmproj.path}: llama.cpp: {error}") from error
         self._pieces = TokenBytes(llama._model.vocab)  # noqa: SLF001
+        with _refused(f"`mmproj` {files.mmproj and files.mmproj.path}: llama.cpp", llama):
+            self._handler.load(llama)  # now, not within the first request's time
+        with _refused(f"`chat_template` {config.chat_template or files.model.path}", llama):
+            self._template = ChatTemplate(files.chat_template, llama._model.vocab)  # noqa: SLF001
         return llama
 
     @property
@@ -166,13 +182,13 @@ class LlamaCppEngine(Engine):
         self._facts = {
             PROMPT_N: float(perf.n_p_eval),
             PROMPT_MS: (prompt_done - started) / _MS_NS,
-            PREPROCESS_MS: (self._handler.steps.prepared_ns - started) / _MS_NS,
+            PREPROCESS_MS: (self._handler.prepared_ns - started) / _MS_NS,
             PROMPT_EVAL_MS: perf.t_p_eval_ms,
             PREDICTED_N: 0.0,
             PREDICTED_MS: 0.0,
         }
-        if request.images:
-            self._facts[VISION_ENCODE_MS] = self._handler.steps.encode_ns / _MS_NS
+        if request.images and self._files.mmproj:
+            self._facts[VISION_ENCODE_MS] = self._handler.encode_ns / _MS_NS
         ignore_end = self._files.dummy and not request.grammar  # random weights end at random, counts should not
         decode = codecs.getincrementaldecoder("utf-8")("replace").decode
         llama.set_seed(request.seed & 0x7FFF_FFFF)  # 2**32-1 would mean a random seed
@@ -201,28 +217,20 @@ class LlamaCppEngine(Engine):
 
     def _evaluate(self, llama: _Prefilled, request: Request) -> None:
         """Evaluate pictures and prompt, on an empty KV cache, up to the first token's logits."""
-        pictures = [{"type": "image_url", "image_url": _URL.format(index)} for index in range(len(request.images))]
-        content = [*pictures, {"type": "text", "text": request.prompt}]
-        self._handler.frames = request.images
+        prompt = self._template.prompt(request.prompt, len(request.images) if self._files.mmproj else 0)
         llama_log.reason()
         llama_cpp.llama_perf_context_reset(llama.ctx)
         try:
-            self._handler(llama=llama, messages=[{"role": "user", "content": content}], stream=True)
+            self._handler.evaluate(llama, prompt, request.images, llama.n_ctx() - request.max_tokens)
+        except TooLong as error:
+            raise BadRequest(
+                f"llama: request {request.id} does not fit the context of {llama.n_ctx()} tokens (prompt of {error} "
+                f"tokens, answer of up to {request.max_tokens}); shorten it or raise --context"
+            ) from error
         except (ValueError, RuntimeError) as error:
-            if "exceeds n_ctx" in str(error):
-                raise BadRequest(self._too_long(request)) from error
             raise EngineError(f"llama: request {request.id} was refused: {llama_log.reason() or error}") from error
-        finally:
-            self._handler.frames = ()
-        if len(llama.prompt) + request.max_tokens > llama.n_ctx():
-            raise BadRequest(self._too_long(request, len(llama.prompt)))
-
-    def _too_long(self, request: Request, prompt_n: int | None = None) -> str:
-        prompt = "the prompt alone is longer" if prompt_n is None else f"prompt of {prompt_n} tokens"
-        return (
-            f"llama: request {request.id} does not fit the context of {self._config.context} tokens ({prompt}, "
-            f"answer of up to {request.max_tokens}); shorten it or raise --context"
-        )
+        if not llama.n_tokens:
+            raise BadRequest(f"llama: request {request.id} has a prompt without a token; write one")
 
     def _check(self, llama: _Prefilled, request: Request) -> None:
         """Refuse requests that would crash llama.cpp: pictures of another size than declared, damaged grammars."""
@@ -253,9 +261,8 @@ class LlamaCppEngine(Engine):
             "architecture": model.architecture,
             "model": str(model.path),
             "model_sha256": sha256(model.path),
-            "mmproj": str(mmproj.path),
-            "mmproj_sha256": sha256(mmproj.path),
-            "projector": str(mmproj.fields.get("clip.projector_type", "")),
+            **(_tower(mmproj) if mmproj else {"pictures": "not seen"}),
+            "chat_template": str(self._config.chat_template or "the model's"),
             "llama_cpp_python": version("llama-cpp-python"),
             "threads": self._threads,
             "gpu_offload_supported": bool(llama_cpp.llama_supports_gpu_offload()),

@@ -1,4 +1,4 @@
-"""Pictures for llama.cpp: llama-cpp-python's MiniCPM-V 2.6 handler with RGB pixels as input."""
+"""Pictures for llama.cpp: llama-cpp-python's handler for any of its models, with RGB pixels as input."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from s2a_bench import extras
 from s2a_bench.clock import now_ns
 from s2a_bench.inference import llama_log
+from s2a_bench.inference.llama_prompt import TooLong
 from s2a_bench.types import Frame
 
 llama_cpp = extras.require("llama_cpp", "llama")
@@ -23,18 +24,22 @@ class Steps:
     """MTMD's bindings, except that a call of the library's handler is split into steps, each timed.
 
     ``prepared_ns`` is the time at which the last prompt was tokenised and its pictures sliced; ``encode_ns`` is the
-    vision tower's time for them so far.
+    vision tower's time for them so far; ``room`` is the most tokens of a prompt, which are more than its positions
+    where a picture's share them (M-RoPE).
     """
 
     def __init__(self) -> None:
         self.prepared_ns = 0
         self.encode_ns = 0
+        self.room = 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(mtmd_cpp, name)
 
-    def mtmd_tokenize(self, *arguments: Any) -> int:
-        failed: int = mtmd_cpp.mtmd_tokenize(*arguments)
+    def mtmd_tokenize(self, mtmd: Any, chunks: Any, *arguments: Any) -> int:
+        failed: int = mtmd_cpp.mtmd_tokenize(mtmd, chunks, *arguments)
+        if not failed and (count := mtmd_cpp.mtmd_helper_get_n_tokens(chunks)) > self.room:
+            raise TooLong(count)
         self.prepared_ns, self.encode_ns = now_ns(), 0
         return failed
 
@@ -55,23 +60,53 @@ class Steps:
         return failed
 
 
-class PixelHandler(chat_format.MiniCPMv26ChatHandler):  # type: ignore[misc, name-defined]  # the library has no types
-    """The library's handler, except that a picture is an RGB array and not the bytes of a JPEG."""
+class PixelHandler(chat_format.MTMDChatHandler):  # type: ignore[misc, name-defined]  # the library has no types
+    """The library's handler, except that a picture is an RGB array, and that the prompt is rendered already."""
 
     def __init__(self, mmproj: str, *, use_gpu: bool) -> None:
-        super().__init__(clip_model_path=mmproj, verbose=False)
+        super().__init__(clip_model_path=mmproj, verbose=False, use_gpu=use_gpu)
         self._mtmd_cpp = self.steps = Steps()
+        self._prompt = ""
+        self._frames: tuple[Frame, ...] = ()
         self.mtmd_ctx: Any = None
-        self.frames: tuple[Frame, ...] = ()
-        self._use_gpu = use_gpu
+
+    @property
+    def prepared_ns(self) -> int:
+        return self.steps.prepared_ns
+
+    @property
+    def encode_ns(self) -> int:
+        return self.steps.encode_ns
+
+    def evaluate(self, llama: Any, prompt: str, frames: tuple[Frame, ...], room: int) -> None:
+        """Evaluate a prompt with markers, of up to ``room`` tokens, on an empty KV cache; raises TooLong."""
+        self._prompt, self._frames, self.steps.room = prompt, frames, room
+        pictures = [{"type": "image_url", "image_url": str(place)} for place in range(len(frames))]
+        try:
+            self(llama=llama, messages=[{"role": "user", "content": pictures}], stream=True)
+        finally:
+            self._frames = ()
+
+    def load(self, llama: Any) -> None:
+        """Load the vision tower; raises ValueError."""
+        self._init_mtmd_context(llama)
+
+    def _get_chat_template(self, _llama: Any) -> str:
+        return "{{ messages }}"
+
+    def _get_template_messages(self, _messages: Any, _marker: str) -> str:
+        return self._prompt
+
+    def _postprocess_template_text(self, text: str, _urls: Any, _marker: str) -> str:
+        return text
 
     def _init_mtmd_context(self, llama_model: Any) -> None:
-        """Load the vision tower; the library's version puts it on a GPU whatever the user chose."""
+        """Load with the language model's kind of flash attention; the library turns llama.cpp's own choice off."""
         if self.mtmd_ctx is not None:
             return
         mtmd = self._mtmd_cpp
         params = mtmd.mtmd_context_params_default()
-        params.use_gpu = self._use_gpu
+        params.use_gpu = self.use_gpu
         params.print_timings = False
         params.n_threads = llama_model.n_threads
         params.flash_attn_type = llama_model.context_params.flash_attn_type
@@ -85,7 +120,7 @@ class PixelHandler(chat_format.MiniCPMv26ChatHandler):  # type: ignore[misc, nam
         self.mtmd_ctx = None
 
     def load_image(self, image_url: str) -> Frame:
-        return self.frames[int(image_url.rstrip("/").rpartition("/")[2])]
+        return self._frames[int(image_url)]
 
     def _create_bitmap_from_bytes(self, image_bytes: Frame) -> Any:
         pixels = np.ascontiguousarray(image_bytes.data)

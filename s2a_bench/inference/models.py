@@ -15,8 +15,12 @@ from s2a_bench.errors import ModelError
 from s2a_bench.inference import EngineConfig, Size
 from s2a_bench.inference.dummy import dummy_files, write_dummy
 from s2a_bench.inference.gguf_file import GgufHeader, read_header
+from s2a_bench.text import read_text
 
 CACHE_VARIABLE = "S2A_BENCH_CACHE"
+NO_TEMPLATE, RAW_PROMPT = "none", "{% for message in messages %}{{ message['content'] }}{% endfor %}"
+"""The value of `EngineConfig.chat_template` for a raw prompt, and the template that makes one."""
+TEMPLATE_BYTES = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +66,14 @@ def fetched(name: str) -> tuple[Path, Path]:
 @dataclass(frozen=True, slots=True)
 class ModelFiles:
     model: GgufHeader
-    mmproj: GgufHeader
+    mmproj: GgufHeader | None
+    """None for a text model, which sees no pictures."""
+    chat_template: str
+    """A Jinja text."""
 
     @property
     def dummy(self) -> bool:
-        return self.model.is_dummy or self.mmproj.is_dummy
+        return any(header.is_dummy for header in (self.model, self.mmproj) if header)
 
 
 def cache_folder() -> Path:
@@ -89,17 +96,17 @@ def tiny_dummy() -> tuple[Path, Path]:
     return files
 
 
-def resolve(config: EngineConfig) -> tuple[Path, Path]:
+def resolve(config: EngineConfig) -> tuple[Path, Path | None]:
     """Return the paths of language model and mmproj for ``config``; raises ModelError, see `load_headers`."""
     files = load_headers(config)
-    return files.model.path, files.mmproj.path
+    return files.model.path, files.mmproj.path if files.mmproj else None
 
 
 def load_headers(config: EngineConfig) -> ModelFiles:
-    """Read and check both headers.
+    """Read and check both headers; a model without an mmproj, named or beside it, is a text model.
 
     A name of `HUB_MODELS` instead of a path stands for its fetched files. Raises ModelError if a file is missing,
-    damaged or of the wrong kind, or if no mmproj is found.
+    damaged or of the wrong kind, or if several mmproj files lie beside the model.
     """
     model_path, mmproj_path = config.model, config.mmproj
     if model_path is None:
@@ -112,7 +119,11 @@ def load_headers(config: EngineConfig) -> ModelFiles:
     model = read_header(model_path, "`model`")
     if model.is_mmproj:
         raise ModelError(f"`model` {model_path}: this is an mmproj (vision tower); give it as `mmproj`")
-    mmproj = read_header(mmproj_path or _mmproj_beside(model_path), "`mmproj`")
+    template = _chat_template(config, model)
+    mmproj_path = mmproj_path or _mmproj_beside(model_path)
+    if mmproj_path is None:
+        return ModelFiles(model, None, template)
+    mmproj = read_header(mmproj_path, "`mmproj`")
     if not mmproj.is_mmproj:
         raise ModelError(
             f"`mmproj` {mmproj.path}: this is a language model ({mmproj.architecture or 'no architecture'}), "
@@ -120,17 +131,29 @@ def load_headers(config: EngineConfig) -> ModelFiles:
         )
     if mmproj.fields.get("clip.has_vision_encoder") is not True:
         raise ModelError(f"`mmproj` {mmproj.path}: has no vision tower; give the mmproj of a model that takes pictures")
-    return ModelFiles(model, mmproj)
+    return ModelFiles(model, mmproj, template)
 
 
-def _mmproj_beside(model: Path) -> Path:
+def _chat_template(config: EngineConfig, model: GgufHeader) -> str:
+    chosen = config.chat_template
+    if chosen == NO_TEMPLATE:
+        return RAW_PROMPT
+    if chosen:
+        try:
+            return read_text(Path(chosen), TEMPLATE_BYTES)
+        except (OSError, ValueError) as error:
+            raise ModelError(f"`chat_template` {chosen}: cannot be read ({error})") from error
+    if not (found := str(model.fields.get("tokenizer.chat_template", ""))):
+        raise ModelError(f"`model` {model.path}: has no chat template; give `chat_template` FILE, or none: no template")
+    return found
+
+
+def _mmproj_beside(model: Path) -> Path | None:
     found = sorted(model.parent.glob("mmproj*.gguf"))
-    if not found:
-        raise ModelError(f"`model` {model}: it is not multimodal, and no mmproj*.gguf lies beside it; give `mmproj`")
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
         raise ModelError(f"`model` {model}: several mmproj files lie beside it ({names}); choose one with `mmproj`")
-    return found[0]
+    return found[0] if found else None
 
 
 def sha256(path: Path) -> str:

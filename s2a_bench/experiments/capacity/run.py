@@ -53,7 +53,7 @@ HEAD_START_S: Final = 0.2
 LATEST: Final = 0.05
 """Lateness of the generator's ticks at p99, as a share of a tick, above which a fleet is no measurement."""
 ECHO: Final = (("name", STAND_IN), ("latency", ""), ("pace", None), ("profile", ""), ("gaps", ""))
-ECHO_OF_MODEL: Final = (("model", None), ("mmproj", None), ("gpu_layers", 0))
+ECHO_OF_MODEL: Final = (("model", None), ("mmproj", None), ("chat_template", ""), ("gpu_layers", 0))
 
 
 def run_capacity(config: CapacityConfig, output: Path, progress: Progress) -> Path:

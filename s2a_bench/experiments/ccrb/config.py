@@ -32,7 +32,7 @@ class PlanRequest(Options):
         "", "--live: ros, ros/action, http, http/VARIANT, shm, loopback [default: ros]", names=paths
     )
     engine: EngineConfig = group(
-        EngineConfig, only=("name", "model", "mmproj", "threads", "pace"), about="--live: ", first=()
+        EngineConfig, only=("name", "model", "mmproj", "chat_template", "threads", "pace"), about="--live: ", first=()
     )
 
     def check(self) -> None:

@@ -24,7 +24,18 @@ class LatencyConfig(RequestsConfig):
     engine: EngineConfig = group(
         EngineConfig,
         only=(
-            *("name", "profile", "gaps", "latency", "model", "mmproj", "threads", "gpu_layers", "context"),
+            *(
+                "name",
+                "profile",
+                "gaps",
+                "latency",
+                "model",
+                "mmproj",
+                "chat_template",
+                "threads",
+                "gpu_layers",
+                "context",
+            ),
             *("flash_attention", "answer", "horizon", "action_dim"),
         ),
     )

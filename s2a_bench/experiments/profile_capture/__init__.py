@@ -24,7 +24,9 @@ class CaptureConfig(Options):
 
     name: str = option(..., "name of the profile; its file is NAME.toml", argument=True)
     title: str = option("", "what figures call it [default: the board's or CPU's name]")
-    engine: EngineConfig = group(EngineConfig, only=("model", "mmproj", "threads", "gpu_layers", "context"))
+    engine: EngineConfig = group(
+        EngineConfig, only=("model", "mmproj", "chat_template", "threads", "gpu_layers", "context")
+    )
     source: str = option("synthetic", f"{', '.join(SOURCES)}, as video:FILE")
     size: Size = option((640, 480), "WIDTHxHEIGHT of the frames [default: 640x480]")
     requests: int = option(20, "requests that count, each about a new frame", ge=1)

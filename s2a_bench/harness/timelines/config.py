@@ -156,7 +156,10 @@ class LiveOptions(Options):
         "timed", "--live: timed, ros, call?function=MODULE:NAME; timed only waits", names=lambda: ROBOTS
     )
     engine: EngineConfig = group(
-        EngineConfig, only=("name", "model", "mmproj", "threads", "gpu_layers", "pace"), about="--live: ", first=()
+        EngineConfig,
+        only=("name", "model", "mmproj", "chat_template", "threads", "gpu_layers", "pace"),
+        about="--live: ",
+        first=(),
     )
     source: str = option("synthetic", "--live: the camera", names=lambda: SOURCES)
     size: Size = option((640, 480), "--live: WIDTHxHEIGHT of the frames [default: 640x480]")

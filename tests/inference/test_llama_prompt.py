@@ -1,0 +1,208 @@
+"""Prompts of the llama engine: chat templates, models of texts alone, and a real language model."""
+
+import ctypes
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from s2a_bench.errors import BadRequest, ModelError, UsageError
+from s2a_bench.inference import Engine, EngineConfig
+from s2a_bench.inference.llama_cpp import LlamaCppEngine
+from s2a_bench.inference.llama_pictures import Steps, mtmd_cpp
+from s2a_bench.inference.llama_prompt import MARKER, ChatTemplate
+from s2a_bench.inference.models import RAW_PROMPT, load_headers
+from s2a_bench.testing.engine import EngineSuite, ask, rgb_frame
+
+MINICPM = (
+    "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n"
+    "<|im_start|>user\n{}{}<|im_end|>\n<|im_start|>assistant\n"
+)
+"""What llama-cpp-python's handler for MiniCPM-V 2.6 writes."""
+PARTS = (
+    "{{ bos_token }}{% for message in messages %}<{{ message['role'] }}>"
+    "{% for part in message['content'] %}{% if part['type'] == 'text' %}{{ part['text'] }}{% endif %}{% endfor %}"
+    "{% endfor %}{% if add_generation_prompt %}<model>{% endif %}"
+)
+TEXT = "{% for message in messages %}{{ '<' + message.role + '>' + message.content + eos_token }}{% endfor %}"
+EITHER = (
+    "{% for message in messages %}{% if message.content is string %}{{ message.content }}{% else %}"
+    "{% for part in message.content %}[{{ part.text }}]{% endfor %}{% endif %}{% endfor %}"
+)
+
+
+@pytest.fixture(scope="module")
+def blind(texts: EngineConfig) -> Iterator[LlamaCppEngine]:
+    engine = LlamaCppEngine(texts)
+    yield engine
+    engine.close()
+
+
+class TestTextModel(EngineSuite):
+    @pytest.fixture
+    def engine(self, blind: LlamaCppEngine) -> Engine:
+        return blind
+
+    @pytest.fixture
+    def fresh_engine(self, texts: EngineConfig) -> LlamaCppEngine:
+        return LlamaCppEngine(texts)
+
+
+def vocab_of(engine: LlamaCppEngine) -> Any:
+    assert engine._llama is not None
+    return engine._llama._model.vocab
+
+
+@pytest.fixture(scope="module")
+def vocab(tiny: EngineConfig) -> Iterator[Any]:
+    engine = LlamaCppEngine(tiny)
+    yield vocab_of(engine)
+    engine.close()
+
+
+@pytest.fixture(scope="module")
+def base(gemma: Path) -> Iterator[LlamaCppEngine]:
+    engine = LlamaCppEngine(EngineConfig(model=gemma, chat_template="none", sampling="greedy", threads=2))
+    yield engine
+    engine.close()
+
+
+def tokenised(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """Return the list that each prompt's text, and its chunks, are added to: ids of texts, the tokens of slices."""
+    seen: list[Any] = []
+    tokenize = Steps.mtmd_tokenize
+
+    def told(steps: Steps, mtmd: Any, chunks: Any, text: Any, *rest: Any) -> int:
+        failed = tokenize(steps, mtmd, chunks, text, *rest)
+        found: list[Any] = []
+        for place in range(mtmd_cpp.mtmd_input_chunks_size(chunks)):
+            chunk = mtmd_cpp.mtmd_input_chunks_get(chunks, place)
+            if mtmd_cpp.mtmd_input_chunk_get_type(chunk) == mtmd_cpp.MTMD_INPUT_CHUNK_TYPE_TEXT:
+                count = ctypes.c_size_t()
+                ids = mtmd_cpp.mtmd_input_chunk_get_tokens_text(chunk, ctypes.byref(count))
+                found.append([ids[index] for index in range(count.value)])
+            else:
+                found.append(mtmd_cpp.mtmd_input_chunk_get_n_tokens(chunk))
+        seen.extend((ctypes.string_at(text._obj.text, text._obj.text_len).decode(), found))
+        return failed
+
+    monkeypatch.setattr(Steps, "mtmd_tokenize", told)
+    return seen
+
+
+def test_minicpm_is_asked_token_by_token_as_before(tiny: EngineConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = tokenised(monkeypatch)
+    engine = LlamaCppEngine(tiny)
+    picture = rgb_frame(1, 640, 480)
+    ask(engine, "stop now", images=(picture,))
+    ask(engine, "stop now", images=(picture, picture))
+    ask(engine, "stop now")
+    engine.close()
+    before = [258, 82, 88, 82, 83, 68, 76, 198, 56, 78, 84, 220, 64, 81, 68, 220, 64, 220, 71, 68, 75, 79, 69, 84, 75]
+    before += [220, 64, 82, 82, 72, 82, 83, 64, 77, 83, 13, 259, 198, 258, 84, 82, 68, 81, 198]
+    after = [82, 83, 78, 79, 220, 77, 78, 86, 259, 198, 258, 64, 82, 82, 72, 82, 83, 64, 77, 83, 198]
+    slices = [64, [261, 270], 64, [271, 270], 64]
+    assert seen == [
+        MINICPM.format(MARKER, "stop now"),
+        [[*before, 260], *slices, [271, *after]],
+        MINICPM.format(MARKER * 2, "stop now"),
+        [[*before, 260], *slices, [271, 260], *slices, [271, *after]],
+        MINICPM.format("", "stop now"),
+        [[*before, *after]],
+    ]
+
+
+@pytest.mark.parametrize(
+    ("source", "prompt"),
+    [
+        (PARTS, "<|im_start|><user>{0}{0}go<model>"),
+        (TEXT, "<user>{0}{0}go<|im_end|>"),
+        (EITHER, "[{0}][{0}][go]"),
+        (RAW_PROMPT, "{0}{0}go"),
+    ],
+)
+def test_a_template_takes_parts_or_one_text(vocab: Any, source: str, prompt: str) -> None:
+    assert ChatTemplate(source, vocab).prompt("go", 2) == prompt.format(MARKER)
+
+
+def test_what_the_tokenizer_adds_is_not_there_twice(base: LlamaCppEngine) -> None:
+    assert ChatTemplate(PARTS, vocab_of(base)).prompt("go", 0) == "<user>go<model>"
+    for prompt in ("go", "<bos>go"):
+        ask(base, prompt, max_tokens=1)
+        assert base._llama is not None
+        assert base._llama.prompt[0] == 2
+        assert base._llama.prompt[1] != 2
+
+
+@pytest.mark.parametrize(
+    ("source", "why"),
+    [
+        ("{% if", "TemplateSyntaxError: unexpected 'end of template'"),
+        ("{{ messages | rot13 }}", "No filter named 'rot13'"),
+        ("{{ raise_exception('tools alone') }}", "tools alone"),
+        ("{{ messages[1].content }}", "UndefinedError"),
+    ],
+)
+def test_a_template_that_renders_nothing_is_a_line(texts: EngineConfig, tmp_path: Path, source: str, why: str) -> None:
+    file = tmp_path / "mine.jinja"
+    file.write_text(source)
+    with pytest.raises(ModelError, match=rf"^`chat_template` {file}: .*{why}"):
+        LlamaCppEngine(texts.but(chat_template=str(file)))
+
+
+def test_a_template_that_cannot_be_read_is_a_line(texts: EngineConfig, tmp_path: Path) -> None:
+    for content in (None, b"\xff", b"x" * (2 << 20)):
+        file = tmp_path / "mine.jinja"
+        if content is not None:
+            file.write_bytes(content)
+        with pytest.raises(ModelError, match=rf"^`chat_template` {file}: cannot be read"):
+            load_headers(texts.but(chat_template=str(file)))
+
+
+def test_a_model_without_a_template_names_the_ways_out(gemma: Path) -> None:
+    with pytest.raises(ModelError, match="has no chat template; give `chat_template` FILE, or none: no template"):
+        load_headers(EngineConfig(model=gemma))
+
+
+def test_a_template_is_for_an_engine_with_a_model() -> None:
+    with pytest.raises(UsageError, match="`chat_template` is for an engine with a model"):
+        EngineConfig(name="echo", chat_template="none").check()
+
+
+def test_a_model_of_texts_does_not_see_the_picture(blind: LlamaCppEngine) -> None:
+    facts = blind.describe()
+    seen = ask(blind, images=(rgb_frame(1),))
+    assert "vision_encode_ms" not in blind.facts
+    assert seen == ask(blind, images=(rgb_frame(2),)) == ask(blind)
+    assert facts["pictures"] == "not seen"
+    assert not {"mmproj", "mmproj_sha256", "projector"} & set(facts)
+    with pytest.raises(BadRequest, match="640x480 whose data are"):
+        ask(blind, images=(replace(rgb_frame(), width=640, height=480),))
+
+
+def test_a_prompt_without_a_token_is_refused(texts: EngineConfig, tiny: EngineConfig) -> None:
+    for config in (texts, tiny):
+        engine = LlamaCppEngine(config.but(chat_template="none"))
+        with pytest.raises(BadRequest, match="a prompt without a token; write one"):
+            ask(engine, "")
+        assert ask(engine, "go")
+        engine.close()
+
+
+def test_a_real_model_goes_on_with_the_raw_prompt(base: LlamaCppEngine) -> None:
+    prompt = "1. pick(cup)\n2. place(cup, table)\n3."
+    answer = "".join(token.text for token in ask(base, prompt, max_tokens=24))
+    assert "(" in answer
+    assert "\n4." in answer
+    assert answer == "".join(token.text for token in ask(base, prompt, max_tokens=24, images=(rgb_frame(),)))
+    assert (base.facts["prompt_n"], base.facts["predicted_n"]) == (len(base._llama.prompt), 24)  # type: ignore[union-attr]
+
+
+def test_a_real_model_ends_its_answer_itself_and_obeys_a_grammar(base: LlamaCppEngine) -> None:
+    grammar = 'root ::= ("stop" | "go") "(" [0-9] ")"'
+    tokens = ask(base, "Say go(3). You say: ", max_tokens=40, grammar=grammar)
+    assert re.fullmatch(r"(stop|go)\(\d\)", "".join(token.text for token in tokens))
+    assert len(tokens) < 40
