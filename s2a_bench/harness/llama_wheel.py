@@ -14,13 +14,15 @@ from typing import Any
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.models import chat_template
 
 
 def server_settings(engine: EngineConfig, port: int, *, ignore_end: bool) -> dict[str, Any]:
     """Return settings under which the server computes as the llama engine does, like `llama_flags` of a program."""
     return {
         "model": str(engine.model),
-        "mmproj": str(engine.mmproj),
+        "mmproj": str(engine.mmproj or ""),
+        "chat_template": chat_template(engine),
         "threads": engine.threads or len(os.sched_getaffinity(0)),
         "gpu_layers": engine.gpu_layers,
         "context": engine.context,
@@ -43,6 +45,8 @@ def main() -> int:
     settings = json.loads(line)
     params = llama.CommonParams()
     params.model.path, params.mmproj.path = settings["model"], settings["mmproj"]
+    if settings["chat_template"]:
+        params.chat_template, params.use_jinja = settings["chat_template"], True
     params.n_ctx, params.n_parallel, params.fit_params = settings["context"], 1, False
     params.n_batch = params.n_ubatch = settings["batch"]
     params.cpuparams.n_threads = params.cpuparams_batch.n_threads = settings["threads"]

@@ -119,7 +119,8 @@ def load_headers(config: EngineConfig) -> ModelFiles:
     model = read_header(model_path, "`model`")
     if model.is_mmproj:
         raise ModelError(f"`model` {model_path}: this is an mmproj (vision tower); give it as `mmproj`")
-    template = _chat_template(config, model)
+    if not (template := chat_template(config) or str(model.fields.get("tokenizer.chat_template", ""))):
+        raise ModelError(f"`model` {model_path}: has no chat template; give `chat_template` FILE, or none: no template")
     mmproj_path = mmproj_path or _mmproj_beside(model_path)
     if mmproj_path is None:
         return ModelFiles(model, None, template)
@@ -134,18 +135,13 @@ def load_headers(config: EngineConfig) -> ModelFiles:
     return ModelFiles(model, mmproj, template)
 
 
-def _chat_template(config: EngineConfig, model: GgufHeader) -> str:
+def chat_template(config: EngineConfig) -> str:
+    """Return the chosen chat template, a Jinja text; empty: the model's own; raises ModelError."""
     chosen = config.chat_template
-    if chosen == NO_TEMPLATE:
-        return RAW_PROMPT
-    if chosen:
-        try:
-            return read_text(Path(chosen), TEMPLATE_BYTES)
-        except (OSError, ValueError) as error:
-            raise ModelError(f"`chat_template` {chosen}: cannot be read ({error})") from error
-    if not (found := str(model.fields.get("tokenizer.chat_template", ""))):
-        raise ModelError(f"`model` {model.path}: has no chat template; give `chat_template` FILE, or none: no template")
-    return found
+    try:
+        return RAW_PROMPT if chosen == NO_TEMPLATE else read_text(Path(chosen), TEMPLATE_BYTES) if chosen else ""
+    except (OSError, ValueError) as error:
+        raise ModelError(f"`chat_template` {chosen}: cannot be read ({error})") from error
 
 
 def _mmproj_beside(model: Path) -> Path | None:
