@@ -6,17 +6,9 @@ import pytest
 
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import dummy
-from s2a_bench.inference.dummy import (
-    FULL_UNKNOWN,
-    KINDS,
-    PART_BYTES,
-    DummyFiles,
-    Kind,
-    Tensor,
-    byte_names,
-    make_vocab,
-    write_dummy,
-)
+from s2a_bench.inference.dummy import DummyFiles, write_dummy
+from s2a_bench.inference.dummy.tensors import KINDS, PART_BYTES, Kind, Tensor
+from s2a_bench.inference.dummy.vocab import FULL_UNKNOWN, byte_names, make_vocab
 from s2a_bench.inference.gguf_file import read_header
 
 gguf = pytest.importorskip("gguf")
@@ -120,7 +112,7 @@ def test_the_byte_alphabet_is_gpt_2s() -> None:
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_a_tensor_has_as_many_bytes_as_it_says_however_it_is_cut(kind: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.inference.dummy.PART_BYTES", 1000)
+    monkeypatch.setattr("s2a_bench.inference.dummy.tensors.PART_BYTES", 1000)
     tensor = Tensor("t", (6, 512), kind)
     assert sum(chunk.nbytes for chunk in tensor.parts(0)) == tensor.nbytes
     assert tensor.nbytes == 6 * 512 // KINDS[kind][0] * KINDS[kind][1]

@@ -11,198 +11,25 @@ their size through the layers.
 
 from __future__ import annotations
 
-import math
 import os
-import string
 import tempfile
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from s2a_bench import extras
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import Quant, Size
+from s2a_bench.inference.dummy.tensors import Kind, Tensor
+from s2a_bench.inference.dummy.vocab import Vocab, make_vocab
 from s2a_bench.text import none_of
 
 if TYPE_CHECKING:
     from gguf import GGUFWriter
-
-Kind: TypeAlias = Literal["f32", "f16", "q8_0", "q4_0", "q6_k"]
-Bytes: TypeAlias = NDArray[np.uint8]
-
-PART_BYTES = 1 << 24
-
-_F16_SPREAD = math.sqrt(7 / 3)  # of a number uniform in +-[1, 2)
-_Q4_SPREAD = math.sqrt((16**2 - 1) / 12)
-_Q6_SPREAD = math.sqrt((64**2 - 1) / 12)
-_Q8_SPREAD = math.sqrt((256**2 - 1) / 12)
-_Q6_SCALE = 8  # keeps the half-precision factor beside it a normal number
-
-
-@dataclass(frozen=True, slots=True)
-class Tensor:
-    """One tensor: its shape in numpy's order (columns last); a ``value``, or one for each, if it is not random."""
-
-    name: str
-    shape: tuple[int, ...]
-    kind: Kind = "f32"
-    value: float | Sequence[float] | None = None
-
-    @property
-    def nbytes(self) -> int:
-        block, size, _ = KINDS[self.kind]
-        return math.prod(self.shape) // block * size
-
-    @property
-    def spread(self) -> float:
-        return 1 / math.sqrt(math.prod(self.shape[1:])) if len(self.shape) > 1 else 0.02
-
-    def parts(self, seed: int) -> Iterator[Bytes]:
-        block, size, draw = KINDS[self.kind]
-        left = math.prod(self.shape) // block
-        generator = np.random.Generator(np.random.SFC64([seed, zlib.crc32(self.name.encode())]))
-        while left:
-            blocks = min(left, PART_BYTES // size)
-            left -= blocks
-            if self.value is None:
-                yield draw(_random_bytes(generator, blocks * size), self.spread)
-            else:
-                yield np.broadcast_to(np.asarray(self.value, _FLOATS[self.kind]), blocks).copy().view(np.uint8)
-
-
-def _random_bytes(generator: np.random.Generator, size: int) -> Bytes:
-    return generator.integers(0, 2**64 - 1, -(-size // 8), np.uint64, endpoint=True).view(np.uint8)[:size]
-
-
-def _f32(raw: Bytes, spread: float) -> Bytes:
-    numbers = raw.view("<i4").astype("<f4") * np.float32(spread * math.sqrt(3) / 2**31)
-    return numbers.view(np.uint8)
-
-
-def _f16(raw: Bytes, spread: float) -> Bytes:
-    # sign and mantissa stay random, the exponent is set: no conversion, which would take minutes for 15 GB
-    exponent = 15 + round(math.log2(spread / _F16_SPREAD))
-    halves = raw.view("<u2")
-    halves &= 0x83FF
-    halves |= exponent << 10
-    return raw
-
-
-def _set_factor(raw: Bytes, layout: list[Any], factor: float) -> Bytes:
-    """Set a block's factor, ``d``, negated in every second block: asymmetric codes then average to 0."""
-    factors = raw.view(layout)["d"]
-    factors[0::2], factors[1::2] = factor, -factor
-    return raw
-
-
-def _q8_0(raw: Bytes, spread: float) -> Bytes:
-    return _set_factor(raw, [("d", "<f2"), ("q", "i1", 32)], spread / _Q8_SPREAD)
-
-
-def _q4_0(raw: Bytes, spread: float) -> Bytes:
-    return _set_factor(raw, [("d", "<f2"), ("q", "u1", 16)], spread / _Q4_SPREAD)
-
-
-def _q6_k(raw: Bytes, spread: float) -> Bytes:
-    layout: list[Any] = [("ql", "u1", 128), ("qh", "u1", 64), ("scales", "i1", 16), ("d", "<f2")]
-    raw.view(layout)["scales"] = _Q6_SCALE
-    return _set_factor(raw, layout, spread / _Q6_SPREAD / _Q6_SCALE)
-
-
-KINDS: dict[Kind, tuple[int, int, Callable[[Bytes, float], Bytes]]] = {
-    "f32": (1, 4, _f32),
-    "f16": (1, 2, _f16),
-    "q8_0": (32, 34, _q8_0),
-    "q4_0": (32, 18, _q4_0),
-    "q6_k": (256, 210, _q6_k),
-}
-"""Tensor type -> (numbers in a block, bytes of a block, function that turns random bytes into blocks)."""
-
-_FLOATS: dict[Kind, str] = {"f32": "<f4", "f16": "<f2"}
-
-NORMAL, CONTROL = 1, 3
-"""Token types of GGUF (``gguf.TokenType``)."""
-
-FULL_BASE = 151_643
-"""The number of Qwen2's byte-level tokens and merges; the special tokens follow."""
-
-FULL_UNKNOWN = 128_244
-"""MiniCPM-V 2.6 keeps ``<unk>`` within Qwen2's range."""
-
-_LETTERS = "etaoinshrdlcumwfgypbvkjxqz"
-
-_QWEN_SPECIAL = ("<|endoftext|>", "<|im_start|>", "<|im_end|>")
-_IMAGE_SPECIAL = tuple(
-    mark
-    for name in ("image", "ref", "box", "quad", "point", "slice", "image_id")
-    for mark in (f"<{name}>", f"</{name}>")
-)
-_RESERVED = tuple(f"<|reserved_special_token_{index}|>" for index in range(6))
-TEXT = frozenset(string.ascii_letters + string.digits + string.punctuation + " \n")
-SPECIAL = _QWEN_SPECIAL + _IMAGE_SPECIAL + _RESERVED
-
-
-@dataclass(frozen=True, slots=True)
-class Vocab:
-    """Tokens by index with their GGUF types, merges by rank, and the indices of tokens with a role."""
-
-    tokens: list[str]
-    types: list[int]
-    merges: list[str]
-    pad: int
-    bos: int
-    eos: int
-    unknown: int
-
-    def texts(self) -> list[bool]:
-        """Return for each token whether it is a text: no control token, no byte of a longer character."""
-        unreadable = {name for byte, name in byte_names().items() if chr(byte) not in TEXT}
-        return [kind == NORMAL and token not in unreadable for token, kind in zip(self.tokens, self.types, strict=True)]
-
-
-def byte_names() -> dict[int, str]:
-    """Return GPT-2's printable character for each of the 256 bytes (``bytes_to_unicode``), in GPT-2's order."""
-    printable = [*range(33, 127), *range(161, 173), *range(174, 256)]
-    others = [byte for byte in range(256) if byte not in printable]
-    return {byte: chr(byte) for byte in printable} | {byte: chr(256 + index) for index, byte in enumerate(others)}
-
-
-def make_vocab(*, full: bool) -> Vocab:
-    tokens, merges = list(byte_names().values()), ["\u0120 t"]  # at least one for llama.cpp; \u0120 stands for a space
-    if full:
-        merges = _letter_merges(FULL_BASE - len(tokens))
-    tokens += [merge.replace(" ", "") for merge in merges]
-    types = [NORMAL] * len(tokens) + [CONTROL] * len(SPECIAL)
-    first = len(tokens)
-    tokens += SPECIAL
-    if full:
-        unknown = FULL_UNKNOWN
-        tokens[unknown], types[unknown] = "<unk>", CONTROL
-    else:
-        unknown = len(tokens)
-        tokens.append("<unk>")
-        types.append(CONTROL)
-    return Vocab(tokens, types, merges, pad=first, bos=first + 1, eos=first + 2, unknown=unknown)
-
-
-def _letter_merges(count: int) -> list[str]:
-    """Return ``count`` merges, the shorter texts first: pairs of letters, the same after a space, triples, fours."""
-    pairs = [first + second for first, second in product(_LETTERS, repeat=2)]
-    merges = [f"{pair[0]} {pair[1]}" for pair in pairs]
-    merges += [f"\u0120 {pair}" for pair in pairs]
-    merges += [f"{pair} {letter}" for pair, letter in product(pairs, _LETTERS)]
-    # the commonest pairs with each other, so that English text takes about as few tokens as it does in Qwen2
-    side = math.isqrt(count - len(merges) - 1) + 1
-    merges += [f"{first} {second}" for first, second in product(pairs[:side], repeat=2)]
-    return merges[:count]
-
 
 Progress: TypeAlias = Callable[[int, int], None]
 """(bytes written, total bytes) -> None."""
