@@ -25,12 +25,16 @@ _Q6_SCALE = 8  # keeps the half-precision factor beside it a normal number
 
 @dataclass(frozen=True, slots=True)
 class Tensor:
-    """One tensor: its shape in numpy's order (columns last); a ``value``, or one for each, if it is not random."""
+    """One tensor: its shape in numpy's order (columns last); a ``value``, or one for each, if it is not random.
+
+    The rows ``blank`` are 0; such a tensor is drawn in one part.
+    """
 
     name: str
     shape: tuple[int, ...]
     kind: Kind = "f32"
     value: float | Sequence[float] | None = None
+    blank: Sequence[int] = ()
 
     @property
     def nbytes(self) -> int:
@@ -46,10 +50,13 @@ class Tensor:
         left = math.prod(self.shape) // block
         generator = np.random.Generator(np.random.SFC64([seed, zlib.crc32(self.name.encode())]))
         while left:
-            blocks = min(left, PART_BYTES // size)
+            blocks = left if self.blank else min(left, PART_BYTES // size)
             left -= blocks
             if self.value is None:
-                yield draw(_random_bytes(generator, blocks * size), self.spread)
+                part = draw(_random_bytes(generator, blocks * size), self.spread)
+                if self.blank:  # bytes of 0 are numbers of 0 in every type
+                    part.reshape(self.shape[0], -1)[self.blank] = 0
+                yield part
             else:
                 yield np.broadcast_to(np.asarray(self.value, _FLOATS[self.kind]), blocks).copy().view(np.uint8)
 

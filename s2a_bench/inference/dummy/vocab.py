@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import string
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
 NORMAL, CONTROL = 1, 3
 """Token types of GGUF (``gguf.TokenType``)."""
 
-FULL_BASE = 151_643
-"""The number of Qwen2's byte-level tokens and merges; the special tokens follow."""
+FULL_SIZE = 151_666
+"""The number of MiniCPM-V 2.6's tokens: Qwen2's byte-level ones, then `SPECIAL`."""
 
 FULL_UNKNOWN = 128_244
 """MiniCPM-V 2.6 keeps ``<unk>`` within Qwen2's range."""
@@ -54,18 +55,21 @@ def byte_names() -> dict[int, str]:
     return {byte: chr(byte) for byte in printable} | {byte: chr(256 + index) for index, byte in enumerate(others)}
 
 
-def make_vocab(*, full: bool) -> Vocab:
-    tokens, merges = list(byte_names().values()), ["\u0120 t"]  # at least one for llama.cpp; \u0120 stands for a space
-    if full:
-        merges = _letter_merges(FULL_BASE - len(tokens))
+def make_vocab(*, full: bool, size: int = FULL_SIZE, special: Sequence[str] = SPECIAL) -> Vocab:
+    """Return the 256 bytes, merges, and ``special``, which begins with padding, begin and end; ``size`` if ``full``."""
+    tokens = list(byte_names().values())
+    # \u0120 stands for a space, \u010a for a new line: MTMD looks up the empty line, which MiniCPM-V 2.6 does not need
+    merges = [] if special is SPECIAL else ["\u010a \u010a"]
+    # at least one for llama.cpp
+    merges += _letter_merges(size - len(special) - len(tokens) - len(merges)) if full else ["\u0120 t"]
     tokens += [merge.replace(" ", "") for merge in merges]
-    types = [NORMAL] * len(tokens) + [CONTROL] * len(SPECIAL)
-    first = len(tokens)
-    tokens += SPECIAL
-    if full:
+    types = [NORMAL] * len(tokens) + [CONTROL] * len(special)
+    first = unknown = len(tokens)
+    tokens += special
+    if special is SPECIAL and full:
         unknown = FULL_UNKNOWN
         tokens[unknown], types[unknown] = "<unk>", CONTROL
-    else:
+    elif special is SPECIAL:
         unknown = len(tokens)
         tokens.append("<unk>")
         types.append(CONTROL)
