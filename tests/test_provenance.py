@@ -39,6 +39,12 @@ LLAMA = {"engine": "llama", "model": "/m/tiny.gguf", "name": "tiny", "dummy": Tr
         (LLAMA, "llama (tiny, DUMMY WEIGHTS), tokens measured", "llama/dummy/measured", ("dummy weights",)),
         (LLAMA | {"dummy": False}, "llama (tiny), tokens measured", "llama/real/measured", ()),
         (
+            LLAMA | {"dummy": False, "pictures": "not seen"},
+            "llama (tiny), tokens measured, PICTURE NOT SEEN",
+            "llama/real/measured/pictures-not-seen",
+            ("picture not seen",),
+        ),
+        (
             LLAMA | {"dummy": False, "paced_tokens_per_s": 5.0},
             "llama (tiny), tokens PACED",
             "llama/real/paced",
@@ -53,6 +59,13 @@ def test_what_an_engine_tells_is_said_in_words_and_in_one(
     found = Provenance.of_engine(facts, link="real")
     assert (found.line, found.code, found.labels) == (line, code, labels)
     assert Provenance.from_dict(found.to_dict()) == found
+
+
+def test_a_run_of_before_there_were_text_models_saw_its_pictures() -> None:
+    found = Provenance.of_engine(LLAMA, link="real")
+    before = {name: value for name, value in found.to_dict().items() if name != "pictures"}
+    assert Provenance.from_dict(before) == found
+    assert Provenance.from_dict({**before, "pictures": "seen by someone"}).labels == found.labels
 
 
 def test_what_a_peer_tells_is_bounded_and_has_the_right_types() -> None:
@@ -231,3 +244,6 @@ def test_runs_of_unlike_provenance_differ_fatally(tmp_path: Path) -> None:
     assert "provenance tokens: measured against emulated" in found
     assert not any(each.fatal for each in differences(made(measured), made(measured)))
     assert any(each.fatal for each in differences(made(measured), made(Provenance())))
+    unseen = Provenance.of_engine({**LLAMA, "dummy": False, "pictures": "not seen"})
+    (found,) = (str(each) for each in differences(made(measured), made(unseen)) if each.fatal)
+    assert found == "provenance pictures: seen against not seen"
