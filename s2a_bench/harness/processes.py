@@ -24,7 +24,7 @@ from s2a_bench.errors import COMPILE_AGAIN, SETUP_AGAIN, EngineError, PortInUse,
 from s2a_bench.harness import llama_wheel
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.models import load_headers, sha256
+from s2a_bench.inference.models import chat_template, load_headers, sha256
 from s2a_bench.machine.tuning import start_child
 from s2a_bench.provenance import NOT_SENT
 from s2a_bench.transport import Program
@@ -241,6 +241,7 @@ class LlamaServerProcess(ServerProcess):
         port = _free_port(program.port)
         command = [str(program.path.absolute()), *llama_flags(engine)]
         command += ["--mmproj", str(engine.mmproj)] if engine.mmproj else []
+        command += ["--jinja", "--chat-template", template] if (template := chat_template(engine)) else []
         command += ["--host", "127.0.0.1", "--port", str(port), "--ctx-size", str(engine.context), "--parallel", "1"]
         self._on_gpu = engine.gpu_layers != 0
         if engine.mmproj and not self._on_gpu:
