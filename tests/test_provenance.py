@@ -74,6 +74,12 @@ def test_what_a_peer_tells_is_bounded_and_has_the_right_types() -> None:
     assert (found.weights, found.tokens, found.model) == ("unknown", "unknown", "")
 
 
+def test_every_field_but_the_clients_own_travels_over_ros() -> None:
+    wire = pytest.importorskip("s2a_bench.transport.ros.wire")
+    origin = Provenance.of_engine({**LLAMA, "pictures": "not seen", "quantisation": "F16"}, link="real")
+    assert Provenance.from_dict(wire.provenance_of(wire.provenance_message(origin.to_dict()))) == origin
+
+
 def test_a_replay_and_an_echo_say_what_they_are() -> None:
     replay = Provenance.of_engine(open_engine(EngineConfig(name="replay", profile="rtx-4080")).describe(), link="real")
     assert (replay.emulated, replay.profile, replay.labels) == (True, "rtx-4080", ("emulated", "replay engine"))
