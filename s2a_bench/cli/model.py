@@ -56,7 +56,7 @@ def _fetch(config: FetchConfig, *, json_: Json = False) -> None:
 
 
 def _latency_command(fetched: Fetched) -> str | None:
-    """Return the command that measures with these files; None unless they are a language model with its mmproj."""
+    """Return the command that measures with these files; None if they are no model."""
     from s2a_bench.inference.models import load_headers
 
     model, *mmproj = (file.path for file in fetched.files)
@@ -65,7 +65,10 @@ def _latency_command(fetched: Fetched) -> str | None:
     except ModelError as error:
         typer.echo(f"note: {with_flags(str(error))}", err=True)
         return None
-    return shlex.join(["s2a-bench", "latency", "--model", str(files.model.path), "--mmproj", str(files.mmproj.path)])
+    if not files.mmproj:
+        typer.echo("note: without an mmproj a model sees no picture; --mmproj FILE fetches one too", err=True)
+    tower = ["--mmproj", str(files.mmproj.path)] if files.mmproj else []
+    return shlex.join(["s2a-bench", "latency", "--model", str(files.model.path), *tower])
 
 
 def _bytes_bar(*, disable: bool = False) -> Progress:

@@ -10,7 +10,8 @@ import pytest
 from benchmarks.models import PROMPT, TOKENS, Engine, picture, server
 from s2a_bench.errors import BadRequest, ModelError
 from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.dummy import FAMILIES, write_dummy
+from s2a_bench.inference.dummy import write_dummy
+from s2a_bench.inference.dummy.families import FAMILIES
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.testing.engine import ask, rgb_frame
 
