@@ -28,8 +28,7 @@ from s2a_bench.frames.convert import encode_png
 from s2a_bench.harness.processes import start_program
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.dummy import write_dummy
-
-FAMILIES = ["minicpm"]
+from s2a_bench.inference.dummy.families import FAMILIES
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.models import load_headers
 from s2a_bench.testing.transport import wiring_of
@@ -142,7 +141,7 @@ def models(arguments: Sequence[str], folder: Path) -> Iterator[tuple[str, Engine
     if arguments:
         return
     for like in FAMILIES:
-        files = write_dummy(folder / like)
+        files = write_dummy(folder / like, like=like)
         yield f"{like}, tiny dummy", EngineConfig(model=files.model, mmproj=files.mmproj, sampling="greedy")
     if find_spec(GEMMA):
         gemma = import_module(GEMMA).assemble()

@@ -13,11 +13,14 @@ from typing import Any, Final
 
 UNKNOWN: Final = "unknown"
 NONE: Final = "none"
+NOT_SENT: Final = "not seen or sent"
 ORIGIN: Final = "Provenance: "
 """The beginning of a line of provenance."""
 
 LABELS: Final = {
     ("weights", "dummy"): "dummy weights",
+    ("pictures", "not seen"): "picture not seen",
+    ("pictures", NOT_SENT): "picture not seen or sent",
     ("tokens", "emulated"): "emulated",
     ("tokens", "paced"): "paced",
     ("link", "emulated"): "emulated link",
@@ -34,8 +37,9 @@ class Provenance:
     ``weights`` are real, dummy, or none without a model; emulated tokens have none, or the dummy ones of their profile.
     ``tokens`` are measured, emulated (their times come from a profile, a rate or a distribution) or paced (held back);
     ``link`` real (within this machine), emulated after ``link_profile``, or none; ``clock`` monotonic or virtual.
-    ``profile`` names the emulated profile or latencies. A field that nothing reported is "unknown", as the link to
-    another machine is.
+    ``profile`` names the emulated profile or latencies. ``pictures`` are "not seen" by a text model, "not seen or
+    sent" where its server refuses them; else empty. A field that nothing reported is "unknown", as the link to another
+    machine is.
     """
 
     engine: str = UNKNOWN
@@ -47,6 +51,7 @@ class Provenance:
     profile: str = ""
     link: str = UNKNOWN
     clock: str = "monotonic"
+    pictures: str = ""
     link_profile: str = ""
 
     def __post_init__(self) -> None:
@@ -70,12 +75,14 @@ class Provenance:
             tokens="emulated" if emulated else "paced" if paced else "measured",
             profile=_text(facts.get("profile")) or _latencies(_text(facts.get("latency"))),
             link=link,
+            pictures=_text(facts.get("pictures")),
         )
 
     @classmethod
-    def computed(cls, profile: str = "", weights: str = NONE) -> Provenance:
+    def computed(cls, profile: str = "", weights: str = NONE, pictures: str = "") -> Provenance:
         """Describe numbers without a model and a measurement: arrivals of a profile or a rate, in virtual time."""
-        return cls(engine=NONE, weights=weights, tokens="emulated", profile=profile, link=NONE, clock="virtual")
+        fixed = {"tokens": "emulated", "link": NONE, "clock": "virtual"}
+        return cls(NONE, weights=weights, profile=profile, pictures=pictures, **fixed)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Provenance:
@@ -95,16 +102,22 @@ class Provenance:
         return self.tokens == "emulated"
 
     @property
+    def unseen(self) -> str:
+        """Return the label of pictures that the model does not see; else empty."""
+        return LABELS.get(("pictures", self.pictures), "")
+
+    @property
     def labels(self) -> tuple[str, ...]:
-        """Return the labels of everything except a real, measured model."""
+        """Return the labels of everything except a real, measured model that sees its pictures."""
         found = tuple(label for (name, value), label in LABELS.items() if getattr(self, name) == value)
         no_model = self.weights == NONE and self.engine not in {NONE, UNKNOWN}
         return (*found, f"{self.engine} engine") if no_model else found
 
     @property
     def code(self) -> str:
-        """Return the text of a column: engine/weights/tokens, with an emulated or unknown link and a virtual clock."""
+        """Return the text of a column: engine/weights/tokens, then an unreal link, a virtual clock, unseen pictures."""
         more = [f"{name}-{value}" for name, value in (("link", self.link), ("clock", self.clock)) if value in _UNPLAIN]
+        more += [f"pictures-{self.pictures.replace(' ', '-')}"] if self.unseen else []
         return "/".join((self.engine, self.weights, self.tokens, *more))
 
     @property
@@ -119,8 +132,8 @@ class Provenance:
         tokens = f"tokens {self.tokens.upper() if self.tokens in _LOUD else self.tokens}"
         tokens += f" after {self.profile}" if self.profile else ""
         tokens += " with DUMMY WEIGHTS" if self.engine == NONE and self.weights == "dummy" else ""
-        clock = ["virtual time"] if self.clock == "virtual" else []
-        return ", ".join((engine, tokens, *link, *clock))
+        clock = "virtual time" if self.clock == "virtual" else ""
+        return ", ".join(filter(None, (engine, tokens, self.unseen.upper(), *link, clock)))
 
 
 _FIELDS: Final = tuple(item.name for item in fields(Provenance))

@@ -39,6 +39,12 @@ LLAMA = {"engine": "llama", "model": "/m/tiny.gguf", "name": "tiny", "dummy": Tr
         (LLAMA, "llama (tiny, DUMMY WEIGHTS), tokens measured", "llama/dummy/measured", ("dummy weights",)),
         (LLAMA | {"dummy": False}, "llama (tiny), tokens measured", "llama/real/measured", ()),
         (
+            LLAMA | {"dummy": False, "pictures": "not seen"},
+            "llama (tiny), tokens measured, PICTURE NOT SEEN",
+            "llama/real/measured/pictures-not-seen",
+            ("picture not seen",),
+        ),
+        (
             LLAMA | {"dummy": False, "paced_tokens_per_s": 5.0},
             "llama (tiny), tokens PACED",
             "llama/real/paced",
@@ -55,10 +61,23 @@ def test_what_an_engine_tells_is_said_in_words_and_in_one(
     assert Provenance.from_dict(found.to_dict()) == found
 
 
+def test_a_run_of_before_there_were_text_models_saw_its_pictures() -> None:
+    found = Provenance.of_engine(LLAMA, link="real")
+    before = {name: value for name, value in found.to_dict().items() if name != "pictures"}
+    assert Provenance.from_dict(before) == found
+    assert Provenance.from_dict({**before, "pictures": "seen by someone"}).labels == found.labels
+
+
 def test_what_a_peer_tells_is_bounded_and_has_the_right_types() -> None:
     found = Provenance.from_dict({"engine": "x" * 10**6, "weights": 3, "tokens": None, "other": "y", "model": ["z"]})
     assert len(found.engine) == 200
     assert (found.weights, found.tokens, found.model) == ("unknown", "unknown", "")
+
+
+def test_every_field_but_the_clients_own_travels_over_ros() -> None:
+    wire = pytest.importorskip("s2a_bench.transport.ros.wire")
+    origin = Provenance.of_engine({**LLAMA, "pictures": "not seen", "quantisation": "F16"}, link="real")
+    assert Provenance.from_dict(wire.provenance_of(wire.provenance_message(origin.to_dict()))) == origin
 
 
 def test_a_replay_and_an_echo_say_what_they_are() -> None:
@@ -231,3 +250,6 @@ def test_runs_of_unlike_provenance_differ_fatally(tmp_path: Path) -> None:
     assert "provenance tokens: measured against emulated" in found
     assert not any(each.fatal for each in differences(made(measured), made(measured)))
     assert any(each.fatal for each in differences(made(measured), made(Provenance())))
+    unseen = Provenance.of_engine({**LLAMA, "dummy": False, "pictures": "not seen"})
+    (found,) = (str(each) for each in differences(made(measured), made(unseen)) if each.fatal)
+    assert found == "provenance pictures: seen against not seen"

@@ -14,6 +14,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from s2a_bench.boards.gaps import Gaps, from_table
 from s2a_bench.errors import UsageError
+from s2a_bench.provenance import Provenance
 from s2a_bench.text import none_of, read_text
 from s2a_bench.toml_file import Line, TomlTable, parse
 
@@ -61,8 +62,10 @@ class Profile:
         return self.facts.get("model", {}).get("dummy") is True
 
     @property
-    def weights(self) -> str:
-        return "dummy" if self.dummy else "real"
+    def provenance(self) -> Provenance:
+        """Of numbers that are computed from it."""
+        pictures = str(self.facts.get("model", {}).get("pictures", ""))
+        return Provenance.computed(self.name, "dummy" if self.dummy else "real", pictures)
 
 
 class _Trace(TomlTable):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.boards.gaps import Constant, Floats, Gaps, Lognormal, Recorded, from_table, read_family
 from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
 from s2a_bench.options import option
-from s2a_bench.provenance import NONE, Provenance
+from s2a_bench.provenance import Provenance
 
 if TYPE_CHECKING:
     import numpy as np
@@ -41,12 +41,12 @@ class Board:
     gaps: Gaps
     prompt_cv: float = 0.0
     rate_cv: float = 0.0
-    weights: str = NONE
-    """Of the measured model: real, dummy; none for a bare rate."""
+    profile_origin: Provenance = field(default_factory=Provenance.computed)
+    """The profile's, with its model's weights; none for a bare rate."""
 
     @property
     def provenance(self) -> Provenance:
-        return Provenance.computed(self.name or self.title, self.weights)
+        return replace(self.profile_origin, profile=self.name or self.title)
 
     @property
     def even(self) -> bool:
@@ -79,7 +79,7 @@ def board_of_profile(profile: Profile, jitter: str, prompt_s: float | None) -> B
         gaps=gaps,
         prompt_cv=profile.prompt_cv if jitter == AS_PROFILE else 0.0,
         rate_cv=profile.rate_cv if jitter == AS_PROFILE and not recorded else 0.0,
-        weights=profile.weights,
+        profile_origin=profile.provenance,
     )
 
 

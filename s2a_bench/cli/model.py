@@ -56,7 +56,7 @@ def _fetch(config: FetchConfig, *, json_: Json = False) -> None:
 
 
 def _latency_command(fetched: Fetched) -> str | None:
-    """Return the command that measures with these files; None unless they are a language model with its mmproj."""
+    """Return the command that measures with these files; None if they are no model."""
     from s2a_bench.inference.models import load_headers
 
     model, *mmproj = (file.path for file in fetched.files)
@@ -65,7 +65,10 @@ def _latency_command(fetched: Fetched) -> str | None:
     except ModelError as error:
         typer.echo(f"note: {with_flags(str(error))}", err=True)
         return None
-    return shlex.join(["s2a-bench", "latency", "--model", str(files.model.path), "--mmproj", str(files.mmproj.path)])
+    if not files.mmproj:
+        typer.echo("note: without an mmproj a model sees no picture; --mmproj FILE fetches one too", err=True)
+    tower = ["--mmproj", str(files.mmproj.path)] if files.mmproj else []
+    return shlex.join(["s2a-bench", "latency", "--model", str(files.model.path), *tower])
 
 
 def _bytes_bar(*, disable: bool = False) -> Progress:
@@ -80,8 +83,8 @@ def _dummy(config: DummyConfig) -> None:
     from s2a_bench.inference.dummy import dummy_files, write_dummy
     from s2a_bench.inference.models import dummy_folder
 
-    folder = config.output or dummy_folder(config.size)
-    files = dummy_files(folder, config.size, config.kind)
+    folder = config.output or dummy_folder(config.size, config.like)
+    files = dummy_files(folder, config.size, config.kind, like=config.like)
     if config.force or not (files.model.is_file() and files.mmproj.is_file()):
         with _bytes_bar(disable=config.size == "tiny") as bar:
             task = bar.add_task("write", total=None)
@@ -89,13 +92,13 @@ def _dummy(config: DummyConfig) -> None:
             def show(done: int, total: int) -> None:
                 bar.update(task, completed=done, total=total)
 
-            write_dummy(folder, config.size, config.kind, progress=show)
+            write_dummy(folder, config.size, config.kind, progress=show, like=config.like)
     typer.echo(files.model)
     typer.echo(files.mmproj)
 
 
 for _name, _function, _config, _about in (
     ("fetch", _fetch, FetchConfig, "Fetch a model from the hub: resumable, checked against the hub's SHA-256."),
-    ("dummy", _dummy, DummyConfig, "Write random weights in the shapes of MiniCPM-V 2.6, to measure speed."),
+    ("dummy", _dummy, DummyConfig, "Write random weights in the shapes of a model, to measure speed."),
 ):
     app.command(_name)(command(_function, _config, about=_about))

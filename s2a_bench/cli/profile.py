@@ -16,7 +16,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.experiments.profile_capture import CaptureConfig, profile_json, ttft_s
 from s2a_bench.machine.environment import board_facts, matches, state_changes
 from s2a_bench.store.manifest import plain
-from s2a_bench.writers.tables import TextTable
+from s2a_bench.writers.tables import EMULATED, TextTable
 
 app = typer.Typer(cls=Commands, help="Measure this machine as a hardware profile, and show profiles.", **PLAIN)
 SCHEMA = "s2a-bench-profile/1"
@@ -32,7 +32,7 @@ def list_(json_: Json = False) -> None:
     rows: list[tuple[str, ...]] = []
     for profile, _ in found:
         ttft = f"{ttft_s(profile):.3g}" + (" (assumed)" if "prompt_s" in profile.assumed else "")
-        origin = profile.origin + (", dummy" if profile.dummy else "")
+        origin = _origin(profile).replace(" weights", "")
         gaps, rate = _gaps(profile, full=False), f"{profile.tokens_per_s:.3g}"
         rows.append((profile.name, profile.title, origin, gaps, rate, ttft))
     print_table(TextTable("Profiles", ("name", "board", "origin", "gaps", "tokens/s", "TTFT s"), rows, 4))
@@ -101,10 +101,13 @@ def _gaps(profile: Profile, *, full: bool = True) -> str:
     return f"{table['family']}{numbers}{recorded}{assumed}"
 
 
+def _origin(profile: Profile) -> str:
+    return ", ".join((profile.origin, *(label for label in profile.provenance.labels if label != EMULATED)))
+
+
 def line_of(profile: Profile) -> str:
-    origin = profile.origin + (", dummy weights" if profile.dummy else "")
     rate = f"{profile.tokens_per_s:.4g} tokens/s, first token after {ttft_s(profile):.3g} s"
-    return f"{profile.name}: {profile.title}, {rate} ({origin})"
+    return f"{profile.name}: {profile.title}, {rate} ({_origin(profile)})"
 
 
 def _print_profiles(command: str, profiles: list[dict[str, Any]], **more: Any) -> None:

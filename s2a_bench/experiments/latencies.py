@@ -6,7 +6,7 @@ import csv
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from s2a_bench.boards.gaps import Gaps
 from s2a_bench.boards.latency import draw_ns, read_latency, whole_ns
 from s2a_bench.errors import StoreError, UsageError
-from s2a_bench.provenance import NONE, Provenance
+from s2a_bench.provenance import Provenance
 from s2a_bench.store.run import fits, read_run
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ class Source:
     recorded_ns: Ints | None = None
     profile: str = ""
     tokens: int = 0
-    weights: str = NONE
+    origin: Provenance = field(default_factory=Provenance.computed)
     requests: tuple[Mapping[str, object], ...] = ()
     """Measured requests, as the columns of `COLUMNS`."""
     service_ns: Ints | None = None
@@ -45,7 +45,7 @@ class Source:
 
     @property
     def provenance(self) -> Provenance:
-        return Provenance.computed(self.name, self.weights)
+        return replace(self.origin, profile=self.name)
 
     def draw(self, rng: np.random.Generator, count: int) -> Ints:
         """Draw latencies of shape (count,), in ns; raises TypeError for a recording."""
@@ -75,7 +75,7 @@ def sources(written: str, tokens: int) -> Iterator[Source]:
         if written not in profile_files() and not (written.endswith(".toml") and Path(written).is_file()):
             kinds = "a number of ms, a family, a .csv file, a run folder, or a profile of 'profile list'"
             raise UsageError(f"`latency`: '{written}' should be {kinds}")
-        yield Source(written, profile=written, tokens=tokens, weights=load_profile(written).weights)
+        yield Source(written, profile=written, tokens=tokens, origin=load_profile(written).provenance)
 
 
 def split(value: object) -> object:
@@ -109,6 +109,7 @@ def measured(folder: Path, only: str = "") -> Iterator[Source]:
             raise UsageError(f"`latency`: {folder} has no cell '{only}', only {', '.join(cells)}")
         spans = _pieces(run)
         for cell in [only] if only else cells:
+            answered = run.origins.of(cell)
             rows = good[good["cell"] == cell].to_dict("records")
             requests = [_request(row, run, spans) for row in rows]
             services = [
@@ -123,7 +124,7 @@ def measured(folder: Path, only: str = "") -> Iterator[Source]:
             yield Source(
                 f"{folder}#{cell}",
                 recorded_ns=np.array([request["latency_ns"] for request in requests], np.int64),
-                weights=run.origins.of(cell).weights,
+                origin=Provenance.computed("", answered.weights, answered.pictures),
                 requests=tuple({**request, "provenance": run.origins.of_row(cell)} for request in requests),
                 service_ns=np.array(services, np.int64),
             )

@@ -32,7 +32,7 @@ from s2a_bench.facts import (
 )
 from s2a_bench.inference import declared_engine
 from s2a_bench.machine.resources import ENERGY_J
-from s2a_bench.provenance import NONE, UNKNOWN, Provenance
+from s2a_bench.provenance import NONE, NOT_SENT, UNKNOWN, Provenance
 from s2a_bench.stats import Ratio, Summary, SummaryEnds, summary_of
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import ONE_WAY
@@ -117,6 +117,8 @@ class RequestCell:
     """Whether the engine's times come from a profile, or from given latencies."""
     mixed: bool = False
     """Whether a pipeline of the run names its payload: then payloads are compared."""
+    sends: bool = True
+    """Whether its pictures are sent."""
 
     @property
     def n(self) -> int:
@@ -140,9 +142,11 @@ class RequestCell:
         return without(self.name, "payload")
 
     def is_compared_with(self, base: RequestCell) -> bool:
-        """Return True if its transport is compared with that of ``base``, and their payloads match."""
+        """Return True if its transport is compared with that of ``base``, and both send the same."""
         matching = self.mixed or not (self.payload and base.payload) or self.payload == base.payload
-        return matching and base.pipeline in declared_transport(self.pipeline).compared_with
+        return (
+            matching and self.sends == base.sends and base.pipeline in declared_transport(self.pipeline).compared_with
+        )
 
     def values(self, metric: RequestMetric | str) -> Floats:
         """Return a metric's values, times in ms: one a request or token that has it."""
@@ -454,7 +458,7 @@ def action_shape(run: StoredRun) -> str:
 
 
 def engine_note(run: StoredRun, cells: list[RequestCell]) -> Note:
-    """Return what stood in for a model: an echo, a replayed profile, dummy weights; empty for a real model."""
+    """Return what stood in for a model: an echo, a replayed profile, dummy weights, one that sees no pictures."""
     engines = dict.fromkeys(cell.about["engine"] for cell in cells)
     idle = [name for name in engines if not declared_engine(name).computes]
     notes = [Note(f"{name} engine", f"{name} engine") for name in idle]
@@ -467,6 +471,8 @@ def engine_note(run: StoredRun, cells: list[RequestCell]) -> Note:
     answered = [cell.name for cell in cells if not declared_engine(cell.about["engine"]).plays]
     if any(run.origins.of(name).weights == "dummy" for name in answered):
         notes.append(Note("dummy weights", DUMMY))
+    unseen = dict.fromkeys(run.origins.of(cell.name).unseen for cell in cells)
+    notes += [Note(label, label) for label in unseen if label]
     if UNKNOWN in engines:
         notes.append(Note("engine unknown, as the server does not report it", "engine unknown"))
     return Note(", ".join(notes), *(label for note in notes for label in note.labels))
@@ -522,7 +528,8 @@ def _cell(
     failed = samples["error"] != ""
     good = samples[~samples["warmup"] & ~failed]
     errors = int((failed & ~samples["warmup"]).sum())
-    return RequestCell(name, about, good, tokens, int(samples["warmup"].sum()), errors, stages, origin.emulated, mixed)
+    sends, warmups = origin.pictures != NOT_SENT, int(samples["warmup"].sum())
+    return RequestCell(name, about, good, tokens, warmups, errors, stages, origin.emulated, mixed, sends)
 
 
 def _place(cell: RequestCell) -> tuple[int, float, str, int, str]:

@@ -24,8 +24,9 @@ from s2a_bench.errors import COMPILE_AGAIN, SETUP_AGAIN, EngineError, PortInUse,
 from s2a_bench.harness import llama_wheel
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.models import load_headers, sha256
+from s2a_bench.inference.models import chat_template, load_headers, sha256
 from s2a_bench.machine.tuning import start_child
+from s2a_bench.provenance import NOT_SENT
 from s2a_bench.transport import Program
 
 READY_TIMEOUT_S = 600.0
@@ -238,10 +239,12 @@ class LlamaServerProcess(ServerProcess):
     def __init__(self, program: Program, engine: EngineConfig, log: Path, *, ignore_end: bool) -> None:
         """Start the program on its port, or any free one for 0."""
         port = _free_port(program.port)
-        command = [str(program.path.absolute()), *llama_flags(engine), "--mmproj", str(engine.mmproj)]
+        command = [str(program.path.absolute()), *llama_flags(engine)]
+        command += ["--mmproj", str(engine.mmproj)] if engine.mmproj else []
+        command += ["--jinja", "--chat-template", template] if (template := chat_template(engine)) else []
         command += ["--host", "127.0.0.1", "--port", str(port), "--ctx-size", str(engine.context), "--parallel", "1"]
         self._on_gpu = engine.gpu_layers != 0
-        if not self._on_gpu:
+        if engine.mmproj and not self._on_gpu:
             command.append("--no-mmproj-offload")
         if ignore_end:
             command.append("--ignore-eos")
@@ -292,14 +295,14 @@ def start_program(program: Program, engine: EngineConfig, log: Path, *, has_gram
     """
     files = load_headers(engine)
     process = PROGRAMS[program.kind](program, engine, log, ignore_end=files.dummy and not has_grammar)
+    tower = {"mmproj": str(files.mmproj.path), "mmproj_sha256": sha256(files.mmproj.path)} if files.mmproj else {}
     process.facts["engine"] = {
         "engine": "llama-server",
         "name": str(files.model.fields.get("general.name", "")),
         "model": str(files.model.path),
-        "mmproj": str(files.mmproj.path),
         "model_sha256": sha256(files.model.path),
-        "mmproj_sha256": sha256(files.mmproj.path),
         "dummy": files.dummy,
+        **(tower or {"pictures": NOT_SENT}),  # it refuses pictures that its model does not see
     }
     return process
 

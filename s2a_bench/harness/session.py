@@ -37,7 +37,7 @@ from s2a_bench.harness.plan import RequestPlan
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.inference import swing
 from s2a_bench.machine.resources.sampler import ResourceSampler
-from s2a_bench.provenance import UNKNOWN, Provenance
+from s2a_bench.provenance import NOT_SENT, UNKNOWN, Provenance
 from s2a_bench.secrets import struck_pieces
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
 from s2a_bench.trace import STAGES, Mark, Trace
@@ -160,7 +160,8 @@ class Session:
         started_ns = now_ns()
         self._sampler.edge()
         frames = self.feed.capture(trace)
-        request = Request(request_id, plan.prompt, frames, plan.max_pieces, plan.grammar, plan.seed, state=state)
+        sent = frames if self.origin.pictures != NOT_SENT else ()
+        request = Request(request_id, plan.prompt, sent, plan.max_pieces, plan.grammar, plan.seed, state=state)
         try:
             for piece_at in self._pieces(request, trace, context):
                 seen.append(piece_at)  # noqa: PERF402 - what came before an error is kept

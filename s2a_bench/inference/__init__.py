@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import cache, lru_cache
 from math import tau
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, Protocol, TypeAlias, get_args
 
 from pydantic import BeforeValidator
 
@@ -324,6 +324,7 @@ def chunk(config: EngineConfig, request: Request) -> Iterator[Action]:
 
 
 Size: TypeAlias = Literal["tiny", "full"]
+Like: TypeAlias = Literal["minicpm-v-2.6", "qwen2.5-vl-3b", "smolvlm2-500m", "gemma3-4b"]
 Quant: TypeAlias = Literal["f16", "q8_0", "q4_0"]
 """Of dummy weights."""
 
@@ -335,7 +336,8 @@ class FetchConfig(Options):
 
 
 class DummyConfig(Options):
-    size: Size = option("tiny", "tiny: 13 MB, for tests; full: the shapes of MiniCPM-V 2.6")
+    like: Like = option("minicpm-v-2.6", f"the model to imitate: {', '.join(get_args(Like))}")
+    size: Size = option("tiny", "tiny: some 10 MB, for tests; full: the model's shapes")
     quant: Quant | None = option(
         None, "type of the language model's weights: f16, q8_0, q4_0 [default: f16 (tiny), q4_0 (full)]"
     )

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from s2a_bench import extras
 from s2a_bench.errors import ModelError
-from s2a_bench.inference import EngineConfig, Size
+from s2a_bench.inference import EngineConfig, Like, Size
 from s2a_bench.inference.dummy import dummy_files, write_dummy
 from s2a_bench.inference.gguf_file import GgufHeader, read_header
 from s2a_bench.text import read_text
@@ -83,8 +83,9 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "s2a-bench"
 
 
-def dummy_folder(size: Size) -> Path:
-    return cache_folder() / "models" / f"dummy-{size}"
+def dummy_folder(size: Size, like: Like = "minicpm-v-2.6") -> Path:
+    """Return the folder of one dummy in the cache: a folder has one mmproj, so that it is found."""
+    return cache_folder() / "models" / (f"dummy-{size}" if like == "minicpm-v-2.6" else f"dummy-{like}-{size}")
 
 
 def tiny_dummy() -> tuple[Path, Path]:

@@ -137,6 +137,7 @@ class ReplayEngine(Engine):
             "engine": "replay",
             "emulated": True,
             "dummy": profile.dummy,  # of the recorded model
+            **({"pictures": unseen} if (unseen := profile.provenance.pictures) else {}),
             "profile": profile.name,
             "title": profile.title,
             "origin": profile.origin,

@@ -18,6 +18,7 @@ from s2a_bench.experiments.ccrb.view.figures import build_scenario
 from s2a_bench.experiments.ccrb.view.outcomes import origin_notes, token_times_s
 from s2a_bench.experiments.ccrb.view.tables import ccrb_json
 from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.models import tiny_dummy
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import StoredRun, read_run
@@ -87,6 +88,19 @@ def test_a_paced_dummy_is_live_and_says_what_is_set_and_what_means_nothing(paced
     assert {cell["rate_tokens_per_s"] for cell in printed["cells"]} == {40.0}
     assert not any("prompt_s" in cell for cell in printed["cells"])
     assert (printed["live"]["dummy"], printed["live"]["robot"]) == (True, "longitudinal simulator")
+
+
+def test_a_text_model_is_live_and_its_tokens_say_that_the_scene_is_not_seen(tmp_path: Path) -> None:
+    model = tmp_path / "texts.gguf"
+    model.symlink_to(tiny_dummy()[0])
+    engine = EngineConfig(model=model, threads=1)
+    run = drive(PlanRequest(live=True, transport="loopback", engine=engine), tmp_path / "runs")
+    first = origin_notes(run)[0]
+    assert first.startswith("LIVE tokens over loopback, picture not seen; car simulated.")
+    assert first.labels == ("picture not seen",)  # type: ignore[attr-defined]
+    printed = ccrb_json(run)
+    jsonschema.validate(printed, SCHEMA)
+    assert printed["provenance"]["run"]["pictures"] == "not seen"
 
 
 def test_the_figure_marks_every_token(paced: StoredRun) -> None:

@@ -118,6 +118,18 @@ def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: Ti
     assert run.manifest["prior"]["mean_s"] == pytest.approx((warm_ns.iloc[-1] - warm_ns.iloc[0]) / 47e9)
 
 
+def test_plans_of_a_profile_whose_model_sees_no_picture_say_so(
+    config: TimelineConfig, fast_board: str, tmp_path: Path
+) -> None:
+    with Path(fast_board).open("a") as profile:
+        profile.write('\n[model]\npictures = "not seen"\n')
+    run, view = live(config, tmp_path)
+    assert view.scenes[0].title.endswith(", picture not seen, emulated, replay engine")
+    (note,) = origin_notes(run, timelines_of(run))
+    assert note.endswith("skills only take their time. Picture not seen: the plan is not about it.")
+    assert note.labels == ("emulated", "picture not seen")  # type: ignore[attr-defined]
+
+
 acted: list[str] = []
 
 

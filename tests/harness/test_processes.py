@@ -19,9 +19,11 @@ from s2a_bench.harness import processes
 from s2a_bench.harness.processes import LlamaServerProcess, OwnProcess, OwnServer, ServerProcess, keep_serving
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.models import RAW_PROMPT
 from s2a_bench.machine.tuning import start_child
 from s2a_bench.sweep.perform import _outside
 from s2a_bench.testing.transport import wiring_of
+from s2a_bench.transport import Program
 
 
 class Dies(ServerProcess):
@@ -113,6 +115,25 @@ def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same() -> None:
 def test_only_our_own_server_is_mended_by_our_set_up() -> None:
     assert "make setup" in OwnServer._cure
     assert "make setup" not in LlamaServerProcess._cure
+
+
+def test_a_named_llama_server_gets_the_vision_tower_and_the_template_that_there_are(tmp_path: Path) -> None:
+    program = tmp_path / "llama-server"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+
+    def command(engine: EngineConfig) -> list[str]:
+        named = Program("llama-server", program, 0)
+        with LlamaServerProcess(named, engine, tmp_path / "log", ignore_end=False) as server:
+            flags: list[str] = server.facts["command"]
+        return flags
+
+    texts = EngineConfig(model=tmp_path / "texts.gguf")
+    assert not {"--mmproj", "--no-mmproj-offload", "--chat-template"} & {*command(texts)}
+    flags = command(texts.but(mmproj=tmp_path / "tower.gguf", chat_template="none"))
+    assert flags[flags.index("--mmproj") + 1] == str(tmp_path / "tower.gguf")
+    assert flags[flags.index("--chat-template") + 1] == RAW_PROMPT
+    assert "--no-mmproj-offload" in flags
 
 
 def test_a_cell_of_a_sweep_that_met_an_illegal_instruction_says_so_too(

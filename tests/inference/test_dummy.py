@@ -6,20 +6,14 @@ import pytest
 
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import dummy
-from s2a_bench.inference.dummy import (
-    FULL_UNKNOWN,
-    KINDS,
-    PART_BYTES,
-    DummyFiles,
-    Kind,
-    Tensor,
-    byte_names,
-    make_vocab,
-    write_dummy,
-)
+from s2a_bench.inference.dummy import DummyFiles, write_dummy
+from s2a_bench.inference.dummy.families import FAMILIES, mmproj_tensors, model_tensors
+from s2a_bench.inference.dummy.tensors import KINDS, PART_BYTES, Kind, Tensor
+from s2a_bench.inference.dummy.vocab import FULL_UNKNOWN, byte_names, make_vocab
 from s2a_bench.inference.gguf_file import read_header
 
 gguf = pytest.importorskip("gguf")
+MINICPM = FAMILIES["minicpm-v-2.6"]
 
 
 def digests(files: DummyFiles) -> list[str]:
@@ -36,8 +30,8 @@ def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(tmp_path: Pa
 def test_the_numbers_are_those_of_this_revision() -> None:
     # the caches of users hold these; raise REVISION whenever this changes
     assert dummy.REVISION == 3
-    shape, digest = dummy.SHAPES["tiny"], hashlib.sha256()
-    for tensor in (*dummy._model_tensors(shape, 281, "f16"), *dummy._mmproj_tensors(shape)):
+    shape, digest = MINICPM.shapes["tiny"], hashlib.sha256()
+    for tensor in (*model_tensors(MINICPM, shape, 281, "f16"), *mmproj_tensors(MINICPM, shape, shape.width)):
         digest.update(tensor.name.encode())
         for chunk in tensor.parts(0):
             digest.update(chunk)
@@ -79,10 +73,10 @@ def test_gguf_py_reads_finite_weights_of_the_right_spread(tmp_path: Path, quant:
 
 
 def test_full_size_has_the_parameters_of_minicpm_v_2_6() -> None:
-    shape = dummy.SHAPES["full"]
+    shape = MINICPM.shapes["full"]
     vocab = make_vocab(full=True)
-    model = list(dummy._model_tensors(shape, len(vocab.tokens), "q4_0"))
-    mmproj = list(dummy._mmproj_tensors(shape))
+    model = list(model_tensors(MINICPM, shape, len(vocab.tokens), "q4_0"))
+    mmproj = list(mmproj_tensors(MINICPM, shape, shape.width))
     # Qwen2-7B pads its vocabulary to 152064, MiniCPM-V 2.6 does not
     assert sum(int(np.prod(tensor.shape)) for tensor in model) == 7_615_616_512 - (152_064 - 151_666) * 3584 * 2
     # llama.cpp counts as many in the real file: "type f32: 141 tensors, type f16: 198 tensors" (ollama issue 9528)
@@ -120,7 +114,7 @@ def test_the_byte_alphabet_is_gpt_2s() -> None:
 
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_a_tensor_has_as_many_bytes_as_it_says_however_it_is_cut(kind: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.inference.dummy.PART_BYTES", 1000)
+    monkeypatch.setattr("s2a_bench.inference.dummy.tensors.PART_BYTES", 1000)
     tensor = Tensor("t", (6, 512), kind)
     assert sum(chunk.nbytes for chunk in tensor.parts(0)) == tensor.nbytes
     assert tensor.nbytes == 6 * 512 // KINDS[kind][0] * KINDS[kind][1]
@@ -128,7 +122,7 @@ def test_a_tensor_has_as_many_bytes_as_it_says_however_it_is_cut(kind: Kind, mon
 
 def test_the_largest_tensors_come_in_small_pieces() -> None:
     # the full model is written with about 0.13 GB of memory because of this
-    for tensor in dummy._model_tensors(dummy.SHAPES["full"], 151_666, "f16"):
+    for tensor in model_tensors(MINICPM, MINICPM.shapes["full"], 151_666, "f16"):
         if tensor.nbytes > 1e9:
             assert next(tensor.parts(0)).nbytes <= PART_BYTES == 1 << 24
             break

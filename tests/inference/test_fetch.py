@@ -416,12 +416,13 @@ def test_json_is_one_object_of_the_schema(hub: Hub) -> None:
     assert found["latency"].startswith("s2a-bench latency --model ")
 
 
-def test_one_file_alone_is_fetched_and_its_partner_is_asked_for(hub: Hub) -> None:
+def test_one_file_alone_is_fetched_as_a_text_model_and_its_partner_is_named(hub: Hub) -> None:
     result = run(f"{REPOSITORY}:{MODEL}")
     assert result.exit_code == 0, result.output
-    (path,) = result.stdout.splitlines()
+    path, command = result.stdout.splitlines()
     assert Path(path).name == MODEL
-    assert "no mmproj*.gguf lies beside it; give --mmproj" in result.stderr
+    assert command == f"s2a-bench latency --model {path}"
+    assert "note: without an mmproj a model sees no picture; --mmproj FILE fetches one too" in result.stderr
     assert hub.gets(MMPROJ) == []
     # the second file of the same commit lies beside the first
     assert run(f"{REPOSITORY}:{MODEL}").stdout == result.stdout

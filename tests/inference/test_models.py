@@ -94,11 +94,12 @@ def test_the_two_files_are_not_exchangeable(tiny: EngineConfig) -> None:
     assert "give it as `model`" in refusal(model, model)
 
 
-def test_a_language_model_alone_is_not_enough(tiny: EngineConfig, tmp_path: Path) -> None:
+def test_a_language_model_alone_is_a_text_model(tiny: EngineConfig, tmp_path: Path) -> None:
     model, mmproj = paths(tiny)
     alone = tmp_path / "model.gguf"
     alone.symlink_to(model)
-    assert "give `mmproj`" in refusal(alone)
+    assert resolve(EngineConfig(model=alone)) == (alone, None)
+    assert load_headers(EngineConfig(model=alone)).dummy
     (tmp_path / "mmproj-a.gguf").symlink_to(mmproj)
     assert resolve(EngineConfig(model=alone)) == (alone, tmp_path / "mmproj-a.gguf")
     (tmp_path / "mmproj-b.gguf").symlink_to(mmproj)

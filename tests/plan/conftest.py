@@ -5,7 +5,7 @@ import pytest
 from gguf import GGUFWriter
 
 from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.dummy import make_vocab
+from s2a_bench.inference.dummy.vocab import make_vocab
 from s2a_bench.inference.tokenizer import Tokenizer
 from s2a_bench.plan import GRANULARITIES, Format, SkillSet, Tokenize, choose_format, load_skills, paper_format
 from tests.inference.conftest import cached, tiny  # noqa: F401 - fixtures

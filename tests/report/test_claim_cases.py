@@ -153,6 +153,11 @@ NO_EVIDENCE: dict[str, tuple[Made, str, str]] = {
         "RTX 4080: 34.2",
         "8 layers on the GPU",
     ),
+    "a text model at the 4080's rate": (
+        lambda kit: kit.rates(34.2, replace(REAL, pictures="not seen"), GPU),
+        "RTX 4080: 34.2",
+        "pictures: not seen",
+    ),
     "dummy weights at the 4080's rate": (lambda kit: kit.rates(34.2, DUMMY, GPU), "RTX 4080: 34.2", "weights: dummy"),
     "a paced server": (
         lambda kit: kit.rates(34.2, replace(REAL, tokens="paced"), GPU),

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 def run_boundary(config: BoundaryConfig, output: Path, progress: Progress) -> Path:
     grid = Provenance.computed()
-    boards = {board.name: Provenance.computed(board.name, board.weights) for board in config.boards}
+    boards = {board.name: board.provenance for board in config.boards}
     manifest = {
         "configuration": config.to_manifest(),
         "environment": environment.collect(),

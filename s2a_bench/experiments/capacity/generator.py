@@ -30,7 +30,7 @@ from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.requester import SEEDS, ChunkRequester, Job, wait_s
 from s2a_bench.harness.servers import ServerSet
-from s2a_bench.harness.session import Measured, Place, RequestContext, Session
+from s2a_bench.harness.session import UNKNOWN_ORIGIN, Measured, Place, RequestContext, Session
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import allowed, end_with_parent, keep_large_blocks, limit_threads
 from s2a_bench.policy.chunks import ControlSetting, mode
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.frames import FrameSource
     from s2a_bench.harness.plan import FeedPlan, RequestPlan, RunPlan
+    from s2a_bench.provenance import Provenance
     from s2a_bench.types import Frame, Piece
 
 STRIDE: Final = 1 << 20
@@ -75,6 +76,7 @@ class FleetPlan:
     """Place in the run before those of its requests."""
     own: RunPlan | None = None
     """Of the server that each process starts for its robots alone; None: `wiring` leads to one that all share."""
+    origin: Provenance = UNKNOWN_ORIGIN
 
 
 class ChunkRobot:
@@ -321,7 +323,7 @@ class Fleet:
         source = _Shared(self._source, f"{plan.feed.nonce}/{cell.name} {plan.mode} {robot}", self._reads)
         preencoded = cell.payload == "jpeg-preencoded"
         feed = RequestFeed(source, preencoded=preencoded, cameras=plan.feed.cameras, size=plan.feed.resize)
-        session = Session(cell, client, feed, plan.request)
+        session = Session(cell, client, feed, plan.request, origin=plan.origin)
         session.answered = True  # its server has answered the warm-up
         self._stack.callback(lambda: None if session.busy else client.close())
         return session

@@ -237,6 +237,7 @@ class _Robots(ExitStack):
             first=STRIDE * STRIDE * [*config.made].index(mode) if mode else 0,
             every_ns=config.plan_ns if config.load == "plans" else 0,
             think_ns=round(config.think_s * 1e9),
+            origin=session.origin,
         )
         self._fleets: list[Any]
         in_process = session.cell.transport.in_process

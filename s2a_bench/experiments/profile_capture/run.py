@@ -38,6 +38,7 @@ _MODEL_FACTS = (
     "quantisation",
     "parameters",
     "dummy",
+    "pictures",
     "model",
     "model_sha256",
     "mmproj",

@@ -101,6 +101,5 @@ def _execute(
 
 
 def _remarks(link: ModelLink) -> str:
-    paced = f", paced to {link.pace:g} tokens/s" if link.pace else ""
-    dummy = ", dummy weights" if link.writer.manifest["model"].get("dummy") else ""
-    return f"{paced}{dummy}{' (EMULATED)' if link.origin.emulated else ''}"
+    paced = [f"paced to {link.pace:g} tokens/s"] if link.pace else []
+    return "".join(f", {each}" for each in (*paced, *(label for label in link.origin.labels if label != "paced")))

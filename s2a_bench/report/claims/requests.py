@@ -54,6 +54,7 @@ def on_board(board: str) -> Need:
 PAPERS_MODEL: Final = (
     one_of("model", _MODEL),
     one_of("weights", "real"),
+    one_of("pictures", "seen"),
     one_of("processor", "all layers on the GPU"),
     one_of("tokens", "measured"),
 )
@@ -70,6 +71,7 @@ def facts_of(run: StoredRun, origins: Sequence[Provenance]) -> dict[str, Any]:
     }
     names = re.sub(r"[^a-z0-9]", "", f"{known['model']} {model.get('model')}".lower())
     return known | {
+        "pictures": next(filter(None, (origin.pictures for origin in origins)), "seen"),
         "board": ", ".join(filter(None, (facts.get("board"), facts.get("cpu"), gpus))) or "a machine that is not known",
         "model": _MODEL if _MODEL_NAMES.search(names) else known["model"],
         "processor": _processor(model, {origin.model_sha256 for origin in origins}),

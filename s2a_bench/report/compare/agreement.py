@@ -19,7 +19,7 @@ _MACHINE: Final = (*_KIND, "affinity", "governor", "power_mode")
 _MODEL: Final = ("engine", "dummy", "model_sha256", "mmproj_sha256", "profile", "gaps", "latency")
 """Facts that identify a model; an emulated one and one of dummy weights are different models."""
 
-_ORIGIN: Final = ("engine", "weights", "tokens", "link", "link_profile", "clock")
+_ORIGIN: Final = ("engine", "weights", "pictures", "tokens", "link", "link_profile", "clock")
 """Fields of the provenance that must be equal; files of models are compared by their hashes."""
 
 _PASSING: Final = ("host", "clock_id", "load", "gpus", "packages", "memory_bytes")
@@ -103,7 +103,8 @@ def _tuning(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 def _origin(manifest: Mapping[str, Any]) -> dict[str, Any]:
     every = Origins.of_manifest(manifest).every
-    return {name: ", ".join(dict.fromkeys(getattr(each, name) for each in every)) for name in _ORIGIN}
+    found = {name: ", ".join(dict.fromkeys(getattr(each, name) for each in every)) for name in _ORIGIN}
+    return found | {"pictures": found["pictures"] or "seen"}
 
 
 def _gpus(facts: Mapping[str, Any], key: str) -> dict[str, Any]:

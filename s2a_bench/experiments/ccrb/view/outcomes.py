@@ -154,8 +154,9 @@ def tokens_line(run: StoredRun) -> Note:
     kind = "EMULATED (replayed)" if live["emulated"] else "LIVE"
     pace = live.get("paced_tokens_per_s")
     paced = f", paced to {pace:g} tokens/s (the rate is set)" if pace else ""
-    line = f"{kind} tokens over {live['transport']}{paced}; car simulated."
-    return Note(line, *([EMULATED] if live["emulated"] else []))
+    unseen = run.origins.run.unseen
+    line = f"{kind} tokens over {live['transport']}{paced}{unseen and f', {unseen}'}; car simulated."
+    return Note(line, *([EMULATED] if live["emulated"] else []), *([unseen] if unseen else []))
 
 
 def _live_notes(run: StoredRun) -> list[str]:

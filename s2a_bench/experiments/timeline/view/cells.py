@@ -129,8 +129,10 @@ def _live_notes(run: StoredRun) -> list[Note]:
     source = "tokens of a running server" if live["engine"] == "unknown" else "real tokens"
     tokens = "EMULATED tokens" if live["emulated"] else f"LIVE: {source}"
     how = f"parsed and executed as they arrive, {grammar}; {robot}"
-    labels = [*([EMULATED] if live["emulated"] else []), *([DUMMY] if dummy else [])]
-    return [Note(f"{tokens} over {live['transport']}{paced}, {how}.{dummy}", *labels)]
+    unseen = run.origins.run.unseen
+    blind = f" {unseen.capitalize()}: the plan is not about it." if unseen else ""
+    labels = [label for label, holds in ((EMULATED, live["emulated"]), (DUMMY, dummy), (unseen, unseen)) if holds]
+    return [Note(f"{tokens} over {live['transport']}{paced}, {how}.{dummy}{blind}", *labels)]
 
 
 def jitter_notes(run: StoredRun) -> tuple[str, ...]:

@@ -1,0 +1,137 @@
+"""A GGUF without an mmproj: its picture travels and is decoded, and every result says that it is not seen."""
+
+from __future__ import annotations
+
+import csv
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+import s2a_bench as s2a
+from s2a_bench.boards.profile import load_profile
+from s2a_bench.inference.models import tiny_dummy
+from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.store.schema import PROVENANCE
+from tests.cli.program import called, program
+
+FEW = ("--size", "64x48", "--payload", "raw", "--max-tokens", "4", "--requests", "2", "--warmup", "1", "--threads", "1")
+UNSEEN, UNSENT = "picture not seen", "picture not seen or sent"
+LLAMA_SERVER = pytest.mark.skipif(find_spec("xllamacpp") is None, reason="the wheel xllamacpp is not installed")
+
+
+@pytest.fixture(scope="module")
+def texts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The tiny dummy's language model alone."""
+    model = tmp_path_factory.mktemp("model") / "texts.gguf"
+    model.symlink_to(tiny_dummy()[0])
+    return model
+
+
+def only(folder: Path) -> StoredRun:
+    (found,) = folder.iterdir()
+    return read_run(found)
+
+
+@pytest.fixture(scope="module")
+def blind(texts: Path, tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
+    folder = tmp_path_factory.mktemp("blind")
+    done = program("latency", "--transport", "http/binary", "--model", texts, *FEW, "--output", folder)
+    assert f"Dummy weights, {UNSEEN}." in " ".join(done.stdout.split())
+    assert UNSEEN.upper() in " ".join(done.stdout.split())
+    return only(folder)
+
+
+def test_the_picture_travels_and_is_decoded_and_the_manifest_says_that_it_is_not_seen(blind: StoredRun) -> None:
+    samples = blind.samples
+    assert (samples["error"] == "").all()
+    assert (samples["payload_bytes"] == 64 * 48 * 3).all()
+    assert (samples["rgb_engine"] == samples["rgb_source"]).all()
+    assert blind.origins.of("http/binary").pictures == "not seen"
+    model = blind.manifest["model"]
+    assert model["pictures"] == "not seen"
+    assert not {"mmproj", "mmproj_sha256", "projector"} & model.keys()
+
+
+def test_every_table_and_figure_and_the_page_say_it(blind: StoredRun, tmp_path: Path) -> None:
+    files = [*(blind.path / "tables").iterdir(), *(blind.path / "figures").glob("*.md")]
+    assert {file.suffix for file in files} == {".csv", ".md", ".tex"}
+    for file in files:
+        if file.suffix == ".csv":
+            codes = {row[PROVENANCE] for row in csv.DictReader(file.read_text().splitlines())}
+            assert codes <= {"llama/dummy/measured/pictures-not-seen"}, file
+        else:
+            assert UNSEEN.upper() in file.read_text(), file
+    page, tex = tmp_path / "page.html", tmp_path / "tex"
+    called("report", blind.path, "--output", page, "--latex", tex)
+    assert f'<span class="label">{UNSEEN}</span></h2>' in page.read_text()
+    assert all(UNSEEN.upper() in file.read_text() for file in tex.glob("*.tex"))
+
+
+def test_it_is_not_compared_with_a_model_that_sees_its_picture(blind: StoredRun, tmp_path: Path) -> None:
+    program("latency", "--transport", "http/binary", *FEW, "--data-only", "--output", tmp_path)
+    done = called("compare", only(tmp_path).path, blind.path, code=1)
+    assert "provenance pictures: seen against not seen" in done.stderr
+    assert f"Dummy weights, {UNSEEN}." in called("compare", only(tmp_path).path, blind.path, "--unlike").stdout
+
+
+@LLAMA_SERVER
+def test_llama_server_refuses_pictures_then_so_it_gets_none_and_is_compared_by_its_tokens(
+    texts: Path, tmp_path: Path
+) -> None:
+    cells = ("--transport", "http/as-deployed,http/llama-server", "--payload", "jpeg")
+    done = program("latency", "--model", texts, *FEW, *cells, "--json", "--output", tmp_path / "latency")
+    run, printed = only(tmp_path / "latency"), json.loads(done.stdout)
+    assert (run.samples["error"] == "").all()
+    assert {cell: each.unseen for cell, each in run.origins.cells.items()} == {
+        "http/as-deployed": UNSEEN,
+        "http/llama-server": UNSENT,
+    }
+    theirs = run.samples[run.samples["cell"] == "http/llama-server"]
+    assert theirs["image_encode_ns"].isna().all()
+    assert run.samples["prompt_n"].nunique() == 1  # both evaluate the same
+    assert not printed["ratios"]
+    server = next(each for each in run.manifest["servers"].values() if "version" in each)
+    assert server["engine"]["pictures"] == printed["provenance"]["cells"]["http/llama-server"]["pictures"]
+    assert not {"mmproj", "mmproj_sha256"} & server["engine"].keys()
+    program(
+        "throughput",
+        "--engine",
+        "llama-server",
+        "--model",
+        texts,
+        *FEW,
+        "--payload",
+        "jpeg",
+        "--output",
+        tmp_path / "throughput",
+    )
+    table = s2a.load(only(tmp_path / "throughput").path).table("ratios")
+    assert {*table["metric"]} >= {"tokens_per_s"}
+
+
+@LLAMA_SERVER
+def test_robots_of_a_fleet_send_no_picture_to_it_either(texts: Path, tmp_path: Path) -> None:
+    fleet = ("--closed-loop", "--robots", "1", "--seconds", "0.5", "--settle", "0", "--size", "64x48", "--threads", "1")
+    program("capacity", "--transport", "http/llama-server", "--model", texts, *fleet, "--output", tmp_path)
+    run = only(tmp_path)
+    assert (run.samples["error"] == "").all()
+    assert run.origins.labels == ("dummy weights", UNSENT)
+
+
+def test_a_profile_of_it_says_so_and_so_do_what_it_computes_and_its_replay(
+    texts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = ("--requests", "14", "--warmup", "1", "--tokens", "4", "--size", "64x48", "--threads", "1")
+    monkeypatch.chdir(tmp_path)
+    done = program("profile", "capture", "blind", "--model", texts, *few, cwd=tmp_path)
+    assert f"(measured, dummy weights, {UNSEEN})" in done.stdout
+    assert load_profile("blind").facts["model"]["pictures"] == "not seen"
+    assert "picture not seen" in " ".join(called("profile", "list").stdout.split())
+    computed = s2a.timeline(profiles=["blind"], tokens_per_skill=[4], output=tmp_path / "runs")
+    drawn = s2a.chunks(latency=["blind"], cycles=100, output=tmp_path / "runs")
+    played = s2a.latency(transports=["loopback"], engine="replay", profile="blind", size="64x48", requests=1, warmup=0)
+    for run in (computed, drawn, played):
+        assert UNSEEN in read_run(run.path).origins.labels, run
+        assert UNSEEN.upper() in run._repr_html_(), run

@@ -1,0 +1,102 @@
+"""Models of several families: the prompt, and the answer's tokens, are those of llama.cpp's own server."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from benchmarks.models import PROMPT, TOKENS, Engine, picture, server
+from s2a_bench.errors import BadRequest, ModelError
+from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.dummy import write_dummy
+from s2a_bench.inference.dummy.families import FAMILIES
+from s2a_bench.inference.llama_cpp import LlamaCppEngine
+from s2a_bench.testing.engine import ask, rgb_frame
+
+ACTIONS = 'root ::= ("stop" | "go") "(" [0-9] ")"'
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def family(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> EngineConfig:
+    model, mmproj = write_dummy(tmp_path_factory.mktemp("dummy"), like=request.param)
+    return EngineConfig(model=model, mmproj=mmproj, sampling="greedy", threads=1)
+
+
+@pytest.fixture(scope="module")
+def engine(family: EngineConfig) -> Iterator[LlamaCppEngine]:
+    with closing(LlamaCppEngine(family)) as engine:
+        yield engine
+
+
+@pytest.mark.skipif(find_spec("xllamacpp") is None, reason="the wheel xllamacpp is not installed")
+def test_llama_server_is_asked_the_same_and_answers_the_same(
+    family: EngineConfig, engine: LlamaCppEngine, tmp_path: Path
+) -> None:
+    ours = Engine(engine)
+    with server(family, tmp_path / "log") as theirs:
+        assert theirs.prompt(PROMPT) == ours.prompt(PROMPT)
+        for frames in ((picture(1),), (picture(2), picture(3)), ()):
+            native, foreign = (side.ask(PROMPT, frames) for side in (ours, theirs))
+            assert foreign.prompt_n == native.prompt_n
+            assert foreign.ids == native.ids
+            assert len(native.ids) == TOKENS
+
+
+@pytest.mark.skipif(find_spec("xllamacpp") is None, reason="the wheel xllamacpp is not installed")
+@pytest.mark.parametrize("template", ["none", "typed"])
+def test_a_real_model_is_asked_the_same_by_llama_server(gemma: Path, tmp_path: Path, template: str) -> None:
+    (tmp_path / "typed").write_text(
+        "{{ bos_token }}{% for message in messages %}Q: {% for part in message.content %}"
+        "{{ part.text }}{% endfor %}{% endfor %}{% if add_generation_prompt %}\nA:{% endif %}"
+    )
+    chosen = template if template == "none" else str(tmp_path / "typed")
+    config = EngineConfig(model=gemma, chat_template=chosen, sampling="greedy", threads=2)
+    with closing(LlamaCppEngine(config)) as engine, server(config, tmp_path / "log") as theirs:
+        ours = Engine(engine)
+        prompt, tokens = ours.prompt(PROMPT)
+        assert theirs.prompt(PROMPT) == (prompt, tokens)
+        assert prompt == (PROMPT if template == "none" else f"Q: {PROMPT}\nA:")
+        assert tokens.count(2) == 1  # one beginning
+        native, foreign = ours.ask(PROMPT, ()), theirs.ask(PROMPT, ())
+    assert (foreign.prompt_n, foreign.ids) == (native.prompt_n, native.ids)
+
+
+def test_the_picture_is_seen_and_every_part_of_the_prompt_is_timed(engine: LlamaCppEngine) -> None:
+    answers = [[token.id for token in ask(engine, images=(rgb_frame(seed, 640, 480),))] for seed in (1, 2)]
+    facts = engine.facts
+    parts = [facts[name] for name in ("preprocess_ms", "vision_encode_ms", "prompt_eval_ms")]
+    assert min(parts) > 0
+    assert sum(parts) <= facts["prompt_ms"] * 1.001 + 1
+    assert answers[0] != answers[1]
+
+
+def test_a_grammar_is_obeyed_after_a_picture(engine: LlamaCppEngine) -> None:
+    tokens = ask(engine, images=(rgb_frame(1, 64, 48),), grammar=ACTIONS, max_tokens=40)
+    assert "".join(token.text for token in tokens)[-3:].strip("(0123456789") == ")"
+
+
+def test_a_picture_that_does_not_fit_is_refused_before_it_is_evaluated(family: EngineConfig) -> None:
+    with closing(LlamaCppEngine(family.but(context=512))) as engine:
+        with pytest.raises(BadRequest, match=r"does not fit the context of 512 tokens \(prompt of \d+ tokens"):
+            ask(engine, images=(rgb_frame(1, 640, 480),) * 4)
+        assert ask(engine)
+
+
+@pytest.mark.parametrize("batch", [32, 100])
+def test_the_batch_changes_no_token(family: EngineConfig, engine: LlamaCppEngine, batch: int) -> None:
+    pictures = (rgb_frame(1, 640, 480),)
+    with closing(LlamaCppEngine(family.but(batch=batch))) as small:
+        assert ask(small, images=pictures) == ask(engine, images=pictures)
+
+
+def test_the_vision_tower_of_another_family_is_a_line(tmp_path: Path) -> None:
+    files = {like: write_dummy(tmp_path, like=like) for like in FAMILIES}
+    for model in FAMILIES:
+        for mmproj in FAMILIES:
+            if model == mmproj:
+                continue
+            config = EngineConfig(model=files[model].model, mmproj=files[mmproj].mmproj)
+            with pytest.raises(ModelError, match=rf"^`mmproj` {files[mmproj].mmproj}: llama\.cpp: ."):
+                LlamaCppEngine(config)
