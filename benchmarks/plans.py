@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
-from itertools import chain, pairwise
+from itertools import chain, pairwise, product
 from pathlib import Path
 from typing import Final
 
@@ -240,12 +240,11 @@ def lines(arguments: Sequence[str], answers: int) -> Iterator[str]:
     yield table("model", "prompt", "grammar", *FAMILIES)
     for cell, fits in compared.items():
         yield f"| {named[cell]} | {' | '.join(f'{one.start:.2f}, {one.late:.0%}' for one in fits.values())} |"
-    first = next(iter(found))
-    yield ""
-    for cell in planned:
-        ours, theirs = (flat(rows[one]) / mean(rows[one]) for one in (cell, (first, *cell[1:])))
+    first, *others = found
+    for model, ruled in product(others, (True, False)):
+        ours, theirs = (flat(rows[each, PLANNER, ruled]) / mean(rows[each, PLANNER, ruled]) for each in (model, first))
         apart = f"{ks_2samp(ours, theirs).statistic:.2f} / {wasserstein_distance(ours, theirs):.2f}"
-        yield f"{cell[0]} against {first}, {'with' if cell[2] else 'without'} the grammar, in mean gaps: {apart}"
+        yield f"\n{model} against {first}, {'with' if ruled else 'without'} the grammar, in mean gaps: {apart}"
 
 
 def main() -> None:

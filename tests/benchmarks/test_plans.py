@@ -24,18 +24,18 @@ def test_every_prompt_is_printed_with_its_plans_and_gaps(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path))
-    monkeypatch.setattr("sys.argv", ["plans", "--answers", "2"])
-    monkeypatch.setattr(plans, "find_spec", lambda _name: None)
+    model, _ = resolve(EngineConfig())
+    monkeypatch.setattr("sys.argv", ["plans", f"one={model}", f"other={model}", "--answers", "2"])
     plans.main()
     tables = [block.splitlines() for block in capsys.readouterr().out.split("\n\n")]
-    _, valid, gaps, families, starts, apart = tables
-    assert len(valid) == len(gaps) == 2 + 3 * 2
-    assert len(families) == len(starts) == 2 + 2
+    _, valid, gaps, families, starts, *apart = tables
+    assert len(valid) == len(gaps) == 2 + 2 * 3 * 2
+    assert len(families) == len(starts) == 2 + 2 * 2
     for row in valid[2:]:
         assert shares(row) == ([100.0] * 3 if "| with |" in row else [0.0] * 3)
     assert all(len(table[2].split("|")) == len(table[0].split("|")) for table in (valid, gaps, families, starts))
     assert "nan" not in "\n".join(families + starts)
-    assert all(line.endswith("0.00 / 0.00") for line in apart), "the dummy against itself"
+    assert [line.partition(",")[0] for (line,) in apart] == ["other against one"] * 2
 
 
 def test_a_real_model_plans_with_the_grammar_and_its_tokens_are_counted(gemma: Path) -> None:
