@@ -71,9 +71,7 @@ class Engine:
         self.engine = engine
 
     def prompt(self, text: str) -> tuple[str, list[int]]:
-        list(self.engine.generate(Request("prompt", text, max_tokens=1)))
-        assert self.engine._llama is not None
-        return self.engine._template.prompt(text, 0), list(self.engine._llama.prompt)
+        return self.engine.prompt(text)
 
     def ask(self, text: str, frames: tuple[Frame, ...]) -> Asked:
         started_ns = now_ns()
