@@ -57,7 +57,7 @@ class Wanted:
             names = ", ".join(path.as_posix() for path in sorted(ggufs)) or "no GGUF file"
             quants = self.quant or " or ".join(QUANTS)
             raise ModelError(
-                f"{self.repository}: no model is {quants}, or several; it has {names}; name one as REPO:FILE"
+                f"{self.repository}: no model is {quants}, or several; it has {names}; name one as OWNER/REPO:FILE"
             )
         tower = self.mmproj or (mmproj.as_posix() if mmproj else "")
         return (models[0].as_posix(), tower) if tower else (models[0].as_posix(),)

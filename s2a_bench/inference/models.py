@@ -19,8 +19,6 @@ from s2a_bench.inference.dummy import dummy_files, write_dummy
 from s2a_bench.inference.gguf_file import GgufHeader, read_header
 
 CACHE_VARIABLE = "S2A_BENCH_CACHE"
-
-
 HUB = "hub:"
 HUB_MODELS = {
     "minicpm-v-2.6": "openbmb/MiniCPM-V-2_6-gguf",

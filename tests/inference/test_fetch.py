@@ -267,7 +267,7 @@ def test_a_file_that_the_library_fetched_is_used_as_it_is(hub: Hub) -> None:
 
 def test_an_unknown_quantisation_names_those_there_are(hub: Hub) -> None:
     assert refusal(wanted(NAME, "Q9", None)) == (
-        f"{REPOSITORY}: no model is Q9, or several; it has {MODEL}, {MMPROJ}; name one as REPO:FILE"
+        f"{REPOSITORY}: no model is Q9, or several; it has {MODEL}, {MMPROJ}; name one as OWNER/REPO:FILE"
     )
     assert hub.gets(MODEL) == hub.gets(MMPROJ) == []
 
