@@ -98,6 +98,7 @@ class _Boundary(_Run, total=False):
 class _Capacity(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
     action_dim: int
     batch: str | Path | None
+    chat_template: str
     closed_loop: bool
     context: int
     control_hz: float
@@ -135,6 +136,7 @@ class _Capacity(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyTh
     threads: int
 
 class _Ccrb(_Run, total=False):
+    chat_template: str
     engine: str
     follower: str
     front_gap: float
@@ -209,6 +211,7 @@ class _Latency(
 ):
     action_dim: int
     answer: Literal["auto", "tokens", "actions"]
+    chat_template: str
     context: int
     engine: str
     flash_attention: str
@@ -229,6 +232,7 @@ class _Throughput(
     _Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, _LatencyThroughput, total=False
 ):
     batch: int
+    chat_template: str
     context: int
     engine: str
     flash_attention: str
@@ -247,6 +251,7 @@ class _Throughput(
 class _Timeline(_Run, _CapacityChunksLatencyThroughputTimeline, total=False):
     calibrate: str | Path | None
     calibration_plans: int
+    chat_template: str
     engine: str
     epsilon: float
     gpu_layers: int

@@ -61,6 +61,7 @@ LEROBOT = ("--transport", "grpc", "--policy-type", "act", "--pretrained", "x")
         ("gguf", "llama", ("latency", "--engine", "llama")),
         ("gguf", "model", ("model", "dummy")),
         ("huggingface_hub", "model", ("model", "fetch", "minicpm-v-2.6")),
+        ("huggingface_hub", "model", ("model", "list")),
         ("highway_env", "ccrb", ("ccrb", "--simulator", "embedded")),
         ("json_numpy", "act", (*BLACK_BOX, "--dialect", "openvla", "--payload", "raw")),
         ("ray", "ray", ("sweep", "paper", "--ray", "local")),

@@ -21,6 +21,7 @@ from s2a_bench.experiments.ccrb.view.tables import CcrbStudy
 from s2a_bench.experiments.profile_capture import BoardFacts, ProfileJson
 from s2a_bench.experiments.throughput.metrics import Reference
 from s2a_bench.inference.fetch import FetchedFile
+from s2a_bench.inference.model_list import ListedModel
 from s2a_bench.provenance import Origins
 from s2a_bench.report.compare.shown import CompareJson
 from s2a_bench.store.manifest import RunWarning
@@ -117,8 +118,8 @@ def profile_schema() -> dict[str, Any]:
 
 
 def model_schema() -> dict[str, Any]:
-    """Return the schema of `model fetch --json`."""
-    return _redefined("s2a-bench-model-1", {"fetched": FetchedFile})
+    """Return the schema of `model fetch|list --json`."""
+    return _redefined("s2a-bench-model-1", {"fetched": FetchedFile, "listed": ListedModel})
 
 
 def _redefined(name: str, named: dict[str, Any], kept: Sequence[str] = ()) -> dict[str, Any]:

@@ -1,8 +1,9 @@
-"""`model`: fetch model files, and write dummy ones."""
+"""`model`: list models, fetch their files, and write dummy ones."""
 
 from __future__ import annotations
 
 import shlex
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -10,11 +11,12 @@ import typer
 from s2a_bench import extras
 from s2a_bench.cli.adapter import command, with_flags
 from s2a_bench.cli.experiment import PLAIN, Commands
-from s2a_bench.cli.output import Json, print_json
+from s2a_bench.cli.output import Json, print_json, print_line, print_table
 from s2a_bench.errors import ModelError
 from s2a_bench.inference import DummyConfig, EngineConfig, FetchConfig
 from s2a_bench.inference.gguf_file import read_header
 from s2a_bench.store.manifest import present
+from s2a_bench.writers.tables import TextTable
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -23,7 +25,29 @@ if TYPE_CHECKING:
 
 SCHEMA = "s2a-bench-model/1"
 
-app = typer.Typer(cls=Commands, help="Fetch model files, and write dummy ones.", **PLAIN)
+app = typer.Typer(cls=Commands, help="List models, fetch their files, and write dummy ones.", **PLAIN)
+
+
+@app.command("list")
+def list_(json_: Json = False) -> None:
+    """List the known models and those on this machine, with the tokens that a picture costs."""
+    from s2a_bench.inference.model_list import listed
+
+    extras.need("model", "huggingface_hub", "gguf")
+    models = [*listed()]
+    if json_:
+        print_json({"schema": SCHEMA, "command": "model list", "models": [*map(present, models)]})
+        return
+    rows: list[tuple[str, ...]] = []
+    for model in models:
+        parameters = f"{model.parameters / 1e6:,.0f}" if model.parameters else ""
+        sizes = " + ".join(f"{size / 1e6:,.1f}" for size in model.bytes.values())
+        rows.append((Path(model.name).name, model.state, parameters, sizes, str(model.picture_tokens or "")))
+    header = "name", "state", "parameters (M)", "files (MB)", "tokens of a 640x480 picture"
+    print_table(TextTable("Models", header, rows, 2))
+    for model in models:
+        if model.error:
+            print_line(f"{Path(model.name).name}: {model.error}")
 
 
 def _fetch(config: FetchConfig, *, json_: Json = False) -> None:

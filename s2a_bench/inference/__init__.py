@@ -155,7 +155,7 @@ class EngineConfig(Options):
         "",
         "echo: time to the whole answer: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: at once]",
     )
-    model: Path | None = option(None, "GGUF model [default: the tiny dummy]", first=True)
+    model: Path | None = option(None, "GGUF, name, or hub:OWNER/REPO[:FILE] [default: the tiny dummy]", first=True)
     mmproj: Path | None = option(None, "GGUF vision tower that goes with --model")
     chat_template: str = option("", "file of a Jinja template, or none: the raw prompt [default: the model's own]")
     threads: int = option(0, "CPU threads of the model; 0: all", ge=0, le=LARGEST)
@@ -330,9 +330,9 @@ Quant: TypeAlias = Literal["f16", "q8_0", "q4_0"]
 
 
 class FetchConfig(Options):
-    what: str = option(..., "minicpm-v-2.6, or ORG/REPO:FILE", flag="name", argument=True)
-    quant: str | None = option(None, "quantisation of the language model, as Q8_0 [default: Q4_K_M]")
-    mmproj: str | None = option(None, "the repository's vision tower to fetch too [default: the known one, or none]")
+    what: str = option(..., "a name of 'model list', or OWNER/REPO[:FILE]", flag="name", argument=True)
+    quant: str | None = option(None, "quantisation of the language model, as F16 [default: Q4_K_M, else Q8_0]")
+    mmproj: str | None = option(None, "the repository's vision tower [default: F16, else Q8_0; with FILE none]")
 
 
 class DummyConfig(Options):

@@ -12,7 +12,7 @@ import fcntl
 import io
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from logging import ERROR, getLogger
@@ -21,11 +21,14 @@ from typing import Annotated, Any, TypeAlias
 
 from s2a_bench import extras
 from s2a_bench.errors import ModelError, UsageError
-from s2a_bench.inference.models import HUB_MODELS, digest, remember_sha256, sha256
+from s2a_bench.inference.models import digest, hub_address, pair, remember_sha256, sha256
 from s2a_bench.store.schema import Count, Facts, about
 
 Progress: TypeAlias = Callable[[str, int, int], None]
 """(file, bytes present, total bytes) -> None."""
+
+QUANTS = "Q4_K_M", "Q8_0"
+"""The default quantisations of a language model, in this order."""
 
 _SHA256 = re.compile(r"[0-9a-f]{64}")
 Sha256 = Annotated[str, Facts(pattern="^[0-9a-f]{64}$")]
@@ -37,10 +40,27 @@ _REFUSED = (401, 403, 404)
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """The files to fetch: a repository of the hub and the names of its files, the language model's first."""
+    """What to fetch of a repository: a file, or else the language model of a quantisation and its mmproj."""
 
     repository: str
-    files: tuple[str, ...]
+    file: str = ""
+    quant: str | None = None
+    mmproj: str | None = None
+
+    def files(self, listed: Iterable[str]) -> tuple[str, ...]:
+        """Choose from the repository's file names, the language model's first; raises ModelError if none fits."""
+        if self.file:
+            return (self.file, self.mmproj) if self.mmproj else (self.file,)
+        ggufs = [Path(name) for name in listed if name.endswith(".gguf")]
+        models, mmproj = pair(ggufs, *((self.quant,) if self.quant else QUANTS))
+        if len(models) != 1 or (self.quant and self.quant.lower() not in models[0].name.lower()):
+            names = ", ".join(path.as_posix() for path in sorted(ggufs)) or "no GGUF file"
+            quants = self.quant or " or ".join(QUANTS)
+            raise ModelError(
+                f"{self.repository}: no model is {quants}, or several; it has {names}; name one as OWNER/REPO:FILE"
+            )
+        tower = self.mmproj or (mmproj.as_posix() if mmproj else "")
+        return (models[0].as_posix(), tower) if tower else (models[0].as_posix(),)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,21 +96,11 @@ class Fetched:
 
 
 def wanted(what: str, quant: str | None, mmproj: str | None) -> Wanted:
-    """Read ``NAME`` or ``ORG/REPO:FILE`` and its flags; raises UsageError if they make no sense."""
-    if what in HUB_MODELS:
-        known = HUB_MODELS[what]
-        return Wanted(known.repository, (known.model_file(quant or known.quant), mmproj or known.mmproj))
-    utils = extras.require("huggingface_hub.utils", "model")
-    repository, _, file = what.partition(":")
-    try:
-        utils.validate_repo_id(repository)
-    except utils.HFValidationError:
-        file = ""
-    if not file or "/" not in repository:
-        raise UsageError(f"model fetch: '{what}' is neither {', '.join(HUB_MODELS)} nor ORG/REPO:FILE")
-    if quant:
-        raise UsageError(f"`quant` {quant}: goes with {', '.join(HUB_MODELS)}; with ORG/REPO:FILE, name the file")
-    return Wanted(repository, (file, mmproj) if mmproj else (file,))
+    """Read ``NAME`` or ``OWNER/REPO[:FILE]`` and its flags; raises UsageError if they make no sense."""
+    repository, file = hub_address(what, "model fetch:")
+    if file and quant:
+        raise UsageError(f"`quant` {quant}: goes with a name or OWNER/REPO; with OWNER/REPO:FILE, name the file")
+    return Wanted(repository, file, quant, mmproj)
 
 
 def fetch(want: Wanted, progress: Progress | None = None) -> Fetched:
@@ -103,8 +113,9 @@ def fetch(want: Wanted, progress: Progress | None = None) -> Fetched:
     with _one_line(want):
         commit, files = _listing(want)
         _check_space(want.repository, files)
-        done = tuple(_fetch_file(want.repository, commit, file, progress) for file in files)
-    return Fetched(_endpoint(), want.repository, commit, done)
+        # the language model last: what is interrupted before is not taken for a text model
+        done = [_fetch_file(want.repository, commit, file, progress) for file in reversed(files)]
+    return Fetched(_endpoint(), want.repository, commit, tuple(reversed(done)))
 
 
 def _endpoint() -> str:
@@ -121,7 +132,7 @@ def _listing(want: Wanted) -> tuple[str, tuple[HubFile, ...]]:
     except (ValueError, LookupError, TypeError, AttributeError) as error:  # no JSON, or not a hub's
         raise ModelError(f"{want.repository}: {_no_hub(want)}") from error
     by_case = {name.lower(): name for name in siblings} | {name: name for name in siblings}
-    names = (by_case.get(file) or by_case.get(file.lower(), file) for file in want.files)
+    names = (by_case.get(file) or by_case.get(file.lower(), file) for file in want.files(siblings))
     return str(info.sha), tuple(_hub_file(want.repository, name, siblings) for name in names)
 
 
@@ -209,7 +220,8 @@ def _download(repository: str, commit: str, file: HubFile, progress: Progress | 
 
 
 def _by_hand(want: Wanted) -> str:
-    return f"download {' and '.join(want.files)} of {want.repository} by hand and give --model PATH --mmproj PATH"
+    files = " and ".join(filter(None, (want.file or "the language model", want.mmproj or "its mmproj")))
+    return f"download {files} of {want.repository} by hand and give --model PATH --mmproj PATH"
 
 
 def _no_hub(want: Wanted) -> str:

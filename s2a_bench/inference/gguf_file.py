@@ -31,6 +31,8 @@ Value: TypeAlias = str | int | float | bool
 class GgufHeader:
     path: Path
     fields: dict[str, Value]
+    parameters: int
+    """Numbers in all tensors."""
 
     @property
     def architecture(self) -> str:
@@ -117,26 +119,28 @@ def _parse(path: Path, data: mmap.mmap, flag: str) -> GgufHeader:
             cursor.skip_array()
         else:
             fields[key] = cursor.string() if kind == _STRING else cursor.scalar(_SCALARS[kind])
-    last = _end_of_tensors(cursor, n_tensors)
+    last, parameters = _tensors(cursor, n_tensors)
     alignment = int(fields.get("general.alignment", 32))
     end = -(-cursor.at // alignment) * alignment + last
     if end > len(data):
         raise ModelError(f"{flag} {path}: cut short, {len(data)} of {end} bytes are there; fetch the file again")
-    return GgufHeader(path, fields)
+    return GgufHeader(path, fields, parameters)
 
 
-def _end_of_tensors(cursor: _Cursor, count: int) -> int:
-    """Return the offset within the data of the last tensor's end."""
+def _tensors(cursor: _Cursor, count: int) -> tuple[int, int]:
+    """Return the offset within the data of the last tensor's end, and the numbers in all tensors."""
     sizes = extras.require("gguf.constants", "model").GGML_QUANT_SIZES
-    last = 0
+    last = numbers = 0
     for _ in range(count):
         _name, n_dims = cursor.string(), cursor.integer("<I")
         if n_dims > _MAX_DIMS:
             raise ValueError(n_dims)
         shape = [cursor.integer("<Q") for _ in range(n_dims)]
         block, block_bytes = sizes[cursor.integer("<I")]
-        last = max(last, cursor.integer("<Q") + math.prod(shape) // block * block_bytes)
-    return last
+        size = math.prod(shape)
+        numbers += size
+        last = max(last, cursor.integer("<Q") + size // block * block_bytes)
+    return last, numbers
 
 
 def _at_most(count: int, most: int) -> int:

@@ -1,17 +1,19 @@
-"""Find and check the two files of a model: the user's, a known name's, or the tiny dummy, made on first use."""
+"""Find and check a model's files: the user's, a known name's, the hub's, or the tiny dummy's, made on first use."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
+import re
 import tempfile
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from s2a_bench import extras
-from s2a_bench.errors import ModelError
+from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import EngineConfig, Like, Size
 from s2a_bench.inference.dummy import dummy_files, write_dummy
 from s2a_bench.inference.gguf_file import GgufHeader, read_header
@@ -21,46 +23,79 @@ CACHE_VARIABLE = "S2A_BENCH_CACHE"
 NO_TEMPLATE, RAW_PROMPT = "none", "{% for message in messages %}{{ message['content'] }}{% endfor %}"
 """The value of `EngineConfig.chat_template` for a raw prompt, and the template that makes one."""
 TEMPLATE_BYTES = 1 << 20
-
-
-@dataclass(frozen=True, slots=True)
-class HubModel:
-    repository: str
-    model: str
-    """File name of the language model with ``{quant}`` in it."""
-    mmproj: str
-    quant: str
-    """The default quantisation."""
-
-    def model_file(self, quant: str) -> str:
-        return self.model.format(quant=quant)
-
-
-HUB_MODELS: dict[str, HubModel] = {
-    "minicpm-v-2.6": HubModel(
-        "openbmb/MiniCPM-V-2_6-gguf", "ggml-model-{quant}.gguf", "mmproj-model-f16.gguf", "Q4_K_M"
-    ),
+HUB = "hub:"
+HUB_MODELS = {
+    "minicpm-v-2.6": "openbmb/MiniCPM-V-2_6-gguf",
+    "qwen2.5-vl-3b": "ggml-org/Qwen2.5-VL-3B-Instruct-GGUF",
+    "qwen2.5-vl-7b": "ggml-org/Qwen2.5-VL-7B-Instruct-GGUF",
+    "qwen3-vl-2b": "Qwen/Qwen3-VL-2B-Instruct-GGUF",
+    "qwen3-vl-4b": "Qwen/Qwen3-VL-4B-Instruct-GGUF",
+    "smolvlm2-256m": "ggml-org/SmolVLM2-256M-Video-Instruct-GGUF",
+    "smolvlm2-500m": "ggml-org/SmolVLM2-500M-Video-Instruct-GGUF",
+    "smolvlm2-2.2b": "ggml-org/SmolVLM2-2.2B-Instruct-GGUF",
+    "gemma3-4b": "ggml-org/gemma-3-4b-it-GGUF",
+    "gemma3-270m": "ggml-org/gemma-3-270m-it-GGUF",
+    "internvl3-2b": "ggml-org/InternVL3-2B-Instruct-GGUF",
 }
-"""Name for `model fetch` and ``--model`` -> its files."""
+"""Name for `model fetch` and ``--model`` -> its repository on the hub."""
 
 
-def fetched(name: str) -> tuple[Path, Path]:
-    """Return the paths of a known model's fetched language model and mmproj, in the hub's cache.
+def hub_address(name: str, flag: str) -> tuple[str, str]:
+    """Return the repository and the file, "" for the default one, of a known name or ``[hub:]OWNER/REPO[:FILE]``.
 
-    Raises ModelError if it is not fetched yet, or if several quantisations are.
+    Raises UsageError, which names ``flag``.
     """
+    utils = extras.require("huggingface_hub.utils", "model")
+    repository, colon, file = HUB_MODELS.get(name, name.removeprefix(HUB)).partition(":")
+    try:
+        utils.validate_repo_id(repository)
+    except utils.HFValidationError:
+        repository = ""
+    if "/" not in repository or (colon and not file):
+        raise UsageError(f"{flag} '{name}' is neither {', '.join(HUB_MODELS)} nor OWNER/REPO[:FILE]")
+    return repository, file
+
+
+def pair(files: Iterable[Path], *quants: str) -> tuple[list[Path], Path | None]:
+    """Return the language models of the first of ``quants`` that there is, else all of them; and the mmproj."""
+    paths = sorted(files)
+    mmprojs = [path for path in paths if "mmproj" in path.name.lower()]
+    models = _of_quant([path for path in paths if path not in mmprojs], quants)
+    return models, next(iter(_of_quant(mmprojs, ("F16", "Q8_0"))), None)
+
+
+def _of_quant(paths: list[Path], quants: Iterable[str]) -> list[Path]:
+    endings = (re.compile(rf"(.*[-._])?{re.escape(quant)}\.gguf", re.IGNORECASE) for quant in quants)
+    return next((found for ending in endings if (found := [p for p in paths if ending.fullmatch(p.name)])), paths)
+
+
+def cached() -> dict[str, list[Path]]:
+    """Return the GGUF files in the hub's cache, by repository."""
     hub = extras.require("huggingface_hub", "model")
-    known = HUB_MODELS[name]
-    mmproj = hub.try_to_load_from_cache(known.repository, known.mmproj)
-    folder = Path(mmproj).parent if isinstance(mmproj, str) else None
-    models = [path for path in sorted(folder.glob(known.model_file("*"))) if path.is_file()] if folder else []
-    if not models or not isinstance(mmproj, str):
-        raise ModelError(f"`model` {name}: not fetched yet; run: s2a-bench model fetch {name}")
-    if len(models) > 1:
-        before, after = known.model_file("*").split("*")
-        quants = ", ".join(path.name.removeprefix(before).removesuffix(after) for path in models)
-        raise ModelError(f"`model` {name}: several were fetched ({quants}); give a path, as {models[0]}")
-    return models[0], Path(mmproj)
+    try:
+        repos = hub.scan_cache_dir(extras.require("huggingface_hub.constants", "model").HF_HUB_CACHE).repos
+    except (hub.CacheNotFound, ValueError):  # no such folder, or a file
+        return {}
+    mains = {
+        repo.repo_id: repo.refs["main"].files for repo in repos if repo.repo_type == "model" and "main" in repo.refs
+    }
+    return {name: [f.file_path for f in files if f.file_path.suffix == ".gguf"] for name, files in mains.items()}
+
+
+def fetched(name: str) -> tuple[Path, Path | None]:
+    """Return the language model and the mmproj, if it has one, of a known name or ``hub:OWNER/REPO[:FILE]``.
+
+    Raises ModelError if it is not fetched yet, or if several quantisations are and none is named.
+    """
+    repository, file = hub_address(name, "`model`")
+    models, mmproj = pair(cached().get(repository, ()))
+    models = [path for path in models if not file or path.as_posix().lower().endswith(f"/{file.lower()}")]
+    if len(models) == 1:
+        return models[0], mmproj
+    if not models:
+        raise ModelError(f"`model` {name}: not fetched yet; run: s2a-bench model fetch {name.removeprefix(HUB)}")
+    names = ", ".join(path.name for path in models)
+    raise ModelError(f"`model` {name}: {names} were fetched; choose one, as {HUB}{repository}:{models[0].name}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,15 +141,15 @@ def resolve(config: EngineConfig) -> tuple[Path, Path | None]:
 def load_headers(config: EngineConfig) -> ModelFiles:
     """Read and check both headers; a model without an mmproj, named or beside it, is a text model.
 
-    A name of `HUB_MODELS` instead of a path stands for its fetched files. Raises ModelError if a file is missing,
-    damaged or of the wrong kind, or if several mmproj files lie beside the model.
+    A name of `HUB_MODELS` or ``hub:OWNER/REPO[:FILE]`` stands for its fetched files. Raises ModelError if a file is
+    missing, damaged or of the wrong kind, or if several mmproj files lie beside the model.
     """
     model_path, mmproj_path = config.model, config.mmproj
     if model_path is None:
         if mmproj_path is not None:
             raise ModelError(f"`mmproj` {mmproj_path}: needs the language model too; give `model`, or leave out both")
         model_path, mmproj_path = tiny_dummy()
-    elif str(model_path) in HUB_MODELS and not model_path.is_file():
+    elif (str(model_path) in HUB_MODELS or str(model_path).startswith(HUB)) and not model_path.is_file():
         model_path, fetched_mmproj = fetched(str(model_path))
         mmproj_path = mmproj_path or fetched_mmproj
     model = read_header(model_path, "`model`")

@@ -85,7 +85,7 @@ def test_the_version_is_printed() -> None:
     ("line", "offered"),
     [
         ("thr", "throughput"),
-        ("model ", "dummy fetch"),
+        ("model ", "dummy fetch list"),
         ("latency --fl", "--flash-attention"),
         ("latency --transport http,ros", "http,ros http,ros/topic http,ros/action"),
         ("serve http/b", "http/best-effort http/binary"),

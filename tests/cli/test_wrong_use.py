@@ -88,8 +88,8 @@ WRONG = {
     "model": [
         ("dummy --size huge", "--size: 'huge' should be 'tiny' or 'full'"),
         ("dummy --output /dev/null/x", "--output /dev/null/x: cannot write the dummy model", 1),
-        ("fetch gpt", "model fetch: 'gpt' is neither minicpm-v-2.6 nor ORG/REPO:FILE"),
-        ("fetch a/b:c.gguf --quant Q8_0", "--quant Q8_0: goes with minicpm-v-2.6"),
+        ("fetch gpt", "model fetch: 'gpt' is neither minicpm-v-2.6, qwen2.5-vl-3b"),
+        ("fetch a/b:c.gguf --quant Q8_0", "--quant Q8_0: goes with a name or OWNER/REPO"),
     ],
     "profile": [
         ("capture ../x", "NAME: '../x' should be a plain file name"),

@@ -24,7 +24,7 @@ from s2a_bench.cli.model import app
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.fetch import Wanted, fetch, wanted
-from s2a_bench.inference.models import fetched, load_headers
+from s2a_bench.inference.models import HUB_MODELS, fetched, load_headers
 
 NAME = "minicpm-v-2.6"
 REPOSITORY = "openbmb/MiniCPM-V-2_6-gguf"
@@ -39,6 +39,7 @@ class Hub:
     """What the hub holds, how it misbehaves, and the requests that it received."""
 
     files: dict[str, bytes]
+    repository: str = REPOSITORY
     sha256: dict[str, str] = field(default_factory=dict)
     """Checksums that it gives instead of the right ones."""
     cuts: dict[str, list[int]] = field(default_factory=dict)
@@ -80,10 +81,10 @@ class Handler(BaseHTTPRequestHandler):
         refuse = hub.refuse or (hub.refuse_files if "/resolve/" in path else None)
         if refuse:
             return self.answer(refuse[0], refuse[1])
-        if path == f"/api/models/{REPOSITORY}":
+        if path == f"/api/models/{hub.repository}":
             return self.answer(200, {"Content-Type": "application/json"}, self.list())
         head, _, name = path.rpartition("/")
-        if name not in hub.files or head not in {f"/{REPOSITORY}/resolve/{at}" for at in ("main", COMMIT)}:
+        if name not in hub.files or head not in {f"/{hub.repository}/resolve/{at}" for at in ("main", COMMIT)}:
             return self.answer(404, {"X-Error-Code": "EntryNotFound", "X-Repo-Commit": COMMIT})
         # the real hub leads to another host, whose answer has none of these headers
         content = hashlib.sha256(hub.files[name]).hexdigest()
@@ -98,7 +99,7 @@ class Handler(BaseHTTPRequestHandler):
         for name, data in self.hub.files.items():
             lfs = {"sha256": self.hub.digest(name), "size": len(data), "pointerSize": 135}
             siblings.append({"rfilename": name, "size": len(data)} | ({"lfs": lfs} if self.hub.lfs else {}))
-        return json.dumps({"id": REPOSITORY, "sha": COMMIT, "siblings": siblings}).encode()
+        return json.dumps({"id": self.hub.repository, "sha": COMMIT, "siblings": siblings}).encode()
 
     def content(self, digest: str) -> None:
         ((name, data),) = [item for item in self.hub.files.items() if hashlib.sha256(item[1]).hexdigest() == digest]
@@ -173,7 +174,7 @@ def test_both_files_arrive_whole_in_the_hubs_own_cache_and_are_not_fetched_twice
     assert [file.sha256 for file in done.files] == [hub.digest(MODEL), hub.digest(MMPROJ)]
     assert [file.resumed_at for file in done.files] == [0, 0]
     assert blobs(tmp_path) == sorted(file.sha256 for file in done.files)
-    assert calls[-1] == (MMPROJ, len(hub.files[MMPROJ]), len(hub.files[MMPROJ]))
+    assert calls[-1] == (MODEL, len(hub.files[MODEL]), len(hub.files[MODEL]))
     # another program that uses the hub's library finds them
     assert huggingface_hub.try_to_load_from_cache(REPOSITORY, MODEL) == str(done.files[0].path)
     again = fetch(wanted(NAME, None, None))
@@ -199,8 +200,8 @@ def test_a_broken_connection_is_taken_up_where_it_broke(hub: Hub) -> None:
 
 @pytest.mark.parametrize("how", ["interrupted", "no network for long"])
 def test_a_later_fetch_goes_on_where_an_earlier_one_ended(hub: Hub, tmp_path: Path, how: str) -> None:
-    def interrupt(_name: str, there: int, _total: int) -> None:
-        if there > 2_000_000:
+    def interrupt(name: str, there: int, _total: int) -> None:
+        if name == MODEL and there > 2_000_000:
             raise KeyboardInterrupt
 
     if how == "interrupted":
@@ -209,8 +210,8 @@ def test_a_later_fetch_goes_on_where_an_earlier_one_ended(hub: Hub, tmp_path: Pa
     else:
         hub.cuts[MODEL] = [2_500_000, *[0] * 5]
         assert "what has arrived is kept" in refusal()
-    (part,) = blobs(tmp_path)
-    assert part == f"{hub.digest(MODEL)}.s2a-bench.part"
+    # the mmproj comes first: a language model without it would pass for a text model
+    assert blobs(tmp_path) == sorted([f"{hub.digest(MODEL)}.s2a-bench.part", hub.digest(MMPROJ)])
     with pytest.raises(ModelError, match="not fetched yet"):
         fetched(NAME)
     before = len(hub.gets(MODEL))
@@ -240,7 +241,7 @@ def test_a_wrong_content_is_refused_and_not_kept(hub: Hub, tmp_path: Path) -> No
     hub.sha256[MODEL] = "ab" * 32
     message = refusal()
     assert message.startswith(f"{MODEL}: has SHA-256 {hashlib.sha256(hub.files[MODEL]).hexdigest()}, the hub says abab")
-    assert blobs(tmp_path) == []
+    assert blobs(tmp_path) == [hub.digest(MMPROJ)]
     assert huggingface_hub.try_to_load_from_cache(REPOSITORY, MODEL) is None
 
 
@@ -265,7 +266,9 @@ def test_a_file_that_the_library_fetched_is_used_as_it_is(hub: Hub) -> None:
 
 
 def test_an_unknown_quantisation_names_those_there_are(hub: Hub) -> None:
-    assert refusal(wanted(NAME, "Q9", None)) == (f"{REPOSITORY}: has no ggml-model-Q9.gguf; it has {MODEL}, {MMPROJ}")
+    assert refusal(wanted(NAME, "Q9", None)) == (
+        f"{REPOSITORY}: no model is Q9, or several; it has {MODEL}, {MMPROJ}; name one as OWNER/REPO:FILE"
+    )
     assert hub.gets(MODEL) == hub.gets(MMPROJ) == []
 
 
@@ -312,7 +315,10 @@ def test_no_network_names_the_ways_out(hub: Hub, monkeypatch: pytest.MonkeyPatch
     message = refusal()
     assert message.startswith(f"{REPOSITORY}: cannot be fetched from http://127.0.0.1:1 (ConnectError")
     assert "set HF_ENDPOINT to a hub in reach" in message
-    assert f"download {MODEL} and {MMPROJ} of {REPOSITORY} by hand and give --model PATH --mmproj PATH" in message
+    assert (
+        f"download the language model and its mmproj of {REPOSITORY} by hand and give --model PATH --mmproj PATH"
+        in message
+    )
 
 
 @pytest.mark.parametrize("endpoint", ["nonsense", "ftp://x", "http://[", ""])
@@ -365,18 +371,141 @@ def test_two_fetches_of_one_file_do_not_write_into_each_other(hub: Hub, tmp_path
 
 
 @pytest.mark.parametrize(
-    "what", ["", "minicpm", "a/b", "a/b:", "a:b.gguf", "a/b/c:d.gguf", "../b c:d.gguf", "a/b..c:d", "a--b/c:d"]
+    "what",
+    ["", "minicpm", "hub:", "hub:a", "a/b:", "a:b.gguf", "a/b/c:d.gguf", "../b c:d.gguf", "a/b..c:d", "a--b/c:d"],
 )
 def test_what_is_neither_name_nor_file_is_wrong_usage(what: str) -> None:
-    with pytest.raises(UsageError, match=r"neither minicpm-v-2.6 nor ORG/REPO:FILE"):
+    with pytest.raises(UsageError, match=r"neither minicpm-v-2.6, .* nor OWNER/REPO\[:FILE\]"):
         wanted(what, None, None)
 
 
-def test_a_quantisation_goes_with_a_name_only() -> None:
+def test_a_quantisation_goes_with_a_repository_not_with_a_file(hub: Hub) -> None:
     with pytest.raises(UsageError, match="`quant` Q8_0"):
         wanted("a/b:c.gguf", "Q8_0", None)
-    assert wanted("a/b:c.gguf", None, "m.gguf") == Wanted("a/b", ("c.gguf", "m.gguf"))
-    assert wanted(NAME, "Q8_0", None).files == ("ggml-model-Q8_0.gguf", MMPROJ)
+    assert hub.requests == []
+    assert wanted("a/b:c.gguf", None, "m.gguf") == wanted("hub:a/b:c.gguf", None, "m.gguf")
+    assert wanted("a/b:c.gguf", None, "m.gguf").files([]) == ("c.gguf", "m.gguf")
+
+
+# as the repositories list them, by what public programs download from there
+LISTINGS = {
+    "minicpm-v-2.6": ["ggml-model-Q4_K_M.gguf", "ggml-model-Q2_K.gguf", "ggml-model-f16.gguf", "mmproj-model-f16.gguf"],
+    "qwen2.5-vl-3b": [
+        "Qwen2.5-VL-3B-Instruct-Q4_K_M.gguf",
+        "Qwen2.5-VL-3B-Instruct-Q8_0.gguf",
+        "Qwen2.5-VL-3B-Instruct-f16.gguf",
+        "mmproj-Qwen2.5-VL-3B-Instruct-Q8_0.gguf",
+        "mmproj-Qwen2.5-VL-3B-Instruct-f16.gguf",
+    ],
+    "qwen2.5-vl-7b": [
+        "Qwen2.5-VL-7B-Instruct-Q4_K_M.gguf",
+        "mmproj-Qwen2.5-VL-7B-Instruct-Q8_0.gguf",
+        "mmproj-Qwen2.5-VL-7B-Instruct-f16.gguf",
+    ],
+    "qwen3-vl-2b": ["Qwen3VL-2B-Instruct-Q4_K_M.gguf", "mmproj-Qwen3VL-2B-Instruct-F16.gguf"],
+    "qwen3-vl-4b": ["Qwen3VL-4B-Instruct-Q4_K_M.gguf", "mmproj-Qwen3VL-4B-Instruct-Q8_0.gguf"],
+    "smolvlm2-256m": [
+        "SmolVLM2-256M-Video-Instruct-Q8_0.gguf",
+        "SmolVLM2-256M-Video-Instruct-f16.gguf",
+        "mmproj-SmolVLM2-256M-Video-Instruct-f16.gguf",
+    ],
+    "smolvlm2-500m": [
+        "SmolVLM2-500M-Video-Instruct-Q8_0.gguf",
+        "SmolVLM2-500M-Video-Instruct-f16.gguf",
+        "mmproj-SmolVLM2-500M-Video-Instruct-Q8_0.gguf",
+        "mmproj-SmolVLM2-500M-Video-Instruct-f16.gguf",
+    ],
+    "smolvlm2-2.2b": [
+        "SmolVLM2-2.2B-Instruct-Q4_K_M.gguf",
+        "SmolVLM2-2.2B-Instruct-Q8_0.gguf",
+        "mmproj-SmolVLM2-2.2B-Instruct-Q8_0.gguf",
+        "mmproj-SmolVLM2-2.2B-Instruct-f16.gguf",
+    ],
+    "gemma3-4b": ["gemma-3-4b-it-Q4_K_M.gguf", "gemma-3-4b-it-Q8_0.gguf", "mmproj-model-f16.gguf"],
+    "gemma3-270m": ["gemma-3-270m-it-Q8_0.gguf"],
+    "internvl3-2b": [
+        "InternVL3-2B-Instruct-Q4_K_M.gguf",
+        "InternVL3-2B-Instruct-Q8_0.gguf",
+        "mmproj-InternVL3-2B-Instruct-Q8_0.gguf",
+        "mmproj-InternVL3-2B-Instruct-f16.gguf",
+    ],
+}
+CHOSEN = {name: (files[0], files[-1]) if len(files) > 1 else tuple(files) for name, files in LISTINGS.items()}
+"""Every list begins with the language model that is wanted, and ends with the mmproj, if there is one."""
+
+
+def hold(hub: Hub, name: str, files: list[str]) -> None:
+    """Give the hub other files: each has a content of its own that the header check accepts."""
+    model, mmproj = hub.files[MODEL], hub.files[MMPROJ]
+    hub.repository = HUB_MODELS.get(name, name)
+    hub.files = {file: (mmproj if "mmproj" in file else model) + file.encode() for file in files}
+
+
+@pytest.mark.parametrize("name", HUB_MODELS)
+def test_every_known_name_fetches_its_files_and_is_then_a_model(hub: Hub, name: str) -> None:
+    hold(hub, name, [*LISTINGS[name], "imatrix.dat"])
+    done = fetch(wanted(name, None, None))
+    assert tuple(file.path.name for file in done.files) == CHOSEN[name]
+    assert fetched(name) == (done.files[0].path, done.files[1].path if len(done.files) > 1 else None)
+    assert set(hub.files) - set(CHOSEN[name]) == {file for file in hub.files if not hub.gets(file)}
+
+
+def test_any_repository_of_the_hub_is_a_model_once_it_is_fetched(hub: Hub) -> None:
+    address = "robots/plan.er_2-GGUF"
+    # the second is another quantisation, whose name ends as the wanted one does
+    hold(
+        hub, address, ["p.Q4_K_M.gguf", "p.UD-IQ4_K_M.gguf", "p.Q8_0.gguf", "p.mmproj-Q8_0.gguf", "p.mmproj-bf16.gguf"]
+    )
+    name = Path(f"hub:{address}")
+    with pytest.raises(ModelError, match=rf"^`model` {name}: not fetched yet; run: s2a-bench model fetch {address}$"):
+        load_headers(EngineConfig(model=name))
+    assert hub.requests == []
+    fetch(wanted(address, None, None))
+    model, mmproj = fetched(str(name))
+    assert (model.name, mmproj and mmproj.name) == ("p.Q4_K_M.gguf", "p.mmproj-Q8_0.gguf")
+    with pytest.raises(ModelError, match=rf"{address}:p.Q8_0.gguf: not fetched yet; .* fetch {address}:p.Q8_0.gguf$"):
+        fetched(f"{name}:p.Q8_0.gguf")
+    fetch(wanted(address, "q8_0", None))
+    with pytest.raises(
+        ModelError, match=rf"{name}: p.Q4_K_M.gguf, p.Q8_0.gguf were fetched; choose one, as {name}:p.Q4_K_M.gguf$"
+    ):
+        load_headers(EngineConfig(model=name))
+    files = load_headers(EngineConfig(model=Path(f"{name}:P.Q8_0.gguf")))
+    assert (files.model.path, files.mmproj and files.mmproj.path) == (model.with_name("p.Q8_0.gguf"), mmproj)
+
+
+@pytest.mark.parametrize(
+    ("files", "quant", "names"),
+    [
+        (["a-Q8_0.gguf", "a-F16.gguf"], None, ("a-Q8_0.gguf",)),
+        (["a-F16.gguf", "mmproj-a.gguf"], None, ("a-F16.gguf", "mmproj-a.gguf")),
+        (["Q8_0/a-Q8_0.gguf", "Q4_K_M/a-Q4_K_M.gguf"], None, ("Q4_K_M/a-Q4_K_M.gguf",)),
+        (["a-F16.gguf", "a-BF16.gguf"], "f16", ("a-F16.gguf",)),
+        (["a-F16.gguf"], "Q4_0", None),
+        (["a-Q2_K.gguf", "a-Q3_K.gguf"], None, None),
+        (["a-Q4_K_M.gguf", "b-Q4_K_M.gguf"], None, None),
+        (["mmproj-a-F16.gguf"], None, None),
+        (["model.safetensors"], None, None),
+    ],
+)
+def test_the_listing_gives_one_language_model_or_names_all(
+    files: list[str], quant: str | None, names: tuple[str, ...] | None
+) -> None:
+    want = wanted("a/b", quant, None)
+    if names is not None:
+        assert want.files(files) == names
+        return
+    with pytest.raises(
+        ModelError, match=rf"^a/b: no model is {quant or 'Q4_K_M or Q8_0'}, or several; it has "
+    ) as error:
+        want.files(files)
+    assert all(file in str(error.value) for file in files if file.endswith("gguf"))
+
+
+def test_another_mmproj_of_the_repository_is_fetched_by_its_name(hub: Hub) -> None:
+    hold(hub, "qwen2.5-vl-3b", LISTINGS["qwen2.5-vl-3b"])
+    done = fetch(wanted("qwen2.5-vl-3b", "Q8_0", "mmproj-Qwen2.5-VL-3B-Instruct-Q8_0.gguf"))
+    assert [file.path.name for file in done.files] == LISTINGS["qwen2.5-vl-3b"][1::2]
 
 
 def test_a_name_stands_for_its_files_once_they_are_fetched(hub: Hub) -> None:
@@ -384,13 +513,14 @@ def test_a_name_stands_for_its_files_once_they_are_fetched(hub: Hub) -> None:
         load_headers(EngineConfig(model=Path(NAME)))
     done = fetch(wanted(NAME, None, None))
     files = load_headers(EngineConfig(model=Path(NAME)))
-    assert (files.model.path, files.mmproj.path) == tuple(file.path for file in done.files)
-    other = done.files[0].path.with_name("ggml-model-Q8_0.gguf")
-    other.symlink_to(done.files[0].path)
-    with pytest.raises(ModelError, match=r"several were fetched \(Q4_K_M, Q8_0\); give a path"):
-        load_headers(EngineConfig(model=Path(NAME)))
-    assert load_headers(EngineConfig(model=other)).mmproj.path == files.mmproj.path
+    assert (files.model.path, files.mmproj and files.mmproj.path) == tuple(file.path for file in done.files)
     assert hub.gets(MODEL) == [None]
+
+
+@pytest.mark.parametrize("name", ["hub:", "hub:a", "hub:a/b/c", "hub:a/b:", "hub:a b/c"])
+def test_what_is_no_address_on_the_hub_is_wrong_usage(name: str) -> None:
+    with pytest.raises(UsageError, match=rf"^`model` '{name}' is neither .* nor OWNER/REPO\[:FILE\]$"):
+        load_headers(EngineConfig(model=Path(name)))
 
 
 def run(*arguments: str) -> Any:

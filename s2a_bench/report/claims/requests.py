@@ -54,9 +54,9 @@ def on_board(board: str) -> Need:
 PAPERS_MODEL: Final = (
     one_of("model", _MODEL),
     one_of("weights", "real"),
-    one_of("pictures", "seen"),
     one_of("processor", "all layers on the GPU"),
     one_of("tokens", "measured"),
+    one_of("pictures", "seen"),
 )
 """The needs of a claim about a model; an unknown provenance meets none."""
 

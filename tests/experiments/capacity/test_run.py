@@ -138,7 +138,7 @@ def robots_of(monkeypatch: pytest.MonkeyPatch, *, twin: bool = False, mode: str 
     config = CapacityConfig(**options)
     plan = resolve(config.live_requests)
     launch: Any = SimpleNamespace(plan=plan, wiring=lambda _: SimpleNamespace(to_json=dict))
-    return _Robots(config, None, launch, SimpleNamespace(cell=plan.cells[0]), mode, twin=twin)  # type: ignore[arg-type]
+    return _Robots(config, None, launch, SimpleNamespace(cell=plan.cells[0], origin=None), mode, twin=twin)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -207,7 +207,7 @@ def test_the_manifest_says_when_requests_are_made_and_as_many_fleets_are_expecte
     def run(task: Any, plan: Any, *_: Any) -> Any:
         cadences.append(plan.manifest["cadence"])
         count = len(plan.cells) // (1 if config.load == "closed" else 2)
-        sessions = [SimpleNamespace(cell=cell, measure=lambda _: None) for cell in plan.cells]
+        sessions = [SimpleNamespace(cell=cell, measure=lambda _: None, origin=None) for cell in plan.cells]
         keep = lambda *_: None  # noqa: E731
         launch = SimpleNamespace(sessions=sessions, progress=progress, plan=plan, keep=keep)
         monkeypatch.setattr(run_module._Cell, "run", lambda cell: cells.append((cell.mode, cell.instant is None)))
