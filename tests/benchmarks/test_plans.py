@@ -38,6 +38,7 @@ def test_every_prompt_is_printed_with_its_plans_and_gaps(
     assert [line.partition(",")[0] for (line,) in apart] == ["other against one"] * 2
 
 
+@pytest.mark.slow
 def test_a_real_model_plans_with_the_grammar_and_its_tokens_are_counted(gemma: Path) -> None:
     config = EngineConfig(model=gemma, chat_template="none", threads=1)
     found = plans.ask_all(config, 1)
