@@ -85,7 +85,7 @@ class LlamaServer:
     def __init__(self, address: str) -> None:
         self._post = partial(httpx.post, timeout=600, trust_env=False)
         self._address = address
-        self._client = open_client(wiring_of("http", url=address, dialect="llama-server", payload="png"))
+        self._client = open_client(wiring_of("http", timeout_s=600, url=address, dialect="llama-server", payload="png"))
 
     def _answer(self, path: str, body: Mapping[str, Any]) -> Any:
         answer = self._post(f"{self._address}/{path}", json=body)
