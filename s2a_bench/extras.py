@@ -19,7 +19,7 @@ EXTRAS: Final = {
     "model": "GGUF model files",
     "llama": "the llama engine",
     "llama-server": "llama.cpp's own server, without a compiler",
-    "ccrb": "the embedded simulator and pictures of the road",
+    "ccrb": "the embedded simulator",
     "nvidia": "load, memory and power of NVIDIA GPUs",
     "act": "the openvla dialect, /act",
     "ray": "sweeps, and fleets of robots, on a Ray cluster",

@@ -230,6 +230,17 @@ def test_its_robot_carries_out_skills(command: Command, tmp_path: Path) -> None:
     assert len((tmp_path / "skills.txt").read_text().splitlines()) == 2
 
 
+def test_its_world_is_driven(command: Command) -> None:
+    drive = ("ccrb", "--skills", "3", "--policy", "naive", "--json")
+    late, exact = (
+        json.loads(command(*drive, "--simulator", each).stdout)["cells"][0] for each in ("toy-world", "longitudinal")
+    )
+    assert late["outcome"] == exact["outcome"]
+    assert 0 < abs(late["min_front_gap_m"] - exact["min_front_gap_m"]) < 1
+    one_lane = command("ccrb", "--simulator", "toy-world", "--lane-change", code=2).stderr
+    assert "--lane-change: the toy-world simulator knows one lane" in one_lane
+
+
 def test_its_dialect_is_asked(command: Command, tmp_path: Path) -> None:
     class Speaker(Ollama):
         path = "/toy/chat"

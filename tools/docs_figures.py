@@ -1,4 +1,4 @@
-"""Draw the figures of docs/{policies,timeline,boundary,chunks}.md: `.venv/bin/python tools/docs_figures.py`.
+"""Draw the figures of docs/{policies,timeline,boundary,chunks,ccrb}.md: `.venv/bin/python tools/docs_figures.py`.
 
 They come from runs in virtual time with fixed seeds, so that running this again changes no figure. Those of the
 studies are drawn by `python -m studies figures`.
@@ -25,6 +25,7 @@ from s2a_bench.experiments.timeline.view.figures import policy_colours
 from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
+from s2a_bench.scenario import SIMULATORS, DriveCommand
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.style import paper_column
@@ -105,6 +106,20 @@ def safe_start_figure() -> Figure:
     return figure
 
 
+def windscreen_figure() -> Figure:
+    """Draw what the model is asked about: the lead at 40 m, and at 12 m while it brakes."""
+    figure = new_figure(1.7, ("The ego's view of the lead",))
+    world = SIMULATORS["longitudinal"]()
+    camera = world.camera(640, 480)
+    for axes, gap_m, lead_mps2 in zip(figure.subplots(1, 2), (40.0, 12.0), (0.0, -6.0), strict=True):
+        world.place(np.array([[gap_m], [0.0], [-14.0]]), np.full((3, 1), 50 / 3.6))
+        world.step(DriveCommand(np.array([[lead_mps2], [0.0], [0.0]]), np.array([0])))
+        axes.imshow(camera.read().data[..., ::-1])
+        axes.set_title(f"gap {gap_m:g} m, lead {lead_mps2:g} m/s\N{SUPERSCRIPT TWO}")
+        axes.axis("off")
+    return figure
+
+
 RUNS = TemporaryDirectory()
 """Where runs are until all is drawn: their tables are read when they are needed."""
 
@@ -127,6 +142,7 @@ FIGURES: dict[str, Callable[[], Figure]] = {
         ORIN.but(policies=("naive", "s2a-clairvoyant", "s2a-mean", "stream-to-act"), jitter="profile")
     ),
     "timeline": lambda: timelines(TimelineConfig()),
+    "windscreen": windscreen_figure,
     "boundary": lambda: boundary(BoundaryConfig()),
     "boundary-jitter": lambda: boundary(BoundaryConfig(jitter="lognormal:cv=0.2")),
     "chunks-lanes": lambda: drawn(chunks(SPREAD), "lanes"),

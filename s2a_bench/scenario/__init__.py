@@ -5,23 +5,23 @@ Arrays hold M roll-outs in lock step; `LEAD`, `EGO` and `REAR` index the cars. S
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, ClassVar, Final, Protocol
 
-from s2a_bench.errors import UsageError
 from s2a_bench.policy import Floats
-from s2a_bench.text import none_of
+from s2a_bench.registry import Registry
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from s2a_bench.frames import FrameSource
+
 LEAD, EGO, REAR = 0, 1, 2
 ROLES: Final = ("lead", "ego", "rear")
 STEP_S: Final = 0.005
 """Default step of the simulators."""
+LANE_WIDTH_M: Final = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,8 @@ class Simulator(Protocol):
 
     name: ClassVar[str]
     """As in SIMULATORS."""
+    real: ClassVar[bool]
+    """Whether it has physics of its own, so that cars follow a command with an error; else they follow exactly."""
     steers: ClassVar[bool]
     """Whether cars can leave their lane."""
     most: ClassVar[int | None]
@@ -66,17 +68,22 @@ class Simulator(Protocol):
     def step(self, command: DriveCommand) -> State:
         """Simulate one step; cars brake to a stop, never backwards."""
 
+    def camera(self, width: int, height: int) -> FrameSource:
+        """Open a camera with the ego's view, of the first roll-out; closing it leaves the world alone.
 
-SIMULATORS: dict[str, str] = {
-    "longitudinal": "s2a_bench.scenario.longitudinal:Longitudinal",
-    "embedded": "s2a_bench.scenario.embedded:Embedded",
-}
-"""Value of ``--simulator`` -> constructor."""
+        Each `read`, once cars are placed, delivers the current state, stamped at that moment, in the camera's own
+        encoding. Raises UsageError naming `size` if it is impossible, and `simulator` if the world cannot be seen.
+        """
+
+    def close(self) -> None:
+        """Let go of the world, and restore what was changed outside of it; may be called twice."""
 
 
-def simulator(name: str) -> Simulator:
-    """Build a simulator; raises UsageError for an unknown name."""
-    if name not in SIMULATORS:
-        raise UsageError(f"`simulator`: {none_of(name, SIMULATORS)}")
-    build: Callable[..., Simulator] = resolve_name(SIMULATORS[name])
-    return build()
+SIMULATORS: Final[Registry[type[Simulator]]] = Registry(
+    "simulators",
+    "simulator",
+    {
+        "longitudinal": "s2a_bench.scenario.longitudinal:Longitudinal",
+        "embedded": "s2a_bench.scenario.embedded:Embedded",
+    },
+)

@@ -1,6 +1,6 @@
 """The embedded simulator: highway-env's kinematic bicycles on a straight road, driven by accelerations.
 
-highway-env integrates with explicit Euler steps and steers by its lane controller. Pictures: `ccrb.render`.
+highway-env integrates with explicit Euler steps and steers by its lane controller.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import numpy as np
 
 from s2a_bench import extras
 from s2a_bench.policy import Floats
-from s2a_bench.scenario import EGO, LEAD, REAR, STEP_S, DriveCommand, State
+from s2a_bench.scenario import EGO, LANE_WIDTH_M, LEAD, REAR, STEP_S, DriveCommand, State
+from s2a_bench.scenario.windscreen import Windscreen
 
 ROAD_M: Final = 5000.0
 BEHIND_M: Final = 500.0
-LANE_WIDTH_M: Final = 4.0
 LANES: Final = {0: 1, 1: 0}
 """Lane of `DriveCommand` -> lane of highway-env, which counts from the left."""
 MIDDLE_M: Final = LANE_WIDTH_M * LANES[0]
@@ -28,6 +28,7 @@ class Embedded:
     """One road with three vehicles."""
 
     name: ClassVar[str] = "embedded"
+    real: ClassVar[bool] = False
     steers: ClassVar[bool] = True
     most: ClassVar[int | None] = 1
 
@@ -36,20 +37,26 @@ class Embedded:
     def __init__(self) -> None:
         extras.need("ccrb", "highway_env")
         self._cars: dict[int, Any] = {}
+        self._acceleration = np.zeros((3, 1))
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         controlled = extras.require("highway_env.vehicle.controller", "ccrb").ControlledVehicle
         free = extras.require("highway_env.vehicle.kinematics", "ccrb").Vehicle
-        road = build_road()
-        self._cars = {}
+        made_of = extras.require("highway_env.road.road", "ccrb")
+        straight = made_of.RoadNetwork.straight_road_network
+        network = straight(len(LANES), start=-BEHIND_M, length=ROAD_M + BEHIND_M, speed_limit=50.0)
+        # Fixed and unused; without it highway-env creates a randomly seeded one.
+        road = made_of.Road(network, np_random=np.random.RandomState(0), record_history=False)
+        self._cars, self._acceleration = {}, np.zeros((3, 1))
         for car in (LEAD, EGO, REAR):
             kind = controlled if car == EGO else free
-            at = centre(car, float(position_m[car, 0]), 0.0, free.LENGTH)
+            at = np.array([float(position_m[car, 0]) + LENGTHS[car] * free.LENGTH, MIDDLE_M])
             self._cars[car] = kind(road, at, heading=0.0, speed=float(speed_mps[car, 0]))
             road.vehicles.append(self._cars[car])
         return self._state()
 
     def step(self, command: DriveCommand) -> State:
+        self._acceleration = command.acceleration_mps2
         for car, vehicle in self._cars.items():
             # A car may come to rest within the step, but not go backwards.
             least = -vehicle.speed / self.step_s
@@ -61,22 +68,13 @@ class Embedded:
             vehicle.speed = max(vehicle.speed, 0.0)
         return self._state()
 
+    def camera(self, width: int, height: int) -> Windscreen:
+        return Windscreen(lambda: (self._state(), self._acceleration), width, height)
+
+    def close(self) -> None: ...
+
     def _state(self) -> State:
         position = [[vehicle.position[0] - LENGTHS[car] * vehicle.LENGTH] for car, vehicle in self._cars.items()]
         speed = [[vehicle.speed] for vehicle in self._cars.values()]
         lateral = [[MIDDLE_M - vehicle.position[1]] for vehicle in self._cars.values()]
         return State(np.array(position), np.array(speed), np.array(lateral))
-
-
-def build_road() -> Any:
-    """Build the road; raises MissingExtra without highway-env."""
-    made_of = extras.require("highway_env.road.road", "ccrb")
-    straight = made_of.RoadNetwork.straight_road_network
-    network = straight(len(LANES), start=-BEHIND_M, length=ROAD_M + BEHIND_M, speed_limit=50.0)
-    # Fixed and unused; without it highway-env creates a randomly seeded one.
-    return made_of.Road(network, np_random=np.random.RandomState(0), record_history=False)
-
-
-def centre(car: int, position_m: float, lateral_m: float, length_m: float) -> Floats:
-    """Return highway-env's coordinates of a car, in m."""
-    return np.array([position_m + LENGTHS[car] * length_m, MIDDLE_M - lateral_m])

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from s2a_bench.policy import Floats
 from s2a_bench.scenario import STEP_S, DriveCommand, State
+from s2a_bench.scenario.windscreen import Windscreen
 
 
 class LockStep:
@@ -31,25 +32,34 @@ class Longitudinal(LockStep):
     """Cars without width or steering; constant acceleration within a step, down to rest."""
 
     name: ClassVar[str] = "longitudinal"
+    real: ClassVar[bool] = False
     steers: ClassVar[bool] = False
     most: ClassVar[int | None] = None
 
     step_s = STEP_S
 
     def __init__(self) -> None:
-        self._state = State(np.empty((3, 0)), np.empty((3, 0)), np.empty((3, 0)))
+        self._acceleration = np.empty((3, 0))
+        self._state = State(self._acceleration, self._acceleration, self._acceleration)
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         self._state = State(position_m.astype(float), speed_mps.astype(float), np.zeros(position_m.shape))
+        self._acceleration = np.zeros(position_m.shape)
         return self._state
 
     def step(self, command: DriveCommand) -> State:
         """Integrate by the trapezoidal rule, which is exact until a car comes to rest within the step."""
-        before = self._state
+        before, self._acceleration = self._state, command.acceleration_mps2
         speed = np.maximum(before.speed_mps + command.acceleration_mps2 * self.step_s, 0.0)
         position = before.position_m + (before.speed_mps + speed) * (self.step_s / 2)
         self._state = State(position, speed, before.lateral_m)
         return self._state
 
+    def camera(self, width: int, height: int) -> Windscreen:
+        return Windscreen(lambda: (self._state, self._acceleration), width, height)
+
+    def close(self) -> None: ...
+
     def keep(self, columns: NDArray[np.int64]) -> None:
+        super().keep(columns)
         self._state = self._state.keep(columns)

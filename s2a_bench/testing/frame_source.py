@@ -13,7 +13,7 @@ from s2a_bench.errors import SourceError, UsageError
 from s2a_bench.frames import FrameSource
 
 MakeSource: TypeAlias = Callable[[int, int], FrameSource]
-CHANNELS = {"yuv422_yuy2": (2,), "bgr8": (3,), "rgb8": (3,), "mono8": ()}
+CHANNELS = {"yuv422_yuy2": (2,), "bgr8": (3,), "rgb8": (3,), "bgra8": (4,), "rgba8": (4,), "mono8": ()}
 SIZES = [(64, 48), (98, 30)]
 
 

@@ -73,7 +73,7 @@ def test_each_request_has_a_picture_of_its_own_and_the_warm_up_is_marked(paced: 
     assert list(samples["frame_index"]) == [0, 1]
     assert list(samples["warmup"]) == [True, False]
     assert set(paced.table(TOKENS)["request_id"]) == set(samples["request_id"])
-    assert paced.manifest["configuration"]["live"]["source"] == "scenario"
+    assert paced.manifest["configuration"]["live"]["source"] == "camera of longitudinal"
 
 
 def test_a_paced_dummy_is_live_and_says_what_is_set_and_what_means_nothing(paced: StoredRun) -> None:

@@ -134,8 +134,8 @@ class CcrbConfig(Options):
             span = getattr(self, name)
             if len(span) != 2 or not 0 < span[0] < span[1] <= most:  # noqa: PLR2004 - from, to
                 raise UsageError(f"`{name}`: should be two numbers above 0 and at most {most:g}, the lower first")
-        if self.scenario.lane_change and self.simulator == "longitudinal":
-            raise UsageError("`lane_change`: the longitudinal simulator knows one lane; take `simulator` embedded")
+        if self.scenario.lane_change and not SIMULATORS[self.simulator].steers:
+            raise UsageError(f"`lane_change`: the {self.simulator} simulator knows one lane; take `simulator` embedded")
         if self.plan_request.live:
             self._check_live()
         self.timeline.check()

@@ -27,8 +27,8 @@ from s2a_bench.harness.timelines.policies import prepare as prepare_policies
 from s2a_bench.plan import Parser
 from s2a_bench.policy import Plans, PlanShape
 from s2a_bench.policy.estimator import GapPrior
-from s2a_bench.scenario import Simulator, simulator
-from s2a_bench.scenario.ccrb.render import RoadSource
+from s2a_bench.scenario import Simulator
+from s2a_bench.scenario.ccrb.drive import place
 from s2a_bench.store.requests import SKILLS
 
 if TYPE_CHECKING:
@@ -36,22 +36,23 @@ if TYPE_CHECKING:
     from s2a_bench.progress import Progress
 
 
-def run_ccrb_live(config: CcrbConfig, output: Path, progress: Progress) -> Path:
+def run_ccrb_live(config: CcrbConfig, world: Simulator, output: Path, progress: Progress) -> Path:
     """Request one plan and drive it under every policy; raises S2AError. The folder keeps the requests so far."""
 
-    def road(feed: FeedPlan) -> FrameSource:
-        return Stamped(RoadSource(config.scenario.cars, *feed.size, fps=feed.fps), feed.nonce)
+    def view(feed: FeedPlan) -> FrameSource:
+        camera = world.camera(*feed.size)
+        place(world, config.scenario.cars)
+        return Stamped(camera, feed.nonce)
 
-    world = simulator(config.simulator)
     plan, (ask,) = prepare_requests(config.request, progress)
-    live = {**config.request.to_manifest(), "source": RoadSource.name}
+    live = {**config.request.to_manifest(), "source": f"camera of {world.name}"}
     plan = plan.with_manifest(
         configuration={**config.to_manifest(), "live": live},
         follower_law=config.scenario.follower_law,
         seeds={"sampling": plan.request.seed, "nonce": plan.feed.nonce},
     )
     tables = (ROLLOUTS, TRAJECTORIES, SKILLS)
-    task = Task("ccrb", drive=partial(_drive, config, ask, world), tables=tables, source=road)
+    task = Task("ccrb", drive=partial(_drive, config, ask, world), tables=tables, source=view)
     return run_requests(task, plan, output, progress)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
@@ -19,7 +20,7 @@ from s2a_bench.harness.timelines.rows import skill_rows, to_ns, token_rows
 from s2a_bench.machine import environment
 from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.provenance import Origins
-from s2a_bench.scenario import Simulator, simulator
+from s2a_bench.scenario import SIMULATORS, Simulator
 from s2a_bench.scenario.ccrb.drive import drive
 from s2a_bench.scenario.ccrb.ttc import NAME as TTC
 from s2a_bench.scenario.ccrb.ttc import ttc_aware
@@ -110,11 +111,16 @@ _BOARD = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_origin"
 
 
 def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
-    if config.plan_request.live:
+    with closing(SIMULATORS[config.simulator]()) as world:
+        if not config.plan_request.live:
+            return _run_modelled(config, world, output, progress)
         from s2a_bench.experiments.ccrb.live import run_ccrb_live
 
-        return run_ccrb_live(config, output, progress)
-    world, board, ready = simulator(config.simulator), config.timeline.boards[0], prepare(config)
+        return run_ccrb_live(config, world, output, progress)
+
+
+def _run_modelled(config: CcrbConfig, world: Simulator, output: Path, progress: Progress) -> Path:
+    board, ready = config.timeline.boards[0], prepare(config)
     manifest = {
         "configuration": config.to_manifest(),
         "environment": environment.collect(),

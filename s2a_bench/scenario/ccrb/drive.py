@@ -91,6 +91,14 @@ def follower_survives(cars: Cars, plan: DrivingPlan, n_skills: ArrayLike, t_nom_
     return np.asarray(found.code & 2 == 0)
 
 
+def place(simulator: Simulator, cars: Cars, rollouts: int = 1) -> State:
+    """Place the cars as they are at t = 0."""
+    position, speed = np.zeros((3, rollouts)), np.empty((3, rollouts))
+    position[LEAD], position[REAR] = cars.front_gap_m, -np.asarray(cars.rear_gap_m, float)
+    speed[:] = cars.speed_mps
+    return simulator.place(position, speed)
+
+
 class _Drive(LockStep):
     """The loop and its state; `LockStep.keep` includes the laws, the delay, the watch and the simulator."""
 
@@ -99,11 +107,9 @@ class _Drive(LockStep):
         self._ego = Ego(cars, plan, schedule, rollouts)
         self._rear = follower(cars, rollouts)
         self._lead_decel = each(cars.lead_decel_mps2, rollouts)
-        position, speed = np.zeros((3, rollouts)), np.empty((3, rollouts))
-        position[LEAD], position[REAR] = cars.front_gap_m, -np.asarray(cars.rear_gap_m, float)
-        speed[:] = cars.speed_mps
-        self._delay = Delay(position, speed, np.asarray(cars.reaction_s, float), simulator.step_s)
-        self._state = simulator.place(position, speed)
+        self._state = state = place(simulator, cars, rollouts)
+        reaction_s = np.asarray(cars.reaction_s, float)
+        self._delay = Delay(state.position_m, state.speed_mps, reaction_s, simulator.step_s)
         self._acceleration = np.zeros((3, rollouts))
         self._watch = CollisionWatch(self._state)
         self._outcomes = self._watch.outcomes()

@@ -12,6 +12,7 @@ from s2a_toy.mode import ToyMode
 from s2a_toy.policy import ToyCareful, ToyPolicy
 from s2a_toy.source import Stripes
 from s2a_toy.transport import TOY, ToyOptions
+from s2a_toy.world import SERVER
 
 from s2a_bench.frames import FrameSource
 from s2a_bench.inference import Engine, EngineConfig
@@ -21,6 +22,7 @@ from s2a_bench.testing.engine import EngineSuite
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 from s2a_bench.testing.mode import ModeSuite
 from s2a_bench.testing.policy import PolicySuite
+from s2a_bench.testing.simulator import SimulatorSuite
 from s2a_bench.testing.transport import Connect, TransportSuite
 from s2a_bench.transport import Client, Handler, Wiring
 
@@ -75,3 +77,12 @@ class TestToyWords(EngineSuite):
     @pytest.fixture
     def fresh_engine(self) -> Engine:
         return ToyWords(EngineConfig())
+
+
+class TestToyWorld(SimulatorSuite):
+    name = "toy-world"
+    DRIVEN = 0.5
+
+    @classmethod
+    def outside(cls) -> object:
+        return dict(SERVER)

@@ -12,7 +12,7 @@ from s2a_bench.policy import Plans
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import safe_start
-from s2a_bench.scenario import simulator
+from s2a_bench.scenario import SIMULATORS
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import SAFETY_M, Cars, braking_plan, start_deadline
 from s2a_bench.scenario.ccrb.drive import drive
@@ -103,7 +103,7 @@ def test_at_steady_speed_no_follower_does_anything() -> None:
     for follower in FOLLOWERS:
         cars = Cars(follower=follower, front_gap_m=1000.0, lead_decel_mps2=0.01)
         later = Schedule(np.array([[20.0]]), np.array([[2.0]]))
-        path = drive(simulator("longitudinal"), cars, braking_plan(cars, 1, 2.0), later, record=True).trajectory
+        path = drive(SIMULATORS["longitudinal"](), cars, braking_plan(cars, 1, 2.0), later, record=True).trajectory
         assert path is not None
         assert np.abs(path.acceleration_mps2[path.time_s < 20, 2]).max() < 1e-9
 

@@ -15,7 +15,7 @@ from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.naive import Naive
 from s2a_bench.policy.wait_then_act import Clairvoyant, WaitThenAct
-from s2a_bench.scenario import EGO, LEAD, REAR, simulator
+from s2a_bench.scenario import EGO, LEAD, REAR, SIMULATORS
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import Cars, braking_plan
 from s2a_bench.scenario.ccrb.drive import Driven, drive
@@ -43,7 +43,7 @@ def schedule(policy: str, rate: float = 4.8, n_skills: int = 5, t_nom_s: float =
 @cache
 def driven(world: str, policy: str, **changed: Any) -> Driven:
     cars = Cars(**changed)
-    return drive(simulator(world), cars, braking_plan(cars, 5, 0.8), schedule(policy), record=True)
+    return drive(SIMULATORS[world](), cars, braking_plan(cars, 5, 0.8), schedule(policy), record=True)
 
 
 @pytest.mark.parametrize("world", ["longitudinal", "embedded"])
@@ -80,11 +80,11 @@ def test_in_lock_step_roll_outs_come_out_as_alone(follower: str) -> None:
     alone = []
     for gap, delay in zip(gaps, delays, strict=True):
         cars = Cars(rear_gap_m=gap, reaction_s=delay, follower=follower)
-        alone.append(drive(simulator("longitudinal"), cars, braking_plan(cars, 5, 0.8), schedule("naive")).outcomes)
+        alone.append(drive(SIMULATORS["longitudinal"](), cars, braking_plan(cars, 5, 0.8), schedule("naive")).outcomes)
     cars = Cars(rear_gap_m=gaps, reaction_s=delays, follower=follower)
     each = schedule("naive")
     many = Schedule(np.tile(each.start_s, (1, 4)), np.tile(each.duration_s, (1, 4)))
-    together = drive(simulator("longitudinal"), cars, braking_plan(cars, 5, 0.8), many).outcomes
+    together = drive(SIMULATORS["longitudinal"](), cars, braking_plan(cars, 5, 0.8), many).outcomes
     assert together.code.tolist() == [int(one.code[0]) for one in alone]
     assert together.min_rear_gap_m == pytest.approx([one.min_rear_gap_m[0] for one in alone], abs=0.02)
     assert together.min_front_gap_m == pytest.approx([one.min_front_gap_m[0] for one in alone], abs=1e-9)
@@ -93,8 +93,8 @@ def test_in_lock_step_roll_outs_come_out_as_alone(follower: str) -> None:
 def test_nobody_stalls_or_is_hit_where_tokens_come_fast() -> None:
     for policy in POLICIES:
         cars = Cars(rear_gap_m=25.0)
-        found = drive(simulator("longitudinal"), cars, braking_plan(cars, 5, 0.8), schedule(policy, rate=50)).outcomes
-        assert found.name(0) == "none"
+        found = drive(SIMULATORS["longitudinal"](), cars, braking_plan(cars, 5, 0.8), schedule(policy, rate=50))
+        assert found.outcomes.name(0) == "none"
 
 
 def test_before_the_first_skill_the_ego_cruises_and_in_a_gap_it_brakes() -> None:
@@ -127,8 +127,8 @@ def test_a_drive_that_ends_when_all_is_decided_has_the_outcome_of_a_long_one(fol
     for seed in (11, 12):
         cars, many = draw(seed, follower, reflex=False)
         plan = braking_plan(cars, 5, 0.8)
-        short = drive(simulator("longitudinal"), cars, plan, many, resting_mps=0.5).outcomes
-        long = drive(simulator("longitudinal"), cars, plan, many, resting_mps=-1.0).outcomes
+        short = drive(SIMULATORS["longitudinal"](), cars, plan, many, resting_mps=0.5).outcomes
+        long = drive(SIMULATORS["longitudinal"](), cars, plan, many, resting_mps=-1.0).outcomes
         assert short.code.tolist() == long.code.tolist()
         assert short.impact_speed_mps == pytest.approx(long.impact_speed_mps, nan_ok=True)
 
@@ -138,14 +138,14 @@ def test_a_lane_change_needs_a_simulator_that_steers() -> None:
     plan = braking_plan(cars, 5, 0.8, lane_change=True)
     each = schedule("naive", n_skills=6)
     with pytest.raises(UsageError, match=r"`lane_change`: .* take `simulator` embedded"):
-        drive(simulator("longitudinal"), cars, plan, each)
+        drive(SIMULATORS["longitudinal"](), cars, plan, each)
 
 
 def test_the_embedded_simulator_changes_lanes_and_passes_the_lead() -> None:
     cars = Cars()
     each = schedule("naive", n_skills=6)
     each.duration_s[-1] = 5.0
-    found = drive(simulator("embedded"), cars, braking_plan(cars, 5, 0.8, lane_change=True), each, record=True)
+    found = drive(SIMULATORS["embedded"](), cars, braking_plan(cars, 5, 0.8, lane_change=True), each, record=True)
     assert found.outcomes.name(0) == "none"
     path = found.trajectory
     assert path is not None
@@ -157,7 +157,7 @@ def test_a_world_for_one_refuses_many() -> None:
     each = schedule("naive")
     many = Schedule(np.tile(each.start_s, (1, 2)), np.tile(each.duration_s, (1, 2)))
     with pytest.raises(UsageError, match="runs 1 roll-out at a time, not 2"):
-        drive(simulator("embedded"), Cars(), braking_plan(Cars(), 5, 0.8), many)
+        drive(SIMULATORS["embedded"](), Cars(), braking_plan(Cars(), 5, 0.8), many)
 
 
 @pytest.mark.parametrize(
@@ -170,7 +170,7 @@ def test_a_world_for_one_refuses_many() -> None:
 def test_names_that_there_are_not_are_refused(changed: dict[str, str], message: str) -> None:
     cars = Cars(**changed)  # type: ignore[arg-type]
     with pytest.raises(UsageError, match=message):
-        drive(simulator("longitudinal"), cars, braking_plan(cars, 5, 0.8), schedule("naive"))
+        drive(SIMULATORS["longitudinal"](), cars, braking_plan(cars, 5, 0.8), schedule("naive"))
 
 
 def draw(seed: int, follower: str, *, reflex: bool) -> tuple[Cars, Schedule]:
@@ -194,7 +194,7 @@ def draw(seed: int, follower: str, *, reflex: bool) -> tuple[Cars, Schedule]:
 
 
 def go(cars: Cars, many: Schedule, *, record: bool = False) -> Driven:
-    return drive(simulator("longitudinal"), cars, braking_plan(cars, 5, 0.8), many, record=record)
+    return drive(SIMULATORS["longitudinal"](), cars, braking_plan(cars, 5, 0.8), many, record=record)
 
 
 @pytest.mark.slow
