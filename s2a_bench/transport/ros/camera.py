@@ -11,7 +11,7 @@ import os
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from threading import Lock, Thread
-from typing import Any, cast
+from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
 from s2a_bench.errors import RequestFailed, TransportError
@@ -23,14 +23,13 @@ from s2a_bench.trace import RESIDUAL, Mark, Trace
 from s2a_bench.transport.limits import LIMITS, Limits, check_pixels
 from s2a_bench.transport.pictures import bgr_of, decoded, encoded, rgb_of
 from s2a_bench.transport.ros.options import RosOptions
-from s2a_bench.types import Encoding, Frame
+from s2a_bench.types import Frame
 
 CAMERA = "/camera/image_raw"
 COMPRESSED_CAMERA = "/camera/image_raw/compressed"
 FRAME_ID = "camera"
 PIXELS = frozenset({"raw", "yuyv"})
 """Payloads that are sensor_msgs/Image; the others are CompressedImage."""
-COLOURS = frozenset({"bgr8", "rgb8", "bgra8", "rgba8"})
 CAMERA_QOS = {"reliable": QoS(depth=1), "sensor_data": QoS(depth=5, reliable=False)}
 """By the names of ROS 2's profiles; a reliable subscription does not match a best-effort publisher."""
 CLOCK, CLOCK_QOS = "/clock", QoS(depth=1, reliable=False)
@@ -61,20 +60,9 @@ def picture_of(message: Any, trace: Trace, limits: Limits = LIMITS) -> Frame:
 
 
 def _decompressed(message: Any, trace: Trace, limits: Limits) -> Frame:
-    """Decode a CompressedImage; ``format`` is plain, as "jpeg", or says what was compressed as what.
-
-    image_transport writes "rgb8; jpeg compressed bgr8". Where bgr8 does not stand at the end, the picture was
-    compressed as it was: a mosaic as grey, or with red and blue in each other's place.
-    """
-    encoding, _, coding = message.format[: ros.SHOWN].partition(";")
-    ros.refuse_depth("16UC1" if "compressedDepth" in coding else encoding)
+    encoding = ros.compressed_as(message)
     frame = decoded(f"image/{message.format[: ros.SHOWN]}", message.data, trace, limits)
-    if "compressed" in coding and "compressed bgr8" not in coding:
-        if encoding in COLOURS:
-            return rgb_of(replace(frame, encoding="bgr8"), trace)
-        if encoding.startswith("bayer_"):
-            return rgb_of(replace(frame, encoding=cast("Encoding", encoding), data=frame.data[..., 0].copy()), trace)
-    return frame
+    return rgb_of(ros.labelled(frame, encoding), trace)
 
 
 class CameraPublisher:
