@@ -35,6 +35,15 @@ class QoS:
     lifespan_s: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """A publisher of any process: its absolute topic, its ROS type, and whether it offers reliable delivery."""
+
+    topic: str
+    type_name: str
+    reliable: bool
+
+
 class Publisher(Protocol):
     def pack(self, message: Any) -> Any:
         """Serialise a message into what `send` takes."""
@@ -226,6 +235,9 @@ class Middleware(Protocol):
 
     def subscription(self, topic: str, type_name: str, qos: QoS) -> Subscription:
         """Subscribe to the absolute ROS topic name ``/x``."""
+
+    def offers(self) -> list[Offer]:
+        """Return the publishers that are known by now; those of other processes appear within a second or so."""
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         """Offer the service ``/x`` of ROS type ``pkg/srv/Name``; ``answer`` turns a request into its response.

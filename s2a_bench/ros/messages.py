@@ -15,10 +15,9 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from functools import cache, partial
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, TypeAlias, cast, get_args
+from typing import TYPE_CHECKING, Any, TypeAlias, get_args
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -27,7 +26,7 @@ from rosbags.typesys.msg import MSGParser, make_typesdict
 
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.text import none_of
-from s2a_bench.types import Deep, Encoding, Frame, Pixels
+from s2a_bench.types import Deep, Frame, Pixels
 
 if TYPE_CHECKING:
     if sys.version_info >= (3, 11):
@@ -73,7 +72,6 @@ ALSO = {"yuyv": "yuv422_yuy2", "uyvy": "yuv422", "8UC3": "bgr8", "8UC1": "mono8"
 """Second names since ROS 2 Iron, and OpenCV's types, whose order of colours is blue first."""
 CHROMA_BELOW = frozenset({"nv12", "nv21"})
 """Encodings with half as many rows of colour below those of brightness."""
-COLOURS = frozenset({"bgr8", "rgb8", "bgra8", "rgba8"})
 DEPTH = frozenset({"16UC1", "32FC1"})
 """Encodings of distances (REP 118)."""
 
@@ -302,19 +300,13 @@ def compressed_image_message(data: Pixels, stamp_ns: int, frame_id: str, coding:
     return message(COMPRESSED_IMAGE, header=header(stamp_ns, frame_id), format=format_, data=data)
 
 
-def encoding_of(image: Any) -> Encoding:
-    """Return the encoding of a sensor_msgs/Image; raises TransportError for depth, and for one that is not known."""
-    encoding = ALSO.get(image.encoding, image.encoding)
-    refuse_depth(encoding)
-    if encoding not in CHANNELS:
-        raise TransportError(f"image encoding '{encoding[:SHOWN]}' is none of {', '.join(CHANNELS)}")
-    return cast("Encoding", encoding)
-
-
 def frame_of_image(image: Any, index: int = -1) -> Frame:
     """Unwrap a sensor_msgs/Image; the pixels stay a view of the message. Raises TransportError."""
-    encoding = encoding_of(image)
-    channels = CHANNELS[encoding]
+    encoding = ALSO.get(image.encoding, image.encoding)
+    refuse_depth(encoding)
+    channels = CHANNELS.get(encoding)
+    if channels is None:
+        raise TransportError(f"image encoding '{encoding[:SHOWN]}' is none of {', '.join(CHANNELS)}")
     if not (image.width and image.height):
         raise TransportError(f"image of {image.width}x{image.height} {image.encoding} is empty")
     height = image.height * 3 // 2 if encoding in CHROMA_BELOW else image.height
@@ -325,29 +317,6 @@ def frame_of_image(image: Any, index: int = -1) -> Frame:
     if encoding in get_args(Deep) and bool(image.is_bigendian) != (sys.byteorder == "big"):
         pixels = pixels.reshape(*pixels.shape[:2], -1, 2)[..., ::-1].reshape(pixels.shape)
     return Frame(index, nanoseconds(image.header.stamp), image.width, image.height, encoding, pixels)
-
-
-def compressed_as(image: Any) -> Encoding:
-    """Return what a sensor_msgs/CompressedImage is once it is decoded to ``rgb8``; raises TransportError for depth.
-
-    ``format`` is plain, as "jpeg", or says what was compressed as what: image_transport writes "rgb8; jpeg compressed
-    bgr8". Where bgr8 does not stand at the end, the picture was compressed as it was: a mosaic as grey, or with red and
-    blue in each other's place.
-    """
-    encoding, _, coding = image.format[:SHOWN].partition(";")
-    refuse_depth("16UC1" if "compressedDepth" in coding else encoding)
-    if "compressed" in coding and "compressed bgr8" not in coding:
-        if encoding in COLOURS:
-            return "bgr8"
-        if encoding.startswith("bayer_"):
-            return cast("Encoding", encoding)
-    return "rgb8"
-
-
-def labelled(frame: Frame, encoding: Encoding) -> Frame:
-    """Return a decoded ``rgb8`` frame as what `compressed_as` says it is."""
-    mosaic = encoding.startswith("bayer_")
-    return replace(frame, encoding=encoding, data=frame.data[..., 0].copy() if mosaic else frame.data)
 
 
 def refuse_depth(encoding: str) -> None:

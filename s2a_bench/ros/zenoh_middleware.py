@@ -19,7 +19,7 @@ from zenoh import ext
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, QoS, Tuning
+from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, Offer, QoS, Tuning
 from s2a_bench.ros import zenoh_names as names
 from s2a_bench.ros.action import ActionNode
 from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, serialise
@@ -315,6 +315,9 @@ class ZenohMiddleware(ActionNode[QueryOrigin, Bell]):
         self, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION, waiter: Bell | None = None
     ) -> ZenohSubscription:
         return ZenohSubscription(self._node, topic, type_name, qos, version, waiter or self.waiter())
+
+    def offers(self) -> list[Offer]:
+        return self._node.offers()
 
     def service_end(
         self, name: str, type_name: str, version: str, waiter: Bell, qos: QoS | None = None, *, pictures: bool = False

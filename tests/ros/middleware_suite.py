@@ -13,7 +13,7 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import Middleware, Publisher, QoS, Subscription
+from s2a_bench.ros import Middleware, Offer, Publisher, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.types import Frame
 
@@ -146,6 +146,28 @@ class MiddlewareSuite:
         subscription = join().subscription("/test/other_type", STRING, QoS())
         _kept = join().publisher("/test/other_type", "std_msgs/msg/Header", QoS())
         wait_publishers(subscription, 1)
+
+    def test_publishers_of_any_topic_are_told_with_type_and_reliability(self, join: Join) -> None:
+        first, second, asking = join(), join(), join()
+        kept = [
+            first.publisher("/test/offer/one", STRING, QoS()),
+            first.publisher("/test/offer/two", ros.IMAGE, QoS(1, reliable=False)),
+            second.publisher("/test/offer/two", ros.COMPRESSED_IMAGE, QoS(1)),
+        ]
+        offers = [
+            Offer("/test/offer/one", STRING, reliable=True),
+            Offer("/test/offer/two", ros.COMPRESSED_IMAGE, reliable=True),
+            Offer("/test/offer/two", ros.IMAGE, reliable=False),
+        ]
+
+        def found() -> list[Offer]:
+            here = [offer for offer in asking.offers() if offer.topic.startswith("/test/offer/")]
+            return sorted(here, key=lambda offer: (offer.topic, offer.type_name))
+
+        until(lambda: found() == offers)
+        second.close()
+        until(lambda: found() == [offers[0], offers[2]])
+        assert len(kept) == 3
 
     def test_a_sender_hears_a_publisher_once_it_subscribes(self, join: Join) -> None:
         server, client = join(), join()
