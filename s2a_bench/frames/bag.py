@@ -36,7 +36,6 @@ class Recording(ImageMessages):
         self._path, key, topic = where.partition(TOPIC_KEY)
         if key and not topic.startswith("/"):
             raise UsageError(f"`source`: 'bag:{where}' should end with the absolute name of a topic, {TOPIC_KEY}/name")
-        self.place = self._path
         self._reader: Any = _open(self._path)
         try:
             self._connection = _connection(self._reader.connections, self._path, topic)

@@ -10,7 +10,6 @@ from typing import Any, ClassVar, Final
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed
-from s2a_bench.frames.encoded import MOST_PIXELS, encoded_size
 from s2a_bench.options import Options, option
 
 KIB: Final = 1 << 10
@@ -33,7 +32,7 @@ class Limits(Options):
     connections: int = option(256, "most connections at once", ge=1, le=MIB)
     head_s: float = option(10.0, "seconds from a request's first byte to the end of its headers", gt=0, le=86_400)
     body_s: float = option(120.0, "seconds from there to the end of its body", gt=0, le=86_400)
-    pixels: int = option(MOST_PIXELS, "most pixels of a picture, read before it is decoded", ge=1, le=2**31)
+    pixels: int = option(50_000_000, "most pixels of a picture, read before it is decoded", ge=1, le=2**31)
     waiting: int = option(64, "most requests that wait for the engine", flag="max-waiting", ge=0, le=MIB)
     answer_tokens: int = option(65_536, "most tokens that a request may ask for", ge=1, le=2**31 - 1)
     answer_s: float = option(
@@ -117,14 +116,6 @@ def check_pixels(width: int, height: int, limits: Limits) -> None:
         raise RequestFailed(f"a picture of {width}x{height} is empty")
     if width * height > limits.pixels:
         raise RequestFailed(f"a picture of {width}x{height}; at most {limits.pixels} pixels are taken")
-
-
-def check_encoded(data: memoryview, limits: Limits) -> None:
-    """Raise RequestFailed for a file that is neither JPEG nor PNG, or whose header gives too many pixels."""
-    size = encoded_size(data)
-    if size is None:
-        raise RequestFailed(f"{len(data)} bytes that are neither a JPEG nor a PNG")
-    check_pixels(*size, limits)
 
 
 PIECES_A_TOKEN, PIECES = 8, 64

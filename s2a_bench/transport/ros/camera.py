@@ -9,19 +9,20 @@ from __future__ import annotations
 import logging
 import os
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from threading import Lock, Thread
 from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
 from s2a_bench.errors import RequestFailed, TransportError
 from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_SIM_AGE_MS, CAMERA_STAMP_AGE_MS, STALE_FRAMES
+from s2a_bench.frames.messages import decompressed
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.service import LogOnce, appeared
 from s2a_bench.trace import RESIDUAL, Mark, Trace
 from s2a_bench.transport.limits import LIMITS, Limits, check_pixels
-from s2a_bench.transport.pictures import bgr_of, decoded, encoded, rgb_of
+from s2a_bench.transport.pictures import bgr_of, encoded, rgb_of
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.types import Frame
 
@@ -54,15 +55,11 @@ def picture_message(frame: Frame, payload: str, offset_ns: int, trace: Trace) ->
 def picture_of(message: Any, trace: Trace, limits: Limits = LIMITS) -> Frame:
     """Turn a received image message into an RGB frame; its stamp is ROS time. Raises TransportError."""
     if hasattr(message, "format"):
-        return replace(_decompressed(message, trace, limits), stamp_ns=ros.nanoseconds(message.header.stamp))
+        frame = decompressed(message, limits.pixels)
+        trace.mark("image_decode")
+        return rgb_of(frame, trace)
     check_pixels(message.width, message.height, limits)
     return rgb_of(ros.frame_of_image(message), trace)
-
-
-def _decompressed(message: Any, trace: Trace, limits: Limits) -> Frame:
-    encoding = ros.compressed_as(message)
-    frame = decoded(f"image/{message.format[: ros.SHOWN]}", message.data, trace, limits)
-    return rgb_of(ros.labelled(frame, encoding), trace)
 
 
 class CameraPublisher:
