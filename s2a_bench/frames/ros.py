@@ -47,10 +47,10 @@ class TopicCamera(ImageMessages):
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
         super().__init__(f"ros:{where}", width, height)
-        self._topic, _, given = where.partition("?")
+        self._topic = where.partition("?")[0]
         if not NAME.fullmatch(self._topic):
             raise UsageError(f"`source`: '{self.name}' should look like ros:/camera/image_raw, from the root")
-        how = build(TopicParameters, f"ros?{given}" if given else "ros", "source")
+        how = build(TopicParameters, self.name, "source")
         self._wait_s = how.wait_s
         self._changed = Condition()
         self._middleware: Any = None
@@ -93,13 +93,9 @@ class TopicCamera(ImageMessages):
 
     def _offers(self) -> list[Offer]:
         """Wait for publishers of the topic and return those of pictures, of one type."""
-        found: list[Offer] = []
-
-        def discovered() -> bool:
-            found[:] = self._middleware.offers()
-            return any(offer.topic == self._topic for offer in found)
-
-        there = appeared(discovered, self._wait_s)
+        middleware = self._middleware
+        there = appeared(lambda: any(offer.topic == self._topic for offer in middleware.offers()), self._wait_s)
+        found = middleware.offers()
         for type_name in TYPES:
             if offers := [offer for offer in found if (offer.topic, offer.type_name) == (self._topic, type_name)]:
                 return offers
@@ -134,7 +130,7 @@ class TopicCamera(ImageMessages):
         if isinstance(newest, TransportError):
             raise newest
         if newest is None:
-            count = self._subscription.publishers()
+            count = sum(offer.topic == self._topic for offer in self._middleware.offers())
             raise TransportError(
                 f"no picture for {self._wait_s:g} s of {count} publisher{'s' * (count != 1)}; see whether `ros2 topic "
                 f"hz {self._topic}` counts any. Large pictures need larger receive buffers: `s2a-bench doctor`"

@@ -82,9 +82,6 @@ class Subscription(Protocol):
     def matched(self) -> int:
         """Count the publishers that reach this subscription."""
 
-    def publishers(self) -> int:
-        """Count the publishers of the topic, those too whose QoS does not fit; callable from any thread."""
-
 
 @dataclass(frozen=True, slots=True)
 class Accepted:
@@ -237,7 +234,10 @@ class Middleware(Protocol):
         """Subscribe to the absolute ROS topic name ``/x``."""
 
     def offers(self) -> list[Offer]:
-        """Return the publishers that are known by now; those of other processes appear within a second or so."""
+        """Return all publishers that are known by now; those of other processes appear within a second or so.
+
+        Callable from any thread.
+        """
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         """Offer the service ``/x`` of ROS type ``pkg/srv/Name``; ``answer`` turns a request into its response.

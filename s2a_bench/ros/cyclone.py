@@ -93,7 +93,7 @@ class _CycloneSubscription:
         waiter.watch(self.reader)
         self.interrupt, self.arrived = waiter.interrupt, self.reader.arrived
         self.matched = self.announced = self.reader.matched
-        self.publishers, self.sender = self.reader.publishers, self.reader.sender
+        self.sender = self.reader.sender
 
     def take(self, timeout_s: float) -> memoryview | None:
         deadline_ns = now_ns() + int(timeout_s * 1e9)

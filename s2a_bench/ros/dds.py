@@ -13,7 +13,7 @@ import types
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from itertools import islice
 from threading import Lock
 from typing import Any
@@ -226,7 +226,7 @@ class RawReader(_Endpoint):
 
         Such a reader matches ROS, and programs without ROS whose fields are the same, but none of our own writers.
         """
-        self._type_name, self._topic, self._participant = type_name, topic, participant
+        self._type_name = type_name
         data_type = _described_type(type_name) if described else _raw_type(type_name)
         entity = DataReader(participant, Topic(participant, topic, data_type), qos=qos)
         super().__init__(entity, entity.get_matched_publications, entity.get_matched_publication_data)
@@ -252,16 +252,6 @@ class RawReader(_Endpoint):
 
     def sender(self) -> int:
         return int(self._info.publication_handle)
-
-    def publishers(self) -> int:
-        """Count the topic's writers: where the QoS of one did not fit, by looking through those of the domain."""
-        if not self.entity.get_requested_incompatible_qos_status().total_count:
-            return self.matched()
-        return sum(writer.topic_name == self._topic for writer in self._writers())
-
-    @cached_property
-    def _writers(self) -> Callable[[], list[Any]]:
-        return writers_of(self._participant)
 
 
 def writers_of(participant: DomainParticipant) -> Callable[[], list[Any]]:

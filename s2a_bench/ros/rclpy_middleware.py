@@ -119,10 +119,10 @@ class _RclpySubscription:
     def unpack(self, packed: bytes) -> Any:
         return deserialise(memoryview(packed), self._type_name)
 
-    def publishers(self) -> int:
+    def matched(self) -> int:
         return 0 if self._node.closed else int(self._node.node.count_publishers(self.topic))
 
-    matched = sender = publishers
+    sender = matched
     """Humble's subscriptions do not know which of them reach it; Jazzy's do not know whose a message is."""
 
     def sender_hears(self, sender: int, publisher: _RclpyPublisher) -> bool:

@@ -140,10 +140,6 @@ class ZenohSubscription:
         """Count the publishers of the type, those of other versions too, which do not reach us."""
         return sum(1 for _ in self._node.peers(names.PUBLISHER, self._seen.entity))
 
-    def publishers(self) -> int:
-        """Count the publishers that are announced under the topic's name, those of other types too."""
-        return self._node.named(names.PUBLISHER, self._seen.entity)
-
     def matched(self) -> int:
         return self._node.matching(names.PUBLISHER, self._seen.entity)
 

@@ -150,10 +150,6 @@ class Node:
         matching = (token for token, each in known if each.type_hash == entity.type_hash)
         return {names.session_of(token) for token in matching if not gid or names.gid_of(token) == gid}
 
-    def named(self, kind: str, entity: names.Entity) -> int:
-        with self._lock:
-            return len(self._known.get((kind, entity.name), {}))
-
     def offers(self) -> list[Offer]:
         def offer(token: str, each: names.Entity) -> Offer:
             reliable = not token.rpartition("/")[2].startswith(names.BEST_EFFORT)

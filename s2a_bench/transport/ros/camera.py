@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import os
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
 from threading import Lock, Thread
@@ -102,7 +103,7 @@ class CameraCache:
 
     def __init__(self, middleware: Middleware, namespace: str, options: RosOptions, limits: Limits = LIMITS) -> None:
         self.limits = limits
-        self._options = options
+        self._middleware, self._options = middleware, options
         topics = ((CAMERA, ros.IMAGE), (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE))
         self._cameras = [
             middleware.subscription(namespace + topic, kind, CAMERA_QOS[options.qos]) for topic, kind in topics
@@ -206,7 +207,8 @@ class CameraCache:
         return f"{present}, no frame comes: look at the buffers ({buffers}) and at what is published{other}"
 
     def _publishers(self) -> dict[str, int]:
-        return {camera.topic: count for camera in self._cameras if (count := camera.publishers())}
+        counts = Counter(offer.topic for offer in self._middleware.offers())
+        return {camera.topic: counts[camera.topic] for camera in self._cameras if counts[camera.topic]}
 
     def seen(self) -> tuple[int, int | None]:
         """Return how many frames have come, and when the newest usable one did (CLOCK_MONOTONIC)."""
