@@ -15,6 +15,7 @@ from pathlib import Path
 
 import s2a_bench
 from s2a_bench.act import ROBOTS
+from s2a_bench.frames import SOURCES
 from s2a_bench.inference import ENGINES
 from s2a_bench.policy import POLICIES
 from s2a_bench.policy.chunks import MODES
@@ -25,8 +26,8 @@ ALLOWED = Path(__file__).parent / "data" / "names.txt"
 EXPERIMENTS = {path.parent.name for path in (ROOT / "s2a_bench" / "experiments").glob("*/__init__.py")}
 COMMON = {"queue", "replace"}
 """Modes whose names are words of other things too (a stage, an error handler): seen where they are imported only."""
-ROBOTS_AT = "s2a_bench/act/"
-"""Where a robot's name is a robot, whatever else is called so."""
+OTHERS = {"s2a_bench/act/": ROBOTS, "s2a_bench/frames/": SOURCES}
+"""Where a name is a robot's or a camera's, whatever else is called so."""
 KINDS = {
     "policy": (POLICIES, "s2a_bench/policy/"),
     "mode": (MODES, "s2a_bench/policy/"),
@@ -70,8 +71,10 @@ def named(path: Path) -> Iterator[str]:
             if where.startswith((home.format(name), declared)):
                 continue
             module = registry._builtins[name].partition(":")[0]
-            robot = where.startswith(ROBOTS_AT) and name in ROBOTS.built_in()
-            if any(within(each, module) for each in modules) or (name in texts and name not in COMMON and not robot):
+            elsewhere = any(where.startswith(at) and name in kinds.built_in() for at, kinds in OTHERS.items())
+            if any(within(each, module) for each in modules) or (
+                name in texts and name not in COMMON and not elsewhere
+            ):
                 yield f"{kind} {name}"
     parts = path.relative_to(ROOT).parts
     if parts[1] == "experiments" and parts[2] in EXPERIMENTS:

@@ -44,6 +44,7 @@ SOURCES: Final[Registry[SourceKind]] = Registry(
         "images": "s2a_bench.frames.files:ImageFolder",
         "v4l2": "s2a_bench.frames.v4l2:V4L2Camera",
         "bag": "s2a_bench.frames.bag:Recording",
+        "ros": "s2a_bench.frames.ros:TopicCamera",
     },
 )
 

@@ -35,6 +35,15 @@ class QoS:
     lifespan_s: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """A publisher of any process: its absolute topic, its ROS type, and whether it offers reliable delivery."""
+
+    topic: str
+    type_name: str
+    reliable: bool
+
+
 class Publisher(Protocol):
     def pack(self, message: Any) -> Any:
         """Serialise a message into what `send` takes."""
@@ -72,9 +81,6 @@ class Subscription(Protocol):
 
     def matched(self) -> int:
         """Count the publishers that reach this subscription."""
-
-    def publishers(self) -> int:
-        """Count the publishers of the topic, those too whose QoS does not fit; callable from any thread."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,6 +232,12 @@ class Middleware(Protocol):
 
     def subscription(self, topic: str, type_name: str, qos: QoS) -> Subscription:
         """Subscribe to the absolute ROS topic name ``/x``."""
+
+    def offers(self) -> list[Offer]:
+        """Return all publishers that are known by now; those of other processes appear within a second or so.
+
+        Callable from any thread.
+        """
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         """Offer the service ``/x`` of ROS type ``pkg/srv/Name``; ``answer`` turns a request into its response.

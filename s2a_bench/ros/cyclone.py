@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
+from functools import cached_property
 from importlib.metadata import version as package_version
 from threading import Lock
 from typing import Any
@@ -15,17 +17,18 @@ from cyclonedds.qos import Policy, Qos
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import QoS, Tuning
+from s2a_bench.ros import Offer, QoS, Tuning
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import ActionNode
 from s2a_bench.ros.config import configuration
-from s2a_bench.ros.dds import DdsWaiter, RawReader, RawWriter, dds_qos
+from s2a_bench.ros.dds import DdsWaiter, RawReader, RawWriter, dds_qos, is_described, writers_of
 from s2a_bench.ros.dds_service import Caller, DdsServiceClient, DdsServiceServer
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise, type_hash
 from s2a_bench.ros.remap import check_node_name
 
 PARTICIPANT_ENTITIES = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 NODE_ENTITIES = "rmw_dds_common/msg/NodeEntitiesInfo"
+BEST_EFFORT = Policy.Reliability.BestEffort
 GID = "rmw_dds_common/msg/Gid"
 
 
@@ -79,21 +82,18 @@ class _CyclonePublisher(RawWriter):
 
 
 class _CycloneSubscription:
-    def __init__(
-        self,
-        participant: DomainParticipant,
-        topic: str,
-        type_name: str,
-        qos: QoS,
-        version: str,
-        waiter: DdsWaiter,
-    ) -> None:
-        self.topic, self._type_name, self._version, self._waiter = topic, type_name, version, waiter
-        self.reader = RawReader(participant, "rt" + topic, type_name, _topic_qos(qos, type_name, version))
+    def __init__(self, reader: RawReader, topic: str, type_name: str, version: str, waiter: DdsWaiter) -> None:
+        self.reader, self.topic, self._type_name, self._version, self._waiter = (
+            reader,
+            topic,
+            type_name,
+            version,
+            waiter,
+        )
         waiter.watch(self.reader)
         self.interrupt, self.arrived = waiter.interrupt, self.reader.arrived
         self.matched = self.announced = self.reader.matched
-        self.publishers, self.sender = self.reader.publishers, self.reader.sender
+        self.sender = self.reader.sender
 
     def take(self, timeout_s: float) -> memoryview | None:
         deadline_ns = now_ns() + int(timeout_s * 1e9)
@@ -156,10 +156,24 @@ class CycloneMiddleware(ActionNode[Caller, DdsWaiter]):
     def subscription(
         self, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION, waiter: DdsWaiter | None = None
     ) -> _CycloneSubscription:
+        """Subscribe; to a program without ROS that describes the type only where it is one of `offers` already."""
         waiter = waiter or self.waiter()
-        subscription = _CycloneSubscription(self._participant, topic, type_name, qos, version, waiter)
-        self._node.add(subscription.reader)
-        return subscription
+        described = any(w.topic_name == "rt" + topic and is_described(w, type_name) for w in self._writers())
+        topic_qos = _topic_qos(qos, type_name, version)
+        reader = RawReader(self._participant, "rt" + topic, type_name, topic_qos, described=described)
+        self._node.add(reader)
+        return _CycloneSubscription(reader, topic, type_name, version, waiter)
+
+    @cached_property
+    def _writers(self) -> Callable[[], list[Any]]:
+        return writers_of(self._participant)
+
+    def offers(self) -> list[Offer]:
+        return [
+            Offer(w.topic_name[2:], ros.ros_type_name(w.type_name), w.qos[Policy.Reliability] != BEST_EFFORT)
+            for w in self._writers()
+            if w.topic_name.startswith("rt/")
+        ]
 
     def service_end(
         self,

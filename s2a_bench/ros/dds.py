@@ -13,7 +13,7 @@ import types
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from itertools import islice
 from threading import Lock
 from typing import Any
@@ -30,16 +30,18 @@ from cyclonedds.core import (
 )
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
+from cyclonedds.idl import types as idl
 from cyclonedds.internal import DDS, dds_c_t
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
 from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
+from rosbags.interfaces import Nodetype
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import QoS
-from s2a_bench.ros.messages import dds_type_name
+from s2a_bench.ros.messages import dds_type_name, typestore
 from s2a_bench.ros.service import AT_ONCE, WAIT_SLICE_NS
 
 FOREVER_NS = 2**63 - 1
@@ -94,8 +96,28 @@ class _Loan:
 
 @cache
 def _raw_type(type_name: str) -> type:
-    name = "Raw_" + type_name.replace("/", "_")
-    return dataclass(types.new_class(name, (IdlStruct,), {"typename": dds_type_name(type_name)}))
+    return _struct("Raw_" + type_name.replace("/", "_"), type_name, {})
+
+
+def _struct(name: str, type_name: str, fields: dict[str, Any]) -> type:
+    how = {"typename": dds_type_name(type_name)}
+    return dataclass(types.new_class(name, (IdlStruct,), how, lambda body: body.update(__annotations__=fields)))
+
+
+@cache
+def _described_type(type_name: str) -> type:
+    """Return the type with its fields, which peers match that describe theirs (XTypes); its CDR is left to rosbags."""
+    fields = typestore().fielddefs[type_name][1]
+    return _struct(type_name.rpartition("/")[2], type_name, {name: _field_type(*kind) for name, kind in fields})
+
+
+def _field_type(node: Nodetype, detail: Any) -> Any:
+    if node == Nodetype.BASE:
+        return {"string": str, "bool": bool}.get(detail[0]) or getattr(idl, detail[0])
+    if node == Nodetype.NAME:
+        return _described_type(detail)
+    inner = _field_type(*detail[0])
+    return idl.array[inner, detail[1]] if node == Nodetype.ARRAY else idl.sequence[inner]
 
 
 def dds_qos(qos: QoS, announced: str) -> Qos:
@@ -148,6 +170,12 @@ def _known(ask: Callable[[int], Any], handle: int) -> Any:
         raise
 
 
+def is_described(endpoint: Any, type_name: str) -> bool:
+    """Return whether a DcpsEndpoint describes the ROS type otherwise than our own endpoints, which have no fields."""
+    raw = _raw_type(type_name).__idl__.get_type_id()  # type: ignore[attr-defined]
+    return endpoint.type_name == dds_type_name(type_name) and endpoint.type_id not in (None, raw)
+
+
 class _Endpoint:
     def __init__(self, entity: Any, handles: Callable[[], list[int]], known: Callable[[int], Any]) -> None:
         self.entity = entity
@@ -191,10 +219,16 @@ class RawWriter(_Endpoint):
 class RawReader(_Endpoint):
     """A DataReader that lends the received CDR; one thread at a time takes."""
 
-    def __init__(self, participant: DomainParticipant, topic: str, type_name: str, qos: Qos) -> None:
-        """Create the reader on a DDS topic name, prefix included."""
-        self._type_name, self._topic, self._participant = type_name, topic, participant
-        entity = DataReader(participant, Topic(participant, topic, _raw_type(type_name)), qos=qos)
+    def __init__(
+        self, participant: DomainParticipant, topic: str, type_name: str, qos: Qos, *, described: bool = False
+    ) -> None:
+        """Create the reader on a DDS topic name, prefix included; ``described``: for writers that describe the type.
+
+        Such a reader matches ROS, and programs without ROS whose fields are the same, but none of our own writers.
+        """
+        self._type_name = type_name
+        data_type = _described_type(type_name) if described else _raw_type(type_name)
+        entity = DataReader(participant, Topic(participant, topic, data_type), qos=qos)
         super().__init__(entity, entity.get_matched_publications, entity.get_matched_publication_data)
         self._serdata = ct.c_void_p()
         self._info = dds_c_t.sample_info()
@@ -219,23 +253,17 @@ class RawReader(_Endpoint):
     def sender(self) -> int:
         return int(self._info.publication_handle)
 
-    def publishers(self) -> int:
-        """Count the topic's writers: where the QoS of one did not fit, by looking through those of the domain."""
-        if not self.entity.get_requested_incompatible_qos_status().total_count:
-            return self.matched()
-        return sum(writer.topic_name == self._topic for writer in self._writers())
 
-    @cached_property
-    def _writers(self) -> Callable[[], list[Any]]:
-        """Returns the writers of the domain; the reader is kept, as Cyclone gives back no memory of one."""
-        reader = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-        alive = ReadCondition(reader, ViewState.Any | SampleState.Any | InstanceState.Alive)
+def writers_of(participant: DomainParticipant) -> Callable[[], list[Any]]:
+    """Return what reads the writers of the domain; keep it, as Cyclone gives back no memory of a reader."""
+    reader = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
+    alive = ReadCondition(reader, ViewState.Any | SampleState.Any | InstanceState.Alive)
 
-        def read() -> list[Any]:
-            with _reading:
-                return list(reader.read(WRITERS_AT_MOST, alive))
+    def read() -> list[Any]:
+        with _reading:
+            return list(reader.read(WRITERS_AT_MOST, alive))
 
-        return read
+    return read
 
 
 class DdsWaiter:

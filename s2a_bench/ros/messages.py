@@ -222,6 +222,11 @@ def dds_type_name(type_name: str) -> str:
     return f"{package}::{kind}::dds_::{name}_"
 
 
+def ros_type_name(type_name: str) -> str:
+    """Turn ``pkg::msg::dds_::Name_`` into ``pkg/msg/Name``."""
+    return type_name.replace("::dds_::", "/").replace("::", "/").removesuffix("_")
+
+
 @cache
 def type_hash(type_name: str, version: str = DEFAULT_VERSION) -> str:
     """Return the type's REP-2016 hash, ``RIHS01_`` and 64 hex digits."""

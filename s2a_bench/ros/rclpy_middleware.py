@@ -18,10 +18,11 @@ from importlib.metadata import version as package_version
 from typing import Any
 
 import rclpy
+from rclpy.qos import ReliabilityPolicy
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import SERVICE_QOS, QoS, Tuning
+from s2a_bench.ros import SERVICE_QOS, Offer, QoS, Tuning
 from s2a_bench.ros.config import CYCLONE_URI, LARGE_PICTURES, RMW_CYCLONE
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise
 from s2a_bench.ros.rclpy_client import RclpyActionClient
@@ -118,10 +119,10 @@ class _RclpySubscription:
     def unpack(self, packed: bytes) -> Any:
         return deserialise(memoryview(packed), self._type_name)
 
-    def publishers(self) -> int:
+    def matched(self) -> int:
         return 0 if self._node.closed else int(self._node.node.count_publishers(self.topic))
 
-    matched = sender = publishers
+    sender = matched
     """Humble's subscriptions do not know which of them reach it; Jazzy's do not know whose a message is."""
 
     def sender_hears(self, sender: int, publisher: _RclpyPublisher) -> bool:
@@ -163,6 +164,14 @@ class RclpyMiddleware:
         subscription = _RclpySubscription(self._open(), topic, type_name, qos)
         self._close.append(subscription.close)
         return subscription
+
+    def offers(self) -> list[Offer]:
+        node = self._open().node
+        return [
+            Offer(topic, info.topic_type, info.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT)
+            for topic, _ in node.get_topic_names_and_types()
+            for info in node.get_publishers_info_by_topic(topic)
+        ]
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
         offer(self._open(), name, type_name, answer, qos)

@@ -47,4 +47,4 @@ class Remapped:
         self.publisher, self.subscription = renamed(middleware.publisher), renamed(middleware.subscription)
         self.service, self.service_client = renamed(middleware.service), renamed(middleware.service_client)
         self.action_client, self.action_server = renamed(middleware.action_client), renamed(middleware.action_server)
-        self.describe, self.close = middleware.describe, middleware.close
+        self.offers, self.describe, self.close = middleware.offers, middleware.describe, middleware.close

@@ -19,7 +19,7 @@ from zenoh import ext
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, QoS, Tuning
+from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, Offer, QoS, Tuning
 from s2a_bench.ros import zenoh_names as names
 from s2a_bench.ros.action import ActionNode
 from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, serialise
@@ -139,10 +139,6 @@ class ZenohSubscription:
     def announced(self) -> int:
         """Count the publishers of the type, those of other versions too, which do not reach us."""
         return sum(1 for _ in self._node.peers(names.PUBLISHER, self._seen.entity))
-
-    def publishers(self) -> int:
-        """Count the publishers that are announced under the topic's name, those of other types too."""
-        return self._node.named(names.PUBLISHER, self._seen.entity)
 
     def matched(self) -> int:
         return self._node.matching(names.PUBLISHER, self._seen.entity)
@@ -315,6 +311,9 @@ class ZenohMiddleware(ActionNode[QueryOrigin, Bell]):
         self, topic: str, type_name: str, qos: QoS, version: str = DEFAULT_VERSION, waiter: Bell | None = None
     ) -> ZenohSubscription:
         return ZenohSubscription(self._node, topic, type_name, qos, version, waiter or self.waiter())
+
+    def offers(self) -> list[Offer]:
+        return self._node.offers()
 
     def service_end(
         self, name: str, type_name: str, version: str, waiter: Bell, qos: QoS | None = None, *, pictures: bool = False

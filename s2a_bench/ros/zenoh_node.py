@@ -22,9 +22,9 @@ import zenoh
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import QoS, Tuning
+from s2a_bench.ros import Offer, QoS, Tuning
 from s2a_bench.ros import zenoh_names as names
-from s2a_bench.ros.messages import dds_type_name
+from s2a_bench.ros.messages import dds_type_name, ros_type_name
 from s2a_bench.ros.remap import check_node_name
 from s2a_bench.ros.router import endpoint_of
 from s2a_bench.ros.service import AT_ONCE, WAIT_SLICE_NS, LogOnce
@@ -150,9 +150,14 @@ class Node:
         matching = (token for token, each in known if each.type_hash == entity.type_hash)
         return {names.session_of(token) for token in matching if not gid or names.gid_of(token) == gid}
 
-    def named(self, kind: str, entity: names.Entity) -> int:
+    def offers(self) -> list[Offer]:
+        def offer(token: str, each: names.Entity) -> Offer:
+            reliable = not token.rpartition("/")[2].startswith(names.BEST_EFFORT)
+            return Offer(each.name.replace("%", "/"), ros_type_name(each.type_name), reliable)
+
         with self._lock:
-            return len(self._known.get((kind, entity.name), {}))
+            known = [of_name for (kind, _), of_name in self._known.items() if kind == names.PUBLISHER]
+            return [offer(*item) for of_name in known for item in of_name.items()]
 
     def matching(self, kind: str, entity: names.Entity) -> int:
         """Count the endpoints of a kind to which ``entity`` speaks, or which speak to it."""

@@ -50,12 +50,14 @@ class FrameSourceSuite:
     def test_frames_count_from_zero(self, source: FrameSource) -> None:
         assert [source.read().index for _ in range(5)] == [0, 1, 2, 3, 4]
 
-    def test_stamps_are_readings_of_the_monotonic_clock_in_order(self, source: FrameSource) -> None:
+    def test_stamps_are_readings_of_the_monotonic_clock_in_order(self, make_source: MakeSource) -> None:
         before = now_ns()
+        source = make_source(*SIZES[0])
         stamps = [source.read().stamp_ns for _ in range(5)]
         assert before <= stamps[0]
         assert stamps == sorted(stamps)
         assert stamps[-1] <= now_ns()
+        source.close()
 
     def test_a_frame_stays_as_it_was_while_more_are_read(self, source: FrameSource) -> None:
         frames = [source.read() for _ in range(3)]

@@ -6,7 +6,6 @@ manifest records them; three are flags of `serve`. `Bounds` are those of one ans
 
 from __future__ import annotations
 
-import re
 from typing import Any, ClassVar, Final
 
 from s2a_bench.clock import now_ns
@@ -117,48 +116,6 @@ def check_pixels(width: int, height: int, limits: Limits) -> None:
         raise RequestFailed(f"a picture of {width}x{height} is empty")
     if width * height > limits.pixels:
         raise RequestFailed(f"a picture of {width}x{height}; at most {limits.pixels} pixels are taken")
-
-
-def check_encoded(data: memoryview, limits: Limits) -> None:
-    """Raise RequestFailed for a file that is neither JPEG nor PNG, or whose header gives too many pixels."""
-    size = _png_size(data) or _jpeg_size(data)
-    if size is None:
-        raise RequestFailed(f"{len(data)} bytes that are neither a JPEG nor a PNG")
-    check_pixels(*size, limits)
-
-
-def _png_size(data: memoryview) -> tuple[int, int] | None:
-    """Read IHDR, which comes first (PNG, third edition, 5.6)."""
-    head = bytes(data[:24])
-    if not (head.startswith(b"\x89PNG\r\n\x1a\n") and head[12:16] == b"IHDR"):
-        return None
-    return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:], "big")
-
-
-_MARKER = re.compile(rb"[^\xff]*\xff+([^\xff])", re.DOTALL)
-_SEGMENTS = 10_000
-"""More than any picture has before its frame header."""
-_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""Markers of a JPEG's frame header (ITU T.81, table B.1)."""
-_ALONE = frozenset({0x00, 0x01, *range(0xD0, 0xD8)})
-"""Markers without a length."""
-
-
-def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
-    """Read the first frame header (ITU T.81, B.2.2), skipping what libjpeg skips before a marker."""
-    if bytes(data[:2]) != b"\xff\xd8":
-        return None
-    at = 2
-    for _ in range(_SEGMENTS):
-        match = _MARKER.match(data, at)
-        if match is None or match.end() + 7 > len(data):
-            return None
-        marker, at = match[1][0], match.end()
-        if marker in _FRAME:
-            return int.from_bytes(data[at + 5 : at + 7], "big"), int.from_bytes(data[at + 3 : at + 5], "big")
-        if marker not in _ALONE:
-            at += max(2, int.from_bytes(data[at : at + 2], "big"))
-    return None
 
 
 PIECES_A_TOKEN, PIECES = 8, 64

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from s2a_bench.errors import RequestFailed, UsageError
-from s2a_bench.frames.convert import decode_image, encode_jpeg, encode_png, to_bgr, to_rgb
+from s2a_bench.frames.convert import check_encoded, decode_image, encode_jpeg, encode_png, to_bgr, to_rgb
 from s2a_bench.trace import Trace
-from s2a_bench.transport.limits import LIMITS, Limits, check_encoded, check_pixels
+from s2a_bench.transport.limits import LIMITS, Limits, check_pixels
 from s2a_bench.types import Frame, Pixels
 
 JPEG_QUALITY = 90
@@ -85,7 +85,7 @@ def decoded(media_type: str, data: bytes | memoryview, trace: Trace, limits: Lim
             if parameters["encoding"] != "bgr8":
                 raise ValueError(f"raw encoding '{parameters['encoding']}' is not bgr8")
             return rgb_of(Frame(-1, 0, width, height, "bgr8", pixels), trace)
-        check_encoded(memoryview(data), limits)
+        check_encoded(memoryview(data), limits.pixels)
         rgb = decode_image(data)
     except (ValueError, KeyError) as error:
         raise RequestFailed(f"the {len(data)} bytes sent as {media_type} are no such picture: {error}") from error

@@ -13,7 +13,7 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import Middleware, Publisher, QoS, Subscription
+from s2a_bench.ros import Middleware, Offer, Publisher, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.types import Frame
 
@@ -53,11 +53,6 @@ def text(value: str) -> Any:
 def wait_matched(publisher: Publisher, subscription: Subscription) -> None:
     """Wait until each knows the other."""
     until(lambda: publisher.matched() and subscription.matched(), lambda: subscription.take(0.01))
-
-
-def wait_publishers(subscription: Subscription, count: int) -> None:
-    """Wait until a subscription's topic has so many publishers."""
-    until(lambda: subscription.publishers() == count, lambda: subscription.take(0.01))
 
 
 def check_interrupt(end: Any, wait: Callable[[float], object]) -> None:
@@ -129,23 +124,31 @@ class MiddlewareSuite:
         assert subscription.unpack(subscription.take(5)).data == "x"
         assert other.take(0.05) is None
 
-    def test_the_publishers_of_a_topic_are_counted_whatever_their_qos(self, join: Join) -> None:
-        subscription = join().subscription("/test/count", STRING, QoS())
-        assert (subscription.topic, subscription.publishers()) == ("/test/count", 0)
-        first, second = join(), join()
-        kept = [first.publisher("/test/other", STRING, QoS()), first.publisher("/test/count", STRING, QoS())]
-        wait_publishers(subscription, 1)
-        kept.append(second.publisher("/test/count", STRING, QoS(reliable=False)))
-        wait_publishers(subscription, 2)
-        first.close()
-        wait_publishers(subscription, 1)
-        second.close()
-        wait_publishers(subscription, 0)
+    def test_publishers_are_told_with_type_and_reliability_until_they_leave(self, join: Join) -> None:
+        first, second, asking = join(), join(), join()
+        subscription = asking.subscription("/test/offer/two", ros.IMAGE, QoS(1))
+        kept = [
+            first.publisher("/test/offer/one", STRING, QoS()),
+            first.publisher("/test/offer/two", ros.IMAGE, QoS(1, reliable=False)),
+            second.publisher("/test/offer/two", ros.COMPRESSED_IMAGE, QoS(1)),
+        ]
+        offers = [
+            Offer("/test/offer/one", STRING, reliable=True),
+            Offer("/test/offer/two", ros.COMPRESSED_IMAGE, reliable=True),
+            Offer("/test/offer/two", ros.IMAGE, reliable=False),
+        ]
 
-    def test_a_publisher_of_another_type_counts_as_one_of_the_topic(self, join: Join) -> None:
-        subscription = join().subscription("/test/other_type", STRING, QoS())
-        _kept = join().publisher("/test/other_type", "std_msgs/msg/Header", QoS())
-        wait_publishers(subscription, 1)
+        def found() -> list[Offer]:
+            here = [offer for offer in asking.offers() if offer.topic.startswith("/test/offer/")]
+            return sorted(here, key=lambda offer: (offer.topic, offer.type_name))
+
+        assert subscription.topic == "/test/offer/two"
+        until(lambda: found() == offers)
+        second.close()
+        until(lambda: found() == [offers[0], offers[2]])
+        first.close()
+        until(lambda: not found())
+        assert len(kept) == 3
 
     def test_a_sender_hears_a_publisher_once_it_subscribes(self, join: Join) -> None:
         server, client = join(), join()

@@ -234,7 +234,7 @@ class Node:
     def create_guard_condition(self, _callback: Any, callback_group: CallbackGroup) -> Guard:
         return Guard(callback_group)
 
-    def create_publisher(self, _cls: Any, topic: str, _qos: Any) -> Any:
+    def create_publisher(self, cls: Any, topic: str, qos: Any) -> Any:
         def receivers() -> list[Subscribed]:
             return [subscribed for node in self.peers() for subscribed in node.subscribed[topic]]
 
@@ -245,7 +245,7 @@ class Node:
                     receiver.messages.append(message)
                 CAME.notify_all()
 
-        self.topics[topic].append(publish)
+        self.topics[topic].append(SimpleNamespace(topic_type=cls.__msgtype__, qos_profile=qos))
         return SimpleNamespace(publish=publish, get_subscription_count=lambda: len(receivers()), topic_name=topic)
 
     def create_subscription(
@@ -259,6 +259,15 @@ class Node:
 
     def count_publishers(self, topic: str) -> int:
         return sum(len(node.topics[topic]) for node in self.peers())
+
+    def get_topic_names_and_types(self) -> list[tuple[str, list[str]]]:
+        every = {
+            topic: {each.topic_type for each in ends} for node in self.peers() for topic, ends in node.topics.items()
+        }
+        return [(topic, sorted(types)) for topic, types in every.items()]
+
+    def get_publishers_info_by_topic(self, topic: str) -> list[Any]:
+        return [end for node in self.peers() for end in node.topics[topic]]
 
     def create_service(self, kind: Any, name: str, callback: Any, *, qos_profile: Any) -> None:
         assert qos_profile

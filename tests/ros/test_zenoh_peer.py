@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from s2a_bench.frames import open_source
 from s2a_bench.ros import Middleware, QoS, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.router import Router, endpoint_of, free_endpoint
@@ -86,6 +87,16 @@ def test_we_hear_its_topics(ours: Middleware, peer: Peer) -> None:
     packed = heard.take(WAIT_S)
     assert heard.unpack(packed).data.startswith("say ")
     until(heard.matched)
+
+
+def test_its_camera_is_a_source(ours: Middleware, peer: Peer) -> None:
+    peer("films", "/front/image")
+    where = f"/front/image?middleware=zenoh&domain_id=0&router={ours.describe()['router']}"
+    with closing(open_source(f"ros:{where}", 16, 12)) as source:
+        frames = [source.read() for _ in range(3)]
+    numbers = [int(frame.data[0, 0, 0]) for frame in frames]
+    assert all(np.all(frame.data == number) for frame, number in zip(frames, numbers, strict=True))
+    assert len({*numbers}) == 3
 
 
 def test_texts_of_every_length_arrive(ours: Middleware, peer: Peer) -> None:

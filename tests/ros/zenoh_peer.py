@@ -24,6 +24,7 @@ DEFINITIONS = {
     "rcl_interfaces/srv/GetParameterTypes": "string[] names\n---\nuint8[] types\n",
 }
 GET_TYPES = "rcl_interfaces/srv/GetParameterTypes"
+SAID = {"says": "std_msgs/msg/String", "films": "sensor_msgs/msg/Image"}
 
 
 def write_definitions(folder: Path) -> None:
@@ -39,13 +40,24 @@ def tell(**what: Any) -> None:
     print(json.dumps(what), flush=True)  # noqa: T201 - how it talks to the test
 
 
+def said(role: str, number: int, type_of: Any) -> dict[str, Any]:
+    """Return the fields of what is published: a text, or a picture of 16x12 that is its number all over."""
+    if role == "says":
+        return {"data": f"say {number}"}
+    stamp = type_of("builtin_interfaces/msg/Time")(sec=1, nanosec=2)
+    header = type_of("std_msgs/msg/Header")(stamp=stamp, frame_id="camera")
+    shape = {"height": 12, "width": 16, "encoding": "rgb8", "is_bigendian": 0, "step": 48}
+    return {"header": header, "data": np.full(16 * 12 * 3, number % 256, np.uint8), **shape}
+
+
 def main(port: int, folder: str, role: str, name: str) -> None:
     from zenoh_ros2_sdk import ROS2Publisher, ROS2ServiceClient, ROS2ServiceServer, ROS2Subscriber
     from zenoh_ros2_sdk.message_registry import get_registry
     from zenoh_ros2_sdk.session import ZenohSession
 
     session = ZenohSession.get_instance("127.0.0.1", port)
-    get_registry(folder).load_service_type(GET_TYPES)
+    known = get_registry(folder)
+    known.load_service_type(GET_TYPES)
     ended = threading.Event()
     where = {"domain_id": 0, "router_port": port, "node_name": "peer"}
 
@@ -56,12 +68,12 @@ def main(port: int, folder: str, role: str, name: str) -> None:
     def types(request: Any) -> Any:
         return server.response_msg_class(types=np.array([len(each) for each in request.names], np.uint8))
 
-    if role == "sees":
-        ends: Any = ROS2Subscriber(name, "sensor_msgs/msg/Image", image, **where)
+    if role in SAID:
+        ends: Any = ROS2Publisher(name, SAID[role], **where)
+    elif role == "sees":
+        ends = ROS2Subscriber(name, "sensor_msgs/msg/Image", image, **where)
     elif role == "hears":
         ends = ROS2Subscriber(name, "std_msgs/msg/String", lambda message: tell(data=message.data), **where)
-    elif role == "says":
-        ends = ROS2Publisher(name, "std_msgs/msg/String", **where)
     elif role == "asks":
         ends = ROS2ServiceClient(name, GET_TYPES, **where)
     else:
@@ -73,9 +85,9 @@ def main(port: int, folder: str, role: str, name: str) -> None:
         tell(types=answer and [int(each) for each in answer.types])
     number = 0
     while not ended.wait(0.05):
-        if role == "says":
-            ends.publish(data=f"say {number}")
-            number += 1
+        if role in SAID:
+            ends.publish(**said(role, number, known.get_message_class))
+        number += 1
     ends.close()
     session.close()
 

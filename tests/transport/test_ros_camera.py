@@ -61,7 +61,7 @@ class Robot:
     def camera(self, qos: str = "reliable", middleware: Middleware | None = None) -> Publisher:
         """A publisher on the camera's topic that the server knows."""
         publisher = (middleware or self.peer).publisher("/robot" + CAMERA, ros.IMAGE, CAMERA_QOS[qos])
-        until(lambda: self.server._cache._cameras[0].publishers() == 1)
+        until(lambda: self.server._cache._publishers().get("/robot" + CAMERA, 0) == 1)
         return publisher
 
     def diagnosed(self, diagnostics: Subscription, wanted: str) -> Any:
@@ -119,7 +119,7 @@ def test_a_request_on_the_topic_fails_too_and_is_answered_again_once_the_publish
     kept = robot.camera(middleware=other)
     assert BLIND in refusal(client)
     other.close()
-    until(lambda: robot.server._cache._cameras[0].publishers() == 0)
+    until(lambda: robot.server._cache._publishers().get("/robot" + CAMERA, 0) == 0)
     assert ask(client, Request("b", "plan"))[0]
     assert [request.images for request in robot.handler.requests] == [()]
     del kept
@@ -235,5 +235,5 @@ def test_an_old_frame_is_told_of_with_buffers_while_there_is_a_publisher(
         assert re.search(rf"more than `max_frame_age` 0\.3 s: 1 publisher on {TOPIC}, no frame comes: look at", why)
     assert len(logged(caplog, "newest frame came")) == 1
     other.close()
-    until(lambda: robot.server._cache._cameras[0].publishers() == 0)
+    until(lambda: robot.server._cache._publishers().get("/robot" + CAMERA, 0) == 0)
     assert refusal(client).endswith("s: see whether the camera still publishes")

@@ -8,29 +8,30 @@ from __future__ import annotations
 
 import logging
 import os
+from collections import Counter
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from threading import Lock, Thread
-from typing import Any, cast
+from typing import Any
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
 from s2a_bench.errors import RequestFailed, TransportError
 from s2a_bench.facts import CAMERA_AGE_MS, CAMERA_FRAMES, CAMERA_SIM_AGE_MS, CAMERA_STAMP_AGE_MS, STALE_FRAMES
+from s2a_bench.frames.messages import decompressed
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.service import LogOnce, appeared
 from s2a_bench.trace import RESIDUAL, Mark, Trace
 from s2a_bench.transport.limits import LIMITS, Limits, check_pixels
-from s2a_bench.transport.pictures import bgr_of, decoded, encoded, rgb_of
+from s2a_bench.transport.pictures import bgr_of, encoded, rgb_of
 from s2a_bench.transport.ros.options import RosOptions
-from s2a_bench.types import Encoding, Frame
+from s2a_bench.types import Frame
 
 CAMERA = "/camera/image_raw"
 COMPRESSED_CAMERA = "/camera/image_raw/compressed"
 FRAME_ID = "camera"
 PIXELS = frozenset({"raw", "yuyv"})
 """Payloads that are sensor_msgs/Image; the others are CompressedImage."""
-COLOURS = frozenset({"bgr8", "rgb8", "bgra8", "rgba8"})
 CAMERA_QOS = {"reliable": QoS(depth=1), "sensor_data": QoS(depth=5, reliable=False)}
 """By the names of ROS 2's profiles; a reliable subscription does not match a best-effort publisher."""
 CLOCK, CLOCK_QOS = "/clock", QoS(depth=1, reliable=False)
@@ -55,26 +56,11 @@ def picture_message(frame: Frame, payload: str, offset_ns: int, trace: Trace) ->
 def picture_of(message: Any, trace: Trace, limits: Limits = LIMITS) -> Frame:
     """Turn a received image message into an RGB frame; its stamp is ROS time. Raises TransportError."""
     if hasattr(message, "format"):
-        return replace(_decompressed(message, trace, limits), stamp_ns=ros.nanoseconds(message.header.stamp))
+        frame = decompressed(message, limits.pixels)
+        trace.mark("image_decode")
+        return rgb_of(frame, trace)
     check_pixels(message.width, message.height, limits)
     return rgb_of(ros.frame_of_image(message), trace)
-
-
-def _decompressed(message: Any, trace: Trace, limits: Limits) -> Frame:
-    """Decode a CompressedImage; ``format`` is plain, as "jpeg", or says what was compressed as what.
-
-    image_transport writes "rgb8; jpeg compressed bgr8". Where bgr8 does not stand at the end, the picture was
-    compressed as it was: a mosaic as grey, or with red and blue in each other's place.
-    """
-    encoding, _, coding = message.format[: ros.SHOWN].partition(";")
-    ros.refuse_depth("16UC1" if "compressedDepth" in coding else encoding)
-    frame = decoded(f"image/{message.format[: ros.SHOWN]}", message.data, trace, limits)
-    if "compressed" in coding and "compressed bgr8" not in coding:
-        if encoding in COLOURS:
-            return rgb_of(replace(frame, encoding="bgr8"), trace)
-        if encoding.startswith("bayer_"):
-            return rgb_of(replace(frame, encoding=cast("Encoding", encoding), data=frame.data[..., 0].copy()), trace)
-    return frame
 
 
 class CameraPublisher:
@@ -117,7 +103,7 @@ class CameraCache:
 
     def __init__(self, middleware: Middleware, namespace: str, options: RosOptions, limits: Limits = LIMITS) -> None:
         self.limits = limits
-        self._options = options
+        self._middleware, self._options = middleware, options
         topics = ((CAMERA, ros.IMAGE), (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE))
         self._cameras = [
             middleware.subscription(namespace + topic, kind, CAMERA_QOS[options.qos]) for topic, kind in topics
@@ -221,7 +207,8 @@ class CameraCache:
         return f"{present}, no frame comes: look at the buffers ({buffers}) and at what is published{other}"
 
     def _publishers(self) -> dict[str, int]:
-        return {camera.topic: count for camera in self._cameras if (count := camera.publishers())}
+        counts = Counter(offer.topic for offer in self._middleware.offers())
+        return {camera.topic: counts[camera.topic] for camera in self._cameras if counts[camera.topic]}
 
     def seen(self) -> tuple[int, int | None]:
         """Return how many frames have come, and when the newest usable one did (CLOCK_MONOTONIC)."""
