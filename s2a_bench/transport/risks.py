@@ -55,7 +55,8 @@ def examine(url: str) -> list[Finding]:
     findings = [each for each in results if not isinstance(each, str)]
     if words:
         dangerous = not local or any(UNPICKLES in each for each in words)
-        cure = f"let it listen on 127.0.0.1 alone, and reach it by ssh -L {port}:127.0.0.1:{port} {host}"
+        reach = "" if local else f", and reach it by ssh -L {port}:127.0.0.1:{port} {host}"
+        cure = f"let it listen on 127.0.0.1 alone{reach}"
         findings.insert(0, Finding("access", "warning" if dangerous else "advice", f"{host}: {', '.join(words)}", cure))
     return findings
 
