@@ -156,7 +156,9 @@ def load_headers(config: EngineConfig) -> ModelFiles:
     if model.is_mmproj:
         raise ModelError(f"`model` {model_path}: this is an mmproj (vision tower); give it as `mmproj`")
     if not (template := chat_template(config) or str(model.fields.get("tokenizer.chat_template", ""))):
-        raise ModelError(f"`model` {model_path}: has no chat template; give `chat_template` FILE, or none: no template")
+        raise ModelError(
+            f"`model` {model_path}: has no chat template; give `chat_template`: a FILE, or none for the raw prompt"
+        )
     mmproj_path = mmproj_path or _mmproj_beside(model_path)
     if mmproj_path is None:
         return ModelFiles(model, None, template)
@@ -175,7 +177,10 @@ def chat_template(config: EngineConfig) -> str:
     """Return the chosen chat template, a Jinja text; empty: the model's own; raises ModelError."""
     chosen = config.chat_template
     try:
-        return RAW_PROMPT if chosen == NO_TEMPLATE else read_text(Path(chosen), TEMPLATE_BYTES) if chosen else ""
+        template = RAW_PROMPT if chosen == NO_TEMPLATE else read_text(Path(chosen), TEMPLATE_BYTES) if chosen else ""
+        if chosen and not template:
+            raise ValueError("it is empty")
+        return template  # noqa: TRY300
     except (OSError, ValueError) as error:
         raise ModelError(f"`chat_template` {chosen}: cannot be read ({error})") from error
 
