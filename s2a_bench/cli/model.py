@@ -34,14 +34,14 @@ def list_(json_: Json = False) -> None:
         return
     rows: list[tuple[str, ...]] = []
     for model in models:
+        name = model.name.rpartition("/")[2] if model.name.startswith("/") else model.name
         parameters = f"{model.parameters / 1e6:,.0f}" if model.parameters else ""
         sizes = " + ".join(f"{size / 1e6:,.1f}" for size in model.bytes.values())
-        rows.append((Path(model.name).name, model.state, parameters, sizes, str(model.picture_tokens or "")))
+        rows.append((name, model.state, parameters, sizes, str(model.picture_tokens or "")))
     header = "name", "state", "parameters (M)", "files (MB)", "tokens of a 640x480 picture"
     print_table(TextTable("Models", header, rows, 2))
-    for model in models:
-        if model.error:
-            print_line(f"{Path(model.name).name}: {model.error}")
+    for model in filter(lambda each: each.error, models):
+        print_line(f"{model.name}: {model.error}")
 
 
 def _fetch(config: FetchConfig, *, json_: Json = False) -> None:

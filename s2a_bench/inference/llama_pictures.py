@@ -17,7 +17,6 @@ llama_cpp = extras.require("llama_cpp", "llama")
 chat_format = extras.require("llama_cpp.llama_chat_format", "llama")
 mtmd_cpp = extras.require("llama_cpp.mtmd_cpp", "llama")
 
-_MROPE = llama_cpp.LLAMA_ROPE_TYPE_MROPE, llama_cpp.LLAMA_ROPE_TYPE_IMROPE
 _NO_CALLBACK = mtmd_cpp.mtmd_helper_post_decode_callback()
 
 
@@ -115,9 +114,6 @@ class PixelHandler(chat_format.MTMDChatHandler):  # type: ignore[misc, name-defi
         if self.mtmd_ctx is None:
             raise ValueError(llama_log.reason() or "MTMD cannot load it")
         llama_model._stack.callback(self._free)  # noqa: SLF001 as the library does
-        rope = llama_cpp.llama_model_rope_type(llama_model.model)
-        if (rope in _MROPE) != mtmd.mtmd_decode_use_mrope(self.mtmd_ctx):
-            raise ValueError("it belongs to another family: of the two one counts positions by M-RoPE")
 
     def _free(self) -> None:
         self._mtmd_cpp.mtmd_free(self.mtmd_ctx)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from benchmarks.models import PROMPT, TOKENS, Engine, picture, server
 from s2a_bench.errors import BadRequest, ModelError
-from s2a_bench.inference import EngineConfig, Like
+from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.dummy import write_dummy, write_mmproj
 from s2a_bench.inference.dummy.families import FAMILIES
 from s2a_bench.inference.llama_cpp import LlamaCppEngine, llama_cpp
@@ -110,14 +110,6 @@ def test_a_vision_tower_of_another_width_is_a_line(family: EngineConfig, tmp_pat
         write_mmproj(other, 512, "tiny", like=like)
         with pytest.raises(ModelError, match=rf"^`mmproj` {other}: llama\.cpp: .*mismatch.*256.*512\)$"):
             LlamaCppEngine(family.but(mmproj=other))
-
-
-@pytest.mark.parametrize(("model", "tower"), [("qwen2.5-vl-3b", "minicpm-v-2.6"), ("minicpm-v-2.6", "qwen2.5-vl-3b")])
-def test_a_vision_tower_of_another_kind_of_positions_is_a_line(tmp_path: Path, model: Like, tower: Like) -> None:
-    other = write_dummy(tmp_path, like=tower).mmproj
-    config = EngineConfig(model=write_dummy(tmp_path, like=model).model, mmproj=other)
-    with pytest.raises(ModelError, match=rf"^`mmproj` {other}: llama\.cpp: it belongs to another family: .*M-RoPE$"):
-        LlamaCppEngine(config)
 
 
 def test_a_real_language_model_answers_about_pictures_with_a_dummy_of_its_tower(gemma: Path, tmp_path: Path) -> None:
