@@ -87,6 +87,9 @@ class LlamaServer:
         self._address = address
         self._client = open_client(wiring_of("http", timeout_s=600, url=address, dialect="llama-server", payload="png"))
 
+    def close(self) -> None:
+        self._client.close()
+
     def _answer(self, path: str, body: Mapping[str, Any]) -> Any:
         answer = self._post(f"{self._address}/{path}", json=body)
         answer.raise_for_status()
@@ -129,7 +132,8 @@ def server(config: EngineConfig, log: Path) -> Iterator[LlamaServer]:
     """Start the wheel's server on a model; a dummy's answers end at the limit, as in the engine."""
     with start_program(Program("llama-server-wheel", Path(), 0), config, log, has_grammar=False) as process:
         process.wait_ready()
-        yield LlamaServer(process.address)
+        with closing(LlamaServer(process.address)) as found:
+            yield found
 
 
 def models(arguments: Sequence[str], folder: Path) -> Iterator[tuple[str, EngineConfig]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -17,11 +16,6 @@ from s2a_bench.inference import DummyConfig, EngineConfig, FetchConfig
 from s2a_bench.inference.gguf_file import read_header
 from s2a_bench.store.manifest import present
 from s2a_bench.writers.tables import TextTable
-
-if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
-
-    from s2a_bench.inference.fetch import Fetched
 
 SCHEMA = "s2a-bench-model/1"
 
@@ -40,52 +34,39 @@ def list_(json_: Json = False) -> None:
         return
     rows: list[tuple[str, ...]] = []
     for model in models:
+        name = model.name.rpartition("/")[2] if model.name.startswith("/") else model.name
         parameters = f"{model.parameters / 1e6:,.0f}" if model.parameters else ""
         sizes = " + ".join(f"{size / 1e6:,.1f}" for size in model.bytes.values())
-        rows.append((Path(model.name).name, model.state, parameters, sizes, str(model.picture_tokens or "")))
+        rows.append((name, model.state, parameters, sizes, str(model.picture_tokens or "")))
     header = "name", "state", "parameters (M)", "files (MB)", "tokens of a 640x480 picture"
     print_table(TextTable("Models", header, rows, 2))
-    for model in models:
-        if model.error:
-            print_line(f"{Path(model.name).name}: {model.error}")
+    for model in filter(lambda each: each.error, models):
+        print_line(f"{model.name}: {model.error}")
 
 
 def _fetch(config: FetchConfig, *, json_: Json = False) -> None:
-    from s2a_bench.inference import fetch
+    from s2a_bench.inference.fetch import fetch
 
     extras.need("model", "huggingface_hub", "gguf")
-    wanted = fetch.wanted(config.what, config.quant, config.mmproj)
-    with _bytes_bar() as bar:
-        tasks: dict[str, TaskID] = {}
-
-        def show(name: str, done: int, total: int) -> None:
-            if name not in tasks:
-                tasks[name] = bar.add_task(name)
-            bar.update(tasks[name], completed=done, total=total)
-
-        fetched = fetch.fetch(wanted, show)
-    for file in fetched.files:
-        read_header(file.path, "model fetch")
-    latency = _latency_command(fetched)
+    fetched = fetch(config)
+    paths = [file.path for file in fetched.files]
+    for path in paths:
+        read_header(path, "model fetch")
+    latency = _latency_command(*paths)
     if json_:
-        names = "endpoint", "repository", "commit"
-        whole: dict[str, Any] = {"schema": SCHEMA, "command": "model fetch"}
-        whole |= {name: getattr(fetched, name) for name in names} | {"files": [*map(present, fetched.files)]}
+        whole = {"schema": SCHEMA, "command": "model fetch"} | present(fetched)
         print_json(whole | ({"latency": latency} if latency else {}))
         return
-    for file in fetched.files:
-        typer.echo(file.path)
-    if latency:
-        typer.echo(latency)
+    for line in (*paths, *filter(None, [latency])):
+        typer.echo(line)
 
 
-def _latency_command(fetched: Fetched) -> str | None:
+def _latency_command(model: Path, mmproj: Path | None = None) -> str | None:
     """Return the command that measures with these files; None if they are no model."""
     from s2a_bench.inference.models import load_headers
 
-    model, *mmproj = (file.path for file in fetched.files)
     try:
-        files = load_headers(EngineConfig(model=model, mmproj=mmproj[0] if mmproj else None))
+        files = load_headers(EngineConfig(model=model, mmproj=mmproj))
     except ModelError as error:
         typer.echo(f"note: {with_flags(str(error))}", err=True)
         return None
@@ -95,22 +76,17 @@ def _latency_command(fetched: Fetched) -> str | None:
     return shlex.join(["s2a-bench", "latency", "--model", str(files.model.path), *tower])
 
 
-def _bytes_bar(*, disable: bool = False) -> Progress:
-    from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
-
-    columns = TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn()
-    return Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), disable=disable)
-
-
 def _dummy(config: DummyConfig) -> None:
+    from rich.console import Console
+    from rich.progress import Progress
+
     from s2a_bench.inference.dummy import dummy_files, write_dummy
     from s2a_bench.inference.models import dummy_folder
 
     folder = config.output or dummy_folder(config.size, config.like)
     files = dummy_files(folder, config.size, config.kind, like=config.like)
     if config.force or not (files.model.is_file() and files.mmproj.is_file()):
-        with _bytes_bar(disable=config.size == "tiny") as bar:
+        with Progress(console=Console(stderr=True), disable=config.size == "tiny") as bar:
             task = bar.add_task("write", total=None)
 
             def show(done: int, total: int) -> None:
@@ -122,7 +98,7 @@ def _dummy(config: DummyConfig) -> None:
 
 
 for _name, _function, _config, _about in (
-    ("fetch", _fetch, FetchConfig, "Fetch a model from the hub: resumable, checked against the hub's SHA-256."),
+    ("fetch", _fetch, FetchConfig, "Fetch a model from the hub, and check it against the hub's SHA-256."),
     ("dummy", _dummy, DummyConfig, "Write random weights in the shapes of a model, to measure speed."),
 ):
     app.command(_name)(command(_function, _config, about=_about))

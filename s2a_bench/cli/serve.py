@@ -15,7 +15,7 @@ from pydantic import create_model
 from s2a_bench.cli.adapter import command, flags_of
 from s2a_bench.cli.ros_args import read as read_ros_args
 from s2a_bench.errors import UsageError
-from s2a_bench.inference import ANSWERS, EngineConfig, acting, check_engine, declared_engine
+from s2a_bench.inference import ANSWERS, OF_MODEL, EngineConfig, acting, check_engine, declared_engine
 from s2a_bench.options import Options, group, option, placed, places
 from s2a_bench.provenance import Provenance
 from s2a_bench.text import none_of, read_text
@@ -27,19 +27,7 @@ from s2a_bench.transport.pipeline import Pipeline, answer_over, one_pipeline
 if TYPE_CHECKING:
     from s2a_bench.harness.processes import ServerProcess
 
-ENGINE = (
-    "name",
-    "model",
-    "mmproj",
-    "chat_template",
-    "threads",
-    "gpu_layers",
-    "context",
-    "profile",
-    "gaps",
-    "latency",
-    *ANSWERS,
-)
+ENGINE = ("name", *OF_MODEL, "threads", "context", "profile", "gaps", "latency", *ANSWERS)
 """The engine's options of a server; ``gaps`` has no flag, only a key of the file."""
 Sorted: TypeAlias = "tuple[dict[str, Any], dict[str, Any], dict[str, Any]]"
 _NUMBER = EngineConfig.model_fields["threads"]

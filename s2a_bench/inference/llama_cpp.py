@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import codecs
 import ctypes
+import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -262,7 +263,7 @@ class LlamaCppEngine(Engine):
             "model": str(model.path),
             "model_sha256": sha256(model.path),
             **(_tower(mmproj) if mmproj else {"pictures": "not seen"}),
-            "chat_template": str(self._config.chat_template or "the model's"),
+            "chat_template_sha256": hashlib.sha256(self._files.chat_template.encode()).hexdigest(),
             "llama_cpp_python": version("llama-cpp-python"),
             "threads": self._threads,
             "gpu_offload_supported": bool(llama_cpp.llama_supports_gpu_offload()),

@@ -46,4 +46,4 @@ def reason() -> str:
     """Return the first error logged since the last call, without the function's name; "" if there is none."""
     first = _lines[0] if _lines else ""
     _lines.clear()
-    return re.sub(r"^[a-z_]+: ", "", first)
+    return re.sub(r"^[a-z_]+: ", "", first.partition("\n")[0])

@@ -33,17 +33,19 @@ class ChatTemplate:
         try:
             self._formatter = chat_format.Jinja2ChatFormatter(source, eos_token=eos, bos_token=bos)
             self._takes_parts = self._reads_parts()
-            self.prompt(_PROBE, 1)
+            if MARKER + _PROBE not in self.prompt(_PROBE, 1):
+                raise ValueError("it does not render the message")
         except Exception as error:  # a template may do anything
             raise ValueError(f"{type(error).__name__}: {error}") from error
 
     def prompt(self, text: str, pictures: int) -> str:
         """Return the prompt of a user's message: a marker for each of so many pictures, then a text."""
-        parts = [{"type": "text", "text": part} for part in [MARKER] * pictures + [text]]
-        return self._rendered(parts if self._takes_parts else MARKER * pictures + text)
+        whole = MARKER * pictures + text
+        return self._rendered([{"type": "text", "text": whole}] if self._takes_parts else whole)
 
     def _rendered(self, content: Any) -> str:
-        prompt: str = self._formatter(messages=[{"role": "user", "content": content}]).prompt
+        messages = [{"role": "user", "content": content}]
+        prompt: str = self._formatter(messages=messages, enable_thinking=True).prompt
         return prompt.removeprefix(self._added)
 
     def _reads_parts(self) -> bool:

@@ -70,16 +70,18 @@ def _of_quant(paths: list[Path], quants: Iterable[str]) -> list[Path]:
 
 
 def cached() -> dict[str, list[Path]]:
-    """Return the GGUF files in the hub's cache, by repository."""
+    """Return the GGUF files in the hub's cache by repository: those of the commit that was fetched last."""
     hub = extras.require("huggingface_hub", "model")
     try:
         repos = hub.scan_cache_dir(extras.require("huggingface_hub.constants", "model").HF_HUB_CACHE).repos
     except (hub.CacheNotFound, ValueError):  # no such folder, or a file
         return {}
-    mains = {
-        repo.repo_id: repo.refs["main"].files for repo in repos if repo.repo_type == "model" and "main" in repo.refs
+    return {
+        repo.repo_id: [file.file_path for file in revision.files if file.file_path.suffix == ".gguf"]
+        for repo in repos
+        if repo.repo_type == "model"
+        for revision in sorted(repo.revisions, key=lambda revision: (revision.last_modified, len(revision.files)))
     }
-    return {name: [f.file_path for f in files if f.file_path.suffix == ".gguf"] for name, files in mains.items()}
 
 
 def fetched(name: str) -> tuple[Path, Path | None]:
@@ -156,7 +158,9 @@ def load_headers(config: EngineConfig) -> ModelFiles:
     if model.is_mmproj:
         raise ModelError(f"`model` {model_path}: this is an mmproj (vision tower); give it as `mmproj`")
     if not (template := chat_template(config) or str(model.fields.get("tokenizer.chat_template", ""))):
-        raise ModelError(f"`model` {model_path}: has no chat template; give `chat_template` FILE, or none: no template")
+        raise ModelError(
+            f"`model` {model_path}: has no chat template; give `chat_template`: a FILE, or none for the raw prompt"
+        )
     mmproj_path = mmproj_path or _mmproj_beside(model_path)
     if mmproj_path is None:
         return ModelFiles(model, None, template)
@@ -175,7 +179,10 @@ def chat_template(config: EngineConfig) -> str:
     """Return the chosen chat template, a Jinja text; empty: the model's own; raises ModelError."""
     chosen = config.chat_template
     try:
-        return RAW_PROMPT if chosen == NO_TEMPLATE else read_text(Path(chosen), TEMPLATE_BYTES) if chosen else ""
+        template = RAW_PROMPT if chosen == NO_TEMPLATE else read_text(Path(chosen), TEMPLATE_BYTES) if chosen else ""
+        if chosen and not template:
+            raise ValueError("it is empty")
+        return template  # noqa: TRY300
     except (OSError, ValueError) as error:
         raise ModelError(f"`chat_template` {chosen}: cannot be read ({error})") from error
 
@@ -189,34 +196,22 @@ def _mmproj_beside(model: Path) -> Path | None:
 
 
 def sha256(path: Path) -> str:
-    """Return a file's SHA-256, cached by path, size and time of change, as models are large."""
-    try:
-        return str(json.loads(_note(path).read_text())["sha256"])
-    except (OSError, ValueError, KeyError, TypeError):  # absent or damaged
-        value = digest(path)
-        remember_sha256(path, value)
-        return value
+    """Return a file's SHA-256, cached by path, size and time of change, as models are large.
 
-
-def digest(path: Path) -> str:
+    A cache that cannot be written costs time, nothing else.
+    """
+    status = path.stat()
+    key = hashlib.sha256(f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}".encode()).hexdigest()
+    note = cache_folder() / "sha256" / f"{key}.json"
+    with suppress(OSError, ValueError, KeyError, TypeError):  # absent or damaged
+        return str(json.loads(note.read_text())["sha256"])
     computed = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 22):
+    with path.open("rb") as content:
+        while block := content.read(1 << 22):
             computed.update(block)
-    return computed.hexdigest()
-
-
-def remember_sha256(path: Path, value: str) -> None:
-    """Cache a file's SHA-256 in one step; a cache that cannot be written costs time, nothing else."""
-    note = _note(path)
     with suppress(OSError):
         note.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.NamedTemporaryFile("w", dir=note.parent, delete=False) as file:
-            json.dump({"path": str(path.resolve()), "sha256": value}, file)
+            json.dump({"path": str(path.resolve()), "sha256": computed.hexdigest()}, file)
         Path(file.name).replace(note)
-
-
-def _note(path: Path) -> Path:
-    status = path.stat()
-    key = hashlib.sha256(f"{path.resolve()}|{status.st_size}|{status.st_mtime_ns}".encode()).hexdigest()
-    return cache_folder() / "sha256" / f"{key}.json"
+    return computed.hexdigest()

@@ -1,6 +1,6 @@
-"""`doctor --url`: security risks of an external server, found without a request to its model.
+"""`doctor --url`: what distorts a measurement of an external server, found without a request to its model.
 
-Each transport with URLs has its own examination (`Urls.examine`). This module has the findings that all share.
+Each transport with URLs declares its own examination (`Urls.examine`). What all share is here.
 """
 
 from __future__ import annotations
@@ -17,40 +17,47 @@ from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.transport import TRANSPORTS
 
-Examine: TypeAlias = Callable[[SplitResult], Iterator[Finding]]
-"""Yields findings about the server at a URL with a host; raises OSError or TransportError if none answers."""
+Examine: TypeAlias = Callable[[SplitResult], Iterator[Finding | str]]
+"""Yields findings about the server at a URL with a host, and what leaves it open (NO_KEY, UNPICKLES); raises OSError or
+TransportError if none answers."""
 
 PATIENCE_S: Final = 5.0
 ENCRYPTED: Final = frozenset({"https", "wss"})
+NO_KEY: Final = "no key"
+UNPICKLES: Final = "unpickles what it receives"
 
 
 def examine(url: str) -> list[Finding]:
-    """Return the findings about a URL; raises UsageError for an unknown scheme."""
-    known = {
-        scheme: each.urls.examine
-        for _, each in TRANSPORTS.loaded()
-        for scheme in each.urls.schemes
-        if each.urls.examine
-    }
+    """Return the findings about a URL; raises UsageError for an unknown scheme, MissingExtra."""
+    known = {scheme: each for _, each in TRANSPORTS.loaded() if each.urls.examine for scheme in each.urls.schemes}
     try:
-        address = urlsplit(url)
-        host, _ = address.hostname, address.port
+        parts = urlsplit(url)
+        host, port = parts.hostname or "", parts.port or "PORT"
     except ValueError as error:
         raise UsageError(f"`url`: that is no URL: {error}") from error
-    if not host or address.scheme not in known:
+    if not host or parts.scheme not in known:
         schemes = ", ".join(f"{scheme}://" for scheme in known)
-        without_key = f"{address.scheme}://{host or ''}" if address.scheme else url.rpartition("@")[2]
+        without_key = f"{parts.scheme}://{host}" if parts.scheme else url.rpartition("@")[2]
         raise UsageError(
             f"`url`: '{without_key}' should look like http://192.168.0.5:8000: one of {schemes}, a host, and its port"
         )
-    examine_it: Examine = resolve_name(known[address.scheme])
-    findings = [plain_text(address)]
+    known[parts.scheme].check_machine()
+    examine_it: Examine = resolve_name(known[parts.scheme].urls.examine)
+    local, results = is_local(host), list[Finding | str]()
     try:
-        findings += examine_it(address)
+        results += examine_it(parts)
     except (OSError, TransportError) as error:
-        findings.append(
-            Finding("server", "error", f"{host} does not answer: {printable(str(error))}", "start it, or name another")
-        )
+        why = f"{host} does not answer: {printable(str(error))}"
+        results.append(Finding("server", "error", why, "start it, or name another"))
+    words = [each for each in results if isinstance(each, str)]
+    if not local and parts.scheme not in ENCRYPTED:
+        words.insert(0, "not encrypted")
+    findings = [each for each in results if not isinstance(each, str)]
+    if words:
+        dangerous = not local or any(UNPICKLES in each for each in words)
+        reach = "" if local else f", and reach it by ssh -L {port}:127.0.0.1:{port} {host}"
+        cure = f"let it listen on 127.0.0.1 alone{reach}"
+        findings.insert(0, Finding("access", "warning" if dangerous else "advice", f"{host}: {', '.join(words)}", cure))
     return findings
 
 
@@ -64,28 +71,6 @@ def is_local(host: str) -> bool:
     return False
 
 
-def plain_text(address: SplitResult) -> Finding:
-    host, port = address.hostname or "", address.port or "PORT"
-    if address.scheme in ENCRYPTED:
-        return Finding("plain-text", "state", f"the connection to {host} is encrypted")
-    if is_local(host):
-        return Finding("plain-text", "state", f"{host} is this machine: nothing leaves it")
-    return Finding(
-        "plain-text",
-        "warning",
-        f"the connection to {host} is plain text: others on the network can read pictures and keys, and change actions",
-        f"ssh -L {port}:127.0.0.1:{port} {host}, and then 127.0.0.1 in the URL",
-    )
-
-
-def no_key(address: SplitResult, what: str, cure: str) -> Finding:
-    """Return the finding that a server asks for no key: a choice on this machine, a risk on any other."""
-    local = is_local(address.hostname or "")
-    return Finding("no-key", "advice" if local else "warning", f"it wants no key: {what}", cure)
-
-
 def idle_cut(seconds: float, cure: str) -> Finding:
-    message = (
-        f"it closes a connection after {seconds:g} s of silence: a request after a longer pause connects again first"
-    )
-    return Finding("idle", "advice", message, cure)
+    what = f"it closes a connection after {seconds:g} s of silence: a request after a longer pause connects again first"
+    return Finding("idle", "advice", what, cure)

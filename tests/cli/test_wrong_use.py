@@ -87,7 +87,7 @@ WRONG = {
     ],
     "model": [
         ("dummy --size huge", "--size: 'huge' should be 'tiny' or 'full'"),
-        ("dummy --output /dev/null/x", "--output /dev/null/x: cannot write the dummy model", 1),
+        ("dummy --output /dev/null/x", "--output /dev/null/x: cannot write mmproj-", 1),
         ("fetch gpt", "model fetch: 'gpt' is neither minicpm-v-2.6, qwen2.5-vl-3b"),
         ("fetch a/b:c.gguf --quant Q8_0", "--quant Q8_0: goes with a name or OWNER/REPO"),
     ],

@@ -1,9 +1,9 @@
 """`model fetch` against a hub in this process that speaks as the real one does, and misbehaves on demand."""
 
 import errno
-import fcntl
 import hashlib
 import json
+import os
 import shutil
 import threading
 from collections.abc import Iterator
@@ -22,8 +22,9 @@ from typer.testing import CliRunner
 
 from s2a_bench.cli.model import app
 from s2a_bench.errors import ModelError, UsageError
-from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.fetch import Wanted, fetch, wanted
+from s2a_bench.inference import EngineConfig, FetchConfig
+from s2a_bench.inference.fetch import Fetched, chosen
+from s2a_bench.inference.fetch import fetch as fetch_config
 from s2a_bench.inference.models import HUB_MODELS, fetched, load_headers
 
 NAME = "minicpm-v-2.6"
@@ -47,6 +48,7 @@ class Hub:
     refuse: tuple[int, dict[str, str]] | None = None
     """Status and headers of every answer."""
     refuse_files: tuple[int, dict[str, str]] | None = None
+    commit: str = COMMIT
     lfs: bool = True
     ranges: bool = True
     listing: bytes | None = None
@@ -84,11 +86,11 @@ class Handler(BaseHTTPRequestHandler):
         if path == f"/api/models/{hub.repository}":
             return self.answer(200, {"Content-Type": "application/json"}, self.list())
         head, _, name = path.rpartition("/")
-        if name not in hub.files or head not in {f"/{hub.repository}/resolve/{at}" for at in ("main", COMMIT)}:
-            return self.answer(404, {"X-Error-Code": "EntryNotFound", "X-Repo-Commit": COMMIT})
+        if name not in hub.files or head not in {f"/{hub.repository}/resolve/{at}" for at in ("main", hub.commit)}:
+            return self.answer(404, {"X-Error-Code": "EntryNotFound", "X-Repo-Commit": hub.commit})
         # the real hub leads to another host, whose answer has none of these headers
         content = hashlib.sha256(hub.files[name]).hexdigest()
-        facts = {"X-Repo-Commit": COMMIT, "X-Linked-Etag": f'"{hub.digest(name)}"', "ETag": '"of the redirect"'}
+        facts = {"X-Repo-Commit": hub.commit, "X-Linked-Etag": f'"{hub.digest(name)}"', "ETag": '"of the redirect"'}
         facts["X-Linked-Size"] = str(len(hub.files[name]))
         return self.answer(302, facts | {"Location": f"http://localhost:{hub.port}/store/{content}"})
 
@@ -99,7 +101,7 @@ class Handler(BaseHTTPRequestHandler):
         for name, data in self.hub.files.items():
             lfs = {"sha256": self.hub.digest(name), "size": len(data), "pointerSize": 135}
             siblings.append({"rfilename": name, "size": len(data)} | ({"lfs": lfs} if self.hub.lfs else {}))
-        return json.dumps({"id": self.hub.repository, "sha": COMMIT, "siblings": siblings}).encode()
+        return json.dumps({"id": self.hub.repository, "sha": self.hub.commit, "siblings": siblings}).encode()
 
     def content(self, digest: str) -> None:
         ((name, data),) = [item for item in self.hub.files.items() if hashlib.sha256(item[1]).hexdigest() == digest]
@@ -152,9 +154,13 @@ def point_at(monkeypatch: pytest.MonkeyPatch, endpoint: str) -> None:
     monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", endpoint + "/{repo_id}/resolve/{revision}/{filename}")
 
 
-def refusal(want: Wanted | None = None) -> str:
+def fetch(what: str = NAME, **flags: Any) -> Fetched:
+    return fetch_config(FetchConfig(what=what, **flags))
+
+
+def refusal(what: str = NAME, **flags: Any) -> str:
     with pytest.raises(ModelError) as caught:
-        fetch(want or wanted(NAME, None, None))
+        fetch(what, **flags)
     message = str(caught.value)
     assert "\n" not in message
     return message
@@ -166,31 +172,28 @@ def blobs(tmp_path: Path) -> list[str]:
 
 
 def test_both_files_arrive_whole_in_the_hubs_own_cache_and_are_not_fetched_twice(hub: Hub, tmp_path: Path) -> None:
-    calls: list[tuple[str, int, int]] = []
-    done = fetch(wanted(NAME, None, None), lambda *call: calls.append(call))
+    done = fetch()
     assert (done.repository, done.commit) == (REPOSITORY, COMMIT)
     assert [file.path.read_bytes() for file in done.files] == [hub.files[MODEL], hub.files[MMPROJ]]
     assert [file.path.name for file in done.files] == [MODEL, MMPROJ]
     assert [file.sha256 for file in done.files] == [hub.digest(MODEL), hub.digest(MMPROJ)]
-    assert [file.resumed_at for file in done.files] == [0, 0]
     assert blobs(tmp_path) == sorted(file.sha256 for file in done.files)
-    assert calls[-1] == (MODEL, len(hub.files[MODEL]), len(hub.files[MODEL]))
     # another program that uses the hub's library finds them
-    assert huggingface_hub.try_to_load_from_cache(REPOSITORY, MODEL) == str(done.files[0].path)
-    again = fetch(wanted(NAME, None, None))
+    assert huggingface_hub.hf_hub_download(REPOSITORY, MODEL) == str(done.files[0].path)
+    again = fetch()
     assert [file.path for file in again.files] == [file.path for file in done.files]
     assert hub.gets(MODEL) == hub.gets(MMPROJ) == [None]
 
 
 def test_the_token_goes_to_the_hub_and_not_to_where_it_leads(hub: Hub) -> None:
-    fetch(wanted(NAME, None, None))
+    fetch()
     sent = {(path.startswith("/store/"), authorization) for _, path, _, authorization in hub.requests}
     assert sent == {(False, f"Bearer {TOKEN}"), (True, None)}
 
 
 def test_a_broken_connection_is_taken_up_where_it_broke(hub: Hub) -> None:
     hub.cuts[MODEL] = [1_000_000]
-    done = fetch(wanted(NAME, None, None))
+    done = fetch()
     first, second = hub.gets(MODEL)
     assert first is None
     assert second
@@ -198,75 +201,72 @@ def test_a_broken_connection_is_taken_up_where_it_broke(hub: Hub) -> None:
     assert done.files[0].path.read_bytes() == hub.files[MODEL]
 
 
-@pytest.mark.parametrize("how", ["interrupted", "no network for long"])
-def test_a_later_fetch_goes_on_where_an_earlier_one_ended(hub: Hub, tmp_path: Path, how: str) -> None:
-    def interrupt(name: str, there: int, _total: int) -> None:
-        if name == MODEL and there > 2_000_000:
-            raise KeyboardInterrupt
-
-    if how == "interrupted":
-        with pytest.raises(KeyboardInterrupt):
-            fetch(wanted(NAME, None, None), interrupt)
+@pytest.mark.parametrize("broken", [KeyboardInterrupt, None], ids=["interrupted", "no network for long"])
+def test_an_interrupted_fetch_leaves_no_language_model_and_starts_its_file_again(
+    hub: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: type[BaseException] | None
+) -> None:
+    hub.cuts[MODEL] = [2_500_000, *[0] * 6]
+    if broken:
+        waits = Mock(side_effect=broken)
+        monkeypatch.setattr(huggingface_hub.file_download, "time", SimpleNamespace(sleep=waits))
+        with pytest.raises(broken):
+            fetch()
+        hub.cuts.clear()
+        monkeypatch.setattr(huggingface_hub.file_download, "time", SimpleNamespace(sleep=lambda _: None))
     else:
-        hub.cuts[MODEL] = [2_500_000, *[0] * 5]
-        assert "what has arrived is kept" in refusal()
+        assert "check the network" in refusal()
+        assert hub.cuts[MODEL] == [0]
+        hub.cuts.clear()
     # the mmproj comes first: a language model without it would pass for a text model
-    assert blobs(tmp_path) == sorted([f"{hub.digest(MODEL)}.s2a-bench.part", hub.digest(MMPROJ)])
+    assert blobs(tmp_path) == [hub.digest(MMPROJ)]
     with pytest.raises(ModelError, match="not fetched yet"):
         fetched(NAME)
     before = len(hub.gets(MODEL))
-    done = fetch(wanted(NAME, None, None))
-    assert done.files[0].resumed_at > 2_000_000
-    assert hub.gets(MODEL)[before:] == [f"bytes={done.files[0].resumed_at}-"]
-    assert done.files[0].path.read_bytes() == hub.files[MODEL]
-
-
-def test_a_server_that_ignores_ranges_sends_all_of_it_again(hub: Hub) -> None:
-    hub.ranges = False
-    hub.cuts[MODEL] = [3_000_000]
-    assert fetch(wanted(NAME, None, None)).files[0].path.read_bytes() == hub.files[MODEL]
-    assert len(hub.gets(MODEL)) == 2
-
-
-def test_a_part_that_is_longer_than_the_file_starts_again(hub: Hub, tmp_path: Path) -> None:
-    folder = tmp_path / "hub" / f"models--{REPOSITORY.replace('/', '--')}" / "blobs"
-    folder.mkdir(parents=True)
-    (folder / f"{hub.digest(MODEL)}.s2a-bench.part").write_bytes(b"x" * (len(hub.files[MODEL]) + 1))
-    done = fetch(wanted(NAME, "q4_k_m", None))  # in whatever case
-    assert done.files[0].path.read_bytes() == hub.files[MODEL]
-    assert hub.gets(MODEL) == [None]
+    assert fetch().files[0].path.read_bytes() == hub.files[MODEL]
+    assert hub.gets(MODEL)[before:] == [None]
 
 
 def test_a_wrong_content_is_refused_and_not_kept(hub: Hub, tmp_path: Path) -> None:
     hub.sha256[MODEL] = "ab" * 32
-    message = refusal()
-    assert message.startswith(f"{MODEL}: has SHA-256 {hashlib.sha256(hub.files[MODEL]).hexdigest()}, the hub says abab")
+    found = hashlib.sha256(hub.files[MODEL]).hexdigest()
+    assert refusal() == f"{MODEL}: has SHA-256 {found}, the hub says {'ab' * 32}; it was deleted, fetch again"
     assert blobs(tmp_path) == [hub.digest(MMPROJ)]
-    assert huggingface_hub.try_to_load_from_cache(REPOSITORY, MODEL) is None
+    with pytest.raises(ModelError, match="not fetched yet"):
+        fetched(NAME)
 
 
-def test_a_damaged_file_in_the_cache_is_told_and_left_to_the_user(hub: Hub) -> None:
-    path = fetch(wanted(NAME, None, None)).files[0].path
+def test_a_damaged_file_in_the_cache_is_deleted_and_fetched_again(hub: Hub) -> None:
+    path = fetch().files[0].path
     with path.open("r+b") as file:
         file.seek(5_000_000)
         file.write(b"?")
-    assert refusal() == (
-        f"{path.resolve()}: does not have the hub's SHA-256 {hub.digest(MODEL)}; delete it and fetch again"
-    )
-    path.resolve().unlink()
-    assert fetch(wanted(NAME, None, None)).files[0].path.read_bytes() == hub.files[MODEL]
+    assert f"the hub says {hub.digest(MODEL)}; it was deleted, fetch again" in refusal()
+    assert not path.is_symlink()
+    assert fetch().files[0].path.read_bytes() == hub.files[MODEL]
+    assert hub.gets(MODEL) == [None, None]
+
+
+def test_the_files_of_the_commit_that_was_fetched_last_are_the_model(hub: Hub) -> None:
+    first = fetch()
+    hub.commit = "f" * 40
+    assert fetched(NAME) == tuple(file.path for file in first.files)
+    hub.files[MODEL] += b"of a later commit"
+    second = fetch()
+    assert fetched(NAME) == tuple(file.path for file in second.files)
+    assert [file.path.parent.name for file in (*first.files, *second.files)] == [COMMIT] * 2 + ["f" * 40] * 2
+    assert len(hub.gets(MMPROJ)) == 1
 
 
 def test_a_file_that_the_library_fetched_is_used_as_it_is(hub: Hub) -> None:
     for name in (MODEL, MMPROJ):
         huggingface_hub.hf_hub_download(REPOSITORY, name)
     before = len(hub.gets(MODEL))
-    fetch(wanted(NAME, None, None))
+    fetch()
     assert len(hub.gets(MODEL)) == before == 1
 
 
 def test_an_unknown_quantisation_names_those_there_are(hub: Hub) -> None:
-    assert refusal(wanted(NAME, "Q9", None)) == (
+    assert refusal(quant="Q9") == (
         f"{REPOSITORY}: no model is Q9, or several; it has {MODEL}, {MMPROJ}; name one as OWNER/REPO:FILE"
     )
     assert hub.gets(MODEL) == hub.gets(MMPROJ) == []
@@ -278,9 +278,9 @@ def test_an_unknown_quantisation_names_those_there_are(hub: Hub) -> None:
         (404, {"X-Error-Code": "RepoNotFound"}, "no such repository at http://127.0.0.1"),
         (401, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
         (403, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
-        (401, {}, "answered 401; check the name, or set HF_TOKEN"),
-        (401, {"X-Error-Message": "Invalid credentials in Authorization header"}, "answered 401: Invalid credentials"),
-        (500, {}, "answered 500; try again later"),
+        (401, {}, "answered 401; check the name and HF_TOKEN, try later, or download"),
+        (401, {"X-Error-Message": "Invalid credentials in Authorization header"}, "answered 401 Invalid credentials"),
+        (500, {}, "answered 500; check the name and HF_TOKEN, try later"),
     ],
 )
 def test_a_refusal_by_the_hub_is_one_line(hub: Hub, status: int, headers: dict[str, str], message: str) -> None:
@@ -290,21 +290,29 @@ def test_a_refusal_by_the_hub_is_one_line(hub: Hub, status: int, headers: dict[s
     assert message in shown
 
 
-def test_files_can_be_gated_where_the_listing_is_not(hub: Hub, tmp_path: Path) -> None:
-    hub.refuse_files = (403, {"X-Error-Code": "GatedRepo"})
-    assert "gated; ask for access" in refusal()
-    assert [name for name in blobs(tmp_path) if not name.endswith(".part")] == []
+@pytest.mark.parametrize(
+    ("headers", "message"),
+    [
+        ({"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
+        ({"X-Error-Message": "Not today."}, "answered 403 Not today; check the name and HF_TOKEN"),
+    ],
+)
+def test_files_can_be_refused_where_the_listing_is_not(
+    hub: Hub, tmp_path: Path, headers: dict[str, str], message: str
+) -> None:
+    hub.refuse_files = (403, headers)
+    assert message in refusal()
+    assert blobs(tmp_path) == []
 
 
 @pytest.mark.parametrize("body", [b"<html>log in to this network</html>", b"[]", b'{"error": "no"}', b"null"])
 def test_what_is_no_hub_is_told_apart(hub: Hub, body: bytes) -> None:
     hub.listing = body
-    assert "does not answer as a hub does; check HF_ENDPOINT" in refusal()
+    assert "set HF_ENDPOINT to a hub in reach, or download its files by hand" in refusal()
 
 
-@pytest.mark.parametrize("checksums", [{}, {MODEL: "../../../stolen"}], ids=["none", "out of the cache"])
-def test_a_hub_without_checksums_is_refused(hub: Hub, tmp_path: Path, checksums: dict[str, str]) -> None:
-    hub.lfs, hub.sha256 = bool(checksums), checksums
+def test_a_hub_without_checksums_is_refused(hub: Hub, tmp_path: Path) -> None:
+    hub.lfs = False
     assert f"gives no SHA-256 for {MODEL}" in refusal()
     assert blobs(tmp_path) == []
 
@@ -314,10 +322,8 @@ def test_no_network_names_the_ways_out(hub: Hub, monkeypatch: pytest.MonkeyPatch
     point_at(monkeypatch, "http://127.0.0.1:1")
     message = refusal()
     assert message.startswith(f"{REPOSITORY}: cannot be fetched from http://127.0.0.1:1 (ConnectError")
-    assert "set HF_ENDPOINT to a hub in reach" in message
-    assert (
-        f"download the language model and its mmproj of {REPOSITORY} by hand and give --model PATH --mmproj PATH"
-        in message
+    assert message.endswith(
+        "set HF_ENDPOINT to a hub in reach, or download its files by hand and give --model PATH --mmproj PATH"
     )
 
 
@@ -332,24 +338,26 @@ def test_offline_by_choice_says_so(hub: Hub, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
     huggingface_hub.close_session()  # the library looks once for each session
     try:
-        assert "HF_HUB_OFFLINE is set" in refusal()
+        assert "please unset the `HF_HUB_OFFLINE` environment variable" in refusal()
     finally:
         huggingface_hub.close_session()
     assert hub.requests == []
 
 
+@pytest.mark.filterwarnings("default")
 def test_a_disk_without_room_is_refused_before_the_first_byte(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=50_000_000))
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1_000_000))
     message = refusal()
-    assert "0.01 GB are to be fetched and 0.05 GB are free in " in message
-    assert "set HF_HOME" in message
-    assert hub.gets(MODEL) == []
+    assert "cannot be written (Not enough free disk space to download the file" in message
+    assert "make room, or set HF_HOME" in message
+    assert hub.gets(MODEL) == hub.gets(MMPROJ) == []
 
 
-def test_a_disk_that_fills_up_is_one_line(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
-    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
+def test_a_disk_that_fills_up_is_one_line(hub: Hub, monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    full = Mock(side_effect=OSError(number, os.strerror(number)))
     monkeypatch.setattr(huggingface_hub.file_download, "http_get", full)
-    assert "the disk is full; make room, or set HF_HOME" in refusal()
+    assert f"cannot be written ([Errno {number}] {os.strerror(number)}); make room, or set HF_HOME" in refusal()
     assert hub.gets(MODEL) == []
 
 
@@ -357,17 +365,8 @@ def test_a_cache_that_cannot_be_written_is_named(hub: Hub, tmp_path: Path) -> No
     (tmp_path / "hub").write_text("a file where the folder should be")
     message = refusal()
     assert str(tmp_path / "hub") in message
-    assert "set HF_HOME to a folder you may write" in message
+    assert "set HF_HOME to a folder that you may write" in message
     assert hub.gets(MODEL) == []
-
-
-def test_two_fetches_of_one_file_do_not_write_into_each_other(hub: Hub, tmp_path: Path) -> None:
-    folder = tmp_path / "hub" / f"models--{REPOSITORY.replace('/', '--')}" / "blobs"
-    folder.mkdir(parents=True)
-    with (folder / f"{hub.digest(MODEL)}.s2a-bench.part").open("ab") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)
-        assert f"{MODEL}: another process fetches it now" in refusal()
-    assert fetch(wanted(NAME, None, None)).files[0].resumed_at == 0
 
 
 @pytest.mark.parametrize(
@@ -376,15 +375,20 @@ def test_two_fetches_of_one_file_do_not_write_into_each_other(hub: Hub, tmp_path
 )
 def test_what_is_neither_name_nor_file_is_wrong_usage(what: str) -> None:
     with pytest.raises(UsageError, match=r"neither minicpm-v-2.6, .* nor OWNER/REPO\[:FILE\]"):
-        wanted(what, None, None)
+        fetch(what)
 
 
 def test_a_quantisation_goes_with_a_repository_not_with_a_file(hub: Hub) -> None:
     with pytest.raises(UsageError, match="`quant` Q8_0"):
-        wanted("a/b:c.gguf", "Q8_0", None)
+        fetch("a/b:c.gguf", quant="Q8_0")
     assert hub.requests == []
-    assert wanted("a/b:c.gguf", None, "m.gguf") == wanted("hub:a/b:c.gguf", None, "m.gguf")
-    assert wanted("a/b:c.gguf", None, "m.gguf").files([]) == ("c.gguf", "m.gguf")
+
+
+def test_a_file_is_found_in_upper_and_lower_case_the_exact_name_first(hub: Hub) -> None:
+    hold(hub, "a/b", ["C.gguf", "c.gguf", "M.gguf"])
+    for file, names in (("c.gguf", ["c.gguf"]), ("C.gguf", ["C.gguf"]), ("m.GGUF", ["M.gguf"])):
+        assert [each.path.name for each in fetch(f"hub:a/b:{file}").files] == names
+    assert refusal("a/b:c.gguf", mmproj="N.gguf") == "a/b: has no N.gguf; it has C.gguf, M.gguf, c.gguf"
 
 
 # as the repositories list them, by what public programs download from there
@@ -444,7 +448,7 @@ def hold(hub: Hub, name: str, files: list[str]) -> None:
 @pytest.mark.parametrize("name", HUB_MODELS)
 def test_every_known_name_fetches_its_files_and_is_then_a_model(hub: Hub, name: str) -> None:
     hold(hub, name, [*LISTINGS[name], "imatrix.dat"])
-    done = fetch(wanted(name, None, None))
+    done = fetch(name)
     assert tuple(file.path.name for file in done.files) == CHOSEN[name]
     assert fetched(name) == (done.files[0].path, done.files[1].path if len(done.files) > 1 else None)
     assert set(hub.files) - set(CHOSEN[name]) == {file for file in hub.files if not hub.gets(file)}
@@ -460,12 +464,12 @@ def test_any_repository_of_the_hub_is_a_model_once_it_is_fetched(hub: Hub) -> No
     with pytest.raises(ModelError, match=rf"^`model` {name}: not fetched yet; run: s2a-bench model fetch {address}$"):
         load_headers(EngineConfig(model=name))
     assert hub.requests == []
-    fetch(wanted(address, None, None))
+    fetch(address)
     model, mmproj = fetched(str(name))
     assert (model.name, mmproj and mmproj.name) == ("p.Q4_K_M.gguf", "p.mmproj-Q8_0.gguf")
     with pytest.raises(ModelError, match=rf"{address}:p.Q8_0.gguf: not fetched yet; .* fetch {address}:p.Q8_0.gguf$"):
         fetched(f"{name}:p.Q8_0.gguf")
-    fetch(wanted(address, "q8_0", None))
+    fetch(address, quant="q8_0")
     with pytest.raises(
         ModelError, match=rf"{name}: p.Q4_K_M.gguf, p.Q8_0.gguf were fetched; choose one, as {name}:p.Q4_K_M.gguf$"
     ):
@@ -491,27 +495,27 @@ def test_any_repository_of_the_hub_is_a_model_once_it_is_fetched(hub: Hub) -> No
 def test_the_listing_gives_one_language_model_or_names_all(
     files: list[str], quant: str | None, names: tuple[str, ...] | None
 ) -> None:
-    want = wanted("a/b", quant, None)
+    config = FetchConfig(what="a/b", quant=quant)
     if names is not None:
-        assert want.files(files) == names
+        assert chosen("a/b", "", config, files) == [*names]
         return
     with pytest.raises(
         ModelError, match=rf"^a/b: no model is {quant or 'Q4_K_M or Q8_0'}, or several; it has "
     ) as error:
-        want.files(files)
+        chosen("a/b", "", config, files)
     assert all(file in str(error.value) for file in files if file.endswith("gguf"))
 
 
 def test_another_mmproj_of_the_repository_is_fetched_by_its_name(hub: Hub) -> None:
     hold(hub, "qwen2.5-vl-3b", LISTINGS["qwen2.5-vl-3b"])
-    done = fetch(wanted("qwen2.5-vl-3b", "Q8_0", "mmproj-Qwen2.5-VL-3B-Instruct-Q8_0.gguf"))
+    done = fetch("qwen2.5-vl-3b", quant="Q8_0", mmproj="mmproj-Qwen2.5-VL-3B-Instruct-Q8_0.gguf")
     assert [file.path.name for file in done.files] == LISTINGS["qwen2.5-vl-3b"][1::2]
 
 
 def test_a_name_stands_for_its_files_once_they_are_fetched(hub: Hub) -> None:
     with pytest.raises(ModelError, match=f"^`model` {NAME}: not fetched yet; run: s2a-bench model fetch {NAME}$"):
         load_headers(EngineConfig(model=Path(NAME)))
-    done = fetch(wanted(NAME, None, None))
+    done = fetch()
     files = load_headers(EngineConfig(model=Path(NAME)))
     assert (files.model.path, files.mmproj and files.mmproj.path) == tuple(file.path for file in done.files)
     assert hub.gets(MODEL) == [None]
@@ -534,6 +538,7 @@ def test_the_command_prints_the_paths_and_the_command_that_uses_them(hub: Hub) -
     assert Path(model).read_bytes() == hub.files[MODEL]
     assert Path(mmproj).read_bytes() == hub.files[MMPROJ]
     assert command == f"s2a-bench latency --model {model} --mmproj {mmproj}"
+    assert result.stderr == ""  # bars are for terminals
 
 
 def test_json_is_one_object_of_the_schema(hub: Hub) -> None:

@@ -120,7 +120,7 @@ def test_minicpm_is_asked_token_by_token_as_before(tiny: EngineConfig, monkeypat
     [
         (PARTS, "<|im_start|><user>{0}{0}go<model>"),
         (TEXT, "<user>{0}{0}go<|im_end|>"),
-        (EITHER, "[{0}][{0}][go]"),
+        (EITHER, "[{0}{0}go]"),
         (RAW_PROMPT, "{0}{0}go"),
     ],
 )
@@ -144,6 +144,8 @@ def test_what_the_tokenizer_adds_is_not_there_twice(base: LlamaCppEngine) -> Non
         ("{{ messages | rot13 }}", "No filter named 'rot13'"),
         ("{{ raise_exception('tools alone') }}", "tools alone"),
         ("{{ messages[1].content }}", "UndefinedError"),
+        ("hello", "ValueError: it does not render the message"),
+        ("{{ messages[0].content[:9] }}", "it does not render the message"),
     ],
 )
 def test_a_template_that_renders_nothing_is_a_line(texts: EngineConfig, tmp_path: Path, source: str, why: str) -> None:
@@ -154,7 +156,7 @@ def test_a_template_that_renders_nothing_is_a_line(texts: EngineConfig, tmp_path
 
 
 def test_a_template_that_cannot_be_read_is_a_line(texts: EngineConfig, tmp_path: Path) -> None:
-    for content in (None, b"\xff", b"x" * (2 << 20)):
+    for content in (None, b"\xff", b"", b"x" * (2 << 20)):
         file = tmp_path / "mine.jinja"
         if content is not None:
             file.write_bytes(content)
@@ -163,7 +165,9 @@ def test_a_template_that_cannot_be_read_is_a_line(texts: EngineConfig, tmp_path:
 
 
 def test_a_model_without_a_template_names_the_ways_out(gemma: Path) -> None:
-    with pytest.raises(ModelError, match="has no chat template; give `chat_template` FILE, or none: no template"):
+    with pytest.raises(
+        ModelError, match="has no chat template; give `chat_template`: a FILE, or none for the raw prompt"
+    ):
         load_headers(EngineConfig(model=gemma))
 
 

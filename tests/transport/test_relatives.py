@@ -27,7 +27,7 @@ from s2a_bench.transport import TRANSPORTS, Choice, Client, open_client
 from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.risks import examine
-from s2a_bench.transport.websocket import risks
+from s2a_bench.transport.websocket import client as websocket_client
 from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.types import Request
 from tests.waiting import until
@@ -336,13 +336,13 @@ def test_a_path_that_fastapi_refuses_is_not_taken_for_a_key() -> None:
         found = {finding.code: finding for finding in examine(address)}
         assert found["path"].message.endswith("lets clients in at /openpi/policy")
         assert found["path"].fix == f"name {address}/openpi/policy"
-        assert "greets with: model" in found["no-key"].message
+        assert "no key" in found["access"].message
         assert "path" not in {finding.code for finding in examine(address + "/openpi/policy")}
         with pytest.raises(RequestFailed, match=r"403.*refused: a wrong path or a key; see `url` and `api_key_env`"):
             asked(address, "openpi")
     with fastapi("/openpi/policy", key="Api-Key k") as address:
         found = {finding.code: finding for finding in examine(address)}
-    assert set(found) == {"plain-text", "server"}
+    assert set(found) == {"server"}
     assert "refused: a wrong path or a key" in found["server"].message
     with fastapi("/") as address:
         assert f"name {address}/" in {finding.fix for finding in examine(address + "/wrong")}
@@ -488,8 +488,6 @@ def test_a_description_of_the_server_is_for_websocket_alone() -> None:
 
 
 def test_the_doctor_tells_of_a_server_that_waits_for_its_clients_first_message(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(risks, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(websocket_client, "PATIENCE_S", 0.3)
     with relative(lambda _: None, greets=False) as (address, _):
-        found = {finding.code: finding for finding in examine(address)}
-    assert "every client in (and greets with: nothing)" in found["no-key"].message
-    assert {"plain-text", "no-key", "any-page", "keepalive"} == set(found)
+        assert [(each.code, each.message) for each in examine(address)] == [("access", "127.0.0.1: no key")]

@@ -13,7 +13,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.testing.transport import RecordingHandler, served, wiring_of
 from s2a_bench.transport import risks
-from s2a_bench.transport.grpc.risks import PREFACE
+from s2a_bench.transport.grpc.client import PREFACE
 from s2a_bench.transport.risks import examine, printable
 from tests.servers.sockets import Received, head, serving
 
@@ -45,9 +45,9 @@ def found(url: str) -> dict[str, Finding]:
 def test_grpc_is_told_of_without_calling_a_method() -> None:
     with answering(SETTINGS) as (place, heard):
         findings = found(f"grpc://{place}")
-    assert findings["pickle"].level == "warning"
-    assert "unpickles what any client sends" in findings["pickle"].message
-    assert {"sleep", "filter", "no-key"} <= set(findings)
+    assert findings["access"].level == "warning"
+    assert "no key, unpickles what it receives if it is lerobot's" in findings["access"].message
+    assert {"access", "sleep", "filter"} == set(findings)
     assert heard == [PREFACE]
 
 
@@ -60,19 +60,17 @@ def test_what_speaks_no_grpc_is_an_error(reply: bytes) -> None:
 def test_a_server_of_models_without_a_key_is_told_of() -> None:
     with served(wiring_of("http"), RecordingHandler(["x"])) as (server, _):
         findings = found(server.address)
-    assert findings["plain-text"].level == "state"
-    assert findings["no-key"].level == "advice"
-    assert "(s2a of s2a-bench)" in findings["no-key"].message
+    assert [(each.level, each.message) for each in findings.values()] == [("advice", "127.0.0.1: no key")]
 
 
-def test_off_this_machine_both_are_warnings(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_off_this_machine_it_is_a_warning_that_names_encryption(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(risks, "is_local", lambda _host: False)
-    body = b'{"data": [{"id": "a\\u001b[31m"}]}'
+    body = b'{"data": [{"id": "a"}]}'
     with answering(b"HTTP/1.1 200 OK\r\ncontent-length: %d\r\n\r\n%b" % (len(body), body)) as (place, _):
         findings = found(f"http://{place}")
-    assert [findings[code].level for code in ("plain-text", "no-key")] == ["warning", "warning"]
-    assert findings["plain-text"].fix.startswith("ssh -L ")
-    assert findings["no-key"].message.isprintable()
+        port = place.rpartition(":")[2]
+    assert (findings["access"].level, findings["access"].message) == ("warning", "127.0.0.1: not encrypted, no key")
+    assert findings["access"].fix.endswith(f"ssh -L {port}:127.0.0.1:{port} 127.0.0.1")
 
 
 @pytest.mark.parametrize(
@@ -101,7 +99,7 @@ def test_an_act_that_answers_anyone_is_told_of(replies: list[tuple[str, str]], i
     with serving(deploy) as url:
         for each in (url, f"{url}/act"):
             findings = found(each)
-            assert ("no-key" in findings) == is_open
+            assert ("access" in findings) == is_open
             assert ("server" in findings) == (not is_open)
     assert posted == [b"{}"] * 2 * len(replies)
 
@@ -110,6 +108,15 @@ def test_an_http_server_that_closes_idle_connections_is_told_of() -> None:
     head = b"HTTP/1.1 200 OK\r\nkeep-alive: timeout=5, max=100\r\ncontent-length: 2\r\n\r\n{}"
     with answering(head) as (place, _):
         assert "after 5 s of silence" in found(f"http://{place}")["idle"].message
+
+
+@pytest.mark.parametrize(
+    ("head", "closes"),
+    [(b"1.1 200 OK", False), (b"1.1 200 OK\r\nConnection: close", True), (b"1.0 200 OK", True), (b"1.0 404 No", False)],
+)
+def test_an_http_server_that_closes_after_each_answer_is_told_of(head: bytes, closes: bool) -> None:
+    with answering(b"HTTP/" + head + b"\r\ncontent-length: 2\r\n\r\n{}") as (place, _):
+        assert ("connections" in found(f"http://{place}")) == closes
 
 
 def test_nobody_there_is_one_line() -> None:

@@ -552,7 +552,7 @@ class TestLayoutOfAServer:
                 assert client.describe() == {"url": url, "template": "get_modality_config", "layout": "n1.5"}
             with robot("", url=url, template=str(template)) as client:
                 actions, _ = ask(client, Request("a", "go", (yuyv_frame(),), state=(1, 2, 3)))
-            assert {each.code: each.level for each in examine(url)}["pickle"] == "state"
+            assert [each.message for each in examine(url)] == ["127.0.0.1: no key"]
         np.testing.assert_array_equal(np.stack([action.values for action in actions]), CHUNK)  # type: ignore[union-attr]
 
     def test_the_key_goes_with_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -768,49 +768,36 @@ class TestDangers:
             return {"status": "ok"}
 
         with policy(answers) as url:
-            found = {finding.code: finding for finding in examine(url)}
+            (found,) = examine(url)
         assert requests == [{"endpoint": "ping"}, {"endpoint": "get_modality_config"}]
-        assert found["no-key"].level == "advice"
-        assert "`kill`" in found["no-key"].message
-        assert found["pickle"].level == "advice"
-        assert "no answer tells which GR00T it is: early N1.7 servers unpickle" in found["pickle"].message
+        assert found.level == "advice"
+        assert found.message == "127.0.0.1: no key, may unpickle what it receives (early GR00T N1.7)"
 
     @pytest.mark.parametrize("answer", [b"ERROR", b"PK\x03\x04" + bytes(9), pickle.dumps({"status": "ok"})])
     def test_n1_is_known_by_its_answer_to_a_ping(self, answer: bytes) -> None:
         requests: list[Any] = []
         with policy(lambda request: requests.append(request) or answer) as url:  # type: ignore[func-returns-value]
-            findings = examine(url)
+            (found,) = examine(url)
         assert requests == [{"endpoint": "ping"}]
-        assert [(finding.code, finding.level) for finding in findings] == [
-            ("plain-text", "state"),
-            ("pickle", "warning"),
-        ]
-        assert "torch.load" in findings[1].message
+        assert found.level == "warning"
+        assert "127.0.0.1: unpickles what it receives (GR00T N1," in found.message
 
-    @pytest.mark.parametrize(
-        ("mark", "level", "what"),
-        [
-            ("__ModalityConfig__", "advice", "GR00T N1.7's: early N1.7 servers unpickle arrays of kind O"),
-            ("__ModalityConfig_class__", "state", "N1.5's or N1.6's: they unpickle nothing"),
-        ],
-    )
-    def test_which_gr00t_may_unpickle_its_configurations_tell(self, mark: str, level: str, what: str) -> None:
+    @pytest.mark.parametrize(("mark", "may"), [("__ModalityConfig__", True), ("__ModalityConfig_class__", False)])
+    def test_which_gr00t_may_unpickle_its_configurations_tell(self, mark: str, may: bool) -> None:
         with policy(Policy(configs(mark))) as url:
-            found = {finding.code: finding for finding in examine(url)}
-        assert found["pickle"].level == level
-        assert what in found["pickle"].message
+            (found,) = examine(url)
+        assert found.level == "advice"
+        assert ("may unpickle" in found.message) == may
 
     @pytest.mark.parametrize("answer", [b"hello", [1], msgpack.packb(5)])
     def test_what_is_no_gr00t_is_an_error(self, answer: Any) -> None:
         with policy(lambda _: answer) as url:
-            found = {finding.code: finding for finding in examine(url)}
-        assert found["server"].level == "error"
-        assert "pickle" not in found
+            assert [(finding.code, finding.level) for finding in examine(url)] == [("server", "error")]
 
     def test_a_key_is_no_danger(self) -> None:
         with policy(lambda _: {"error": "Unauthorized: Invalid API token"}) as url:
             found = {finding.code: finding for finding in examine(url)}
-        assert "no-key" not in found
+        assert "no key" not in found["access"].message
         assert "Invalid API token" in found["server"].message
 
     def test_where_nothing_answers_it_is_told(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import ClassVar
 
 from s2a_bench.harness.config import RequestsConfig
-from s2a_bench.inference import EngineConfig
+from s2a_bench.inference import OF_MODEL, EngineConfig
 from s2a_bench.options import group, option
 from s2a_bench.transport import PAYLOADS, Payloads
 
@@ -24,18 +24,7 @@ class LatencyConfig(RequestsConfig):
     engine: EngineConfig = group(
         EngineConfig,
         only=(
-            *(
-                "name",
-                "profile",
-                "gaps",
-                "latency",
-                "model",
-                "mmproj",
-                "chat_template",
-                "threads",
-                "gpu_layers",
-                "context",
-            ),
+            *("name", "profile", "gaps", "latency", *OF_MODEL, "threads", "context"),
             *("flash_attention", "answer", "horizon", "action_dim"),
         ),
     )

@@ -11,7 +11,7 @@ from s2a_bench.boards.profile import Profile
 from s2a_bench.errors import UsageError
 from s2a_bench.frames import SOURCES
 from s2a_bench.harness.config import DEFAULT_PROMPT
-from s2a_bench.inference import EngineConfig
+from s2a_bench.inference import OF_MODEL, EngineConfig
 from s2a_bench.options import Options, Size, TextOrFile, group, option
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import Count, Facts, Many, NonNegative, Positive, about
@@ -24,9 +24,7 @@ class CaptureConfig(Options):
 
     name: str = option(..., "name of the profile; its file is NAME.toml", argument=True)
     title: str = option("", "what figures call it [default: the board's or CPU's name]")
-    engine: EngineConfig = group(
-        EngineConfig, only=("model", "mmproj", "chat_template", "threads", "gpu_layers", "context")
-    )
+    engine: EngineConfig = group(EngineConfig, only=(*OF_MODEL, "threads", "context"))
     source: str = option("synthetic", f"{', '.join(SOURCES)}, as video:FILE")
     size: Size = option((640, 480), "WIDTHxHEIGHT of the frames [default: 640x480]")
     requests: int = option(20, "requests that count, each about a new frame", ge=1)

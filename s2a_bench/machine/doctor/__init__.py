@@ -125,5 +125,5 @@ def warnings_of(findings: Iterable[Finding]) -> list[RunWarning]:
 
 class DoctorConfig(Options):
     output: Path = option(Path("results"), "folder for run folders, whose disk is checked")
-    url: str = option("", "check a server of another operator for risks, instead of this machine")
+    url: str = option("", "check an external server for what distorts a measurement of it, instead of this machine")
     strict: bool = option(False, "exit with 1 on warnings too")

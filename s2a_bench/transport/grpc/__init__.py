@@ -42,7 +42,7 @@ class Grpc(PolicyTransport[GrpcOptions]):
     serves = False
     payloads = ("raw",)
     stages: ClassVar[dict[str, str]] = {"pickle_pack": "pack", "send": "network", "pickle_parse": "parse"}
-    urls = Urls(GrpcOptions.SCHEMES, examine="s2a_bench.transport.grpc.risks:examine")
+    urls = Urls(GrpcOptions.SCHEMES, examine="s2a_bench.transport.grpc.client:examine")
     needs = ("grpc", "grpc")
     client_class = "s2a_bench.transport.grpc.client:GrpcClient"
     facts = (PAYLOAD_BYTES, PAYLOAD_DOWN_BYTES, RECONNECTS, GET_ACTIONS_MS)

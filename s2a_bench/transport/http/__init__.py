@@ -61,7 +61,7 @@ class Http(Transport[HttpOptions]):
     client_class = "s2a_bench.transport.http.client:HttpClient"
     urls = Urls(
         HttpOptions.SCHEMES,
-        examine="s2a_bench.transport.http.risks:examine",
+        examine="s2a_bench.transport.http.detect:examine",
         cache_hits="s2a_bench.transport.http.detect:cache_hits",
     )
 

@@ -1,25 +1,28 @@
-"""Questions to a server outside the measurement: its dialect, its models, the hits of its caches."""
+"""Questions to a server outside the measurement: its dialect, its models, the hits of its caches, what distorts."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Any
-from urllib.parse import urlsplit, urlunsplit
+from urllib.parse import SplitResult, urlsplit, urlunsplit
 
 import httpx
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, ServerDied
+from s2a_bench.errors import RequestFailed, S2AError, ServerDied
+from s2a_bench.machine.doctor import Finding
 from s2a_bench.trace import FACT_LIMIT
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.http.clients import BoundedClient, HttpResponse
 from s2a_bench.transport.http.dialects import NATIVE, open_dialect
-from s2a_bench.transport.http.dialects.common import NO_LIST, NO_MODEL, Dialect, Get, first_model
+from s2a_bench.transport.http.dialects.common import NO_LIST, NO_MODEL, Dialect, Get, endpoint, first_model
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
+from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, idle_cut
 
 OWNERS = {"llamacpp": "llama-server", "vllm": "vllm", "s2a-bench": NATIVE}
 """``owned_by`` of the first model -> dialect. Ollama gives ``library``, clouds their names: plain OpenAI."""
@@ -27,7 +30,6 @@ OWNERS = {"llamacpp": "llama-server", "vllm": "vllm", "s2a-bench": NATIVE}
 HITS = re.compile(r"^(\w+:\w*(?:hits|cached_tokens|tokens_cached)(?:_total)?)(?:\{.*\})? (\S+)", re.MULTILINE)
 """A counter of cache hits: vLLM's of prefixes and pictures, SGLang's of prompt tokens."""
 
-PATIENCE_S = 5.0
 LIMIT = 1 << 20
 
 
@@ -67,6 +69,38 @@ def cache_hits(wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
     except (*NO_LIST, ServerDied, RequestFailed, httpx.HTTPError, httpx.InvalidURL):
         return {}
     return hits
+
+
+def examine(parts: SplitResult) -> Iterator[Finding | str]:
+    """Request the list of models without a key, and where there is none an action of no observation."""
+    url, model, why = urlunsplit(parts), "", ""
+    heads: list[httpx.Response] = []
+    try:
+        with probe(url) as client:
+            client.event_hooks["response"] = [heads.append]
+            _, model = first_model(url, getter(client, {}))
+    except ServerDied as error:
+        raise OSError(str(error).rpartition(": ")[2]) from error
+    except (*NO_LIST, S2AError, httpx.HTTPError, httpx.InvalidURL) as error:
+        why = f": {error}"
+    for head in heads[-1:]:
+        if idle := re.search(r"timeout=(\d{1,6})", head.headers.get("keep-alive", "")):
+            yield idle_cut(int(idle[1]), "send requests more often, or start the server with a longer keep-alive")
+        if head.is_success and (head.http_version == "HTTP/1.0" or head.headers.get("connection") == "close"):
+            what = "it closes the connection after each answer: each request connects first"
+            yield Finding("connections", "advice", what, "let the server, or a proxy before it, keep connections")
+    if model or (not why and _acts(endpoint(url, "", "/act"))):
+        yield NO_KEY
+    else:
+        yield Finding("server", "state", f"it answers, and shows no list of models without a key{why}")
+
+
+def _acts(url: str) -> bool:
+    """Return whether a server takes POST alone, and from everybody an object whose refusal needs no model."""
+    with suppress(S2AError, httpx.HTTPError), probe(url) as client:
+        if client.get(url).status_code == httpx.codes.METHOD_NOT_ALLOWED:
+            return client.post(url, json={}).status_code in {200, 400, 500}
+    return False
 
 
 def getter(client: BoundedClient, headers: dict[str, str]) -> Get:

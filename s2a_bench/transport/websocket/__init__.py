@@ -36,7 +36,7 @@ class Websocket(PolicyTransport[WebsocketOptions]):
     name = "websocket"
     options = WebsocketOptions
     variants = VARIANTS
-    urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.transport.websocket.risks:examine")
+    urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.transport.websocket.client:examine")
     needs = ("websocket", *PACKAGES)
     client_class = "s2a_bench.transport.websocket.client:WebsocketClient"
     server_class = "s2a_bench.transport.websocket.server:WebsocketServer"

@@ -42,7 +42,7 @@ class Zmq(PolicyTransport[ZmqOptions]):
     name = "zmq"
     options = ZmqOptions
     variants = (GR00T,)
-    urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.transport.zmq.risks:examine")
+    urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.transport.zmq.client:examine")
     needs = ("zmq", *PACKAGES)
     client_class = "s2a_bench.transport.zmq.client:ZmqClient"
     server_class = "s2a_bench.transport.zmq.server:ZmqServer"

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from typing import Any, Final
+from urllib.parse import SplitResult, urlunsplit
 
 import zmq
 
@@ -18,12 +19,14 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
+from s2a_bench.machine.doctor import Finding
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring, observed
 from s2a_bench.transport.limits import Bounds
-from s2a_bench.transport.listening import read_key
+from s2a_bench.transport.listening import in_url, read_key
 from s2a_bench.transport.observation import EXTENSION, template_of
 from s2a_bench.transport.policy_client import PolicyClient
+from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, UNPICKLES, printable
 from s2a_bench.transport.zmq import ZmqOptions, layouts
 from s2a_bench.transport.zmq.npy import PictureFile
 from s2a_bench.transport.zmq.watch import ConnectionWatch
@@ -40,6 +43,8 @@ KEPT_FILES: Final = 16
 """Most pictures whose memory is kept for the next request."""
 WRONG_POLICY: Final = b"ERROR"
 """The reply of some GR00T servers that serve another kind of policy."""
+N1: Final = WRONG_POLICY, b"PK\x03\x04", *(bytes((0x80, protocol)) for protocol in range(2, 6))
+"""How answers of GR00T N1 begin: its only error, an archive of torch.save, a pickle."""
 
 
 class ZmqClient(PolicyClient[ZmqOptions]):
@@ -147,6 +152,29 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         if self._link is not None:
             self._link.close()
             self._link = None
+
+
+def examine(parts: SplitResult) -> Iterator[Finding | str]:
+    """Ping without a key; if that is answered, read how its configurations are marked."""
+    url = urlunsplit((parts.scheme, f"{in_url(parts.hostname or '')}:{parts.port or 5555}", "", "", ""))
+    bounds = Bounds(url, 3 * PATIENCE_S, 0)
+    with closing(ReqSocket(url, PATIENCE_S, lambda: True)) as link:
+        link.greet(bounds)
+        pong = link.exchange(pack({layouts.ENDPOINT: layouts.PING}), bounds)
+        if pong.startswith(N1):
+            yield f"{UNPICKLES} (GR00T N1, whose protocol s2a-bench does not speak)"
+            return
+        answer, marks = read(pong)
+        if not isinstance(answer, dict):
+            raise RequestFailed(f"{url} answers a ping with {type(answer).__name__}, which GR00T's servers do not")
+        if layouts.ERROR in answer:
+            error = printable(str(answer[layouts.ERROR]))
+            yield Finding("server", "state", f"it answers, and refuses requests without a key: {error}")
+        else:
+            yield NO_KEY
+            _, marks = read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES}), bounds))
+    if not marks & {layouts.N1_5, layouts.N1_6}:
+        yield "may unpickle what it receives (early GR00T N1.7)"
 
 
 class ReqSocket:
