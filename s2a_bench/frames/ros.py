@@ -101,9 +101,11 @@ class TopicCamera(ImageMessages):
                 return offers
         others = sorted({offer.topic for offer in found if offer.type_name in TYPES})
         types = sorted({offer.type_name for offer in found if offer.topic == self._topic})
-        what = f"is of type {', '.join(types)}" if there else f"has no publisher after {self._wait_s:g} s"
+        listed = f"topics of pictures here: {', '.join(others[:10]) or 'none'}"
+        if there:
+            raise TransportError(f"{self._topic} is of type {', '.join(types)}; {listed}")
         raise TransportError(
-            f"{self._topic} {what}; topics of pictures here: {', '.join(others[:10]) or 'none'}. "
+            f"{self._topic} has no publisher after {self._wait_s:g} s; {listed}. "
             "Is ROS_DOMAIN_ID the publisher's, and ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET set if it is on another host?"
         )
 
@@ -130,9 +132,12 @@ class TopicCamera(ImageMessages):
         if isinstance(newest, TransportError):
             raise newest
         if newest is None:
-            count = sum(offer.topic == self._topic for offer in self._middleware.offers())
+            count = self._subscription.matched()
+            what = f"no picture for {self._wait_s:g} s of {count} publisher{'s' * (count != 1)}"
+            if not count:
+                raise TransportError(f"{what}: start it again, or one with the QoS and the type of ROS 2")
             raise TransportError(
-                f"no picture for {self._wait_s:g} s of {count} publisher{'s' * (count != 1)}; see whether `ros2 topic "
-                f"hz {self._topic}` counts any. Large pictures need larger receive buffers: `s2a-bench doctor`"
+                f"{what}; see whether `ros2 topic hz {self._topic}` counts any. Large pictures need larger receive "
+                "buffers: `s2a-bench doctor`"
             )
         return newest
