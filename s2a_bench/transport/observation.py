@@ -150,13 +150,10 @@ class Template:
         except RequestFailed as error:
             raise UsageError(f"{error}; see `cameras` and `state`") from error
 
-    def check_pictures(self, cameras: int, listed: Sequence[str]) -> None:
-        """Raise UsageError if the server, which reads the pictures ``listed``, ignores one of so many."""
+    def ignored(self, listed: Sequence[str]) -> list[tuple[int, str]]:
+        """Return place and key of each picture that a server which reads the pictures ``listed`` ignores."""
         read = {root + key for root in PICTURE_ROOTS for key in listed}
-        for index, path in self._keys:
-            if index < cameras and path not in read and not path.endswith(ANY):
-                known, cure = ", ".join(map(repr, listed)), "take a template with these keys, or write one"
-                raise UsageError(f"`template` {self.name}: the server ignores '{path}', it reads {known}; {cure}")
+        return [(index, path) for index, path in self._keys if path not in read and not path.endswith(ANY)]
 
     def check_server(self, transport: str, reads: Sequence[str]) -> None:
         """Refuse a description of the server of which ``transport`` does not read all, only the keys ``reads``."""

@@ -19,7 +19,7 @@ from PIL import Image
 from websockets.extensions.permessage_deflate import ClientPerMessageDeflateFactory
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, S2AError, ServerDied
+from s2a_bench.errors import RequestFailed, S2AError, ServerDied, UsageError
 from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.provenance import Provenance
@@ -55,6 +55,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         self._headers[codec.MARKS_HEADER] = "1"
         self._link: BoundedConnection | None = None
         self._metadata: dict[str, str] = {}
+        self._ignored: list[tuple[int, str]] = []
         self._provenance: dict[str, str] = {}
 
     def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:
@@ -124,8 +125,11 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         return link
 
     def _exchanged(self, link: BoundedConnection, body: bytes, cameras: int, trace: Trace) -> tuple[bytes, int]:
-        if self._listed:
-            self._template.check_pictures(cameras, self._listed)
+        for index, path in self._ignored:
+            if index < cameras:
+                known, cure = ", ".join(map(repr, self._listed)), "take a template with these keys, or write one"
+                name = self._template.name
+                raise UsageError(f"`template` {name}: the server ignores '{path}', it reads {known}; {cure}")
         packed_ns = trace.marks[-1][1]
         link.send(body)
         return self._message(link), packed_ns
@@ -142,6 +146,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         described = metadata.get("input")
         listed = described.get("image_keys") if isinstance(described, dict) else None
         self._listed = [struck(str(key))[:64] for key in listed[:CAMERAS]] if isinstance(listed, list) else []
+        self._ignored = self._template.ignored(self._listed) if self._listed else []
         if self._template.unnamed and not (self._native or self._listed):
             raise RequestFailed(f"{self._url}: its greeting lists no pictures; take a template that names them")
 
