@@ -24,7 +24,7 @@ from s2a_bench.errors import COMPILE_AGAIN, SETUP_AGAIN, EngineError, PortInUse,
 from s2a_bench.harness import llama_wheel
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
-from s2a_bench.inference.models import chat_template, load_headers, sha256
+from s2a_bench.inference.models import chat_template, load_headers
 from s2a_bench.machine.tuning import start_child
 from s2a_bench.provenance import NOT_SENT
 from s2a_bench.transport import Program
@@ -295,14 +295,10 @@ def start_program(program: Program, engine: EngineConfig, log: Path, *, has_gram
     """
     files = load_headers(engine)
     process = PROGRAMS[program.kind](program, engine, log, ignore_end=files.dummy and not has_grammar)
-    tower = {"mmproj": str(files.mmproj.path), "mmproj_sha256": sha256(files.mmproj.path)} if files.mmproj else {}
     process.facts["engine"] = {
         "engine": "llama-server",
-        "name": str(files.model.fields.get("general.name", "")),
-        "model": str(files.model.path),
-        "model_sha256": sha256(files.model.path),
-        "dummy": files.dummy,
-        **(tower or {"pictures": NOT_SENT}),  # it refuses pictures that its model does not see
+        **files.describe(),
+        **({} if files.mmproj else {"pictures": NOT_SENT}),  # it refuses pictures that its model does not see
     }
     return process
 

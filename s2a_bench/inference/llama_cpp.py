@@ -47,7 +47,7 @@ from s2a_bench.inference.llama_decode import (
 )
 from s2a_bench.inference.llama_pictures import PixelHandler
 from s2a_bench.inference.llama_prompt import ChatTemplate, TextHandler, TooLong
-from s2a_bench.inference.models import ModelFiles, load_headers, sha256
+from s2a_bench.inference.models import ModelFiles, load_headers
 from s2a_bench.types import Request, Token
 
 llama_cpp = extras.require("llama_cpp", "llama")
@@ -105,9 +105,9 @@ def _refused(what: str, llama: _Prefilled) -> Iterator[None]:
         raise ModelError(f"{what}: {error}") from error
 
 
-def _tower(mmproj: GgufHeader) -> dict[str, str]:
-    projector = str(mmproj.fields.get("clip.projector_type") or mmproj.fields.get("clip.vision.projector_type", ""))
-    return {"mmproj": str(mmproj.path), "mmproj_sha256": sha256(mmproj.path), "projector": projector}
+def _projector(mmproj: GgufHeader) -> dict[str, str]:
+    fields = mmproj.fields
+    return {"projector": str(fields.get("clip.projector_type") or fields.get("clip.vision.projector_type", ""))}
 
 
 class LlamaCppEngine(Engine):
@@ -254,15 +254,12 @@ class LlamaCppEngine(Engine):
 
     def describe(self) -> dict[str, str | int | float | bool]:
         """Describe the model; the first call hashes the files, which takes seconds for gigabytes."""
-        model, mmproj = self._files.model, self._files.mmproj
+        mmproj = self._files.mmproj
         facts: dict[str, str | int | float | bool] = {
             "engine": "llama",
-            "dummy": self._files.dummy,
-            "name": str(model.fields.get("general.name", "")),
-            "architecture": model.architecture,
-            "model": str(model.path),
-            "model_sha256": sha256(model.path),
-            **(_tower(mmproj) if mmproj else {"pictures": "not seen"}),
+            **self._files.describe(),
+            "architecture": self._files.model.architecture,
+            **(_projector(mmproj) if mmproj else {"pictures": "not seen"}),
             "chat_template_sha256": hashlib.sha256(self._files.chat_template.encode()).hexdigest(),
             "llama_cpp_python": version("llama-cpp-python"),
             "threads": self._threads,

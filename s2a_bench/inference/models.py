@@ -112,6 +112,15 @@ class ModelFiles:
     def dummy(self) -> bool:
         return any(header.is_dummy for header in (self.model, self.mmproj) if header)
 
+    def describe(self) -> dict[str, str | bool]:
+        """Return what a manifest tells of the files; the first call hashes them, which takes seconds for gigabytes."""
+        found: dict[str, str | bool] = {"dummy": self.dummy}
+        found["name"] = str(self.model.fields.get("general.name", ""))
+        for kind, header in (("model", self.model), ("mmproj", self.mmproj)):
+            if header:
+                found |= {kind: str(header.path), f"{kind}_sha256": sha256(header.path)}
+        return found
+
 
 def cache_folder() -> Path:
     """Return the user's cache folder of s2a-bench, or that of the variable S2A_BENCH_CACHE."""
