@@ -57,19 +57,20 @@ def byte_names() -> dict[int, str]:
 
 def make_vocab(*, full: bool, size: int = FULL_SIZE, special: Sequence[str] = SPECIAL) -> Vocab:
     """Return the 256 bytes, merges, and ``special``, which begins with padding, begin and end; ``size`` if ``full``."""
+    minicpm = special is SPECIAL
     tokens = list(byte_names().values())
     # \u0120 stands for a space, \u010a for a new line: MTMD looks up the empty line, which MiniCPM-V 2.6 does not need
-    merges = [] if special is SPECIAL else ["\u010a \u010a"]
+    merges = [] if minicpm else ["\u010a \u010a"]
     # at least one for llama.cpp
     merges += _letter_merges(size - len(special) - len(tokens) - len(merges)) if full else ["\u0120 t"]
     tokens += [merge.replace(" ", "") for merge in merges]
     types = [NORMAL] * len(tokens) + [CONTROL] * len(special)
     first = unknown = len(tokens)
     tokens += special
-    if special is SPECIAL and full:
+    if minicpm and full:
         unknown = FULL_UNKNOWN
         tokens[unknown], types[unknown] = "<unk>", CONTROL
-    elif special is SPECIAL:
+    elif minicpm:
         unknown = len(tokens)
         tokens.append("<unk>")
         types.append(CONTROL)

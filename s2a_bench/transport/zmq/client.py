@@ -98,10 +98,8 @@ class ZmqClient(PolicyClient[ZmqOptions]):
     def _pack(self, request: Request, trace: Trace) -> memoryview:
         """Fill the template and write it as MessagePack, marking each stage."""
         if self._modalities:
-            self._template, self._modalities = (
-                layouts.template_of(self._layout, self._modalities, len(request.state)),
-                {},
-            )
+            self._template = layouts.template_of(self._layout, self._modalities, len(request.state))
+            self._modalities = {}
         seen = self._observation(request, trace)
         data = seen if self._layout == layouts.N1_5 else {layouts.OBSERVATION: seen, "options": None}
         message: dict[str, Any] = {layouts.ENDPOINT: layouts.GET_ACTION, layouts.DATA: data, **self._token()}
