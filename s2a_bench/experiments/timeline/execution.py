@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -26,9 +24,6 @@ from s2a_bench.stats import summarise
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import RunWriter
-
-SWITCH_S: Final = 0.0005
-"""Python's switch interval between threads: with the default 5 ms a busy thread would delay starts by as much."""
 
 
 class SideBySide:
@@ -66,17 +61,6 @@ class SideBySide:
         if kind is not None:
             self.send(AbortRequested(now_ns(), "the run was ended"))
         self._pool.shutdown()
-
-
-@contextmanager
-def quick_switching() -> Iterator[None]:
-    """Shorten the switch interval between threads to `SWITCH_S`."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(SWITCH_S)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
 
 
 def keep(
