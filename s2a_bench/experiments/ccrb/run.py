@@ -91,6 +91,7 @@ def keep_loop(
     """Write a closed loop, and beside it the roll-out on the arrivals of its plan, ``ready``."""
     scenario = config.scenario
     plans, schedule, _ = executed(looped.record)
+    writer.update(step_s=world.step_s)
     _keep(config, ready, world, name, plans, schedule, looped.driven, writer, looped.facts)
     with closing(open_simulator("embedded" if scenario.lane_change else "longitudinal")) as exact:
         beside = drive(exact, scenario.cars, scenario.driving, ready.schedules[name])

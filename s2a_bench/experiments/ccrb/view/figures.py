@@ -44,6 +44,7 @@ _PHASES: Final[dict[str, dict[str, Any]]] = {
     "acting": {"facecolor": "#BFE3D5", "edgecolor": "white", "linewidth": 0.6},
     "gap": {"facecolor": "white", "edgecolor": "#999999", "hatch": "//////", "linewidth": 0},
 }
+_FIRST: Final[dict[str, Any]] = {"color": "#555555", "linestyle": "-.", "linewidth": 0.6}
 _CAPTIONS: Final = {"waiting": "no skill yet", "acting": "a skill runs", "gap": "stall: no skill is valid"}
 _REST_MPS: Final = 0.1
 _AFTER_S: Final = 1.0
@@ -67,15 +68,15 @@ _POINT: Final[dict[str, Any]] = {
 
 
 def build_scenario(run: StoredRun) -> Figure:
-    """Draw positions, speeds and gaps over time at the operating point, a column a policy."""
+    """Draw positions, speeds and gaps over time at the operating point, a column a policy, and name its roll-out."""
     found = rollouts_of(run, "point")
     survives, rows = survives_of(found), found.to_dict("records")
     paths = {row["policy"]: _path(run, row) for row in rows}
     skills = dict(list(run.table(SKILLS).groupby("cell", sort=False)))
-    settings = configuration(run)
+    settings, beside = configuration(run), rollouts_of(run, "rollout").set_index("cell")
     title = (
-        f"CCRB with a car behind ({settings['simulator']} simulator): {operating_point(settings)}, "
-        f"N = {settings['n_skills']}, L = {settings['tokens_per_skill']}"
+        f"CCRB with a car behind ({settings['simulator']} simulator{', closed loop' * (len(beside) > 0)}): "
+        f"{operating_point(settings)}, N = {settings['n_skills']}, L = {settings['tokens_per_skill']}"
     )
     figure = new_figure(4.5, (title, *origin_notes(run)), WIDE_IN)
     grid = figure.subplots(3, len(rows), squeeze=False, sharex=True, sharey="row")
@@ -83,13 +84,17 @@ def build_scenario(run: StoredRun) -> Figure:
     for column, row in enumerate(rows):
         path, cell = paths[row["policy"]], row["cell"]
         above = grid[0, column]
-        above.set_title(f"{row['policy']}: {_verdict(row, survives)}", loc="left", pad=3)
+        verdict = f"{row['policy']}: {_verdict(row, survives)}"
+        if cell in beside.index:
+            verdict += f"\nroll-out: {_verdict(beside.loc[cell].to_dict(), survives)}"
+        above.set_title(verdict, loc="left", pad=3)
+        token_s = token_times_s(run, cell)
         for axes in grid[:, column]:
             _shade(axes, path, skills[cell])
+            axes.axvline(token_s[0], **_FIRST)
             axes.set_xlim(0, until_s)
         _draw_cars(above, path, "position_m")
-        # Along the lower edge, whatever the positions.
-        edge, token_s = above.get_xaxis_transform(), token_times_s(run, cell)
+        edge = above.get_xaxis_transform()  # along the lower edge, whatever the positions
         above.plot(token_s, [0.04] * len(token_s), "|", color="#555555", markersize=5, transform=edge, clip_on=False)
         _draw_cars(grid[1, column], path, "speed_kmh")
         _draw_gaps(grid[2, column], path, row)
@@ -135,7 +140,7 @@ def _shade(axes: Axes, path: pd.DataFrame, skills: pd.DataFrame) -> None:
     for skill in skills.to_dict("records"):
         start, end, stall = (skill[f"{name}_ns"] / 1e9 for name in ("start", "end", "stall"))
         if start < last:
-            axes.axvspan(start, end, zorder=0, **_PHASES["acting"])
+            axes.axvspan(start, min(end, last), zorder=0, **_PHASES["acting"])
         if stall > 0 and start - stall < last:
             axes.axvspan(start - stall, start, zorder=0, **_PHASES["gap"])
 
@@ -170,6 +175,7 @@ def _legend() -> list[object]:
         Line2D([], [], color=colour, linestyle=style, label=names[car]) for car, (colour, style) in CAR_STYLES.items()
     ]
     lines.append(Line2D([], [], color="#555555", marker="|", linestyle="", label="a token arrives"))
+    lines.append(Line2D([], [], label="the first token", **_FIRST))
     return lines + [Patch(label=_CAPTIONS[name], **style) for name, style in _PHASES.items()]
 
 

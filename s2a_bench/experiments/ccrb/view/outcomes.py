@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments import TIME
 from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from s2a_bench.store.run import StoredRun
+
+
+IN_TIME: Final = 0.99
+"""Below this real-time factor a world was slower than its clock."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,14 +43,14 @@ class Share:
 
 
 def rollouts_of(run: StoredRun, study: str) -> pd.DataFrame:
-    """Return the roll-outs of a study: point (the operating point), phase (the diagram) or random."""
+    """Return the rows of a study: point (the operating point), rollout (beside closed loops), phase or random."""
     rows = run.table(ROLLOUTS)
     return rows[rows["study"] == study].reset_index(drop=True)
 
 
-def cells_of(run: StoredRun) -> list[dict[str, Any]]:
-    """Return each policy's roll-out at the operating point as JSON, times in s; absent values have no key."""
-    return [_cell(row) for row in rollouts_of(run, "point").to_dict("records")]
+def cells_of(run: StoredRun, study: str = "point") -> list[dict[str, Any]]:
+    """Return each policy's row at the operating point as JSON, times in s; absent values have no key."""
+    return [_cell(row) for row in rollouts_of(run, study).to_dict("records")]
 
 
 def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
@@ -112,10 +116,15 @@ def configuration(run: StoredRun) -> dict[str, Any]:
     return found
 
 
+def request_of(run: StoredRun, cell: str) -> str:
+    """Return the id of the request whose plan ``cell`` was driven on."""
+    skills = run.table(SKILLS)
+    return str(skills[skills["cell"] == cell]["request_id"].iloc[0])
+
+
 def token_times_s(run: StoredRun, cell: str) -> list[float]:
     """Return the arrival times of the tokens that ``cell`` was driven on, in s from its request."""
-    skills, tokens = run.table(SKILLS), run.table(TOKENS)
-    request_id = skills[skills["cell"] == cell]["request_id"].iloc[0]
+    request_id, tokens = request_of(run, cell), run.table(TOKENS)
     zero_ns = run.manifest.get("requests", {}).get(request_id, 0) or run.manifest.get("request", {}).get(
         "requested_ns", 0
     )
@@ -143,6 +152,7 @@ def _compared(theirs: pd.DataFrame, mine: pd.DataFrame, column: str) -> tuple[pd
 def origin_notes(run: StoredRun) -> tuple[str, ...]:
     settings = configuration(run)
     notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
+    notes += _loop_notes(run) if has(run, "rollout") else []
     notes.append(f"Rear: {law(settings)}.")
     notes.append(follower_check(settings, survives_of(rollouts_of(run, "point"))))
     reflex = "on" if settings["reflex"] else "off"
@@ -168,10 +178,27 @@ def _live_notes(run: StoredRun) -> list[str]:
     if "paced_tokens_per_s" not in live:
         line = Note(f"{line} {rate:g} tokens/s arrived.", *line.labels)
     road = "Open loop: one request at t = 0 about the rendered scene; the road does not change the answer."
+    notes = [line] if has(run, "rollout") else [line, road]
     driven = "the set-points driven are those of the scenario."
     if live.get("dummy"):
-        return [line, road, Note(f"Dummy weights: what the plan says means nothing; {driven}", DUMMY)]
-    return [line, road, f"What the plan says is not driven; {driven}"]
+        return [*notes, Note(f"Dummy weights: what the plan says means nothing; {driven}", DUMMY)]
+    return [*notes, f"What the plan says is not driven; {driven}"]
+
+
+def _loop_notes(run: StoredRun) -> list[str]:
+    """Return what closed loops are, what the roll-outs beside them are, and which worlds were slower than the clock."""
+    step = f"in steps of {run.manifest['step_s'] * 1e3:g} ms"
+    about = f"Closed loop: the world ran in virtual time, {step}, while the plan arrived."
+    if "live" in run.manifest:
+        about = f"Closed loop: the world ran on the clock, {step}, while the model answered; each policy had a request "
+        about += "of its own, about the view at that moment."
+    beside = rollouts_of(run, "rollout")["simulator"].iloc[0]
+    notes = [about, f"Roll-out: the policy on the same arrivals in virtual time, {beside} simulator."]
+    factors = rollouts_of(run, "point").set_index("policy")["real_time_factor"]
+    if slow := [f"{factor:.3g} ({policy})" for policy, factor in factors.items() if factor < IN_TIME]:
+        late = f"The world was slower than the clock, real-time factor {', '.join(slow)}: in its own time the model was faster."
+        notes.append(Note(late, "world slower than the clock"))
+    return notes
 
 
 def _emulated_notes(run: StoredRun) -> list[str]:

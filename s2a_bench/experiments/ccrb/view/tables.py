@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from s2a_bench.experiments import TIME, Shown, Tables
+from s2a_bench.experiments import TIME, Shown, Tables, requests
 from s2a_bench.experiments.ccrb.rows import (
     IMPACTS,
+    LOOP,
     MARGINS,
     METRICS,
     MOTION,
@@ -23,10 +24,11 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     origin_notes,
     rate_span,
     rate_span_at_point,
+    request_of,
     rollouts_of,
     scenes_of,
     share_of,
-    survives_of,
+    tokens_line,
 )
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.labels import (
@@ -39,10 +41,10 @@ from s2a_bench.scenario.ccrb.labels import (
 from s2a_bench.store.schema import Count, Facts, Fraction, Many, Positive, about
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import cell_of_row, frame
-from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, number
+from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, entries, number
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from s2a_bench.experiments import Metric
     from s2a_bench.store.run import StoredRun
@@ -52,7 +54,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
     return Shown.build(
         sentences=lambda: _ccrb_sentences(run),
         tables=ccrb_tables(run),
-        main=["outcomes", "phase", "random"],
+        main=["outcomes", "stages", "phase", "random"],
         csvs=lambda: _ccrb_csv(run),
         figures=lambda: ccrb_figures(run),
         json=lambda: ccrb_json(run),
@@ -60,12 +62,9 @@ def show(run: StoredRun, **_: Any) -> Shown:
 
 
 def _ccrb_sentences(run: StoredRun) -> list[str]:
-    rows = rollouts_of(run, "point")
-    survives = survives_of(rows)
     sentences = [
-        f"{row['policy']}: {outcome_label(row['outcome'], survives)}, "
-        f"{row['stalls']} stalls of {row['stall_ns'] / 1e9:.2f} s."
-        for row in rows.to_dict("records")
+        f"{name.replace('  ', f'{policy}, ')}: {_outcome(cell)}, {cell['stalls']} stalls of {cell['stall_s']:.2f} s."
+        for policy, name, cell in _shown(run)
     ]
     sentences += [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
     if studies := run.manifest.get("studies"):
@@ -152,17 +151,42 @@ class CcrbStudy:
     ] = None
 
 
-def _outcome_table(run: StoredRun) -> TextTable:
-    rows, shown = [], [metric for metric in (*TIMES, *IMPACTS) if metric.title]
+def _shown(run: StoredRun) -> Iterator[tuple[str, str, dict[str, Any]]]:
+    """Yield policy, name and cell of each row of the outcomes: a closed loop is followed by its roll-out."""
+    beside = {cell["cell"]: cell for cell in cells_of(run, "rollout")}
     for cell in cells_of(run):
-        outcome = outcome_label(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
-        rows.append((cell["policy"], outcome, *(_entry(cell, metric) for metric in shown)))
+        yield cell["policy"], cell["policy"], cell
+        if cell["cell"] in beside:
+            yield cell["policy"], "  roll-out", beside[cell["cell"]]
+
+
+def _outcome(cell: dict[str, Any]) -> str:
+    return outcome_label(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
+
+
+def _outcome_table(run: StoredRun) -> TextTable:
+    loop = LOOP if has(run, "rollout") else ()
+    shown = [metric for metric in (*TIMES, *IMPACTS, *loop) if metric.title]
+    rows = [(name, _outcome(cell), *(_entry(cell, metric) for metric in shown)) for _, name, cell in _shown(run)]
     settings = configuration(run)
     title = f"CCRB with a car behind, {settings['simulator']} simulator: {operating_point(settings)}"
     header = ("policy", "outcome", *map(_title, shown))
     deadline_s = float(rollouts_of(run, "point")["deadline_ns"].iloc[0]) / 1e9
     deadline = f"S_front = {deadline_s:.2f} s: planned braking that starts by then keeps 2 m to the lead."
     return TextTable(title, header, rows, 2, notes=(*origin_notes(run), deadline, NO_SCORE))
+
+
+def _stage_table(run: StoredRun) -> TextTable:
+    (cell,) = requests.cells_of(run)
+    groups, whole = requests.groups_present([cell]), ("residual", "ttft", "e2e")
+    rows = []
+    for policy in cells_of(run):
+        asked = cell.good["request_id"] == request_of(run, policy["cell"])
+        mine = replace(cell, good=cell.good[asked])
+        values = (*map(mine.group_ms, groups), *map(mine.values_ms, whole))
+        rows.append((policy["policy"], *(entries(each, "median")[0] for each in values)))
+    title, header = "Each policy's request in ms, to its first token", ("policy", *groups, "residual", "TTFT", "e2e")
+    return TextTable(title, header, rows, 1, notes=(tokens_line(run), "TTFT: from the prompt; e2e: with the capture."))
 
 
 def _margin_table(run: StoredRun) -> TextTable:
@@ -205,6 +229,7 @@ def ccrb_tables(run: StoredRun) -> Tables:
         "random": lambda: _random_table(run) if has(run, "random") else None,
         "phase": lambda: _phase_table(run) if has(run, "phase") else None,
         "margins": lambda: _margin_table(run),
+        "stages": lambda: _stage_table(run) if "live" in run.manifest and has(run, "rollout") else None,
         "outcomes": lambda: _outcome_table(run),
     }
 
@@ -228,7 +253,8 @@ def ccrb_json(run: StoredRun) -> dict[str, Any]:
     """Return the ``--json`` object (docs/schema/s2a-bench-1.json): SI units, a cell a policy, studies as shares."""
     studies = [_study(run, study, gap) for study in ("phase", "random") if has(run, study) for gap in GAPS]
     live = {"live": run.manifest["live"]} if "live" in run.manifest else {}
-    return frame(run, cells_of(run), [], **live, follower_law=law(configuration(run)), studies=studies)
+    beside = {"rollouts": cells} if (cells := cells_of(run, "rollout")) else {}
+    return frame(run, cells_of(run), [], **live, **beside, follower_law=law(configuration(run)), studies=studies)
 
 
 def _study(run: StoredRun, study: str, gap: str) -> dict[str, Any]:
