@@ -14,6 +14,8 @@ from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     import pandas as pd
 
     from s2a_bench.store.run import StoredRun
@@ -48,9 +50,10 @@ def rollouts_of(run: StoredRun, study: str) -> pd.DataFrame:
     return rows[rows["study"] == study].reset_index(drop=True)
 
 
-def cells_of(run: StoredRun, study: str = "point") -> list[dict[str, Any]]:
-    """Return each policy's row at the operating point as JSON, times in s; absent values have no key."""
-    return [_cell(row) for row in rollouts_of(run, study).to_dict("records")]
+def cells_of(run: StoredRun, studies: Collection[str] = ("point",)) -> list[dict[str, Any]]:
+    """Return each policy's rows at the operating point as JSON, times in s; absent values have no key."""
+    rows = run.table(ROLLOUTS)
+    return [_cell(row) for row in rows[rows["study"].isin(studies)].to_dict("records")]
 
 
 def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
@@ -135,7 +138,7 @@ def _cell(row: dict[Any, Any]) -> dict[str, Any]:
     import pandas as pd
 
     plain = {str(name): value for name, value in row.items() if not pd.isna(value)}
-    for name in ("study", "draw", "title", PROVENANCE):
+    for name in ("draw", "title", PROVENANCE):
         plain.pop(name, None)
     plain |= {metric.name: plain.pop(metric.column) / 1e9 for metric in METRICS if metric.kind == TIME}
     plain["rate_tokens_per_s"] = plain.pop("tokens_per_s")
@@ -178,25 +181,23 @@ def _live_notes(run: StoredRun) -> list[str]:
     if "paced_tokens_per_s" not in live:
         line = Note(f"{line} {rate:g} tokens/s arrived.", *line.labels)
     road = "Open loop: one request at t = 0 about the rendered scene; the road does not change the answer."
-    notes = [line] if has(run, "rollout") else [line, road]
+    if has(run, "rollout"):
+        road = "A request a policy, about the view at that moment, which the answer outlives."
     driven = "the set-points driven are those of the scenario."
     if live.get("dummy"):
-        return [*notes, Note(f"Dummy weights: what the plan says means nothing; {driven}", DUMMY)]
-    return [*notes, f"What the plan says is not driven; {driven}"]
+        return [line, road, Note(f"Dummy weights: what the plan says means nothing; {driven}", DUMMY)]
+    return [line, road, f"What the plan says is not driven; {driven}"]
 
 
 def _loop_notes(run: StoredRun) -> list[str]:
-    """Return what closed loops are, what the roll-outs beside them are, and which worlds were slower than the clock."""
-    step = f"in steps of {run.manifest['step_s'] * 1e3:g} ms"
-    about = f"Closed loop: the world ran in virtual time, {step}, while the plan arrived."
-    if "live" in run.manifest:
-        about = f"Closed loop: the world ran on the clock, {step}, while the model answered; each policy had a request "
-        about += "of its own, about the view at that moment."
-    beside = rollouts_of(run, "rollout")["simulator"].iloc[0]
-    notes = [about, f"Roll-out: the policy on the same arrivals in virtual time, {beside} simulator."]
+    step, beside = f"in steps of {run.manifest['step_s'] * 1e3:g} ms", rollouts_of(run, "rollout")["simulator"].iloc[0]
+    notes = [
+        f"Closed loop: the world ran {'on the clock' if 'live' in run.manifest else 'in virtual time'}, {step}, while the "
+        f"plan arrived. Roll-out: the same arrivals in virtual time, {beside} simulator."
+    ]
     factors = rollouts_of(run, "point").set_index("policy")["real_time_factor"]
-    if slow := [f"{factor:.3g} ({policy})" for policy, factor in factors.items() if factor < IN_TIME]:
-        late = f"The world was slower than the clock, real-time factor {', '.join(slow)}: in its own time the model was faster."
+    if slow := ", ".join(f"{factor:.3g} ({policy})" for policy, factor in factors.items() if factor < IN_TIME):
+        late = f"The world was slower than the clock, real-time factor {slow}: in its own time tokens came faster."
         notes.append(Note(late, "world slower than the clock"))
     return notes
 

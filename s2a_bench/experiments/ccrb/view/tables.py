@@ -44,7 +44,7 @@ from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, entries, number
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from s2a_bench.experiments import Metric
     from s2a_bench.store.run import StoredRun
@@ -63,8 +63,9 @@ def show(run: StoredRun, **_: Any) -> Shown:
 
 def _ccrb_sentences(run: StoredRun) -> list[str]:
     sentences = [
-        f"{name.replace('  ', f'{policy}, ')}: {_outcome(cell)}, {cell['stalls']} stalls of {cell['stall_s']:.2f} s."
-        for policy, name, cell in _shown(run)
+        f"{cell['policy']}: {outcome_label(cell['outcome'], cell['follower_survives'])}, "
+        f"{cell['stalls']} stalls of {cell['stall_s']:.2f} s."
+        for cell in cells_of(run)
     ]
     sentences += [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
     if studies := run.manifest.get("studies"):
@@ -109,7 +110,7 @@ CcrbCell = cell_of_row(
     "CcrbCell",
     "A policy at the operating point.",
     RolloutRow,
-    without=("study", "draw", "board", "title", "tokens_per_s", *(metric.column for metric in _TIMES)),
+    without=("draw", "board", "title", "tokens_per_s", *(metric.column for metric in _TIMES)),
     own={
         "profile": str | None,
         "rate_tokens_per_s": Positive,
@@ -151,23 +152,13 @@ class CcrbStudy:
     ] = None
 
 
-def _shown(run: StoredRun) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Yield policy, name and cell of each row of the outcomes: a closed loop is followed by its roll-out."""
-    beside = {cell["cell"]: cell for cell in cells_of(run, "rollout")}
-    for cell in cells_of(run):
-        yield cell["policy"], cell["policy"], cell
-        if cell["cell"] in beside:
-            yield cell["policy"], "  roll-out", beside[cell["cell"]]
-
-
-def _outcome(cell: dict[str, Any]) -> str:
-    return outcome_label(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
-
-
 def _outcome_table(run: StoredRun) -> TextTable:
     loop = LOOP if has(run, "rollout") else ()
-    shown = [metric for metric in (*TIMES, *IMPACTS, *loop) if metric.title]
-    rows = [(name, _outcome(cell), *(_entry(cell, metric) for metric in shown)) for _, name, cell in _shown(run)]
+    rows, shown = [], [metric for metric in (*TIMES, *IMPACTS, *loop) if metric.title]
+    for cell in cells_of(run, ("point", "rollout")):
+        outcome = outcome_label(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
+        name = cell["policy"] if cell["study"] == "point" else "  roll-out"
+        rows.append((name, outcome, *(_entry(cell, metric) for metric in shown)))
     settings = configuration(run)
     title = f"CCRB with a car behind, {settings['simulator']} simulator: {operating_point(settings)}"
     header = ("policy", "outcome", *map(_title, shown))
@@ -253,7 +244,7 @@ def ccrb_json(run: StoredRun) -> dict[str, Any]:
     """Return the ``--json`` object (docs/schema/s2a-bench-1.json): SI units, a cell a policy, studies as shares."""
     studies = [_study(run, study, gap) for study in ("phase", "random") if has(run, study) for gap in GAPS]
     live = {"live": run.manifest["live"]} if "live" in run.manifest else {}
-    beside = {"rollouts": cells} if (cells := cells_of(run, "rollout")) else {}
+    beside = {"rollouts": cells_of(run, ("rollout",))} if has(run, "rollout") else {}
     return frame(run, cells_of(run), [], **live, **beside, follower_law=law(configuration(run)), studies=studies)
 
 
