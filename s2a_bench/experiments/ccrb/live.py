@@ -53,6 +53,8 @@ CRUISE_S: Final = 0.5
 
 def run_ccrb_live(config: CcrbConfig, world: Simulator, output: Path, progress: Progress) -> Path:
     """Request one plan and drive it under every policy; raises S2AError. The folder keeps the requests so far."""
+    if config.closed_loop and not world.real:
+        world.step_s = STEP_S
 
     def view(feed: FeedPlan) -> FrameSource:
         camera = world.camera(*feed.size)
