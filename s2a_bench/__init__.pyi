@@ -70,16 +70,6 @@ class _CapacityChunksLatencyThroughputTimeline(TypedDict, total=False):
     wait_for_server: float
     warmup: int
 
-class _LatencyThroughput(TypedDict, total=False):
-    clock: Literal["", "chrony", "ptp"]
-    fps: float
-    grammar: str
-    launches: int
-    link: str
-    mode: Literal["request", "stream"]
-    quick: bool
-    record: str | Path | None
-
 class _Boundary(_Run, total=False):
     jitter: str
     most_tokens: int
@@ -137,6 +127,7 @@ class _Capacity(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyTh
 
 class _Ccrb(_Run, total=False):
     chat_template: str
+    closed_loop: bool
     engine: str
     follower: str
     front_gap: float
@@ -168,6 +159,7 @@ class _Ccrb(_Run, total=False):
     reaction_s: float
     rear_gap: float
     rear_gap_m: float
+    record: str | Path | None
     reflex: bool
     seed: int
     simulator: str
@@ -206,42 +198,54 @@ class _Chunks(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThro
     slowest: float
     tokens_per_action: int
 
-class _Latency(
-    _Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, _LatencyThroughput, total=False
-):
+class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
     action_dim: int
     answer: Literal["auto", "tokens", "actions"]
     chat_template: str
+    clock: Literal["", "chrony", "ptp"]
     context: int
     engine: str
     flash_attention: str
+    fps: float
     gpu_layers: int
+    grammar: str
     horizon: int
     latency: str | float
+    launches: int
+    link: str
     max_tokens: int
     mmproj: str | Path | None
+    mode: Literal["request", "stream"]
     model: str | Path | None
     profile: str
+    quick: bool
+    record: str | Path | None
     requests: int
     seed: int
     think: float
     think_s: float
     threads: int
 
-class _Throughput(
-    _Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, _LatencyThroughput, total=False
-):
+class _Throughput(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
     batch: int
     chat_template: str
+    clock: Literal["", "chrony", "ptp"]
     context: int
     engine: str
     flash_attention: str
+    fps: float
     gpu_layers: int
+    grammar: str
     kv_type: str
+    launches: int
+    link: str
     max_tokens: int
     mmproj: str | Path | None
+    mode: Literal["request", "stream"]
     model: str | Path | None
     profile: str
+    quick: bool
+    record: str | Path | None
     reference: str | Path | None
     requests: int
     sampling: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, TypeAlias
 
 from pydantic import create_model
 
@@ -40,6 +40,8 @@ Do not output any explanation."""
 """The paper's prompt (section IV-E)."""
 DEFAULT_TASK = "pick up the red block and place it in the box"
 """The prompt of policies, which answer with actions."""
+
+RECORD: Final[Any] = option(None, "also record frames, requests and tokens, as run.mcap (rosbag2)")
 
 if TYPE_CHECKING:
     TransportOptions: TypeAlias = Options
@@ -152,7 +154,7 @@ class RequestsConfig(Options):
         ge=0,
         le=1000,
     )
-    record: Path | None = option(None, "also record frames, requests and tokens, as run.mcap (rosbag2)")
+    record: Path | None = RECORD
     quick: bool = option(False, "fewer samples: a first look", first=True)
 
     def __init__(self, **given: Any) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 from s2a_bench.clock import realtime_offset_ns
 from s2a_bench.options import Options
@@ -33,6 +34,13 @@ class RunRecorder(BagRecorder):
         self._namespace = namespace
         self._offset_ns = realtime_offset_ns()
 
+    def note(self, name: str, type_name: str, message: Any, at_ns: int) -> None:
+        """Record a message on ``<namespace>/name`` with its time on CLOCK_MONOTONIC, also in the header that it has."""
+        stamp_ns = at_ns + self._offset_ns
+        if hasattr(message, "header"):
+            message.header.stamp = ros.stamp(stamp_ns)
+        self.write(f"{self._namespace}/{re.sub('[^A-Za-z0-9/]', '_', name)}", type_name, message, stamp_ns)
+
     def frame(self, frame: Frame) -> None:
         stamp_ns = frame.stamp_ns + self._offset_ns
         if frame.encoding in ros.CHANNELS:
@@ -44,9 +52,8 @@ class RunRecorder(BagRecorder):
 
     def answer(self, cell: str, request: Request, sent_ns: int, tokens: list[tuple[Piece, int]], error: str) -> None:
         """Record a request and its tokens with the times at which the client received them (CLOCK_MONOTONIC)."""
-        topic = f"{self._namespace}/{re.sub('[^A-Za-z0-9/]', '_', cell)}"
-        self.write(topic + "/request", ros.REQUEST, request_message(request), sent_ns + self._offset_ns)
+        self.note(f"{cell}/request", ros.REQUEST, request_message(request), sent_ns)
         for place, (token, seen_ns) in enumerate(tokens, 1):
             last = place == len(tokens)
             message = token_message(request.id, token, last=last, error=error if last else "")
-            self.write(topic + "/token", ros.TOKEN, message, seen_ns + self._offset_ns)
+            self.note(f"{cell}/token", ros.TOKEN, message, seen_ns)

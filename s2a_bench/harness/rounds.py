@@ -76,6 +76,7 @@ class RunningLaunch:
     wiring: Callable[[Pipeline], Wiring[Any]]
     """Returns the wiring of further clients of a cell."""
     sampler: ResourceSampler
+    recorder: RunRecorder | None = None
 
 
 def in_blocks(launch: RunningLaunch, others: Sequence[Slot] = ()) -> None:
@@ -230,6 +231,7 @@ class _Run:
                 self.warnings,
                 servers.wiring,
                 sampler,
+                self.recorder,
             )
             self.task.drive(launch)
             self.guard.see_hits(hits, servers.cache_hits())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from pydantic import Field
@@ -11,6 +12,7 @@ from pydantic import Field
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.boards.tokens import PROMPT_TIME
 from s2a_bench.errors import UsageError
+from s2a_bench.harness.config import RECORD
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Names, Numbers, Options, group, option
 from s2a_bench.policy import COMPARED, POLICIES
@@ -34,6 +36,7 @@ class PlanRequest(Options):
     engine: EngineConfig = group(
         EngineConfig, only=("name", "model", "mmproj", "chat_template", "threads", "pace"), about="--live: ", first=()
     )
+    record: Path | None = RECORD
 
     def check(self) -> None:
         for name in () if self.live else self.given():

@@ -6,10 +6,11 @@ in virtual time. Closed loop: a request a policy, executed as it arrives, while 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -23,30 +24,37 @@ from s2a_bench.act.events import (
     TokenArrived,
 )
 from s2a_bench.act.record import Record, observed
+from s2a_bench.act.ros import STRING
 from s2a_bench.clock import SystemClock, now_ns, quick_switching
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.ccrb.loop import ClosedLoop
+from s2a_bench.experiments.ccrb.loop import ClosedLoop, Looped
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.run import Prepared, complete, drive_point, keep_loop
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.plan import FeedPlan
+from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
 from s2a_bench.harness.session import Measured
 from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt, prepare_requests
 from s2a_bench.harness.timelines.policies import prepare as prepare_policies
 from s2a_bench.plan import Parser
 from s2a_bench.policy import PlanShape, Policy
-from s2a_bench.scenario import Simulator
+from s2a_bench.ros import messages as ros
+from s2a_bench.scenario import ROLES, Simulator
 from s2a_bench.scenario.ccrb.drive import place
 from s2a_bench.store.requests import SKILLS
+from s2a_bench.transport.ros.camera import CAMERA
+from s2a_bench.types import Frame
 
 if TYPE_CHECKING:
     from s2a_bench.progress import Progress
 
 STEP_S: Final = 0.02
 """Step on the clock of a world without physics of its own."""
+PICTURE: Final = (320, 240)
+ODOMETRY: Final = "nav_msgs/msg/Odometry"
 CRUISE_S: Final = 0.5
 """Time on the road before the request of a closed loop."""
 
@@ -63,7 +71,7 @@ def run_ccrb_live(config: CcrbConfig, world: Simulator, output: Path, progress: 
 
     plan, (ask,) = prepare_requests(config.request, progress)
     live = {**config.request.to_manifest(), "source": f"camera of {world.name}"}
-    plan = plan.with_manifest(
+    plan = replace(plan, record=config.plan_request.record).with_manifest(
         configuration={**config.to_manifest(), "live": live},
         follower_law=config.scenario.follower_law,
         seeds={"sampling": plan.request.seed, "nonce": plan.feed.nonce},
@@ -87,9 +95,10 @@ def _drive(config: CcrbConfig, ask: PlanPrompt, world: Simulator, launch: Runnin
         progress.stage("driving the operating point")
         drive_point(config, ready, world, launch.writer)
         return
+    view = world.camera(*PICTURE) if launch.recorder else None
     for name, policy in policies.items():
         progress.stage(f"{name}, over {link.cell.name}")
-        _run_loop(config, ask, link, shape, name, policy, world)
+        _run_loop(config, ask, link, shape, name, policy, world, view)
         progress.advance()
 
 
@@ -121,10 +130,11 @@ def _run_loop(
     name: str,
     policy: Policy,
     world: Simulator,
+    view: FrameSource | None,
 ) -> None:
     """Let the cars drive, request a plan, and execute it as it arrives; raises an error that ends the run."""
     clock = SystemClock()
-    loop = ClosedLoop(config.scenario, world, LiveInbox(), clock)
+    loop = ClosedLoop(config.scenario, world, LiveInbox(), clock, view)
     feed = PlanFeed(Parser(ask.format), loop.put)
     with quick_switching(), ThreadPoolExecutor(1, "world") as pool:
         running = pool.submit(loop.run, policy, shape, config.request.timeout_s)
@@ -136,8 +146,28 @@ def _run_loop(
             running.result()  # the world's own error, if it has one, says more
             raise
         looped = running.result()
+    if link.launch.recorder:
+        _record(link.launch.recorder, name, loop.pictures, looped)
     ready = _arrived(config, ask, link, shape, looped.record, measured, {name: policy})
     keep_loop(config, ready, world, name, looped, link.writer)
+
+
+def _record(recorder: RunRecorder, policy: str, pictures: Sequence[Frame], looped: Looped) -> None:
+    """Write view, skills and cars of a loop that is over, so that no step waits for it, on topics below its policy."""
+    for picture in pictures:
+        recorder.note(f"{policy}/ego{CAMERA}", ros.IMAGE, ros.image_message(picture, 0, "ego"), picture.stamp_ns)
+    for skill in looped.record.ran:
+        for what, at_ns in (("starts", skill.start_ns), ("ends", skill.end_ns or 0)):
+            recorder.note(f"{policy}/skill", STRING, ros.message(STRING, data=f"{skill.call} {what}"), at_ns)
+    path, zero_ns = looped.driven.trajectory, looped.record.requested_ns or 0
+    assert path is not None  # noqa: S101 - recorded
+    for step, car in product(range(len(path.time_s)), range(len(ROLES))):
+        message = ros.default(ODOMETRY, header=ros.header(0, "road"), child_frame_id=ROLES[car])
+        pose = message.pose.pose
+        pose.position.x, pose.position.y = path.position_m[step, car, 0], path.lateral_m[step, car, 0]
+        pose.orientation.w, message.twist.twist.linear.x = 1.0, path.speed_mps[step, car, 0]
+        recorder.note(f"{policy}/{ROLES[car]}/odom", ODOMETRY, message, zero_ns + round(path.time_s[step] * 1e9))
+    recorder.flush()
 
 
 def _arrived(

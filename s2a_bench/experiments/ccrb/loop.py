@@ -28,6 +28,7 @@ from s2a_bench.act.events import (
 from s2a_bench.act.executor import NEVER, SILENCE_S, Executor
 from s2a_bench.act.record import Record
 from s2a_bench.clock import Clock, VirtualClock
+from s2a_bench.frames import FrameSource
 from s2a_bench.plan import Call, Gap
 from s2a_bench.policy import Plans, PlanShape, Policy, Schedule
 from s2a_bench.policy.schedule import safe_start
@@ -35,8 +36,11 @@ from s2a_bench.scenario import Simulator
 from s2a_bench.scenario.ccrb.drive import AFTER_S, Drive, Driven
 from s2a_bench.scenario.ccrb.ego import ACTING, Ego
 from s2a_bench.scenario.ccrb.options import CcrbOptions
+from s2a_bench.types import Frame
 
 SLACK_S: Final = 0.1
+PICTURE_NS: Final = 200_000_000
+"""From a kept picture to the next."""
 
 
 class CommandedEgo(Ego):
@@ -89,8 +93,10 @@ class Looped:
 class ClosedLoop:
     """One policy's run: the inbox of its executor, whose wait steps the world. Use it once."""
 
-    def __init__(self, scenario: CcrbOptions, world: Simulator, inbox: EventQueue, clock: Clock) -> None:
-        """Place the cars; ``inbox`` delivers events on ``clock``."""
+    def __init__(
+        self, scenario: CcrbOptions, world: Simulator, inbox: EventQueue, clock: Clock, view: FrameSource | None = None
+    ) -> None:
+        """Place the cars; ``inbox`` delivers events on ``clock``, and ``view`` of the world `pictures` to be kept."""
         self._inbox, self._clock = inbox, clock
         self._calls = iter(scenario.calls)
         self._zero_ns: int | None = None
@@ -100,6 +106,7 @@ class ClosedLoop:
         self._first_ns = self._due_ns = self._last_ns = clock.now_ns()
         self._steps = 0
         self._squares: list[float] = []
+        self._view, self.pictures = view, list[Frame]()
 
     def put(self, event: Event) -> None:
         """Deliver an event, a skill as the scenario's of that number."""
@@ -150,6 +157,9 @@ class ClosedLoop:
         self._squares += (self._ego.lag_mps[self._ego.phase == ACTING] ** 2).tolist()
         self._steps += 1
         self._last_ns = now_ns + self._step_ns
+        due = not self.pictures or self._last_ns >= self.pictures[-1].stamp_ns + PICTURE_NS
+        if self._view and self._drive.ego_moves and due:
+            self.pictures.append(replace(self._view.read(), stamp_ns=self._last_ns))
         slack_ns = round(SLACK_S * 1e9)
         self._due_ns = NEVER if self._drive.decided().all() else max(self._last_ns, self._clock.now_ns() - slack_ns)
 

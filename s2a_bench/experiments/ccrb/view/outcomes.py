@@ -182,7 +182,7 @@ def _live_notes(run: StoredRun) -> list[str]:
         line = Note(f"{line} {rate:g} tokens/s arrived.", *line.labels)
     road = "Open loop: one request at t = 0 about the rendered scene; the road does not change the answer."
     if has(run, "rollout"):
-        road = "A request a policy, about the view at that moment, which the answer outlives."
+        road = "A request a policy, about the view at that moment."
     driven = "the set-points driven are those of the scenario."
     if live.get("dummy"):
         return [line, road, Note(f"Dummy weights: what the plan says means nothing; {driven}", DUMMY)]
@@ -191,10 +191,9 @@ def _live_notes(run: StoredRun) -> list[str]:
 
 def _loop_notes(run: StoredRun) -> list[str]:
     step, beside = f"in steps of {run.manifest['step_s'] * 1e3:g} ms", rollouts_of(run, "rollout")["simulator"].iloc[0]
-    notes = [
-        f"Closed loop: the world ran {'on the clock' if 'live' in run.manifest else 'in virtual time'}, {step}, while the "
-        f"plan arrived. Roll-out: the same arrivals in virtual time, {beside} simulator."
-    ]
+    clock = f"ran {'on the clock' if 'live' in run.manifest else 'in virtual time'}"
+    roll_out = f"Roll-out: the same arrivals in virtual time, {beside} simulator."
+    notes = [f"Closed loop: the world {clock}, {step}, while the plan arrived.", roll_out]
     factors = rollouts_of(run, "point").set_index("policy")["real_time_factor"]
     if slow := ", ".join(f"{factor:.3g} ({policy})" for policy, factor in factors.items() if factor < IN_TIME):
         late = f"The world was slower than the clock, real-time factor {slow}: in its own time tokens came faster."
