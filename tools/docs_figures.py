@@ -18,6 +18,8 @@ import numpy as np
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
+from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
 from s2a_bench.experiments.timeline.run import run_timeline
@@ -145,6 +147,9 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "windscreen": windscreen_figure,
     "boundary": lambda: boundary(BoundaryConfig()),
     "boundary-jitter": lambda: boundary(BoundaryConfig(jitter="lognormal:cv=0.2")),
+    "closed-loop": lambda: drawn(
+        _run(lambda output: run_ccrb(CcrbConfig(closed_loop=True), output, Quiet())), "scenario"
+    ),
     "chunks-lanes": lambda: drawn(chunks(SPREAD), "lanes"),
     "chunks-stability": lambda: drawn(chunks(SPREAD), "stability"),
     "chunks-triggers": lambda: drawn(chunks(f"{SPREAD},{SLOW_ONES}"), "triggers"),

@@ -134,15 +134,14 @@ def _path(run: StoredRun, row: dict[Any, Any]) -> pd.DataFrame:
 
 
 def _shade(axes: Axes, path: pd.DataFrame, skills: pd.DataFrame) -> None:
-    first = float(skills["start_ns"].iloc[0]) / 1e9
-    axes.axvspan(0, first, zorder=0, **_PHASES["waiting"])
-    last = float(path["time_s"].iloc[-1])
+    first, last = float(skills["start_ns"].iloc[0]) / 1e9, float(path["time_s"].iloc[-1])
+    axes.axvspan(0, min(first, last), zorder=0, **_PHASES["waiting"])
     for skill in skills.to_dict("records"):
         start, end, stall = (skill[f"{name}_ns"] / 1e9 for name in ("start", "end", "stall"))
         if start < last:
             axes.axvspan(start, min(end, last), zorder=0, **_PHASES["acting"])
         if stall > 0 and start - stall < last:
-            axes.axvspan(start - stall, start, zorder=0, **_PHASES["gap"])
+            axes.axvspan(start - stall, min(start, last), zorder=0, **_PHASES["gap"])
 
 
 def _draw_cars(axes: Axes, path: pd.DataFrame, what: str) -> None:

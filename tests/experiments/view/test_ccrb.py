@@ -1,0 +1,233 @@
+"""What is shown of closed loops: their roll-outs and their requests' stages beside them, a figure, a recording."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jsonschema
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+
+from s2a_bench.boards.profile import to_toml
+from s2a_bench.cli.progress import RunProgress
+from s2a_bench.errors import StoreError, UsageError
+from s2a_bench.experiments.ccrb.config import CcrbConfig, PlanRequest
+from s2a_bench.experiments.ccrb.loop import ClosedLoop
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
+from s2a_bench.experiments.ccrb.run import run_ccrb
+from s2a_bench.experiments.ccrb.view.figures import build_scenario
+from s2a_bench.experiments.ccrb.view.outcomes import token_times_s
+from s2a_bench.experiments.ccrb.view.tables import ccrb_json, show
+from s2a_bench.inference import EngineConfig
+from s2a_bench.scenario.ccrb.options import CcrbOptions
+from s2a_bench.store.requests import SKILLS
+from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.writers.figures import caption_of
+from tests.made_runs import SCHEMA
+
+POLICIES = ("naive", "wait-then-act", "stream-to-act")
+TOPICS = {policy: f"/s2a_bench/{policy.replace('-', '_')}" for policy in POLICIES}
+
+
+def run(folder: Path, **options: Any) -> StoredRun:
+    with RunProgress() as progress:
+        return read_run(run_ccrb(CcrbConfig(**options), folder, progress))
+
+
+@pytest.fixture(scope="module")
+def virtual(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
+    return run(tmp_path_factory.mktemp("runs"), closed_loop=True)
+
+
+class Live(NamedTuple):
+    run: StoredRun
+    recording: Path
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Live:
+    """Closed loops on the clock with a board of 120 tokens a second, recorded."""
+    folder = tmp_path_factory.mktemp("runs")
+    facts = {"title": "A board", "origin": "measured", "tokens_per_s": 120.0, "prompt_s": 0.05}
+    (folder / "fast.toml").write_text(to_toml({**facts, "gaps": {"family": "constant"}}))
+    asked = PlanRequest(
+        live=True, transport="http/binary", engine=EngineConfig(name="replay"), record=folder / "run.mcap"
+    )
+    scenario = CcrbOptions(n_skills=3, speed_kmh=20)
+    profile = str(folder / "fast.toml")
+    made = run(folder, closed_loop=True, plan_request=asked, scenario=scenario, profile=profile)
+    return Live(made, folder / "run.mcap")
+
+
+class Message(NamedTuple):
+    at_ns: int
+    data: Any
+
+
+@pytest.fixture(scope="module")
+def recorded(live: Live) -> dict[str, list[Message]]:
+    """Return topic -> messages, as a reader finds them that has no types but the file's."""
+    found = defaultdict(list)
+    with AnyReader([live.recording]) as reader:
+        for connection, at_ns, raw in reader.messages():
+            found[connection.topic].append(Message(at_ns, reader.deserialize(raw, connection.msgtype)))
+    return found
+
+
+def test_a_closed_loop_is_followed_by_its_roll_out(virtual: StoredRun) -> None:
+    table = show(virtual).tables["outcomes"]
+    assert table.header[-2:] == ("real-time factor", "tracking m/s")
+    assert [row[:4] for row in table.rows] == [
+        ("naive", "hit from behind", "1.75", "4"),
+        ("  roll-out", "hit from behind", "1.75", "4"),
+        ("wait-then-act", "hits the lead", "6.75", "0"),
+        ("  roll-out", "hits the lead", "6.75", "0"),
+        ("stream-to-act", "no impact", "3.55", "0"),
+        ("  roll-out", "no impact", "3.55", "0"),
+    ]
+    assert [row[-2] for row in table.rows] == ["1.00", "\N{EN DASH}"] * 3
+    printed = ccrb_json(virtual)
+    jsonschema.validate(printed, SCHEMA)
+    assert [(cell["policy"], cell["outcome"]) for cell in printed["rollouts"]] == [
+        ("naive", "rear"),
+        ("wait-then-act", "front"),
+        ("stream-to-act", "none"),
+    ]
+    assert [cell["policy"] for cell in printed["cells"]] == list(POLICIES)
+
+
+def test_a_run_without_closed_loops_has_no_roll_outs_beside_it(tmp_path: Path) -> None:
+    made = run(tmp_path)
+    table = show(made).tables["outcomes"]
+    assert [row[0] for row in table.rows] == list(POLICIES)
+    assert "real-time factor" not in table.header
+    assert "rollouts" not in ccrb_json(made)
+    assert not any("loop" in note for note in table.notes)
+    assert [axes.get_title("left") for axes in build_scenario(made).axes[:3]] == [
+        "naive: hit from behind",
+        "wait-then-act: hits the lead",
+        "stream-to-act: no impact",
+    ]
+
+
+def test_the_notes_say_which_clock_the_world_had_and_what_it_was_asked(virtual: StoredRun, live: Live) -> None:
+    notes = [" ".join(show(made).tables["outcomes"].notes) for made in (virtual, live.run)]
+    assert "the world ran in virtual time, in steps of 5 ms, while the plan arrived" in notes[0]
+    assert "the world ran on the clock, in steps of 20 ms, while the plan arrived" in notes[1]
+    assert all("Roll-out: the same arrivals in virtual time, longitudinal simulator." in each for each in notes)
+    assert "A request a policy, about the view at that moment." in notes[1]
+    assert "What the plan says is not driven; the set-points driven are those of the scenario." in notes[1]
+    assert "car simulated" in notes[1]
+    assert not any("Open loop" in each for each in notes)
+
+
+@pytest.mark.parametrize(("factor", "told"), [(0.634, "factor 0.634 (naive), 0.634 (wait-then-act)"), (0.995, "")])
+def test_a_world_slower_than_the_clock_is_told_with_its_factor(
+    factor: float, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ClosedLoop, "real_time_factor", factor)
+    made = run(tmp_path, closed_loop=True, policies=POLICIES[:2])
+    slow = [note for note in show(made).tables["outcomes"].notes if "slower than the clock" in note]
+    assert [told in note for note in slow] == [True] * bool(told)
+    assert [note.labels for note in slow] == [("world slower than the clock",)] * bool(told)  # type: ignore[attr-defined]
+    assert ("slower than the clock" in " ".join(caption_of(build_scenario(made)))) is bool(told)
+
+
+def test_each_policys_request_has_its_stages_and_they_add_up(virtual: StoredRun, live: Live) -> None:
+    table = show(live.run).tables["stages"]
+    assert table.header[0] == "policy"
+    assert {"capture", "pack", "network", "inference", "return"} < set(table.header)
+    assert table.header[-3:] == ("residual", "TTFT", "e2e")
+    assert [row[0] for row in table.rows] == list(POLICIES)
+    samples = live.run.samples.set_index("request_id")
+    asked = live.run.table(SKILLS).groupby("cell", sort=False)["request_id"].first()
+    assert len(set(asked)) == 3
+    for row, request in zip(table.rows, asked, strict=True):
+        shown = dict(zip(table.header, row, strict=True))
+        sample = samples.loc[request]
+        for name, column in (("TTFT", "ttft_ns"), ("e2e", "e2e_ns"), ("inference", "inference_ns")):
+            assert float(shown[name]) == pytest.approx(sample[column] / 1e6, rel=0.01)
+        assert sum(float(entry) for entry in row[1:-2]) == pytest.approx(sample["e2e_ns"] / 1e6, rel=0.02)
+    assert table.notes[0].startswith("EMULATED (replayed) tokens over http/binary")
+    assert "stages" not in show(virtual).tables
+
+
+def test_the_figure_names_the_roll_out_and_marks_the_first_token(virtual: StoredRun) -> None:
+    figure = build_scenario(virtual)
+    assert [axes.get_title("left") for axes in figure.axes[:3]] == [
+        "naive: hit from behind\nroll-out: hit from behind",
+        "wait-then-act: hits the lead\nroll-out: hits the lead",
+        "stream-to-act: no impact\nroll-out: no impact",
+    ]
+    cells = list(virtual.table(ROLLOUTS)["cell"].unique())
+    for place, axes in enumerate(figure.axes):
+        marks = [line for line in axes.lines if line.get_linestyle() == "-."]
+        firsts = [float(np.asarray(line.get_xdata())[0]) for line in marks]
+        assert firsts == [token_times_s(virtual, cells[place % 3])[0]]
+    assert "CCRB with a car behind (longitudinal simulator, closed loop)" in caption_of(figure)[0]
+
+
+def test_no_skill_is_drawn_beyond_what_was_driven(virtual: StoredRun) -> None:
+    axes = build_scenario(virtual).axes[1]
+    driven_s = max(float(np.max(line.get_xdata())) for line in axes.lines if len(np.asarray(line.get_xdata())) > 50)
+    ends_s = [patch.get_x() + patch.get_width() for patch in axes.patches]  # type: ignore[attr-defined]
+    assert max(ends_s) == pytest.approx(driven_s)
+
+
+def test_a_recording_has_every_policys_cars_where_they_drove(live: Live, recorded: dict[str, list[Message]]) -> None:
+    paths = live.run.table(TRAJECTORIES)
+    for policy, topic in TOPICS.items():
+        path = paths[paths["cell"].str.endswith(f"/{policy}")]
+        zero_ns = recorded[f"{topic}/ego/odom"][0].at_ns - int(path["at_ns"].iloc[0])
+        for car in ("lead", "ego", "rear"):
+            odometry = recorded[f"{topic}/{car}/odom"]
+            poses = [message.data.pose.pose for message in odometry]
+            assert [pose.position.x for pose in poses] == pytest.approx(list(path[f"{car}_position_m"]))
+            speeds = [message.data.twist.twist.linear.x for message in odometry]
+            assert speeds == pytest.approx(list(path[f"{car}_speed_mps"]))
+            assert {(pose.orientation.x, pose.orientation.w) for pose in poses} == {(0.0, 1.0)}
+            assert [message.at_ns - zero_ns for message in odometry] == pytest.approx(list(path["at_ns"]), abs=2)
+            stamps = [message.data.header.stamp for message in odometry]
+            assert [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps] == [message.at_ns for message in odometry]
+            assert {(each.data.header.frame_id, each.data.child_frame_id) for each in odometry} == {("road", car)}
+
+
+def test_a_recording_has_every_skill_when_it_started_and_ended(live: Live, recorded: dict[str, list[Message]]) -> None:
+    skills = live.run.table(SKILLS)
+    for policy, topic in TOPICS.items():
+        mine = skills[skills["cell"].str.endswith(f"/{policy}")]
+        said = recorded[f"{topic}/skill"]
+        texts = [f"set_speed({speed}) {what}" for speed in ("13.3", "6.7", "0") for what in ("starts", "ends")]
+        assert [message.data.data for message in said] == texts
+        since_ns = np.array([message.at_ns for message in said]) - said[0].at_ns
+        expected_ns = mine[["start_ns", "end_ns"]].to_numpy().ravel()
+        assert since_ns == pytest.approx(expected_ns - expected_ns[0], abs=10)
+
+
+def test_a_recording_has_the_egos_view_and_the_requests_with_their_pictures(
+    recorded: dict[str, list[Message]],
+) -> None:
+    for topic in TOPICS.values():
+        pictures = recorded[f"{topic}/ego/camera/image_raw"]
+        assert {(each.data.width, each.data.height, each.data.encoding) for each in pictures} == {(320, 240, "bgr8")}
+        apart_ns = np.diff([message.at_ns for message in pictures])
+        assert len(apart_ns) >= 3
+        assert apart_ns.min() >= 200_000_000
+        assert pictures[0].at_ns < recorded[f"{topic}/ego/odom"][0].at_ns  # it is seen before the request too
+        assert (pictures[0].data.data != pictures[-1].data.data).any()
+    assert len(recorded["/s2a_bench/camera/image_raw"]) == 4  # the warm-up's too
+    assert len(recorded["/s2a_bench/http/binary/request"]) == 4
+    assert len(recorded["/s2a_bench/http/binary/token"]) == 4 * 18
+
+
+def test_a_recording_is_not_overwritten_and_is_of_a_model_that_answers(tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").touch()
+    engine = EngineConfig(name="replay")
+    asked = PlanRequest(live=True, transport="loopback", engine=engine, record=tmp_path / "run.mcap")
+    with pytest.raises(StoreError, match=r"`record`: .*run\.mcap exists already and is not overwritten"):
+        run(tmp_path, closed_loop=True, plan_request=asked)
+    with pytest.raises(UsageError, match="`record` is about a model that answers; it needs `live`"):
+        PlanRequest(record=tmp_path / "other.mcap")
