@@ -20,6 +20,7 @@ from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.run import Prepared, keep_loop, prepare, run_ccrb
 from s2a_bench.inference import EngineConfig
+from s2a_bench.plan.skillset import GAPS, Gap
 from s2a_bench.policy import COMPARED
 from s2a_bench.scenario import EGO, LEAD, DriveCommand, State
 from s2a_bench.scenario.ccrb.drive import Driven, drive
@@ -33,7 +34,6 @@ from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Piece, Request
 
-GAPS = ("stop", "coast", "hold", "cruise")
 LIVE = PlanRequest(live=True, transport="loopback", engine=EngineConfig(name="replay"))
 
 
@@ -45,7 +45,7 @@ def scenario(number: int) -> CcrbConfig:
     numbers = {
         name: at[name] for name in ("front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s", "n_skills", "t_nom_s")
     }
-    options = CcrbOptions(**numbers, speed_kmh=at["speed_mps"] * 3.6, gap=GAPS[number % 4])
+    options = CcrbOptions(**numbers, speed_kmh=at["speed_mps"] * 3.6, gap=GAPS[number % len(GAPS)])
     return CcrbConfig(
         rate=at["tokens_per_s"], prompt_s=at["prompt_s"], tokens_per_skill=at["tokens_per_skill"], scenario=options
     )
@@ -100,7 +100,7 @@ def by_study(stored: StoredRun, study: str) -> pd.DataFrame:
     ("front_gap_m", "rear_gap_m", "gap"), [(40.0, 14.0, "stop"), (12.0, 20.0, "coast"), (60.0, 10.0, "hold")]
 )
 def test_in_real_time_a_loop_ends_as_the_roll_out_of_the_arrivals_that_it_had(
-    front_gap_m: float, rear_gap_m: float, gap: str, tmp_path: Path
+    front_gap_m: float, rear_gap_m: float, gap: Gap, tmp_path: Path
 ) -> None:
     options = CcrbOptions(front_gap_m=front_gap_m, rear_gap_m=rear_gap_m, gap=gap)
     stored = run(tmp_path, scenario=options, simulator="embedded", policies=("naive", "wait-then-act"))
