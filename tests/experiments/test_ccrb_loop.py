@@ -15,12 +15,12 @@ from s2a_bench.act.events import Requested, VirtualInbox
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.experiments.ccrb import live as ccrb_live
 from s2a_bench.experiments.ccrb.config import CcrbConfig, PlanRequest
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.ccrb.run import Prepared, prepare, run_ccrb
+from s2a_bench.experiments.ccrb.run import Prepared, keep_loop, prepare, run_ccrb
 from s2a_bench.inference import EngineConfig
+from s2a_bench.plan.skillset import GAPS, Gap
 from s2a_bench.policy import COMPARED
 from s2a_bench.scenario import EGO, LEAD, DriveCommand, State
 from s2a_bench.scenario.ccrb.drive import Driven, drive
@@ -32,9 +32,8 @@ from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.transport.loopback.in_process import LoopbackClient
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Piece, Request
 
-GAPS = ("stop", "coast", "hold", "cruise")
 LIVE = PlanRequest(live=True, transport="loopback", engine=EngineConfig(name="replay"))
 
 
@@ -46,7 +45,7 @@ def scenario(number: int) -> CcrbConfig:
     numbers = {
         name: at[name] for name in ("front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s", "n_skills", "t_nom_s")
     }
-    options = CcrbOptions(**numbers, speed_kmh=at["speed_mps"] * 3.6, gap=GAPS[number % 4])
+    options = CcrbOptions(**numbers, speed_kmh=at["speed_mps"] * 3.6, gap=GAPS[number % len(GAPS)])
     return CcrbConfig(
         rate=at["tokens_per_s"], prompt_s=at["prompt_s"], tokens_per_skill=at["tokens_per_skill"], scenario=options
     )
@@ -101,7 +100,7 @@ def by_study(stored: StoredRun, study: str) -> pd.DataFrame:
     ("front_gap_m", "rear_gap_m", "gap"), [(40.0, 14.0, "stop"), (12.0, 20.0, "coast"), (60.0, 10.0, "hold")]
 )
 def test_in_real_time_a_loop_ends_as_the_roll_out_of_the_arrivals_that_it_had(
-    front_gap_m: float, rear_gap_m: float, gap: str, tmp_path: Path
+    front_gap_m: float, rear_gap_m: float, gap: Gap, tmp_path: Path
 ) -> None:
     options = CcrbOptions(front_gap_m=front_gap_m, rear_gap_m=rear_gap_m, gap=gap)
     stored = run(tmp_path, scenario=options, simulator="embedded", policies=("naive", "wait-then-act"))
@@ -178,7 +177,7 @@ def test_an_extended_skill_keeps_the_speed_that_it_has_reached() -> None:
         ego.decide(at_s, still, far, far, far, 0.005)
         lag.append((int(ego.phase[0]), round(float(ego.lag_mps[0]), 3)))
 
-    skill = ego.start(scene.calls[0], 1_000_000_000, str)
+    skill = ego.start(scene.calls[0], 1_000_000_000, print)
     look(0.5)
     clock.sleep_until_ns(1_000_000_000)
     skill.retime(1_500_000_000)
@@ -186,7 +185,7 @@ def test_an_extended_skill_keeps_the_speed_that_it_has_reached() -> None:
     clock.sleep_until_ns(1_300_000_000)
     skill.retime(1_300_000_000)
     look(1.3)
-    ego.start(scene.calls[1], 2_300_000_000, str)
+    ego.start(scene.calls[1], 2_300_000_000, print)
     look(1.8)
     look(2.4)
     # The set-point falls from 10 to 5 and to 0 m/s; the car goes at 7.
@@ -199,17 +198,17 @@ def test_an_extended_skill_keeps_the_speed_that_it_has_reached() -> None:
 def test_a_world_that_is_lost_ends_the_run_and_keeps_what_was_driven(
     fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keep = ccrb_live.keep_loop
+    keep = keep_loop
 
     def lose(*given: Any) -> None:
         keep(*given)
 
-        def lost(self: Longitudinal, command: DriveCommand) -> State:
+        def lost(*_: object) -> State:
             raise TransportError("`simulator`: the server is gone")
 
         monkeypatch.setattr(Longitudinal, "step", lost)
 
-    monkeypatch.setattr(ccrb_live, "keep_loop", lose)
+    monkeypatch.setattr("s2a_bench.experiments.ccrb.live.keep_loop", lose)
     options = CcrbOptions(n_skills=3, speed_kmh=20)
     with pytest.raises(TransportError, match="`simulator`: the server is gone"):
         run(tmp_path, scenario=options, profile=fast_board, policies=("naive", "wait-then-act", "stream-to-act"))
@@ -221,7 +220,7 @@ def test_a_world_that_is_lost_ends_the_run_and_keeps_what_was_driven(
 def test_a_plan_that_stays_away_ends_the_run(fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = LoopbackClient.request
 
-    def cut(self: LoopbackClient, request: Request, trace: Any) -> Iterator[Token]:
+    def cut(self: LoopbackClient, request: Request, trace: Any) -> Iterator[Piece]:
         for token in whole(self, request, trace):
             if token.index < 6:
                 yield token
@@ -238,7 +237,7 @@ def test_ctrl_c_ends_the_world_with_the_request(
 ) -> None:
     whole, asked = LoopbackClient.request, [0]
 
-    def interrupted(self: LoopbackClient, request: Request, trace: Any) -> Iterator[Token]:
+    def interrupted(self: LoopbackClient, request: Request, trace: Any) -> Iterator[Piece]:
         asked[0] += 1
         for token in whole(self, request, trace):
             if asked[0] == 2:
@@ -251,7 +250,7 @@ def test_ctrl_c_ends_the_world_with_the_request(
     assert not [each for each in threads() if each.name.startswith("world")]
 
 
-@pytest.mark.parametrize("name", ["ttc", "phase", "random"])
-def test_what_needs_all_arrivals_is_refused(name: str) -> None:
-    with pytest.raises(UsageError, match=f"`{name}` needs all arrivals beforehand"):
-        CcrbConfig(**{name: True if name != "random" else 3}, closed_loop=True)
+@pytest.mark.parametrize("given", [{"ttc": True}, {"phase": True}, {"random": 3}])
+def test_what_needs_all_arrivals_is_refused(given: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match=f"`{next(iter(given))}` needs all arrivals beforehand"):
+        CcrbConfig(**given, closed_loop=True)
