@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -152,10 +151,11 @@ def _record(recorder: RunRecorder, policy: str, pictures: Sequence[Frame], loope
             recorder.note(f"{policy}/skill", STRING, ros.message(STRING, data=f"{skill.call} {what}"), at_ns)
     path, zero_ns = looped.driven.trajectory, looped.record.requested_ns or 0
     assert path is not None  # noqa: S101 - recorded
-    for step, car in product(range(len(path.time_s)), range(len(ROLES))):
-        message = ros.default(ODOMETRY, header=ros.header(0, "road"), child_frame_id=ROLES[car])
-        pose = message.pose.pose
-        pose.position.x, pose.position.y = path.position_m[step, car, 0], path.lateral_m[step, car, 0]
-        pose.orientation.w, message.twist.twist.linear.x = 1.0, path.speed_mps[step, car, 0]
-        recorder.note(f"{policy}/{ROLES[car]}/odom", ODOMETRY, message, zero_ns + round(path.time_s[step] * 1e9))
+    for step, time_s in enumerate(path.time_s):
+        for car, role in enumerate(ROLES):
+            message = ros.default(ODOMETRY, header=ros.header(0, "road"), child_frame_id=role)
+            pose = message.pose.pose
+            pose.position.x, pose.position.y = path.position_m[step, car, 0], path.lateral_m[step, car, 0]
+            pose.orientation.w, message.twist.twist.linear.x = 1.0, path.speed_mps[step, car, 0]
+            recorder.note(f"{policy}/{role}/odom", ODOMETRY, message, zero_ns + round(time_s * 1e9))
     recorder.flush()

@@ -40,7 +40,6 @@ from s2a_bench.types import Frame
 
 SLACK_S: Final = 0.1
 PICTURE_NS: Final = 200_000_000
-"""From a kept picture to the next."""
 
 
 class CommandedEgo(Ego):

@@ -88,13 +88,12 @@ def build_scenario(run: StoredRun) -> Figure:
         if cell in beside.index:
             verdict += f"\nroll-out: {_verdict(beside.loc[cell].to_dict(), survives)}"
         above.set_title(verdict, loc="left", pad=3)
-        token_s = token_times_s(run, cell)
+        edge, token_s = above.get_xaxis_transform(), token_times_s(run, cell)  # the lower edge, whatever the positions
         for axes in grid[:, column]:
             _shade(axes, path, skills[cell])
             axes.axvline(token_s[0], **_FIRST)
             axes.set_xlim(0, until_s)
         _draw_cars(above, path, "position_m")
-        edge = above.get_xaxis_transform()  # along the lower edge, whatever the positions
         above.plot(token_s, [0.04] * len(token_s), "|", color="#555555", markersize=5, transform=edge, clip_on=False)
         _draw_cars(grid[1, column], path, "speed_kmh")
         _draw_gaps(grid[2, column], path, row)

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 
 IN_TIME: Final = 0.99
-"""Below this real-time factor a world was slower than its clock."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -153,8 +153,7 @@ class CcrbStudy:
 
 
 def _outcome_table(run: StoredRun) -> TextTable:
-    loop = LOOP if has(run, "rollout") else ()
-    rows, shown = [], [metric for metric in (*TIMES, *IMPACTS, *loop) if metric.title]
+    rows, shown = [], [metric for metric in (*TIMES, *IMPACTS, *(LOOP if has(run, "rollout") else ())) if metric.title]
     for cell in cells_of(run, ("point", "rollout")):
         outcome = outcome_label(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
         name = cell["policy"] if cell["study"] == "point" else "  roll-out"
