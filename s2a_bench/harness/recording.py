@@ -35,25 +35,24 @@ class RunRecorder(BagRecorder):
         self._offset_ns = realtime_offset_ns()
 
     def note(self, name: str, type_name: str, message: Any, at_ns: int) -> None:
-        """Record a message on ``<namespace>/name`` with its time on CLOCK_MONOTONIC, also in the header that it has."""
+        """Record a message on ``<namespace><name>``, stamped with its time on CLOCK_MONOTONIC, also in its header."""
         stamp_ns = at_ns + self._offset_ns
         if hasattr(message, "header"):
             message.header.stamp = ros.stamp(stamp_ns)
-        self.write(f"{self._namespace}/{re.sub('[^A-Za-z0-9/]', '_', name)}", type_name, message, stamp_ns)
+        self.write(f"{self._namespace}{re.sub('[^A-Za-z0-9/]', '_', name)}", type_name, message, stamp_ns)
 
-    def frame(self, frame: Frame) -> None:
-        stamp_ns = frame.stamp_ns + self._offset_ns
+    def frame(self, frame: Frame, of: str = "") -> None:
+        """Record a picture of the run's camera, or of the one below ``<namespace><of>``."""
         if frame.encoding in ros.CHANNELS:
-            message = ros.image_message(frame, stamp_ns, FRAME_ID)
-            self.write(self._namespace + CAMERA, ros.IMAGE, message, stamp_ns)
+            self.note(of + CAMERA, ros.IMAGE, ros.image_message(frame, 0, FRAME_ID), frame.stamp_ns)
         else:
-            message = ros.compressed_image_message(frame.data, stamp_ns, FRAME_ID, frame.encoding)
-            self.write(self._namespace + COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE, message, stamp_ns)
+            message = ros.compressed_image_message(frame.data, 0, FRAME_ID, frame.encoding)
+            self.note(of + COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE, message, frame.stamp_ns)
 
     def answer(self, cell: str, request: Request, sent_ns: int, tokens: list[tuple[Piece, int]], error: str) -> None:
         """Record a request and its tokens with the times at which the client received them (CLOCK_MONOTONIC)."""
-        self.note(f"{cell}/request", ros.REQUEST, request_message(request), sent_ns)
+        self.note(f"/{cell}/request", ros.REQUEST, request_message(request), sent_ns)
         for place, (token, seen_ns) in enumerate(tokens, 1):
             last = place == len(tokens)
             message = token_message(request.id, token, last=last, error=error if last else "")
-            self.note(f"{cell}/token", ros.TOKEN, message, seen_ns)
+            self.note(f"/{cell}/token", ros.TOKEN, message, seen_ns)

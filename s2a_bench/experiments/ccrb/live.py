@@ -36,7 +36,6 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.scenario import ROLES, Simulator
 from s2a_bench.scenario.ccrb.drive import place
 from s2a_bench.store.requests import SKILLS
-from s2a_bench.transport.ros.camera import CAMERA
 from s2a_bench.types import Frame
 
 if TYPE_CHECKING:
@@ -145,10 +144,10 @@ class _Requests:
 def _record(recorder: RunRecorder, policy: str, pictures: Sequence[Frame], looped: Looped) -> None:
     """Write view, skills and cars of a loop that is over, so that no step waits for it, on topics below its policy."""
     for picture in pictures:
-        recorder.note(f"{policy}/ego{CAMERA}", ros.IMAGE, ros.image_message(picture, 0, "ego"), picture.stamp_ns)
+        recorder.frame(picture, f"/{policy}/ego")
     for skill in looped.record.ran:
         for what, at_ns in (("starts", skill.start_ns), ("ends", skill.end_ns or 0)):
-            recorder.note(f"{policy}/skill", STRING, ros.message(STRING, data=f"{skill.call} {what}"), at_ns)
+            recorder.note(f"/{policy}/skill", STRING, ros.message(STRING, data=f"{skill.call} {what}"), at_ns)
     path, zero_ns = looped.driven.trajectory, looped.record.requested_ns or 0
     assert path is not None  # noqa: S101 - recorded
     for step, time_s in enumerate(path.time_s):
@@ -157,5 +156,5 @@ def _record(recorder: RunRecorder, policy: str, pictures: Sequence[Frame], loope
             pose = message.pose.pose
             pose.position.x, pose.position.y = path.position_m[step, car, 0], path.lateral_m[step, car, 0]
             pose.orientation.w, message.twist.twist.linear.x = 1.0, path.speed_mps[step, car, 0]
-            recorder.note(f"{policy}/{role}/odom", ODOMETRY, message, zero_ns + round(time_s * 1e9))
+            recorder.note(f"/{policy}/{role}/odom", ODOMETRY, message, zero_ns + round(time_s * 1e9))
     recorder.flush()

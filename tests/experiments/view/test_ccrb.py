@@ -213,6 +213,8 @@ def test_a_recording_has_the_egos_view_and_the_requests_with_their_pictures(
     for topic in TOPICS.values():
         pictures = recorded[f"{topic}/ego/camera/image_raw"]
         assert {(each.data.width, each.data.height, each.data.encoding) for each in pictures} == {(320, 240, "bgr8")}
+        stamps = [each.data.header.stamp for each in pictures]
+        assert [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps] == [each.at_ns for each in pictures]
         apart_ns = np.diff([message.at_ns for message in pictures])
         assert len(apart_ns) >= 3
         assert apart_ns.min() >= 200_000_000
