@@ -313,7 +313,8 @@ def open_middleware(
     try:
         implementation = resolve_name(MIDDLEWARES[name])
     except ModuleNotFoundError as error:
-        raise TransportError(f"middleware {name} is not installed ({error}); {WAYS_OUT[name]}") from error
+        way = f"{WAYS_OUT[name]}; of a source, robot or ego with ?middleware="
+        raise TransportError(f"middleware {name} is not installed ({error}); {way}") from error
     more = (router or Router(),) if name in ROUTED else ()
     middleware: Middleware = implementation(config.domain_id(os.environ, domain_id), tuning, node_name, *more)
     return middleware
