@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from pydantic import Field
 
@@ -12,9 +12,9 @@ from s2a_bench.boards.profile import profile_files
 from s2a_bench.boards.tokens import PROMPT_TIME
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import EngineConfig
-from s2a_bench.options import Names, Numbers, Options, group, one_of, option
+from s2a_bench.options import Names, Numbers, Options, group, option
 from s2a_bench.policy import COMPARED, POLICIES
-from s2a_bench.scenario import SIMULATORS
+from s2a_bench.scenario import SIMULATORS, simulator_class
 from s2a_bench.scenario.ccrb.options import SKILL_SET, CcrbOptions
 from s2a_bench.transport import paths
 
@@ -67,8 +67,11 @@ class CcrbConfig(Options):
     prompt_s: float | None = PROMPT_TIME
     tokens_per_skill: int = option(6, "L, the delimiter included", ge=1, le=1000)
     scenario: CcrbOptions = Field(default_factory=CcrbOptions)
-    simulator: Annotated[str, one_of(lambda: SIMULATORS)] = option(
-        "longitudinal", "longitudinal (along the lane), embedded (highway-env)", first=True
+    simulator: str = option(
+        "longitudinal",
+        f"{', '.join(SIMULATORS)}, with parameters as in NAME?parameter=value",
+        first=True,
+        names=lambda: SIMULATORS,
     )
     ttc: bool = option(False, "add s2a-ttc: stream-to-act that starts by the lead's deadline")
     phase: bool = option(False, "also the phase diagram over rate and rear gap, for every gap behaviour", first=True)
@@ -134,8 +137,9 @@ class CcrbConfig(Options):
             span = getattr(self, name)
             if len(span) != 2 or not 0 < span[0] < span[1] <= most:  # noqa: PLR2004 - from, to
                 raise UsageError(f"`{name}`: should be two numbers above 0 and at most {most:g}, the lower first")
-        if self.scenario.lane_change and not SIMULATORS[self.simulator].steers:
-            raise UsageError(f"`lane_change`: the {self.simulator} simulator knows one lane; take `simulator` embedded")
+        world = simulator_class(self.simulator)
+        if self.scenario.lane_change and not world.steers:
+            raise UsageError(f"`lane_change`: the {world.name} simulator knows one lane; take `simulator` embedded")
         if self.plan_request.live:
             self._check_live()
         self.timeline.check()

@@ -71,7 +71,7 @@ class AboutRollout:
     board: str
     title: str
     emulated: Annotated[bool, about("True where no model answered.")]
-    simulator: Annotated[str, {"enum": ["longitudinal", "embedded"]}]
+    simulator: Annotated[str, {"minLength": 1}]
     follower: Annotated[str, {"enum": list(FOLLOWERS)}]
     gap_behaviour: Annotated[str, {"enum": list(GAPS)}]
     reflex: bool

@@ -20,7 +20,7 @@ from s2a_bench.harness.timelines.rows import skill_rows, to_ns, token_rows
 from s2a_bench.machine import environment
 from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.provenance import Origins
-from s2a_bench.scenario import SIMULATORS, Simulator
+from s2a_bench.scenario import Simulator, open_simulator
 from s2a_bench.scenario.ccrb.drive import drive
 from s2a_bench.scenario.ccrb.ttc import NAME as TTC
 from s2a_bench.scenario.ccrb.ttc import ttc_aware
@@ -111,7 +111,7 @@ _BOARD = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_origin"
 
 
 def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
-    with closing(SIMULATORS[config.simulator]()) as world:
+    with closing(open_simulator(config.simulator)) as world:
         if not config.plan_request.live:
             return _run_modelled(config, world, output, progress)
         from s2a_bench.experiments.ccrb.live import run_ccrb_live
