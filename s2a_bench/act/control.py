@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import gc
 import heapq
-import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from threading import Thread
 from typing import Final, TypeAlias
 
-from s2a_bench.clock import Clock, SystemClock
+from s2a_bench.clock import Clock, SystemClock, quick_switching
 from s2a_bench.policy.chunks import ControlSetting, Ints, Mode
 from s2a_bench.types import Vector
 
@@ -28,8 +27,6 @@ RequestChunk: TypeAlias = "Callable[[int, int], None]"
 
 HEAD_START_NS: Final = 20_000_000
 """From `ControlLoop.start` to the first tick."""
-SWITCH_S: Final = 0.0005
-"""Longest time that another thread of this process delays a tick (Python's default: 5 ms)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -208,12 +205,10 @@ class ControlLoop:
 
     def _guarded(self) -> None:
         gc.freeze()  # no garbage collection of existing objects between two ticks
-        switch_s = sys.getswitchinterval()
-        sys.setswitchinterval(SWITCH_S)
         try:
-            self.run()
+            with quick_switching():
+                self.run()
         except BaseException as error:  # noqa: BLE001 - `join` raises it again
             self._failure = error
         finally:
-            sys.setswitchinterval(switch_s)
             gc.unfreeze()

@@ -38,7 +38,7 @@ class Embedded:
     def __init__(self) -> None:
         extras.need("ccrb", "highway_env")
         self._cars: dict[int, Any] = {}
-        self._acceleration = np.zeros((3, 1))
+        self._shown = (State(*np.zeros((3, 3, 1))), np.zeros((3, 1)))
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         controlled = extras.require("highway_env.vehicle.controller", "ccrb").ControlledVehicle
@@ -48,16 +48,15 @@ class Embedded:
         network = straight(len(LANES), start=-BEHIND_M, length=ROAD_M + BEHIND_M, speed_limit=50.0)
         # Fixed and unused; without it highway-env creates a randomly seeded one.
         road = made_of.Road(network, np_random=np.random.RandomState(0), record_history=False)
-        self._cars, self._acceleration = {}, np.zeros((3, 1))
+        self._cars = {}
         for car in (LEAD, EGO, REAR):
             kind = controlled if car == EGO else free
             at = np.array([float(position_m[car, 0]) + LENGTHS[car] * free.LENGTH, MIDDLE_M])
             self._cars[car] = kind(road, at, heading=0.0, speed=float(speed_mps[car, 0]))
             road.vehicles.append(self._cars[car])
-        return self._state()
+        return self._state(np.zeros((3, 1)))
 
     def step(self, command: DriveCommand) -> State:
-        self._acceleration = command.acceleration_mps2
         for car, vehicle in self._cars.items():
             # A car may come to rest within the step, but not go backwards.
             least = -vehicle.speed / self.step_s
@@ -67,15 +66,17 @@ class Embedded:
             vehicle.action = {"steering": steering, "acceleration": acceleration}
             vehicle.step(self.step_s)
             vehicle.speed = max(vehicle.speed, 0.0)
-        return self._state()
+        return self._state(command.acceleration_mps2)
 
     def camera(self, width: int, height: int) -> Windscreen:
-        return Windscreen(lambda: (self._state(), self._acceleration), width, height)
+        return Windscreen(lambda: self._shown, width, height)
 
     def close(self) -> None: ...
 
-    def _state(self) -> State:
+    def _state(self, acceleration_mps2: Floats) -> State:
         position = [[vehicle.position[0] - LENGTHS[car] * vehicle.LENGTH] for car, vehicle in self._cars.items()]
         speed = [[vehicle.speed] for vehicle in self._cars.values()]
         lateral = [[MIDDLE_M - vehicle.position[1]] for vehicle in self._cars.values()]
-        return State(np.array(position), np.array(speed), np.array(lateral))
+        state = State(np.array(position), np.array(speed), np.array(lateral))
+        self._shown = (state, acceleration_mps2)  # whole, for a camera that another thread reads
+        return state

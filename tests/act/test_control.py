@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from s2a_bench.act.control import SWITCH_S, Acted, ControlLoop, RobotTicks
-from s2a_bench.clock import SystemClock, VirtualClock, now_ns
+from s2a_bench.act.control import Acted, ControlLoop, RobotTicks
+from s2a_bench.clock import SWITCH_S, SystemClock, VirtualClock, now_ns
 from s2a_bench.policy.chunks import ControlSetting, mode
 from s2a_bench.policy.chunks.cycles import NEVER, follow
 

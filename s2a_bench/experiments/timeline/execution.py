@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
-from typing import Any, Final
-
-import numpy as np
+from typing import Any
 
 from s2a_bench.act import SkillRobot
 from s2a_bench.act.events import AbortRequested, Event, LiveInbox
 from s2a_bench.act.executor import Executor
-from s2a_bench.act.record import Record, SkillRun
+from s2a_bench.act.record import Record, executed
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
 from s2a_bench.experiments.timeline.rows import TIMELINES
@@ -21,14 +17,11 @@ from s2a_bench.harness.timelines.config import PlanSetting
 from s2a_bench.harness.timelines.policies import finite
 from s2a_bench.harness.timelines.rows import skill_rows
 from s2a_bench.plan import Gap
-from s2a_bench.policy import TOLERANCE_S, Plans, PlanShape, Policy, Schedule
+from s2a_bench.policy import TOLERANCE_S, PlanShape, Policy
 from s2a_bench.stats import summarise
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import RunWriter
-
-SWITCH_S: Final = 0.0005
-"""Python's switch interval between threads: with the default 5 ms a busy thread would delay starts by as much."""
 
 
 class SideBySide:
@@ -68,17 +61,6 @@ class SideBySide:
         self._pool.shutdown()
 
 
-@contextmanager
-def quick_switching() -> Iterator[None]:
-    """Shorten the switch interval between threads to `SWITCH_S`."""
-    before = sys.getswitchinterval()
-    sys.setswitchinterval(SWITCH_S)
-    try:
-        yield
-    finally:
-        sys.setswitchinterval(before)
-
-
 def keep(
     writer: RunWriter,
     setting: PlanSetting,
@@ -95,7 +77,7 @@ def keep(
         cell = f"{setting.name}/{record.policy}"
         writer.update(executions={f"{cell}/{plan}": _facts(record)})
         if record.ran and record.requested_ns is not None and setting.tokens_per_s > 0:
-            plans, schedule, due_s = _arrays(record, record.requested_ns)
+            plans, schedule, due_s = executed(record)
             timeline = timeline_rows(
                 setting,
                 record.policy,
@@ -122,26 +104,6 @@ def jitter_facts(records: Sequence[Record]) -> dict[str, float | int]:
         return {}
     found = summarise(values)
     return {"starts": found.n, "median_ms": found.median, "p99_ms": found.p99}
-
-
-def _arrays(record: Record, requested_ns: int) -> tuple[Plans, Schedule, Any]:
-    """Return the skills that ran as arrays of shape (N, 1) in s from the request, and their due times."""
-
-    def column(value: Callable[[SkillRun], float]) -> Any:
-        return np.array([[value(skill)] for skill in record.ran])
-
-    def since(at_ns: float) -> float:
-        return (at_ns - requested_ns) / 1e9
-
-    plans = Plans(
-        arrival_s=column(lambda skill: since(skill.arrival_ns)),
-        nominal_s=column(lambda skill: skill.call.skill.durations.nominal_s),
-        least_s=column(lambda skill: skill.call.skill.durations.least_s),
-        most_s=column(lambda skill: skill.call.skill.durations.most_s),
-    )
-    start_s = column(lambda skill: since(skill.start_ns))
-    duration_s = column(lambda skill: ((skill.end_ns or 0) - skill.start_ns) / 1e9)
-    return plans, Schedule(start_s, duration_s), column(lambda skill: since(skill.due_ns))
 
 
 def _facts(record: Record) -> dict[str, Any]:

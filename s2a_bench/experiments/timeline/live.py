@@ -14,9 +14,9 @@ from pathlib import Path
 from s2a_bench.act import SkillKind, SkillRobot, kind
 from s2a_bench.act.events import PlanFeed, StreamBroke
 from s2a_bench.act.record import Record
-from s2a_bench.clock import now_ns
+from s2a_bench.clock import now_ns, quick_switching
 from s2a_bench.errors import S2AError
-from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep, quick_switching
+from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.frames.stamp import Stamped

@@ -13,10 +13,10 @@ from s2a_bench.act.record import Record
 from s2a_bench.act.timed import TimedRobot
 from s2a_bench.boards.gaps import to_table
 from s2a_bench.boards.tokens import Board
-from s2a_bench.clock import SystemClock
+from s2a_bench.clock import SystemClock, quick_switching
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
-from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep, quick_switching
+from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, settings

@@ -74,7 +74,9 @@ def drive(
         )
     if simulator.most is not None and rollouts > simulator.most:
         raise UsageError(f"`simulator`: '{simulator.name}' runs {simulator.most} roll-out at a time, not {rollouts}")
-    return _Drive(simulator, cars, plan, schedule, rollouts).run(record=record, resting_mps=resting_mps)
+    driving = Drive(simulator, cars, Ego(cars, plan, schedule, rollouts), rollouts, record=record)
+    outcomes = driving.run(resting_mps=resting_mps)
+    return Driven(outcomes, driving.trajectory() if record else None)
 
 
 def follower_survives(cars: Cars, plan: DrivingPlan, n_skills: ArrayLike, t_nom_s: ArrayLike) -> NDArray[np.bool_]:
@@ -99,12 +101,13 @@ def place(simulator: Simulator, cars: Cars, rollouts: int = 1) -> State:
     return simulator.place(position, speed)
 
 
-class _Drive(LockStep):
-    """The loop and its state; `LockStep.keep` includes the laws, the delay, the watch and the simulator."""
+class Drive(LockStep):
+    """Roll-outs in progress; `LockStep.keep` includes the laws, the delay, the watch and the simulator."""
 
-    def __init__(self, simulator: Simulator, cars: Cars, plan: DrivingPlan, schedule: Schedule, rollouts: int) -> None:
+    def __init__(self, simulator: Simulator, cars: Cars, ego: Ego, rollouts: int = 1, *, record: bool = False) -> None:
+        """Place the cars; ``record`` a `trajectory` from the request on."""
         self._simulator = simulator
-        self._ego = Ego(cars, plan, schedule, rollouts)
+        self._ego = ego
         self._rear = follower(cars, rollouts)
         self._lead_decel = each(cars.lead_decel_mps2, rollouts)
         self._state = state = place(simulator, cars, rollouts)
@@ -115,31 +118,65 @@ class _Drive(LockStep):
         self._outcomes = self._watch.outcomes()
         self._left = np.arange(rollouts)
         self._seen_at_rest = np.zeros(rollouts, bool)
-        self._records: list[tuple[State, Floats, NDArray[np.int64], NDArray[np.int64]]] = []
+        self._every = max(round(RECORD_S / simulator.step_s), 1) if record else 0
+        self._records: list[tuple[float, State, Floats, NDArray[np.int64], NDArray[np.int64]]] = []
+        self._steps = 0
 
-    def run(self, *, record: bool, resting_mps: float) -> Driven:
+    def run(self, *, resting_mps: float) -> Outcomes:
+        """Step until all roll-outs are decided."""
         step_s = self._simulator.step_s
-        every = max(round(RECORD_S / step_s), 1)
         last = int((float(self._ego.end_s.max()) + AFTER_S) / step_s)
         for step in range(last):
-            self._decide(step * step_s)
-            if record and step % every == 0:
-                now = (self._state, self._acceleration.copy(), self._ego.phase, self._ego.index.copy())
-                self._records.append(now)
-            self._state = self._simulator.step(DriveCommand(self._acceleration, self._ego.lane))
-            self._ego.stopped(self._state.speed_mps[EGO])
-            self._watch.see(self._state)
-            if step % LOOK_STEPS == 0 and not self._go_on(self._decided(resting_mps), record=record):
+            self.step(step * step_s)
+            if step % LOOK_STEPS == 0 and not self._go_on(self.decided(resting_mps)):
                 break
-        self._outcomes.put(self._left, self._watch.outcomes())
-        return Driven(self._outcomes, self._trajectory(every * step_s) if record else None)
+        return self.outcomes()
 
-    def _go_on(self, decided: NDArray[np.bool_], *, record: bool) -> bool:
+    def step(self, now_s: float) -> None:
+        """Let every driver decide, and simulate one step; before the request, at 0, nobody brakes."""
+        self._decide(now_s)
+        if self._every and now_s >= 0:
+            if self._steps % self._every == 0:
+                now = (now_s, self._state, self._acceleration.copy(), self._ego.phase, self._ego.index.copy())
+                self._records.append(now)
+            self._steps += 1
+        self._state = self._simulator.step(DriveCommand(self._acceleration, self._ego.lane))
+        self._ego.stopped(self._state.speed_mps[EGO])
+        self._watch.see(self._state)
+
+    def decided(self, resting_mps: float = RESTING_MPS) -> NDArray[np.bool_]:
+        """Return which roll-outs have a certain outcome."""
+        speed = self._state.speed_mps
+        over = self._ego.phase == DONE
+        # Until the driver behind has seen the ego at rest, the rear car may stop and start again.
+        calm = (speed[REAR] < resting_mps) & (self._acceleration[REAR] <= 0) & self._seen_at_rest
+        behind = self._watch.rear.crashed | calm
+        resting = over & (speed[EGO] <= 0) & behind
+        passed = over & (self._watch.front.gap_m < -PASSED_M)
+        return np.asarray(self._watch.front.crashed | resting | passed)
+
+    def outcomes(self) -> Outcomes:
+        self._outcomes.put(self._left, self._watch.outcomes())
+        return self._outcomes
+
+    def trajectory(self) -> Trajectory:
+        times_s, states, accelerations, phases, skills = zip(*self._records, strict=True)
+        return Trajectory(
+            time_s=np.array(times_s),
+            position_m=np.stack([state.position_m for state in states]),
+            speed_mps=np.stack([state.speed_mps for state in states]),
+            lateral_m=np.stack([state.lateral_m for state in states]),
+            acceleration_mps2=np.stack(accelerations),
+            phase=np.stack(phases),
+            skill=np.stack(skills),
+        )
+
+    def _go_on(self, decided: NDArray[np.bool_]) -> bool:
         """Drop decided roll-outs, many at a time; return whether any is left."""
         share = decided.mean()
         if share == 1:
             return False
-        if record or share < DROP_SHARE or not isinstance(self._simulator, LockStep):
+        if self._every or share < DROP_SHARE or not isinstance(self._simulator, LockStep):
             return True
         self._outcomes.put(self._left, self._watch.outcomes())
         columns = np.flatnonzero(~decided)
@@ -152,35 +189,14 @@ class _Drive(LockStep):
         seen = self._delay.see(state, self._ego.acceleration_mps2, acceleration[REAR])
         self._seen_at_rest = seen.ego_then.speed_mps <= 0
         lead = acceleration[LEAD]
-        np.maximum(lead - LEAD_JERK_MPS3 * step_s, -self._lead_decel, out=lead)
+        if now_s >= 0:
+            np.maximum(lead - LEAD_JERK_MPS3 * step_s, -self._lead_decel, out=lead)
         lead_decel = np.where(state.speed_mps[LEAD] > 0, -lead, 0.0)
         gap = state.position_m[LEAD] - state.position_m[EGO]
         acceleration[EGO] = self._ego.decide(
             now_s, state.speed_mps[EGO], gap, state.speed_mps[LEAD], lead_decel, step_s
         )
         acceleration[REAR] = self._rear.acceleration(seen, step_s)
-
-    def _decided(self, resting_mps: float) -> NDArray[np.bool_]:
-        speed = self._state.speed_mps
-        over = self._ego.phase == DONE
-        # Until the driver behind has seen the ego at rest, the rear car may stop and start again.
-        calm = (speed[REAR] < resting_mps) & (self._acceleration[REAR] <= 0) & self._seen_at_rest
-        behind = self._watch.rear.crashed | calm
-        resting = over & (speed[EGO] <= 0) & behind
-        passed = over & (self._watch.front.gap_m < -PASSED_M)
-        return np.asarray(self._watch.front.crashed | resting | passed)
-
-    def _trajectory(self, step_s: float) -> Trajectory:
-        states, accelerations, phases, skills = zip(*self._records, strict=True)
-        return Trajectory(
-            time_s=np.arange(len(states), dtype=np.float64) * step_s,
-            position_m=np.stack([state.position_m for state in states]),
-            speed_mps=np.stack([state.speed_mps for state in states]),
-            lateral_m=np.stack([state.lateral_m for state in states]),
-            acceleration_mps2=np.stack(accelerations),
-            phase=np.stack(phases),
-            skill=np.stack(skills),
-        )
 
 
 class Delay(LockStep):

@@ -109,7 +109,7 @@ class Ego(LockStep):
             self._next_s[columns] = np.where(
                 last, np.inf, self._start_s[np.minimum(index + 1, len(self._start_s) - 1), columns]
             )
-        after = np.where(np.isinf(self._next_s), DONE, GAP)
+        after = np.where(self.index == len(self._start_s) - 1, DONE, GAP)
         running = np.where(now_s < self._until_s, ACTING, after)
         self.phase = np.where(self.index < 0, WAITING, running)
 
