@@ -85,8 +85,8 @@ class TopicCamera(ImageMessages):
             raise TransportError(f"{self._topic} is of type {', '.join(types)}; {listed}")
         raise TransportError(
             f"{self._topic} has no publisher after {self._wait_s:g} s; {listed}. "
-            "Is ROS_DOMAIN_ID (or `?domain_id=` of the source) the publisher's, and is ROS_AUTOMATIC_DISCOVERY_RANGE "
-            "SUBNET if it is on another host?"
+            f"Is ROS_DOMAIN_ID (or `?domain_id=` of the {self.option}) the publisher's, and is "
+            "ROS_AUTOMATIC_DISCOVERY_RANGE SUBNET if it is on another host?"
         )
 
     def _receive(self) -> None:
