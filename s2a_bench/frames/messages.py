@@ -26,7 +26,6 @@ class ImageMessages(NumberedSource):
     """
 
     option: ClassVar[str] = "source"
-    """Named in errors."""
 
     def begin(self, message: Any) -> None:
         """Take the encoding of the first message; raises SourceError if it cannot be read."""

@@ -322,10 +322,7 @@ def open_middleware(
 
 @dataclass(frozen=True, slots=True)
 class RosParameters:
-    """How to join a domain, as parameters of ``name?middleware=zenoh&...``; a peer is waited for ``wait_s``.
-
-    The defaults are those of the ROS transport: `default_middleware`, ROS_DOMAIN_ID, rmw_zenoh's router.
-    """
+    """How to join a domain, the defaults as of the ROS transport; a peer is waited for ``wait_s``."""
 
     middleware: str = ""
     domain_id: Annotated[int, Field(ge=0, le=232)] | None = None
@@ -337,11 +334,9 @@ class RosParameters:
             raise UsageError(f"middleware = {none_of(self.middleware, MIDDLEWARES)}")
         endpoint_of(self.router)
 
-    def join(self, node_name: str, opened: Callable[[Middleware], T]) -> T:
-        """Return what ``opened`` makes of the node; if it raises, the node leaves."""
-        node = open_middleware(
-            self.middleware, domain_id=self.domain_id, node_name=node_name, router=Router(self.router)
-        )
+    def join(self, name: str, opened: Callable[[Middleware], T]) -> T:
+        """Return what ``opened`` makes of a node called ``name``; if it raises, the node leaves."""
+        node = open_middleware(self.middleware, domain_id=self.domain_id, node_name=name, router=Router(self.router))
         try:
             return opened(node)
         except BaseException:

@@ -1,27 +1,23 @@
-"""The ego of a world over ROS 2, as CARLA's nodes have it: commands go out on a topic, pictures come in on another.
-
-The simulator does not wait for a command: it applies the newest that it has received, at its best that of this step.
-"""
+"""The ego of a world over ROS 2, as CARLA has it: commands go out on a topic, pictures come in on another."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Final, Literal
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.frames import FrameSource
+from s2a_bench.errors import TransportError
 from s2a_bench.frames.ros import TopicCamera
 from s2a_bench.policy import Floats
 from s2a_bench.policy.parameters import canonical
-from s2a_bench.ros import Middleware, Publisher, QoS, RosParameters
+from s2a_bench.ros import QoS, RosParameters
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.remap import NODE_NAME as NAME
 from s2a_bench.ros.service import MATCH_POLL_S, appeared
 from s2a_bench.scenario import EGO, DriveCommand, Simulator, State
 
@@ -33,115 +29,62 @@ COMMANDS: Final = {
     ("bridge", "control"): ("/carla/ego_vehicle/vehicle_control_cmd", CONTROL),
     ("bridge", "ackermann"): ("/carla/ego_vehicle/ackermann_cmd", DRIVE),
 }
-"""(preset, message) -> topic and type of the commands."""
 PICTURES: Final = {"native": "/carla/ego/front/image", "bridge": "/carla/ego_vehicle/rgb_front/image"}
-QUEUE: Final = QoS(depth=1)
-"""As of CARLA's own subscriptions: reliable, volatile, the last."""
-FULL_THROTTLE_MPS2, FULL_BRAKE_MPS2 = 4.0, 8.0
-ROLLING_MPS2, AIR_PER_M = 0.1, 0.0003
-"""Of no car in particular; what a car does instead is its error, and is not corrected."""
-REST_MPS: Final = 0.1
-"""A slower car that is not to accelerate is held by the brake, as CARLA's Ackermann controller does."""
-AHEAD_S, LEAST_MPS = 1.0, 0.05
-"""CARLA takes the sign of an acceleration from the speed, hence of a second later; at 0 its bridge brakes fully."""
-PICTURE_S: Final = 0.05
-"""So long a picture may be on its way."""
-START_M: Final = np.array([[40.0], [0.0], [-40.0]])
+NAME: Final = r"^(/[A-Za-z_][A-Za-z0-9_]*)+$"
+FULL_THROTTLE_MPS2, FULL_BRAKE_MPS2, ROLLING_MPS2, AIR_PER_M, REST_MPS = 4.0, 8.0, 0.1, 0.0003, 0.1
+"""Of no car in particular: what a car does instead is its error. Slower than the last, it is held by the brake."""
 
 
 @dataclass(frozen=True, slots=True)
 class EgoParameters(RosParameters):
-    """Topics of ``preset``, CARLA's own ROS 2 or its older bridge, where ``command`` or ``picture`` name none."""
+    """Topics are those of ``preset``, CARLA's own or its older bridge's, or ``command`` and ``picture``."""
 
     preset: Literal["native", "bridge"] = "native"
     message: Literal["control", "ackermann"] = "control"
-    command: str = ""
-    picture: str = ""
-
-    def __post_init__(self) -> None:
-        RosParameters.__post_init__(self)
-        for name in ("command", "picture"):
-            if (topic := getattr(self, name)) and not NAME.fullmatch(topic):
-                raise UsageError(f"{name} = '{topic}' should look like {PICTURES['native']}")
-
-
-def pedals(acceleration_mps2: float, speed_mps: float) -> tuple[float, float]:
-    """Return throttle and brake, 0 to 1, of a mid-size car on a level road."""
-    if speed_mps < REST_MPS and acceleration_mps2 <= 0:
-        return 0.0, 1.0
-    drive_mps2 = acceleration_mps2 + ROLLING_MPS2 + AIR_PER_M * speed_mps**2
-    return min(max(drive_mps2 / FULL_THROTTLE_MPS2, 0.0), 1.0), min(max(-drive_mps2 / FULL_BRAKE_MPS2, 0.0), 1.0)
+    command: Annotated[str, Field(pattern=NAME)] = ""
+    picture: Annotated[str, Field(pattern=NAME)] = ""
 
 
 def message(type_name: str, acceleration_mps2: float, speed_mps: float) -> Any:
-    """Return a command of one of the types of `COMMANDS`, steering straight on, stamped now."""
-    if type_name == DRIVE:
-        speed = 0.0
-        if acceleration_mps2 > 0 or speed_mps >= REST_MPS:
-            speed = max(speed_mps + acceleration_mps2 * AHEAD_S, LEAST_MPS)
-        return ros.default(DRIVE, speed=speed, acceleration=acceleration_mps2)
-    header = ros.header(time.time_ns())
+    """Return a command, straight on; its speed is of a second later, as CARLA takes an acceleration's sign from it."""
+    rests, header = speed_mps < REST_MPS and acceleration_mps2 <= 0, ros.header(time.time_ns())
     if type_name == CONTROL:
-        throttle, brake = pedals(acceleration_mps2, speed_mps)
+        pedal = acceleration_mps2 + ROLLING_MPS2 + AIR_PER_M * speed_mps**2
+        throttle, brake = (0.0, 1.0) if rests else np.clip((pedal / FULL_THROTTLE_MPS2, -pedal / FULL_BRAKE_MPS2), 0, 1)
         return ros.default(CONTROL, header=header, throttle=throttle, brake=brake)
-    return ros.default(type_name, header=header, drive=message(DRIVE, acceleration_mps2, speed_mps))
+    speed = 0.0 if rests else max(speed_mps + acceleration_mps2, REST_MPS)
+    drive = ros.default(DRIVE, speed=speed, acceleration=acceleration_mps2)
+    return drive if type_name == DRIVE else ros.default(type_name, header=header, drive=drive)
 
 
 class EgoCamera(TopicCamera):
-    """A topic whose pictures come only while the world is stepped: `read` repeats the last one while it is not."""
+    """A topic whose pictures come only as the world is stepped: `read` repeats the last one until there is another."""
 
     option: ClassVar[str] = "ego"
 
-    def renew(self, step: Callable[[], object]) -> None:
-        """Step until two pictures have come, unless closed; the first may have been on its way before."""
-        if self._closed:
-            return
-
-        def stepped() -> bool:
-            step()
-            return self._newest is not None
-
-        with self.errors():
-            for _ in range(2):
-                if self._newest is not None:
-                    super()._grab()
-                if not appeared(stepped, self._wait_s):
-                    self._wait()
+    def renew(self, step: Callable[[], State]) -> None:
+        """Step until a third picture has come; one may have been unread, and one on its way."""
+        for _ in range(0 if self._closed else 3):
+            with self.errors():
+                appeared(lambda: step() is not None and self._newest is not None, self._wait_s)
+                super()._grab()
 
     def _grab(self) -> int:
-        asked_ns = now_ns()
-        with self._changed:
-            if not self._changed.wait_for(lambda: self._newest, PICTURE_S):
-                return asked_ns
-        return super()._grab()
+        return now_ns() if self._newest is None else super()._grab()
 
 
-class RosEgo:
+class RosEgo(Simulator):
     """A simulator whose ego is commanded and seen over ROS 2; all else is the wrapped world's, `close` included."""
 
-    name: ClassVar[str]
-    real: ClassVar[bool]
-    steers: ClassVar[bool]
-    most: ClassVar[int | None]
-    over_ros: ClassVar[bool]
-    step_s: float
-
     def __init__(self, world: Simulator, how: EgoParameters) -> None:
-        """Join the domain; raises TransportError."""
-        self._world, self._how = world, how
         topic, self._type = COMMANDS[how.preset, how.message]
-        self._topic = how.command or topic
-        self._cameras: list[FrameSource] = []
-        self._seen: list[EgoCamera] = []
-        self._state: State
-
-        def opened(node: Middleware) -> tuple[Middleware, Publisher]:
-            publisher = node.publisher(self._topic, self._type, QUEUE)
-            publisher.pack(message(self._type, 0.0, 0.0))  # the first packing takes milliseconds
-            return node, publisher
-
+        self._world, self._how, self._topic = world, how, how.command or topic
+        self._sensors: list[Any] = []
+        self._cameras: list[EgoCamera] = []
         try:
-            self._middleware, self._publisher = how.join("/s2a_bench/ego", opened)
+            self._publisher, self._node = how.join(
+                "/s2a_bench/ego", lambda node: (node.publisher(self._topic, self._type, QoS(depth=1)), node)
+            )
         except TransportError as error:
             raise type(error)(f"`ego`: ros: {error}") from error
 
@@ -149,52 +92,42 @@ class RosEgo:
         return getattr(self._world, name)
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
-        """Restart; with a camera the cars are placed twice, the first time until it shows them."""
+        """Restart, with a camera once more when it has seen the cars there; raises TransportError, SourceError."""
         self._state = self._world.place(position_m, speed_mps)
         if not appeared(lambda: self._publisher.matched() > 0, self._how.wait_s):
             raise TransportError(
                 f"`ego`: ros: no subscriber of {self._topic} ({self._type}) appeared in {self._how.wait_s:g} s; start "
-                "CARLA with --ros2, or its bridge with ?preset=bridge, on the ROS_DOMAIN_ID and middleware of this "
-                "(?domain_id=, ?middleware=), or name the topic with ?command="
+                "CARLA with --ros2, or give the ego its preset, command, domain_id or middleware (?preset=bridge)"
             )
-        for camera in self._seen:
+        for camera in self._cameras:
             camera.renew(self._coast)
             self._state = self._world.place(position_m, speed_mps)
         return self._state
 
     def step(self, command: DriveCommand) -> State:
-        wanted, speed = command.acceleration_mps2, self._state.speed_mps[EGO, 0]
-        self._publisher.send(self._publisher.pack(message(self._type, float(wanted[EGO, 0]), float(speed))))
-        others = wanted.copy()
+        others = command.acceleration_mps2.copy()
+        sent = message(self._type, float(others[EGO, 0]), float(self._state.speed_mps[EGO, 0]))
+        self._publisher.send(self._publisher.pack(sent))
         others[EGO] = np.nan
         self._state = self._world.step(replace(command, acceleration_mps2=others))
         return self._state
 
     def camera(self, width: int, height: int) -> EgoCamera:
-        """Open the world's camera, for its sensor, and then the topic, stepping until there is a picture.
-
-        Places the cars. Raises SourceError.
-        """
-        self._cameras.append(self._world.camera(width, height))
-        self.place(START_M, np.zeros((3, 1)))
-        parameters = (getattr(self._how, field.name) for field in fields(RosParameters))
-        where = canonical(self._how.picture or PICTURES[self._how.preset], RosParameters(*parameters))
+        """Open the world's camera, for its sensor, and the topic, stepping meanwhile; places the cars."""
+        self._sensors.append(self._world.camera(width, height))
+        self.place(np.array([[40.0], [0.0], [-40.0]]), np.zeros((3, 1)))
+        where, how = self._how.picture or PICTURES[self._how.preset], self._how
+        where = canonical(where, RosParameters(how.middleware, how.domain_id, how.router, how.wait_s))
         with ThreadPoolExecutor(1) as threads:
-            opening = threads.submit(EgoCamera, where, width, height)
-            opening.add_done_callback(self._opened)
+            opening = threads.submit(lambda: self._cameras.append(EgoCamera(where, width, height)))
             while not wait([opening], MATCH_POLL_S).done:
                 self._coast()
-        return opening.result()
+        opening.result()
+        return self._cameras[-1]
 
     def close(self) -> None:
-        for camera in (*self._seen, *self._cameras):
-            camera.close()
-        self._middleware.close()
-        self._world.close()
+        for each in (*self._cameras, *self._sensors, self._node, self._world):
+            each.close()
 
     def _coast(self) -> State:
         return self.step(DriveCommand(np.zeros((3, 1)), np.zeros(1, np.int64)))
-
-    def _opened(self, opening: Future[EgoCamera]) -> None:
-        if not opening.exception():
-            self._seen.append(opening.result())
