@@ -49,7 +49,7 @@ def paced(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
 
 
 def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: StoredRun) -> None:
-    token_ns = np.rint(np.array(token_times_s(paced)) * 1e9).astype(np.int64)
+    token_ns = np.rint(np.array(token_times_s(paced, paced.table(SKILLS)["cell"].iloc[0])) * 1e9).astype(np.int64)
     assert len(token_ns) == N * L
     arrivals_ns = token_ns[L - 1 :: L]
     skills = paced.table(SKILLS)

@@ -73,6 +73,9 @@ class CcrbConfig(Options):
         first=True,
         names=lambda: SIMULATORS,
     )
+    closed_loop: bool = option(
+        False, "let the world run while the plan arrives: with --live on the clock, else in virtual time", first=True
+    )
     ttc: bool = option(False, "add s2a-ttc: stream-to-act that starts by the lead's deadline")
     phase: bool = option(False, "also the phase diagram over rate and rear gap, for every gap behaviour", first=True)
     phase_rates: Numbers = option((2.0, 12.0), "tokens/s of the phase diagram: from, to")
@@ -140,6 +143,9 @@ class CcrbConfig(Options):
         world = simulator_class(self.simulator)
         if self.scenario.lane_change and not world.steers:
             raise UsageError(f"`lane_change`: the {world.name} simulator knows one lane; take `simulator` embedded")
+        for name in ("ttc", "phase", "random") if self.closed_loop else ():
+            if getattr(self, name):
+                raise UsageError(f"`{name}` needs all arrivals beforehand, in virtual time; leave out `closed_loop`")
         if self.plan_request.live:
             self._check_live()
         self.timeline.check()
@@ -154,7 +160,8 @@ class CcrbConfig(Options):
             {"profile", *MODELLED, "phase_rates", "phase_gaps_m", "phase_points"} if self.plan_request.live else set()
         )
         given = {**self.model_dump(exclude=left_out), **self.scenario.to_manifest()}
-        return {**given, "t_nom_s": self.scenario.durations.nominal_s, "time": "virtual"}
+        time = "monotonic" if self.closed_loop and self.plan_request.live else "virtual"
+        return {**given, "t_nom_s": self.scenario.durations.nominal_s, "time": time}
 
     def _check_live(self) -> None:
         for name in MODELLED if self.plan_request.engine.kind.plays else (*MODELLED, "profile"):
