@@ -24,7 +24,7 @@ from s2a_bench.scenario import LEAD, Simulator
 from s2a_bench.scenario.ccrb.cars import Cars, braking_plan
 from s2a_bench.scenario.ccrb.drive import Driven, drive
 from s2a_bench.scenario.embedded import Embedded
-from s2a_bench.scenario.ros import EgoParameters, RosEgo, message, pedals
+from s2a_bench.scenario.ros import EgoParameters, RosEgo, message
 from s2a_bench.testing.simulator import SPEED, START, SimulatorSuite, command
 from tests.scenario.carla_stand_in import CONTROL, PLAIN, STAMPED, RosWorld
 
@@ -192,7 +192,7 @@ def test_a_command_that_nobody_takes_is_one_line(meeting: Meeting) -> None:
     assert line.startswith(
         f"`ego`: ros: no subscriber of /carla/hero/vehicle_control_cmd ({CONTROL}) appeared in 0.3 s; start CARLA with"
     )
-    assert "?domain_id=" in line
+    assert line.endswith("command, domain_id or middleware (?preset=bridge)")
 
 
 def test_a_picture_that_never_comes_is_one_line(meeting: Meeting) -> None:
@@ -242,8 +242,8 @@ def test_no_router_is_one_line() -> None:
     [
         ("ros?preset=autoware", "preset = 'autoware': input should be 'native' or 'bridge'"),
         ("ros?message=twist", "message = 'twist': input should be 'control' or 'ackermann'"),
-        ("ros?command=go", "command = 'go' should look like /carla/ego/front/image"),
-        ("ros?picture=/a b", "picture = '/a b' should look like /carla/ego/front/image"),
+        ("ros?command=go", "command = 'go': string should match pattern '^(/"),
+        ("ros?picture=/a b", "picture = '/a b': string should match pattern '^(/"),
         ("ros?middleware=opendds", "middleware = 'opendds' is none of cyclonedds, rclpy, zenoh"),
         ("ros?router=here", "router: 'here' should look like tcp/127.0.0.1:7447"),
         ("ros?wait_s=0", "wait_s = '0'"),
@@ -272,12 +272,13 @@ def test_what_makes_no_sense_is_refused_by_its_parameter(written: str, says: str
 def test_pedals_are_of_a_car_of_4_and_8_mps2_that_rolls_against_the_air(
     acceleration: float, speed: float, throttle: float, brake: float
 ) -> None:
-    assert pedals(acceleration, speed) == pytest.approx((throttle, brake))
+    control = message(CONTROL, acceleration, speed)
+    assert (control.throttle, control.brake) == pytest.approx((throttle, brake))
 
 
 @pytest.mark.parametrize(
     ("acceleration", "speed", "target"),
-    [(0.0, 14.0, 14.0), (-6.0, 14.0, 8.0), (-6.0, 3.0, 0.05), (-1.0, 0.05, 0.0), (0.0, 0.0, 0.0), (2.0, 0.0, 2.0)],
+    [(0.0, 14.0, 14.0), (-6.0, 14.0, 8.0), (-6.0, 3.0, 0.1), (-1.0, 0.05, 0.0), (0.0, 0.0, 0.0), (2.0, 0.0, 2.0)],
 )
 def test_an_ackermann_speed_is_a_second_ahead_and_zero_at_rest_alone(
     acceleration: float, speed: float, target: float
