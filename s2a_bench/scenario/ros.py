@@ -12,14 +12,14 @@ import numpy as np
 from pydantic import Field
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import TransportError
+from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.frames.ros import TopicCamera
 from s2a_bench.policy import Floats
-from s2a_bench.policy.parameters import canonical
+from s2a_bench.policy.parameters import build, canonical
 from s2a_bench.ros import QoS, RosParameters
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.service import MATCH_POLL_S, appeared
-from s2a_bench.scenario import EGO, DriveCommand, Simulator, State
+from s2a_bench.scenario import EGO, SIMULATORS, DriveCommand, Simulator, State
 
 CONTROL: Final = "carla_msgs/msg/CarlaEgoVehicleControl"
 DRIVE: Final = "ackermann_msgs/msg/AckermannDrive"
@@ -43,6 +43,18 @@ class EgoParameters(RosParameters):
     message: Literal["control", "ackermann"] = "control"
     command: Annotated[str, Field(pattern=NAME)] = ""
     picture: Annotated[str, Field(pattern=NAME)] = ""
+
+
+def ego_parameters(written: str, world: type[Simulator]) -> EgoParameters:
+    """Read ``ros[?parameter=value&...]``; raises UsageError, also for a simulator without ROS 2."""
+    if written.partition("?")[0] != "ros":
+        raise UsageError(f"`ego`: '{written}' should be ros, with parameters as in ros?preset=bridge")
+    if not world.over_ros:
+        able = ", ".join(name for name, each in SIMULATORS.loaded() if each.over_ros)
+        raise UsageError(
+            f"`ego`: the {world.name} simulator has no ROS 2; take a `simulator` that has: {able or 'none'}"
+        )
+    return build(EgoParameters, written, "ego")
 
 
 def message(type_name: str, acceleration_mps2: float, speed_mps: float) -> Any:
@@ -131,3 +143,8 @@ class RosEgo(Simulator):
 
     def _coast(self) -> State:
         return self.step(DriveCommand(np.zeros((3, 1)), np.zeros(1, np.int64)))
+
+
+def with_ego(world: Simulator, written: str) -> Simulator:
+    """Return a world with its ego as ``ros[?parameter=value&...]``, or as it is; raises TransportError."""
+    return RosEgo(world, ego_parameters(written, type(world))) if written else world  # type: ignore[abstract]

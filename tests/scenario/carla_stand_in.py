@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from s2a_bench.frames import FrameSource
-from s2a_bench.ros import Middleware, QoS
+from s2a_bench.ros import Middleware, QoS, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.scenario import EGO, DriveCommand, State
 from s2a_bench.scenario.embedded import Embedded
@@ -18,6 +18,9 @@ CONTROL = "carla_msgs/msg/CarlaEgoVehicleControl"
 STAMPED = "ackermann_msgs/msg/AckermannDriveStamped"
 PLAIN = "ackermann_msgs/msg/AckermannDrive"
 QUEUE = QoS(depth=1)
+
+
+NATIVE = ("/carla/ego/vehicle_control_cmd", "/carla/ego/front/image")
 
 
 class RosWorld(Embedded):
@@ -92,3 +95,15 @@ class RosWorld(Embedded):
             data=pixels.reshape(-1),
         )
         self._pictures.send(self._pictures.pack(image))
+
+
+class RosSimulator(RosWorld):
+    """As a registered simulator: it opens a node of its own, in steps that a picture each allows on the clock."""
+
+    name: ClassVar[str] = "stand-in"
+    opened: ClassVar[list[RosWorld]] = []
+    step_s = 0.04
+
+    def __init__(self) -> None:
+        super().__init__(open_middleware("cyclonedds", node_name="/carla"), CONTROL, *NATIVE)
+        self.opened.append(self)

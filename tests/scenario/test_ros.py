@@ -26,9 +26,8 @@ from s2a_bench.scenario.ccrb.drive import Driven, drive
 from s2a_bench.scenario.embedded import Embedded
 from s2a_bench.scenario.ros import EgoParameters, RosEgo, message
 from s2a_bench.testing.simulator import SPEED, START, SimulatorSuite, command
-from tests.scenario.carla_stand_in import CONTROL, PLAIN, STAMPED, RosWorld
+from tests.scenario.carla_stand_in import CONTROL, NATIVE, PLAIN, STAMPED, RosWorld
 
-NATIVE = ("/carla/ego/vehicle_control_cmd", "/carla/ego/front/image")
 SPOKEN = {
     "": (CONTROL, *NATIVE),
     "&message=ackermann": (STAMPED, "/carla/ego/ackermann_control_cmd", "/carla/ego/front/image"),

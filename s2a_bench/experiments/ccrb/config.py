@@ -73,6 +73,7 @@ class CcrbConfig(Options):
         first=True,
         names=lambda: SIMULATORS,
     )
+    ego: str = option("", "ros[?parameter=value&...]: command and see the ego over ROS 2, if the simulator can")
     closed_loop: bool = option(
         False, "let the world run while the plan arrives: with --live on the clock, else in virtual time", first=True
     )
@@ -143,6 +144,10 @@ class CcrbConfig(Options):
         world = simulator_class(self.simulator)
         if self.scenario.lane_change and not world.steers:
             raise UsageError(f"`lane_change`: the {world.name} simulator knows one lane; take `simulator` embedded")
+        if self.ego:
+            from s2a_bench.scenario.ros import ego_parameters
+
+            ego_parameters(self.ego, world)
         for name in ("ttc", "phase", "random") if self.closed_loop else ():
             if getattr(self, name):
                 raise UsageError(f"`{name}` needs all arrivals beforehand, in virtual time; leave out `closed_loop`")
