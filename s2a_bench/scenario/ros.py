@@ -31,7 +31,7 @@ COMMANDS: Final = {
 }
 PICTURES: Final = {"native": "/carla/ego/front/image", "bridge": "/carla/ego_vehicle/rgb_front/image"}
 NAME: Final = r"^(/[A-Za-z_][A-Za-z0-9_]*)+$"
-FULL_THROTTLE_MPS2, FULL_BRAKE_MPS2, ROLLING_MPS2, AIR_PER_M, REST_MPS = 4.0, 8.0, 0.1, 0.0003, 0.1
+FULL_THROTTLE_MPS2, FULL_BRAKE_MPS2, ROLLING_MPS2, AIR_PER_M, REST_MPS = 4.0, 9.0, 0.1, 0.0003, 0.1
 """Of no car in particular: what a car does instead is its error. Slower than the last, it is held by the brake."""
 
 

@@ -75,11 +75,11 @@ class RosWorld(Embedded):
         self._node.close()
 
     def _acceleration_of(self, message: Any) -> float:
-        """A car of 4 m/s2 at full throttle and 8 m/s2 at full brake, less what rolling and the air take."""
+        """A car of 4 m/s2 at full throttle and 9 m/s2 at full brake, less what rolling and the air take."""
         if self._type == CONTROL:
             speed = self.state.speed_mps[EGO, 0]
             assert (message.steer, message.gear, message.hand_brake, message.reverse) == (0, 0, False, False)
-            return float(4.0 * message.throttle - 8.0 * message.brake - 0.1 - 0.0003 * speed**2)
+            return float(4.0 * message.throttle - 9.0 * message.brake - 0.1 - 0.0003 * speed**2)
         return float((message.drive if self._type == STAMPED else message).acceleration)
 
     def _publish(self, eye: FrameSource) -> None:

@@ -262,13 +262,13 @@ def test_what_makes_no_sense_is_refused_by_its_parameter(written: str, says: str
         (-2.0, 0.05, 0.0, 1.0),
         (0.5, 0.0, 0.15, 0.0),
         (0.0, 20.0, 0.055, 0.0),
-        (-8.0, 10.0, 0.0, 0.98375),
+        (-8.0, 10.0, 0.0, 7.87 / 9),
         (-0.1, 10.0, 0.0075, 0.0),
         (9.0, 10.0, 1.0, 0.0),
         (-20.0, 10.0, 0.0, 1.0),
     ],
 )
-def test_pedals_are_of_a_car_of_4_and_8_mps2_that_rolls_against_the_air(
+def test_pedals_are_of_a_car_of_4_and_9_mps2_that_rolls_against_the_air(
     acceleration: float, speed: float, throttle: float, brake: float
 ) -> None:
     control = message(CONTROL, acceleration, speed)
@@ -301,7 +301,7 @@ def test_messages_are_byte_for_byte_what_rosbags_makes_of_the_packages_own_defin
     if type_name == CONTROL:
         straight: dict[str, Any] = {"steer": 0.0, "gear": 0}
         straight |= dict.fromkeys(("hand_brake", "reverse", "manual_gear_shift"), False)
-        wanted = of[CONTROL](header=header, throttle=0.0, brake=(3.5 - 0.1 - 0.03) / 8, **straight)
+        wanted = of[CONTROL](header=header, throttle=0.0, brake=(3.5 - 0.1 - 0.03) / 9, **straight)
     else:
         wanted = of[PLAIN](speed=6.5, acceleration=-3.5, **whole)
         wanted = wanted if type_name == PLAIN else of[STAMPED](header=header, drive=wanted)
