@@ -8,20 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from s2a_bench.act.events import (
-    AbortRequested,
-    Event,
-    LiveInbox,
-    PlanFeed,
-    Requested,
-    SkillArrived,
-    TokenArrived,
-)
+from s2a_bench.act.events import AbortRequested, Event, LiveInbox, PlanFeed, SkillArrived
 from s2a_bench.act.record import Record, observed
 from s2a_bench.clock import SystemClock, now_ns, quick_switching
 from s2a_bench.errors import TransportError
@@ -53,6 +45,8 @@ CRUISE_S: Final = 0.5
 
 def run_ccrb_live(config: CcrbConfig, world: Simulator, output: Path, progress: Progress) -> Path:
     """Request one plan and drive it under every policy; raises S2AError. The folder keeps the requests so far."""
+    if config.closed_loop and not world.real:
+        world.step_s = STEP_S
 
     def view(feed: FeedPlan) -> FrameSource:
         camera = world.camera(*feed.size)
@@ -73,89 +67,65 @@ def run_ccrb_live(config: CcrbConfig, world: Simulator, output: Path, progress: 
 
 def _drive(config: CcrbConfig, ask: PlanPrompt, world: Simulator, launch: RunningLaunch) -> None:
     progress = launch.progress
-    link = ModelLink(config.request, launch, f"{world.name} simulator")
     shape = PlanShape(ask.n_skills, ask.tokens_per_skill, config.scenario.durations)
-    plans = len(config.timeline.chosen) if config.closed_loop else 1
-    progress.expect(launch.plan.blocks.warmup + plans)
-    policies = prepare_policies(config.request, shape, link.warm_up(ask)).policies()
-    if not config.closed_loop:
-        progress.stage(f"one plan over {link.cell.name}")
-        ready = _request_plan(config, ask, link, shape, policies)
-        progress.advance()
-        progress.stage("driving the operating point")
-        drive_point(config, ready, world, launch.writer)
-        return
-    for name, policy in policies.items():
-        progress.stage(f"{name}, over {link.cell.name}")
-        _run_loop(config, ask, link, shape, name, policy, world)
+    requests = _Requests(config, ask, ModelLink(config.request, launch, f"{world.name} simulator"), shape, world)
+    progress.expect(launch.plan.blocks.warmup + (len(config.timeline.chosen) if config.closed_loop else 1))
+    policies = prepare_policies(config.request, shape, requests.link.warm_up(ask)).policies()
+    runs = [{name: policy} for name, policy in policies.items()] if config.closed_loop else [policies]
+    for each in runs:
+        progress.stage(f"{', '.join(each)}: a plan over {requests.link.cell.name}")
+        (requests.closed_loop if config.closed_loop else requests.roll_out)(each)
         progress.advance()
 
 
-def _request_plan(
-    config: CcrbConfig, ask: PlanPrompt, link: ModelLink, shape: PlanShape, policies: Mapping[str, Policy]
-) -> Prepared:
-    """Request the plan and apply the policies to its arrivals; raises TransportError for an incomplete plan."""
-    record = Record("")
-    calls = iter(config.scenario.calls)
+@dataclass(frozen=True, slots=True)
+class _Requests:
+    """Requests for plans of one shape, and what is driven on them; every error ends the run."""
 
-    def put(event: Event) -> None:
-        match event:
-            case Requested(at_ns):
-                record.requested_ns = at_ns
-            case TokenArrived(at_ns):
-                record.token_ns.append(at_ns)
-            case SkillArrived(at_ns, call):
-                record.arrivals.append((at_ns, next(calls, call)))
+    config: CcrbConfig
+    ask: PlanPrompt
+    link: ModelLink
+    shape: PlanShape
+    world: Simulator
 
-    measured = link.request(ask, 0, PlanFeed(Parser(ask.format), put))
-    return _arrived(config, ask, link, shape, record, measured, policies)
+    def roll_out(self, policies: Mapping[str, Policy]) -> None:
+        """Request a plan, and drive it in virtual time."""
+        events: list[Event] = []
+        feed = PlanFeed(Parser(self.ask.format), events.append)
+        measured = self.link.request(self.ask, 0, feed)
+        arrivals_ns = [event.at_ns for event in events if isinstance(event, SkillArrived)]
+        arrivals = list(zip(arrivals_ns, self.config.scenario.calls, strict=False))
+        record = Record("", feed.requested_ns, feed.token_ns, arrivals)
+        drive_point(self.config, self._arrived(record, measured, policies), self.world, self.link.writer)
 
+    def closed_loop(self, policies: Mapping[str, Policy]) -> None:
+        """Let the cars drive, request a plan, and execute it under the one policy as it arrives."""
+        clock, ((name, policy),) = SystemClock(), policies.items()
+        loop = ClosedLoop(self.config.scenario, self.world, LiveInbox(), clock)
+        feed = PlanFeed(Parser(self.ask.format), loop.put)
+        with quick_switching(), ThreadPoolExecutor(1, "world") as pool:
+            running = pool.submit(loop.run, policy, self.shape, self.config.request.timeout_s)
+            try:
+                clock.sleep_until_ns(clock.now_ns() + round(CRUISE_S * 1e9))
+                measured = self.link.request(self.ask, 0, feed)
+            except BaseException:
+                loop.put(AbortRequested(now_ns(), "the run was ended"))
+                running.result()  # the world's own error, if it has one, says more
+                raise
+            looped = running.result()
+        ready = self._arrived(looped.record, measured, policies)
+        keep_loop(self.config, ready, self.world, name, looped, self.link.writer)
 
-def _run_loop(
-    config: CcrbConfig,
-    ask: PlanPrompt,
-    link: ModelLink,
-    shape: PlanShape,
-    name: str,
-    policy: Policy,
-    world: Simulator,
-) -> None:
-    """Let the cars drive, request a plan, and execute it as it arrives; raises an error that ends the run."""
-    clock = SystemClock()
-    loop = ClosedLoop(config.scenario, world, LiveInbox(), clock)
-    feed = PlanFeed(Parser(ask.format), loop.put)
-    with quick_switching(), ThreadPoolExecutor(1, "world") as pool:
-        running = pool.submit(loop.run, policy, shape, config.request.timeout_s)
-        try:
-            clock.sleep_until_ns(clock.now_ns() + round(CRUISE_S * 1e9))
-            measured = link.request(ask, 0, feed)
-        except BaseException:
-            loop.put(AbortRequested(now_ns(), "the run was ended"))
-            running.result()  # the world's own error, if it has one, says more
-            raise
-        looped = running.result()
-    ready = _arrived(config, ask, link, shape, looped.record, measured, {name: policy})
-    keep_loop(config, ready, world, name, looped, link.writer)
-
-
-def _arrived(
-    config: CcrbConfig,
-    ask: PlanPrompt,
-    link: ModelLink,
-    shape: PlanShape,
-    record: Record,
-    measured: Measured,
-    policies: Mapping[str, Policy],
-) -> Prepared:
-    """Schedule a received plan; raises TransportError if it is incomplete, or was not executed to its end."""
-    link.require_answers()
-    plans = observed(record, shape)
-    if plans is None or record.why:
-        why = record.why or f"{len(record.arrivals)} of {ask.n_skills} skills arrived"
-        written = link.writer.path / "tokens.csv"
-        raise TransportError(f"{link.cell.name}: {why}; {written} has what the model wrote")
-    link.learn_rate(record.token_ns)
-    request_id, requested_ns = measured.sample.request_id, record.requested_ns
-    link.writer.update(requests={request_id: requested_ns})
-    setting = replace(link.setting(ask), t_nom_s=config.scenario.durations.nominal_s)
-    return complete(config, setting, request_id, plans, policies)
+    def _arrived(self, record: Record, measured: Measured, policies: Mapping[str, Policy]) -> Prepared:
+        """Schedule a received plan; raises TransportError if it is incomplete, or was not executed to its end."""
+        link = self.link
+        link.require_answers()
+        plans = observed(record, self.shape)
+        if plans is None or record.why:
+            why = record.why or f"{len(record.arrivals)} of {self.ask.n_skills} skills arrived"
+            written = link.writer.path / "tokens.csv"
+            raise TransportError(f"{link.cell.name}: {why}; {written} has what the model wrote")
+        link.learn_rate(record.token_ns)
+        link.writer.update(requests={measured.sample.request_id: record.requested_ns})
+        setting = replace(link.setting(self.ask), t_nom_s=self.config.scenario.durations.nominal_s)
+        return complete(self.config, setting, measured.sample.request_id, plans, policies)

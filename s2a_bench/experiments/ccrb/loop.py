@@ -8,10 +8,8 @@ at fixed intervals; a world that is late catches up, but at most `SLACK_S`: beyo
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import count
 from typing import Final
 
 import numpy as np
@@ -25,6 +23,7 @@ from s2a_bench.act.events import (
     SkillArrived,
     StreamEnded,
     TokenArrived,
+    VirtualInbox,
 )
 from s2a_bench.act.executor import NEVER, SILENCE_S, Executor
 from s2a_bench.act.record import Record
@@ -116,27 +115,34 @@ class ClosedLoop:
             for event in events:
                 if isinstance(event, Requested):
                     self._zero_ns = event.at_ns
-                elif isinstance(event, AbortRequested):
+                elif _is_abort(event):
                     self._due_ns = NEVER
             if events or limit_ns <= self._due_ns:
                 return events
             self._step()
 
     def run(self, policy: Policy, shape: PlanShape, silence_s: float = SILENCE_S) -> Looped:
-        """Execute a plan, and step on until the outcome is certain; raises what the world raises."""
+        """Execute a plan, and step on until the outcome is certain; raises what the world raises.
+
+        Once the ego rests after its plan nothing depends on the clock: the car behind closes up without waiting.
+        """
         record = Executor(policy, shape, self._ego, self, self._clock, silence_s=silence_s).run()
         until_ns = self._clock.now_ns() + round(AFTER_S * 1e9)
-        while self._due_ns < until_ns:
-            if any(isinstance(event, AbortRequested) for event in self._inbox.wait(self._due_ns)):
+        while record.outcome == "completed" and self._due_ns < until_ns:
+            if self._drive.ego_moves and any(map(_is_abort, self._inbox.wait(self._due_ns))):
                 break
-            if self._clock.now_ns() >= self._due_ns:
+            if not self._drive.ego_moves or self._clock.now_ns() >= self._due_ns:
                 self._step()
-        elapsed_ns = self._last_ns - self._first_ns
         facts = {
-            "real_time_factor": self._steps * self._step_ns / elapsed_ns if elapsed_ns else 1.0,
+            "real_time_factor": self.real_time_factor,
             "tracking_rms_mps": float(np.sqrt(np.mean(self._squares))) if self._squares else 0.0,
         }
         return Looped(record, Driven(self._drive.outcomes(), self._drive.trajectory()), facts)
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated over elapsed time."""
+        return self._steps * self._step_ns / max(self._last_ns - self._first_ns, 1)
 
     def _step(self) -> None:
         now_ns = self._due_ns
@@ -152,11 +158,15 @@ class ClosedLoop:
         return -1.0 if self._zero_ns is None else (at_ns - self._zero_ns) / 1e9
 
 
+def _is_abort(event: Event) -> bool:
+    return isinstance(event, AbortRequested)
+
+
 def replayed(scenario: CcrbOptions, world: Simulator, policy: Policy, plans: Plans) -> Looped:
     """Run a loop in virtual time on the arrivals of one plan, with tokens and shape."""
     assert plans.token_s is not None and plans.shape is not None  # noqa: S101, PT018 - drawn and observed plans have both
     clock = VirtualClock()
-    loop = ClosedLoop(scenario, world, ReplayedInbox(clock), clock)
+    loop = ClosedLoop(scenario, world, VirtualInbox(clock), clock)
     token_ns, skill_ns = (
         np.rint(times_s[:, 0] * 1e9).astype(int).tolist() for times_s in (plans.token_s, plans.arrival_s)
     )
@@ -168,23 +178,3 @@ def replayed(scenario: CcrbOptions, world: Simulator, policy: Policy, plans: Pla
     loop.put(StreamEnded(token_ns[-1]))
     safe_s = float(safe_start(plans.arrival_s, plans.nominal_s)[0])
     return loop.run(policy, replace(plans.shape, safe_start_s=safe_s))
-
-
-class ReplayedInbox:
-    """The events of a plan at their times; waiting moves a virtual clock."""
-
-    def __init__(self, clock: VirtualClock) -> None:
-        self._clock = clock
-        self._order = count()
-        self._events: list[tuple[int, int, Event]] = []
-
-    def put(self, event: Event) -> None:
-        heapq.heappush(self._events, (event.at_ns, next(self._order), event))
-
-    def wait(self, until_ns: int | None) -> list[Event]:
-        due_ns = self._events[0][0] if self._events else NEVER
-        self._clock.sleep_until_ns(min(due_ns, NEVER if until_ns is None else until_ns))
-        found = []
-        while self._events and self._events[0][0] <= self._clock.now_ns():
-            found.append(heapq.heappop(self._events)[2])
-        return found
