@@ -90,7 +90,7 @@ class RosEgo(Simulator):
 
     def __init__(self, world: Simulator, how: EgoParameters) -> None:
         topic, self._type = COMMANDS[how.preset, how.message]
-        self._world, self._how, self._topic = world, how, how.command or topic
+        self._world, self._how, self._topic, self.step_s = world, how, how.command or topic, world.step_s
         self._sensors: list[Any] = []
         self._cameras: list[EgoCamera] = []
         try:
@@ -105,6 +105,7 @@ class RosEgo(Simulator):
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         """Restart, with a camera once more when it has seen the cars there; raises TransportError, SourceError."""
+        self._world.step_s = self.step_s  # a run may choose it
         self._state = self._world.place(position_m, speed_mps)
         if not appeared(lambda: self._publisher.matched() > 0, self._how.wait_s):
             raise TransportError(

@@ -161,6 +161,13 @@ def test_all_but_the_commands_is_the_wrapped_world(meeting: Meeting) -> None:
     assert world.closed == 1
 
 
+def test_a_step_that_a_run_chooses_is_the_wrapped_worlds(meeting: Meeting) -> None:
+    ego = meeting.ego(meeting.world())
+    ego.step_s = 0.02
+    ego.place(START, SPEED)
+    assert ego.step(command()).position_m[:, 0] == pytest.approx(START[:, 0] + 0.2)
+
+
 def test_pictures_are_of_the_cars_as_they_were_placed_and_as_they_drive_on(meeting: Meeting) -> None:
     ego = meeting.ego(meeting.world())
     camera = ego.camera(160, 120)
