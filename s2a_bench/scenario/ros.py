@@ -11,7 +11,6 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.frames.ros import TopicCamera
 from s2a_bench.policy import Floats
@@ -70,19 +69,22 @@ def message(type_name: str, acceleration_mps2: float, speed_mps: float) -> Any:
 
 
 class EgoCamera(TopicCamera):
-    """A topic whose pictures come only as the world is stepped: `read` repeats the last one until there is another."""
+    """A topic whose pictures come as the world is stepped: `read` repeats the last, with its stamp, until the next."""
 
     option: ClassVar[str] = "ego"
+    _stamp_ns = 0
 
     def renew(self, step: Callable[[], State]) -> None:
         """Step until a third picture has come; one may have been unread, and one on its way."""
         for _ in range(0 if self._closed else 3):
             with self.errors():
                 appeared(lambda: step() is not None and self._newest is not None, self._wait_s)
-                super()._grab()
+                self._stamp_ns = super()._grab()
 
     def _grab(self) -> int:
-        return now_ns() if self._newest is None else super()._grab()
+        if self._newest is not None:
+            self._stamp_ns = super()._grab()
+        return self._stamp_ns
 
 
 class RosEgo(Simulator):

@@ -82,7 +82,7 @@ class CcrbConfig(Options):
     phase_rates: Numbers = option((2.0, 12.0), "tokens/s of the phase diagram: from, to")
     phase_gaps_m: Numbers = option((6.0, 30.0), "m to the car behind in the phase diagram: from, to", flag="phase-gaps")
     phase_points: tuple[int, int] = option((41, 25), "rates and gaps of the phase diagram", hidden=True)
-    random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000, first=True)
+    random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
     plan_request: PlanRequest = Field(default_factory=PlanRequest)
 
@@ -148,6 +148,8 @@ class CcrbConfig(Options):
             from s2a_bench.scenario.ros import ego_parameters
 
             ego_parameters(self.ego, world)
+            if not (self.closed_loop and self.plan_request.live):
+                raise UsageError("`ego`: ROS 2 runs on the clock; it needs `closed_loop` and `live`")
         for name in ("ttc", "phase", "random") if self.closed_loop else ():
             if getattr(self, name):
                 raise UsageError(f"`{name}` needs all arrivals beforehand, in virtual time; leave out `closed_loop`")
