@@ -15,7 +15,6 @@ import numpy as np
 
 from s2a_bench import extras
 from s2a_bench.facts import Fact
-from s2a_bench.frames.convert import to_rgb
 from s2a_bench.trace import Trace
 from s2a_bench.transport import ACTIONS
 from s2a_bench.transport.chunks import actions_of
@@ -68,11 +67,7 @@ class OpenVla(Dialect):
 
     def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:  # noqa: ARG002 - always pixels
         """Return the pixels as RGB, height x width x 3, marking `convert`."""
-        if frame.encoding == "rgb8":
-            return "", frame.data
-        pixels = to_rgb(frame)
-        trace.mark("convert")
-        return "", pixels
+        return "", policy_picture(frame, "raw", trace)
 
     def fields(
         self, request: Request, payload: str, model: str, to_base64: Callable[[Pixels], str], trace: Trace
