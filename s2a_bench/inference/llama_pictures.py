@@ -70,22 +70,18 @@ class PixelHandler(chat_format.MTMDChatHandler):  # type: ignore[misc, name-defi
         self._frames: tuple[Frame, ...] = ()
         self.mtmd_ctx: Any = None
 
-    @property
-    def prepared_ns(self) -> int:
-        return self.steps.prepared_ns
+    def evaluate(self, llama: Any, prompt: str, frames: tuple[Frame, ...], room: int) -> tuple[int, int]:
+        """Evaluate a prompt with markers, of up to ``room`` tokens, on an empty KV cache; raises TooLong.
 
-    @property
-    def encode_ns(self) -> int:
-        return self.steps.encode_ns
-
-    def evaluate(self, llama: Any, prompt: str, frames: tuple[Frame, ...], room: int) -> None:
-        """Evaluate a prompt with markers, of up to ``room`` tokens, on an empty KV cache; raises TooLong."""
+        Return ``prepared_ns`` and ``encode_ns`` of its `Steps`.
+        """
         self._prompt, self._frames, self.steps.room = prompt, frames, room
         pictures = [{"type": "image_url", "image_url": str(place)} for place in range(len(frames))]
         try:
             self(llama=llama, messages=[{"role": "user", "content": pictures}], stream=True)
         finally:
             self._frames = ()
+        return self.steps.prepared_ns, self.steps.encode_ns
 
     def load(self, llama: Any) -> None:
         """Load the vision tower; raises ValueError."""

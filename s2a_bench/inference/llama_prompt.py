@@ -59,18 +59,20 @@ class ChatTemplate:
 class TextHandler:
     """Evaluates prompts of a model without a vision tower, which does not see a request's pictures."""
 
-    prepared_ns, encode_ns = 0, 0
-
     def load(self, llama: Any) -> None:
         """Load nothing more."""
 
-    def evaluate(self, llama: Any, prompt: str, _frames: tuple[Frame, ...], room: int) -> None:
-        """Evaluate a prompt of up to ``room`` tokens on an empty KV cache; raises TooLong."""
+    def evaluate(self, llama: Any, prompt: str, _frames: tuple[Frame, ...], room: int) -> tuple[int, int]:
+        """Evaluate a prompt of up to ``room`` tokens on an empty KV cache; raises TooLong.
+
+        Return when it was tokenised, and 0, the time of the pictures that it has not.
+        """
         tokens = llama.tokenize(prompt.encode(), add_bos=True, special=True)
         if len(tokens) > room:
             raise TooLong(len(tokens))
-        self.prepared_ns = now_ns()
+        prepared_ns = now_ns()
         llama.reset()
         llama._ctx.kv_cache_clear()  # noqa: SLF001 - as the library does
         llama.eval(tokens)
         llama.prompt = tokens
+        return prepared_ns, 0
