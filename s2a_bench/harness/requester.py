@@ -28,8 +28,6 @@ MOST_WAIT_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A request of the loop."""
-
     request: int
     tick: int
     state: tuple[float, ...]

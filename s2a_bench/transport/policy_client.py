@@ -22,7 +22,6 @@ QUOTED: Final = 500
 
 class PolicyClient(Client, Generic[P]):
     def __init__(self, wiring: Wiring[P], alive: Callable[[], bool]) -> None:
-        """Prepare to ask the server at ``wiring.address``."""
         self._wiring, self._alive = wiring, alive
         self._native = not wiring.black_box
         self._template = template_of(wiring.options.template_name)
