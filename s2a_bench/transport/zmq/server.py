@@ -17,7 +17,7 @@ from concurrent.futures import TimeoutError as NotYet
 from contextlib import ExitStack, suppress
 from functools import partial
 from threading import Event, Lock, Semaphore
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import zmq
 
@@ -269,14 +269,11 @@ class ActionExchange(Exchange):
         return self._client.connection.disconnected
 
 
-class Promise:
+class Promise(NamedTuple):
     """The marks of a request, and whether its client has requested them."""
 
-    __slots__ = ("marks", "wanted")
-
-    def __init__(self) -> None:
-        self.wanted = Event()
-        self.marks: Future[bytes] = Future()
+    marks: Future[bytes]
+    wanted: Event
 
 
 def _unknown() -> RequestFailed:
@@ -292,7 +289,7 @@ class Marks:
 
     def promise(self, request: tuple[bytes, str]) -> Promise:
         """Return the promise of a client's request, given by its name and the request's id."""
-        promised = Promise()
+        promised = Promise(Future(), Event())
         with self._lock:
             self._promises[request] = promised
             if len(self._promises) > KEPT:
