@@ -44,8 +44,7 @@ from s2a_bench.inference.llama_decode import (
     beyond_limits,
     grammar_error,
 )
-from s2a_bench.inference.llama_pictures import PixelHandler
-from s2a_bench.inference.llama_prompt import ChatTemplate, TextHandler, TooLong
+from s2a_bench.inference.llama_prompt import ChatTemplate, PixelHandler, TextHandler, TooLong
 from s2a_bench.inference.models import ModelFiles, load_headers
 from s2a_bench.types import Request, Token
 
