@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench.policy import TOLERANCE_S, Floats, Plans, Schedule
-from s2a_bench.policy.evaluate import Counts
 from s2a_bench.policy.schedule import align, least_end, safe_start
 
 RAMP_S = 0.3
@@ -26,7 +26,7 @@ class PlanMetrics:
     """Time to first action, s_1."""
     end_s: Floats
     """Completion, e_N."""
-    stalls: Counts
+    stalls: NDArray[np.int32]
     """Number of stalls longer than the tolerance (stop-and-go)."""
     stall_s: Floats
     """Sum of all stalls of any length."""
