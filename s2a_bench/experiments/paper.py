@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, option
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from s2a_bench.toml_file import loads
 
 
 class AgainstPaper(Options):
@@ -72,4 +67,5 @@ def paper_colours() -> dict[str, str]:
 
 
 def _reference() -> dict[str, Any]:
-    return tomllib.loads(files("s2a_bench.experiments").joinpath("paper_reference.toml").read_text(encoding="utf-8"))
+    file = files("s2a_bench.experiments").joinpath("paper_reference.toml")
+    return loads(file.read_text(encoding="utf-8"), file.name)
