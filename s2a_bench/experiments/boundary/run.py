@@ -12,9 +12,11 @@ from s2a_bench.boards.tokens import gaps_of
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
 from s2a_bench.machine import environment
-from s2a_bench.policy import Plans, policy
+from s2a_bench.policy import Schedule
 from s2a_bench.policy.arrivals import fragments, tokens
-from s2a_bench.policy.conformal import stalled
+from s2a_bench.policy.conformal import ANY_STALL_S
+from s2a_bench.policy.metrics import stalls
+from s2a_bench.policy.schedule import work_conserving
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.stats.seeds import generator
 from s2a_bench.store.run import RunWriter
@@ -54,14 +56,15 @@ def rows(
     Naive is stall-free iff S0 = t_1: for even tokens and equal durations T if L / R <= T, the paper's figure 2. The
     paper draws that line for T_min, but naive runs skills at T_nom. The prompt's time shifts all arrivals equally.
     """
-    duration_s, naive = config.durations[duration], policy("naive")
+    duration_s = config.durations[duration]
     durations_s = np.full((config.n_skills, 1), duration_s)
     gaps, count = gaps_of(config.jitter, 1.0), max(tokens_per_skill) * config.n_skills
     token_s = tokens(gaps, 0.0, count, config.plans_a_point, generator(config.seed, "boundary", board))
     for length in tokens_per_skill:
-        arrival_s = fragments(token_s[: length * config.n_skills], length)
+        unit_s = fragments(token_s[: length * config.n_skills], length)
         for rate in rates:
-            plans = Plans(arrival_s / rate, durations_s, durations_s, durations_s)
+            arrival_s = unit_s / rate
+            naive = Schedule(work_conserving(arrival_s, durations_s, arrival_s[0]), durations_s)
             yield BoundaryRow(
                 duration=duration,
                 duration_s=duration_s,
@@ -72,5 +75,5 @@ def rows(
                 family=config.jitter,
                 plans=config.plans_a_point,
                 stall_free=length / duration_s <= rate,
-                p_stall=float(stalled(naive, plans).mean()),
+                p_stall=float((stalls(naive) > ANY_STALL_S).any(axis=0).mean()),
             )
