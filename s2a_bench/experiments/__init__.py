@@ -87,6 +87,15 @@ class Metric:
 AnyMetric = TypeVar("AnyMetric", bound=Metric)
 
 
+def number(name: str, unit: str, title: str, about: str, better: Better = "lower", **more: Any) -> Metric:
+    """Return a metric of means, of 0 or more unless ``more`` says otherwise; rows may lack it."""
+    return Metric(name, unit, better, title, "mean", about, **{"bounds": (0, None), "optional": True, **more})
+
+
+def share(name: str, title: str, about: str, better: Better = "lower") -> Metric:
+    return number(name, "", title, about, better, bounds=(0, 1), kind=SHARE)
+
+
 def columns(metrics: Iterable[Metric]) -> dict[str, Any]:
     """Return column -> annotated type, for the dataclass of a row."""
     kinds = {metric: metric.column_type | None if metric.optional else metric.column_type for metric in metrics}
