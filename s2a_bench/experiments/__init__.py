@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, Typ
 
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.registry import Registry
-from s2a_bench.store.schema import Facts
+from s2a_bench.store.schema import PROVENANCE, Facts
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from s2a_bench.options import Options
     from s2a_bench.progress import Progress
     from s2a_bench.store.run import StoredRun
+    from s2a_bench.store.schema import Table
     from s2a_bench.writers.csv_text import CsvTable
     from s2a_bench.writers.tables import TextTable
 
@@ -174,6 +175,13 @@ class Comparable:
     origin: Callable[[StoredRun], Sequence[str]]
     shown: tuple[str, ...]
     run_metrics: Callable[[StoredRun], Iterable[Metric]] = lambda _: ()
+
+
+def plain_rows(run: StoredRun, table: Table[Any]) -> list[dict[str, Any]]:
+    """Return the rows of a table without their provenance, None for a missing value."""
+    found = run.table(table).drop(columns=PROVENANCE)
+    rows = found.astype(object).where(found.notna(), None).to_dict("records")
+    return [{str(name): value for name, value in row.items()} for row in rows]
 
 
 def by_name(metrics: Iterable[AnyMetric]) -> dict[str, AnyMetric]:
