@@ -226,10 +226,6 @@ class Experiment:
         figures = {name: partial(marked, build, run) for name, build in shown.figures.items()}
         return replace(shown, tables=tables, figures=figures)
 
-    def cell_class(self) -> type | None:
-        cell: type | None = resolve_name(self.cell) if self.cell else None
-        return cell
-
     def compared_by(self) -> Comparable | None:
         compared: Comparable | None = resolve_name(self.compared) if self.compared else None
         return compared
