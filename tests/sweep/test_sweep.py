@@ -277,7 +277,7 @@ def sit(
     progress = NullProgress()
     with RunWriter.reopen(folder, [CELLS]) as writer:
         run = SweepRun(writer, plan, progress, clock)
-        run.work(run.pending(retry_failed=retry), workers)
+        run.work(workers, retry_failed=retry)
         run.finish()
     return progress
 
