@@ -12,8 +12,6 @@ from s2a_bench.toml_file import loads
 
 
 class AgainstPaper(Options):
-    """The options of views with the paper's values."""
-
     against: str = option("", "paper: draw the paper's values beside ours")
 
     def check(self) -> None:

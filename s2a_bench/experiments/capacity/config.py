@@ -89,8 +89,6 @@ def _read_robots(written: str) -> tuple[int, ...]:
 
 
 class CapacityRequests(LiveRequests):
-    """The requests of a fleet."""
-
     engine: EngineConfig = group(EngineConfig, only=set(EngineConfig.model_fields) - {"answer", "horizon", "latency"})
     sample_resources_hz: float = option(
         2.0, "readings a second of CPU, memory, GPU and power beside the run; 0: none", flag="sample-resources", ge=0

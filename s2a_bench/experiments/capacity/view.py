@@ -38,7 +38,6 @@ CapacityCell = cell_of_row("CapacityCell", "N robots on one server.", FleetRow, 
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
-    """Return what a capacity run shows."""
     fleets = _fleets(run)
     return Shown.build(
         sentences=lambda: [*_knee_sentences(run), *_parted(run)],
