@@ -16,11 +16,11 @@ from statistics import median
 
 import numpy as np
 
+from benchmarks.evaluate import evaluate
 from benchmarks.timing import turns_s
 from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.policy import TOLERANCE_S, Plans, policy
 from s2a_bench.policy.arrivals import fragments, tokens
-from s2a_bench.policy.evaluate import evaluate
 from s2a_bench.policy.schedule import BLOCK, elastic
 
 N_SKILLS = 32

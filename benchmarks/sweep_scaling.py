@@ -20,10 +20,10 @@ from typing import Final
 
 import numpy as np
 
+from benchmarks.evaluate import evaluate
 from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.clock import now_ns
 from s2a_bench.policy.arrivals import fragments, tokens
-from s2a_bench.policy.evaluate import evaluate
 
 BLOCK: Final = 1 << 14
 """Plans drawn from one seed."""

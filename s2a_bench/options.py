@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias, TypeVar, get_args, get_origin
 
@@ -218,29 +218,23 @@ def listed(value: Any) -> tuple[Any, ...]:
 
 def one_of(names: Callable[[], Iterable[str]]) -> AfterValidator:
     """Return a validator: the value, or each of several, is one of ``names()``, called on validation."""
-    return AfterValidator(OneOf(names))
+    return AfterValidator(partial(_one_of, names))
 
 
-@dataclass(frozen=True, slots=True)
-class OneOf:
-    """The check of `one_of`."""
-
-    names: Callable[[], Iterable[str]]
-
-    def __call__(self, value: Any) -> Any:
-        for each in value if isinstance(value, tuple) else (value,):
-            if each not in (known := tuple(self.names())):
-                raise ValueError(none_of(each, known))
-        return value
+def _one_of(names: Callable[[], Iterable[str]], value: Any) -> Any:
+    for each in value if isinstance(value, tuple) else (value,):
+        if each not in (known := tuple(names())):
+            raise ValueError(none_of(each, known))
+    return value
 
 
 def completions(field: FieldInfo) -> Callable[[], Iterable[str]] | None:
     """Return the function that lists the names for an option's value, or None."""
-    checks = (getattr(each, "func", None) for each in field.metadata)
+    checks: Iterable[Any] = (getattr(each, "func", None) for each in field.metadata)
     kinds = (field.annotation, *get_args(field.annotation))
     literal = next((get_args(each) for each in kinds if get_origin(each) is Literal), ())
-    found = next((each.names for each in checks if isinstance(each, OneOf)), extra_of(field).get("names"))
-    return found or ((lambda: literal) if literal else None)
+    found = next((each.args[0] for each in checks if getattr(each, "func", None) is _one_of), None)
+    return found or extra_of(field).get("names") or ((lambda: literal) if literal else None)
 
 
 def _size(value: Any) -> Any:

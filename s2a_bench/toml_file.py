@@ -9,13 +9,14 @@ import re
 import reprlib
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from s2a_bench.errors import UsageError
-from s2a_bench.text import like
+from s2a_bench.text import FILE_LETTERS, like, read_text
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -56,6 +57,14 @@ class TomlTable(BaseModel):
 
 _DEEP = re.compile(r"""(?<![\w-])(?:("[^"\n]*"|'[^'\n]*'|[\w-]+)[ \t]*\.[ \t]*){32}""")
 """A dotted key of more than 32 names: tomllib's time grows with the square of their number."""
+
+
+def read(path: str | Path, option: str, most: int = FILE_LETTERS) -> str:
+    """Return the text of a file that an ``option`` names; raises UsageError."""
+    try:
+        return read_text(path, most)
+    except (OSError, ValueError) as error:  # it is no UTF-8, or its name has a NUL
+        raise UsageError(f"`{option}`: cannot read {path}: {error}") from error
 
 
 def loads(text: str, where: str, parse_float: Callable[[str], Any] = float) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 from s2a_bench.boards.profile import load_profile
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, option
-from s2a_bench.policy.conformal import CONFIDENCE, GUARANTEE, PLANS, Guarantee, check, coarse, upper_bound
+from s2a_bench.policy.conformal import CEILING, CONFIDENCE, GUARANTEE, PLANS, Guarantee, check, upper_bound
 from s2a_bench.store.manifest import RunWarning
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class StudyConfig(Options):
 
     def warnings(self) -> list[RunWarning]:
         """Return what is allowed and worth a warning."""
-        if not coarse(self.calibration_plans, self.epsilon):
+        if upper_bound(0, self.calibration_plans, CONFIDENCE) <= CEILING * self.epsilon:
             return []
         message = (
             f"{self.calibration_plans} calibration plans are few: one lambda may stall up to "

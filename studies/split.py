@@ -10,10 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import Final, get_args
 
 from s2a_bench.policy import policies
-from s2a_bench.policy.conformal import GUARANTEES, choose, scores
+from s2a_bench.policy.conformal import Guarantee, choose, scores
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import StreamToAct
 from s2a_bench.stats.seeds import generator
@@ -51,7 +51,7 @@ def cell(config: StudyConfig, world: World) -> list[StudyRow]:
         assert isinstance(chosen, StreamToAct)  # noqa: S101 - all are its variants
         rule = replace(chosen, prior=prior)
         score = scores(rule, calibration)
-        for guarantee in GUARANTEES:
+        for guarantee in get_args(Guarantee):
             policy = replace(rule, caution=choose(score, config.epsilon, guarantee).caution)
             row = study_row(
                 config.name, world, policy, plans, calibration_plans=config.calibration_plans, condition=guarantee

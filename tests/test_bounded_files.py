@@ -17,7 +17,7 @@ from s2a_bench.text import read_text
 
 
 def test_a_file_without_end_is_one_line() -> None:
-    with pytest.raises(UsageError, match=r"cannot read the sweep file /dev/zero: .* longer than 8388608 letters"):
+    with pytest.raises(UsageError, match=r"`file`: cannot read /dev/zero: .* longer than 8388608 letters"):
         read_sweep_file(Path("/dev/zero"))
 
 

@@ -14,6 +14,7 @@ import re
 import types
 from collections.abc import Sequence
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from s2a_bench.experiments import EXPERIMENTS
@@ -105,7 +106,7 @@ def compare_schema() -> dict[str, Any]:
 
 def frame_schema() -> dict[str, Any]:
     """Return the schema of what the measuring commands print, with what is declared in the place of what was there."""
-    cells = [cell for name in EXPERIMENTS.built_in() if (cell := EXPERIMENTS[name].cell_class())]
+    cells = [resolve_name(where) for name in EXPERIMENTS.built_in() if (where := EXPERIMENTS[name].cell)]
     named: dict[str, Any] = {"ratio": RatioJson, "warning": RunWarning, "origins": Origins}
     named |= {_name(each): each for each in (*cells, Reference, CcrbStudy)}
     named["sweep_cell"] = PlannedCell | SweptCell

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from s2a_bench.errors import UsageError
-from s2a_bench.text import dotted, none_of, read_text
+from s2a_bench.text import dotted, none_of
+from s2a_bench.toml_file import read as read_file
 
 FLAG: Final = "--ros-args"
 END: Final = "--"
@@ -127,10 +128,7 @@ def _take(found: Read, values: Mapping[str, Any], known: Sequence[str], where: s
 
 
 def _read_file(found: Read, path: Path, known: Sequence[str], node_name: str) -> None:
-    try:
-        whole = _yaml(read_text(path), f"--params-file {path}")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"`ros_args`: cannot read --params-file {path}: {error}") from error
+    whole = _yaml(read_file(path, "params_file"), f"--params-file {path}")
     sections = list(_sections(whole, ""))
     if not sections:
         raise UsageError(f"`ros_args`: --params-file {path} has no '{PARAMETERS}'")

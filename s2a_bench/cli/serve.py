@@ -18,8 +18,8 @@ from s2a_bench.errors import UsageError
 from s2a_bench.inference import ANSWERS, OF_MODEL, EngineConfig, acting, check_engine, declared_engine
 from s2a_bench.options import Options, group, option, placed, places
 from s2a_bench.provenance import Provenance
-from s2a_bench.text import none_of, read_text
-from s2a_bench.toml_file import loads
+from s2a_bench.text import none_of
+from s2a_bench.toml_file import loads, read
 from s2a_bench.transport import ACTIONS, SERVER, SERVING, TRANSPORTS, Transport, Wiring, paths
 from s2a_bench.transport.limits import SET, Limits
 from s2a_bench.transport.pipeline import Pipeline, answer_over, one_pipeline
@@ -76,8 +76,9 @@ def _serve(config: Any) -> None:
         if stray := [each for each in getattr(config, other, Options()).given() if each not in served_options(chosen)]:
             raise UsageError(f"`{stray[0]}` is no option of {chosen.name}; it has {', '.join(served_options(chosen))}")
     flags = getattr(config, chosen.name, Options()).given_values()
-    values = _toml(config.config) if config.config else {}
-    of_file = _sorted(values, f"`config` {config.config}", chosen)
+    where = f"`config` {config.config}"
+    of_toml = loads(read(config.config, "config"), where) if config.config else {}
+    of_file = _sorted({key.replace("-", "_"): value for key, value in of_toml.items()}, where, chosen)
     of_args = _ros_args(config.ros_args, chosen, {**of_file[1], **flags})
     of_engine, of_transport, of_limits = (low | high for low, high in zip(of_file, of_args, strict=True))
     limits = Limits(**of_limits | config.limits.given_values())
@@ -95,14 +96,6 @@ def _answering(engine: EngineConfig, pipeline: Pipeline) -> EngineConfig:
             f"`engine` {engine.name} answers with tokens, and {pipeline.name} carries actions; use `engine` {acting()}"
         )
     return engine.but(answer=answer)
-
-
-def _toml(path: Path) -> dict[str, Any]:
-    try:
-        whole = loads(read_text(path), f"`config` {path}")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"`config`: cannot read {path}: {error}") from error
-    return {key.replace("-", "_"): value for key, value in whole.items()}
 
 
 def _ros_args(text: str, chosen: Transport[Any], given: Mapping[str, Any]) -> Sorted:

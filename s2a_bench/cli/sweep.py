@@ -62,7 +62,7 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
             with writer:
                 sitting = SweepRun(writer, plan, progress)
                 with workers:
-                    sitting.work(sitting.pending(retry_failed=config.retry_failed), workers)
+                    sitting.work(workers, retry_failed=config.retry_failed)
                 sitting.finish()
         except (S2AError, KeyboardInterrupt):
             if writer.path.exists():

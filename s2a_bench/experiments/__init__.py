@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, Typ
 
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.registry import Registry
-from s2a_bench.store.schema import Facts
+from s2a_bench.store.schema import PROVENANCE, Facts
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from s2a_bench.options import Options
     from s2a_bench.progress import Progress
     from s2a_bench.store.run import StoredRun
+    from s2a_bench.store.schema import Table
     from s2a_bench.writers.csv_text import CsvTable
     from s2a_bench.writers.tables import TextTable
 
@@ -85,6 +86,15 @@ class Metric:
 
 
 AnyMetric = TypeVar("AnyMetric", bound=Metric)
+
+
+def number(name: str, unit: str, title: str, about: str, better: Better = "lower", **more: Any) -> Metric:
+    """Return a metric of means, of 0 or more unless ``more`` says otherwise; rows may lack it."""
+    return Metric(name, unit, better, title, "mean", about, **{"bounds": (0, None), "optional": True, **more})
+
+
+def share(name: str, title: str, about: str, better: Better = "lower") -> Metric:
+    return number(name, "", title, about, better, bounds=(0, 1), kind=SHARE)
 
 
 def columns(metrics: Iterable[Metric]) -> dict[str, Any]:
@@ -167,6 +177,13 @@ class Comparable:
     run_metrics: Callable[[StoredRun], Iterable[Metric]] = lambda _: ()
 
 
+def plain_rows(run: StoredRun, table: Table[Any]) -> list[dict[str, Any]]:
+    """Return the rows of a table without their provenance, None for a missing value."""
+    found = run.table(table).drop(columns=PROVENANCE)
+    rows = found.astype(object).where(found.notna(), None).to_dict("records")
+    return [{str(name): value for name, value in row.items()} for row in rows]
+
+
 def by_name(metrics: Iterable[AnyMetric]) -> dict[str, AnyMetric]:
     return {metric.name: metric for metric in metrics}
 
@@ -208,10 +225,6 @@ class Experiment:
         tables = {name: replace(table, provenance=table.provenance or line) for name, table in shown.tables.items()}
         figures = {name: partial(marked, build, run) for name, build in shown.figures.items()}
         return replace(shown, tables=tables, figures=figures)
-
-    def cell_class(self) -> type | None:
-        cell: type | None = resolve_name(self.cell) if self.cell else None
-        return cell
 
     def compared_by(self) -> Comparable | None:
         compared: Comparable | None = resolve_name(self.compared) if self.compared else None

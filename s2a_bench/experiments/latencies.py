@@ -110,34 +110,26 @@ def measured(folder: Path, only: str = "") -> Iterator[Source]:
         spans = _pieces(run)
         for cell in [only] if only else cells:
             answered = run.origins.of(cell)
-            rows = good[good["cell"] == cell].to_dict("records")
-            requests = [_request(row, run, spans) for row in rows]
-            services = [
-                service_of(
-                    json.loads(row["marks"]),
-                    run.stages,
-                    spans.get(row["request_id"], (0, None))[1],
-                    request["latency_ns"],
-                )
-                for row, request in zip(rows, requests, strict=True)
-            ]
+            timed = [_request(row, run, spans) for row in good[good["cell"] == cell].to_dict("records")]
             yield Source(
                 f"{folder}#{cell}",
-                recorded_ns=np.array([request["latency_ns"] for request in requests], np.int64),
+                recorded_ns=np.array([request["latency_ns"] for request, _ in timed], np.int64),
                 origin=Provenance.computed("", answered.weights, answered.pictures),
-                requests=tuple({**request, "provenance": run.origins.of_row(cell)} for request in requests),
-                service_ns=np.array(services, np.int64),
+                requests=tuple({**request, "provenance": run.origins.of_row(cell)} for request, _ in timed),
+                service_ns=np.array([service for _, service in timed], np.int64),
             )
 
 
-def _request(row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[int, int | None]]) -> dict[str, Any]:
-    """Return the times of a request, from its marks at the ends of groups of stages; null without the mark."""
+def _request(
+    row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[int, int | None]]
+) -> tuple[dict[str, Any], tuple[int, int, int]]:
+    """Return the times of a request, from its marks at the ends of groups of stages, null without; and `service_of`."""
     marks = json.loads(row["marks"])
     ends = {run.stages.get(stage, ""): at_ns for stage, at_ns in marks}
     streaming_ns, last_engine_ns = pieces.get(row["request_id"], (0, None))
     latency_ns = int(row["e2e_ns"]) + streaming_ns
     one_clock = _whole(row.get("clock_error_ns")) is None
-    return {
+    times = {
         "observation_ns": marks[0][1],
         "sent_ns": ends.get("pack"),
         "server_in_ns": ends.get("network") if one_clock else None,
@@ -146,6 +138,7 @@ def _request(row: Mapping[Any, Any], run: StoredRun, pieces: Mapping[str, tuple[
         "bytes": _whole(row["payload_bytes"]),
         "latency_ns": latency_ns,
     }
+    return times, service_of(marks, run.stages, last_engine_ns, latency_ns)
 
 
 def service_of(

@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, option
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from s2a_bench.toml_file import loads
 
 
 class AgainstPaper(Options):
-    """The options of views with the paper's values."""
-
     against: str = option("", "paper: draw the paper's values beside ours")
 
     def check(self) -> None:
@@ -72,4 +65,5 @@ def paper_colours() -> dict[str, str]:
 
 
 def _reference() -> dict[str, Any]:
-    return tomllib.loads(files("s2a_bench.experiments").joinpath("paper_reference.toml").read_text(encoding="utf-8"))
+    file = files("s2a_bench.experiments").joinpath("paper_reference.toml")
+    return loads(file.read_text(encoding="utf-8"), file.name)

@@ -32,7 +32,7 @@ from s2a_bench.facts import (
 )
 from s2a_bench.inference import declared_engine
 from s2a_bench.machine.resources import ENERGY_J
-from s2a_bench.provenance import NONE, NOT_SENT, UNKNOWN, Provenance
+from s2a_bench.provenance import NONE, NOT_SENT, UNKNOWN
 from s2a_bench.stats import Ratio, Summary, SummaryEnds, summary_of
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import ONE_WAY
@@ -58,6 +58,8 @@ if TYPE_CHECKING:
 
 RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
 """What cells are compared by: columns of the samples without their unit."""
+ABOUT = ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")
+"""Columns of the samples that a cell has one value of."""
 _NS_PER_MS = 1e6
 
 
@@ -387,8 +389,12 @@ def _cells(run: StoredRun, samples: pd.DataFrame) -> list[RequestCell]:
     mixed = any("payload=" in name for name in run.manifest["configuration"].get("transports", ()))
     cells = []
     for name in map(str, samples["cell"].unique()):
-        counted, streamed = (rows[rows["cell"] == name] for rows in (samples, tokens))
-        cells.append(_cell(name, counted, streamed, stages, run.origins.of(name), mixed))
+        mine, streamed = (rows[rows["cell"] == name] for rows in (samples, tokens))
+        about = {key: str(mine[key].iloc[-1]) for key in ABOUT}  # the engine may be unknown before the first answer
+        failed, origin = mine["error"] != "", run.origins.of(name)
+        good, sends = mine[~mine["warmup"] & ~failed], origin.pictures != NOT_SENT
+        warmups, errors = int(mine["warmup"].sum()), int((failed & ~mine["warmup"]).sum())
+        cells.append(RequestCell(name, about, good, streamed, warmups, errors, stages, origin.emulated, mixed, sends))
     return sorted(cells, key=_place)
 
 
@@ -513,25 +519,6 @@ def stages_present(cells: list[RequestCell]) -> list[str]:
     return [stage for stage in stages if any(cell.values_ms(stage).size or cell.ends(stage).lo.size for cell in cells)]
 
 
-def _cell(
-    name: str,
-    samples: pd.DataFrame,
-    tokens: pd.DataFrame,
-    stages: Mapping[str, str],
-    origin: Provenance,
-    mixed: bool,
-) -> RequestCell:
-    about = {
-        key: str(samples[key].iloc[-1])  # the engine may be unknown before the first answer
-        for key in ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")
-    }
-    failed = samples["error"] != ""
-    good = samples[~samples["warmup"] & ~failed]
-    errors = int((failed & ~samples["warmup"]).sum())
-    sends, warmups = origin.pictures != NOT_SENT, int(samples["warmup"].sum())
-    return RequestCell(name, about, good, tokens, warmups, errors, stages, origin.emulated, mixed, sends)
-
-
 def _place(cell: RequestCell) -> tuple[int, float, str, int, str]:
     payload = PAYLOADS.index(cell.payload) if cell.payload in PAYLOADS else len(PAYLOADS)
     transport, variant = declared_transport(cell.pipeline), cell.about["variant"]
@@ -608,12 +595,11 @@ def cell_json(
 
 
 def summarised(
-    cells: Iterable[RequestCell], metrics: Iterable[RequestMetric]
+    cells: Iterable[RequestCell], metrics: Sequence[RequestMetric]
 ) -> Iterator[tuple[RequestCell, str, Summary]]:
     """Yield cell, key of a metric and summary, where there are values; intervals have one a side."""
-    every = list(metrics)
     for cell in cells:
-        for metric in every:
+        for metric in metrics:
             for end, values in {"": cell.values(metric), **cell.ends(metric).named}.items():
                 if found := summary_of(values):
                     yield cell, f"{metric.key.removesuffix('_ms')}{end}_ms" if end else metric.key, found

@@ -12,8 +12,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.plan.skillset import Argument, Gap, Skill, SkillSet, Value
-from s2a_bench.text import none_of, read_text
-from s2a_bench.toml_file import Line, TomlTable, parse
+from s2a_bench.text import none_of
+from s2a_bench.toml_file import Line, TomlTable, parse, read
 from s2a_bench.types import Timing
 
 SKILL_SETS = ("household", "driving")
@@ -141,13 +141,7 @@ def load_skills(choice: str) -> SkillSet:
         return parse_skills(files("s2a_bench.plan").joinpath("skills", f"{choice}.toml").read_text("utf-8"), choice)
     if not choice.endswith(".toml"):
         raise UsageError(f"`skills`: {none_of(choice, SKILL_SETS, ', and no path of a .toml file')}")
-    try:
-        text = read_text(choice)
-    except OSError as error:
-        raise UsageError(f"`skills`: cannot read {choice} ({error.strerror or error})") from error
-    except UnicodeDecodeError as error:
-        raise UsageError(f"`skills` {choice}: not UTF-8 text ({error.reason} at byte {error.start})") from error
-    return parse_skills(text, choice)
+    return parse_skills(read(choice, "skills"), choice)
 
 
 def parse_skills(text: str, origin: str) -> SkillSet:

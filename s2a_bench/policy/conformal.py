@@ -27,7 +27,7 @@ from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import option
@@ -51,7 +51,6 @@ GRID: Final = (*(i / 4 for i in range(17)), 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0,
 """Values of lambda that are tried; beyond them the robot waits for the whole plan."""
 Guarantee: TypeAlias = Literal["high-confidence", "expected"]
 """What epsilon bounds; see the module docstring."""
-GUARANTEES: Final[tuple[Guarantee, ...]] = get_args(Guarantee)
 GUARANTEE: Final[Any] = option(
     "high-confidence",
     "what epsilon bounds: expected (the mean over calibrations), high-confidence (also 2 epsilon for this one, 99.9 %)",
@@ -158,11 +157,6 @@ def check(plans: int, epsilon: float = EPSILON) -> None:
 def fewest(epsilon: float) -> int:
     """Return the least number of plans, or latencies, for a bound of ``epsilon``."""
     return math.ceil(1 / epsilon - ROUNDING) - 1
-
-
-def coarse(plans: int, epsilon: float = EPSILON) -> bool:
-    """Return True if the plans are too few for the second bound even if none stalls: callers warn."""
-    return upper_bound(0, plans, CONFIDENCE) > CEILING * epsilon
 
 
 def calibrate(

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench.policy import TOLERANCE_S, Floats, Plans, Schedule
-from s2a_bench.policy.evaluate import Counts
 from s2a_bench.policy.schedule import align, least_end, safe_start
 
 RAMP_S = 0.3
@@ -26,7 +26,7 @@ class PlanMetrics:
     """Time to first action, s_1."""
     end_s: Floats
     """Completion, e_N."""
-    stalls: Counts
+    stalls: NDArray[np.int32]
     """Number of stalls longer than the tolerance (stop-and-go)."""
     stall_s: Floats
     """Sum of all stalls of any length."""
@@ -76,7 +76,7 @@ def measure(plans: Plans, schedule: Schedule, *, tolerance_s: float = TOLERANCE_
     elastic_end = least_end(arrival_s, least_s)
     stalls_s = stalls(schedule)
     stall_s = stalls_s.sum(axis=0)
-    waits = queue_wait(plans, schedule)
+    waits = start_s - arrival_s
     least = safe_start(arrival_s, most_s)
     late = np.maximum(first - safe, 0.0)
     span = arrival_s[-1] - safe
@@ -110,11 +110,6 @@ def stalls(schedule: Schedule) -> Floats:
     stall_s: Floats = start_s[1:] - start_s[:-1]
     stall_s -= duration_s[:-1]
     return np.maximum(stall_s, 0.0, out=stall_s)
-
-
-def queue_wait(plans: Plans, schedule: Schedule) -> Floats:
-    """Return s_i - t_i, shape (N, M)."""
-    return schedule.start_s - plans.arrival_s
 
 
 def fluidity(stalls_s: Floats, nominal_s: Floats, tolerance_s: float = TOLERANCE_S) -> Floats:

@@ -13,8 +13,8 @@ from pydantic import Field
 
 from s2a_bench.boards.profile import search_path
 from s2a_bench.errors import UsageError
-from s2a_bench.text import like, none_of, read_text
-from s2a_bench.toml_file import TomlTable, parse
+from s2a_bench.text import like, none_of
+from s2a_bench.toml_file import TomlTable, parse, read
 
 Axes: TypeAlias = Mapping[str, Sequence[Any]]
 Setting: TypeAlias = dict[str, Any]
@@ -26,9 +26,13 @@ def expand(grid: Axes, zipped: Axes, excluded: Sequence[Mapping[str, Any]] = ())
 
     A setting is left out if it agrees with every key of an exclude, where a list stands for any of its values.
     """
+
+    def agrees(setting: Setting, pattern: Mapping[str, Any]) -> bool:
+        return all(key in setting and setting[key] in _listed(value) for key, value in pattern.items())
+
     rows = [dict(zip(zipped, row, strict=True)) for row in zip(*zipped.values(), strict=True)] if zipped else [{}]
     whole = [dict(zip(grid, point, strict=True)) | row for point in product(*grid.values()) for row in rows]
-    return [setting for setting in whole if not any(_agrees(setting, pattern) for pattern in excluded)]
+    return [setting for setting in whole if not any(agrees(setting, each) for each in excluded)]
 
 
 def rounds(items: Sequence[Item], repeats: int, seed: int) -> Iterator[tuple[int, Item]]:
@@ -41,10 +45,6 @@ def rounds(items: Sequence[Item], repeats: int, seed: int) -> Iterator[tuple[int
         Random(f"{seed}/{repeat}").shuffle(order)  # noqa: S311 - an order, no secret
         for item in order:
             yield repeat, item
-
-
-def _agrees(setting: Setting, pattern: Mapping[str, Any]) -> bool:
-    return all(key in setting and setting[key] in _listed(value) for key, value in pattern.items())
 
 
 def _listed(value: Any) -> list[Any]:
@@ -108,11 +108,7 @@ class _SweepFile(TomlTable):
 
 def read_sweep_file(path: Path) -> SweepFile:
     """Read and expand a sweep file; raises UsageError naming the file and the key."""
-    try:
-        text = read_text(path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"cannot read the sweep file {path}: {error}") from error
-    file = parse(_SweepFile, text, str(path))
+    file = parse(_SweepFile, read(path, "file"), str(path))
     _check_keys(path, {"settings": file.settings, "grid": file.grid, "zip": file.zip})
     if len({len(values) for values in file.zip.values()}) > 1:
         lengths = ", ".join(f"{key} {len(values)}" for key, values in file.zip.items())

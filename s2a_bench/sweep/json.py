@@ -72,14 +72,11 @@ def sweep_json(sweep: Sweep) -> dict[str, Any]:
 
 def _cell(sweep: Sweep, row: Mapping[Any, Any]) -> SweptCell:
     return SweptCell(
-        **{name: row[name] for name in ("cell", "state", "host", "config_hash", "started")},
-        repeat=int(row["repeat"]),
-        attempt=int(row["attempt"]),
+        **{name: row[name] for name in ("cell", "repeat", "attempt", "state", "host", "virtual", "config_hash")},
+        **{name: row[name] for name in ("started", "wall_s")},
         error=row["error"] or None,
-        virtual=bool(row["virtual"]),
         board=row["board"] or None,
         settings=json.loads(row["settings"]),
         argv=json.loads(row["argv"]),
         run=str(sweep.path / row["folder"]) if row["folder"] else None,
-        wall_s=float(row["wall_s"]),
     )

@@ -102,11 +102,9 @@ class SweepRun:
     def failed(self) -> int:
         return sum(state == "failed" for _, state in self._latest.values())
 
-    def pending(self, *, retry_failed: bool) -> list[SweepCell]:
-        return pending(self._plan, self._rows, retry_failed=retry_failed)
-
-    def work(self, cells: Sequence[SweepCell], workers: CellWorkers) -> None:
-        """Run the measured cells, one at a time on each board, then the virtual ones, many at once."""
+    def work(self, workers: CellWorkers, *, retry_failed: bool) -> None:
+        """Run pending cells: the measured ones, one at a time on each board, then the virtual ones, many at once."""
+        cells = pending(self._plan, self._rows, retry_failed=retry_failed)
         self._progress.expect(len(cells))
         lanes: dict[str, deque[SweepCell]] = {}
         for cell in cells:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import policy_speed
-from s2a_bench.policy.evaluate import evaluate
+from benchmarks.evaluate import evaluate
 
 
 def test_the_plain_loop_that_is_raced_computes_the_same_numbers() -> None:

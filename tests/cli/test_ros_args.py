@@ -71,7 +71,7 @@ def test_an_enclave_reaches_rclpy_by_its_variable() -> None:
         (["-p", "engine:=[a"], "-p engine:=.* is no YAML"),
         (["-p"], "-p needs a value"),
         (["--enclav", "x"], "--enclav is none of -r, --remap"),
-        (["--params-file", "/nowhere/x.yaml"], "cannot read --params-file /nowhere/x.yaml"),
+        (["--params-file", "/nowhere/x.yaml"], "`params_file`: cannot read /nowhere/x.yaml"),
     ],
 )
 def test_what_is_none_is_refused(arguments: list[str], message: str) -> None:
@@ -130,5 +130,5 @@ def test_a_file_that_is_none_is_refused(file: Path, content: str, message: str) 
 
 def test_bytes_that_are_no_text_are_refused(file: Path) -> None:
     file.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(UsageError, match="cannot read --params-file"):
+    with pytest.raises(UsageError, match="`params_file`: cannot read"):
         parsed("--params-file", str(file))

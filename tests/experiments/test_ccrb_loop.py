@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from threading import enumerate as threads
 from typing import Any
@@ -19,6 +20,7 @@ from s2a_bench.experiments.ccrb.config import CcrbConfig, PlanRequest
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.run import Prepared, keep_loop, prepare, run_ccrb
+from s2a_bench.experiments.ccrb.studies import motion_of
 from s2a_bench.inference import EngineConfig
 from s2a_bench.plan.skillset import GAPS, Gap
 from s2a_bench.policy import COMPARED
@@ -70,6 +72,14 @@ def test_on_the_same_arrivals_a_loop_ends_as_its_roll_out(number: int) -> None:
     assert looped.driven.outcomes.name(0) == expected.outcomes.name(0)
     assert differ_m(looped.driven, expected) < 0.03
     assert looped.facts["real_time_factor"] == 1.0
+
+
+def test_motion_does_not_depend_on_when_the_first_sample_was() -> None:
+    config = CcrbConfig()
+    schedule = prepare(config).schedules["naive"]
+    path = drive(Longitudinal(), config.scenario.cars, config.scenario.driving, schedule, record=True).trajectory
+    assert path is not None
+    assert motion_of(replace(path, time_s=path.time_s + 0.013)) == pytest.approx(motion_of(path))
 
 
 @pytest.mark.parametrize("number", range(4))

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,8 +17,8 @@ from hypothesis import strategies as st
 from s2a_bench.errors import EngineError, UsageError
 from s2a_bench.experiments.throughput.config import ThroughputConfig
 from s2a_bench.experiments.throughput.metrics import REFERENCE
-from s2a_bench.experiments.throughput.run import LlamaBench
-from s2a_bench.harness.plan import BlocksPlan, resolve
+from s2a_bench.experiments.throughput.run import llama_bench
+from s2a_bench.harness.plan import BlocksPlan, RunPlan, resolve
 from s2a_bench.harness.processes import llama_flags
 from s2a_bench.harness.rounds import run_blocks
 from s2a_bench.harness.session import Place
@@ -130,6 +131,11 @@ def writer(tmp_path: Path) -> Iterator[RunWriter]:
         yield writer
 
 
+def launch(plan: RunPlan, writer: RunWriter, *prompts: int) -> Any:
+    """Return a launch whose sessions have had prompts of so many tokens."""
+    return SimpleNamespace(plan=plan, writer=writer, sessions=[SimpleNamespace(prompt_n=each) for each in prompts])
+
+
 def test_the_reference_computes_with_our_settings_behind_our_prompts_length(tmp_path: Path, writer: RunWriter) -> None:
     engine = EngineConfig(
         model=tmp_path / "m.gguf",
@@ -140,10 +146,9 @@ def test_the_reference_computes_with_our_settings_behind_our_prompts_length(tmp_
         kv_type="q8_0",
         flash_attention="on",
     )
-    depths = [250, 260]
-    bench = LlamaBench(install(tmp_path), resolve(REQUESTS.but(engine=engine)), writer, lambda: depths.pop(0))
-    bench(Place(0, 1, warmup=True))
-    bench(Place(1, 0, warmup=False))
+    program, plan = install(tmp_path), resolve(REQUESTS.but(engine=engine))
+    llama_bench(program, launch(plan, writer, 250, 90), Place(0, 1, warmup=True))
+    llama_bench(program, launch(plan, writer, 250, 260), Place(1, 0, warmup=False))
     writer.finish("finished")
     kept = read_run(writer.path)
     rows = kept.table(REFERENCE)
@@ -183,8 +188,8 @@ def test_a_reference_that_fails_says_so_in_one_line(
     tmp_path: Path, writer: RunWriter, monkeypatch: pytest.MonkeyPatch, fault: str, message: str
 ) -> None:
     monkeypatch.setenv("S2A_STAND_IN_FAULT", fault)
-    bench = LlamaBench(install(tmp_path), resolve(REQUESTS), writer, lambda: 0)
+    program = install(tmp_path)
     with pytest.raises(EngineError) as error:
-        bench(Place(0, 0, warmup=False))
+        llama_bench(program, launch(resolve(REQUESTS), writer, 0), Place(0, 0, warmup=False))
     assert message in str(error.value)
     assert "\n" not in str(error.value)

@@ -7,9 +7,9 @@ from decimal import Decimal
 import numpy as np
 import pytest
 
+from benchmarks.evaluate import evaluate
 from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.arrivals import uniform
-from s2a_bench.policy.evaluate import evaluate
 from s2a_bench.policy.metrics import measure
 
 N_SKILLS, T_NOM_S = 8, 1.0

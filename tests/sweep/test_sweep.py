@@ -126,7 +126,7 @@ def test_a_wrong_file_is_refused_in_one_line_that_names_file_and_key(text: str, 
 
 
 def test_a_file_that_is_not_there_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="cannot read the sweep file"):
+    with pytest.raises(UsageError, match=r"`file`: cannot read .*none\.toml: "):
         read_sweep_file(tmp_path / "none.toml")
 
 
@@ -277,7 +277,7 @@ def sit(
     progress = NullProgress()
     with RunWriter.reopen(folder, [CELLS]) as writer:
         run = SweepRun(writer, plan, progress, clock)
-        run.work(run.pending(retry_failed=retry), workers)
+        run.work(workers, retry_failed=retry)
         run.finish()
     return progress
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
@@ -11,7 +12,6 @@ from s2a_bench.options import Names, Numbers, Options, WholeNumbers, option
 
 if TYPE_CHECKING:
     from s2a_bench.boards.profile import Profile
-    from s2a_bench.policy.evaluate import Grid
 
 PLANS: Final = 2000
 """Plans a point with jitter; without jitter all plans are equal."""
@@ -61,13 +61,11 @@ class BoundaryConfig(Options):
         return {"t_nom": self.t_nom_s, "t_min": self.t_min * self.t_nom_s}
 
     @property
-    def grid(self) -> Grid:
+    def grid(self) -> tuple[Sequence[int], Sequence[float]]:
+        """The values of L and R at whose every pair there is a point."""
         import numpy as np
 
-        from s2a_bench.policy.evaluate import Grid
-
-        rates = np.geomspace(self.rates[0], self.rates[-1], self.rates_tried)
-        return Grid(tuple(range(1, self.most_tokens + 1)), tuple(float(rate) for rate in rates))
+        return range(1, self.most_tokens + 1), np.geomspace(self.rates[0], self.rates[1], self.rates_tried).tolist()
 
     @property
     def rates_tried(self) -> int:

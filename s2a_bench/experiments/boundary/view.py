@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import numpy as np
 
-from s2a_bench.experiments import Shown
+from s2a_bench.experiments import Shown, plain_rows
 from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
 from s2a_bench.store.schema import PROVENANCE, Positive, about
 from s2a_bench.writers.csv_text import CsvTable
@@ -135,11 +135,10 @@ def disagreements(run: StoredRun) -> int:
 
 
 def _cells(run: StoredRun) -> Iterator[dict[str, Any]]:
-    for row in run.table(BOUNDARY).drop(columns=PROVENANCE).to_dict("records"):
+    for row in plain_rows(run, BOUNDARY):
         rate, board = row.pop("tokens_per_s"), row.pop("board")
         rho = row["tokens_per_skill"] / rate / row["duration_s"]
-        named: dict[str, Any] = {str(name): value for name, value in row.items()}
-        yield asdict(BoundaryCell(**named, rate_tokens_per_s=rate, profile=board or None, rho=rho, emulated=True))
+        yield asdict(BoundaryCell(**row, rate_tokens_per_s=rate, profile=board or None, rho=rho, emulated=True))
 
 
 def _verdict(point: dict[Any, Any], *, random: bool) -> str:

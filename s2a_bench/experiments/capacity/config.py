@@ -16,11 +16,11 @@ from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import LiveRequests
 from s2a_bench.inference import STAND_IN, EngineConfig
 from s2a_bench.options import Names, Options, group, option
-from s2a_bench.policy.chunks import MODES, Rounding
+from s2a_bench.policy.chunks import MODES, ControlSetting, Rounding, modes
 from s2a_bench.transport import ACTIONS, TOKENS
 
 if TYPE_CHECKING:
-    from s2a_bench.policy.chunks import ControlSetting, Mode
+    from s2a_bench.policy.chunks import Mode
 
 SHOWN: Final = (
     *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
@@ -89,8 +89,6 @@ def _read_robots(written: str) -> tuple[int, ...]:
 
 
 class CapacityRequests(LiveRequests):
-    """The requests of a fleet."""
-
     engine: EngineConfig = group(EngineConfig, only=set(EngineConfig.model_fields) - {"answer", "horizon", "latency"})
     sample_resources_hz: float = option(
         2.0, "readings a second of CPU, memory, GPU and power beside the run; 0: none", flag="sample-resources", ge=0
@@ -200,8 +198,6 @@ class CapacityConfig(Options):
 
     @property
     def setting(self) -> ControlSetting:
-        from s2a_bench.policy.chunks import ControlSetting
-
         return ControlSetting(round(1e9 / self.control_hz), self.horizon, self.rounding)
 
     @property
@@ -212,16 +208,7 @@ class CapacityConfig(Options):
     @cached_property
     def made(self) -> dict[str, Mode]:
         """Mode by its canonical name."""
-        from s2a_bench.policy.chunks import mode
-        from s2a_bench.policy.parameters import canonical
-
-        built = [mode(written) for written in self.modes]
-        for each in built:
-            try:
-                each.execution_horizon(self.setting)
-            except ValueError as error:
-                raise UsageError(f"`modes`: {each.name}: a chunk has {self.horizon} actions (`horizon`)") from error
-        return {canonical(each.name, each): each for each in built}
+        return modes(self.modes, self.setting)
 
     @cached_property
     def load(self) -> Literal["chunks", "plans", "closed"]:

@@ -7,7 +7,7 @@ Latencies count from the intended time of a request, whatever delays it here, an
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -85,10 +85,10 @@ class ChunkRobot:
     def __init__(self, plan: FleetPlan, session: Session, blocks: count[int], phase_ns: int, done: Any) -> None:
         self._session, self._setting = session, plan.setting
         chosen = mode(plan.mode)
-        self._requester = ChunkRequester(
-            [session], plan.setting.horizon, plan.seed, chosen.streams, self._arrived, blocks, done=done
-        )
         self.ticks = RobotTicks(chosen, plan.setting, lambda *_: None, self._request, ENDLESS, phase_ns)
+        self._requester = ChunkRequester(
+            [session], plan.setting.horizon, plan.seed, chosen.streams, self.ticks.arrived, blocks, done=done
+        )
         self.over = self._requester.over
 
     def work(self) -> None:
@@ -115,9 +115,6 @@ class ChunkRobot:
             acted.arrival_ns[:whole, 0],
             acted.late_ns,
         )
-
-    def _arrived(self, request: int, actions: Sequence[Any], at_ns: int) -> None:
-        self.ticks.arrived(request, actions, at_ns)
 
     def _request(self, request: int, tick: int) -> None:
         self._requester.jobs.put(Job(request, tick, ()))

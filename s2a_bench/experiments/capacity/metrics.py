@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments import SHARE, TIME, Metric, by_name
+from s2a_bench.experiments import TIME, Metric, by_name, number, share
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,36 +29,28 @@ def _time(name: str, title: str, about: str) -> Metric:
     return Metric(f"{name}_s", "s", title=title, about=about, bounds=(0, None), kind=TIME, optional=True)
 
 
-def _share(name: str, title: str, about: str, better: Any = "lower") -> Metric:
-    return Metric(name, "", better, title, "mean", about, bounds=(0, 1), kind=SHARE, optional=True)
-
-
-def _number(name: str, unit: str, title: str, about: str, better: Any = "neither", **more: Any) -> Metric:
-    return Metric(name, unit, better, title, "mean", about, bounds=(0, None), optional=True, **more)
-
-
 METRICS: Final[Mapping[str, Metric]] = by_name(
     (
-        _number("requests_per_s", "1/s", "req/s", "Complete answers a second, of all robots.", "higher"),
+        number("requests_per_s", "1/s", "req/s", "Complete answers a second, of all robots.", "higher"),
         _time("latency_mean", "latency", "From the intended time of a request to its complete answer, the mean."),
         _time("latency_p50", "p50", "Its median."),
         _time("latency_p99", "p99", "Its 99th percentile."),
         _time("ttft_p50", "TTFT p50", "From the intended time of a request to the first piece of its answer."),
         _time("ttft_p99", "TTFT p99", "Its 99th percentile."),
-        _share("in_time", "in time, %", "Share of the answers that came before the robot had to wait.", "higher"),
-        _share("stalled", "stalled, %", "Share of the due ticks without an action; of the plans, those that stall."),
-        _share("stalled_low", "from", "Its interval, over robots and blocks of time; the lower end."),
-        _share("stalled_high", "to", "The upper end."),
-        _share("stalled_alone", "alone", "The share of one robot alone.", "neither"),
-        _share("stalled_worst", "worst", "The greatest share of a robot."),
+        share("in_time", "in time, %", "Share of the answers that came before the robot had to wait.", "higher"),
+        share("stalled", "stalled, %", "Share of the due ticks without an action; of the plans, those that stall."),
+        share("stalled_low", "from", "Its interval, over robots and blocks of time; the lower end."),
+        share("stalled_high", "to", "The upper end."),
+        share("stalled_alone", "alone", "The share of one robot alone.", "neither"),
+        share("stalled_worst", "worst", "The greatest share of a robot."),
         _time("age_p50", "age p50", "Of the observation behind an executed action, the median."),
         _time("age_p99", "p99", "Its 99th percentile."),
-        _number("unfair", "", "worst/mean", "The greatest mean latency of a robot over that of all.", "lower"),
+        number("unfair", "", "worst/mean", "The greatest mean latency of a robot over that of all."),
         _time("late_p99", "late", "Measured: lateness of the generator's own ticks, 99th percentile."),
-        _number("generator_cpu", "cores", "generator", "Measured: CPU time of the generator a second."),
-        _number("server_cpu", "cores", "server", "Measured: CPU time of the server a second."),
-        _share("gpu", "GPU, %", "Measured: utilisation.", "neither"),
-        _number("watts", "W", "W", "Measured: power."),
+        number("generator_cpu", "cores", "generator", "Measured: CPU time of the generator a second.", "neither"),
+        number("server_cpu", "cores", "server", "Measured: CPU time of the server a second.", "neither"),
+        share("gpu", "GPU, %", "Measured: utilisation.", "neither"),
+        number("watts", "W", "W", "Measured: power.", "neither"),
     )
 )
 

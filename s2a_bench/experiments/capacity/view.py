@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments import SHARE, TIME, Comparable, Metric, Shown, Subject
+from s2a_bench.experiments import SHARE, TIME, Comparable, Metric, Shown, Subject, plain_rows
 from s2a_bench.experiments.capacity.metrics import METRICS
 from s2a_bench.experiments.capacity.rows import FLEETS, KNEES, ROBOTS, TWIN, FleetRow
 from s2a_bench.store.manifest import present
-from s2a_bench.store.schema import PROVENANCE, Table
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.json import cell_of_row, frame
@@ -39,7 +38,6 @@ CapacityCell = cell_of_row("CapacityCell", "N robots on one server.", FleetRow, 
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
-    """Return what a capacity run shows."""
     fleets = _fleets(run)
     return Shown.build(
         sentences=lambda: [*_knee_sentences(run), *_parted(run)],
@@ -47,7 +45,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
         main=["capacity"],
         csvs=lambda: {"capacity.csv": CsvTable.of(fleets[0] if fleets else (), (row.values() for row in fleets))},
         figures=lambda: {"capacity": partial(build_capacity, run)} if _panels(_drawn(fleets)) else {},
-        json=lambda: frame(run, [present(CapacityCell(**row)) for row in fleets], [], knees=_rows(run, KNEES)),
+        json=lambda: frame(run, [present(CapacityCell(**row)) for row in fleets], [], knees=plain_rows(run, KNEES)),
     )
 
 
@@ -58,7 +56,7 @@ def _knee_sentences(run: StoredRun) -> Iterator[str]:
         "plans": f" with a plan every {settings['plan_every_s'] or 0:g} s",
         "closed": "",
     }[settings["load"]]
-    for knee in sorted(_rows(run, KNEES), key=lambda row: row["source"] == PREDICTED):
+    for knee in sorted(plain_rows(run, KNEES), key=lambda row: row["source"] == PREDICTED):
         high = None if knee["high"] is None else int(knee["high"])
         robots = f"{knee['robots']} robot{'s' * (knee['robots'] != 1)}"
         if high == 0:
@@ -151,7 +149,7 @@ def build_capacity(run: StoredRun) -> Figure:
                 _draw(axes, name, mine, colour, style)
         axes.set_ylim(bottom=0)
         axes.set_ylabel(label)
-    for knee in _rows(run, KNEES):
+    for knee in plain_rows(run, KNEES):
         if knee["cell"] in cells:
             _draw_knee(list(every), knee, COLOURS[cells.index(knee["cell"])])
     last = every[-1]
@@ -214,7 +212,7 @@ def _subjects(run: StoredRun) -> list[Subject]:
             lambda name, robots=knee["robots"]: [np.array([float(robots)])] if name == KNEE.name else [],  # type: ignore[misc]
             exact=knee["source"] == PREDICTED,
         )
-        for knee in _rows(run, KNEES)
+        for knee in plain_rows(run, KNEES)
     ]
     robots = run.table(ROBOTS)
     clean = {(row["cell"], row["robots"]) for row in _fleets(run) if row["source"] == "measured" and row["clean"]}
@@ -247,7 +245,7 @@ def _fleets(run: StoredRun) -> list[dict[str, Any]]:
 
     A measured fleet is not ``clean`` either if its twin, or that of a smaller one, exceeds the limit.
     """
-    rows = _rows(run, FLEETS)
+    rows = plain_rows(run, FLEETS)
     slow = [row for row in rows if row["source"] == "twin" and not row["within"]]
     for row in rows:
         if row["source"] == "measured":
@@ -255,11 +253,3 @@ def _fleets(run: StoredRun) -> list[dict[str, Any]]:
             row["clean"] = row["clean"] and row["robots"] < min(twins, default=math.inf)
     cells = list(dict.fromkeys((row["cell"], row["source"]) for row in rows))
     return sorted(rows, key=lambda row: (cells.index((row["cell"], row["source"])), row["robots"]))
-
-
-def _rows(run: StoredRun, table: Table[Any]) -> list[dict[str, Any]]:
-    """Return the rows of a table, None for a missing value."""
-    return [
-        {str(name): None if value is None or value != value else value for name, value in row.items()}  # noqa: PLR0124
-        for row in run.table(table).drop(columns=PROVENANCE).to_dict("records")
-    ]

@@ -76,6 +76,7 @@ class CcrbConfig(Options):
         first=True,
         names=lambda: SIMULATORS,
     )
+    ego: str = option("", "ros[?parameter=value&...]: command and see the ego over ROS 2, if the simulator can")
     closed_loop: bool = option(
         False, "let the world run while the plan arrives: with --live on the clock, else in virtual time", first=True
     )
@@ -84,7 +85,7 @@ class CcrbConfig(Options):
     phase_rates: Numbers = option((2.0, 12.0), "tokens/s of the phase diagram: from, to")
     phase_gaps_m: Numbers = option((6.0, 30.0), "m to the car behind in the phase diagram: from, to", flag="phase-gaps")
     phase_points: tuple[int, int] = option((41, 25), "rates and gaps of the phase diagram", hidden=True)
-    random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000, first=True)
+    random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
     plan_request: PlanRequest = Field(default_factory=PlanRequest)
 
@@ -146,6 +147,12 @@ class CcrbConfig(Options):
         world = simulator_class(self.simulator)
         if self.scenario.lane_change and not world.steers:
             raise UsageError(f"`lane_change`: the {world.name} simulator knows one lane; take `simulator` embedded")
+        if self.ego:
+            from s2a_bench.scenario.ros import ego_parameters
+
+            ego_parameters(self.ego, world)
+            if not (self.closed_loop and self.plan_request.live):
+                raise UsageError("`ego`: ROS 2 runs on the clock; it needs `closed_loop` and `live`")
         for name in ("ttc", "phase", "random") if self.closed_loop else ():
             if getattr(self, name):
                 raise UsageError(f"`{name}` needs all arrivals beforehand, in virtual time; leave out `closed_loop`")

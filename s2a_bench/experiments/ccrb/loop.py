@@ -158,7 +158,7 @@ class ClosedLoop:
         self._last_ns = now_ns + self._step_ns
         due = not self.pictures or self._last_ns >= self.pictures[-1].stamp_ns + PICTURE_NS
         if self._view and self._drive.ego_moves and due:
-            self.pictures.append(replace(self._view.read(), stamp_ns=self._last_ns))
+            self.pictures.append(self._view.read())
         slack_ns = round(SLACK_S * 1e9)
         self._due_ns = NEVER if self._drive.decided().all() else max(self._last_ns, self._clock.now_ns() - slack_ns)
 

@@ -27,6 +27,7 @@ from s2a_bench.scenario import Simulator, open_simulator
 from s2a_bench.scenario.ccrb.drive import Driven, drive
 from s2a_bench.scenario.ccrb.ttc import NAME as TTC
 from s2a_bench.scenario.ccrb.ttc import ttc_aware
+from s2a_bench.scenario.ros import with_ego
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import RunWriter
 from s2a_bench.types import Timing
@@ -145,7 +146,7 @@ _BOARD = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_origin"
 
 
 def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
-    with closing(open_simulator(config.simulator)) as world:
+    with closing(open_simulator(config.simulator)) as bare, closing(with_ego(bare, config.ego)) as world:
         if not config.plan_request.live:
             return _run_modelled(config, world, output, progress)
         from s2a_bench.experiments.ccrb.live import run_ccrb_live

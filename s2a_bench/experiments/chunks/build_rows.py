@@ -94,7 +94,7 @@ def metrics_of(
     mean_reaction = expected.mean_reaction_ticks
     delay = cycles.delay_ticks[: latency_ns.size]  # a live run may end before an answer
     later = setting.rounding == "floor"  # an action leaves at the end of its tick
-    assumed = np.array(cell.triggers, np.float64) if cell.triggers else cell.mode.assumed_ticks
+    assumed = np.array(cell.triggers[1:] or cell.triggers) if cell.triggers else cell.mode.assumed_ticks
     length = found["ticks"] or math.nan
     return found | {
         **stalls_of(cycles),
@@ -110,7 +110,7 @@ def metrics_of(
         "delay_ticks_p99": float(np.quantile(delay, 0.99)),
         "delay_ticks_max": float(delay.max()),
         "delay_assumed_ticks": _mean(cell.triggers, cell.mode.assumed_ticks),
-        "p_delay_above": None if assumed is None else float(np.mean(delay[1:] > _later(assumed))),
+        "p_delay_above": None if assumed is None else float(np.mean(delay[1:] > assumed)),
         "margin_ticks": margin_ticks(cell.acting, latency_ns, setting) if len(cell.triggers) < 2 else None,  # noqa: PLR2004 - the rule would answer
     }
 
@@ -194,10 +194,6 @@ def _mean(triggers: tuple[int, ...], given: int | None) -> float | None:
 def _blended(cell: ChunkCell, cycles: Cycles) -> float | None:
     age = cell.mode.blended_age(cycles)
     return None if age is None or not np.isfinite(age).any() else float(np.nanmean(age))
-
-
-def _later(assumed: Any) -> Any:
-    return assumed[1:] if isinstance(assumed, np.ndarray) and assumed.size > 1 else assumed
 
 
 def _plain(value: float | None, *, whole: bool) -> float | int | None:

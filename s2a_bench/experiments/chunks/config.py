@@ -18,14 +18,13 @@ from s2a_bench.experiments.latencies import split
 from s2a_bench.harness.config import LiveRequests
 from s2a_bench.inference import STAND_IN
 from s2a_bench.options import Names, Options, group, one_of, option
-from s2a_bench.policy.chunks import COMPARED, MODES, Rounding
+from s2a_bench.policy.chunks import COMPARED, MODES, ControlSetting, Rounding, modes
 from s2a_bench.policy.conformal import GUARANTEE, Guarantee
-from s2a_bench.text import none_of
 
 if TYPE_CHECKING:
     from s2a_bench.act import ActionKind
     from s2a_bench.experiments.latencies import Source
-    from s2a_bench.policy.chunks import ControlSetting, Mode
+    from s2a_bench.policy.chunks import Mode
 
 SHOWN: Final = (
     *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
@@ -134,25 +133,11 @@ class ChunksConfig(Options):
 
     @property
     def setting(self) -> ControlSetting:
-        from s2a_bench.policy.chunks import ControlSetting
-
         return ControlSetting(round(1e9 / self.control_hz), self.horizon, self.rounding).slowed(self.slow_down)
 
     @cached_property
     def made(self) -> dict[str, Mode]:
-        from s2a_bench.policy.parameters import build, canonical
-
-        known = {written: written.partition("?")[0] for written in self.modes}
-        if unknown := [name for name in known.values() if name not in MODES]:
-            raise UsageError(f"`modes`: {none_of(unknown[0], MODES)}")
-        built = [build(MODES[name], written, "modes") for written, name in known.items()]
-        found = {canonical(each.name, each): each for each in built}
-        for name, each in found.items():
-            try:
-                each.execution_horizon(self.setting)
-            except ValueError as error:
-                raise UsageError(f"`modes`: {name}: a chunk has {self.horizon} actions (`horizon`)") from error
-        return found
+        return modes(self.modes, self.setting)
 
     @cached_property
     def sources(self) -> tuple[Source, ...]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.act import open_robot
-from s2a_bench.act.control import ControlLoop, RobotTicks
+from s2a_bench.act.control import ControlLoop, RobotTicks, Send
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.chunks.build_rows import stall_metrics, stalls_of, write_cell
 from s2a_bench.experiments.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes
@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from s2a_bench.policy.chunks import Cycles, Ints, Mode, Ticks
     from s2a_bench.progress import Progress
     from s2a_bench.store.run import RunWriter
-    from s2a_bench.types import Vector
 CLIENTS: Final = 4
 """Of a cell, for modes with several concurrent requests."""
 KEEP_S: Final = 0.05
@@ -221,19 +220,12 @@ def _run(
     """Act for ``ticks``, or until ``warmup`` requests have been made; write the requests."""
     sends_state = robot is not None and _accepts_state(config, sessions[0], robot)
 
-    def on_actions(request: int, actions: Sequence[Any], at_ns: int) -> None:
-        acting.arrived(request, actions, at_ns)
-
-    def send(action: Vector | None, at_ns: int) -> None:
-        if robot is not None:
-            robot.send(action, at_ns)
-
-    requester = ChunkRequester(sessions, config.horizon, config.seed, streams, on_actions, blocks, warmup)
-
     def request_chunk(request: int, tick: int) -> None:
         requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else ()))
 
+    send: Send = (lambda *_: None) if robot is None else robot.send
     acting = RobotTicks(chosen, setting, send, request_chunk, ticks)
+    requester = ChunkRequester(sessions, config.horizon, config.seed, streams, acting.arrived, blocks, warmup)
     loop = ControlLoop([acting])
     with requester.running():
         try:

@@ -9,56 +9,46 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
-from s2a_bench.experiments import COUNT, SHARE, Better, Metric, columns
+from s2a_bench.experiments import COUNT, Better, Metric, by_name, columns, number, share
 from s2a_bench.store.schema import Count, Many, NonNegative, Positive, Table, about, with_fields
 
 
-def _number(name: str, unit: str, title: str, about: str, better: Better = "lower", **more: Any) -> Metric:
-    given = {"bounds": (0, None), "optional": True, **more}
-    return Metric(name, unit, better, title, "mean", about=about, **given)
-
-
 def _ticks(name: str, title: str, about: str, **more: Any) -> Metric:
-    return _number(name, "ticks", title, about, **more)
-
-
-def _share(name: str, title: str, about: str, better: Better = "lower") -> Metric:
-    return _number(name, "", title, about, better, bounds=(0, 1), kind=SHARE)
+    return number(name, "ticks", title, about, **more)
 
 
 def _plant(name: str, unit: str, title: str, about: str, better: Better = "lower") -> Metric:
     units = "u: the actions' unit, in virtual time the target's standard deviation."
-    return _number(name, unit, title, f"{about} {units}", better)
+    return number(name, unit, title, f"{about} {units}", better)
 
 
-METRICS: Final[Mapping[str, Metric]] = {
-    metric.name: metric
-    for metric in (
+METRICS: Final[Mapping[str, Metric]] = by_name(
+    (
         _ticks("ticks", "ticks", "Control ticks from the first action on.", better="neither", kind=COUNT),
         _ticks("stall_ticks", "stalled", "Those without an action.", kind=COUNT),
-        _number("stall_ticks_per_s", "1/s", "stalls/s", "Stalled ticks a second, from the first action on."),
-        _share("stall_share", "stalled", "Share of the ticks that stall."),
+        number("stall_ticks_per_s", "1/s", "stalls/s", "Stalled ticks a second, from the first action on."),
+        share("stall_share", "stalled", "Share of the ticks that stall."),
         _ticks("longest_stall_ticks", "longest", "The longest stall.", kind=COUNT),
-        _number("boundaries", "", "cycles", "From one executed chunk to the next.", "neither", kind=COUNT),
-        _number("stalled_cycles", "", "stalled cycles", "Boundaries with a stall.", kind=COUNT),
-        _share("p_stall_cycle", "P(stall), %", "Share of the boundaries with a stall."),
-        _share("p_stall_low", "from", "Its two-sided 95 % interval (Clopper and Pearson), the lower end."),
-        _share("p_stall_high", "to", "The upper end."),
-        _share("p_stall_closed", "form", "What the closed form says of the same delays, where it holds."),
+        number("boundaries", "", "cycles", "From one executed chunk to the next.", "neither", kind=COUNT),
+        number("stalled_cycles", "", "stalled cycles", "Boundaries with a stall.", kind=COUNT),
+        share("p_stall_cycle", "P(stall), %", "Share of the boundaries with a stall."),
+        share("p_stall_low", "from", "Its two-sided 95 % interval (Clopper and Pearson), the lower end."),
+        share("p_stall_high", "to", "The upper end."),
+        share("p_stall_closed", "form", "What the closed form says of the same delays, where it holds."),
         _ticks("age_ticks_mean", "age", "Of the observation behind an executed action."),
         _ticks("age_ticks_p99", "p99", "Its 99th percentile."),
         _ticks("age_ticks_max", "max", "The greatest."),
         _ticks("age_ticks_blended", "blended", "Its mean with blended actions: ages weighted as the actions are."),
-        _number("reaction_s_mean", "s", "react (ms)", "From an event to the start of the first tick that knows of it."),
-        _number("reaction_s_p99", "s", "p99", "Its 99th percentile."),
-        _number("reaction_s_closed", "s", "form", "Its mean by the closed form of the same delays, where it holds."),
-        _number("first_action_s", "s", "first action", "From the first observation until an action leaves."),
-        _number("control_rate_hz", "Hz", "Hz", "Executed actions a second, from the first on.", "higher"),
+        number("reaction_s_mean", "s", "react (ms)", "From an event to the start of the first tick that knows of it."),
+        number("reaction_s_p99", "s", "p99", "Its 99th percentile."),
+        number("reaction_s_closed", "s", "form", "Its mean by the closed form of the same delays, where it holds."),
+        number("first_action_s", "s", "first action", "From the first observation until an action leaves."),
+        number("control_rate_hz", "Hz", "Hz", "Executed actions a second, from the first on.", "higher"),
         _ticks("delay_ticks_mean", "d", "Realised d, by the row's convention.", better="neither"),
         _ticks("delay_ticks_p99", "p99", "Its 99th percentile.", better="neither"),
         _ticks("delay_ticks_max", "max", "The greatest.", better="neither"),
         _ticks("delay_assumed_ticks", "assumed", "The d that the mode is ready for: trigger, or `assumed`."),
-        _share("p_delay_above", "above, %", "Share of the requests whose d is above the assumed one."),
+        share("p_delay_above", "above, %", "Share of the requests whose d is above the assumed one."),
         _ticks(
             "margin_ticks",
             "margin",
@@ -67,23 +57,23 @@ METRICS: Final[Mapping[str, Metric]] = {
             bounds=(-1, None),
             kind=COUNT,
         ),
-        _number(
+        number(
             "slow_down",
             "",
             "beta",
             "The least slow-down of actions at which at most a share epsilon of the cycles stalls, at the greatest m.",
             bounds=(1, None),
         ),
-        _number(
+        number(
             "slower",
             "",
             "slower",
             "By how many times slower than `control_hz` actions were executed.",
             bounds=(1, None),
         ),
-        _share("thrown_away_share", "unused, %", "Actions never executed, of all."),
-        _number("jump_mean", "actions", "jump", "By how many actions the robot is thrown at a boundary."),
-        _number("jump_max", "actions", "max", "The greatest."),
+        share("thrown_away_share", "unused, %", "Actions never executed, of all."),
+        number("jump_mean", "actions", "jump", "By how many actions the robot is thrown at a boundary."),
+        number("jump_max", "actions", "max", "The greatest."),
         _plant("tracking_rms", "u", "tracking", "Position of the plant less the target's, root mean square."),
         _plant("tracking_rms_ideal", "u", "ideal", "The same, with a request in every tick and no latency.", "neither"),
         _plant("jerk_rms", "u/s^3", "jerk", "Change of acceleration over a control period, by it; root mean square."),
@@ -92,16 +82,16 @@ METRICS: Final[Mapping[str, Metric]] = {
         _plant("boundary_jump_p99", "u", "p99", "Its 99th percentile."),
         _plant("action_step_mean", "u", "step", "From one action to the next within a chunk.", "neither"),
         _ticks("blocked_ticks", "blocked", "Ticks in which the control loop waits for an answer.", kind=COUNT),
-        _share("agreement", "alike, %", "Live: share of the ticks as the mode's arrays have them.", "higher"),
-        _number("jitter_s_p50", "s", "jitter (ms)", "Live: delay of an action after its due time, the median."),
-        _number("jitter_s_p99", "s", "p99", "Its 99th percentile."),
-        _number("jitter_s_max", "s", "max", "The greatest."),
+        share("agreement", "alike, %", "Live: share of the ticks as the mode's arrays have them.", "higher"),
+        number("jitter_s_p50", "s", "jitter (ms)", "Live: delay of an action after its due time, the median."),
+        number("jitter_s_p99", "s", "p99", "Its 99th percentile."),
+        number("jitter_s_max", "s", "max", "The greatest."),
         _ticks("late_ticks", "late", "Live: ticks whose action left a whole tick late or more.", kind=COUNT),
-        _number("blocked_s_p99", "s", "busy (ms)", "Live: time of requests and sending in a tick, 99th percentile."),
-        _number("blocked_s_max", "s", "max", "The greatest."),
-        _number("bytes_up_per_s", "bytes/s", "MB/s up", "Live: bytes of pictures sent in a second."),
+        number("blocked_s_p99", "s", "busy (ms)", "Live: time of requests and sending in a tick, 99th percentile."),
+        number("blocked_s_max", "s", "max", "The greatest."),
+        number("bytes_up_per_s", "bytes/s", "MB/s up", "Live: bytes of pictures sent in a second."),
     )
-}
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

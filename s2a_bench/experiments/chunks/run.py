@@ -48,7 +48,7 @@ def trigger_rows(config: ChunksConfig, drawn: LatencyDraw) -> Iterator[TriggerRo
         return
     setting = config.setting
     length = config.triggered.execution_horizon(setting)
-    for trigger in _steps(0, length - 1):
+    for trigger in np.unique(np.linspace(0, length - 1, min(length, MOST_POINTS)).round()).astype(int).tolist():
         mode = config.triggered.varied((trigger,))
         cycles = mode.cycles(drawn.judged, setting)
         found = stalls_of(cycles)
@@ -88,10 +88,6 @@ def mean_age(cycles: Cycles) -> float:
     """Return the mean age of the observation in ticks over executed actions; each chunk is executed in one run."""
     middle = cycles.start_tick - cycles.request_tick + (cycles.executed - 1) / 2
     return float(np.average(middle, weights=cycles.executed))
-
-
-def _steps(first: int, last: int) -> list[int]:
-    return [int(step) for step in np.unique(np.linspace(first, last, min(last - first + 1, MOST_POINTS)).round())]
 
 
 MOST_TICKS = 100_000_000

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from s2a_bench.policy.chunks.metrics import mean
 from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
@@ -122,16 +123,12 @@ def smoothness(motion: PlantMotion, actions: Floats, chunk: Ints, reference: Flo
     jump = step[other]
     found = {
         "jerk_rms": _rms(motion.jerk),
-        "boundary_jump_mean": _mean(jump),
+        "boundary_jump_mean": mean(jump),
         "boundary_jump_p99": float(np.quantile(jump, 0.99)) if jump.size else nan,
-        "action_step_mean": _mean(step[~other]),
+        "action_step_mean": mean(step[~other]),
     }
     return found if reference is None else {"tracking_rms": _rms(motion.position[:, 0] - reference), **found}
 
 
 def _rms(values: Floats) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _mean(values: Floats) -> float:
-    return float(values.mean()) if values.size else nan

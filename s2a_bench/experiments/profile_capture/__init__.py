@@ -20,8 +20,6 @@ LEAST_GAPS: Final = 40
 
 
 class CaptureConfig(Options):
-    """The options of a capture."""
-
     name: str = option(..., "name of the profile; its file is NAME.toml", argument=True)
     title: str = option("", "what figures call it [default: the board's or CPU's name]")
     engine: EngineConfig = group(EngineConfig, only=(*OF_MODEL, "threads", "context"))

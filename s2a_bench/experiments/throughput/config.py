@@ -44,8 +44,6 @@ class ThroughputEngine(EngineConfig):
 
 
 class ThroughputConfig(FirstVariants):
-    """The options of a throughput run."""
-
     QUICK: ClassVar[dict[str, int]] = {"requests": 3, "warmup": 1, "max_tokens": 32}
     OF_ENGINE: ClassVar[tuple[str, ...]] = ("flash_attention",)
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import json
 import subprocess
-from collections.abc import Callable
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,11 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import COMPILE_AGAIN, EngineError, how_it_ended
 from s2a_bench.experiments.throughput.config import IN_PROCESS, ThroughputConfig
 from s2a_bench.experiments.throughput.metrics import REFERENCE, ReferenceRow
-from s2a_bench.harness.plan import RunPlan, resolve
+from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.processes import llama_flags
 from s2a_bench.harness.rounds import RunningLaunch, Task, in_blocks, run_requests
 from s2a_bench.harness.session import Place
 from s2a_bench.progress import Progress
-from s2a_bench.store.run import RunWriter
 
 LONGEST_S = 7200
 """Long enough for a board with half a token a second."""
@@ -33,11 +32,7 @@ def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -
     """Measure and return the run folder, which keeps the samples so far if S2AError or KeyboardInterrupt is raised."""
 
     def drive(launch: RunningLaunch) -> None:
-        def longest_prompt() -> int:
-            return max(session.prompt_n for session in launch.sessions)
-
-        reference = config.reference
-        in_blocks(launch, [LlamaBench(reference, launch.plan, launch.writer, longest_prompt)] if reference else [])
+        in_blocks(launch, [partial(llama_bench, config.reference, launch)] if config.reference else [])
 
     sampling = "greedy" if config.greedy else "model"
     plan = resolve(config.but(engine=config.engine.but(sampling=sampling)))
@@ -48,58 +43,50 @@ def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -
     return run_requests(Task("throughput", drive=drive), replace(plan, cells=cells), output, progress)
 
 
-class LlamaBench:
-    """Runs llama-bench once a block; called with its place."""
+def llama_bench(program: Path, launch: RunningLaunch, place: Place) -> None:
+    """Run llama-bench once, after as many tokens as our longest prompt has, and write its row."""
+    engine, depth = launch.plan.engine, max(session.prompt_n for session in launch.sessions)
+    command = [str(program), *llama_flags(engine), "--output", "json", "--repetitions", "1", "--n-prompt", "0"]
+    command += ["--n-gen", str(launch.plan.request.max_pieces), "--n-depth", str(depth)]
+    launch.writer.update(reference={"command": command})
+    started_ns = now_ns()
+    test = _timed(program, command, engine.flash_attention)
+    row = ReferenceRow(
+        **asdict(place),
+        started_ns=started_ns,
+        finished_ns=now_ns(),
+        n_gen=test["n_gen"],
+        depth=test.get("n_depth", 0),
+        decode_ns=test["samples_ns"][0],
+        facts={name: test[name] for name in test if not name.startswith(("samples", "avg", "stddev"))},
+    )
+    launch.writer.append(REFERENCE, [row])
 
-    def __init__(self, program: Path, plan: RunPlan, writer: RunWriter, depth: Callable[[], int]) -> None:
-        """Prepare the command; ``depth()`` is the number of tokens in the context before the timed ones."""
-        self._program = program
-        self._writer = writer
-        self._depth = depth
-        engine = plan.engine
-        self._flash_attention = engine.flash_attention
-        self._command = [str(program), *llama_flags(engine), "--output", "json", "--repetitions", "1"]
-        self._command += ["--n-prompt", "0", "--n-gen", str(plan.request.max_pieces)]
 
-    def __call__(self, place: Place) -> None:
-        command = [*self._command, "--n-depth", str(self._depth())]
-        self._writer.update(reference={"command": command})
-        started_ns = now_ns()
-        test = self._run(command)
-        row = ReferenceRow(
-            **asdict(place),
-            started_ns=started_ns,
-            finished_ns=now_ns(),
-            n_gen=test["n_gen"],
-            depth=test.get("n_depth", 0),
-            decode_ns=test["samples_ns"][0],
-            facts={name: test[name] for name in test if not name.startswith(("samples", "avg", "stddev"))},
+def _timed(program: Path, command: list[str], flash_attention: str) -> dict[str, Any]:
+    """Return llama-bench's JSON of its one test; raises EngineError."""
+    try:
+        done = subprocess.run(  # noqa: S603 - the user's own program
+            command, capture_output=True, text=True, errors="replace", check=False, timeout=LONGEST_S
         )
-        self._writer.append(REFERENCE, [row])
-
-    def _run(self, command: list[str]) -> dict[str, Any]:
-        try:
-            done = subprocess.run(  # noqa: S603 - the user's own program
-                command, capture_output=True, text=True, errors="replace", check=False, timeout=LONGEST_S
-            )
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise EngineError(f"--reference {self._program}: {error}") from error
-        last_line = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1][:200]
-        if done.returncode:
-            how = how_it_ended(done.returncode, COMPILE_AGAIN)
-            raise EngineError(f"--reference {self._program}: {how}: {last_line}")
-        try:
-            (test,) = json.loads(done.stdout)
-            if not (test["n_gen"] > 0 and test["samples_ns"][0] > 0):
-                raise ValueError("it generated nothing")
-        except (ValueError, KeyError, TypeError, IndexError) as error:
-            raise EngineError(
-                f"--reference {self._program}: its answer is not llama-bench's JSON of one test ({error!r}); "
-                "a llama-bench of 2026 is needed"
-            ) from error
-        if isinstance(test.get("flash_attn"), bool) and self._flash_attention != "off":
-            raise EngineError(
-                f"--reference {self._program}: it is too old for --flash-attn {self._flash_attention}, which it reads "
-                "as off, and would measure other settings; take a newer one, or --flash-attention off"
-            )
-        return dict(test)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise EngineError(f"--reference {program}: {error}") from error
+    last_line = (done.stderr.strip() or done.stdout.strip() or "nothing").splitlines()[-1][:200]
+    if done.returncode:
+        how = how_it_ended(done.returncode, COMPILE_AGAIN)
+        raise EngineError(f"--reference {program}: {how}: {last_line}")
+    try:
+        (test,) = json.loads(done.stdout)
+        if not (test["n_gen"] > 0 and test["samples_ns"][0] > 0):
+            raise ValueError("it generated nothing")
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise EngineError(
+            f"--reference {program}: its answer is not llama-bench's JSON of one test ({error!r}); "
+            "a llama-bench of 2026 is needed"
+        ) from error
+    if isinstance(test.get("flash_attn"), bool) and flash_attention != "off":
+        raise EngineError(
+            f"--reference {program}: it is too old for --flash-attn {flash_attention}, which it reads "
+            "as off, and would measure other settings; take a newer one, or --flash-attention off"
+        )
+    return dict(test)

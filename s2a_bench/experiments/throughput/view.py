@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments import Shown, Tables
+from s2a_bench.experiments import Shown
 from s2a_bench.experiments.paper import paper_throughput
 from s2a_bench.experiments.requests import (
     OF_ANSWERS,
@@ -49,7 +49,12 @@ _REFERENCE_FILL: Final = "#FFFFFF"
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
     return Shown.build(
         sentences=lambda: throughput_sentences(run),
-        tables=throughput_tables(run),
+        tables={
+            "throughput": lambda: speed_table(run),
+            "prompt": lambda: _prompt_table(run),
+            "gaps": lambda: _gap_table(run),
+            "positions": lambda: position_table(run),
+        },
         main=["throughput", "prompt"],
         csvs=lambda: throughput_csv(run),
         figures=lambda: throughput_figures(run, against_paper=against == "paper"),
@@ -70,15 +75,6 @@ def throughput_sentences(run: StoredRun) -> list[str]:
         if metric == ENGINE_METRIC
     ]
     return sentences or ["No request was answered; samples.csv says why."]
-
-
-def throughput_tables(run: StoredRun) -> Tables:
-    return {
-        "throughput": lambda: speed_table(run),
-        "prompt": lambda: _prompt_table(run),
-        "gaps": lambda: _gap_table(run),
-        "positions": lambda: position_table(run),
-    }
 
 
 def speed_table(run: StoredRun) -> TextTable:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
-from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Better, Metric, columns
+from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Better, Metric, by_name, columns
 from s2a_bench.store.schema import Table, with_fields
 
 
@@ -38,9 +38,8 @@ def _mean(name: str, title: str = "", about: str = "", better: Better = "lower",
 _UNBOUND: Final = (None, None)
 _SHARE: Final = (0, 1)
 
-METRICS: Final[Mapping[str, TimelineMetric]] = {
-    metric.name: metric
-    for metric in (
+METRICS: Final[Mapping[str, TimelineMetric]] = by_name(
+    (
         _time("start_s", "start", "Time to first action, s_1."),
         _time("end_s", "end", "Completion, e_N."),
         _time("safe_start_s", about="S0."),
@@ -107,7 +106,7 @@ METRICS: Final[Mapping[str, TimelineMetric]] = {
             optional=True,
         ),
     )
-}
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,10 +23,11 @@ A simulation has one latency per request, and ends before the first request with
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, Protocol, TypeAlias
 
+from s2a_bench.errors import UsageError
 from s2a_bench.registry import Registry
 
 if TYPE_CHECKING:
@@ -268,7 +269,7 @@ class Mode(Protocol):
 
 MODES: Final[Registry[Callable[..., Mode]]] = Registry(
     "modes",
-    "mode",
+    "modes",
     {
         "sync": "s2a_bench.policy.chunks.append:Sync",
         "queue": "s2a_bench.policy.chunks.append:Queue",
@@ -291,3 +292,16 @@ def mode(written: str) -> Mode:
     from s2a_bench.policy.parameters import build
 
     return build(MODES[written.partition("?")[0]], written, MODES.field)
+
+
+def modes(written: Iterable[str], setting: ControlSetting) -> dict[str, Mode]:
+    """Build each mode once, by its canonical name; raises UsageError, also for one that needs longer chunks."""
+    from s2a_bench.policy.parameters import canonical
+
+    found = {canonical(each.name, each): each for each in map(mode, written)}
+    for name, each in found.items():
+        try:
+            each.execution_horizon(setting)
+        except ValueError as error:
+            raise UsageError(f"`modes`: {name}: a chunk has {setting.horizon} actions (`horizon`)") from error
+    return found

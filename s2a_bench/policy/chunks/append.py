@@ -106,15 +106,11 @@ class Streamed(Appending):
         slower_ns = max(0, self.gap_ns - setting.period_ns) if self.start == "safe" else 0
         return -(-(self.execution_horizon(setting) - 1) * slower_ns // setting.period_ns)
 
-    def waits_within(self, setting: ControlSetting) -> bool:
-        """Whether it may stall within a chunk: then closed forms do not hold."""
-        return self.start == "naive" and self.gap_ns > setting.period_ns
-
     def stepper(self, setting: ControlSetting) -> ChunkStepper:
         return QueueStepper(self.execution_horizon(setting), self.trigger, self.hold_ticks(setting))
 
     def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:
-        if self.waits_within(setting):
+        if self.start == "naive" and self.gap_ns > setting.period_ns:  # it may stall within a chunk
             return Closed()
         length = self.execution_horizon(setting)
         known = setting.known_ticks(latency_ns + (length - 1) * self.gap_ns)

@@ -56,12 +56,12 @@ def measure(mode: Mode, cycles: Cycles, ticks: Ticks) -> ChunkMetrics:
         stall_ticks=stall_ticks,
         stall_share=stall_ticks / length if length else np.nan,
         longest_stall_ticks=_longest(ticks),
-        p_stall_cycle=_mean(cycles.stall_ticks[settled] > 0),
-        age_ticks_mean=_mean(age),
+        p_stall_cycle=mean(cycles.stall_ticks[settled] > 0),
+        age_ticks_mean=mean(age),
         age_ticks_p99=float(np.quantile(age, 0.99)) if age.size else np.nan,
         age_ticks_max=float(age.max()) if age.size else np.nan,
-        thrown_away_share=_mean(cycles.thrown_away[:last]) / cycles.horizon,
-        jump_mean=_mean(jump),
+        thrown_away_share=mean(cycles.thrown_away[:last]) / cycles.horizon,
+        jump_mean=mean(jump),
         jump_max=float(jump.max()) if jump.size else np.nan,
         requests=cycles.request_tick.size,
         blocked_ticks=(stall_ticks + first) if mode.blocks else 0,
@@ -97,5 +97,6 @@ def _longest(ticks: Ticks) -> int:
     return int(lengths.max(initial=0))
 
 
-def _mean(values: NDArray[Any]) -> float:
+def mean(values: NDArray[Any]) -> float:
+    """Return the mean; NaN without values."""
     return float(values.mean()) if values.size else float("nan")

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
@@ -101,8 +101,8 @@ class TrackedLatency:
     tracker: Tracker = field(repr=False)
 
     @staticmethod
-    def begin(latency_ns: Iterable[float], epsilon: float = EPSILON, **options: Any) -> TrackedLatency:
-        return TrackedLatency(Tracker(map(float, latency_ns), epsilon, **options))
+    def begin(latency_ns: Iterable[float], epsilon: float = EPSILON) -> TrackedLatency:
+        return TrackedLatency(Tracker(map(float, latency_ns), epsilon))
 
     @property
     def latency_ns(self) -> float:

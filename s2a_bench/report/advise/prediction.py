@@ -223,7 +223,6 @@ def waiting_ms(load: float, service_ms: float) -> float | None:
 
 
 def advice_table(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile, provenance: str) -> TextTable:
-    """Return the table of the predictions."""
     checked = any(each.measured_ms is not None for each in found)
     rows = [
         (
@@ -263,7 +262,6 @@ def _measured(advice: Advice) -> str:
 
 
 def sentence(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile) -> str:
-    """Return the advice in a sentence."""
     best = found[0]
     if best.load > 1:
         return f"{profile.name} carries {config.rate:g} such requests a second over no transport of the sweep."
@@ -276,7 +274,6 @@ def sentence(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile
 
 
 def advice_json(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile, provenance: str) -> dict[str, Any]:
-    """Return the object of ``--json``."""
     return {
         "schema": "s2a-bench-advise/1",
         "command": "advise",

@@ -132,14 +132,7 @@ def open_comparison(
         raise UsageError(f"these are runs of {' and '.join(commands)}: name runs of one command")
     by = _comparable(commands[0])
     with fits(*runs):
-        dated = [
-            [
-                (str(run.manifest.get("started") or ""), each)
-                for run in side
-                for each in _launches(run, by.subjects(run))
-            ]
-            for side in (baseline, other)
-        ]
+        dated = [[each for run in side for each in _launches(run, by.subjects(run))] for side in (baseline, other)]
         sides = [[launch for _, launch in side] for side in dated]
         found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
         metrics = {**by.metrics, **by_name(metric for run in runs for metric in by.run_metrics(run))}
@@ -161,14 +154,14 @@ def open_comparison(
     return ComparedRuns(tuple(baseline), tuple(other), by, metrics, differ, tuple(pairs), only, least, started)
 
 
-def _launches(run: StoredRun, subjects: Iterable[Subject]) -> list[dict[str, Subject]]:
-    """Return name -> cell of a run, for each launch; raises UnlikeRuns if it has none."""
+def _launches(run: StoredRun, subjects: Iterable[Subject]) -> list[tuple[str, dict[str, Subject]]]:
+    """Return when a run started and name -> cell, for each launch; raises UnlikeRuns if it has none."""
     found: dict[int, dict[str, Subject]] = {}
     for subject in subjects:
         found.setdefault(subject.launch, {})[subject.name] = subject
     if not found:
         raise UnlikeRuns(f"{run.path} has no complete cell, its state is {run.manifest['state']}: measure it again")
-    return list(found.values())
+    return [(str(run.manifest.get("started") or ""), launch) for launch in found.values()]
 
 
 def _comparable(command: str) -> Comparable:

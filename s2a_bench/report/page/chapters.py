@@ -85,14 +85,13 @@ def differences_of(chapters: Sequence[Chapter]) -> list[str]:
     return [*lines, f"The runs differ in {names}."] if names else lines
 
 
-def _chapter(run: StoredRun, title: str, against_paper: bool, **more: Any) -> Chapter:
+def _chapter(run: StoredRun, title: str, against_paper: bool, command: str = "") -> Chapter:
     """Make the chapter of a run; an unfinished one may lack the rows of its tables."""
     manifest = run.manifest
     caveats = list(_unfinished(manifest))
     with fits(run):
         content = content_of(run, against_paper=against_paper)
-    command = more.pop("command", repeat_command(manifest))
-    return Chapter(_slug(run.path.name), title, run, content, command, caveats, **more)
+    return Chapter(_slug(run.path.name), title, run, content, command or repeat_command(manifest), caveats)
 
 
 def _slug(name: str) -> str:

@@ -9,10 +9,15 @@ from hypothesis import strategies as st
 from matplotlib.collections import PathCollection, QuadMesh
 from matplotlib.figure import Figure
 
+from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.boundary.run import rows, run_boundary
 from s2a_bench.experiments.boundary.view import board_table, boundary_csv, build_boundary, disagreements, line_table
+from s2a_bench.policy import Plans, policy
+from s2a_bench.policy.conformal import ANY_STALL_S
+from s2a_bench.policy.metrics import measure
+from s2a_bench.stats.seeds import generator
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import caption_of
@@ -56,18 +61,57 @@ def test_formula_and_trial_agree_without_jitter(
         most_tokens=7,
     )
     for duration in config.durations:
-        for row in rows(config, duration, config.grid):
+        for row in rows(config, duration, *config.grid):
             close = abs(row.tokens_per_skill / row.tokens_per_s - row.duration_s) < 1e-5  # a stall too short to be one
             assert close or row.stall_free == (row.p_stall == 0)
 
 
 def test_the_line_itself_is_stall_free() -> None:
     config = BoundaryConfig(profiles=(), rates=(1.0, 2.0), points=2, most_tokens=2, t_nom_s=1.0)
-    free = {(row.tokens_per_skill, row.tokens_per_s): row for row in rows(config, "t_nom", config.grid)}
+    free = {(row.tokens_per_skill, row.tokens_per_s): row for row in rows(config, "t_nom", *config.grid)}
     assert free[1, 1.0].stall_free
     assert free[1, 1.0].p_stall == 0
     assert free[2, 2.0].p_stall == 0
     assert free[2, 1.0].p_stall == 1
+
+
+def test_the_line_is_tokens_over_duration() -> None:
+    found = rows(BoundaryConfig(profiles=(), t_min=0.8), "t_min", (2, 4), (2.49, 2.5, 4.99, 5.0))
+    assert [row.stall_free for row in found] == [False, True, True, True, False, False, False, True]
+
+
+def test_the_papers_line_leaves_out_what_runs_smoothly_at_nominal_durations() -> None:
+    config = BoundaryConfig(profiles=(), t_min=0.8)
+    papers, true = ([row.stall_free for row in rows(config, name, *config.grid)] for name in ("t_min", "t_nom"))
+    assert all(nominal >= paper for paper, nominal in zip(papers, true, strict=True))
+    papers, true = (next(rows(config, name, (4,), (4.8,))).stall_free for name in ("t_min", "t_nom"))
+    assert (papers, true) == (False, True)  # 4 tokens at 4.8 tokens/s: 0.83 s a skill
+
+
+def shares(seed: int = 1) -> list[float]:
+    config = BoundaryConfig(profiles=(), jitter="lognormal:cv=0.5", plans=400, seed=seed)
+    return [row.p_stall for row in rows(config, "t_nom", (1, 4, 6), (0.58, 4.8, 34.2))]
+
+
+def test_jitter_blurs_the_boundary_and_leaves_the_far_ends() -> None:
+    share = shares()
+    assert share[6] == 1.0
+    assert share[2] == 0.0
+    assert 0.05 < share[4] < 0.95
+
+
+def test_a_seed_makes_the_simulation_repeat_itself() -> None:
+    assert shares(seed=3) == shares(seed=3)
+    assert shares(seed=3) != shares(seed=4)
+
+
+def test_the_simulated_share_is_that_of_naive_timelines_over_the_same_gaps() -> None:
+    gaps = Lognormal(1.0, 0.5).sample(generator(1, "boundary", ""), 6 * 8, 400)
+    arrival_s = np.cumsum(gaps, axis=0)[3 : 4 * 8 : 4] / 4.8
+    ones = np.ones_like(arrival_s)
+    plans = Plans(arrival_s, ones, ones, ones)
+    stalled = measure(plans, policy("naive").schedule(plans), tolerance_s=ANY_STALL_S).stalls > 0
+    assert shares()[4] == stalled.mean()
 
 
 def test_with_jitter_the_line_is_a_slope(jittery: StoredRun) -> None:

@@ -217,7 +217,7 @@ def test_a_recording_has_the_egos_view_and_the_requests_with_their_pictures(
         assert [stamp.sec * 10**9 + stamp.nanosec for stamp in stamps] == [each.at_ns for each in pictures]
         apart_ns = np.diff([message.at_ns for message in pictures])
         assert len(apart_ns) >= 3
-        assert apart_ns.min() >= 200_000_000
+        assert apart_ns.min() > 150_000_000
         assert pictures[0].at_ns < recorded[f"{topic}/ego/odom"][0].at_ns  # it is seen before the request too
         assert (pictures[0].data.data != pictures[-1].data.data).any()
     assert len(recorded["/s2a_bench/camera/image_raw"]) == 4  # the warm-up's too

@@ -15,9 +15,8 @@ from s2a_bench.experiments.chunks.view import chunk_sentences, show
 from s2a_bench.experiments.chunks.view.figures import (
     build_lanes,
     build_reactions,
-    build_smoothness,
-    build_stability,
     build_triggers,
+    chunk_figures,
     lanes_of,
     short,
 )
@@ -90,7 +89,7 @@ def test_lanes_show_the_modes_and_the_calibrated_trigger(run: StoredRun) -> None
 
 
 def test_stalls_are_a_line_a_mode_over_mean_latency(run: StoredRun) -> None:
-    (axes,) = drawn(run, build_stability).axes
+    (axes,) = drawn(run, lambda run: chunk_figures(run)["stability"]()).axes
     assert [line.get_label() for line in axes.lines] == ["sync", "queue?trigger=6", "replace", "aggregate?trigger=6"]
     share = {line.get_label(): np.asarray(line.get_ydata()) for line in axes.lines}
     ms = np.asarray(axes.lines[0].get_xdata())
@@ -129,7 +128,7 @@ def test_smoothness_stands_beside_the_ideal(run: StoredRun) -> None:
 
 
 def test_smoothness_is_a_line_a_mode_and_the_ideal_dashed(run: StoredRun) -> None:
-    panels = drawn(run, build_smoothness).axes
+    panels = drawn(run, lambda run: chunk_figures(run)["smoothness"]()).axes
     for axes in panels:
         *modes, ideal = axes.lines
         assert [line.get_label() for line in modes] == ["sync", "queue?trigger=6", "replace", "aggregate?trigger=6"]

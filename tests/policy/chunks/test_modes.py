@@ -146,11 +146,11 @@ def test_time_scaling_takes_longer_ticks_and_never_shorter_ones_than_asked() -> 
 @pytest.mark.parametrize(
     ("written", "message"),
     [
-        ("wait", "`mode`: 'wait' is none of sync, queue, streamed, replace, aggregate"),
-        ("queue?trigger=-1", "`mode`: queue: trigger = '-1': input should be greater than or equal to 0"),
-        ("replace?execute=0", "`mode`: replace: execute = '0'"),
-        ("replace?s=2", "`mode`: replace: 's' is no parameter; its parameters are execute, under_way, assumed"),
-        ("aggregate?kind=best", "`mode`: aggregate: kind = 'best'"),
+        ("wait", "`modes`: 'wait' is none of sync, queue, streamed, replace, aggregate"),
+        ("queue?trigger=-1", "`modes`: queue: trigger = '-1': input should be greater than or equal to 0"),
+        ("replace?execute=0", "`modes`: replace: execute = '0'"),
+        ("replace?s=2", "`modes`: replace: 's' is no parameter; its parameters are execute, under_way, assumed"),
+        ("aggregate?kind=best", "`modes`: aggregate: kind = 'best'"),
     ],
 )
 def test_a_mode_that_is_none_is_refused(written: str, message: str) -> None:

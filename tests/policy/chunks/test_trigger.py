@@ -201,7 +201,7 @@ def test_the_maximum_never_forgets_one_outlier_and_tracking_does() -> None:
     found = follow(Maximum(), latency_ns, setting, 60)
     assert set(found[501:].tolist()) == {45}
     assert np.flatnonzero(stalled(found, latency_ns, setting)).tolist() == [0, 500]
-    found = follow(TrackedLatency.begin(latency_ns[:500], 0.01, step=0.002), latency_ns[500:], setting, 60)
+    found = follow(TrackedLatency.begin(latency_ns[:500], 0.01), latency_ns[500:], setting, 60)
     assert set(found.tolist()) == {2}
     assert np.flatnonzero(stalled(found, latency_ns[500:], setting)).tolist() == [0]
 

@@ -28,6 +28,8 @@ COLOURS: Final = ("#0072B2", "#56B4E9", "#009E73")
 _BAR: Final = 0.34
 _AGE: Final = 0.42
 LINE_COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#999999")
+STALLS: Final = {"stall_share": "stalled share"}
+SMOOTHNESS: Final = {"tracking_rms": "tracking error (sd)", "jerk_rms": "jerk (sd/s$^3$)"}
 _RULES: Final = {"calibrated": "o", "tracked": "s", "maximum": "^", "mean": "v", "oracle": "*"}
 _INK: Final = "#222222"
 _MOST_PANELS: Final = 8
@@ -59,7 +61,7 @@ def lanes_of(run: StoredRun) -> list[CellTicks]:
     found = []
     for row in rows_of(run):
         mine = ticks[ticks["cell"] == row["cell"]]
-        if len(mine) and row["rule"] in {"given", "calibrated"}:
+        if len(mine) and _drawn(row):
             sent = requests[requests["cell"] == row["cell"]]
             found.append(CellTicks(row["mode"], row["rule"], row["latency"], mine, sent, row["delta_t_s"]))
     return found[:MOST_LANES]
@@ -168,29 +170,18 @@ def chunk_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
     if lanes_of(run):
         found["lanes"] = partial(build_lanes, run)
     if len(means := run.table(MEANS)):
-        found["stability"] = partial(build_stability, run)
+        found["stability"] = partial(build_over_means, run, "Stalled share of the ticks", STALLS)
     if len(run.table(TRIGGERS)):
         found["triggers"] = partial(build_triggers, run)
     if len(run.table(REACTIONS)):
         found["reactions"] = partial(build_reactions, run)
     if means["tracking_rms"].notna().any():
-        found["smoothness"] = partial(build_smoothness, run)
+        found["smoothness"] = partial(build_over_means, run, "Following a target", SMOOTHNESS)
     return found
 
 
-def build_stability(run: StoredRun) -> Figure:
-    """Draw the stalled share of the ticks over mean latency, a line a mode."""
-    return _over_means(run, "Stalled share of the ticks", {"stall_share": "stalled share"})
-
-
-def build_smoothness(run: StoredRun) -> Figure:
-    """Draw tracking error and jerk over mean latency; dashed: the plant with a request in every tick."""
-    panels = {"tracking_rms": "tracking error (sd)", "jerk_rms": "jerk (sd/s$^3$)"}
-    return _over_means(run, "Following a target", panels)
-
-
-def _over_means(run: StoredRun, what: str, shown: Mapping[str, str]) -> Figure:
-    """Draw columns over mean latency, a panel each; dashed: their ideal, if any."""
+def build_over_means(run: StoredRun, what: str, shown: Mapping[str, str]) -> Figure:
+    """Draw columns over mean latency, a panel each, a line a mode; dashed: a request in every tick, no latency."""
     rows = run.table(MEANS)
     modes = [str(mode) for mode in rows["mode"].unique()][: len(LINE_COLOURS)]
     columns = 2 if max(map(len, modes)) <= LINE_CHARS // 3 else 1

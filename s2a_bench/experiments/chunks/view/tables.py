@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from s2a_bench.experiments import SHARE, Tables
+from s2a_bench.experiments import SHARE, Tables, plain_rows
 from s2a_bench.experiments.chunks.rows import CHUNKS, METRICS, ChunkRow
 from s2a_bench.policy.conformal import promise
 from s2a_bench.store.manifest import present
-from s2a_bench.store.schema import PROVENANCE, about
+from s2a_bench.store.schema import about
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, EMULATED, Note, TextTable, number
@@ -63,10 +63,7 @@ _EMULATED: Final = Note(
 
 def rows_of(run: StoredRun) -> list[Row]:
     """Return the rows of a run in the order of the options; a missing value is None."""
-    table = run.table(CHUNKS).drop(columns=PROVENANCE)
-    whole = table.astype(object).where(table.notna(), None)
-    rows = [{str(name): value for name, value in row.items()} for row in whole.to_dict("records")]
-    settings = run.manifest["configuration"]
+    rows, settings = plain_rows(run, CHUNKS), run.manifest["configuration"]
     order = [*((name, "given") for name in settings["modes"]), *((None, rule) for rule in settings["rules"])]
 
     def place(row: Row) -> tuple[str, int]:

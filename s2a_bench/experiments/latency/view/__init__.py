@@ -274,7 +274,7 @@ def _frame_table(run: StoredRun) -> TextTable | None:
     if run.frames.empty:
         return None
     cells = cells_of(run)
-    used = [_used(run, cell) for cell in cells]
+    used = [run.frames[run.frames["used_by"].isin(cell.good["request_id"])] for cell in cells]
     rows = []
     for stage, group in run.stages.items():
         entries_of = [_frame_entry(frames, stage) for frames in used]
@@ -291,10 +291,6 @@ def _frame_table(run: StoredRun) -> TextTable | None:
         2,
         frozenset({rule + 1}),
     )
-
-
-def _used(run: StoredRun, cell: RequestCell) -> pd.DataFrame:
-    return run.frames[run.frames["used_by"].isin(cell.good["request_id"])]
 
 
 def _frame_entry(frames: pd.DataFrame, column: str) -> str:

@@ -145,14 +145,10 @@ def _legend(cells: Sequence[Timelines]) -> list[object]:
     ]
     if any((cell.skills["stall_ns"] > _VISIBLE_NS).any() for cell in cells):
         handles.append(Patch(label="stall", **STALL_STYLE))
-    if any(_stretched(cell) for cell in cells):
+    longer_ns = (cell.skills["end_ns"] - cell.skills["start_ns"] - cell.skills["nominal_ns"] for cell in cells)
+    if any((each > _VISIBLE_NS).any() for each in longer_ns):
         handles.append(Patch(facecolor="#B5B5B5", linewidth=0, label="stretched (paler)"))
     return handles
-
-
-def _stretched(cell: Timelines) -> bool:
-    longer_ns = cell.skills["end_ns"] - cell.skills["start_ns"] - cell.skills["nominal_ns"]
-    return bool((longer_ns > _VISIBLE_NS).any())
 
 
 def _caption(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:

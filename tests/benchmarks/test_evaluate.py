@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.evaluate import evaluate
 from s2a_bench.policy import Plans, policy
-from s2a_bench.policy.evaluate import evaluate
 from s2a_bench.policy.metrics import measure
 from s2a_bench.policy.schedule import BLOCK
 from s2a_bench.testing.policy import draw
