@@ -221,10 +221,6 @@ class EngineConfig(Options):
         return f"{self.horizon} actions of {self.action_dim}"
 
 
-class _UndeclaredEngine(Engine):
-    """The engine of an old run that is not installed."""
-
-
 def acting() -> str:
     return " or ".join(name for name, kind in ENGINES.loaded() if kind.acts)
 
@@ -235,7 +231,7 @@ def declared_engine(name: str) -> type[Engine]:
     try:
         return ENGINES[name]
     except UsageError:
-        return _UndeclaredEngine
+        return Engine
 
 
 def check_engine(config: EngineConfig) -> None:

@@ -112,13 +112,10 @@ ONE_SUBSCRIPTION = (1, 0, 0, 0, 0, 0)
 class Unserved(CallbackGroup):  # type: ignore[misc]
     """A group whose entities no executor waits for or serves."""
 
-    def can_execute(self, entity: Any) -> bool:
-        del entity
+    def can_execute(self, _entity: Any) -> bool:
         return False
 
-    def beginning_execution(self, entity: Any) -> bool:
-        del entity
-        return False
+    beginning_execution = can_execute
 
     def ending_execution(self, entity: Any) -> None:
         """Nothing has begun."""

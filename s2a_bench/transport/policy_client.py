@@ -21,6 +21,9 @@ QUOTED: Final = 500
 
 
 class PolicyClient(Client, Generic[P]):
+    _link: Any = None
+    """The connection, where there is one."""
+
     def __init__(self, wiring: Wiring[P], alive: Callable[[], bool]) -> None:
         self._wiring, self._alive = wiring, alive
         self._native = not wiring.black_box
@@ -44,7 +47,12 @@ class PolicyClient(Client, Generic[P]):
 
     def _abandon(self) -> None:
         """Give up the connection, whose answer is incomplete."""
-        self.close()
+        if self._link is not None:
+            self._link.close()
+            self._link = None
+
+    def close(self) -> None:
+        self._abandon()
 
     def _bounds(self, max_tokens: int) -> Bounds:
         return Bounds(self._url, self._wiring.deadline_of(max_tokens), max_tokens)

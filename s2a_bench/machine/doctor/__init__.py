@@ -103,9 +103,7 @@ CHECKS: dict[str, str] = {
 }
 """Code of the findings -> check, in the order of the output; engines and transports declare more."""
 
-BEFORE_RUN = (
-    *("cpus", "cpu-governor", "jetson-clocks", "load", "temperature", "gpu-throttling", "clock-source", "disk"),
-)
+BEFORE_RUN = "cpus", "cpu-governor", "jetson-clocks", "load", "temperature", "gpu-throttling", "clock-source", "disk"
 """The checks before every measurement: their findings distort its numbers or end it early."""
 
 

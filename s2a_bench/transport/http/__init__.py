@@ -56,9 +56,7 @@ class Http(Transport[HttpOptions]):
         "llama-server": ("#8C510A", ":"),
     }
     compared_with = BESIDE
-    packages = (
-        *("fastapi", "httptools", "httpx", "json-numpy", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"),
-    )
+    packages = "fastapi", "httptools", "httpx", "json-numpy", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"
     client_class = "s2a_bench.transport.http.client:HttpClient"
     urls = Urls(
         HttpOptions.SCHEMES,

@@ -70,11 +70,6 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
                 raise ServerDied(f"the server has ended: {error}") from error
             raise RequestFailed(str(error), starting=error.starting) from error
 
-    def _abandon(self) -> None:
-        if self._link is not None:
-            self._link.close()
-            self._link = None
-
     def _pack(self, request: Request, trace: Trace) -> bytes:
         """Fill the template and write it as MessagePack, marking each stage."""
         observation = self._observation(request, trace)

@@ -144,11 +144,6 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         template = {"template": layouts.MODALITIES} if self._modalities else {}
         return {**super().describe(), **template, "layout": self._layout}
 
-    def close(self) -> None:
-        if self._link is not None:
-            self._link.close()
-            self._link = None
-
 
 def examine(parts: SplitResult) -> Iterator[Finding | str]:
     """Ping without a key; if that is answered, read how its configurations are marked."""
