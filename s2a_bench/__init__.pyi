@@ -137,6 +137,8 @@ class _Capacity(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyTh
 
 class _Ccrb(_Run, total=False):
     chat_template: str
+    closed_loop: bool
+    ego: str
     engine: str
     follower: str
     front_gap: float

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import heapq
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import count
 from queue import Empty, SimpleQueue
 from typing import Literal, Protocol, TypeAlias
 
-from s2a_bench.clock import now_ns
+from s2a_bench.clock import VirtualClock, now_ns
 from s2a_bench.plan import Call, Parser, SkillParsed
 from s2a_bench.plan import Event as PlanEvent
 
@@ -136,4 +138,29 @@ class LiveInbox:
                 found.append(self._events.get(timeout=None if until_ns is None else max(until_ns - now_ns(), 0) / 1e9))
         while not self._events.empty():  # this is the only reader
             found.append(self._events.get())
+        return found
+
+
+class VirtualInbox:
+    """An inbox on a virtual clock, which waiting moves; events arrive at their times, then in the order of `put`."""
+
+    def __init__(self, clock: VirtualClock, events: Iterable[Event] = ()) -> None:
+        self._clock = clock
+        self._order = count()
+        self._events: list[tuple[int, int, Event]] = []
+        for event in events:
+            self.put(event)
+
+    def put(self, event: Event) -> None:
+        heapq.heappush(self._events, (event.at_ns, next(self._order), event))
+
+    def wait(self, until_ns: int | None) -> list[Event]:
+        """Jump to the next event, or to ``until_ns``; raises RuntimeError without either."""
+        times_ns = [each for each in (until_ns, *(event[0] for event in self._events[:1])) if each is not None]
+        if not times_ns:
+            raise RuntimeError("nothing will ever happen: the executor would wait for ever")
+        self._clock.sleep_until_ns(min(times_ns))
+        found = []
+        while self._events and self._events[0][0] <= self._clock.now_ns():
+            found.append(heapq.heappop(self._events)[2])
         return found

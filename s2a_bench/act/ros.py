@@ -11,10 +11,10 @@ gap behaviour is published on ``<namespace>/gap`` as std_msgs/msg/String: stop, 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from threading import Lock, Thread
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from pydantic import Field
@@ -23,21 +23,10 @@ from s2a_bench.act import ActionKind, ActionRobot, Report, Running, SkillKind
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RobotError, S2AError, TransportError, UsageError
 from s2a_bench.plan import Call, Gap, SkillSet
-from s2a_bench.ros import (
-    MIDDLEWARES,
-    ActionClient,
-    ActionEvent,
-    Middleware,
-    QoS,
-    Rejected,
-    Result,
-    open_middleware,
-)
+from s2a_bench.ros import ActionClient, ActionEvent, Middleware, QoS, Rejected, Result, RosParameters
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
-from s2a_bench.ros.router import ROUTER, Router, endpoint_of
 from s2a_bench.ros.service import appeared
-from s2a_bench.text import none_of
 from s2a_bench.types import Vector
 
 TRAJECTORY: Final = "trajectory_msgs/msg/JointTrajectory"
@@ -48,26 +37,21 @@ STRING: Final = "std_msgs/msg/String"
 POLL_S: Final = 0.2
 FOR_ACTIONS: Final = ("topic", "type", "joints")
 FOR_SKILLS: Final = ("namespace",)
-_T = TypeVar("_T")
 _NAME: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
 @dataclass(frozen=True, slots=True)
-class RosRobot(SkillKind, ActionKind):
+class RosRobot(RosParameters, SkillKind, ActionKind):
     """Publish each action on ``topic`` as a message of ``type``; send skills to the node in ``namespace``.
 
-    ``joints`` are the joints' names separated by colons; joint_1, joint_2, ... by default. ``middleware``,
-    ``domain_id`` and ``router`` are those of the ROS transport: default_middleware, ROS_DOMAIN_ID, rmw_zenoh's. Without
-    a peer, a subscription or an action server, within ``wait_s`` opening fails; 0 does not wait for a peer.
+    ``joints`` are the joints' names separated by colons; joint_1, joint_2, ... by default. Without a peer, a
+    subscription or an action server, within ``wait_s`` opening fails; 0 does not wait for a peer.
     """
 
     topic: str = "/joint_trajectory"
     type: Literal["JointTrajectory", "Float64MultiArray"] = "JointTrajectory"
     joints: str = ""
     namespace: str = "/robot"
-    middleware: str = ""
-    domain_id: Annotated[int, Field(ge=0, le=232)] | None = None
-    router: str = ROUTER
     wait_s: Annotated[float, Field(ge=0, le=3600)] = 10.0
 
     def __post_init__(self) -> None:
@@ -78,9 +62,7 @@ class RosRobot(SkillKind, ActionKind):
             raise UsageError(f"joints = '{self.joints}': {self.type} has no names of joints")
         if self.joints and len(set(self.names)) < len(self.names):
             raise UsageError(f"joints = '{self.joints}' names one twice")
-        if self.middleware and self.middleware not in MIDDLEWARES:
-            raise UsageError(f"middleware = {none_of(self.middleware, MIDDLEWARES)}")
-        endpoint_of(self.router)
+        RosParameters.__post_init__(self)
 
     @property
     def names(self) -> list[str]:
@@ -89,7 +71,7 @@ class RosRobot(SkillKind, ActionKind):
     def open_skills(self, skills: SkillSet) -> RosSkills:
         del skills
         self._refuse(FOR_ACTIONS, "actions, not skills")
-        return self._join("/s2a_bench/executor", lambda node: RosSkills(node, self.namespace, self.wait_s))
+        return self.join("/s2a_bench/executor", lambda node: RosSkills(node, self.namespace, self.wait_s))
 
     def open_actions(self, dims: int, period_ns: int) -> RosActions:
         """Join the domain; raises UsageError for other joints than ``dims``, RobotError without a subscription."""
@@ -97,25 +79,12 @@ class RosRobot(SkillKind, ActionKind):
         names = self.names or [f"joint_{joint}" for joint in range(1, dims + 1)]
         if len(names) != dims:
             raise UsageError(f"`robot`: ros: joints = '{self.joints}' names {len(names)} joints of {dims}")
-        return self._join("/s2a_bench/robot", lambda node: RosActions(self, node, names, period_ns))
+        return self.join("/s2a_bench/robot", lambda node: RosActions(self, node, names, period_ns))
 
     def _refuse(self, names: Sequence[str], about: str) -> None:
         for field in fields(self):
             if field.name in names and getattr(self, field.name) != field.default:
                 raise UsageError(f"`robot`: ros: {field.name} is about {about}")
-
-    def _join(self, node_name: str, opened: Callable[[Middleware], _T]) -> _T:
-        middleware = open_middleware(
-            self.middleware,
-            domain_id=self.domain_id,
-            node_name=node_name,
-            router=Router(self.router),
-        )
-        try:
-            return opened(middleware)
-        except BaseException:
-            middleware.close()
-            raise
 
 
 class RosActions(ActionRobot):

@@ -14,17 +14,16 @@ from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, cycle, repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
 
 from s2a_bench.boards.gaps import FAMILIES, Constant, Gaps, from_table, read_family
 from s2a_bench.errors import UsageError
 from s2a_bench.text import like
 
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Ints: TypeAlias = NDArray[np.int64]
+Ints: TypeAlias = NDArray[np.int64]
 
 EXAMPLE: Final = "lognormal:mean_ms=80,cv=0.5"
 UNITS_NS: Final = {"latency_ns": 1, "latency_ms": 1_000_000, "latency_s": 1_000_000_000}
@@ -69,8 +68,6 @@ def sequence_ns(latencies: Latencies) -> Iterator[int]:
     A recording is played in its order and starts again after its end. A family with memory keeps it for `STRETCH`
     latencies.
     """
-    import numpy as np
-
     if latencies.recorded_ns is not None:
         return cycle(latencies.recorded_ns.tolist())
     if latencies.gaps is None:
@@ -81,8 +78,6 @@ def sequence_ns(latencies: Latencies) -> Iterator[int]:
 
 
 def whole_ns(latency_s: NDArray[np.float64]) -> Ints:
-    import numpy as np
-
     return np.rint(latency_s * 1e9).astype(np.int64)
 
 
@@ -107,8 +102,6 @@ def family(written: str) -> Gaps:
 
 def read_delays(path: Path) -> Ints:
     """Return the latencies of a CSV file in its order, in ns; raises UsageError naming file, line and column."""
-    import numpy as np
-
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)

@@ -21,8 +21,8 @@ from pydantic import Field
 
 from s2a_bench.boards.profile import SHIPPED
 from s2a_bench.errors import UsageError
-from s2a_bench.text import none_of, read_text
-from s2a_bench.toml_file import Line, TomlTable, checked, loads
+from s2a_bench.text import none_of
+from s2a_bench.toml_file import Line, TomlTable, checked, loads, read
 
 PUBLISHED: Final = SHIPPED / "links" / "published.toml"
 OPPORTUNITY_BYTES: Final = 1500
@@ -173,10 +173,7 @@ def load_link(text: str) -> LinkProfile:
     elif first.endswith(".csv"):
         values = {"trace": first}
     elif "/" in first or first.endswith(".toml"):
-        try:
-            values = {"name": Path(first).stem, **loads(read_text(first), f"link {first}")}
-        except (OSError, UnicodeDecodeError) as error:
-            raise UsageError(f"`link`: cannot read {first}: {error}") from error
+        values = {"name": Path(first).stem, **loads(read(first, "link"), f"link {first}")}
     elif first in (known := published()):
         values = known[first].model_dump(exclude_unset=True)
     else:
@@ -239,10 +236,7 @@ def _mahimahi_steps(path: str, profile: LinkProfile) -> tuple[list[Step], float]
 
 
 def _lines(path: str) -> list[str]:
-    try:
-        return read_text(path, 64 * MOST_STEPS).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"`link`: cannot read {path}: {error}") from error
+    return read(path, "link", 64 * MOST_STEPS).splitlines()
 
 
 def _checked_steps(steps: list[Step], where: str) -> list[Step]:

@@ -15,8 +15,8 @@ from pydantic import Field, ValidationInfo, field_validator
 from s2a_bench.boards.gaps import Gaps, from_table
 from s2a_bench.errors import UsageError
 from s2a_bench.provenance import Provenance
-from s2a_bench.text import none_of, read_text
-from s2a_bench.toml_file import Line, TomlTable, parse
+from s2a_bench.text import none_of
+from s2a_bench.toml_file import Line, TomlTable, parse, read
 
 SHIPPED: Final = Path(__file__).parent.parent / "profiles"
 """A link to profiles/ at the top of the repository; files in an installed package."""
@@ -114,11 +114,7 @@ class _ProfileFile(TomlTable):
 
 def read_profile(path: Path) -> Profile:
     """Read a file, whose name is the profile's. Raises UsageError naming file and key."""
-    try:
-        text = read_text(path)
-    except (OSError, UnicodeDecodeError) as error:
-        raise UsageError(f"profile {path}: cannot be read: {error}") from error
-    return parse_profile(path.stem, text, f"profile {path}")
+    return parse_profile(path.stem, read(path, "profile"), f"profile {path}")
 
 
 def parse_profile(name: str, text: str, where: str) -> Profile:

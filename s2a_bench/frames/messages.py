@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Final, cast
+from typing import Any, ClassVar, Final, cast
 
 from s2a_bench.errors import SourceError, TransportError
 from s2a_bench.frames import NumberedSource, check_size
@@ -25,6 +25,8 @@ class ImageMessages(NumberedSource):
     YUYV, which cannot be scaled, is converted to ``bgr8`` for another size.
     """
 
+    option: ClassVar[str] = "source"
+
     def begin(self, message: Any) -> None:
         """Take the encoding of the first message; raises SourceError if it cannot be read."""
         self.encoding: Encoding = self._frame(message).encoding
@@ -35,7 +37,7 @@ class ImageMessages(NumberedSource):
         frame = self._frame(message)
         if frame.encoding != self.encoding:
             raise SourceError(
-                f"`source`: {self.name} changes from {self.encoding} at {self.width}x{self.height} to "
+                f"`{self.option}`: {self.name} changes from {self.encoding} at {self.width}x{self.height} to "
                 f"{message.encoding} at {message.width}x{message.height}; a source has one format: cut the recording, "
                 "or leave the camera's settings as they are"
             )
@@ -57,7 +59,7 @@ class ImageMessages(NumberedSource):
         try:
             yield
         except (ValueError, TransportError) as error:
-            raise SourceError(f"`source`: {self.name}: {what}{error}") from error
+            raise SourceError(f"`{self.option}`: {self.name}: {what}{error}") from error
 
 
 def decompressed(image: Any, most_pixels: int = MOST_PIXELS) -> Frame:

@@ -2,44 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from threading import Condition, Thread
-from typing import Annotated, Any, ClassVar, Final
-
-from pydantic import Field
+from typing import Any, ClassVar, Final
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.frames.messages import TYPES, ImageMessages
 from s2a_bench.policy.parameters import build
-from s2a_bench.ros import MIDDLEWARES, Offer, QoS, open_middleware
+from s2a_bench.ros import Offer, QoS, RosParameters
 from s2a_bench.ros.remap import NODE_NAME as NAME
-from s2a_bench.ros.router import ROUTER, Router, endpoint_of
 from s2a_bench.ros.service import appeared
-from s2a_bench.text import none_of
 from s2a_bench.types import Frame, Pixels
 
 POLL_S: Final = 0.5
 
 
-@dataclass(frozen=True, slots=True)
-class TopicParameters:
-    """Where a topic is, as of the ROS transport; for ``wait_s`` a publisher is waited for, and each picture."""
-
-    middleware: str = ""
-    domain_id: Annotated[int, Field(ge=0, le=232)] | None = None
-    router: str = ROUTER
-    wait_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
-
-    def __post_init__(self) -> None:
-        if self.middleware and self.middleware not in MIDDLEWARES:
-            raise UsageError(f"middleware = {none_of(self.middleware, MIDDLEWARES)}")
-        endpoint_of(self.router)
-
-
 class TopicCamera(ImageMessages):
     """A topic of sensor_msgs/Image or CompressedImage; the subscription is reliable if all its publishers are.
 
+    ``/topic?middleware=...`` has `RosParameters`; for ``wait_s`` a publisher is waited for, and each picture.
     read() returns the newest picture, one time; ``stamp_ns`` is when it was received.
     """
 
@@ -50,7 +31,7 @@ class TopicCamera(ImageMessages):
         self._topic = where.partition("?")[0]
         if not NAME.fullmatch(self._topic):
             raise UsageError(f"`source`: '{self.name}' should look like ros:/camera/image_raw, from the root")
-        how = build(TopicParameters, self.name, "source")
+        how = build(RosParameters, self.name, "source")
         self._wait_s = how.wait_s
         self._changed = Condition()
         self._middleware: Any = None
@@ -58,9 +39,7 @@ class TopicCamera(ImageMessages):
         self._thread = Thread(target=self._receive, name="topic", daemon=True)
         try:
             with self.errors():
-                self._middleware = open_middleware(
-                    how.middleware, domain_id=how.domain_id, node_name="/s2a_bench/source", router=Router(how.router)
-                )
+                self._middleware = how.join("/s2a_bench/source", lambda node: node)
                 offers = self._offers()
                 qos = QoS(depth=1, reliable=all(offer.reliable for offer in offers))
                 self._subscription = self._middleware.subscription(self._topic, offers[0].type_name, qos)
@@ -106,8 +85,8 @@ class TopicCamera(ImageMessages):
             raise TransportError(f"{self._topic} is of type {', '.join(types)}; {listed}")
         raise TransportError(
             f"{self._topic} has no publisher after {self._wait_s:g} s; {listed}. "
-            "Is ROS_DOMAIN_ID (or `?domain_id=` of the source) the publisher's, and is ROS_AUTOMATIC_DISCOVERY_RANGE "
-            "SUBNET if it is on another host?"
+            f"Is ROS_DOMAIN_ID (or `?domain_id=` of the {self.option}) the publisher's, and is "
+            "ROS_AUTOMATIC_DISCOVERY_RANGE SUBNET if it is on another host?"
         )
 
     def _receive(self) -> None:

@@ -21,6 +21,8 @@ from itertools import pairwise, product
 from math import ceil, floor
 from typing import Final, TypeAlias
 
+import numpy as np
+
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import ClockMoved, RequestFailed, S2AError
 from s2a_bench.machine.clocks import FRESH_NS, wall_clock
@@ -152,8 +154,6 @@ def interval_at(at_ns: int, exchanges: Sequence[Exchange | Bounded]) -> Interval
     The least and the greatest value are those of vertices of the polygon: of lines through two of the bounds, or
     through one at the limit of `RATE`.
     """
-    import numpy as np
-
     base_ns = exchanges[0].upper[1]
     upper = _lower_hull((time - at_ns, bound - base_ns) for time, bound in (each.upper for each in exchanges))
     mirrored = _lower_hull((time - at_ns, base_ns - bound) for time, bound in (each.lower for each in exchanges))

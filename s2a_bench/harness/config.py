@@ -55,8 +55,6 @@ else:  # a group of options for each transport; options that only `serve` has ar
 
 
 class RequestsConfig(Options):
-    """The settings of one run of requests."""
-
     PANEL: ClassVar[str] = "Requests"
     QUICK: ClassVar[dict[str, int]] = {"requests": 10, "warmup": 2, "max_tokens": 8}
     """The defaults under ``quick``."""

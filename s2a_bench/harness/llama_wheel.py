@@ -35,7 +35,6 @@ def server_settings(engine: EngineConfig, port: int, *, ignore_end: bool) -> dic
 
 
 def main() -> int:
-    """Serve until standard input ends."""
     line = sys.stdin.readline()
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what llama.cpp prints belongs in the log

@@ -77,8 +77,6 @@ class RequestPlan:
 
 @dataclass(frozen=True, slots=True)
 class RunPlan:
-    """One run of requests."""
-
     cells: tuple[Pipeline, ...]
     blocks: BlocksPlan
     feed: FeedPlan
@@ -108,7 +106,6 @@ class RunPlan:
         return replace(self, manifest={**self.manifest, **facts})
 
     def with_cells(self, cells: Sequence[Pipeline]) -> RunPlan:
-        """Return the plan with further cells."""
         every = (*self.cells, *cells)
         stages = path_of(cell.transport.stages for cell in every)
         return replace(self, cells=every, request=replace(self.request, stages=stages)).with_manifest(stages=stages)

@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from pathlib import Path
 from selectors import EVENT_READ, DefaultSelector
-from typing import IO, Any
+from typing import IO, Any, cast
 
 import httpx
 
@@ -133,38 +133,32 @@ class OwnProcess(ServerProcess):
 
     def __init__(self, name: str, module: str, job: str, log: Path | None, pass_fds: Sequence[int] = ()) -> None:
         super().__init__(name, [sys.executable, "-m", module], log, pass_fds)
-        assert self._process.stdin is not None  # noqa: S101 - opened as a pipe above
+        self._input, self._output = cast("tuple[IO[bytes], IO[bytes]]", (self._process.stdin, self._process.stdout))
         with suppress(BrokenPipeError):  # it has ended: `wait_ready` says how
-            self._process.stdin.write(job.encode() + b"\n")
-            self._process.stdin.flush()
+            self._input.write(job.encode() + b"\n")
+            self._input.flush()
 
     def _ask_to_stop(self) -> None:
-        if self._process.stdin is not None:
-            with suppress(BrokenPipeError):  # it never read its job
-                self._process.stdin.close()
+        with suppress(BrokenPipeError):  # it never read its job
+            self._input.close()
 
     def ask(self) -> dict[str, Any]:
         """Send an empty line, and return the JSON line that a relay answers with; raises ServerDied."""
-        stdin, stdout = self._process.stdin, self._process.stdout
-        assert stdin is not None  # noqa: S101 - opened as pipes above
-        assert stdout is not None  # noqa: S101
         try:
-            stdin.write(b"\n")
-            stdin.flush()
-            answer: dict[str, Any] = json.loads(stdout.readline())
+            self._input.write(b"\n")
+            self._input.flush()
+            answer: dict[str, Any] = json.loads(self._output.readline())
         except (OSError, ValueError):
             self.ends_within(STOP_TIMEOUT_S)
             raise self.death() from None
         return answer
 
     def wait_ready(self) -> None:
-        stdout = self._process.stdout
-        assert stdout is not None  # noqa: S101 - opened as a pipe above
         with DefaultSelector() as selector:
-            selector.register(stdout, EVENT_READ)
+            selector.register(self._output, EVENT_READ)
             if not selector.select(READY_TIMEOUT_S):
                 raise self.no_start(NOT_READY)
-        line = stdout.readline()
+        line = self._output.readline()
         if not line.endswith(b"\n"):
             self.ends_within(STOP_TIMEOUT_S)  # dumping core, perhaps
             self._process.kill()
@@ -313,5 +307,4 @@ def _free_port(wanted: int) -> int:
             raise PortInUse(
                 f"`port`: {wanted} cannot be had on 127.0.0.1 ({error.strerror}); choose another, or 0 for any free one"
             ) from error
-        port: int = probe.getsockname()[1]
-        return port
+        return int(probe.getsockname()[1])

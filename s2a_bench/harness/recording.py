@@ -8,7 +8,6 @@ while a sample is measured; in stream mode, which has no pauses, a thread writes
 from __future__ import annotations
 
 import re
-from contextlib import AbstractContextManager
 from pathlib import Path
 
 from s2a_bench.clock import realtime_offset_ns
@@ -28,11 +27,9 @@ def namespace_of(options: Options) -> str:
     return found or NAMESPACE
 
 
-class RunRecorder(AbstractContextManager["RunRecorder"]):
-    """The recording of one run. Use as a context manager."""
-
+class RunRecorder(BagRecorder):
     def __init__(self, path: Path, namespace: str, *, live: bool) -> None:
-        self._recorder = BagRecorder(path, live=live)
+        super().__init__(path, live=live)
         self._namespace = namespace
         self._offset_ns = realtime_offset_ns()
 
@@ -40,22 +37,16 @@ class RunRecorder(AbstractContextManager["RunRecorder"]):
         stamp_ns = frame.stamp_ns + self._offset_ns
         if frame.encoding in ros.CHANNELS:
             message = ros.image_message(frame, stamp_ns, FRAME_ID)
-            self._recorder.write(self._namespace + CAMERA, ros.IMAGE, message, stamp_ns)
+            self.write(self._namespace + CAMERA, ros.IMAGE, message, stamp_ns)
         else:
             message = ros.compressed_image_message(frame.data, stamp_ns, FRAME_ID, frame.encoding)
-            self._recorder.write(self._namespace + COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE, message, stamp_ns)
+            self.write(self._namespace + COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE, message, stamp_ns)
 
     def answer(self, cell: str, request: Request, sent_ns: int, tokens: list[tuple[Piece, int]], error: str) -> None:
         """Record a request and its tokens with the times at which the client received them (CLOCK_MONOTONIC)."""
         topic = f"{self._namespace}/{re.sub('[^A-Za-z0-9/]', '_', cell)}"
-        self._recorder.write(topic + "/request", ros.REQUEST, request_message(request), sent_ns + self._offset_ns)
+        self.write(topic + "/request", ros.REQUEST, request_message(request), sent_ns + self._offset_ns)
         for place, (token, seen_ns) in enumerate(tokens, 1):
             last = place == len(tokens)
             message = token_message(request.id, token, last=last, error=error if last else "")
-            self._recorder.write(topic + "/token", ros.TOKEN, message, seen_ns + self._offset_ns)
-
-    def flush(self) -> None:
-        self._recorder.flush()
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._recorder.__exit__(kind)
+            self.write(topic + "/token", ros.TOKEN, message, seen_ns + self._offset_ns)

@@ -9,16 +9,13 @@ from itertools import count
 from queue import SimpleQueue
 from threading import Event, Thread
 from time import monotonic
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.harness.session import Measured, Place, RequestContext, Session
-from s2a_bench.types import Action
+from s2a_bench.types import Action, Piece, Vector
 
-if TYPE_CHECKING:
-    from s2a_bench.types import Piece, Vector
-
-OnActions: TypeAlias = "Callable[[int, Sequence[Vector], int], None]"
+OnActions: TypeAlias = Callable[[int, Sequence[Vector], int], None]
 """Called with a request's number, the actions received so far, and the time in ns."""
 
 SEEDS: Final = 2**31
@@ -31,8 +28,6 @@ MOST_WAIT_S: Final = 5.0
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A request of the loop."""
-
     request: int
     tick: int
     state: tuple[float, ...]

@@ -132,7 +132,8 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
         guard = SampleGuard({cell.name: cell.options.against_loss for cell in plan.cells})
         run = _Run(task, plan, sources, writer, progress, guard, link)
         if plan.record is not None:
-            run.recorder = stack.enter_context(RunRecorder(plan.record, plan.namespace, live=plan.feed.stream))
+            run.recorder = RunRecorder(plan.record, plan.namespace, live=plan.feed.stream)
+            stack.enter_context(run.recorder)
         run.measure()
         return writer.path
 

@@ -58,7 +58,6 @@ class ServerSet:
     ) -> None:
         """Prepare; ``stack`` stops the servers. The names of servers of a later launch than 0 contain its number."""
         self._link = link
-        self._cells = plan.cells
         self._plan = plan
         self._suffix = f"-launch-{launch + 1}" if launch else ""
         self._stack = stack
@@ -70,12 +69,12 @@ class ServerSet:
 
     @property
     def count(self) -> int:
-        return len({each.server for each in self._cells if not each.options.external_address})
+        return len({each.server for each in self._plan.cells if not each.options.external_address})
 
     def start(self) -> dict[str, Any]:
         """Start all servers and wait until they are ready; return the facts that each reports."""
         with self._link.server_side() if self._link else nullcontext():
-            for pipeline in self._cells:
+            for pipeline in self._plan.cells:
                 if pipeline.server not in self._servers:
                     self._servers[pipeline.server] = self._launch(pipeline)
         facts = {}
@@ -128,7 +127,7 @@ class ServerSet:
     def cache_hits(self) -> Mapping[str, float]:
         """Return counter -> cache hits that the external servers have counted so far."""
         hits: Counter[str] = Counter()
-        for server, pipeline in {each.server: each for each in self._cells}.items():
+        for server, pipeline in {each.server: each for each in self._plan.cells}.items():
             if pipeline.black_box and (hits_of := pipeline.transport.urls.cache_hits):
                 hits.update(resolve_name(hits_of)(self._wiring(pipeline, self._servers[server].address)))
         return hits
@@ -138,7 +137,7 @@ class ServerSet:
         started = {server.name for server in self._servers.values() if isinstance(server.process, OwnServer)}
         names = sorted(facts, key=lambda name: name not in started)
         known = self._local_facts or next((facts[name]["engine"] for name in names if "engine" in facts[name]), {})
-        differs = {name for pipeline in self._cells for name, _ in pipeline.engine}
+        differs = {name for pipeline in self._plan.cells for name, _ in pipeline.engine}
         return {name: fact for name, fact in known.items() if name not in differs}
 
     def origin(self, pipeline: Pipeline) -> Provenance:

@@ -99,7 +99,6 @@ def stop_soon(server: Server) -> None:
 
 
 def main() -> int:
-    """Run a server until standard input ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole process group; the harness decides
     limit_threads()
     line = sys.stdin.readline()

@@ -43,6 +43,7 @@ class Engine(Protocol):
     """The facts that it may report."""
     honours: ClassVar[Sequence[str]] = ()
     """The names in `Request.sampling` that it honours."""
+    _facts: dict[str, float] = {}  # noqa: RUF012 - replaced, never changed
 
     def __init__(self, config: EngineConfig) -> None:
         """Open the engine; raises EngineError, and UsageError for what `check` refuses."""
@@ -63,7 +64,7 @@ class Engine(Protocol):
     @property
     def facts(self) -> dict[str, float]:
         """Return the declared facts about the last request, as llama.cpp's ``timings``."""
-        return {}
+        return self._facts
 
     def generate(self, request: Request) -> Iterator[Piece]:
         """Yield the answer's pieces, at most ``request.max_tokens``; closing the iterator cancels the rest.

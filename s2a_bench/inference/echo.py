@@ -51,15 +51,10 @@ class EchoEngine(Engine):
 
     def __init__(self, config: EngineConfig, clock: Clock | None = None) -> None:
         self.check(config)
-        self._facts: dict[str, float] = {}
         self._config = config
         self._clock = clock or SystemClock()
         self._latencies_ns = _sequence_ns(config) if config.latency else None
         self._closed = False
-
-    @property
-    def facts(self) -> dict[str, float]:
-        return self._facts
 
     def generate(self, request: Request) -> Iterator[Piece]:
         if self._closed:

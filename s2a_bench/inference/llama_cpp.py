@@ -37,7 +37,6 @@ from s2a_bench.inference import (
     EngineConfig,
     llama_log,
 )
-from s2a_bench.inference.gguf_file import GgufHeader
 from s2a_bench.inference.llama_decode import (
     GrammarSampler,
     TokenBatch,
@@ -45,8 +44,7 @@ from s2a_bench.inference.llama_decode import (
     beyond_limits,
     grammar_error,
 )
-from s2a_bench.inference.llama_pictures import PixelHandler
-from s2a_bench.inference.llama_prompt import ChatTemplate, TextHandler, TooLong
+from s2a_bench.inference.llama_prompt import ChatTemplate, PixelHandler, TextHandler, TooLong
 from s2a_bench.inference.models import ModelFiles, load_headers
 from s2a_bench.types import Request, Token
 
@@ -105,17 +103,11 @@ def _refused(what: str, llama: _Prefilled) -> Iterator[None]:
         raise ModelError(f"{what}: {error}") from error
 
 
-def _projector(mmproj: GgufHeader) -> dict[str, str]:
-    fields = mmproj.fields
-    return {"projector": str(fields.get("clip.projector_type") or fields.get("clip.vision.projector_type", ""))}
-
-
 class LlamaCppEngine(Engine):
     """A GGUF model on this machine. ``facts`` holds numbers of the last request, under llama-server's names."""
 
     def __init__(self, config: EngineConfig) -> None:
         """Load both files; raises UsageError for layers on a GPU that this build cannot use, ModelError."""
-        self._facts: dict[str, float] = {}
         if config.gpu_layers and not llama_cpp.llama_supports_gpu_offload():
             raise UsageError(
                 "`gpu_layers`: this llama-cpp-python is built for the CPU alone; "
@@ -161,10 +153,6 @@ class LlamaCppEngine(Engine):
             self._template = ChatTemplate(files.chat_template, llama._model.vocab)  # noqa: SLF001
         return llama
 
-    @property
-    def facts(self) -> dict[str, float]:
-        return self._facts
-
     def generate(self, request: Request) -> Iterator[Token]:
         """Yield one `Token` per token of the model; the last token of a character carries all its bytes.
 
@@ -177,19 +165,19 @@ class LlamaCppEngine(Engine):
         turn = self._turn
         self._check(llama, request)
         started = now_ns()
-        self._evaluate(llama, request)
+        prepared_ns, encode_ns = self._evaluate(llama, request)
         prompt_done = now_ns()
         perf = llama_cpp.llama_perf_context(llama.ctx)
         self._facts = {
             PROMPT_N: float(perf.n_p_eval),
             PROMPT_MS: (prompt_done - started) / _MS_NS,
-            PREPROCESS_MS: (self._handler.prepared_ns - started) / _MS_NS,
+            PREPROCESS_MS: (prepared_ns - started) / _MS_NS,
             PROMPT_EVAL_MS: perf.t_p_eval_ms,
             PREDICTED_N: 0.0,
             PREDICTED_MS: 0.0,
         }
         if request.images and self._files.mmproj:
-            self._facts[VISION_ENCODE_MS] = self._handler.encode_ns / _MS_NS
+            self._facts[VISION_ENCODE_MS] = encode_ns / _MS_NS
         ignore_end = self._files.dummy and not request.grammar  # random weights end at random, counts should not
         decode = codecs.getincrementaldecoder("utf-8")("replace").decode
         llama.set_seed(request.seed & 0x7FFF_FFFF)  # 2**32-1 would mean a random seed
@@ -216,13 +204,13 @@ class LlamaCppEngine(Engine):
                 self._facts[PREDICTED_N] = float(count)
                 self._facts[PREDICTED_MS] = (last_ns - prompt_done) / _MS_NS
 
-    def _evaluate(self, llama: _Prefilled, request: Request) -> None:
-        """Evaluate pictures and prompt, on an empty KV cache, up to the first token's logits."""
+    def _evaluate(self, llama: _Prefilled, request: Request) -> tuple[int, int]:
+        """Evaluate pictures and prompt, on an empty KV cache, up to the first token's logits; return its times."""
         prompt = self._template.prompt(request.prompt, len(request.images) if self._files.mmproj else 0)
         llama_log.reason()
         llama_cpp.llama_perf_context_reset(llama.ctx)
         try:
-            self._handler.evaluate(llama, prompt, request.images, llama.n_ctx() - request.max_tokens)
+            times = self._handler.evaluate(llama, prompt, request.images, llama.n_ctx() - request.max_tokens)
         except TooLong as error:
             raise BadRequest(
                 f"llama: request {request.id} does not fit the context of {llama.n_ctx()} tokens (prompt of {error} "
@@ -232,6 +220,7 @@ class LlamaCppEngine(Engine):
             raise EngineError(f"llama: request {request.id} was refused: {llama_log.reason() or error}") from error
         if not llama.n_tokens:
             raise BadRequest(f"llama: request {request.id} has a prompt without a token; write one")
+        return times
 
     def _check(self, llama: _Prefilled, request: Request) -> None:
         """Refuse requests that would crash llama.cpp: pictures of another size than declared, damaged grammars."""
@@ -254,12 +243,15 @@ class LlamaCppEngine(Engine):
 
     def describe(self) -> dict[str, str | int | float | bool]:
         """Describe the model; the first call hashes the files, which takes seconds for gigabytes."""
-        mmproj = self._files.mmproj
+        seen = {"pictures": "not seen"}
+        if self._files.mmproj:
+            fields = self._files.mmproj.fields
+            seen = {"projector": str(fields.get("clip.projector_type") or fields.get("clip.vision.projector_type", ""))}
         facts: dict[str, str | int | float | bool] = {
             "engine": "llama",
             **self._files.describe(),
             "architecture": self._files.model.architecture,
-            **(_projector(mmproj) if mmproj else {"pictures": "not seen"}),
+            **seen,
             "chat_template_sha256": hashlib.sha256(self._files.chat_template.encode()).hexdigest(),
             "llama_cpp_python": version("llama-cpp-python"),
             "threads": self._threads,

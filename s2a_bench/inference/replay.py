@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from itertools import accumulate, count, islice
 from random import Random
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TypeAlias
+
+import numpy as np
 
 from s2a_bench.boards.gaps import Constant, Gaps, Lognormal, Recorded, to_table
 from s2a_bench.boards.profile import Profile, load_profile
@@ -20,10 +22,7 @@ from s2a_bench.inference import Engine, EngineConfig, chunk
 from s2a_bench.text import none_of
 from s2a_bench.types import Piece, Request, Token
 
-if TYPE_CHECKING:
-    import numpy as np
-
-Draw: TypeAlias = "Callable[[np.random.Generator, int, int], list[float]]"
+Draw: TypeAlias = Callable[[np.random.Generator, int, int], list[float]]
 """(generator, number of gaps, number of gaps played before) -> gaps in s."""
 
 _PLACES = ("kitchen", "table", "shelf", "sofa")
@@ -82,7 +81,6 @@ class ReplayEngine(Engine):
         _settings(config)
 
     def __init__(self, config: EngineConfig, clock: Clock | None = None) -> None:
-        self._facts: dict[str, float] = {}
         self._profile, self._gaps, self._draw = _settings(config)
         self._config = config
         self._clock = clock or SystemClock()
@@ -90,17 +88,11 @@ class ReplayEngine(Engine):
         self._played = 0
         self._closed = False
 
-    @property
-    def facts(self) -> dict[str, float]:
-        return self._facts
-
     def generate(self, request: Request) -> Iterator[Piece]:
         if self._closed:
             raise EngineError("replay: the engine is closed; open a new one")
         if request.max_tokens <= 0:
             return
-        import numpy as np
-
         started_ns = self._clock.now_ns()
         rng = np.random.default_rng((request.seed % 2**32, self._requests))
         self._requests += 1

@@ -11,15 +11,18 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pkgutil import resolve_name
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Annotated, Any, Literal, Protocol, TypeAlias, TypeVar
+
+from pydantic import Field
 
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.extras import how_to_install
 from s2a_bench.ros import config
-from s2a_bench.ros.router import Router
+from s2a_bench.ros.router import ROUTER, Router, endpoint_of
 from s2a_bench.text import none_of
 
 Tuning: TypeAlias = Literal["tuned", "default"]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,7 +313,32 @@ def open_middleware(
     try:
         implementation = resolve_name(MIDDLEWARES[name])
     except ModuleNotFoundError as error:
-        raise TransportError(f"middleware {name} is not installed ({error}); {WAYS_OUT[name]}") from error
+        way = f"{WAYS_OUT[name]}; of a source, robot or ego with ?middleware="
+        raise TransportError(f"middleware {name} is not installed ({error}); {way}") from error
     more = (router or Router(),) if name in ROUTED else ()
     middleware: Middleware = implementation(config.domain_id(os.environ, domain_id), tuning, node_name, *more)
     return middleware
+
+
+@dataclass(frozen=True, slots=True)
+class RosParameters:
+    """How to join a domain, the defaults as of the ROS transport; a peer is waited for ``wait_s``."""
+
+    middleware: str = ""
+    domain_id: Annotated[int, Field(ge=0, le=232)] | None = None
+    router: str = ROUTER
+    wait_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
+
+    def __post_init__(self) -> None:
+        if self.middleware and self.middleware not in MIDDLEWARES:
+            raise UsageError(f"middleware = {none_of(self.middleware, MIDDLEWARES)}")
+        endpoint_of(self.router)
+
+    def join(self, name: str, opened: Callable[[Middleware], T]) -> T:
+        """Return what ``opened`` makes of a node called ``name``; if it raises, the node leaves."""
+        node = open_middleware(self.middleware, domain_id=self.domain_id, node_name=name, router=Router(self.router))
+        try:
+            return opened(node)
+        except BaseException:
+            node.close()
+            raise

@@ -34,6 +34,7 @@ from s2a_bench.ros.service import (
     ServiceNode,
     Waiter,
     appeared,
+    awaited,
 )
 
 ALL_GOALS: Final = bytes(16)
@@ -258,15 +259,12 @@ class ClientAction:
         self._results.call(self._results.pack(request), goal_id)
 
     def next_event(self, timeout_s: float) -> ActionEvent | None:
-        deadline_ns = now_ns() + int(timeout_s * 1e9)
-        while not self._waiter.interrupted:
-            if not self._events:
-                self._collect()
-            if self._events:
-                return self._events.popleft()
-            if not self._waiter.wait_until(deadline_ns):
-                return None
-        return None
+        return awaited(self._event, self._waiter, timeout_s)
+
+    def _event(self) -> ActionEvent | None:
+        if not self._events:
+            self._collect()
+        return self._events.popleft() if self._events else None
 
     def _collect(self) -> None:
         """Turn all that has arrived into events.
@@ -368,14 +366,11 @@ class ServedAction(Generic[Caller]):
         self._thread.join()
 
     def next_goal(self, timeout_s: float) -> ServedGoal[Caller] | None:
-        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        return awaited(self._goal, self._goal_waiter, timeout_s)
+
+    def _goal(self) -> ServedGoal[Caller] | None:
         id_ends = self.send_goal.body_at + 16
-        while not self._goal_waiter.interrupted:
-            taken = next(self.send_goal.arrived(), None)
-            if taken is None:
-                if not self._goal_waiter.wait_until(deadline_ns):
-                    return None
-                continue
+        while not self._goal_waiter.interrupted and (taken := next(self.send_goal.arrived(), None)):
             packed, caller = taken
             if not self._understood(caller):
                 continue

@@ -15,7 +15,6 @@ from cyclonedds.core import DDSException
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.qos import Policy, Qos
 
-from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import Offer, QoS, Tuning
 from s2a_bench.ros import messages as ros
@@ -25,6 +24,7 @@ from s2a_bench.ros.dds import DdsWaiter, RawReader, RawWriter, dds_qos, is_descr
 from s2a_bench.ros.dds_service import Caller, DdsServiceClient, DdsServiceServer
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise, type_hash
 from s2a_bench.ros.remap import check_node_name
+from s2a_bench.ros.service import awaited
 
 PARTICIPANT_ENTITIES = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 NODE_ENTITIES = "rmw_dds_common/msg/NodeEntitiesInfo"
@@ -83,25 +83,14 @@ class _CyclonePublisher(RawWriter):
 
 class _CycloneSubscription:
     def __init__(self, reader: RawReader, topic: str, type_name: str, version: str, waiter: DdsWaiter) -> None:
-        self.reader, self.topic, self._type_name, self._version, self._waiter = (
-            reader,
-            topic,
-            type_name,
-            version,
-            waiter,
-        )
-        waiter.watch(self.reader)
-        self.interrupt, self.arrived = waiter.interrupt, self.reader.arrived
-        self.matched = self.announced = self.reader.matched
-        self.sender = self.reader.sender
+        self.reader, self.topic, self._type_name, self._version = reader, topic, type_name, version
+        self._waiter = waiter
+        waiter.watch(reader)
+        self.interrupt, self.arrived, self.sender = waiter.interrupt, reader.arrived, reader.sender
+        self.matched = self.announced = reader.matched
 
     def take(self, timeout_s: float) -> memoryview | None:
-        deadline_ns = now_ns() + int(timeout_s * 1e9)
-        while not self._waiter.interrupted:
-            packed = self.reader.take()
-            if packed is not None or not self._waiter.wait_until(deadline_ns):
-                return packed
-        return None
+        return awaited(self.reader.take, self._waiter, timeout_s)
 
     def sender_hears(self, sender: int, publisher: RawWriter) -> bool:
         client = self.reader.endpoint(sender)

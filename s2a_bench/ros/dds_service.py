@@ -99,8 +99,6 @@ class _End:
 
 
 class DdsServiceClient(_End):
-    """Sends requests and finds the replies that are its own."""
-
     def __init__(
         self, participant: DomainParticipant, name: str, type_name: str, version: str, waiter: DdsWaiter
     ) -> None:
@@ -128,8 +126,6 @@ class DdsServiceClient(_End):
 
 
 class DdsServiceServer(_End, ServiceEnd[Caller]):
-    """Takes requests and sends replies to their clients."""
-
     def __init__(
         self,
         participant: DomainParticipant,

@@ -86,13 +86,9 @@ def log_message(record: logging.LogRecord, name: str) -> Any:
         stamp=ros.stamp(time.time_ns()),
         level=min(max(record.levelno // 10 * 10, logging.DEBUG), logging.CRITICAL),
         name=name,
-        msg=_text(record.getMessage()),
+        # CDR holds no NUL, and no half of a surrogate pair
+        msg=record.getMessage()[:LONGEST].replace("\0", "\ufffd").encode("utf-8", "replace").decode(),
         file=record.pathname,
         function=record.funcName or "",
         line=record.lineno,
     )
-
-
-def _text(text: str) -> str:
-    """Return what CDR can hold of a text: no NUL, no half of a surrogate pair."""
-    return text[:LONGEST].replace("\0", "\ufffd").encode("utf-8", "replace").decode()

@@ -1,7 +1,7 @@
 """ROS 2 message classes, their CDR, and the frames of this project as ``sensor_msgs`` images.
 
 Types and CDR are rosbags'; this module reads the interface files (.msg, .srv, .action) of ``s2a_msgs``, ``llama_msgs``
-and what actions need, adds the types ROS derives from them, and keeps the traps of serialising in one place.
+and what rosbags lacks of others, adds the types ROS derives from them, and keeps the traps of serialising in one place.
 
 A service gives ``X_Request`` and ``X_Response``; an action gives goal, result and feedback, the two services around
 them and the feedback message. Beside each request and response stands ``...__wire``: the body behind the header
@@ -153,12 +153,8 @@ def _types(version: str) -> tuple[Typestore, Defaults]:
     for name, (constants, fields) in store.fielddefs.items():
         store.fielddefs[name] = (constants, [(field, char_as_uint8(kind)) for field, kind in fields])
     root = files("s2a_bench.ros")
-    folders = {
-        "s2a_msgs": root / "s2a_msgs",
-        "action_msgs": root / "interfaces" / "action_msgs",
-        "rcl_interfaces": root / "interfaces" / "rcl_interfaces",
-        "llama_msgs": root / "interfaces" / VERSIONS[version],
-    }
+    folders = {each.name: each for each in (root / "interfaces").iterdir() if not each.name.startswith("llama_msgs")}
+    folders |= {"s2a_msgs": root / "s2a_msgs", "llama_msgs": root / "interfaces" / VERSIONS[version]}
     defaults: Defaults = {}
     for package, folder in folders.items():
         definitions, given = read_package(folder, package)

@@ -32,17 +32,6 @@ from s2a_bench.ros.rclpy_types import from_ros, interface_class, message_class, 
 from s2a_bench.ros.service import appeared
 
 
-def offer(node: SpinningNode, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS) -> None:
-    """Create a service of the node; a request for which ``answer`` raises is logged by the node, and not answered."""
-    cls = interface_class(type_name)
-
-    def callback(request: Any, _response: Any) -> Any:
-        response = answer(from_ros(request, type_name + "_Request", DEFAULT_VERSION))
-        return to_ros(response, cls.Response, type_name + "_Response", DEFAULT_VERSION)
-
-    node.node.create_service(cls, name, callback, qos_profile=qos_profile(qos))
-
-
 class RclpyServiceClient:
     def __init__(self, node: SpinningNode, name: str, type_name: str) -> None:
         self._node, self._name, self._type_name = node, name, type_name
@@ -174,7 +163,14 @@ class RclpyMiddleware:
         ]
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
-        offer(self._open(), name, type_name, answer, qos)
+        """Create a service; a request for which ``answer`` raises is logged by the node, and not answered."""
+        cls = interface_class(type_name)
+
+        def callback(request: Any, _response: Any) -> Any:
+            response = answer(from_ros(request, type_name + "_Request", DEFAULT_VERSION))
+            return to_ros(response, cls.Response, type_name + "_Response", DEFAULT_VERSION)
+
+        self._open().node.create_service(cls, name, callback, qos_profile=qos_profile(qos))
 
     def service_client(self, name: str, type_name: str) -> RclpyServiceClient:
         return RclpyServiceClient(self._open(), name, type_name)

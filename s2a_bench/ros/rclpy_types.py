@@ -32,7 +32,7 @@ def interface_class(type_name: str) -> Any:
     except (ImportError, AttributeError) as error:
         raise MissingInterface(
             f"{type_name} is not in this ROS 2 workspace ({error}): build its package with "
-            f"`colcon build --packages-select {package}` and source install/setup.bash, or use `middleware` cyclonedds"
+            f"`colcon build --packages-select {package}` and source install/setup.bash, or use middleware cyclonedds"
         ) from error
 
 

@@ -30,6 +30,7 @@ WARNED_AT_MOST: Final = 100
 """Kinds of a warning that are logged."""
 
 _log = logging.getLogger(__name__)
+Taken = TypeVar("Taken")
 Caller = TypeVar("Caller")
 """What a middleware keeps of a request to address its reply."""
 
@@ -52,6 +53,15 @@ def appeared(present: Callable[[], bool], timeout_s: float, given_up: Callable[[
             return False
         time.sleep(MATCH_POLL_S)
     return True
+
+
+def awaited(take: Callable[[], Taken], waiter: Waits, timeout_s: float) -> Taken | None:
+    """Return what ``take`` finds, as soon as it finds something; None after the time, or an interrupt."""
+    deadline_ns = now_ns() + int(timeout_s * 1e9)
+    while not waiter.interrupted:
+        if (found := take()) is not None or not waiter.wait_until(deadline_ns):
+            return found
+    return None
 
 
 class End(Protocol):

@@ -17,14 +17,13 @@ from weakref import ref
 import zenoh
 from zenoh import ext
 
-from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, Offer, QoS, Tuning
 from s2a_bench.ros import zenoh_names as names
 from s2a_bench.ros.action import ActionNode
 from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, serialise
 from s2a_bench.ros.router import Router
-from s2a_bench.ros.service import ClientEnd, LogOnce, ServiceEnd
+from s2a_bench.ros.service import ClientEnd, LogOnce, ServiceEnd, awaited
 from s2a_bench.ros.zenoh_node import Bell, Node, SampleQueue, direct, give_way, open_session, refusals
 
 CACHED_AT_MOST: Final = 1000
@@ -104,13 +103,11 @@ class ZenohSubscription:
             )
 
     def take(self, timeout_s: float) -> memoryview | None:
-        deadline_ns = now_ns() + int(timeout_s * 1e9)
-        while not self._bell.interrupted:
-            sample = self._inbox.take()
-            if sample is None:
-                if not self._bell.wait_until(deadline_ns):
-                    return None
-            elif self._wanted(sample):
+        return awaited(self._next, self._bell, timeout_s)
+
+    def _next(self) -> memoryview | None:
+        while not self._bell.interrupted and (sample := self._inbox.take()) is not None:
+            if self._wanted(sample):
                 return memoryview(sample.payload.to_bytes())
         return None
 

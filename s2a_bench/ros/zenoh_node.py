@@ -83,7 +83,7 @@ def open_session(endpoint: str, *, host: bool, tuning: Tuning = "tuned") -> zeno
             "choose another port with `router`"
             if host
             else "start one (ros2 run rmw_zenoh_cpp rmw_zenohd, or s2a-bench serve ros --middleware zenoh), "
-            "or name it with `router`"
+            "or name it with `router`, of a source, robot or ego with ?router="
         )
         raise TransportError(f"{what} ({reason_of(error)}): {way}") from error
 

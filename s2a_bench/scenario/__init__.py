@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Protocol
 
 from s2a_bench.policy import Floats
+from s2a_bench.policy.parameters import build, check
 from s2a_bench.registry import Registry
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ class DriveCommand:
 
 
 class Simulator(Protocol):
-    """A world of three cars."""
+    """A world of three cars; its parameters, if any, are the fields of a dataclass, all with defaults."""
 
     name: ClassVar[str]
     """As in SIMULATORS."""
@@ -60,6 +61,8 @@ class Simulator(Protocol):
     """Whether cars can leave their lane."""
     most: ClassVar[int | None]
     """Most roll-outs in lock step; None: no limit."""
+    over_ros: ClassVar[bool]
+    """Whether its ego can be driven and seen over ROS 2; `step` then takes NaN as its acceleration."""
     step_s: float
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
@@ -87,3 +90,15 @@ SIMULATORS: Final[Registry[type[Simulator]]] = Registry(
         "embedded": "s2a_bench.scenario.embedded:Embedded",
     },
 )
+
+
+def simulator_class(written: str) -> type[Simulator]:
+    """Return the class of the simulator ``name[?parameter=value&...]``; raises UsageError for what is wrong in it."""
+    made_by = SIMULATORS[written.partition("?")[0]]
+    check(made_by, written, SIMULATORS.field)
+    return made_by
+
+
+def open_simulator(written: str) -> Simulator:
+    """Open the simulator ``name[?parameter=value&...]``; raises S2AError."""
+    return build(simulator_class(written), written, SIMULATORS.field)

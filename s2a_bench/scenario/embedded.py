@@ -31,6 +31,7 @@ class Embedded:
     real: ClassVar[bool] = False
     steers: ClassVar[bool] = True
     most: ClassVar[int | None] = 1
+    over_ros: ClassVar[bool] = False
 
     step_s = STEP_S
 

@@ -35,6 +35,7 @@ class Longitudinal(LockStep):
     real: ClassVar[bool] = False
     steers: ClassVar[bool] = False
     most: ClassVar[int | None] = None
+    over_ros: ClassVar[bool] = False
 
     step_s = STEP_S
 

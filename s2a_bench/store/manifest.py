@@ -168,11 +168,6 @@ def read(folder: Path) -> dict[str, Any]:
         raise StoreError(
             f"{path} has schema {reprlib.repr(schema)}, this s2a-bench reads {SCHEMA!r}; use the version that wrote it"
         )
-    _check(manifest, path)
-    return dict(manifest)
-
-
-def _check(manifest: Mapping[str, Any], path: Path) -> None:
     try:
         (_SweepManifest if manifest.get("command") == SWEEP else _Manifest).model_validate(manifest)
     except ValidationError as error:
@@ -181,3 +176,4 @@ def _check(manifest: Mapping[str, Any], path: Path) -> None:
         problem = first["msg"].replace("Input", reprlib.repr(first["input"]), 1)
         problem = "is missing" if first["type"] == "missing" else problem
         raise StoreError(f"{path} is damaged: {reprlib.repr(key.lstrip('.'))[1:-1]}: {problem}") from None
+    return dict(manifest)

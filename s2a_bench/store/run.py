@@ -14,7 +14,7 @@ from datetime import datetime, timezone
 from itertools import count
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, final
 
 from s2a_bench.errors import MissingExtra, StoreError
 from s2a_bench.provenance import Origins
@@ -36,8 +36,7 @@ from s2a_bench.store.schema import PROVENANCE, SCHEMA, Row, Table
 if TYPE_CHECKING:
     import pandas as pd
 
-STATES = ("running", "finished", "interrupted", "failed")
-"""A killed run stays "running"; its rows are whole."""
+Ended: TypeAlias = Literal["finished", "interrupted", "failed"]
 
 
 @final
@@ -163,10 +162,11 @@ class RunWriter(AbstractContextManager["RunWriter"]):
                 raise
             manifests.write(self.path, self._manifest)
 
-    def finish(self, state: str, error: str | None = None) -> None:
-        """Close the files, write the Parquet ones and the final state; a second call does nothing."""
-        if state not in STATES[1:]:
-            raise ValueError(f"a run ends {', '.join(STATES[1:])}, not {state!r}")
+    def finish(self, state: Ended, error: str | None = None) -> None:
+        """Close the files, write the Parquet ones and the final state; a second call does nothing.
+
+        A killed run stays "running"; its rows are whole.
+        """
         if self._finished:
             return
         self._finished = True
@@ -191,9 +191,10 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         empty = self._made and not (self._rows or self._finished) and str(self.path) not in str(error)
         if error is not None and empty and self._discard():
             return
-        state = "finished" if error is None else "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        ended: Ended = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
+        why = None if error is None else str(error) or type(error).__name__
         try:
-            self.finish(state, None if error is None else str(error) or type(error).__name__)
+            self.finish("finished" if error is None else ended, why)
         except StoreError:
             if error is None:  # else the first error matters more
                 raise

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.frames import FrameSource
-from s2a_bench.scenario import EGO, LANE_WIDTH_M, LEAD, REAR, SIMULATORS, DriveCommand, Simulator, State
+from s2a_bench.scenario import EGO, LANE_WIDTH_M, LEAD, REAR, SIMULATORS, DriveCommand, Simulator, State, open_simulator
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 
 START = np.array([[40.0], [0.0], [-14.0]])
@@ -37,7 +37,7 @@ class SimulatorSuite(FrameSourceSuite):
     test_its_kind_says_what_to_write_after_its_name = None  # type: ignore[assignment]  # a camera is not opened by name
 
     def open_world(self) -> Simulator:
-        return SIMULATORS[self.name]()
+        return open_simulator(self.name)
 
     @classmethod
     def outside(cls) -> object:
@@ -66,7 +66,7 @@ class SimulatorSuite(FrameSourceSuite):
     def test_it_is_registered_under_its_name(self, world: Simulator) -> None:
         assert isinstance(world, SIMULATORS[world.name])
         assert world.step_s > 0
-        assert {type(world.real), type(world.steers)} == {bool}
+        assert {type(world.real), type(world.steers), type(world.over_ros)} == {bool}
 
     def test_cars_begin_where_they_are_placed_also_the_second_time(self, world: Simulator) -> None:
         for _ in range(2):

@@ -164,6 +164,7 @@ class Client(Protocol):
     @property
     def camera(self) -> CameraSink | None:
         """None where the newest frame goes with the prompt instead. The first use may wait for the server."""
+        return None
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Send a request with its frames as captured, yield pieces as they arrive, mark every stage.
@@ -174,6 +175,7 @@ class Client(Protocol):
 
     def describe(self) -> dict[str, str]:
         """Return what the manifest records of the client beside its wiring."""
+        return {}
 
     def close(self) -> None:
         """Close connections; may be called twice."""

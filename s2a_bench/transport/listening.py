@@ -36,7 +36,8 @@ class UrlOptions(TransportOptions):
     @field_validator("url")
     @classmethod
     def _names_a_server(cls, url: str) -> str:
-        checked_url(url, cls.SCHEMES)
+        if url:
+            check_url(url, cls.SCHEMES)
         if cls.ENDS_WITH_PORT and url and (not urlsplit(url).port or url.partition("//")[2] != urlsplit(url).netloc):
             raise ValueError(f"'{url.partition('?')[0]}' should look like {cls.SCHEMES[0]}://HOST:PORT")
         return url
@@ -109,10 +110,8 @@ def cannot_bind(host: str, port: str, number: int | None, why: str | None) -> Po
     return PortInUse(f"`{blamed}`: cannot bind {in_url(host)}:{port}: {why}")
 
 
-def checked_url(url: str, schemes: Collection[str]) -> str:
-    """Return a URL with one of the schemes, or ""; raises ValueError, without a password, for any other text."""
-    if not url:
-        return url
+def check_url(url: str, schemes: Collection[str]) -> None:
+    """Raise ValueError, without a password, for a text that is no URL with one of the schemes."""
     try:
         address = urlsplit(url)
         valid = address.scheme in schemes and bool(address.hostname) and address.port != 0
@@ -126,7 +125,6 @@ def checked_url(url: str, schemes: Collection[str]) -> str:
     for name, _ in parse_qsl(address.query, keep_blank_values=True):
         if is_secret(name):
             raise ValueError(f"leave '{name}' out, which would be kept with the results; see `api_key_env`")
-    return url
 
 
 def read_key(variable: str) -> str:

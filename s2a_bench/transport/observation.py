@@ -32,7 +32,7 @@ from pydantic import AfterValidator, Field
 
 from s2a_bench import toml_file
 from s2a_bench.errors import RequestFailed, UsageError
-from s2a_bench.text import none_of, read_text
+from s2a_bench.text import none_of
 from s2a_bench.types import Pixels, Vector
 
 TEMPLATES: Final = Path(__file__).with_name("templates")
@@ -288,10 +288,7 @@ def template_of(name: str) -> Template:
     path = TEMPLATES / f"{name}.toml" if name in known else Path(name)
     if not path.suffix:
         raise UsageError(f"`template`: {none_of(name, known, ', nor a TOML or JSON file')}")
-    try:
-        text = read_text(path, FILE_LETTERS)
-    except (OSError, UnicodeDecodeError, ValueError) as error:
-        raise UsageError(f"`template`: cannot read {name}: {error}") from error
+    text = toml_file.read(path, "template", FILE_LETTERS)
     return Template(_loads(text, name) if path.suffix == ".json" else toml_file.loads(text, name), name)
 
 

@@ -67,7 +67,7 @@ class Pipeline:
     def risks(self) -> Iterator[tuple[str, str, str]]:
         """Yield the risks of the options in its name, as `TransportOptions.risks` does."""
         fields = type(self.options).model_fields
-        for name, value in _parse(self.name).options.items():
+        for name, value in _parse(self.name)[2].items():
             if name in fields and (risk := str(extra_of(fields[name]).get("risk", ""))):
                 yield name, risk, value
 
@@ -76,23 +76,15 @@ class Pipeline:
         return Wiring(self.transport.name, self.variant, self.options, address, self.black_box, **settings)
 
 
-@dataclass(frozen=True, slots=True)
-class _Named:
-    """A name as written, unchecked."""
-
-    transport: str
-    variant: str
-    options: dict[str, str]
-
-
-def _parse(text: str) -> _Named:
+def _parse(text: str) -> tuple[str, str, dict[str, str]]:
+    """Return the transport, the variant and the options of a name as written, unchecked."""
     path, _, query = text.partition("?")
     transport, _, variant = path.partition("/")
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=bool(query))
     except ValueError as error:
         raise UsageError(f"`transport`: '{text}' should look like {path}?option=value&option=value") from error
-    return _Named(transport, variant, {name.replace("-", "_"): value for name, value in pairs})
+    return transport, variant, {name.replace("-", "_"): value for name, value in pairs}
 
 
 def pipelines(
@@ -117,7 +109,7 @@ def pipelines(
     found: dict[str, Pipeline] = {}
     for text in names:
         wanted = _Payloads(tuple(payloads), strict=strict, mode=mode)
-        for pipeline in _standing_for(_parse(text), given, wanted, engine, of_engine, every=every):
+        for pipeline in _standing_for(text, given, wanted, engine, of_engine, every=every):
             found.setdefault(pipeline.name, pipeline)
     return list(found.values())
 
@@ -161,12 +153,11 @@ def carries_alone(kind: str, compared: Sequence[Pipeline]) -> str:
 
 def one_pipeline(text: str, **options: Any) -> Pipeline:
     """Return one pipeline of a name, with the first variant if it names none; ``options`` are those of flags."""
-    named = _parse(text)
-    return next(_standing_for(named, {named.transport: options}, _Payloads(), every=False))
+    return next(_standing_for(text, {_parse(text)[0]: options}, _Payloads(), every=False))
 
 
 def _standing_for(
-    named: _Named,
+    text: str,
     flags_of: Mapping[str, Mapping[str, Any]],
     wanted: _Payloads,
     engine: str = "",
@@ -174,14 +165,15 @@ def _standing_for(
     *,
     every: bool,
 ) -> Iterator[Pipeline]:
-    transport = TRANSPORTS[named.transport]
+    name, chosen, written = _parse(text)
+    transport = TRANSPORTS[name]
     flags = flags_of.get(transport.name, {})
-    given = {name: value for name, value in named.options.items() if name not in of_engine}
-    engine_options = tuple(sorted(named.options.items() - given.items()))
+    given = {name: value for name, value in written.items() if name not in of_engine}
+    engine_options = tuple(sorted(written.items() - given.items()))
     plain = _checked(transport.options, flags, transport.name)
     options = _checked(transport.options, {**flags, **given}, transport.name)
     measured = transport.measured(Choice(_filled(options, wanted.only), engine=engine))
-    variants = [named.variant] if named.variant else measured if every else measured[:1]
+    variants = [chosen] if chosen else measured if every else measured[:1]
     for variant in variants:
         if variant not in (transport.variants or ("",)):
             known = ", ".join(transport.variants) or "none: it has no variants"

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from typing import Any, Final, Generic
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring
+from s2a_bench.transport import Client, Wiring
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pictures import policy_picture
@@ -20,12 +20,8 @@ QUOTED: Final = 500
 """Letters shown of a server's error: its end, as a traceback's reason comes last."""
 
 
-class PolicyClient(ABC, Generic[P]):
-    """The part that all protocols have in common."""
-
+class PolicyClient(Client, Generic[P]):
     def __init__(self, wiring: Wiring[P], alive: Callable[[], bool]) -> None:
-        """Prepare to ask the server at ``wiring.address``."""
-        self.camera = None
         self._wiring, self._alive = wiring, alive
         self._native = not wiring.black_box
         self._template = template_of(wiring.options.template_name)
@@ -69,7 +65,3 @@ class PolicyClient(ABC, Generic[P]):
     def describe(self) -> dict[str, str]:
         """Return where the server is, and the template, for the manifest."""
         return {"url": self._url, "template": self._template.name}
-
-    @abstractmethod
-    def close(self) -> None:
-        """Close the connection; may be called twice."""

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from threading import Event, Lock, Semaphore, Thread, current_thread
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import Final, TypeAlias
 
 import numpy as np
 
@@ -23,14 +23,11 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, EngineError, Overdue, S2AError, TooLarge
 from s2a_bench.machine.clocks import COMMANDS, wall_clock
 from s2a_bench.machine.tuning import give_back_memory
+from s2a_bench.options import Options
 from s2a_bench.trace import RESIDUAL, Trace
-from s2a_bench.transport import ACTIONS
+from s2a_bench.transport import ACTIONS, Handler
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.types import Action, Piece, Request, Token
-
-if TYPE_CHECKING:
-    from s2a_bench.options import Options
-    from s2a_bench.transport import Handler
 
 CLOCK_PROMPT: Final = "s2a-bench exchanges time stamps: "
 """Followed by `TOKENS` or `ACTIONS`, the prompt of a request that is answered without the engine, for its marks.

@@ -7,7 +7,6 @@ import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from s2a_bench.errors import StoreError
@@ -80,7 +79,7 @@ def _inert(value: object) -> object:
     return value
 
 
-def write_texts(run: StoredRun, tables: Mapping[str, TextTable], csvs: Mapping[str, CsvTable]) -> list[Path]:
+def write_texts(run: StoredRun, tables: Mapping[str, TextTable], csvs: Mapping[str, CsvTable]) -> None:
     """Write each table to ``tables/`` as .md and .tex, and the CSV files; raises StoreError."""
     texts = {f"{name}.md": to_markdown(table) for name, table in tables.items()}
     texts |= {f"{name}.tex": to_latex(table) for name, table in tables.items()}
@@ -92,4 +91,3 @@ def write_texts(run: StoredRun, tables: Mapping[str, TextTable], csvs: Mapping[s
             (folder / name).write_text(text, encoding="utf-8")
     except OSError as error:
         raise StoreError(f"cannot write {folder}: {why(error, folder)}; the samples are kept") from error
-    return [folder / name for name in texts]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import heapq
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import count
 
 from s2a_bench.act import Report, Running, SkillRobot
-from s2a_bench.act.events import Event, Requested, SkillArrived, SkillOver, StreamEnded, TokenArrived
+from s2a_bench.act.events import Event, Requested, SkillArrived, SkillOver, StreamEnded, TokenArrived, VirtualInbox
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record
 from s2a_bench.clock import VirtualClock
@@ -88,40 +86,13 @@ class Task:
         self.robot.say("abort")
 
 
-class ScriptedInbox:
-    """An inbox with a script of events, ordered by time and then by position; waiting moves a virtual clock."""
-
-    def __init__(self, clock: VirtualClock, script: Iterable[Event] = ()) -> None:
-        self._clock = clock
-        self._order = count()
-        self._events: list[tuple[int, int, Event]] = []
-        for event in script:
-            self.put(event)
-
-    def put(self, event: Event) -> None:
-        heapq.heappush(self._events, (event.at_ns, next(self._order), event))
-
-    def wait(self, until_ns: int | None) -> list[Event]:
-        """Jump to the next event, or to ``until_ns``; raises RuntimeError without either."""
-        if not self._events and until_ns is None:
-            raise RuntimeError("nothing will ever happen: the executor would wait for ever")
-        if not self._events or (until_ns is not None and until_ns < self._events[0][0]):
-            self._clock.sleep_until_ns(until_ns or 0)
-            return []
-        self._clock.sleep_until_ns(self._events[0][0])
-        found = []
-        while self._events and self._events[0][0] <= self._clock.now_ns():
-            found.append(heapq.heappop(self._events)[2])
-        return found
-
-
 @dataclass
 class SelfPaced(Obedient):
     """Takes each skill ``off_s`` longer (or shorter) than commanded, and reports its end itself; inf: never."""
 
     off_s: float = 0.0
     error: str = ""
-    inbox: ScriptedInbox | None = None
+    inbox: VirtualInbox | None = None
     count: int = 0
 
     def running(self, end_ns: int, report: Report) -> Running:  # noqa: ARG002 - in virtual time the end is foreseen
@@ -147,7 +118,7 @@ def run(
 ) -> tuple[Record, Obedient]:
     """Run one plan and return the record and the robot."""
     clock = VirtualClock(ZERO_NS - 1_000_000_000)
-    inbox = ScriptedInbox(clock, events)
+    inbox = VirtualInbox(clock, events)
     body = robot(clock)
     if isinstance(body, SelfPaced):
         body.inbox = inbox

@@ -10,9 +10,9 @@ import pytest
 
 from s2a_bench.act import ROBOTS, events
 from s2a_bench.act.call import SkillMotion
+from s2a_bench.act.events import VirtualInbox
 from s2a_bench.clock import VirtualClock, now_ns
 from s2a_bench.plan import load_skills
-from tests.act.drive import ScriptedInbox
 
 PAGE = (Path(__file__).parent.parent.parent / "docs" / "executor.md").read_text()
 ARM, PROGRAM = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
@@ -37,7 +37,7 @@ def test_the_example_program_carries_a_plan_out(
 ) -> None:
     clock = VirtualClock(5)
     monkeypatch.setattr("s2a_bench.clock.SystemClock", lambda: clock)
-    monkeypatch.setattr(events, "LiveInbox", lambda: ScriptedInbox(clock))
+    monkeypatch.setattr(events, "LiveInbox", lambda: VirtualInbox(clock))
     exec(PROGRAM, {})  # noqa: S102 - our own page
     assert capsys.readouterr().out == "completed [0] ['pick(cup)', 'pick(box)']\n"
     assert clock.now_ns() == 5 + 4 * 10**9

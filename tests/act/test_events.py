@@ -6,9 +6,8 @@ from threading import Timer
 
 import pytest
 
-from s2a_bench.act.events import Event, LiveInbox, StreamEnded, TokenArrived
+from s2a_bench.act.events import Event, LiveInbox, StreamEnded, TokenArrived, VirtualInbox
 from s2a_bench.clock import VirtualClock, now_ns
-from tests.act.drive import ScriptedInbox
 
 FIRST, SECOND = TokenArrived(5), StreamEnded(5)
 
@@ -42,14 +41,14 @@ def test_a_live_inbox_whose_time_is_past_still_gives_what_there_is() -> None:
 )
 def test_a_script_is_jumped_through(until_ns: int | None, found: list[Event], at_ns: int) -> None:
     clock = VirtualClock(0)
-    inbox = ScriptedInbox(clock, [TokenArrived(7), FIRST, SECOND])
+    inbox = VirtualInbox(clock, [TokenArrived(7), FIRST, SECOND])
     assert inbox.wait(until_ns) == found
     assert clock.now_ns() == at_ns
 
 
 def test_an_event_of_the_past_is_given_now_and_an_empty_script_has_an_end() -> None:
     clock = VirtualClock(10)
-    inbox = ScriptedInbox(clock)
+    inbox = VirtualInbox(clock)
     inbox.put(FIRST)
     assert inbox.wait(None) == [FIRST]
     assert clock.now_ns() == 10

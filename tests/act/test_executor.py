@@ -18,6 +18,7 @@ from s2a_bench.act.events import (
     StreamBroke,
     StreamEnded,
     TokenArrived,
+    VirtualInbox,
 )
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record
@@ -31,7 +32,6 @@ from tests.act.drive import (
     EVERY_POLICY,
     ZERO_NS,
     Obedient,
-    ScriptedInbox,
     SelfPaced,
     call,
     ends,
@@ -139,7 +139,7 @@ def test_unless_told_otherwise_silence_is_a_minute_and_a_skill_may_overrun_by_te
         (plan([1.0]), "skill0() went on for 10 s after its end"),
     ):
         clock = VirtualClock(ns(0))
-        inbox = ScriptedInbox(clock, events)
+        inbox = VirtualInbox(clock, events)
         record = Executor(Naive(), shape(1), SelfPaced(clock, off_s=float("inf")), inbox, clock).run()
         assert record.why == why
 

@@ -7,13 +7,13 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.act.events import Event, PlanFeed
+from s2a_bench.act.events import Event, PlanFeed, VirtualInbox
 from s2a_bench.act.executor import Executor
 from s2a_bench.act.record import Record
 from s2a_bench.clock import VirtualClock
 from s2a_bench.plan import Parser, load_skills, paper_format
 from s2a_bench.policy import policy
-from tests.act.drive import Obedient, ScriptedInbox, ns, shape, starts
+from tests.act.drive import Obedient, ns, shape, starts
 
 HOUSEHOLD = load_skills("household")
 PLAN = "1. go_to(kitchen)\n2. pick(cup)\n3. place(cup, table)\n"
@@ -31,7 +31,7 @@ def execute(chunks: list[str], n_skills: int, gap_s: float = 0.5, name: str = "n
         feed.ended(ns((len(chunks) + 1) * gap_s))
     clock = VirtualClock(ns(0))
     robot = Obedient(clock)
-    record = Executor(policy(name), shape(n_skills), robot, ScriptedInbox(clock, events), clock).run()
+    record = Executor(policy(name), shape(n_skills), robot, VirtualInbox(clock, events), clock).run()
     assert {word.split()[1] for _, word in robot.commands if word.startswith("start")} <= {"go_to", "pick", "place"}
     return record
 

@@ -129,10 +129,10 @@ def test_a_wrong_file_is_one_line_that_names_file_and_key(changes: dict[str, Any
 
 def test_what_is_no_toml_and_what_cannot_be_read_say_so(tmp_path: Path) -> None:
     path = tmp_path / "x.toml"
-    with pytest.raises(UsageError, match=r"profile .*x\.toml: cannot be read"):
+    with pytest.raises(UsageError, match=r"`profile`: cannot read .*x\.toml: "):
         read_profile(path)
     path.write_bytes(b"\xff\xfe")
-    with pytest.raises(UsageError, match=r"profile .*x\.toml: cannot be read"):
+    with pytest.raises(UsageError, match=r"`profile`: cannot read .*x\.toml: "):
         read_profile(path)
     path.write_text("title = ")
     with pytest.raises(UsageError, match=r"profile .*x\.toml: no TOML"):

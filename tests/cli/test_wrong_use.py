@@ -12,6 +12,7 @@ from tests.cli.program import refused
 WRONG = {
     "ccrb": [
         ("--simulator gazebo", "--simulator: 'gazebo' is none of longitudinal, embedded"),
+        ("--simulator 'embedded?port=1'", "--simulator: embedded: 'port' is no parameter; it has no parameters"),
         ("--lane-change", "--lane-change: the longitudinal simulator knows one lane"),
         ("--pace 4.8", "--pace is about a model that answers; it needs --live"),
         ("--live --rate 9", "--rate is about tokens that are modelled; leave it out with --live"),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.cli.progress import RunProgress
-from s2a_bench.errors import TransportError
+from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.ccrb.config import CcrbConfig, PlanRequest
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
@@ -19,6 +19,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import origin_notes, token_times_s
 from s2a_bench.experiments.ccrb.view.tables import ccrb_json
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.models import tiny_dummy
+from s2a_bench.scenario import SIMULATORS
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import StoredRun, read_run
@@ -26,6 +27,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Request, Token
 from tests.made_runs import SCHEMA
+from tests.scenario.carla_stand_in import RosSimulator
 
 N, L, T_NS = 3, 6, 800_000_000
 REPLAYED = PlanRequest(live=True, transport="loopback", engine=EngineConfig(name="replay"))
@@ -49,7 +51,7 @@ def paced(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
 
 
 def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: StoredRun) -> None:
-    token_ns = np.rint(np.array(token_times_s(paced)) * 1e9).astype(np.int64)
+    token_ns = np.rint(np.array(token_times_s(paced, paced.table(SKILLS)["cell"].iloc[0])) * 1e9).astype(np.int64)
     assert len(token_ns) == N * L
     arrivals_ns = token_ns[L - 1 :: L]
     skills = paced.table(SKILLS)
@@ -135,3 +137,46 @@ def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
         drive(REPLAYED, tmp_path / "runs", fast_board)
     (folder,) = (tmp_path / "runs").iterdir()
     assert len(read_run(folder).table(TOKENS)) == 2 * L
+
+
+def test_the_ego_is_commanded_and_seen_over_ros_while_its_plan_arrives(
+    fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
+    monkeypatch.setitem(SIMULATORS._builtins, "stand-in", "tests.scenario.carla_stand_in:RosSimulator")
+    monkeypatch.setattr(RosSimulator, "opened", [])
+    ego = "ros?middleware=cyclonedds&wait_s=60"
+    config = CcrbConfig(
+        scenario=CcrbOptions(n_skills=N),
+        tokens_per_skill=L,
+        plan_request=REPLAYED,
+        profile=fast_board,
+        policies=("naive",),
+        simulator="stand-in",
+        ego=ego,
+        closed_loop=True,
+    )
+    with RunProgress() as progress:
+        run = read_run(run_ccrb(config, tmp_path, progress))
+    (world,) = RosSimulator.opened
+    driven = run.table(ROLLOUTS).query("study == 'point'")
+    assert list(driven["simulator"]) == ["stand-in"]
+    assert run.manifest["configuration"]["ego"] == ego
+    assert len(run.samples) == 2
+    pedals = [(message.throttle, message.brake) for message in world.received]
+    assert any(throttle > 0.03 and brake == 0 for throttle, brake in pedals)  # it kept its speed
+    assert any(throttle == 0 and 0.1 < brake < 1 for throttle, brake in pedals)  # and braked as planned
+    assert world.closed == 2  # by the ego, and by the run
+
+
+@pytest.mark.parametrize(
+    ("ego", "says"),
+    [
+        ("ros", "the embedded simulator has no ROS 2; take a `simulator` that has: "),
+        ("dds", "'dds' should be ros, with parameters as in ros?preset=bridge"),
+    ],
+)
+def test_an_ego_that_cannot_be_reached_is_refused_before_anything_is_opened(ego: str, says: str) -> None:
+    with pytest.raises(UsageError, match=r"^`ego`: ") as error:
+        CcrbConfig(simulator="embedded", ego=ego).check()
+    assert says in str(error.value)

@@ -279,7 +279,7 @@ def observations() -> list[bytes]:
 
 def read_gr00t(data: bytes) -> None:
     """Read what a GR00T server is asked, and what its client is answered."""
-    message = gr00t.unpack(data)
+    message, _ = gr00t.read(data)
     with suppress(RequestFailed):
         observed.remote_of(message)
     if isinstance(message, dict):

@@ -12,8 +12,7 @@ import pytest
 from s2a_bench.errors import BadRequest, ModelError, UsageError
 from s2a_bench.inference import Engine, EngineConfig
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
-from s2a_bench.inference.llama_pictures import Steps, mtmd_cpp
-from s2a_bench.inference.llama_prompt import MARKER, ChatTemplate
+from s2a_bench.inference.llama_prompt import MARKER, ChatTemplate, Steps, mtmd_cpp
 from s2a_bench.inference.models import RAW_PROMPT, load_headers
 from s2a_bench.testing.engine import EngineSuite, ask, rgb_frame
 

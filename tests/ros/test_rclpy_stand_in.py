@@ -22,6 +22,8 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.config import CYCLONE_URI, LARGE_PICTURES, RMW_CYCLONE
 from s2a_bench.ros.diagnostics import LOG, ROSOUT_QOS
 from s2a_bench.ros.parameters import SERVICE, Parameter, value_of
+from s2a_bench.scenario.longitudinal import Longitudinal
+from s2a_bench.scenario.ros import EgoParameters, RosEgo
 from s2a_bench.testing.transport import RecordingHandler, ask, connector, wiring_of, yuyv_frame
 from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.ros import ROS
@@ -199,6 +201,14 @@ def test_the_action_needs_llama_msgs(monkeypatch: pytest.MonkeyPatch) -> None:
     for opened in (lambda: open_server(wiring, RecordingHandler([])), lambda: open_client(wiring)):
         with pytest.raises(MissingInterface, match="colcon build --packages-select llama_msgs"):
             opened()
+    assert GRAPH == []
+
+
+def test_an_ego_over_ros_needs_the_package_of_its_commands() -> None:
+    for message, package in (("control", "carla_msgs"), ("ackermann", "ackermann_msgs")):
+        how = EgoParameters(middleware="rclpy", domain_id=7, message=message)  # type: ignore[arg-type]
+        with pytest.raises(MissingInterface, match=rf"^`ego`: ros: {package}/.*--packages-select {package}` and"):
+            RosEgo(Longitudinal(), how)
     assert GRAPH == []
 
 

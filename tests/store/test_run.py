@@ -373,8 +373,6 @@ def test_the_way_out_of_the_block_is_the_state_of_the_run(tmp_path: Path, open_r
     with open_run() as run:
         run.finish("failed", "server died")
         run.finish("finished")  # too late
-        with pytest.raises(ValueError, match="not 'running'"):
-            run.finish("running")
     assert (read_run(run.path).manifest["state"], read_run(run.path).manifest["error"]) == ("failed", "server died")
 
 

@@ -14,7 +14,8 @@ import pytest
 from s2a_bench.errors import RequestFailed
 from s2a_bench.transport.messagepack import MAP, VALUES
 from s2a_bench.transport.websocket.codec import packb, unpackb
-from s2a_bench.transport.zmq.wire import pack, unpack
+from s2a_bench.transport.zmq import wire
+from s2a_bench.transport.zmq.wire import pack
 
 HOSTILE = {
     "nothing": b"",
@@ -39,6 +40,10 @@ HOSTILE = {
     "a time stamp of 96 bits": b"\xc7\x0c\xff" + struct.pack(">Iq", 1, -1),
     "a time stamp of no bytes": b"\xc7\x00\xff",
 }
+
+
+def unpack(data: Any) -> Any:
+    return wire.read(data)[0]
 
 
 @pytest.mark.parametrize("read", [unpackb, unpack])

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
+from pydantic.alias_generators import to_snake
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed
@@ -21,7 +22,7 @@ from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring, open_client
 from s2a_bench.transport.ros.joining import join
-from s2a_bench.transport.ros.node import EVENT, Activity, snake
+from s2a_bench.transport.ros.node import EVENT, Activity
 from s2a_bench.transport.ros.server import RosServer
 from s2a_bench.transport.serving import STUCK_S, Queued
 from s2a_bench.types import Request
@@ -57,7 +58,7 @@ def server(stack: ExitStack, wiring: Wiring[Any]) -> RosServer:
 def call(peer: Middleware, service: str, **fields: Any) -> Any:
     type_name = SERVICE + service
     request = ros.default(type_name + "_Request", **fields)
-    return peer.service_client(f"{NODE}/{snake(service)}", type_name).call(request, WAIT_S)
+    return peer.service_client(f"{NODE}/{to_snake(service)}", type_name).call(request, WAIT_S)
 
 
 def received(subscription: Subscription, wanted: Callable[[Any], bool]) -> Any:

@@ -13,11 +13,15 @@ import pytest
 from s2a_bench.errors import EngineError, RequestFailed
 from s2a_bench.transport.zmq.layouts import actions_in, answer_of, modalities
 from s2a_bench.transport.zmq.npy import PictureFile, array_of, file_of
-from s2a_bench.transport.zmq.wire import pack, read, unpack
+from s2a_bench.transport.zmq.wire import pack, read
 from s2a_bench.types import Token
 
 DTYPES = ["bool", "int8", "uint8", ">u2", "int32", "uint64", "float16", "float32", ">f4", "float64"]
 SHAPES = [(), (3,), (0,), (2, 3), (0, 3), (1, 1, 4, 5, 3)]
+
+
+def unpack(data: Any) -> Any:
+    return read(data)[0]
 
 
 def saved(array: Any, **more: Any) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import TYPE_CHECKING, Any, ClassVar, Final
 
 from pydantic import Field
 
@@ -12,9 +12,9 @@ from s2a_bench.boards.profile import profile_files
 from s2a_bench.boards.tokens import PROMPT_TIME
 from s2a_bench.errors import UsageError
 from s2a_bench.inference import EngineConfig
-from s2a_bench.options import Names, Numbers, Options, group, one_of, option
+from s2a_bench.options import Names, Numbers, Options, group, option
 from s2a_bench.policy import COMPARED, POLICIES
-from s2a_bench.scenario import SIMULATORS
+from s2a_bench.scenario import SIMULATORS, simulator_class
 from s2a_bench.scenario.ccrb.options import SKILL_SET, CcrbOptions
 from s2a_bench.transport import paths
 
@@ -67,15 +67,22 @@ class CcrbConfig(Options):
     prompt_s: float | None = PROMPT_TIME
     tokens_per_skill: int = option(6, "L, the delimiter included", ge=1, le=1000)
     scenario: CcrbOptions = Field(default_factory=CcrbOptions)
-    simulator: Annotated[str, one_of(lambda: SIMULATORS)] = option(
-        "longitudinal", "longitudinal (along the lane), embedded (highway-env)", first=True
+    simulator: str = option(
+        "longitudinal",
+        f"{', '.join(SIMULATORS)}, with parameters as in NAME?parameter=value",
+        first=True,
+        names=lambda: SIMULATORS,
+    )
+    ego: str = option("", "ros[?parameter=value&...]: command and see the ego over ROS 2, if the simulator can")
+    closed_loop: bool = option(
+        False, "let the world run while the plan arrives: with --live on the clock, else in virtual time", first=True
     )
     ttc: bool = option(False, "add s2a-ttc: stream-to-act that starts by the lead's deadline")
     phase: bool = option(False, "also the phase diagram over rate and rear gap, for every gap behaviour", first=True)
     phase_rates: Numbers = option((2.0, 12.0), "tokens/s of the phase diagram: from, to")
     phase_gaps_m: Numbers = option((6.0, 30.0), "m to the car behind in the phase diagram: from, to", flag="phase-gaps")
     phase_points: tuple[int, int] = option((41, 25), "rates and gaps of the phase diagram", hidden=True)
-    random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000, first=True)
+    random: int = option(0, "also as many random scenarios; 0: none", ge=0, le=100_000)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
     plan_request: PlanRequest = Field(default_factory=PlanRequest)
 
@@ -134,8 +141,18 @@ class CcrbConfig(Options):
             span = getattr(self, name)
             if len(span) != 2 or not 0 < span[0] < span[1] <= most:  # noqa: PLR2004 - from, to
                 raise UsageError(f"`{name}`: should be two numbers above 0 and at most {most:g}, the lower first")
-        if self.scenario.lane_change and not SIMULATORS[self.simulator].steers:
-            raise UsageError(f"`lane_change`: the {self.simulator} simulator knows one lane; take `simulator` embedded")
+        world = simulator_class(self.simulator)
+        if self.scenario.lane_change and not world.steers:
+            raise UsageError(f"`lane_change`: the {world.name} simulator knows one lane; take `simulator` embedded")
+        if self.ego:
+            from s2a_bench.scenario.ros import ego_parameters
+
+            ego_parameters(self.ego, world)
+            if not (self.closed_loop and self.plan_request.live):
+                raise UsageError("`ego`: ROS 2 runs on the clock; it needs `closed_loop` and `live`")
+        for name in ("ttc", "phase", "random") if self.closed_loop else ():
+            if getattr(self, name):
+                raise UsageError(f"`{name}` needs all arrivals beforehand, in virtual time; leave out `closed_loop`")
         if self.plan_request.live:
             self._check_live()
         self.timeline.check()
@@ -150,7 +167,8 @@ class CcrbConfig(Options):
             {"profile", *MODELLED, "phase_rates", "phase_gaps_m", "phase_points"} if self.plan_request.live else set()
         )
         given = {**self.model_dump(exclude=left_out), **self.scenario.to_manifest()}
-        return {**given, "t_nom_s": self.scenario.durations.nominal_s, "time": "virtual"}
+        time = "monotonic" if self.closed_loop and self.plan_request.live else "virtual"
+        return {**given, "t_nom_s": self.scenario.durations.nominal_s, "time": time}
 
     def _check_live(self) -> None:
         for name in MODELLED if self.plan_request.engine.kind.plays else (*MODELLED, "profile"):

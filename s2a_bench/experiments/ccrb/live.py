@@ -1,43 +1,52 @@
-"""The CCRB run on a model's tokens: one real request about the rendered scene, then the roll-outs in virtual time.
+"""The CCRB run on a model's tokens, about the ego's view; the ego drives the scenario's set-points.
 
-Open loop: the request is at t = 0, and the road does not change the answer. The model's text is parsed only for the
-arrival times of its skills; the ego drives the scenario's set-points.
+The model's text is parsed only for the arrival times of its skills. Open loop: one request at t = 0, then the roll-outs
+in virtual time. Closed loop: a request a policy, executed as it arrives, while the world runs on the clock.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
-from s2a_bench.act.events import Event, PlanFeed, SkillArrived
+from s2a_bench.act.events import AbortRequested, Event, LiveInbox, PlanFeed, SkillArrived
+from s2a_bench.act.record import Record, observed
+from s2a_bench.clock import SystemClock, now_ns, quick_switching
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.loop import ClosedLoop
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.ccrb.run import Prepared, complete, drive_point
+from s2a_bench.experiments.ccrb.run import Prepared, complete, drive_point, keep_loop
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.plan import FeedPlan
 from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
+from s2a_bench.harness.session import Measured
 from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt, prepare_requests
 from s2a_bench.harness.timelines.policies import prepare as prepare_policies
 from s2a_bench.plan import Parser
-from s2a_bench.policy import Plans, PlanShape
-from s2a_bench.policy.estimator import GapPrior
+from s2a_bench.policy import PlanShape, Policy
 from s2a_bench.scenario import Simulator
 from s2a_bench.scenario.ccrb.drive import place
 from s2a_bench.store.requests import SKILLS
 
 if TYPE_CHECKING:
-    from s2a_bench.policy import Floats
     from s2a_bench.progress import Progress
+
+STEP_S: Final = 0.02
+"""Step on the clock of a world without physics of its own."""
+CRUISE_S: Final = 0.5
+"""Time on the road before the request of a closed loop."""
 
 
 def run_ccrb_live(config: CcrbConfig, world: Simulator, output: Path, progress: Progress) -> Path:
     """Request one plan and drive it under every policy; raises S2AError. The folder keeps the requests so far."""
+    if config.closed_loop and not world.real:
+        world.step_s = STEP_S
 
     def view(feed: FeedPlan) -> FrameSource:
         camera = world.camera(*feed.size)
@@ -58,47 +67,65 @@ def run_ccrb_live(config: CcrbConfig, world: Simulator, output: Path, progress: 
 
 def _drive(config: CcrbConfig, ask: PlanPrompt, world: Simulator, launch: RunningLaunch) -> None:
     progress = launch.progress
-    progress.expect(launch.plan.blocks.warmup + 1)
-    link = ModelLink(config.request, launch, f"{world.name} simulator")
-    prior = link.warm_up(ask)
-    progress.stage(f"one plan over {link.cell.name}")
-    ready = _request_plan(config, ask, link, prior)
-    progress.advance()
-    progress.stage("driving the operating point")
-    drive_point(config, ready, world, launch.writer)
+    shape = PlanShape(ask.n_skills, ask.tokens_per_skill, config.scenario.durations)
+    requests = _Requests(config, ask, ModelLink(config.request, launch, f"{world.name} simulator"), shape, world)
+    progress.expect(launch.plan.blocks.warmup + (len(config.timeline.chosen) if config.closed_loop else 1))
+    policies = prepare_policies(config.request, shape, requests.link.warm_up(ask)).policies()
+    runs = [{name: policy} for name, policy in policies.items()] if config.closed_loop else [policies]
+    for each in runs:
+        progress.stage(f"{', '.join(each)}: a plan over {requests.link.cell.name}")
+        (requests.closed_loop if config.closed_loop else requests.roll_out)(each)
+        progress.advance()
 
 
-def _request_plan(config: CcrbConfig, ask: PlanPrompt, link: ModelLink, prior: GapPrior | None) -> Prepared:
-    """Request the plan and apply the policies to its arrivals; raises TransportError for an incomplete plan."""
-    events: list[Event] = []
-    feed = PlanFeed(Parser(ask.format), events.append)
-    measured = link.request(ask, 0, feed)
-    link.require_answers()
-    requested_ns = feed.requested_ns or 0
-    came_ns = [event.at_ns for event in events if isinstance(event, SkillArrived)][: ask.n_skills]
-    if len(came_ns) < ask.n_skills:
-        raise TransportError(
-            f"{link.cell.name}: {len(came_ns)} of {ask.n_skills} skills arrived; {link.writer.path / 'tokens.csv'} has "
-            "what the model wrote"
-        )
-    link.learn_rate(feed.token_ns)
-    request_id = measured.sample.request_id
-    link.writer.update(request={"request_id": request_id, "requested_ns": requested_ns})
-    times = config.scenario.durations
-    setting = replace(link.setting(ask), t_nom_s=times.nominal_s)
+@dataclass(frozen=True, slots=True)
+class _Requests:
+    """Requests for plans of one shape, and what is driven on them; every error ends the run."""
 
-    def column(at_ns: list[int]) -> Floats:
-        return (np.array(at_ns, dtype=np.float64)[:, np.newaxis] - requested_ns) / 1e9
+    config: CcrbConfig
+    ask: PlanPrompt
+    link: ModelLink
+    shape: PlanShape
+    world: Simulator
 
-    rows = np.ones((ask.n_skills, 1))
-    shape = PlanShape(ask.n_skills, ask.tokens_per_skill, times)
-    plans = Plans(
-        column(came_ns),
-        times.nominal_s * rows,
-        times.least_s * rows,
-        times.most_s * rows,
-        column(feed.token_ns),
-        shape,
-    )
-    policies = prepare_policies(config.request, shape, prior).policies()
-    return complete(config, setting, request_id, plans, policies)
+    def roll_out(self, policies: Mapping[str, Policy]) -> None:
+        """Request a plan, and drive it in virtual time."""
+        events: list[Event] = []
+        feed = PlanFeed(Parser(self.ask.format), events.append)
+        measured = self.link.request(self.ask, 0, feed)
+        arrivals_ns = [event.at_ns for event in events if isinstance(event, SkillArrived)]
+        arrivals = list(zip(arrivals_ns, self.config.scenario.calls, strict=False))
+        record = Record("", feed.requested_ns, feed.token_ns, arrivals)
+        drive_point(self.config, self._arrived(record, measured, policies), self.world, self.link.writer)
+
+    def closed_loop(self, policies: Mapping[str, Policy]) -> None:
+        """Let the cars drive, request a plan, and execute it under the one policy as it arrives."""
+        clock, ((name, policy),) = SystemClock(), policies.items()
+        loop = ClosedLoop(self.config.scenario, self.world, LiveInbox(), clock)
+        feed = PlanFeed(Parser(self.ask.format), loop.put)
+        with quick_switching(), ThreadPoolExecutor(1, "world") as pool:
+            running = pool.submit(loop.run, policy, self.shape, self.config.request.timeout_s)
+            try:
+                clock.sleep_until_ns(clock.now_ns() + round(CRUISE_S * 1e9))
+                measured = self.link.request(self.ask, 0, feed)
+            except BaseException:
+                loop.put(AbortRequested(now_ns(), "the run was ended"))
+                running.result()  # the world's own error, if it has one, says more
+                raise
+            looped = running.result()
+        ready = self._arrived(looped.record, measured, policies)
+        keep_loop(self.config, ready, self.world, name, looped, self.link.writer)
+
+    def _arrived(self, record: Record, measured: Measured, policies: Mapping[str, Policy]) -> Prepared:
+        """Schedule a received plan; raises TransportError if it is incomplete, or was not executed to its end."""
+        link = self.link
+        link.require_answers()
+        plans = observed(record, self.shape)
+        if plans is None or record.why:
+            why = record.why or f"{len(record.arrivals)} of {self.ask.n_skills} skills arrived"
+            written = link.writer.path / "tokens.csv"
+            raise TransportError(f"{link.cell.name}: {why}; {written} has what the model wrote")
+        link.learn_rate(record.token_ns)
+        link.writer.update(requests={measured.sample.request_id: record.requested_ns})
+        setting = replace(link.setting(self.ask), t_nom_s=self.config.scenario.durations.nominal_s)
+        return complete(self.config, setting, measured.sample.request_id, plans, policies)

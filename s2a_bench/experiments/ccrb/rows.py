@@ -50,18 +50,24 @@ MOTION: Final = (
     _metric("peak_jerk", MPS3, "peak jerk"),
     _metric("sparc", "", "SPARC", "higher", bounds=(None, 0)),
 )
-METRICS: Final = (*TIMES, *IMPACTS, *MARGINS, *MOTION)
+LOOP: Final = (
+    _metric("real_time_factor", "", "real-time factor", "higher", about="Simulated over elapsed time: 1 is in time."),
+    _metric("tracking_rms_mps", "m/s", "tracking", about="RMS of set-point minus speed while a skill runs."),
+)
+"""Metrics of closed loops alone."""
+METRICS: Final = (*TIMES, *IMPACTS, *MARGINS, *MOTION, *LOOP)
 
 
 @dataclass(frozen=True, slots=True)
 class AboutRollout:
     """The columns of a row of `ROLLOUTS` besides the metrics: what was tried. SI units.
 
-    ``study`` is point, phase or random; ``draw`` counts its scenarios. ``title`` names the board. ``late``: s2a-ttc
-    could not keep the deadline ``deadline_ns`` (S_front) without stalls; null for other policies. Studies stop when the
-    outcome is decided: their least rear gap is null without an impact. Null are also impact speeds without that impact,
-    times to collision where the cars never closed in, the required deceleration (DRAC, to the lead) with a front
-    impact, motion without a trajectory, and ``prompt_s`` of a live model.
+    ``study`` is point, rollout (beside a closed loop, on the arrivals of its plan), phase or random; ``draw`` counts
+    its scenarios. ``title`` names the board. ``late``: s2a-ttc could not keep the deadline ``deadline_ns`` (S_front)
+    without stalls; null for other policies. Studies stop when the outcome is decided: their least rear gap is null
+    without an impact. Null are also impact speeds without that impact, times to collision where the cars never closed
+    in, the required deceleration (DRAC, to the lead) with a front impact, motion without a trajectory, and ``prompt_s``
+    of a live model.
     """
 
     cell: Annotated[str, {"minLength": 1}]
@@ -71,7 +77,7 @@ class AboutRollout:
     board: str
     title: str
     emulated: Annotated[bool, about("True where no model answered.")]
-    simulator: Annotated[str, {"enum": ["longitudinal", "embedded"]}]
+    simulator: Annotated[str, {"minLength": 1}]
     follower: Annotated[str, {"enum": list(FOLLOWERS)}]
     gap_behaviour: Annotated[str, {"enum": list(GAPS)}]
     reflex: bool
@@ -101,7 +107,7 @@ RolloutRow: Final = with_fields(
         **columns(TIMES),
         "late": Annotated[bool | None, about("s2a-ttc only: no stall-free start keeps the deadline.")],
         "outcome": Annotated[str, {"enum": ["none", "front", "rear", "both"]}],
-        **columns((*IMPACTS, *MARGINS, *MOTION)),
+        **columns((*IMPACTS, *MARGINS, *MOTION, *LOOP)),
     },
 )
 

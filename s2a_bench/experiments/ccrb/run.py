@@ -7,11 +7,14 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import process_time
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from s2a_bench.act.record import executed
 from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.loop import Looped, replayed
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.studies import SCENES, drive_block, motion_of, rollout_rows, studies, trajectory_rows
 from s2a_bench.harness.timelines.config import PlanSetting, settings
@@ -20,10 +23,11 @@ from s2a_bench.harness.timelines.rows import skill_rows, to_ns, token_rows
 from s2a_bench.machine import environment
 from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.provenance import Origins
-from s2a_bench.scenario import SIMULATORS, Simulator
-from s2a_bench.scenario.ccrb.drive import drive
+from s2a_bench.scenario import Simulator, open_simulator
+from s2a_bench.scenario.ccrb.drive import Driven, drive
 from s2a_bench.scenario.ccrb.ttc import NAME as TTC
 from s2a_bench.scenario.ccrb.ttc import ttc_aware
+from s2a_bench.scenario.ros import with_ego
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import RunWriter
 from s2a_bench.types import Timing
@@ -39,6 +43,7 @@ class Prepared:
     setting: PlanSetting
     request_id: str
     plans: Plans
+    policies: Mapping[str, Policy]
     schedules: dict[str, Schedule]
     late: bool | None
 
@@ -64,7 +69,7 @@ def complete(
     if config.ttc:
         timed = ttc_aware(plans, scenario.deadline_s)
         schedules[TTC], late = timed.schedule, bool(timed.late[0])
-    return Prepared(setting, request_id, plans, schedules, late)
+    return Prepared(setting, request_id, plans, policies, schedules, late)
 
 
 def _with_lane_change(plans: Plans, lane: Timing) -> Plans:
@@ -78,21 +83,50 @@ def drive_point(config: CcrbConfig, ready: Prepared, world: Simulator, writer: R
     scenario = config.scenario
     for name, schedule in ready.schedules.items():
         driven = drive(world, scenario.cars, scenario.driving, schedule, record=True)
-        path = driven.trajectory
-        assert path is not None  # noqa: S101 - recorded
-        cell = f"{ready.setting.name}/{scenario.gap}/{name}"
-        late = ready.late if name == TTC else None
-        about = {**_about(config, ready, world), "cell": cell, "policy": name, "late": late}
-        writer.append(ROLLOUTS, rollout_rows(about, schedule, driven.outcomes, motion=motion_of(path)))
-        writer.append(SKILLS, skill_rows(cell, ready.plans, schedule, [ready.request_id], texts=[scenario.texts]))
-        writer.append(TRAJECTORIES, trajectory_rows(cell, path))
+        _keep(config, ready, world, name, ready.plans, schedule, driven, writer)
 
 
-def _about(config: CcrbConfig, ready: Prepared, world: Simulator) -> dict[str, Any]:
+def keep_loop(
+    config: CcrbConfig, ready: Prepared, world: Simulator, name: str, looped: Looped, writer: RunWriter
+) -> None:
+    """Write a closed loop, and beside it the roll-out on the arrivals of its plan, ``ready``."""
+    scenario = config.scenario
+    plans, schedule, _ = executed(looped.record)
+    _keep(config, ready, world, name, plans, schedule, looped.driven, writer, looped.facts)
+    with closing(open_simulator("embedded" if scenario.lane_change else "longitudinal")) as exact:
+        beside = drive(exact, scenario.cars, scenario.driving, ready.schedules[name])
+        about = {**_about(config, ready, exact, name), "study": "rollout"}
+        writer.append(ROLLOUTS, rollout_rows(about, ready.schedules[name], beside.outcomes))
+
+
+def _keep(
+    config: CcrbConfig,
+    ready: Prepared,
+    world: Simulator,
+    name: str,
+    plans: Plans,
+    schedule: Schedule,
+    driven: Driven,
+    writer: RunWriter,
+    facts: Mapping[str, float] = MappingProxyType({}),
+) -> None:
+    path = driven.trajectory
+    assert path is not None  # noqa: S101 - recorded
+    about = {**_about(config, ready, world, name), **facts}
+    texts = [[str(call) for call in config.scenario.calls]]
+    writer.append(ROLLOUTS, rollout_rows(about, schedule, driven.outcomes, motion=motion_of(path)))
+    writer.append(SKILLS, skill_rows(about["cell"], plans, schedule, [ready.request_id], texts=texts))
+    writer.append(TRAJECTORIES, trajectory_rows(about["cell"], path))
+
+
+def _about(config: CcrbConfig, ready: Prepared, world: Simulator, name: str) -> dict[str, Any]:
     setting, scenario = ready.setting, config.scenario
     of_setting = ("board", "title", "emulated", "tokens_per_s", "prompt_s", "n_skills", "t_nom_s")
     of_scenario = ("follower", "reflex", "lane_change", "front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s")
     return {
+        "cell": f"{setting.name}/{scenario.gap}/{name}",
+        "policy": name,
+        "late": ready.late if name == TTC else None,
         "study": "point",
         "draw": 0,
         "simulator": world.name,
@@ -111,7 +145,7 @@ _BOARD = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_origin"
 
 
 def run_ccrb(config: CcrbConfig, output: Path, progress: Progress) -> Path:
-    with closing(SIMULATORS[config.simulator]()) as world:
+    with closing(open_simulator(config.simulator)) as bare, closing(with_ego(bare, config.ego)) as world:
         if not config.plan_request.live:
             return _run_modelled(config, world, output, progress)
         from s2a_bench.experiments.ccrb.live import run_ccrb_live
@@ -135,7 +169,10 @@ def _run_modelled(config: CcrbConfig, world: Simulator, output: Path, progress: 
         tokens_s = ready.plans.token_s
         assert tokens_s is not None  # noqa: S101 - drawn plans have tokens
         writer.append(TOKENS, token_rows(ready.setting.name, tokens_s, [ready.request_id]))
-        drive_point(config, ready, world, writer)
+        if not config.closed_loop:
+            drive_point(config, ready, world, writer)
+        for name, policy in ready.policies.items() if config.closed_loop else ():
+            keep_loop(config, ready, world, name, replayed(config.scenario, world, policy, ready.plans), writer)
         _drive_studies(config, writer, progress)
         return writer.path
 

@@ -68,7 +68,7 @@ def motion_of(path: Trajectory) -> dict[str, float]:
     speed = path.speed_mps[:, EGO, 0]
     if len(speed) < 3:  # noqa: PLR2004 - over at once
         return {}
-    step_s = float(path.time_s[1])
+    step_s = float(path.time_s[1] - path.time_s[0])
     return {"rms_jerk": rms_jerk(speed, step_s), "peak_jerk": peak_jerk(speed, step_s), "sparc": sparc(speed, step_s)}
 
 

@@ -151,8 +151,6 @@ class Relay:
 
 
 def main() -> None:
-    """Relay until standard input ends."""
-
     def answer(facts: Mapping[str, Any]) -> None:
         sys.stdout.write(json.dumps(facts) + "\n")
         sys.stdout.flush()

@@ -53,16 +53,13 @@ class Tensor:
             blocks = left if self.blank else min(left, PART_BYTES // size)
             left -= blocks
             if self.value is None:
-                part = draw(_random_bytes(generator, blocks * size), self.spread)
+                drawn = generator.integers(0, 2**64 - 1, -(-blocks * size // 8), np.uint64, endpoint=True)
+                part = draw(drawn.view(np.uint8)[: blocks * size], self.spread)
                 if self.blank:  # bytes of 0 are numbers of 0 in every type
                     part.reshape(self.shape[0], -1)[self.blank] = 0
                 yield part
             else:
                 yield np.broadcast_to(np.asarray(self.value, _FLOATS[self.kind]), blocks).copy().view(np.uint8)
-
-
-def _random_bytes(generator: np.random.Generator, size: int) -> Bytes:
-    return generator.integers(0, 2**64 - 1, -(-size // 8), np.uint64, endpoint=True).view(np.uint8)[:size]
 
 
 def _f32(raw: Bytes, spread: float) -> Bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 from s2a_bench import extras
@@ -26,23 +26,15 @@ JETSON_CLOCKS = {
 @contextmanager
 def nvml() -> Iterator[tuple[Any, list[Any]]]:
     """Open NVML and yield the module and the GPUs; no GPUs without a driver or nvidia-ml-py."""
-    try:
-        pynvml = extras.require("pynvml", "nvidia")
-    except MissingExtra:
-        yield None, []
-        return
-    try:
-        pynvml.nvmlInit()
-    except pynvml.NVMLError:
-        yield pynvml, []
-        return
-    try:
-        gpus = []
-        with suppress(pynvml.NVMLError):
-            gpus = [pynvml.nvmlDeviceGetHandleByIndex(place) for place in range(pynvml.nvmlDeviceGetCount())]
+    pynvml, gpus = None, []
+    with ExitStack() as stack:
+        with suppress(MissingExtra):
+            pynvml = extras.require("pynvml", "nvidia")
+            with suppress(pynvml.NVMLError):
+                pynvml.nvmlInit()
+                stack.callback(pynvml.nvmlShutdown)
+                gpus = [pynvml.nvmlDeviceGetHandleByIndex(place) for place in range(pynvml.nvmlDeviceGetCount())]
         yield pynvml, gpus
-    finally:
-        pynvml.nvmlShutdown()
 
 
 def identity(lib: Any, card: Any) -> dict[str, str]:

@@ -83,7 +83,7 @@ class Reader(Protocol):
         """Return columns of `ResourceRow` by name; an unreadable one is absent."""
 
     def close(self) -> None:
-        """Close the source; may be called twice."""
+        """Close the source, if it is one to be closed; may be called twice."""
 
 
 READERS: dict[str, str] = {

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from s2a_bench.machine.resources import Unreadable
+from s2a_bench.machine.resources import Reader, Unreadable
 
 PROC = Path("/proc")
 POWERCAP = Path("/sys/class/powercap")
@@ -21,7 +21,7 @@ def cpu_clock(pid: int) -> int:
     return (~pid << 3) | 2
 
 
-class CpuTimes:
+class CpuTimes(Reader):
     cheap = True
 
     def __init__(self, pids: Sequence[int]) -> None:
@@ -40,11 +40,8 @@ class CpuTimes:
                 values["server_cpu_ns"] = sum(time.clock_gettime_ns(clock) for clock in self._servers)
         return values
 
-    def close(self) -> None:
-        pass
 
-
-class HostMemory:
+class HostMemory(Reader):
     cheap = False
 
     def __init__(self, pids: Sequence[int], root: Path = PROC) -> None:
@@ -72,9 +69,6 @@ class HostMemory:
             with suppress(OSError, LookupError, ValueError, ZeroDivisionError):
                 values[name] = source()
         return values
-
-    def close(self) -> None:
-        pass
 
     def _rss(self, process: str) -> int:
         return int((self._root / process / "statm").read_text().split()[1]) * PAGE_BYTES

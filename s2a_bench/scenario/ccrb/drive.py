@@ -155,6 +155,10 @@ class Drive(LockStep):
         passed = over & (self._watch.front.gap_m < -PASSED_M)
         return np.asarray(self._watch.front.crashed | resting | passed)
 
+    @property
+    def ego_moves(self) -> bool:
+        return bool((self._state.speed_mps[EGO] > 0).any())
+
     def outcomes(self) -> Outcomes:
         self._outcomes.put(self._left, self._watch.outcomes())
         return self._outcomes

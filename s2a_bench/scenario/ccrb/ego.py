@@ -64,6 +64,8 @@ class Ego(LockStep):
         self._level, self._slope = self._points[0].copy(), np.zeros(rollouts)
         self.phase = np.full(rollouts, WAITING)
         self.acceleration_mps2 = np.zeros(rollouts)
+        self.lag_mps = np.zeros(rollouts)
+        """Set-point minus speed; of interest while a skill runs."""
         self.end_s = self._start_s[-1] + self._duration_s[-1]
 
     @property
@@ -75,8 +77,8 @@ class Ego(LockStep):
     ) -> Floats:
         """Return the ego's acceleration in m/s^2 for the next step, shape (M,)."""
         self._advance(now_s)
-        wanted = self._level + self._slope * (now_s - self._from_s)
-        wish = np.where(self.phase == ACTING, self._slope + (wanted - speed) / EGO_LOOP_S, 0.0)
+        self.lag_mps = self._level + self._slope * (now_s - self._from_s) - speed
+        wish = np.where(self.phase == ACTING, self._slope + self.lag_mps / EGO_LOOP_S, 0.0)
         between = self.phase == GAP
         if between.any():
             for gap, rule in self._between.items():

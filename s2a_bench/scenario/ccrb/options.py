@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import Annotated, ClassVar, Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, one_of, option
-from s2a_bench.plan import Skill, load_skills
+from s2a_bench.plan import Call, Skill, load_skills
 from s2a_bench.plan.skillset import GAPS, Gap
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import (
@@ -109,12 +110,15 @@ class CcrbOptions(Options):
         return float(start_deadline(self.cars, self.decel_mps2))
 
     @property
-    def texts(self) -> list[str]:
+    def calls(self) -> list[Call]:
+        """Return the plan's skills, with the scenario's durations and gap behaviour."""
+        speed = replace(_skill("set_speed"), durations=self.durations, gap=self.gap)
+        lane = replace(_skill("change_lane"), durations=self.lane_durations, gap=self.gap)
         plan = self.driving
-        points = plan.set_point_mps[1:, 0] / KMH
+        kmh = (plan.set_point_mps[1:, 0] / KMH).round(1)
         return [
-            "change_lane(left)" if lane else f"set_speed({round(float(kmh), 1):g})"
-            for kmh, lane in zip(points, plan.lane, strict=True)
+            Call(lane, ("left",)) if aside else Call(speed, (f"{point:g}",))
+            for point, aside in zip(kmh, plan.lane, strict=True)
         ]
 
     def check(self) -> None:

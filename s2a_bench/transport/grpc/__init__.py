@@ -21,8 +21,6 @@ PAYLOAD_DOWN_BYTES = Fact("payload_down_bytes", "bytes", "what the chunk weighs 
 
 
 class GrpcOptions(TemplateOptions):
-    """The options of the client of lerobot's policy server."""
-
     SCHEMES: ClassVar[tuple[str, ...]] = ("grpc",)
     ENDS_WITH_PORT: ClassVar[bool] = True
     USUAL_TEMPLATE: ClassVar[str] = LEROBOT
@@ -34,8 +32,6 @@ class GrpcOptions(TemplateOptions):
 
 
 class Grpc(PolicyTransport[GrpcOptions]):
-    """lerobot's policies over gRPC."""
-
     name = "grpc"
     options = GrpcOptions
     variants = (LEROBOT,)

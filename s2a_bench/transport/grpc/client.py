@@ -46,8 +46,6 @@ _LOADED: Final[dict[str, dict[str, Any]]] = {}
 
 
 class GrpcClient(PolicyClient[GrpcOptions]):
-    """Asks one policy server."""
-
     def __init__(self, wiring: Wiring[GrpcOptions], alive: Callable[[], bool]) -> None:
         """Prepare to ask the server at ``wiring.address``; the first request connects and has it load the policy."""
         super().__init__(wiring, alive)

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from pkgutil import resolve_name
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
@@ -66,13 +67,9 @@ class Http(Transport[HttpOptions]):
     )
 
     def server(self, wiring: Wiring[HttpOptions], handler: Handler) -> Server:
-        if wiring.variant in FAST:
-            from s2a_bench.transport.http.fast import FastServer
-
-            return FastServer(wiring, handler)
-        from s2a_bench.transport.http.server import HttpServer
-
-        return HttpServer(wiring, handler)
+        kind = "fast:FastServer" if wiring.variant in FAST else "server:HttpServer"
+        bound: Server = resolve_name(f"s2a_bench.transport.http.{kind}")(wiring, handler)
+        return bound
 
     def measured(self, choice: Choice[HttpOptions]) -> Sequence[str]:
         """Return the variants that the server speaks; llama.cpp's server too if it is installed and comparable."""

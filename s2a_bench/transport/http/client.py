@@ -21,7 +21,7 @@ from s2a_bench.errors import RequestFailed, ServerDied, TransportError, UsageErr
 from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, PROMPT_MS, RECONNECTS, THINKING_N
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring
+from s2a_bench.transport import Client, Wiring
 from s2a_bench.transport.http import HEADERS_MS, THINKING_MS, THINKING_PIECES, blocks, native
 from s2a_bench.transport.http.clients import BoundedClient, HttpResponse, LeanClient
 from s2a_bench.transport.http.detect import body_of, met
@@ -45,10 +45,9 @@ QUOTED = 200
 """Characters that are quoted of a body that is no error object."""
 
 
-class HttpClient:
+class HttpClient(Client):
     def __init__(self, wiring: Wiring[HttpOptions], alive: Callable[[], bool]) -> None:
         """Prepare requests to ``wiring.address``; a black box of unknown dialect is asked for its list of models."""
-        self.camera = None
         self._wiring, self._alive = wiring, alive
         options, key = wiring.options, read_key(wiring.options.api_key_env)
         self._codec = native.CODECS[wiring.variant]

@@ -12,7 +12,7 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import orjson
 import pybase64
@@ -21,10 +21,8 @@ from s2a_bench.errors import BadRequest, Busy, EngineError, Overdue, S2AError, T
 from s2a_bench.transport.access import Access
 from s2a_bench.transport.http import VARIANTS
 from s2a_bench.transport.http.dialects.common import sampled
+from s2a_bench.transport.serving import Core, Queued
 from s2a_bench.types import Request
-
-if TYPE_CHECKING:
-    from s2a_bench.transport.serving import Core, Queued
 
 AS_DEPLOYED, BEST_EFFORT, BINARY, LLAMA_SERVER = VARIANTS
 
@@ -53,12 +51,8 @@ class Codec:
     from_base64: Callable[[str], bytes]
 
 
-def _dumps(value: Any) -> bytes:
-    return json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
-
-
 STANDARD = Codec(
-    dumps=_dumps,
+    dumps=lambda value: json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode(),
     loads=json.loads,
     to_base64=lambda data: base64.b64encode(data).decode("ascii"),
     from_base64=base64.b64decode,
@@ -146,12 +140,6 @@ def native_parameters(request: Request) -> dict[str, Any]:
     """Return the fields that only our server knows."""
     optional = {"grammar": request.grammar, "state": request.state}
     return {"request_id": request.id, **{name: value for name, value in optional.items() if value}}
-
-
-def messages(prompt: str, uris: list[str]) -> list[dict[str, Any]]:
-    """Return one user message: the pictures, then the prompt."""
-    pictures: list[dict[str, Any]] = [{"type": "image_url", "image_url": {"url": uri}} for uri in uris]
-    return [{"role": "user", "content": [*pictures, {"type": "text", "text": prompt}]}]
 
 
 def stream_event(

@@ -12,7 +12,7 @@ from threading import Event
 
 from s2a_bench.errors import EngineError, RequestFailed, ServerDied
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler, TransportOptions, Wiring
+from s2a_bench.transport import Client, Handler, TransportOptions, Wiring
 from s2a_bench.transport.pictures import bgr_of, rgb_of
 from s2a_bench.types import Piece, Request
 
@@ -39,10 +39,9 @@ class LoopbackServer:
         self._stopped.set()
 
 
-class LoopbackClient:
+class LoopbackClient(Client):
     def __init__(self, wiring: Wiring[TransportOptions], alive: Callable[[], bool]) -> None:
         del alive  # a server in this process lives as long as it is registered
-        self.camera = None
         self._address = wiring.address
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
@@ -62,9 +61,3 @@ class LoopbackClient:
         except EngineError as error:
             raise RequestFailed(str(error)) from error
         trace.receive(served.to_remote())
-
-    def describe(self) -> dict[str, str]:
-        return {}
-
-    def close(self) -> None:
-        """Do nothing: there is no connection."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pkgutil import resolve_name
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
@@ -49,13 +50,9 @@ class Ros(Transport[RosOptions]):
     server_class = "s2a_bench.transport.ros.server:RosServer"
 
     def client(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> Client:
-        if wiring.variant == ACTION:
-            from s2a_bench.transport.ros.action import GenerateClient
-
-            return GenerateClient(wiring, alive)
-        from s2a_bench.transport.ros.topic import TopicClient
-
-        return TopicClient(wiring, alive)
+        kind = "action:GenerateClient" if wiring.variant == ACTION else "topic:TopicClient"
+        opened: Client = resolve_name(f"s2a_bench.transport.ros.{kind}")(wiring, alive)
+        return opened
 
     def measured(self, choice: Choice[RosOptions]) -> Sequence[str]:
         """Return `action` for an external node, else the default."""

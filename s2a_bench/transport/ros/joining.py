@@ -17,7 +17,7 @@ from s2a_bench.ros.llama import GENERATE_RESPONSE
 from s2a_bench.ros.remap import Remapped, table
 from s2a_bench.ros.router import ROUTER, Router, free_endpoint, listens, may_host
 from s2a_bench.ros.service import appeared
-from s2a_bench.transport import Wiring
+from s2a_bench.transport import Client, Wiring
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.ros.camera import CAMERA, COMPRESSED_CAMERA, POLL_S, CameraPublisher
 from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
@@ -154,7 +154,7 @@ def _action_offered(probe: Middleware, name: str) -> Callable[[], bool]:
         return lambda: False
 
 
-class RosClient:
+class RosClient(Client):
     """What the clients of both variants have: a node, the server's camera, and messages that they wait for."""
 
     def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
@@ -172,9 +172,6 @@ class RosClient:
         deadline_ns = now_ns() + int(self._wiring.timeout_s * 1e9)
         while now_ns() < deadline_ns:
             yield take(min(POLL_S, bounds.left_s()))
-
-    def describe(self) -> dict[str, str]:
-        return {}
 
     def close(self) -> None:
         self.middleware.close()

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from threading import Event, Thread
 from typing import Any, Final
 
+from pydantic.alias_generators import to_snake
+
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.options import Options
@@ -113,7 +115,7 @@ class NodeApi:
         self._events = middleware.publisher(EVENTS, EVENT, PARAMETERS_QOS)
         held = Parameters(parameters, change, lambda changed: self._tell(changed_parameters=changed))
         for kind, answer in held.services():
-            middleware.service(f"{name}/{snake(kind)}", SERVICE + kind, answer, PARAMETERS_QOS)
+            middleware.service(f"{name}/{to_snake(kind)}", SERVICE + kind, answer, PARAMETERS_QOS)
         self._tell(new_parameters=held.messages())
         self._diagnostics = middleware.publisher(DIAGNOSTICS, ARRAY, DIAGNOSTICS_QOS)
         console = logging.StreamHandler()
@@ -154,7 +156,3 @@ def declared(wiring: Wiring[RosOptions], settings: Options | None) -> list[Param
         *of_options(wiring.limits, SET),
         *(of_options(settings, type(settings).model_fields) if settings else ()),
     ]
-
-
-def snake(name: str) -> str:
-    return "".join(f"_{letter.lower()}" if letter.isupper() else letter for letter in name).lstrip("_")

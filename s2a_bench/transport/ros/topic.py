@@ -139,8 +139,6 @@ class TopicSource:
 
 
 class TopicExchange(RosExchange):
-    """One request of the topic variant."""
-
     def __init__(self, source: TopicSource, message: Any, shared: Shared, trace: Trace) -> None:
         super().__init__(shared, trace)
         self._source, self._message = source, message

@@ -57,21 +57,18 @@ def request_message(request: Request, images: Sequence[Any] = (), compressed_ima
 
 def token_message(request_id: str, piece: Piece, *, last: bool, error: str = "", marks: Sequence[Any] = ()) -> Any:
     """Turn a piece of an answer into s2a_msgs/Token; ``last`` ends the answer, with marks or an error."""
+    actions = [piece] if isinstance(piece, Action) else []
     return ros.message(
         ros.TOKEN,
         id=request_id,
         index=piece.index,
-        text="" if isinstance(piece, Action) else piece.text,
+        text="" if actions else piece.text,
         token=piece.id,
-        actions=[_actions_message(piece)] if isinstance(piece, Action) else [],
+        actions=[ros.message(ros.ACTIONS, index=a.index, dims=len(a.values), values=a.values) for a in actions],
         last=last,
         error=error,
         marks=marks,
     )
-
-
-def _actions_message(action: Action) -> Any:
-    return ros.message(ros.ACTIONS, index=action.index, dims=len(action.values), values=action.values)
 
 
 def pieces_of(message: Any) -> list[Piece]:

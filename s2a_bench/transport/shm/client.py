@@ -13,7 +13,7 @@ import orjson
 from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring
+from s2a_bench.transport import Client, Wiring
 from s2a_bench.transport.connections import wait_at_most
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.pictures import bgr_of, encoded
@@ -27,10 +27,8 @@ NEARER_S: Final = 0.1
 """A wait that ends later than it should by no more than this is left as it is: to change it is a system call."""
 
 
-class ShmClient:
+class ShmClient(Client):
     """One link to a server; a request that does not fit opens another, with more memory."""
-
-    camera = None
 
     def __init__(self, wiring: Wiring[ShmOptions], alive: Callable[[], bool]) -> None:
         """Connect; raises ServerDied if no server listens."""
@@ -61,9 +59,6 @@ class ShmClient:
             if not done:  # what was not read belongs to this request only
                 self.close()
 
-    def describe(self) -> dict[str, str]:
-        return {}
-
     def close(self) -> None:
         """Close the link; the memory goes with its last user, the socket of a server that was killed is removed."""
         if self._link is not None:
@@ -84,7 +79,16 @@ class ShmClient:
         """Write pictures and header into memory; return the link, and where the header lies."""
         pictures = [self._picture(frame, trace) for frame in request.images]
         size = sum(about["bytes"] for about, _ in pictures)
-        header = _header(request, [about for about, _ in pictures])
+        fields = {
+            "id": request.id,
+            "prompt": request.prompt,
+            "max_tokens": request.max_tokens,
+            "grammar": request.grammar,
+            "seed": request.seed,
+            "state": request.state,
+            "images": [about for about, _ in pictures],
+        }
+        header = orjson.dumps(fields)
         needed = size + len(header)
         trace.mark("header_pack")
         link = self._link
@@ -140,20 +144,6 @@ class ShmClient:
         if not self._alive():
             return ServerDied(f"the server at {self._path} has ended")
         return RequestFailed(f"{self._path} broke off: {str(error) or 'it closed the link'}")
-
-
-def _header(request: Request, pictures: list[dict[str, Any]]) -> bytes:
-    return orjson.dumps(
-        {
-            "id": request.id,
-            "prompt": request.prompt,
-            "max_tokens": request.max_tokens,
-            "grammar": request.grammar,
-            "seed": request.seed,
-            "state": request.state,
-            "images": pictures,
-        }
-    )
 
 
 class ShmConnection:

@@ -40,8 +40,6 @@ from s2a_bench.types import Action, Frame, Piece, Request
 
 
 class WebsocketClient(PolicyClient[WebsocketOptions]):
-    """One variant of openpi's protocol."""
-
     def __init__(self, wiring: Wiring[WebsocketOptions], alive: Callable[[], bool]) -> None:
         """Prepare to ask the server at ``wiring.address``; the first request, or `describe`, connects."""
         super().__init__(wiring, alive)

@@ -65,10 +65,7 @@ def _packable(value: Any) -> Any:
         raise ValueError(f"arrays of type {value.dtype} do not travel")
     if isinstance(value, np.generic):
         return {GENERIC: True, b"data": value.item(), b"dtype": value.dtype.str}
-    if value.flags.c_contiguous and value.size:
-        data: Any = value.reshape(-1).view(np.uint8).data  # without the copy of tobytes
-    else:
-        data = value.tobytes()
+    data = np.ascontiguousarray(value).reshape(-1).view(np.uint8).data  # without the copy of tobytes
     return {ARRAY: True, b"data": data, b"dtype": value.dtype.str, b"shape": value.shape}
 
 

@@ -48,8 +48,6 @@ N1: Final = WRONG_POLICY, b"PK\x03\x04", *(bytes((0x80, protocol)) for protocol 
 
 
 class ZmqClient(PolicyClient[ZmqOptions]):
-    """Asks one policy server."""
-
     def __init__(self, wiring: Wiring[ZmqOptions], alive: Callable[[], bool]) -> None:
         """Prepare; request the layout of a foreign server, unless the options name it."""
         super().__init__(wiring, alive)
@@ -214,7 +212,6 @@ class ReqSocket:
         self._poller.register(self._socket, zmq.POLLIN)
 
     def exchange(self, body: memoryview, bounds: Bounds) -> bytes:
-        """Send a request; return its answer."""
         try:
             self._socket.send(body, copy=False)
             ends_ns = self._patience_ns(bounds)

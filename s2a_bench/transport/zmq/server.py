@@ -17,7 +17,7 @@ from concurrent.futures import TimeoutError as NotYet
 from contextlib import ExitStack, suppress
 from functools import partial
 from threading import Event, Lock, Semaphore
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import zmq
 
@@ -154,17 +154,14 @@ class ZmqServer:
                 message, marks = read(frame.buffer)
                 trace.mark("msgpack_parse")
                 self._check(message)
-                endpoint, extension = (
-                    message.get(layouts.ENDPOINT, layouts.GET_ACTION),
-                    observed.take_extension(message),
-                )
+                endpoint = message.get(layouts.ENDPOINT, layouts.GET_ACTION)
+                extension = observed.take_extension(message)
+                request = (client.name, str(extension.get("id"))) if extension is not None else None
                 if endpoint == layouts.GET_ACTION:
-                    promised = (
-                        self._marks.promise(client.name, str(extension.get("id"))) if extension is not None else None
-                    )
+                    promised = self._marks.promise(request) if request else None
                     self._core.answer(ActionExchange(client, message, marks, extension, trace, promised, self._core))
-                elif endpoint == layouts.MARKS and extension is not None:
-                    client.say(self._marks.take(client.name, str(extension.get("id")), self._core.limits.answer_s))
+                elif endpoint == layouts.MARKS and request:
+                    client.say(self._marks.take(request, self._core.limits.answer_s))
                 else:
                     client.say(pack(self._reply(endpoint)))
             except Exception as error:  # noqa: BLE001 - the client must hear of it, whatever broke
@@ -272,14 +269,11 @@ class ActionExchange(Exchange):
         return self._client.connection.disconnected
 
 
-class Promise:
+class Promise(NamedTuple):
     """The marks of a request, and whether its client has requested them."""
 
-    __slots__ = ("marks", "wanted")
-
-    def __init__(self) -> None:
-        self.wanted = Event()
-        self.marks: Future[bytes] = Future()
+    marks: Future[bytes]
+    wanted: Event
 
 
 def _unknown() -> RequestFailed:
@@ -293,18 +287,19 @@ class Marks:
         self._lock = Lock()
         self._promises: OrderedDict[tuple[bytes, str], Promise] = OrderedDict()
 
-    def promise(self, name: bytes, request_id: str) -> Promise:
-        promised = Promise()
+    def promise(self, request: tuple[bytes, str]) -> Promise:
+        """Return the promise of a client's request, given by its name and the request's id."""
+        promised = Promise(Future(), Event())
         with self._lock:
-            self._promises[name, request_id] = promised
+            self._promises[request] = promised
             if len(self._promises) > KEPT:
                 self._promises.popitem(last=False)
         return promised
 
-    def take(self, name: bytes, request_id: str, seconds: float) -> bytes:
+    def take(self, request: tuple[bytes, str], seconds: float) -> bytes:
         """Wait for the marks of a request; raises RequestFailed for one that is not known."""
         with self._lock:
-            promised = self._promises.pop((name, request_id), None)
+            promised = self._promises.pop(request, None)
         if promised is None:
             raise _unknown()
         promised.wanted.set()

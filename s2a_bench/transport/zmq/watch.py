@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import socket
-import struct
 from contextlib import suppress
 from typing import Any, Final
 
 import zmq
+from zmq.utils.monitor import parse_monitor_message
 
-EVENT: Final = struct.Struct("=HI")
-"""The first frame of a monitor's event."""
 BEGUN: Final = {zmq.EVENT_ACCEPTED, zmq.EVENT_CONNECTED}
 REFUSED: Final = {zmq.EVENT_CONNECT_RETRIED, zmq.EVENT_CLOSED}
 
@@ -38,7 +36,8 @@ class ConnectionWatch:
 
     def hear(self) -> None:
         while self.monitor.getsockopt(zmq.EVENTS) & int(zmq.POLLIN):
-            event, value = EVENT.unpack(self.monitor.recv_multipart()[0])
+            message = parse_monitor_message(self.monitor.recv_multipart())
+            event, value = message["event"], message["value"]
             if event in BEGUN:
                 self.met = True
                 self._end(value)

@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import msgpack
 import numpy as np
-from numpy.typing import NDArray
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.transport.messagepack import array_in, unpacked
@@ -39,8 +38,11 @@ def pack(message: Any, files: Mapping[int, PictureFile] = NO_FILES, *, maps: boo
     def plain(value: Any) -> Any:
         if not isinstance(value, np.ndarray):
             raise TypeError(f"{type(value).__name__} is none of its types")
-        if maps:
-            return _map_of(value)
+        if maps:  # its elements are packed from where they are
+            solid = np.ascontiguousarray(value)
+            data = solid.reshape(-1).view(np.uint8).data
+            fields = {ND: True, TYPE: solid.dtype.str, KIND: b"", SHAPE: value.shape, BYTES: data}
+            return {key.encode(): each for key, each in fields.items()}
         file = files.get(value.__array_interface__["data"][0])
         return {ARRAY: True, FILE: (file.file(value) if file else None) or file_of(value)}
 
@@ -53,13 +55,11 @@ def pack(message: Any, files: Mapping[int, PictureFile] = NO_FILES, *, maps: boo
     return memoryview(packer.getbuffer())  # without the copy of packb
 
 
-def unpack(data: Any) -> Any:
-    """Return the message in a buffer, its arrays read-only; raises RequestFailed for any other bytes."""
-    return read(data)[0]
-
-
 def read(data: Any) -> tuple[Any, set[str]]:
-    """Return what `unpack` does, and the marks of its arrays and configurations: N1.5 to N1.7, `OURS`."""
+    """Return the message in a buffer, its arrays read-only, and the marks of its arrays and configurations.
+
+    Marks are N1.5 to N1.7, and `OURS`. Raises RequestFailed for any other bytes.
+    """
     marks: set[str] = set()
 
     def plain(value: dict[Any, Any]) -> Any:
@@ -77,14 +77,6 @@ def read(data: Any) -> tuple[Any, set[str]]:
         return value
 
     return unpacked(data, plain), marks
-
-
-def _map_of(array: NDArray[Any]) -> dict[bytes, Any]:
-    """Return an array as msgpack-numpy has it; its elements are packed from where they are."""
-    solid = np.ascontiguousarray(array)
-    data = solid.reshape(-1).view(np.uint8).data
-    fields = {ND: True, TYPE: solid.dtype.str, KIND: b"", SHAPE: array.shape, BYTES: data}
-    return {key.encode(): value for key, value in fields.items()}
 
 
 def _array_in(fields: Mapping[str, Any]) -> Any:

@@ -22,6 +22,7 @@ class ToyWorld(Simulator):
     real: ClassVar[bool] = True
     steers: ClassVar[bool] = False
     most: ClassVar[int | None] = 1
+    over_ros: ClassVar[bool] = False
 
     step_s = STEP_S
 

@@ -36,7 +36,8 @@ def test_before_a_lane_change_half_the_speed_is_left() -> None:
 def test_the_plan_is_made_of_calls_of_the_driving_skill_set(lane_change: bool) -> None:
     options = CcrbOptions(lane_change=lane_change, n_skills=5)
     known = {str(call) for call in load_skills("driving").calls}
-    assert set(options.texts) <= known
+    assert {str(call) for call in options.calls} <= known
+    assert {call.skill.gap for call in options.calls} == {options.gap}
     assert len(options.driving.lane) == 5 + lane_change
 
 

@@ -79,7 +79,6 @@ def build_scenario(run: StoredRun) -> Figure:
     )
     figure = new_figure(4.5, (title, *origin_notes(run)), WIDE_IN)
     grid = figure.subplots(3, len(rows), squeeze=False, sharex=True, sharey="row")
-    token_s = token_times_s(run)
     until_s = max(float(path["time_s"].iloc[-1]) for path in paths.values())
     for column, row in enumerate(rows):
         path, cell = paths[row["policy"]], row["cell"]
@@ -90,7 +89,7 @@ def build_scenario(run: StoredRun) -> Figure:
             axes.set_xlim(0, until_s)
         _draw_cars(above, path, "position_m")
         # Along the lower edge, whatever the positions.
-        edge = above.get_xaxis_transform()
+        edge, token_s = above.get_xaxis_transform(), token_times_s(run, cell)
         above.plot(token_s, [0.04] * len(token_s), "|", color="#555555", markersize=5, transform=edge, clip_on=False)
         _draw_cars(grid[1, column], path, "speed_kmh")
         _draw_gaps(grid[2, column], path, row)

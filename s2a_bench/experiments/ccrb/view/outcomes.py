@@ -112,11 +112,13 @@ def configuration(run: StoredRun) -> dict[str, Any]:
     return found
 
 
-def token_times_s(run: StoredRun) -> list[float]:
-    """Return the arrival times of the driven plan's tokens, in s from the request."""
-    request_id = run.table(SKILLS)["request_id"].iloc[0]
-    tokens = run.table(TOKENS)
-    zero_ns = run.manifest.get("request", {}).get("requested_ns", 0)
+def token_times_s(run: StoredRun, cell: str) -> list[float]:
+    """Return the arrival times of the tokens that ``cell`` was driven on, in s from its request."""
+    skills, tokens = run.table(SKILLS), run.table(TOKENS)
+    request_id = skills[skills["cell"] == cell]["request_id"].iloc[0]
+    zero_ns = run.manifest.get("requests", {}).get(request_id, 0) or run.manifest.get("request", {}).get(
+        "requested_ns", 0
+    )
     return [(int(at_ns) - zero_ns) / 1e9 for at_ns in tokens[tokens["request_id"] == request_id]["client_ns"]]
 
 

@@ -23,11 +23,10 @@ NATIVE = "s2a"
 
 @dataclass(frozen=True, slots=True)
 class EncodedPicture:
-    """A picture ready to be packed; ``shape`` is that of its bytes: (n,) or (height, width, 3)."""
+    """A picture ready to be packed."""
 
     media_type: str
     base64: str
-    shape: tuple[int, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from s2a_bench.transport import TOKENS
 from s2a_bench.transport.http.dialects import EncodedPicture, Event
 from s2a_bench.transport.http.dialects.framing import Framing, ServerSentEvents
 from s2a_bench.transport.pictures import encoded
-from s2a_bench.types import Frame, Pixels, Request
+from s2a_bench.types import Pixels, Request
 
 TEMPERATURE, TOP_P = 0.7, 0.8
 
@@ -67,18 +67,14 @@ class Dialect:
         """Return the headers that carry an API key (RFC 6750)."""
         return {"authorization": f"Bearer {key}"}
 
-    def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
-        return encoded(frame, payload, trace)
-
     def fields(
         self, request: Request, payload: str, model: str, to_base64: Callable[[Pixels], str], trace: Trace
     ) -> dict[str, Any]:
         pictures = []
         for frame in request.images:
-            media_type, data = self.encode(frame, payload, trace)
-            text = to_base64(data.reshape(-1))
+            media_type, data = encoded(frame, payload, trace)
+            pictures.append(EncodedPicture(media_type, to_base64(data.reshape(-1))))
             trace.mark("base64_encode")
-            pictures.append(EncodedPicture(media_type, text, data.shape))
         return self.body(request, pictures, model)
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:

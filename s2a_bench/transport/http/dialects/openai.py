@@ -31,14 +31,7 @@ from s2a_bench.transport.chunks import NUMBERS as TICKS
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http import native
 from s2a_bench.transport.http.dialects import NATIVE, EncodedPicture, Event
-from s2a_bench.transport.http.dialects.common import (
-    Dialect,
-    evaluated,
-    numbers,
-    text_of,
-    token_id,
-    usage_of,
-)
+from s2a_bench.transport.http.dialects.common import Dialect, evaluated, numbers, text_of, token_id, usage_of
 from s2a_bench.transport.limits import whole_number
 from s2a_bench.types import Action, Request
 
@@ -66,9 +59,11 @@ class OpenAI(Dialect):
     facts = (*TIMINGS.values(), *METRICS.values(), THINKING_N, PREDICTED_STEPS, USAGE_ZERO)
 
     def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
-        extra = self._extra(request)
         uris = [f"data:{picture.media_type};base64,{picture.base64}" for picture in pictures]
-        return {**native.parameters(request, model), **extra, "messages": native.messages(request.prompt, uris)}
+        content: list[Any] = [{"type": "image_url", "image_url": {"url": uri}} for uri in uris]
+        content.append({"type": "text", "text": request.prompt})
+        messages = [{"role": "user", "content": content}]
+        return {**native.parameters(request, model), **self._extra(request), "messages": messages}
 
     def _extra(self, request: Request) -> dict[str, Any]:  # noqa: ARG002 - for subclasses
         return {}

@@ -15,17 +15,16 @@ import numpy as np
 
 from s2a_bench import extras
 from s2a_bench.facts import Fact
-from s2a_bench.frames.convert import to_rgb
 from s2a_bench.trace import Trace
 from s2a_bench.transport import ACTIONS
 from s2a_bench.transport.chunks import actions_of
-from s2a_bench.transport.http.dialects import EncodedPicture, Event
+from s2a_bench.transport.http.dialects import Event
 from s2a_bench.transport.http.dialects.common import Dialect
 from s2a_bench.transport.http.dialects.framing import WholeBody
 from s2a_bench.transport.observation import Template, template_of
 from s2a_bench.transport.pictures import policy_picture
 from s2a_bench.transport.policies import PolicyTransport
-from s2a_bench.types import Frame, Pixels, Request
+from s2a_bench.types import Pixels, Request
 
 json_numpy = extras.require("json_numpy", "act")
 
@@ -66,21 +65,15 @@ class OpenVla(Dialect):
         if self._template is not None:
             self._template.check_request(cameras, state)
 
-    def encode(self, frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:  # noqa: ARG002 - always pixels
-        """Return the pixels as RGB, height x width x 3, marking `convert`."""
-        if frame.encoding == "rgb8":
-            return "", frame.data
-        pixels = to_rgb(frame)
-        trace.mark("convert")
-        return "", pixels
-
     def fields(
         self, request: Request, payload: str, model: str, to_base64: Callable[[Pixels], str], trace: Trace
     ) -> dict[str, Any]:
-        if self._template is None:
-            return super().fields(request, payload, model, to_base64, trace)
-        as_text, as_lists = self._template.server.arrays_as_text, self._template.server.arrays_as_lists
-        pictures = [policy_picture(frame, payload, trace) for frame in request.images]
+        """Return the template's observation, OpenVLA's own without one, in the form of ``json_numpy.dumps``."""
+        template, frames = self._template, request.images if self._template else request.images[:1]
+        pictures = [policy_picture(frame, payload, trace) for frame in frames]
+        filled: dict[str, Any] = {"instruction": request.prompt} | ({"image": pictures[0]} if pictures else {})
+        if template:
+            filled = template.fill(pictures, request.state, request.prompt)
 
         def sendable(value: Any) -> Any:
             if isinstance(value, dict):
@@ -91,24 +84,15 @@ class OpenVla(Dialect):
                 value = np.frombuffer(value, np.uint8)
             if not isinstance(value, np.ndarray):
                 return value
-            if as_lists:
+            if template and template.server.arrays_as_lists:
                 return value.tolist()
             data = np.ascontiguousarray(value).reshape(-1).view(np.uint8)
             array = {ARRAY: to_base64(data), "dtype": value.dtype.str, "shape": value.shape}
-            return json.dumps(array) if as_text else array
+            return json.dumps(array) if template and template.server.arrays_as_text else array
 
-        observation: dict[str, Any] = sendable(self._template.fill(pictures, request.state, request.prompt))
+        observation: dict[str, Any] = sendable(filled)
         trace.mark("base64_encode")
         return {**observation, "unnorm_key": model} if model else observation
-
-    def body(self, request: Request, pictures: list[EncodedPicture], model: str) -> dict[str, Any]:
-        """Return the array in the form of ``json_numpy.dumps``, and the instruction."""
-        fields: dict[str, Any] = {"instruction": request.prompt}
-        if model:
-            fields["unnorm_key"] = model
-        for picture in pictures[:1]:
-            fields["image"] = {ARRAY: picture.base64, "dtype": "|u1", "shape": picture.shape}
-        return fields
 
     def event(self, message: Any) -> Event:
         """Read the action: an array, an array in a JSON text (a server that was sent ``encoded``), or a list of them.

@@ -1,0 +1,266 @@
+"""`ccrb --closed-loop`: the same outcomes as roll-outs, on a virtual clock and on the real one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from threading import enumerate as threads
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from s2a_bench.act.events import Requested, VirtualInbox
+from s2a_bench.cli.progress import RunProgress
+from s2a_bench.clock import VirtualClock
+from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.experiments.ccrb.config import CcrbConfig, PlanRequest
+from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
+from s2a_bench.experiments.ccrb.run import Prepared, keep_loop, prepare, run_ccrb
+from s2a_bench.experiments.ccrb.studies import motion_of
+from s2a_bench.inference import EngineConfig
+from s2a_bench.plan.skillset import GAPS, Gap
+from s2a_bench.policy import COMPARED
+from s2a_bench.scenario import EGO, LEAD, DriveCommand, State
+from s2a_bench.scenario.ccrb.drive import Driven, drive
+from s2a_bench.scenario.ccrb.ego import ACTING, DONE, GAP
+from s2a_bench.scenario.ccrb.options import CcrbOptions
+from s2a_bench.scenario.ccrb.studies import draw
+from s2a_bench.scenario.embedded import Embedded
+from s2a_bench.scenario.longitudinal import Longitudinal
+from s2a_bench.store.requests import SKILLS
+from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.transport.loopback.in_process import LoopbackClient
+from s2a_bench.types import Piece, Request
+
+LIVE = PlanRequest(live=True, transport="loopback", engine=EngineConfig(name="replay"))
+
+
+def scenario(number: int) -> CcrbConfig:
+    """Return one of 20 random scenarios."""
+    at: dict[str, Any] = {
+        name: values[number].item() for name, values in draw(np.random.default_rng(45), 20).numbers.items()
+    }
+    numbers = {
+        name: at[name] for name in ("front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s", "n_skills", "t_nom_s")
+    }
+    options = CcrbOptions(**numbers, speed_kmh=at["speed_mps"] * 3.6, gap=GAPS[number % len(GAPS)])
+    return CcrbConfig(
+        rate=at["tokens_per_s"], prompt_s=at["prompt_s"], tokens_per_skill=at["tokens_per_skill"], scenario=options
+    )
+
+
+def driven(config: CcrbConfig, ready: Prepared, name: str) -> Driven:
+    return drive(Longitudinal(), config.scenario.cars, config.scenario.driving, ready.schedules[name])
+
+
+def differ_m(one: Driven, other: Driven) -> float:
+    names = ("min_front_gap_m", "min_rear_gap_m")
+    return max(abs(float(getattr(one.outcomes, name)[0] - getattr(other.outcomes, name)[0])) for name in names)
+
+
+@pytest.mark.parametrize("number", range(20))
+def test_on_the_same_arrivals_a_loop_ends_as_its_roll_out(number: int) -> None:
+    config = scenario(number)
+    ready, name = prepare(config), COMPARED[number % 3]
+    looped = replayed(config.scenario, Embedded(), ready.policies[name], ready.plans)
+    expected = driven(config, ready, name)
+    assert looped.record.outcome == "completed"
+    assert looped.driven.outcomes.name(0) == expected.outcomes.name(0)
+    assert differ_m(looped.driven, expected) < 0.03
+    assert looped.facts["real_time_factor"] == 1.0
+
+
+def test_motion_does_not_depend_on_when_the_first_sample_was() -> None:
+    config = CcrbConfig()
+    schedule = prepare(config).schedules["naive"]
+    path = drive(Longitudinal(), config.scenario.cars, config.scenario.driving, schedule, record=True).trajectory
+    assert path is not None
+    assert motion_of(replace(path, time_s=path.time_s + 0.013)) == pytest.approx(motion_of(path))
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_a_step_as_on_the_clock_changes_gaps_by_decimetres_at_most(number: int) -> None:
+    config, world = scenario(number), Longitudinal()
+    ready, world.step_s = prepare(config), 0.02
+    for name in COMPARED:
+        looped = replayed(config.scenario, world, ready.policies[name], ready.plans)
+        expected = driven(config, ready, name)
+        assert looped.driven.outcomes.name(0) == expected.outcomes.name(0)
+        assert differ_m(looped.driven, expected) < 0.2
+
+
+def run(folder: Path, **options: Any) -> StoredRun:
+    with RunProgress() as progress:
+        return read_run(
+            run_ccrb(CcrbConfig(**{"closed_loop": True, "plan_request": LIVE, **options}), folder, progress)
+        )
+
+
+def by_study(stored: StoredRun, study: str) -> pd.DataFrame:
+    rows = stored.table(ROLLOUTS)
+    return rows[rows["study"] == study].set_index("policy")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("front_gap_m", "rear_gap_m", "gap"), [(40.0, 14.0, "stop"), (12.0, 20.0, "coast"), (60.0, 10.0, "hold")]
+)
+def test_in_real_time_a_loop_ends_as_the_roll_out_of_the_arrivals_that_it_had(
+    front_gap_m: float, rear_gap_m: float, gap: Gap, tmp_path: Path
+) -> None:
+    options = CcrbOptions(front_gap_m=front_gap_m, rear_gap_m=rear_gap_m, gap=gap)
+    stored = run(tmp_path, scenario=options, simulator="embedded", policies=("naive", "wait-then-act"))
+    loops, rollouts = by_study(stored, "point"), by_study(stored, "rollout")
+    assert list(loops["outcome"]) == list(rollouts["outcome"])
+    assert loops["min_front_gap_m"].to_numpy() == pytest.approx(rollouts["min_front_gap_m"].to_numpy(), abs=1.0)
+    assert loops["min_rear_gap_m"].to_numpy() == pytest.approx(rollouts["min_rear_gap_m"].to_numpy(), abs=1.0)
+    assert loops["start_ns"].to_numpy() == pytest.approx(rollouts["start_ns"].to_numpy(), abs=200e6)
+
+
+def test_each_policy_has_a_request_of_its_own_with_the_same_seed(fast_board: str, tmp_path: Path) -> None:
+    options = CcrbOptions(n_skills=3, speed_kmh=20)
+    stored = run(tmp_path, scenario=options, profile=fast_board, policies=("naive", "wait-then-act"))
+    skills = stored.table(SKILLS)
+    assert list(skills.groupby("cell", sort=False)["request_id"].nunique()) == [1, 1]
+    assert skills["request_id"].nunique() == 2
+    assert set(stored.manifest["requests"]) == set(skills["request_id"])
+    assert list(skills["text"][:3]) == ["set_speed(13.3)", "set_speed(6.7)", "set_speed(0)"]
+    assert stored.manifest["configuration"]["time"] == "monotonic"
+    paths = stored.table(TRAJECTORIES)
+    assert 0 <= paths.groupby("cell")["at_ns"].min().max() < 200e6
+    assert len(by_study(stored, "point")) == len(by_study(stored, "rollout")) == 2
+
+
+class Heavy(Longitudinal):
+    """A world whose steps take time."""
+
+    def __init__(self, clock: VirtualClock, costs_s: Iterator[float]) -> None:
+        super().__init__()
+        self._clock, self._costs_s = clock, costs_s
+
+    def step(self, command: DriveCommand) -> State:
+        self._clock.sleep_until_ns(self._clock.now_ns() + round(next(self._costs_s, 0.0) * 1e9))
+        return super().step(command)
+
+
+@pytest.mark.parametrize(("each_s", "once_s", "factor"), [(0.01, 0.0, 0.5), (0.0, 0.09, 1.0), (0.0, 0.6, 0.9)])
+def test_a_world_that_is_slow_is_told_as_a_factor_and_one_late_step_is_caught_up(
+    each_s: float, once_s: float, factor: float
+) -> None:
+    clock = VirtualClock()
+    loop = ClosedLoop(
+        CcrbOptions(), Heavy(clock, iter([once_s, *[each_s] * 3000])), VirtualInbox(clock, [Requested(0)]), clock
+    )
+    loop.wait(0)
+    loop.wait(5_000_000_000)
+    assert loop.real_time_factor == pytest.approx(factor, abs=0.02)
+
+
+def test_before_the_request_all_cars_keep_their_speed() -> None:
+    clock, world = VirtualClock(), Longitudinal()
+    loop = ClosedLoop(CcrbOptions(), world, VirtualInbox(clock, [Requested(3_000_000_000)]), clock)
+    loop.wait(3_000_000_000)
+    before = world.step(DriveCommand(np.zeros((3, 1)), np.zeros(1, int)))
+    assert np.ptp(before.speed_mps) == 0
+    assert before.position_m[LEAD, 0] - before.position_m[EGO, 0] == pytest.approx(40.0)
+    loop.wait(4_000_000_000)
+    after = world.step(DriveCommand(np.zeros((3, 1)), np.zeros(1, int)))
+    assert after.speed_mps[LEAD, 0] < before.speed_mps[LEAD, 0] - 1.0
+
+
+def ego_at(scene: CcrbOptions) -> tuple[CommandedEgo, VirtualClock]:
+    clock = VirtualClock()
+    return CommandedEgo(scene, lambda: clock.now_ns() / 1e9, lambda at_ns: at_ns / 1e9), clock
+
+
+def test_an_extended_skill_keeps_the_speed_that_it_has_reached() -> None:
+    scene = CcrbOptions(n_skills=2, t_nom_s=1.0, speed_kmh=36.0)
+    ego, clock = ego_at(scene)
+    lag, still, far = [], np.full(1, 7.0), np.full(1, 1e6)
+
+    def look(at_s: float) -> None:
+        clock.sleep_until_ns(round(at_s * 1e9))
+        ego.decide(at_s, still, far, far, far, 0.005)
+        lag.append((int(ego.phase[0]), round(float(ego.lag_mps[0]), 3)))
+
+    skill = ego.start(scene.calls[0], 1_000_000_000, print)
+    look(0.5)
+    clock.sleep_until_ns(1_000_000_000)
+    skill.retime(1_500_000_000)
+    look(1.2)
+    clock.sleep_until_ns(1_300_000_000)
+    skill.retime(1_300_000_000)
+    look(1.3)
+    ego.start(scene.calls[1], 2_300_000_000, print)
+    look(1.8)
+    look(2.4)
+    # The set-point falls from 10 to 5 and to 0 m/s; the car goes at 7.
+    assert lag[:2] == [(ACTING, 0.5), (ACTING, -2.0)]
+    assert lag[2][0] == GAP
+    assert lag[3] == (ACTING, -4.5)
+    assert lag[4][0] == DONE
+
+
+def test_a_world_that_is_lost_ends_the_run_and_keeps_what_was_driven(
+    fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keep = keep_loop
+
+    def lose(*given: Any) -> None:
+        keep(*given)
+
+        def lost(*_: object) -> State:
+            raise TransportError("`simulator`: the server is gone")
+
+        monkeypatch.setattr(Longitudinal, "step", lost)
+
+    monkeypatch.setattr("s2a_bench.experiments.ccrb.live.keep_loop", lose)
+    options = CcrbOptions(n_skills=3, speed_kmh=20)
+    with pytest.raises(TransportError, match="`simulator`: the server is gone"):
+        run(tmp_path, scenario=options, profile=fast_board, policies=("naive", "wait-then-act", "stream-to-act"))
+    (folder,) = tmp_path.glob("*-ccrb-*")
+    assert list(by_study(read_run(folder), "point").index) == ["naive"]
+    assert not [each for each in threads() if each.name.startswith("world")]
+
+
+def test_a_plan_that_stays_away_ends_the_run(fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = LoopbackClient.request
+
+    def cut(self: LoopbackClient, request: Request, trace: Any) -> Iterator[Piece]:
+        for token in whole(self, request, trace):
+            if token.index < 6:
+                yield token
+
+    monkeypatch.setattr(LoopbackClient, "request", cut)
+    with pytest.raises(
+        TransportError, match=r"loopback: 1 of 3 skills arrived; .*tokens\.csv has what the model wrote"
+    ):
+        run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
+
+
+def test_ctrl_c_ends_the_world_with_the_request(
+    fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, asked = LoopbackClient.request, [0]
+
+    def interrupted(self: LoopbackClient, request: Request, trace: Any) -> Iterator[Piece]:
+        asked[0] += 1
+        for token in whole(self, request, trace):
+            if asked[0] == 2:
+                raise KeyboardInterrupt
+            yield token
+
+    monkeypatch.setattr(LoopbackClient, "request", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
+    assert not [each for each in threads() if each.name.startswith("world")]
+
+
+@pytest.mark.parametrize("given", [{"ttc": True}, {"phase": True}, {"random": 3}])
+def test_what_needs_all_arrivals_is_refused(given: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match=f"`{next(iter(given))}` needs all arrivals beforehand"):
+        CcrbConfig(**given, closed_loop=True)
