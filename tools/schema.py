@@ -19,13 +19,14 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.ccrb.view.tables import CcrbStudy
-from s2a_bench.experiments.profile_capture import BoardFacts, ProfileJson
+from s2a_bench.experiments.profile_capture import ProfileJson
 from s2a_bench.experiments.throughput.metrics import Reference
 from s2a_bench.inference.fetch import FetchedFile
 from s2a_bench.inference.model_list import ListedModel
 from s2a_bench.provenance import Origins
 from s2a_bench.report.compare.shown import CompareJson
 from s2a_bench.store.manifest import RunWarning
+from s2a_bench.store.schema import Many, about
 from s2a_bench.sweep.json import PlannedCell, SweptCell
 from s2a_bench.writers.json import RatioJson
 
@@ -111,6 +112,19 @@ def frame_schema() -> dict[str, Any]:
     named |= {_name(each): each for each in (*cells, Reference, CcrbStudy)}
     named["sweep_cell"] = PlannedCell | SweptCell
     return _redefined("s2a-bench-1", named, kept=("level", "check"))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BoardFacts:
+    """This board; unreadable facts are absent."""
+
+    model: Annotated[str | None, about("From the device tree.")] = None
+    gpu: str | None = None
+    cpu: str | None = None
+    cores: Annotated[Many, about("That this process may use.")]
+    memory_bytes: int | None = None
+    power_mode: str | None = None
+    governor: str | None = None
 
 
 def profile_schema() -> dict[str, Any]:

@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from s2a_bench.cli import output as terminal
-from s2a_bench.cli.adapter import HELP_ALL, build, command, flags_named
+from s2a_bench.cli.adapter import HELP_ALL, command
 from s2a_bench.cli.output import Json, print_failures, print_json, print_line
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, write_shown
@@ -114,13 +114,6 @@ def click_command(name: str) -> Any:
 def options_of(experiment: Experiment) -> tuple[type[Options], ...]:
     """Return the classes of an experiment's options: of the run, and of its view."""
     return tuple(resolve_name(name) for name in (experiment.config, experiment.view_options) if name)
-
-
-def config_of(experiment: Experiment, given: Mapping[str, Any]) -> Options:
-    """Build the configuration of a run from a command's parameters; raises UsageError naming the flag."""
-    config = options_of(experiment)[0]
-    with flags_named(config):
-        return build(config, given)
 
 
 def command_of(experiment: Experiment) -> Callable[..., None]:

@@ -15,7 +15,6 @@ from typing import Any, Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.text import dotted, none_of
-from s2a_bench.toml_file import read as read_file
 
 FLAG: Final = "--ros-args"
 END: Final = "--"
@@ -128,6 +127,8 @@ def _take(found: Read, values: Mapping[str, Any], known: Sequence[str], where: s
 
 
 def _read_file(found: Read, path: Path, known: Sequence[str], node_name: str) -> None:
+    from s2a_bench.toml_file import read as read_file
+
     whole = _yaml(read_file(path, "params_file"), f"--params-file {path}")
     sections = list(_sections(whole, ""))
     if not sections:

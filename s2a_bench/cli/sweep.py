@@ -13,8 +13,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from s2a_bench import extras
-from s2a_bench.cli.adapter import command, flags_named
-from s2a_bench.cli.experiment import ParseError, click_command, config_of, options_of
+from s2a_bench.cli.adapter import build, command, flags_named
+from s2a_bench.cli.experiment import ParseError, click_command, options_of
 from s2a_bench.cli.output import Json, print_error, print_json, print_line, print_table
 from s2a_bench.cli.output import console as open_console
 from s2a_bench.errors import MissingExtra, S2AError, UsageError
@@ -157,10 +157,10 @@ def _check(name: str, argv: Sequence[str], *, trusted: bool) -> bool:
         given = click_command(name).make_context(name, list(argv)).params
     except ParseError as error:
         raise UsageError(error.format_message()) from error
-    experiment = EXPERIMENTS[name]
-    config = config_of(experiment, given)
-    if not trusted and (risk := _risk([*config.risks()])):
-        with flags_named(*options_of(experiment)):
+    kinds = options_of(EXPERIMENTS[name])
+    with flags_named(*kinds):
+        config = build(kinds[0], given)
+        if not trusted and (risk := _risk([*config.risks()])):
             raise UsageError(f"{risk}; read the file, and allow it with `trust_file`")
     return config.virtual
 

@@ -378,11 +378,6 @@ def split(runs: Iterable[StoredRun]) -> Split:
     return [(run, cells_of(run)) for run in runs]
 
 
-def _launches_of(run: StoredRun) -> list[tuple[int, list[RequestCell]]]:
-    samples = run.samples
-    return [(int(launch), _cells(run, samples[samples["launch"] == launch])) for launch in samples["launch"].unique()]
-
-
 def _cells(run: StoredRun, samples: pd.DataFrame) -> list[RequestCell]:
     tokens, stages = run.tokens, run.stages
     samples = _bounded(samples, run.manifest.get("link") or {})
@@ -623,7 +618,9 @@ def compared_by(metrics: Iterable[RequestMetric], shown: tuple[str, ...], **more
         )
 
     def subjects(run: StoredRun) -> list[Subject]:
-        return [subject(cell, launch) for launch, cells in _launches_of(run) for cell in cells]
+        samples = run.samples
+        launches = {int(launch): samples[samples["launch"] == launch] for launch in samples["launch"].unique()}
+        return [subject(cell, launch) for launch, mine in launches.items() for cell in _cells(run, mine)]
 
     return Comparable(named, subjects, lambda run: stand_ins(split([run])), shown, **more)
 

@@ -14,7 +14,7 @@ from s2a_bench.harness.config import DEFAULT_PROMPT
 from s2a_bench.inference import OF_MODEL, EngineConfig
 from s2a_bench.options import Options, Size, TextOrFile, group, option
 from s2a_bench.store.manifest import present
-from s2a_bench.store.schema import Count, Facts, Many, NonNegative, Positive, about
+from s2a_bench.store.schema import Count, Facts, NonNegative, Positive, about
 
 LEAST_GAPS: Final = 40
 
@@ -39,19 +39,6 @@ class CaptureConfig(Options):
             raise UsageError(
                 f"`requests` {self.requests} of `tokens` {self.tokens} make {gaps} gaps; a profile needs {LEAST_GAPS}"
             )
-
-
-@dataclass(frozen=True, kw_only=True)
-class BoardFacts:
-    """This board; unreadable facts are absent."""
-
-    model: Annotated[str | None, about("From the device tree.")] = None
-    gpu: str | None = None
-    cpu: str | None = None
-    cores: Annotated[Many, about("That this process may use.")]
-    memory_bytes: int | None = None
-    power_mode: str | None = None
-    governor: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
