@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import create_model
 
@@ -13,6 +13,7 @@ from s2a_bench import extras
 from s2a_bench.boards.links import LinkProfile, load_link, published
 from s2a_bench.errors import UsageError
 from s2a_bench.frames import SOURCES
+from s2a_bench.harness import RECORD
 from s2a_bench.inference import STAND_IN, EngineConfig, acting, check_engine
 from s2a_bench.options import Grammar, Names, Options, Size, Square, TextOrFile, group, option
 from s2a_bench.transport import (
@@ -40,8 +41,6 @@ Do not output any explanation."""
 """The paper's prompt (section IV-E)."""
 DEFAULT_TASK = "pick up the red block and place it in the box"
 """The prompt of policies, which answer with actions."""
-
-RECORD: Final[Any] = option(None, "also record frames, requests and tokens, as run.mcap (rosbag2)")
 
 if TYPE_CHECKING:
     TransportOptions: TypeAlias = Options

@@ -12,7 +12,7 @@ from pydantic import Field
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.boards.tokens import PROMPT_TIME
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.config import RECORD
+from s2a_bench.harness import RECORD
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Names, Numbers, Options, group, option
 from s2a_bench.policy import COMPARED, POLICIES
