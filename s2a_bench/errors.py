@@ -3,7 +3,7 @@
 A field of a configuration is in backquotes, as `requests`: the command line shows it as its flag, --requests.
 
 S2AError
-├── UsageError, MissingExtra, SourceError, RobotError, StoreError, UnlikeRuns, NotPermitted
+├── UsageError, MissingExtra, SourceError, RobotError, SimulatorError, StoreError, UnlikeRuns, NotPermitted
 ├── EngineError: ModelError, BadRequest, Overdue
 └── TransportError: MissingInterface, PortInUse, ServerDied, ClockMoved
     └── RequestFailed: Busy, TooLarge, MessagesLost
@@ -113,6 +113,10 @@ class ServerDied(TransportError):
 
 class RobotError(S2AError):
     """A robot cannot be reached, or fails at an action."""
+
+
+class SimulatorError(S2AError):
+    """A simulator's server cannot be reached, or fails at a step."""
 
 
 class StoreError(S2AError):

@@ -20,6 +20,7 @@ EXTRAS: Final = {
     "llama": "the llama engine",
     "llama-server": "llama.cpp's own server, without a compiler",
     "ccrb": "the embedded simulator",
+    "carla": "the driving scenario on a CARLA server",
     "nvidia": "load, memory and power of NVIDIA GPUs",
     "act": "the openvla dialect, /act",
     "ray": "sweeps, and fleets of robots, on a Ray cluster",

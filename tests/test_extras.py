@@ -63,6 +63,7 @@ LEROBOT = ("--transport", "grpc", "--policy-type", "act", "--pretrained", "x")
         ("huggingface_hub", "model", ("model", "fetch", "minicpm-v-2.6")),
         ("huggingface_hub", "model", ("model", "list")),
         ("highway_env", "ccrb", ("ccrb", "--simulator", "embedded")),
+        ("carla", "carla", ("ccrb", "--simulator", "carla")),
         ("json_numpy", "act", (*BLACK_BOX, "--dialect", "openvla", "--payload", "raw")),
         ("ray", "ray", ("sweep", "paper", "--ray", "local")),
         ("grpc", "grpc", ("latency", "--url", "grpc://a:1", *LEROBOT)),
@@ -183,7 +184,7 @@ def test_every_extra_is_described_and_in_all() -> None:
     (everything,) = (Requirement(text).extras for text in offered["all"])
     assert everything | {"model"} == set(extras.EXTRAS)
     (made,) = (Requirement(text).extras for text in offered["dev"] if text.startswith("s2a-bench"))
-    assert made == everything - {"ray"}
+    assert made == everything - {"ray", "carla"}
 
 
 @pytest.mark.parametrize(

@@ -19,21 +19,6 @@ T = TypeVar("T")
 def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
     """Build ``name?parameter=value&...``; raises UsageError naming ``field``, the parameter, and the known ones."""
     name, _, given = written.partition("?")
-    values, known = _values(made_by, written, field)
-    try:
-        return made_by(**values)
-    except UsageError as error:
-        raise UsageError(f"`{field}`: {name}: {error}" + f"; {known}" * bool(given)) from error
-
-
-def check(made_by: Callable[..., object], written: str, field: str) -> None:
-    """Raise as `build` does for unknown parameters and wrong values, without building."""
-    _values(made_by, written, field)
-
-
-def _values(made_by: Callable[..., object], written: str, field: str) -> tuple[dict[str, Any], str]:
-    """Return the parameters given in ``name?parameter=value&...``, and the sentence about the known ones."""
-    name, _, given = written.partition("?")
     types = _types(made_by) if given else {}
     known = f"its parameters are {', '.join(types)}" if types else "it has no parameters"
     values: dict[str, Any] = {}
@@ -44,7 +29,10 @@ def _values(made_by: Callable[..., object], written: str, field: str) -> tuple[d
             meant = "" if parameter in values else like(parameter, types)
             raise UsageError(f"`{field}`: {name}: '{parameter}' {wrong}; {known}{meant}")
         values[parameter] = _value(types[parameter], text, f"`{field}`: {name}: {parameter} = '{text}'", known)
-    return values, known
+    try:
+        return made_by(**values)
+    except UsageError as error:
+        raise UsageError(f"`{field}`: {name}: {error}" + f"; {known}" * bool(given)) from error
 
 
 def canonical(name: str, policy: object) -> str:

@@ -17,7 +17,7 @@ import s2a_bench
 HEAVY = ("numpy", "cv2", "pandas", "matplotlib", "pydantic", "llama_cpp", "cyclonedds")
 OPTIONAL = {
     *("gguf", "huggingface_hub", "llama_cpp", "highway_env", "gymnasium", "pygame", "pynvml", "json_numpy", "ray"),
-    "xllamacpp",
+    *("carla", "xllamacpp"),
 }
 TYPES = "TYPE_CHECKING"
 

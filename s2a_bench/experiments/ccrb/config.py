@@ -71,10 +71,7 @@ class CcrbConfig(Options):
     tokens_per_skill: int = option(6, "L, the delimiter included", ge=1, le=1000)
     scenario: CcrbOptions = Field(default_factory=CcrbOptions)
     simulator: str = option(
-        "longitudinal",
-        f"{', '.join(SIMULATORS)}, with parameters as in NAME?parameter=value",
-        first=True,
-        names=lambda: SIMULATORS,
+        "longitudinal", f"{', '.join(SIMULATORS)}; or NAME?parameter=value", first=True, names=lambda: SIMULATORS
     )
     ego: str = option("", "ros[?parameter=value&...]: command and see the ego over ROS 2, if the simulator can")
     closed_loop: bool = option(

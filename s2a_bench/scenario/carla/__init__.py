@@ -1,0 +1,1 @@
+"""The driving scenario in CARLA."""
