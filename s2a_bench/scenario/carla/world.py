@@ -24,6 +24,7 @@ from s2a_bench.scenario import EGO, LANE_WIDTH_M, LEAD, REAR, ROLES, DriveComman
 from s2a_bench.scenario.windscreen import BEHIND_M, VIEW_DEG
 from s2a_bench.types import Encoding, Pixels
 
+CONNECT_S: Final = 10.0
 ROAD_M, ORIGIN_M, END_M, MIDDLE_M, DROP_M = 1500.0, 250.0, 10.0, 1.5 * LANE_WIDTH_M, 0.3
 """On x: the road, its position 0, the margin at its ends. On y, to the right: their lane. On z: they settle from it."""
 LANE: Final = f"""
@@ -68,10 +69,11 @@ class CarlaWorld:
         self._contacts: list[tuple[int, int]] = []  # frame, and the other car
         self._past: deque[tuple[int, Floats]] = deque(maxlen=5)  # frame, and speeds
         client = self._client = carla.Client(self.host, self.port)
-        client.set_timeout(self.timeout_s)
+        client.set_timeout(min(self.timeout_s, CONNECT_S))
         try:
             with self._calls("connecting"):
                 before = client.get_world().get_settings()
+            client.set_timeout(self.timeout_s)
             with self._calls("making the road"):
                 self._undo.callback(lambda: client.get_world().apply_settings(before))
                 look = carla.OpendriveGenerationParameters(wall_height=0.0, enable_pedestrian_navigation=False)
