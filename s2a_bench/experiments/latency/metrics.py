@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -27,7 +27,6 @@ from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 from s2a_bench.writers.json import frame, ratio_entry, summaries, summaries_of_ends
 
 if TYPE_CHECKING:
-    from s2a_bench.experiments import Comparable
     from s2a_bench.stats import Ratio
     from s2a_bench.store.run import StoredRun
 
@@ -75,38 +74,30 @@ METRICS: Final = (
 )
 
 
-def compared(metrics: Sequence[RequestMetric] = METRICS) -> Comparable:
-    """Return what latency runs are compared by: metrics, groups of stages, and each run's stages."""
-    groups = [RequestMetric(f"group.{name}", "ms", of=partial(RequestCell.sums_ms, group=name)) for name in GROUPS]
-    shown = ("e2e_without_inference", "e2e", "itl")
-    return compared_by(
-        (*metrics, *groups), shown, run_metrics=lambda run: [RequestMetric(stage, "ms") for stage in run.stages]
-    )
+COMPARED: Final = compared_by(
+    (*METRICS, *(RequestMetric(f"group.{name}", "ms", of=partial(RequestCell.sums_ms, group=name)) for name in GROUPS)),
+    ("e2e_without_inference", "e2e", "itl"),
+    run_metrics=lambda run: [RequestMetric(stage, "ms") for stage in run.stages],
+)
+"""What latency runs are compared by: metrics, groups of stages, and each run's stages."""
+LatencyCell: Final = cell_class(
+    "LatencyCell",
+    "One pipeline, stage by stage; a value that no sample has is an absent key.",
+    METRICS,
+    residual_flagged=Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")],
+    stages_ms=Annotated[dict[str, Summary | SummaryEnds], {"propertyNames": {"pattern": "^[a-z][a-z0-9_]*$"}}],
+    groups_ms=Annotated[dict[str, Summary | SummaryEnds], {"propertyNames": {"enum": list(GROUPS)}}],
+)
 
 
-def latency_cell(metrics: Sequence[RequestMetric] = METRICS) -> type:
-    return cell_class(
-        "LatencyCell",
-        "One pipeline, stage by stage; a value that no sample has is an absent key.",
-        metrics,
-        residual_flagged=Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")],
-        stages_ms=Annotated[dict[str, Summary | SummaryEnds], {"propertyNames": {"pattern": "^[a-z][a-z0-9_]*$"}}],
-        groups_ms=Annotated[dict[str, Summary | SummaryEnds], {"propertyNames": {"enum": list(GROUPS)}}],
-    )
-
-
-COMPARED: Final = compared()
-LatencyCell: Final = latency_cell()
-
-
-def latency_json(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, Any]:
+def latency_json(run: StoredRun) -> dict[str, Any]:
     cells = cells_of(run)
     found = [
         cell_json(
-            LatencyCell if metrics is METRICS else latency_cell(metrics),
+            LatencyCell,
             cell,
             run,
-            metrics,
+            METRICS,
             residual_flagged=cell.flagged(),
             stages_ms={
                 **summaries((stage, cell.values_ms(stage)) for stage in stages_present([cell])),
@@ -122,14 +113,12 @@ def latency_json(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> 
     return frame(run, found, [ratio_entry(*ratio) for ratio in _ratios(cells, run)])
 
 
-def latency_csv(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> dict[str, CsvTable]:
+def latency_csv(run: StoredRun) -> dict[str, CsvTable]:
     """Return file name -> CSV table in long form, unrounded; absent values have no row."""
     cells = cells_of(run)
     return {
         "stages.csv": CsvTable.of(("cell", "group", "stage", *SUMMARY, "emulated"), _stage_rows(cells)),
-        "summary.csv": CsvTable.of(
-            ("cell", "metric", "errors", "warmups", *SUMMARY, "emulated"), _rows(cells, metrics)
-        ),
+        "summary.csv": CsvTable.of(("cell", "metric", "errors", "warmups", *SUMMARY, "emulated"), _rows(cells)),
         "ratios.csv": ratio_table(cells, _ratios(cells, run)),
     }
 
@@ -149,9 +138,9 @@ def _stage_rows(cells: list[RequestCell]) -> Iterator[tuple[object, ...]]:
                     yield *place, *summary_values(summary), cell.emulated
 
 
-def _rows(cells: list[RequestCell], metrics: Sequence[RequestMetric]) -> Iterator[tuple[object, ...]]:
+def _rows(cells: list[RequestCell]) -> Iterator[tuple[object, ...]]:
     """Yield a row a cell and metric; a cell without successful samples has one row, without numbers."""
     for cell in cells:
-        found = [(key, summary_values(summary)) for _, key, summary in summarised([cell], metrics)]
+        found = [(key, summary_values(summary)) for _, key, summary in summarised([cell], METRICS)]
         for key, values in found or [("", (0, *[None] * (len(SUMMARY) - 1)))]:
             yield cell.name, key, cell.errors, cell.warmups, *values, cell.emulated

@@ -140,19 +140,17 @@ def ratios_of(run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[st
     Cells of different engines are compared by the engines' figures too.
     """
     reference, seed = reference_by_launch(run), run.bootstrap_seed
-    for cell in cells:
-        base = _base(cell, cells)
+    bases = [(cell, _base(cell, cells)) for cell in cells]
+    for cell, base in bases:
         others = {LLAMA_BENCH: reference, **({base.name: base.by_launch(RATIO_METRIC)} if base else {})}
         for name, values in others.items():
             if ratio := ratio_of_launches(cell.by_launch(RATIO_METRIC), values, seed):
                 yield RATIO_METRIC, cell.name, name, ratio
-    for cell in cells:
-        base = _base(cell, cells)
-        if not (
-            base and base.has_engine_time and cell.has_engine_time and cell.about["engine"] != base.about["engine"]
-        ):
+    for cell, base in bases:
+        if base is None or cell.about["engine"] == base.about["engine"] or not cell.has_engine_time:
             continue
-        if ratio := ratio_of_launches(cell.by_launch(ENGINE_METRIC), base.by_launch(ENGINE_METRIC), seed):
+        rates = cell.by_launch(ENGINE_METRIC), base.by_launch(ENGINE_METRIC)
+        if base.has_engine_time and (ratio := ratio_of_launches(*rates, seed)):
             yield ENGINE_METRIC, cell.name, base.name, ratio
 
 

@@ -198,12 +198,12 @@ def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> Text
     return _by_cell(title, header, cells, rows, (*_notes(run, cells), *launches_note(found)))
 
 
-def _token_table(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> TextTable | None:
+def _token_table(run: StoredRun) -> TextTable | None:
     """Return the table of gaps and delays of tokens; None if no server reports when they left the engine."""
     cells = [cell for cell in cells_of(run) if cell.values("token_delay").size or cell.ends("token_delay").lo.size]
     if not cells:
         return None
-    columns = [metric for metric in metrics if metric.shown]
+    columns = [metric for metric in METRICS if metric.shown]
     rows = [tuple(text for metric in columns for text in _statistics(cell, metric)) for cell in cells]
     header = [f"{metric.title} {statistic}" for metric in columns for statistic in metric.shown]
     title = f"{answer_kind(run).capitalize()} in ms: from one to the next (gap), and engine to client (delay)"
@@ -299,14 +299,14 @@ def _frame_entry(frames: pd.DataFrame, column: str) -> str:
     return _entry(exact, Ends(lo, hi))
 
 
-def latency_tables(run: StoredRun, metrics: Sequence[RequestMetric] = METRICS) -> Tables:
+def latency_tables(run: StoredRun) -> Tables:
     modelled = any(cell.values_ms("e2e_without_model").size for cell in cells_of(run))
     return {
         "stages": lambda: stage_table(run),
         "summary": lambda: summary_table(run),
         "summary-e2e": lambda: summary_table(run, "e2e"),
         "summary-model": lambda: summary_table(run, "e2e_without_model") if modelled else None,
-        "tokens": lambda: _token_table(run, metrics),
+        "tokens": lambda: _token_table(run),
         "frames": lambda: _frame_table(run),
         "facts": lambda: fact_table(run),
     }
