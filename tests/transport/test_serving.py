@@ -145,7 +145,7 @@ def test_marks_that_are_not_known_keep_nothing_of_who_asks() -> None:
     marks, seen = Marks(), []
     for _ in range(2):
         with pytest.raises(RequestFailed, match="unknown request") as raised:
-            marks.take(b"stranger", "a", 1)
+            marks.take((b"stranger", "a"), 1)
         seen.append(raised.value)
     assert seen[0] is not seen[1]  # one exception would keep the frames of all
 
