@@ -138,6 +138,22 @@ def test_its_frame_source_is_a_camera(command: Command, tmp_path: Path) -> None:
     assert json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())["state"] == "finished"
 
 
+def test_its_middleware_carries_the_ros_transport(command: Command, tmp_path: Path, dds_domain: int) -> None:
+    pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
+    domain = ("--domain-id", str(dds_domain))
+    done = command("latency", "--transport", "ros/topic", "--middleware", "toy-dds", *domain, *SMALL)
+    manifest = json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())
+    assert manifest["cells"]["ros/topic"]["options"]["middleware"] == "toy-dds"
+    named = command("latency", "--transport", "ros/topic?middleware=toy-dds,loopback", *domain, *SMALL)
+    samples = pd.read_csv(folder_of(named, tmp_path) / "samples.csv")
+    assert "ros/topic?middleware=toy-dds" in set(samples["cell"])
+    assert samples["error"].isna().all()
+    unknown = command("latency", "--transport", "ros", "--middleware", "toy", *SMALL, code=2)
+    assert "--middleware: 'toy' is none of cyclonedds, rclpy, zenoh, toy-dds" in unknown.stderr
+    absent = command("latency", "--transport", "loopback", "--source", "ros:/no_camera?middleware=toy", code=2)
+    assert "middleware = 'toy' is none of cyclonedds, rclpy, zenoh, toy-dds" in absent.stderr
+
+
 def test_its_policy_takes_its_parameter(command: Command) -> None:
     args = ("timeline", "--profile", "jetson-agx-orin", "--tokens-per-skill", "6", "--json")
     cells = {
