@@ -143,7 +143,8 @@ def test_its_middleware_carries_the_ros_transport(command: Command, tmp_path: Pa
     domain = ("--domain-id", str(dds_domain))
     done = command("latency", "--transport", "ros/topic", "--middleware", "toy-dds", *domain, *SMALL)
     manifest = json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())
-    assert manifest["cells"]["ros/topic"]["options"]["middleware"] == "toy-dds"
+    assert manifest["configuration"]["pipelines"]["ros/topic"]["middleware"] == "toy-dds"
+    assert manifest["servers"]["ros"]["transport"]["middleware"] == "cyclonedds"
     named = command("latency", "--transport", "ros/topic?middleware=toy-dds,loopback", *domain, *SMALL)
     samples = pd.read_csv(folder_of(named, tmp_path) / "samples.csv")
     assert "ros/topic?middleware=toy-dds" in set(samples["cell"])
