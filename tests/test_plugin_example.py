@@ -305,7 +305,7 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
     broken = tmp_path / "site" / "s2a_broken-1.0.dist-info"
     broken.mkdir(parents=True)
     (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: s2a-broken\nVersion: 1.0\n")
-    kinds = ("transports", "experiments", "policies", "dialects", "engines", "frame_sources")
+    kinds = ("transports", "experiments", "policies", "dialects", "engines", "frame_sources", "middlewares")
     (broken / "entry_points.txt").write_text(
         "".join(f"[s2a_bench.{kind}]\nbroken = s2a_broken:THING\n" for kind in kinds)
     )
@@ -319,7 +319,9 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
 
     assert run("--help").returncode == 0
     assert run("boundary", "--points", "3").returncode == 0
-    for args in (("broken",), ("latency", "--transport", "broken", *SMALL), ("timeline", "--policy", "broken")):
+    middleware = ("latency", "--transport", "ros?middleware=broken", *SMALL)
+    transport = ("latency", "--transport", "broken", *SMALL)
+    for args in (("broken",), transport, middleware, ("timeline", "--policy", "broken")):
         done = run(*args)
         assert done.returncode == 2
         assert "the package s2a-broken does not load: ModuleNotFoundError" in done.stderr
