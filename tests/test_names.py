@@ -1,4 +1,4 @@
-"""Consumers trust declarations: no experiment uses another one, and nobody names one policy, mode, engine or transport.
+"""Consumers trust declarations: no experiment uses another one, and nobody names one policy, mode, engine and so on.
 
 Research stands outside: `studies` imports what docs/library.md lists, and the package never imports `studies`.
 
@@ -19,6 +19,7 @@ from s2a_bench.frames import SOURCES
 from s2a_bench.inference import ENGINES
 from s2a_bench.policy import POLICIES
 from s2a_bench.policy.chunks import MODES
+from s2a_bench.ros import MIDDLEWARES
 from s2a_bench.transport import TRANSPORTS
 
 ROOT = Path(__file__).parent.parent
@@ -33,6 +34,7 @@ KINDS = {
     "mode": (MODES, "s2a_bench/policy/"),
     "engine": (ENGINES, "s2a_bench/inference/"),
     "transport": (TRANSPORTS, "s2a_bench/transport/{}/"),
+    "middleware": (MIDDLEWARES, "s2a_bench/ros/"),
 }
 
 
@@ -70,7 +72,8 @@ def named(path: Path) -> Iterator[str]:
         for name in registry.built_in():
             if where.startswith((home.format(name), declared)):
                 continue
-            module = registry._builtins[name].partition(":")[0]
+            opened = registry[name].opens if kind == "middleware" else registry._builtins[name]
+            module = opened.partition(":")[0]
             elsewhere = any(where.startswith(at) and name in kinds.built_in() for at, kinds in OTHERS.items())
             if any(within(each, module) for each in modules) or (
                 name in texts and name not in COMMON and not elsewhere

@@ -138,6 +138,23 @@ def test_its_frame_source_is_a_camera(command: Command, tmp_path: Path) -> None:
     assert json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())["state"] == "finished"
 
 
+def test_its_middleware_carries_the_ros_transport(command: Command, tmp_path: Path, dds_domain: int) -> None:
+    pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
+    domain = ("--domain-id", str(dds_domain))
+    done = command("latency", "--transport", "ros/topic", "--middleware", "toy-dds", *domain, *SMALL)
+    manifest = json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())
+    assert manifest["configuration"]["pipelines"]["ros/topic"]["middleware"] == "toy-dds"
+    assert manifest["servers"]["ros"]["transport"]["middleware"] == "cyclonedds"
+    named = command("latency", "--transport", "ros/topic?middleware=toy-dds,loopback", *domain, *SMALL)
+    samples = pd.read_csv(folder_of(named, tmp_path) / "samples.csv")
+    assert "ros/topic?middleware=toy-dds" in set(samples["cell"])
+    assert samples["error"].isna().all()
+    unknown = command("latency", "--transport", "ros", "--middleware", "toy", *SMALL, code=2)
+    assert "--middleware: 'toy' is none of cyclonedds, rclpy, zenoh, toy-dds" in unknown.stderr
+    absent = command("latency", "--transport", "loopback", "--source", "ros:/no_camera?middleware=toy", code=2)
+    assert "middleware = 'toy' is none of cyclonedds, rclpy, zenoh, toy-dds" in absent.stderr
+
+
 def test_its_policy_takes_its_parameter(command: Command) -> None:
     args = ("timeline", "--profile", "jetson-agx-orin", "--tokens-per-skill", "6", "--json")
     cells = {
@@ -288,7 +305,7 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
     broken = tmp_path / "site" / "s2a_broken-1.0.dist-info"
     broken.mkdir(parents=True)
     (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: s2a-broken\nVersion: 1.0\n")
-    kinds = ("transports", "experiments", "policies", "dialects", "engines", "frame_sources")
+    kinds = ("transports", "experiments", "policies", "dialects", "engines", "frame_sources", "middlewares")
     (broken / "entry_points.txt").write_text(
         "".join(f"[s2a_bench.{kind}]\nbroken = s2a_broken:THING\n" for kind in kinds)
     )
@@ -302,7 +319,9 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
 
     assert run("--help").returncode == 0
     assert run("boundary", "--points", "3").returncode == 0
-    for args in (("broken",), ("latency", "--transport", "broken", *SMALL), ("timeline", "--policy", "broken")):
+    middleware = ("latency", "--transport", "ros?middleware=broken", *SMALL)
+    transport = ("latency", "--transport", "broken", *SMALL)
+    for args in (("broken",), transport, middleware, ("timeline", "--policy", "broken")):
         done = run(*args)
         assert done.returncode == 2
         assert "the package s2a-broken does not load: ModuleNotFoundError" in done.stderr

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pkgutil import resolve_name
-from typing import Annotated, Any, Literal, Protocol, TypeAlias, TypeVar
+from typing import Annotated, Any, Final, Literal, Protocol, TypeAlias, TypeVar
 
 from pydantic import Field
 
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.extras import how_to_install
+from s2a_bench.registry import Registry
 from s2a_bench.ros import config
 from s2a_bench.ros.router import ROUTER, Router, endpoint_of
 from s2a_bench.text import none_of
@@ -269,28 +270,72 @@ class Middleware(Protocol):
         """Leave the domain at once, so that peers need not wait for the lease; may be called twice."""
 
 
-MIDDLEWARES: dict[str, str] = {
-    "cyclonedds": "s2a_bench.ros.cyclone:CycloneMiddleware",
-    "rclpy": "s2a_bench.ros.rclpy_middleware:RclpyMiddleware",
-    "zenoh": "s2a_bench.ros.zenoh_middleware:ZenohMiddleware",
-}
-"""Name -> class, built as ``Class(domain_id, tuning, node_name)``; of what is `ROUTED` with a `Router` behind that."""
-ROUTED = frozenset({"zenoh"})
-"""Middlewares whose nodes meet at a router."""
-WAYS_OUT = {
-    "cyclonedds": f"it has wheels for x86-64 only: elsewhere use --middleware zenoh ({how_to_install('zenoh')}), "
+@dataclass(frozen=True, slots=True)
+class MiddlewareKind:
+    """The declaration of a middleware, which is also read where its packages are not installed."""
+
+    opens: str
+    """``module:class``, built as ``Class(domain_id, tuning, node_name)``; if `routed`, with a `Router` behind that."""
+    module: str
+    """The top-level module without which it is not installed."""
+    way_out: str
+    """What to do then."""
+    dds: str
+    """What carries its messages: an RMW or its own name; empty for the library of a sourced ROS 2, which has an RMW."""
+    routed: bool = False
+    """Whether its nodes meet at a router."""
+    extra: str = ""
+    """The extra of s2a-bench that installs it."""
+    packages: tuple[str, ...] = ()
+    checks: Mapping[str, str] = field(default_factory=dict)
+    """As of a `Transport`, and so are ``packages``."""
+    has_action: str = ""
+    """``module:function`` that returns whether an action's type is built, where types come from a workspace."""
+
+    def dds_in(self, environ: Mapping[str, str]) -> str:
+        return self.dds or environ.get("RMW_IMPLEMENTATION") or config.DEFAULT_RMW
+
+    def builds(self, action: str) -> bool:
+        return not self.has_action or bool(resolve_name(self.has_action)(action))
+
+
+CYCLONEDDS = MiddlewareKind(
+    "s2a_bench.ros.cyclone:CycloneMiddleware",
+    "cyclonedds",
+    f"it has wheels for x86-64 only: elsewhere use --middleware zenoh ({how_to_install('zenoh')}), "
     "or the rclpy of a ROS 2 (source /opt/ros/<distribution>/setup.bash), or leave ros out of --transport",
-    "rclpy": "it comes with ROS 2: source /opt/ros/<distribution>/setup.bash, or use --middleware cyclonedds",
-    "zenoh": f"{how_to_install('zenoh')}, or use --middleware cyclonedds",
-}
+    config.CYCLONE,
+    packages=("cyclonedds",),
+)
+RCLPY = MiddlewareKind(
+    "s2a_bench.ros.rclpy_middleware:RclpyMiddleware",
+    "rclpy",
+    "it comes with ROS 2: source /opt/ros/<distribution>/setup.bash, or use --middleware cyclonedds",
+    dds="",
+    has_action="s2a_bench.ros.rclpy_types:has_action",
+)
+ZENOH = MiddlewareKind(
+    "s2a_bench.ros.zenoh_middleware:ZenohMiddleware",
+    "zenoh",
+    f"{how_to_install('zenoh')}, or use --middleware cyclonedds",
+    config.RMW_ZENOH,
+    routed=True,
+    extra="zenoh",
+    packages=("eclipse-zenoh",),
+    checks={"zenoh": "s2a_bench.transport.ros.checks:zenoh"},
+)
+MIDDLEWARES: Final[Registry[MiddlewareKind]] = Registry(
+    "middlewares",
+    "middleware",
+    {"cyclonedds": "s2a_bench.ros:CYCLONEDDS", "rclpy": "s2a_bench.ros:RCLPY", "zenoh": "s2a_bench.ros:ZENOH"},
+)
 
 
 def default_middleware(environ: Mapping[str, str]) -> str:
-    """Choose rclpy inside a sourced ROS 2 environment that has it for this Python, else cyclonedds, else zenoh."""
+    """Choose the client library of a sourced ROS 2 that has it for this Python, else the first that is installed."""
     sourced = environ.get("ROS_DISTRO") and environ.get("AMENT_PREFIX_PATH")
-    if sourced and find_spec("rclpy"):
-        return "rclpy"
-    return "zenoh" if find_spec("zenoh") and not find_spec("cyclonedds") else "cyclonedds"
+    kinds = {name: kind for name, kind in MIDDLEWARES.loaded() if (kind.dds or sourced) and find_spec(kind.module)}
+    return min(kinds, key=lambda name: bool(kinds[name].dds), default=next(iter(MIDDLEWARES)))
 
 
 def open_middleware(
@@ -308,14 +353,13 @@ def open_middleware(
     Raises UsageError for an unknown name or domain, TransportError when the domain cannot be joined.
     """
     name = name or default_middleware(os.environ)
-    if name not in MIDDLEWARES:
-        raise UsageError(f"middleware: {none_of(name, MIDDLEWARES)}")
+    kind = MIDDLEWARES[name]
     try:
-        implementation = resolve_name(MIDDLEWARES[name])
+        implementation = resolve_name(kind.opens)
     except ModuleNotFoundError as error:
-        way = f"{WAYS_OUT[name]}; of a source, robot or ego with ?middleware="
+        way = f"{kind.way_out}; of a source, robot or ego with ?middleware="
         raise TransportError(f"middleware {name} is not installed ({error}); {way}") from error
-    more = (router or Router(),) if name in ROUTED else ()
+    more = (router or Router(),) if kind.routed else ()
     middleware: Middleware = implementation(config.domain_id(os.environ, domain_id), tuning, node_name, *more)
     return middleware
 

@@ -25,7 +25,10 @@ TUNED_INTERNAL = '<Internal><SocketReceiveBufferSize max="16MB"/></Internal>'
 """Fragments of nearly the largest UDP datagram, and the receive buffer the kernel allows: half the time for a VGA
 image, and no lost fragments at 1920x1080."""
 CYCLONE_URI = "CYCLONEDDS_URI"
-RMW_CYCLONE = "rmw_cyclonedds_cpp"
+CYCLONE, RMW_CYCLONE, RMW_FAST, RMW_ZENOH = "cyclonedds", "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_zenoh_cpp"
+"""What carries messages: Cyclone DDS from PyPI, and RMWs of an installed ROS 2."""
+DEFAULT_RMW = RMW_FAST
+"""Of Humble and Jazzy, where RMW_IMPLEMENTATION says nothing."""
 LARGE_PICTURES = (
     f'<CycloneDDS><Domain id="any"><General>{TUNED_GENERAL}</General>{TUNED_INTERNAL}</Domain></CycloneDDS>'
 )

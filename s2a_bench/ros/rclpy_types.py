@@ -107,3 +107,10 @@ def installed_version(action: Any, type_name: str) -> str:
         if fits(action.Goal, type_name + "_Goal", version):
             return version
     raise MissingInterface(f"{type_name} of this ROS 2 workspace is none of llama_msgs {', '.join(ros.VERSIONS)}")
+
+
+def has_action(type_name: str) -> bool:
+    try:
+        return bool(installed_version(interface_class(type_name), type_name))
+    except MissingInterface:
+        return False

@@ -316,6 +316,11 @@ JAZZY = {"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": "/opt/ros/jazzy"}
             "state",
             "domain 0, rclpy on rmw_cyclonedds_cpp, CYCLONEDDS_URI file:///x.xml",
         ),
+        (
+            JAZZY | {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp", "CYCLONEDDS_URI": "file:///x.xml"},
+            "state",
+            "domain 0, rclpy on rmw_zenoh_cpp, all interfaces",
+        ),
     ],
 )
 def test_dds_says_domain_and_interface(

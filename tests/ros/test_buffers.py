@@ -39,6 +39,8 @@ def rclpy_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
         ("", SOURCED, "^--qos reliable, and on both sides: export FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA; sudo sysctl"),
         ("rclpy", SOURCED | {"ROS_DISTRO": "humble"}, "FASTRTPS_DEFAULT_PROFILES_FILE=FILE.xml, .* receiveBufferSize"),
         ("", SOURCED | {"RMW_IMPLEMENTATION": "rmw_connextdds"}, "larger receive buffers for rmw_connextdds"),
+        ("", SOURCED | {"RMW_IMPLEMENTATION": "rmw_zenoh_cpp"}, "^--qos reliable: .* Zenoh's link is busy$"),
+        ("zenoh", SOURCED, "^--qos reliable: .* Zenoh's link is busy$"),
     ],
 )
 def test_the_advice_against_loss_is_that_of_the_dds_in_use(
@@ -50,6 +52,7 @@ def test_the_advice_against_loss_is_that_of_the_dds_in_use(
         monkeypatch.setenv(name, value)
     pipeline = one_pipeline("ros/topic", middleware=middleware)
     assert re.search(advice, pipeline.options.against_loss)
+    assert pipeline.options.datagrams == ("Zenoh" not in advice)
 
 
 @pytest.mark.parametrize(

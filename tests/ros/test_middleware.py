@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 
 import pytest
 
@@ -53,13 +54,14 @@ def test_without_a_domain_that_of_the_environment_is_joined(dds_domain: int, mon
 
 
 def test_an_unknown_middleware_is_named() -> None:
-    with pytest.raises(UsageError, match="'iceoryx' is none of cyclonedds, rclpy, zenoh"):
+    with pytest.raises(UsageError, match="`middleware`: 'iceoryx' is none of cyclonedds, rclpy, zenoh"):
         open_middleware("iceoryx")
 
 
 @pytest.mark.parametrize(("name", "way_out"), [("cyclonedds", "--transport"), ("zenoh", r"pip install '.\[zenoh\]'")])
 def test_a_missing_package_is_named_with_the_way_out(name: str, way_out: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(MIDDLEWARES, name, "s2a_bench.ros.no_such_module:X")
+    missing = replace(MIDDLEWARES[name], opens="s2a_bench.ros.no_such_module:X")
+    monkeypatch.setattr("s2a_bench.ros.MIDDLEWARES", {name: missing})
     with pytest.raises(TransportError, match=rf"{name} is not installed.*{way_out}.*of a source.*\?middleware=$"):
         open_middleware(name)
 
@@ -77,6 +79,8 @@ JAZZY = {"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": "/opt/ros/jazzy"}
         ({}, "rclpy", "cyclonedds"),
         ({}, "cyclonedds zenoh", "cyclonedds"),
         ({}, "zenoh", "zenoh"),
+        ({}, "zenoh rclpy", "zenoh"),
+        (JAZZY, "zenoh", "zenoh"),
         ({}, "", "cyclonedds"),
     ],
 )

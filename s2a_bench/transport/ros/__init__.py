@@ -10,6 +10,8 @@ from pkgutil import resolve_name
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CAMERA_FACTS, PAYLOAD_BYTES, Fact
+from s2a_bench.ros import MIDDLEWARES
+from s2a_bench.ros.config import domain_id
 from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Client, Transport, Urls, Wiring
 from s2a_bench.transport.ros.options import RosOptions
 
@@ -36,13 +38,13 @@ class Ros(Transport[RosOptions]):
     facts = (PAYLOAD_BYTES, *CAMERA_FACTS, UNREADABLE_N)
     order = 20
     style = {TOPIC: ("#0072B2", "-"), ACTION: ("#56B4E9", "--")}
-    packages = ("cyclonedds", "eclipse-zenoh", "rosbags")
+    packages = (*(package for _, kind in MIDDLEWARES.loaded() for package in kind.packages), "rosbags")
     checks = {
         "rmem-max": "s2a_bench.machine.doctor.host:rmem_max",
         "dds": "s2a_bench.transport.ros.checks:dds",
         "ros": "s2a_bench.transport.ros.checks:ros",
         "middleware": "s2a_bench.transport.ros.checks:middleware",
-        "zenoh": "s2a_bench.transport.ros.checks:zenoh",
+        **{code: check for _, kind in MIDDLEWARES.loaded() for code, check in kind.checks.items()},
         "dds-buffers": "s2a_bench.transport.ros.buffers:check",
     }
     udp_checks = ("rmem-max",)
@@ -71,14 +73,11 @@ class Ros(Transport[RosOptions]):
 
     def require(self, choice: Choice[RosOptions]) -> None:
         """Raise UsageError for what a goal cannot carry, and for a stream to an external server."""
-        from s2a_bench.ros.config import domain_id
-        from s2a_bench.transport.ros.joining import is_routed
-
         variant, options, mode = choice.variant, choice.options, choice.mode
         domain_id(os.environ)
-        if is_routed(options):
-            extras.need("zenoh", "zenoh")
-        elif options.router:
+        if options.kind.extra:
+            extras.need(options.kind.extra, options.kind.module)
+        if options.router and not options.kind.routed:
             raise UsageError("`router` is Zenoh's: choose `middleware` zenoh, or leave it out")
         if options.action and variant != ACTION:
             raise UsageError(f"`action` is spoken by ros/{ACTION}, not by ros/{variant}")
@@ -91,16 +90,17 @@ class Ros(Transport[RosOptions]):
             )
 
     def ready(self, wiring: Wiring[RosOptions]) -> str:
+        from s2a_bench.ros.llama import GENERATE_RESPONSE
         from s2a_bench.transport.ros.buffers import hint
         from s2a_bench.transport.ros.camera import CAMERA
-        from s2a_bench.transport.ros.joining import AT, action_is_built, place_of, remapped
+        from s2a_bench.transport.ros.joining import AT, place_of, remapped
 
-        names = remapped(wiring)
+        kind, names = wiring.options.kind, remapped(wiring)
         namespace, hosted, _ = wiring.address.partition(AT)
         action, camera = (names.get(name, name) for name in (f"{namespace}/generate_response", namespace + CAMERA))
-        served = f"action {action}" if action_is_built(wiring.options) else f"topics below {namespace}"
+        served = f"action {action}" if kind.builds(GENERATE_RESPONSE) else f"topics below {namespace}"
         where = place_of(wiring) + (", which this server is" if hosted else "")
-        room = hint(wiring.options.middleware, os.environ)
+        room = hint(kind.dds_in(os.environ), os.environ)
         return f"serving {served}, camera {camera}, in {where}{room and f'; for large pictures: {room}'}"
 
 

@@ -7,11 +7,9 @@ from collections.abc import Iterator, Mapping
 
 from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.machine.doctor.host import RMEM_WANTED
-from s2a_bench.ros import default_middleware
-from s2a_bench.ros.config import LARGE_PICTURES, RMW_CYCLONE
+from s2a_bench.ros import MIDDLEWARES, default_middleware
+from s2a_bench.ros.config import CYCLONE, LARGE_PICTURES, RMW_CYCLONE, RMW_FAST, RMW_ZENOH
 
-FAST = DEFAULT_RMW = "rmw_fastrtps_cpp"
-"""Of Humble and Jazzy, where RMW_IMPLEMENTATION says nothing."""
 KERNEL = f"sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}"
 LARGE_DATA = "export FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA"
 PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
@@ -21,21 +19,14 @@ _SIZE = re.compile(r"([0-9]{1,12})\s*([kKMG]?)")
 _UNITS = {"": 0, "K": 10, "M": 20, "G": 30}
 
 
-def dds_of(middleware: str, environ: Mapping[str, str]) -> str:
-    """Return cyclonedds, or which RMW a middleware is; "" stands for the default."""
-    name = middleware or default_middleware(environ)
-    return environ.get("RMW_IMPLEMENTATION") or DEFAULT_RMW if name == "rclpy" else name
-
-
-def against_loss(middleware: str, environ: Mapping[str, str]) -> str:
-    dds = dds_of(middleware, environ)
-    if dds == RMW_CYCLONE or (dds == "cyclonedds" and environ.get("CYCLONEDDS_URI")):
+def against_loss(dds: str, environ: Mapping[str, str]) -> str:
+    if dds == RMW_CYCLONE or (dds == CYCLONE and environ.get("CYCLONEDDS_URI")):
         return f"--qos reliable, and on both sides: {cyclone_line(environ)}; {KERNEL}"
-    if dds == "cyclonedds":
+    if dds == CYCLONE:
         return f"--qos reliable, --dds-tuning tuned, and {KERNEL}"
-    if dds == "zenoh":
+    if dds == RMW_ZENOH:
         return "--qos reliable: what is best effort is dropped where Zenoh's link is busy"
-    if dds == FAST:
+    if dds == RMW_FAST:
         return f"--qos reliable, and on both sides: {fast_line(environ)}; {KERNEL}"
     return f"--qos reliable, larger receive buffers for {dds}, and {KERNEL}"
 
@@ -53,27 +44,27 @@ def fast_line(environ: Mapping[str, str]) -> str:
     return LARGE_DATA
 
 
-def hint(middleware: str, environ: Mapping[str, str]) -> str:
+def hint(dds: str, environ: Mapping[str, str]) -> str:
     """Return the line that gives this process room for large pictures; "" where it has room or makes it itself."""
-    finding = check(Machine(environ=dict(environ)), middleware)
-    makes_it = dds_of(middleware, environ) == RMW_CYCLONE and not environ.get("CYCLONEDDS_URI")
+    finding = check(Machine(environ=dict(environ)), dds)
+    makes_it = dds == RMW_CYCLONE and not environ.get("CYCLONEDDS_URI")
     return "" if finding is None or makes_it else finding.fix
 
 
-def check(machine: Machine, middleware: str = "") -> Finding | None:
+def check(machine: Machine, dds: str = "") -> Finding | None:
     """Return whether a DDS, by default the one that a run takes, has room for large pictures; our own has."""
     environ, code = machine.environ, "dds-buffers"
-    dds = dds_of(middleware, environ)
+    dds = dds or MIDDLEWARES[default_middleware(environ)].dds_in(environ)
     if dds == RMW_CYCLONE and not environ.get("CYCLONEDDS_URI"):
         finding = f"{dds}: s2a-bench asks for large receive buffers itself; cameras and other nodes lose large pictures"
         return Finding(code, "advice", f"{finding}, with best effort nearly all of 1920x1080", cyclone_line(environ))
-    if environ.get("CYCLONEDDS_URI") and dds in {RMW_CYCLONE, "cyclonedds"}:
+    if environ.get("CYCLONEDDS_URI") and dds in {RMW_CYCLONE, CYCLONE}:
         size = max(_buffer_sizes(machine), default=0)
         if size >= RMEM_WANTED:
             return Finding(code, "state", f"{dds}: CYCLONEDDS_URI asks for {size} bytes of receive buffer")
         finding = f"{dds}: CYCLONEDDS_URI asks for no large receive buffer: pictures of 1920x1080 are lost"
         return Finding(code, "warning", f"{finding}, with best effort all of them", cyclone_line(environ))
-    if dds == FAST:
+    if dds == RMW_FAST:
         if "LARGE_DATA" in environ.get("FASTDDS_BUILTIN_TRANSPORTS", "") or any(map(environ.get, PROFILES)):
             return Finding(code, "state", f"{dds} is configured for large pictures")
         return Finding(code, "advice", f"{dds} has its small receive buffers: pictures may be lost", fast_line(environ))

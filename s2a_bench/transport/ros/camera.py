@@ -7,7 +7,6 @@ camera feeds the cache.
 from __future__ import annotations
 
 import logging
-import os
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
@@ -200,9 +199,7 @@ class CameraCache:
             return ""
         if self._unused:
             return f"{present}, none of its frames can be used: {self._unused}"
-        from s2a_bench.transport.ros.buffers import against_loss  # loads the doctor
-
-        buffers = against_loss(self._options.middleware, os.environ).replace("--", "")
+        buffers = self._options.against_loss.replace("--", "")
         other = "; a best-effort publisher is received with qos sensor_data" * (self._options.qos == "reliable")
         return f"{present}, no frame comes: look at the buffers ({buffers}) and at what is published{other}"
 

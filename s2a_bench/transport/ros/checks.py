@@ -8,10 +8,9 @@ from typing import Final
 from s2a_bench.errors import UsageError
 from s2a_bench.extras import how_to_install
 from s2a_bench.machine.doctor import Finding, Machine
-from s2a_bench.ros import WAYS_OUT, default_middleware
-from s2a_bench.ros.config import CYCLONE_URI, discovery_range, domain_id, static_peers
+from s2a_bench.ros import MIDDLEWARES, default_middleware
+from s2a_bench.ros.config import CYCLONE, CYCLONE_URI, RMW_CYCLONE, discovery_range, domain_id, static_peers
 from s2a_bench.ros.router import ROUTER, endpoint_of
-from s2a_bench.transport.ros.buffers import DEFAULT_RMW, dds_of
 
 STATE_AT: Final = 3
 """The column of /proc/net/tcp that holds a socket's state."""
@@ -19,15 +18,15 @@ LISTEN: Final = "0A"
 
 
 def dds(machine: Machine) -> Finding:
-    """Return which domain and interfaces the default middleware uses; rclpy's are those of the ROS installation."""
-    environ = machine.environ
-    by_rclpy = default_middleware(environ) == "rclpy"
-    default = "SUBNET" if by_rclpy and environ.get("ROS_LOCALHOST_ONLY") != "1" else "LOCALHOST"
+    """Return which domain and interfaces the default middleware uses; a ROS installation has defaults of its own."""
+    environ, name = machine.environ, default_middleware(machine.environ)
+    kind = MIDDLEWARES[name]
+    default = "SUBNET" if not kind.dds and environ.get("ROS_LOCALHOST_ONLY") != "1" else "LOCALHOST"
     try:
         domain = f"domain {domain_id(environ)}"
-        if by_rclpy:
-            domain += f", rclpy on {dds_of('rclpy', environ)}"
-        if environ.get(CYCLONE_URI) and dds_of("", environ) != DEFAULT_RMW:  # it replaces what follows
+        if not kind.dds:
+            domain += f", {name} on {kind.dds_in(environ)}"
+        if environ.get(CYCLONE_URI) and kind.dds_in(environ) in {CYCLONE, RMW_CYCLONE}:  # it replaces what follows
             return Finding("dds", "state", f"{domain}, {CYCLONE_URI} {environ[CYCLONE_URI]}")
         local = discovery_range(environ, default) in {"OFF", "LOCALHOST"}
         bound = local and not static_peers(environ)
@@ -67,20 +66,18 @@ def ros(machine: Machine) -> Finding:
     )
     if python in built:
         return Finding("ros", "state", f"{distro}, {rmw}, rclpy for Python {python}")
-    state = (
-        f"{distro} is sourced, with rclpy for Python {', '.join(built)}"
-        if built
-        else f"{distro} is sourced without rclpy"
-    )
+    library = f", with rclpy for Python {', '.join(built)}" if built else " without rclpy"
     fix = f"make PYTHON=python{built[-1]} VENV=.venv-ros setup" if built else f"sudo apt install ros-{distro}-rclpy"
-    return Finding("ros", "warning", f"{state}; this is Python {python}, so Cyclone DDS from PyPI has to do", fix)
+    state = f"{distro} is sourced{library}; this is Python {python}, so Cyclone DDS from PyPI has to do"
+    return Finding("ros", "warning", state, fix)
 
 
 def middleware(machine: Machine) -> Finding:
     name = default_middleware(machine.environ)
-    if machine.finds(name):
+    kind = MIDDLEWARES[name]
+    if machine.finds(kind.module):
         return Finding("middleware", "state", f"{name} (--middleware takes another)")
-    return Finding("middleware", "error", f"{name} is not installed, so --transport ros cannot run", WAYS_OUT[name])
+    return Finding("middleware", "error", f"{name} is not installed, so --transport ros cannot run", kind.way_out)
 
 
 def zenoh(machine: Machine) -> Finding | None:
@@ -90,7 +87,5 @@ def zenoh(machine: Machine) -> Finding | None:
     port = f":{endpoint_of(ROUTER)[2]:04X}"
     lines = [line.split() for name in ("tcp", "tcp6") for line in (machine.read(f"proc/net/{name}") or "").splitlines()]
     there = any(len(line) > STATE_AT and line[1].endswith(port) and line[STATE_AT] == LISTEN for line in lines)
-    state = "a router listens" if there else "no router listens"
-    return Finding(
-        "zenoh", "state", f"{state} at {ROUTER}{'' if there else ': serve ros --middleware zenoh starts it'}"
-    )
+    absent = f"no router listens at {ROUTER}: serve ros --middleware zenoh starts it"
+    return Finding("zenoh", "state", f"a router listens at {ROUTER}" if there else absent)

@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import TypeVar
 
 from s2a_bench.clock import now_ns, realtime_offset_ns
-from s2a_bench.errors import MissingInterface, ServerDied, TransportError
-from s2a_bench.ros import ROUTED, Middleware, QoS, Tuning, default_middleware, open_middleware
+from s2a_bench.errors import ServerDied, TransportError
+from s2a_bench.ros import Middleware, QoS, Tuning, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE
@@ -41,10 +41,6 @@ def domain_of(wiring: Wiring[RosOptions]) -> int:
     return domain_id(os.environ, wiring.options.domain_id)
 
 
-def is_routed(options: RosOptions) -> bool:
-    return (options.middleware or default_middleware(os.environ)) in ROUTED
-
-
 def router_of(wiring: Wiring[RosOptions]) -> str:
     """Return the endpoint of the router: the server's own, else the option's, else rmw_zenoh's."""
     return wiring.address.partition(AT)[2] or wiring.options.router or ROUTER
@@ -52,7 +48,7 @@ def router_of(wiring: Wiring[RosOptions]) -> str:
 
 def place_of(wiring: Wiring[RosOptions]) -> str:
     domain = f"domain {domain_of(wiring)}"
-    return f"{domain} of the Zenoh router {router_of(wiring)}" if is_routed(wiring.options) else f"DDS {domain}"
+    return f"{domain} of the Zenoh router {router_of(wiring)}" if wiring.options.kind.routed else f"DDS {domain}"
 
 
 def settled(wiring: Wiring[RosOptions]) -> tuple[Wiring[RosOptions], bool]:
@@ -60,7 +56,7 @@ def settled(wiring: Wiring[RosOptions]) -> tuple[Wiring[RosOptions], bool]:
 
     It is without `router`, so that each server of a run has its own, and where none listens at a loopback `router`.
     """
-    if not is_routed(wiring.options):
+    if not wiring.options.kind.routed:
         return wiring, False
     endpoint = wiring.address.partition(AT)[2] or wiring.options.router
     if endpoint and (listens(endpoint) or not may_host(endpoint)):
@@ -123,35 +119,16 @@ def refuse_company(wiring: Wiring[RosOptions], namespace: str) -> None:
     probe = join(wiring, "probe")
     try:
         publisher = probe.publisher(namespace + "/request", ros.REQUEST, QoS())
-        offered = _action_offered(probe, namespace + "/generate_response")
+        built = wiring.options.kind.builds(GENERATE_RESPONSE)
+        action = probe.action_client(namespace + "/generate_response", GENERATE_RESPONSE) if built else None
         probe.subscription(namespace + "/token", ros.TOKEN, QoS()).take(SETTLE_S)
-        if publisher.matched() or offered():
+        if publisher.matched() or (action and action.server_present()):
             raise TransportError(
                 f"another server answers under {namespace} in {place_of(wiring)}: stop it, "
                 f"choose another domain with ROS_DOMAIN_ID or another `namespace`, or measure that server with `url` ros://{namespace}"
             )
     finally:
         probe.close()
-
-
-def action_is_built(options: RosOptions) -> bool:
-    """Return whether a server has the action: rclpy's needs llama_msgs in its workspace."""
-    if (options.middleware or default_middleware(os.environ)) != "rclpy":
-        return True
-    from s2a_bench.ros.rclpy_types import installed_version, interface_class
-
-    try:
-        return bool(installed_version(interface_class(GENERATE_RESPONSE), GENERATE_RESPONSE))
-    except MissingInterface:
-        return False
-
-
-def _action_offered(probe: Middleware, name: str) -> Callable[[], bool]:
-    """Return the question whether an action is offered; a workspace without llama_msgs cannot tell, and offers none."""
-    try:
-        return probe.action_client(name, GENERATE_RESPONSE).server_present
-    except MissingInterface:
-        return lambda: False
 
 
 class RosClient(Client):

@@ -13,7 +13,8 @@ from pydantic import field_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, one_of, option
-from s2a_bench.ros import MIDDLEWARES
+from s2a_bench.ros import MIDDLEWARES, MiddlewareKind, default_middleware
+from s2a_bench.ros.config import RMW_ZENOH
 from s2a_bench.ros.router import ROUTER, endpoint_of
 from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
 
@@ -125,14 +126,9 @@ class RosOptions(TransportOptions):
             raise ValueError(f"'{url}' should look like {SCHEME}/llama, with the namespace of the server")
         return url
 
-    @field_validator("router")
-    @classmethod
-    def _is_an_endpoint(cls, text: str) -> str:
-        if text:
-            endpoint_of(text)
-        return text
-
     def check(self) -> None:
+        if self.router:
+            endpoint_of(self.router)
         if self.url and self.action:
             raise UsageError("`url` and `action` name two servers; give one of them")
 
@@ -146,16 +142,18 @@ class RosOptions(TransportOptions):
         return self.dds_tuning == "tuned"
 
     @property
-    def datagrams(self) -> bool:
-        from s2a_bench.transport.ros.buffers import dds_of
+    def kind(self) -> MiddlewareKind:
+        return MIDDLEWARES[self.middleware or default_middleware(os.environ)]
 
-        return "zenoh" not in dds_of(self.middleware, os.environ)
+    @property
+    def datagrams(self) -> bool:
+        return self.kind.dds_in(os.environ) != RMW_ZENOH
 
     @property
     def against_loss(self) -> str:
         from s2a_bench.transport.ros.buffers import against_loss
 
-        return against_loss(self.middleware, os.environ)
+        return against_loss(self.kind.dds_in(os.environ), os.environ)
 
     def addresses(self) -> Iterable[str]:
         """Yield the namespace, then it with a number; a new random one without the option."""
