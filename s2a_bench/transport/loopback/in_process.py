@@ -61,3 +61,6 @@ class LoopbackClient(Client):
         except EngineError as error:
             raise RequestFailed(str(error)) from error
         trace.receive(served.to_remote())
+
+    def close(self) -> None:
+        """Own no connection."""
