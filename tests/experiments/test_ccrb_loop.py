@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from threading import enumerate as threads
@@ -12,9 +13,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from s2a_bench.act.events import Requested, VirtualInbox
+from s2a_bench.act.events import AbortRequested, Event, Requested, StreamEnded, VirtualInbox
 from s2a_bench.cli.progress import RunProgress
-from s2a_bench.clock import VirtualClock
+from s2a_bench.clock import SystemClock, VirtualClock
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.ccrb.config import CcrbConfig, PlanRequest
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
@@ -258,6 +259,43 @@ def test_ctrl_c_ends_the_world_with_the_request(
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
     assert not [each for each in threads() if each.name.startswith("world")]
+
+
+def test_ctrl_c_before_the_request_is_an_interruption_too(
+    fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sleep = SystemClock.sleep_until_ns
+
+    def interrupted(self: SystemClock, deadline_ns: int) -> None:
+        if any(each.name.startswith("world") for each in threads()):
+            raise KeyboardInterrupt
+        sleep(self, deadline_ns)
+
+    monkeypatch.setattr(SystemClock, "sleep_until_ns", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
+    assert not [each for each in threads() if each.name.startswith("world")]
+
+
+def test_ctrl_c_while_a_whole_plan_is_driven_does_not_wait_for_its_end(
+    fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put, seen, wait = ClosedLoop.put, list[Event](), Future.result
+
+    def noted(self: ClosedLoop, event: Event) -> None:
+        put(self, event)
+        seen.append(event)
+
+    def interrupted(self: Future[Any], timeout: float | None = None) -> Any:
+        if isinstance(seen[-1], StreamEnded):
+            raise KeyboardInterrupt
+        return wait(self, timeout)
+
+    monkeypatch.setattr(ClosedLoop, "put", noted)
+    monkeypatch.setattr(Future, "result", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
+    assert isinstance(seen[-1], AbortRequested)
 
 
 @pytest.mark.parametrize("given", [{"ttc": True}, {"phase": True}, {"random": 3}])
