@@ -75,6 +75,14 @@ def test_on_the_same_arrivals_a_loop_ends_as_its_roll_out(number: int) -> None:
     assert looped.facts["real_time_factor"] == 1.0
 
 
+def test_a_board_of_which_the_first_token_takes_minutes_hits_the_lead_as_in_its_roll_out() -> None:
+    config = CcrbConfig(prompt_s=200.0)
+    ready = prepare(config)
+    looped = replayed(config.scenario, Longitudinal(), ready.policies["naive"], ready.plans)
+    assert (looped.record.outcome, len(looped.record.ran)) == ("completed", 5)
+    assert looped.driven.outcomes.name(0) == driven(config, ready, "naive").outcomes.name(0) == "front"
+
+
 def test_motion_does_not_depend_on_when_the_first_sample_was() -> None:
     config = CcrbConfig()
     schedule = prepare(config).schedules["naive"]

@@ -25,7 +25,7 @@ from s2a_bench.act.events import (
     TokenArrived,
     VirtualInbox,
 )
-from s2a_bench.act.executor import NEVER, SILENCE_S, Executor
+from s2a_bench.act.executor import NEVER, Executor
 from s2a_bench.act.record import Record
 from s2a_bench.clock import Clock, VirtualClock
 from s2a_bench.frames import FrameSource
@@ -127,7 +127,7 @@ class ClosedLoop:
                 return events
             self._step()
 
-    def run(self, policy: Policy, shape: PlanShape, silence_s: float = SILENCE_S) -> Looped:
+    def run(self, policy: Policy, shape: PlanShape, silence_s: float) -> Looped:
         """Execute a plan, and step on until the outcome is certain; raises what the world raises.
 
         Once the ego rests after its plan nothing depends on the clock: the car behind closes up without waiting.
@@ -186,4 +186,5 @@ def replayed(scenario: CcrbOptions, world: Simulator, policy: Policy, plans: Pla
         loop.put(SkillArrived(at_ns, call))
     loop.put(StreamEnded(token_ns[-1]))
     safe_s = float(safe_start(plans.arrival_s, plans.nominal_s)[0])
-    return loop.run(policy, replace(plans.shape, safe_start_s=safe_s))
+    longest_s = token_ns[-1] / 1e9 + 1  # no board is taken for silent
+    return loop.run(policy, replace(plans.shape, safe_start_s=safe_s), longest_s)
