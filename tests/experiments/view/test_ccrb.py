@@ -177,6 +177,19 @@ def test_no_skill_is_drawn_beyond_what_was_driven(virtual: StoredRun) -> None:
     assert max(ends_s) == pytest.approx(driven_s)
 
 
+@pytest.fixture(scope="module")
+def slow(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
+    """A board that is still writing its first skill when the lead is hit."""
+    return run(tmp_path_factory.mktemp("runs"), closed_loop=True, rate=0.3, policies=("naive",))
+
+
+def test_tokens_that_come_after_the_crash_are_not_drawn(slow: StoredRun) -> None:
+    figure = build_scenario(slow)
+    figure.canvas.draw()  # a layout without room would warn
+    (marks,) = (line for line in figure.axes[0].lines if line.get_marker() == "|")
+    assert marks.get_clip_on()
+
+
 def test_a_recording_has_every_policys_cars_where_they_drove(live: Live, recorded: dict[str, list[Message]]) -> None:
     paths = live.run.table(TRAJECTORIES)
     for policy, topic in TOPICS.items():
