@@ -85,8 +85,8 @@ class Looped:
 
     record: Record
     driven: Driven
-    facts: dict[str, float]
-    """The metrics `rows.LOOP`."""
+    facts: dict[str, float | None]
+    """The metrics `rows.LOOP`; tracking is None if no skill ran before an impact."""
 
 
 class ClosedLoop:
@@ -141,7 +141,7 @@ class ClosedLoop:
                 self._step()
         facts = {
             "real_time_factor": self.real_time_factor,
-            "tracking_rms_mps": float(np.sqrt(np.mean(self._squares))) if self._squares else 0.0,
+            "tracking_rms_mps": float(np.sqrt(np.mean(self._squares))) if self._squares else None,
         }
         return Looped(record, Driven(self._drive.outcomes(), self._drive.trajectory()), facts)
 

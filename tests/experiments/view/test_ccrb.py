@@ -190,6 +190,13 @@ def test_tokens_that_come_after_the_crash_are_not_drawn(slow: StoredRun) -> None
     assert marks.get_clip_on()
 
 
+def test_tracking_is_absent_where_no_skill_ran_before_the_crash(slow: StoredRun) -> None:
+    (cell,) = ccrb_json(slow)["cells"]
+    assert cell["outcome"] == "front"
+    assert cell["real_time_factor"] == pytest.approx(1.0)
+    assert "tracking_rms_mps" not in cell
+
+
 def test_a_recording_has_every_policys_cars_where_they_drove(live: Live, recorded: dict[str, list[Message]]) -> None:
     paths = live.run.table(TRAJECTORIES)
     for policy, topic in TOPICS.items():
