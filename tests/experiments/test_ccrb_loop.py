@@ -22,6 +22,7 @@ from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.run import Prepared, keep_loop, prepare, run_ccrb
 from s2a_bench.experiments.ccrb.studies import motion_of
+from s2a_bench.frames import FrameSource
 from s2a_bench.inference import EngineConfig
 from s2a_bench.plan.skillset import GAPS, Gap
 from s2a_bench.policy import COMPARED
@@ -35,7 +36,7 @@ from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.transport.loopback.in_process import LoopbackClient
-from s2a_bench.types import Piece, Request
+from s2a_bench.types import Frame, Piece, Request
 
 LIVE = PlanRequest(live=True, transport="loopback", engine=EngineConfig(name="replay"))
 
@@ -179,6 +180,22 @@ def test_before_the_request_all_cars_keep_their_speed() -> None:
     loop.wait(4_000_000_000)
     after = world.step(DriveCommand(np.zeros((3, 1)), np.zeros(1, int)))
     assert after.speed_mps[LEAD, 0] < before.speed_mps[LEAD, 0] - 1.0
+
+
+class Still(FrameSource):
+    """A camera whose one picture is repeated with its stamp."""
+
+    def read(self) -> Frame:
+        return Frame(0, 0, 2, 2, "bgr8", np.zeros((2, 2, 3), np.uint8))
+
+    def close(self) -> None: ...
+
+
+def test_a_view_that_does_not_change_is_kept_five_times_a_second_as_any_other() -> None:
+    clock = VirtualClock()
+    loop = ClosedLoop(CcrbOptions(), Longitudinal(), VirtualInbox(clock), clock, Still())
+    loop.wait(2_000_000_000)
+    assert len(loop.pictures) == 10
 
 
 def ego_at(scene: CcrbOptions) -> tuple[CommandedEgo, VirtualClock]:

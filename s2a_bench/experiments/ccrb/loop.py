@@ -102,7 +102,7 @@ class ClosedLoop:
         self._ego = CommandedEgo(scenario, lambda: self._since_s(clock.now_ns()), self._since_s)
         self._drive = Drive(world, scenario.cars, self._ego, record=True)
         self._step_ns = round(world.step_s * 1e9)
-        self._first_ns = self._due_ns = self._last_ns = clock.now_ns()
+        self._first_ns = self._due_ns = self._last_ns = self._picture_ns = clock.now_ns()
         self._steps = 0
         self._squares: list[float] = []
         self._view, self.pictures = view, list[Frame]()
@@ -156,8 +156,8 @@ class ClosedLoop:
         self._squares += (self._ego.lag_mps[self._ego.phase == ACTING] ** 2).tolist()
         self._steps += 1
         self._last_ns = now_ns + self._step_ns
-        due = not self.pictures or self._last_ns >= self.pictures[-1].stamp_ns + PICTURE_NS
-        if self._view and self._drive.ego_moves and due:
+        if self._view and self._drive.ego_moves and self._clock.now_ns() >= self._picture_ns:
+            self._picture_ns = self._clock.now_ns() + PICTURE_NS
             self.pictures.append(self._view.read())
         slack_ns = round(SLACK_S * 1e9)
         self._due_ns = NEVER if self._drive.decided().all() else max(self._last_ns, self._clock.now_ns() - slack_ns)
