@@ -300,7 +300,7 @@ def capacity(**options: Unpack[_Capacity]) -> Run:
     """Find how many robots one server carries, each with its control clock: measured, or predicted."""
 
 def ccrb(**options: Unpack[_Ccrb]) -> Run:
-    """Drive car-to-car rear braking with a car behind, under each policy, in virtual time: who hits whom, and when."""
+    """Drive car-to-car rear braking with a car behind, under each policy: who hits whom, and when."""
 
 def chunks(**options: Unpack[_Chunks]) -> Run:
     """Act on chunks of actions, computed or live: how often each mode and trigger stalls, on how old a picture."""

@@ -51,7 +51,7 @@ def ego_parameters(written: str, world: type[Simulator]) -> EgoParameters:
     if not world.over_ros:
         able = ", ".join(name for name, each in SIMULATORS.loaded() if each.over_ros)
         raise UsageError(
-            f"`ego`: the {world.name} simulator has no ROS 2; take a `simulator` that has: {able or 'none'}"
+            f"`ego`: the {world.name} simulator has no ROS 2; take a `simulator` that has: {able or 'none here'}"
         )
     return build(EgoParameters, written, "ego")
 

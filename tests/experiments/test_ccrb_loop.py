@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 from threading import enumerate as threads
@@ -12,15 +13,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from s2a_bench.act.events import Requested, VirtualInbox
+from s2a_bench.act.events import AbortRequested, Event, Requested, StreamEnded, VirtualInbox
 from s2a_bench.cli.progress import RunProgress
-from s2a_bench.clock import VirtualClock
+from s2a_bench.clock import SystemClock, VirtualClock
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.ccrb.config import CcrbConfig, PlanRequest
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.run import Prepared, keep_loop, prepare, run_ccrb
 from s2a_bench.experiments.ccrb.studies import motion_of
+from s2a_bench.frames import FrameSource
 from s2a_bench.inference import EngineConfig
 from s2a_bench.plan.skillset import GAPS, Gap
 from s2a_bench.policy import COMPARED
@@ -34,7 +36,7 @@ from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.transport.loopback.in_process import LoopbackClient
-from s2a_bench.types import Piece, Request
+from s2a_bench.types import Frame, Piece, Request
 
 LIVE = PlanRequest(live=True, transport="loopback", engine=EngineConfig(name="replay"))
 
@@ -72,6 +74,14 @@ def test_on_the_same_arrivals_a_loop_ends_as_its_roll_out(number: int) -> None:
     assert looped.driven.outcomes.name(0) == expected.outcomes.name(0)
     assert differ_m(looped.driven, expected) < 0.03
     assert looped.facts["real_time_factor"] == 1.0
+
+
+def test_a_board_of_which_the_first_token_takes_minutes_hits_the_lead_as_in_its_roll_out() -> None:
+    config = CcrbConfig(prompt_s=200.0)
+    ready = prepare(config)
+    looped = replayed(config.scenario, Longitudinal(), ready.policies["naive"], ready.plans)
+    assert (looped.record.outcome, len(looped.record.ran)) == ("completed", 5)
+    assert looped.driven.outcomes.name(0) == driven(config, ready, "naive").outcomes.name(0) == "front"
 
 
 def test_motion_does_not_depend_on_when_the_first_sample_was() -> None:
@@ -172,6 +182,22 @@ def test_before_the_request_all_cars_keep_their_speed() -> None:
     assert after.speed_mps[LEAD, 0] < before.speed_mps[LEAD, 0] - 1.0
 
 
+class Still(FrameSource):
+    """A camera whose one picture is repeated with its stamp."""
+
+    def read(self) -> Frame:
+        return Frame(0, 0, 2, 2, "bgr8", np.zeros((2, 2, 3), np.uint8))
+
+    def close(self) -> None: ...
+
+
+def test_a_view_that_does_not_change_is_kept_five_times_a_second_as_any_other() -> None:
+    clock = VirtualClock()
+    loop = ClosedLoop(CcrbOptions(), Longitudinal(), VirtualInbox(clock), clock, Still())
+    loop.wait(2_000_000_000)
+    assert len(loop.pictures) == 10
+
+
 def ego_at(scene: CcrbOptions) -> tuple[CommandedEgo, VirtualClock]:
     clock = VirtualClock()
     return CommandedEgo(scene, lambda: clock.now_ns() / 1e9, lambda at_ns: at_ns / 1e9), clock
@@ -258,6 +284,43 @@ def test_ctrl_c_ends_the_world_with_the_request(
     with pytest.raises(KeyboardInterrupt):
         run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
     assert not [each for each in threads() if each.name.startswith("world")]
+
+
+def test_ctrl_c_before_the_request_is_an_interruption_too(
+    fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sleep = SystemClock.sleep_until_ns
+
+    def interrupted(self: SystemClock, deadline_ns: int) -> None:
+        if any(each.name.startswith("world") for each in threads()):
+            raise KeyboardInterrupt
+        sleep(self, deadline_ns)
+
+    monkeypatch.setattr(SystemClock, "sleep_until_ns", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
+    assert not [each for each in threads() if each.name.startswith("world")]
+
+
+def test_ctrl_c_while_a_whole_plan_is_driven_does_not_wait_for_its_end(
+    fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put, seen, wait = ClosedLoop.put, list[Event](), Future.result
+
+    def noted(self: ClosedLoop, event: Event) -> None:
+        put(self, event)
+        seen.append(event)
+
+    def interrupted(self: Future[Any], timeout: float | None = None) -> Any:
+        if isinstance(seen[-1], StreamEnded):
+            raise KeyboardInterrupt
+        return wait(self, timeout)
+
+    monkeypatch.setattr(ClosedLoop, "put", noted)
+    monkeypatch.setattr(Future, "result", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
+    assert isinstance(seen[-1], AbortRequested)
 
 
 @pytest.mark.parametrize("given", [{"ttc": True}, {"phase": True}, {"random": 3}])

@@ -4,8 +4,7 @@ from s2a_bench.experiments import Experiment
 
 EXPERIMENT = Experiment(
     name="ccrb",
-    about="Drive car-to-car rear braking with a car behind, under each policy, in virtual time: who hits whom, "
-    "and when.",
+    about="Drive car-to-car rear braking with a car behind, under each policy: who hits whom, and when.",
     config="s2a_bench.experiments.ccrb.config:CcrbConfig",
     run="s2a_bench.experiments.ccrb.run:run_ccrb",
     view="s2a_bench.experiments.ccrb.view.tables:show",

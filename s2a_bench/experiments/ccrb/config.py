@@ -162,10 +162,8 @@ class CcrbConfig(Options):
         return self.request.risks() if self.plan_request.live else super().risks()
 
     def to_manifest(self) -> dict[str, Any]:
-        left_out = {"scenario", "plan_request"}
-        left_out |= (
-            {"profile", *MODELLED, "phase_rates", "phase_gaps_m", "phase_points"} if self.plan_request.live else set()
-        )
+        modelled = {"profile", *MODELLED, "phase_rates", "phase_gaps_m", "phase_points"}
+        left_out = {"scenario", "plan_request"} | (modelled if self.plan_request.live else set())
         given = {**self.model_dump(exclude=left_out), **self.scenario.to_manifest()}
         time = "monotonic" if self.closed_loop and self.plan_request.live else "virtual"
         return {**given, "t_nom_s": self.scenario.durations.nominal_s, "time": time}

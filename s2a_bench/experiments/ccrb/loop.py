@@ -25,7 +25,7 @@ from s2a_bench.act.events import (
     TokenArrived,
     VirtualInbox,
 )
-from s2a_bench.act.executor import NEVER, SILENCE_S, Executor
+from s2a_bench.act.executor import NEVER, Executor
 from s2a_bench.act.record import Record
 from s2a_bench.clock import Clock, VirtualClock
 from s2a_bench.frames import FrameSource
@@ -85,8 +85,8 @@ class Looped:
 
     record: Record
     driven: Driven
-    facts: dict[str, float]
-    """The metrics `rows.LOOP`."""
+    facts: dict[str, float | None]
+    """The metrics `rows.LOOP`; tracking is None if no skill ran before an impact."""
 
 
 class ClosedLoop:
@@ -102,7 +102,7 @@ class ClosedLoop:
         self._ego = CommandedEgo(scenario, lambda: self._since_s(clock.now_ns()), self._since_s)
         self._drive = Drive(world, scenario.cars, self._ego, record=True)
         self._step_ns = round(world.step_s * 1e9)
-        self._first_ns = self._due_ns = self._last_ns = clock.now_ns()
+        self._first_ns = self._due_ns = self._last_ns = self._picture_ns = clock.now_ns()
         self._steps = 0
         self._squares: list[float] = []
         self._view, self.pictures = view, list[Frame]()
@@ -127,7 +127,7 @@ class ClosedLoop:
                 return events
             self._step()
 
-    def run(self, policy: Policy, shape: PlanShape, silence_s: float = SILENCE_S) -> Looped:
+    def run(self, policy: Policy, shape: PlanShape, silence_s: float) -> Looped:
         """Execute a plan, and step on until the outcome is certain; raises what the world raises.
 
         Once the ego rests after its plan nothing depends on the clock: the car behind closes up without waiting.
@@ -141,7 +141,7 @@ class ClosedLoop:
                 self._step()
         facts = {
             "real_time_factor": self.real_time_factor,
-            "tracking_rms_mps": float(np.sqrt(np.mean(self._squares))) if self._squares else 0.0,
+            "tracking_rms_mps": float(np.sqrt(np.mean(self._squares))) if self._squares else None,
         }
         return Looped(record, Driven(self._drive.outcomes(), self._drive.trajectory()), facts)
 
@@ -156,8 +156,8 @@ class ClosedLoop:
         self._squares += (self._ego.lag_mps[self._ego.phase == ACTING] ** 2).tolist()
         self._steps += 1
         self._last_ns = now_ns + self._step_ns
-        due = not self.pictures or self._last_ns >= self.pictures[-1].stamp_ns + PICTURE_NS
-        if self._view and self._drive.ego_moves and due:
+        if self._view and self._drive.ego_moves and self._clock.now_ns() >= self._picture_ns:
+            self._picture_ns = self._clock.now_ns() + PICTURE_NS
             self.pictures.append(self._view.read())
         slack_ns = round(SLACK_S * 1e9)
         self._due_ns = NEVER if self._drive.decided().all() else max(self._last_ns, self._clock.now_ns() - slack_ns)
@@ -186,4 +186,5 @@ def replayed(scenario: CcrbOptions, world: Simulator, policy: Policy, plans: Pla
         loop.put(SkillArrived(at_ns, call))
     loop.put(StreamEnded(token_ns[-1]))
     safe_s = float(safe_start(plans.arrival_s, plans.nominal_s)[0])
-    return loop.run(policy, replace(plans.shape, safe_start_s=safe_s))
+    longest_s = token_ns[-1] / 1e9 + 1  # no board is taken for silent
+    return loop.run(policy, replace(plans.shape, safe_start_s=safe_s), longest_s)

@@ -52,7 +52,7 @@ MOTION: Final = (
 )
 LOOP: Final = (
     _metric("real_time_factor", "", "real-time factor", "higher", about="Simulated over elapsed time: 1 is in time."),
-    _metric("tracking_rms_mps", "m/s", "tracking", about="RMS of set-point minus speed while a skill runs."),
+    _metric("tracking_rms_mps", "m/s", "tracking", about="RMS of set-point minus speed in skills, if one ran."),
 )
 """Metrics of closed loops alone."""
 METRICS: Final = (*TIMES, *IMPACTS, *MARGINS, *MOTION, *LOOP)

@@ -109,7 +109,7 @@ def _keep(
     schedule: Schedule,
     driven: Driven,
     writer: RunWriter,
-    facts: Mapping[str, float] = MappingProxyType({}),
+    facts: Mapping[str, float | None] = MappingProxyType({}),
 ) -> None:
     path = driven.trajectory
     assert path is not None  # noqa: S101 - recorded

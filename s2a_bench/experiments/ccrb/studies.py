@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -34,9 +34,6 @@ from s2a_bench.scenario.ccrb.outcome import Outcomes
 from s2a_bench.scenario.ccrb.studies import Scenes, draw, drive_along, plane, survived
 from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.stats.seeds import generator
-
-if TYPE_CHECKING:
-    pass
 
 
 def rollout_rows(

@@ -76,7 +76,7 @@ def drive(
         raise UsageError(f"`simulator`: '{simulator.name}' runs {simulator.most} roll-out at a time, not {rollouts}")
     driving = Drive(simulator, cars, Ego(cars, plan, schedule, rollouts), rollouts, record=record)
     outcomes = driving.run(resting_mps=resting_mps)
-    return Driven(outcomes, driving.trajectory() if record else None)
+    return Driven(outcomes, driving.trajectory())
 
 
 def follower_survives(cars: Cars, plan: DrivingPlan, n_skills: ArrayLike, t_nom_s: ArrayLike) -> NDArray[np.bool_]:
@@ -163,7 +163,10 @@ class Drive(LockStep):
         self._outcomes.put(self._left, self._watch.outcomes())
         return self._outcomes
 
-    def trajectory(self) -> Trajectory:
+    def trajectory(self) -> Trajectory | None:
+        """Return what was recorded, None without a step of it."""
+        if not self._records:
+            return None
         times_s, states, accelerations, phases, skills = zip(*self._records, strict=True)
         return Trajectory(
             time_s=np.array(times_s),

@@ -177,6 +177,26 @@ def test_no_skill_is_drawn_beyond_what_was_driven(virtual: StoredRun) -> None:
     assert max(ends_s) == pytest.approx(driven_s)
 
 
+@pytest.fixture(scope="module")
+def slow(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
+    """A board that is still writing its first skill when the lead is hit."""
+    return run(tmp_path_factory.mktemp("runs"), closed_loop=True, rate=0.3, policies=("naive",))
+
+
+def test_tokens_that_come_after_the_crash_are_not_drawn(slow: StoredRun) -> None:
+    figure = build_scenario(slow)
+    figure.canvas.draw()  # a layout without room would warn
+    (marks,) = (line for line in figure.axes[0].lines if line.get_marker() == "|")
+    assert marks.get_clip_on()
+
+
+def test_tracking_is_absent_where_no_skill_ran_before_the_crash(slow: StoredRun) -> None:
+    (cell,) = ccrb_json(slow)["cells"]
+    assert cell["outcome"] == "front"
+    assert cell["real_time_factor"] == pytest.approx(1.0)
+    assert "tracking_rms_mps" not in cell
+
+
 def test_a_recording_has_every_policys_cars_where_they_drove(live: Live, recorded: dict[str, list[Message]]) -> None:
     paths = live.run.table(TRAJECTORIES)
     for policy, topic in TOPICS.items():

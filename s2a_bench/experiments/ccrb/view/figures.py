@@ -94,7 +94,7 @@ def build_scenario(run: StoredRun) -> Figure:
             axes.axvline(token_s[0], **_FIRST)
             axes.set_xlim(0, until_s)
         _draw_cars(above, path, "position_m")
-        above.plot(token_s, [0.04] * len(token_s), "|", color="#555555", markersize=5, transform=edge, clip_on=False)
+        above.plot(token_s, [0.04] * len(token_s), "|", color="#555555", markersize=5, transform=edge)
         _draw_cars(grid[1, column], path, "speed_kmh")
         _draw_gaps(grid[2, column], path, row)
         grid[2, column].set_xlabel("time from the request (s)")
