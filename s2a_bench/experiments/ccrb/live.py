@@ -74,7 +74,7 @@ def run_ccrb_live(config: CcrbConfig, world: Simulator, output: Path, progress: 
 def _drive(config: CcrbConfig, ask: PlanPrompt, world: Simulator, launch: RunningLaunch) -> None:
     progress = launch.progress
     shape = PlanShape(ask.n_skills, ask.tokens_per_skill, config.scenario.durations)
-    view = world.camera(*PICTURE) if launch.recorder else None
+    view = world.camera(*PICTURE) if launch.recorder and config.closed_loop else None
     requests = _Requests(config, ask, ModelLink(config.request, launch, f"{world.name} simulator"), shape, world, view)
     progress.expect(launch.plan.blocks.warmup + (len(config.timeline.chosen) if config.closed_loop else 1))
     policies = prepare_policies(config.request, shape, requests.link.warm_up(ask)).policies()
