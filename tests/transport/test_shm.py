@@ -112,6 +112,9 @@ def test_a_server_that_is_killed_in_mid_answer_leaves_nothing_and_the_next_start
                 f"RequestFailed: {server.address} broke off: it closed the link",
             }
             assert usage(peer.pid).descriptors < before
+            until(lambda: not server.alive())
+            peer.tell("close")  # as a run does in its end
+            peer.hear("closed")
         finally:
             peer.close()
         assert [*own_folder.iterdir()] == []  # the client has removed the socket, which has a name
