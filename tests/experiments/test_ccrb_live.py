@@ -162,6 +162,7 @@ def test_the_ego_is_commanded_and_seen_over_ros_while_its_plan_arrives(
     driven = run.table(ROLLOUTS).query("study == 'point'")
     assert list(driven["simulator"]) == ["stand-in"]
     assert run.manifest["configuration"]["ego"] == ego
+    assert f"Ego: commanded and seen over ROS 2 ({ego})." in origin_notes(run)
     assert len(run.samples) == 2
     pedals = [(message.throttle, message.brake) for message in world.received]
     assert any(throttle > 0.03 and brake == 0 for throttle, brake in pedals)  # it kept its speed

@@ -155,6 +155,8 @@ def origin_notes(run: StoredRun) -> tuple[str, ...]:
     settings = configuration(run)
     notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
     notes += _loop_notes(run) if has(run, "rollout") else []
+    if ego := settings.get("ego"):
+        notes.append(f"Ego: commanded and seen over ROS 2 ({ego}).")
     notes.append(f"Rear: {law(settings)}.")
     notes.append(follower_check(settings, survives_of(rollouts_of(run, "point"))))
     reflex = "on" if settings["reflex"] else "off"
