@@ -17,6 +17,7 @@ from functools import cache
 from itertools import islice
 from threading import Lock
 from typing import Any
+from uuid import UUID
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import (
@@ -46,7 +47,7 @@ from s2a_bench.ros.service import AT_ONCE, WAIT_SLICE_NS
 
 FOREVER_NS = 2**63 - 1
 WRITERS_AT_MOST = 4096
-"""So many writers of a domain are looked through."""
+"""So many changes among the writers of a domain are taken at once."""
 ANY_STATE = SampleState.Any | ViewState.Any | InstanceState.Any
 
 
@@ -255,13 +256,21 @@ class RawReader(_Endpoint):
 
 
 def writers_of(participant: DomainParticipant) -> Callable[[], list[Any]]:
-    """Return what reads the writers of the domain; keep it, as Cyclone gives back no memory of a reader."""
+    """Return what knows the writers of the domain; keep it, as Cyclone gives back no memory of a reader.
+
+    Nor does it of a writer's QoS that was read: each change is taken once.
+    """
     reader = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-    alive = ReadCondition(reader, ViewState.Any | SampleState.Any | InstanceState.Alive)
+    known: dict[UUID, Any] = {}
 
     def read() -> list[Any]:
         with _reading:
-            return list(reader.read(WRITERS_AT_MOST, alive))
+            while changes := reader.take(WRITERS_AT_MOST):
+                for writer in changes:
+                    known.pop(writer.key, None)
+                    if writer.sample_info.instance_state & InstanceState.Alive:
+                        known[writer.key] = writer
+            return list(known.values())
 
     return read
 
