@@ -26,7 +26,10 @@ setup(
     package_data=PYPROJECT["tool"]["setuptools"]["package-data"],
     install_requires=PROJECT["dependencies"],  # for `s2a-bench doctor`: colcon installs none of them
     extras_require=PROJECT["optional-dependencies"],
-    entry_points={"console_scripts": [f"{name} = {where}" for name, where in PROJECT["scripts"].items()]},
+    entry_points={
+        group: [f"{name} = {where}" for name, where in points.items()]
+        for group, points in {"console_scripts": PROJECT["scripts"], **PROJECT["entry-points"]}.items()
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/s2a_bench"]),
         ("share/s2a_bench", ["package.xml"]),

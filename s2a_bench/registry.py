@@ -6,9 +6,12 @@ Built-ins are a table ``name -> "module:attribute"``; other packages add to a ki
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from importlib.metadata import EntryPoint, entry_points
+from importlib import import_module
+from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
+from pathlib import Path
 from pkgutil import resolve_name
 from typing import Generic, TypeVar
 
@@ -72,3 +75,16 @@ class Registry(Mapping[str, T], Generic[T]):
             except UsageError:
                 if name in self._builtins:
                     raise
+
+
+def missing_entry_points(checkout: Path = Path(__file__).parent.parent) -> list[str]:
+    """Return the plug-ins of a checkout that its installed metadata does not name, as it is older; [] elsewhere."""
+    if not (project := checkout / "pyproject.toml").is_file():
+        return []
+    tomllib = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+    declared = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["entry-points"]
+    try:
+        installed = {(point.group, point.name) for point in distribution("s2a-bench").entry_points}
+    except PackageNotFoundError:
+        installed = set()
+    return [name for group, points in declared.items() for name in points if (group, name) not in installed]

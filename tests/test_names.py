@@ -1,6 +1,7 @@
 """Consumers trust declarations: no experiment uses another one, and nobody names one policy, mode, engine and so on.
 
-Research stands outside: `studies` imports what docs/library.md lists, and the package never imports `studies`.
+Research and plug-ins stand outside: `studies` and each of `s2a_bench.plugins` import what docs/library.md lists, and
+the package never imports `studies`; that it imports no plug-in is a contract of import-linter.
 
 What is named is read off the syntax tree: modules that are imported, wherever, and texts that are a registered name.
 `tests/data/names.txt` is what may, as a default or a claim has to name one, and what is still to be moved: it shrinks.
@@ -12,6 +13,8 @@ import ast
 import re
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 import s2a_bench
 from s2a_bench.act import ROBOTS
@@ -69,8 +72,9 @@ def named(path: Path) -> Iterator[str]:
     where = path.relative_to(ROOT).as_posix()
     for kind, (registry, home) in KINDS.items():
         declared = "s2a_bench/transport/__init__.py" if kind == "transport" else home
-        for name in registry.built_in():
-            if where.startswith((home.format(name), declared)):
+        shipped = (name for name, point in registry._offered.items() if within(point.module, "s2a_bench.plugins"))
+        for name in (*registry.built_in(), *shipped):
+            if where.startswith((home.format(name), declared, f"s2a_bench/plugins/{name}/")):
                 continue
             opened = registry[name].opens if kind == "middleware" else registry._builtins[name]
             module = opened.partition(":")[0]
@@ -98,15 +102,22 @@ def test_nobody_names_one_of_a_kind_but_where_it_is_allowed() -> None:
     assert not allowed - found, "no longer so: take the lines out"
 
 
-def test_studies_import_the_documented_modules_alone() -> None:
+PLUGINS = sorted(path.parent for path in (ROOT / "s2a_bench" / "plugins").glob("*/__init__.py"))
+
+
+@pytest.mark.parametrize("folder", [ROOT / "studies", *PLUGINS], ids=lambda path: path.name)
+def test_studies_and_plug_ins_import_the_documented_modules_alone(folder: Path) -> None:
     page = (ROOT / "docs" / "library.md").read_text(encoding="utf-8")
     public = re.findall(r"^\| `(s2a_bench\.\w+)` \|", page, re.MULTILINE)
     face = {"s2a_bench", *(f"s2a_bench.{name}" for name in s2a_bench.__all__)}
+    mine = ".".join(folder.relative_to(ROOT).parts)
     found = {
         f"{path.name}: {name}"
-        for path in (ROOT / "studies").rglob("*.py")
+        for path in folder.rglob("*.py")
         for name in imports_of(path)
-        if within(name, "s2a_bench") and name not in face and not any(within(name, module) for module in public)
+        if within(name, "s2a_bench")
+        and name not in face
+        and not any(within(name, module) for module in (*public, mine))
     }
     assert {"s2a_bench.policy", "s2a_bench.store"} <= set(public)
     assert not found, "docs/library.md does not list these modules"

@@ -1,10 +1,11 @@
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
 from s2a_bench.cli.adapter import with_flags
 from s2a_bench.errors import UsageError
-from s2a_bench.registry import Registry
+from s2a_bench.registry import Registry, missing_entry_points
 
 
 @pytest.fixture
@@ -37,3 +38,12 @@ def test_a_package_that_does_not_load_is_one_line_and_does_not_hide_the_others(r
     with pytest.raises(UsageError, match="'broken' of the package no_such_module:thing does not load: ModuleNotFound"):
         registry["broken"]
     assert [name for name, _ in registry.loaded()] == ["join", "tail"]
+
+
+def test_a_checkout_that_is_older_than_its_plug_ins_names_them(tmp_path: Path) -> None:
+    assert missing_entry_points() == []  # this one: if not, run `make setup`
+    assert missing_entry_points(tmp_path) == []  # no checkout, but an installed package
+    points = {"s2a_bench.middlewares": "rclpy", "s2a_bench.simulators": "moon"}
+    groups = "".join(f'[project.entry-points."{group}"]\n{name} = "a:b"\n' for group, name in points.items())
+    (tmp_path / "pyproject.toml").write_text(f'[project]\nname = "s2a-bench"\n{groups}')
+    assert missing_entry_points(tmp_path) == ["moon"]

@@ -25,6 +25,7 @@ from s2a_bench.cli.ros_args import folded
 from s2a_bench.errors import NotPermitted, S2AError
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.machine import tuning
+from s2a_bench.registry import missing_entry_points
 
 INTERRUPTED: Final = 130
 AGAIN_S: Final = 0.01
@@ -104,6 +105,7 @@ def main() -> None:
     _interrupt_on_signals()
     try:
         check_limits()
+        _note_missing_plug_ins()
         with tuning.allowed():
             code = app(args=folded(sys.argv[1:]), prog_name=app.info.name, standalone_mode=False)
         if code == INTERRUPTED:  # newer typer turns Ctrl-C into this code itself
@@ -136,6 +138,11 @@ def main() -> None:
         print_error(f"error: {line}")
         code = 1
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _note_missing_plug_ins() -> None:
+    if missing := missing_entry_points():
+        print_error(f"note: this checkout was installed before it had {', '.join(missing)}: run `make setup`")
 
 
 def _print_broken(error: BrokenPipeError) -> None:

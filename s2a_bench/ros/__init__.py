@@ -307,13 +307,6 @@ CYCLONEDDS = MiddlewareKind(
     config.CYCLONE,
     packages=("cyclonedds",),
 )
-RCLPY = MiddlewareKind(
-    "s2a_bench.ros.rclpy_middleware:RclpyMiddleware",
-    "rclpy",
-    "it comes with ROS 2: source /opt/ros/<distribution>/setup.bash, or use --middleware cyclonedds",
-    dds="",
-    has_action="s2a_bench.ros.rclpy_types:has_action",
-)
 ZENOH = MiddlewareKind(
     "s2a_bench.ros.zenoh_middleware:ZenohMiddleware",
     "zenoh",
@@ -327,7 +320,7 @@ ZENOH = MiddlewareKind(
 MIDDLEWARES: Final[Registry[MiddlewareKind]] = Registry(
     "middlewares",
     "middleware",
-    {"cyclonedds": "s2a_bench.ros:CYCLONEDDS", "rclpy": "s2a_bench.ros:RCLPY", "zenoh": "s2a_bench.ros:ZENOH"},
+    {"cyclonedds": "s2a_bench.ros:CYCLONEDDS", "zenoh": "s2a_bench.ros:ZENOH"},
 )
 
 

@@ -88,7 +88,6 @@ SIMULATORS: Final[Registry[type[Simulator]]] = Registry(
     {
         "longitudinal": "s2a_bench.scenario.longitudinal:Longitudinal",
         "embedded": "s2a_bench.scenario.embedded:Embedded",
-        "carla": "s2a_bench.scenario.carla.world:CarlaWorld",
     },
 )
 

@@ -250,7 +250,7 @@ def test_no_router_is_one_line() -> None:
         ("ros?message=twist", "message = 'twist': input should be 'control' or 'ackermann'"),
         ("ros?command=go", "command = 'go': string should match pattern '^(/"),
         ("ros?picture=/a b", "picture = '/a b': string should match pattern '^(/"),
-        ("ros?middleware=opendds", "middleware = 'opendds' is none of cyclonedds, rclpy, zenoh"),
+        ("ros?middleware=opendds", "middleware = 'opendds' is none of cyclonedds, zenoh, rclpy"),
         ("ros?router=here", "router: 'here' should look like tcp/127.0.0.1:7447"),
         ("ros?wait_s=0", "wait_s = '0'"),
         ("ros?topic=/a", "'topic' is no parameter; its parameters are middleware, domain_id, router, wait_s, preset, "),

@@ -53,7 +53,7 @@ class RosOptions(TransportOptions):
     namespace: str = option("", "namespace of the topics [default: a new one for each run]", side=SERVER, first=True)
     domain_id: int | None = option(None, "DDS domain [default: ROS_DOMAIN_ID, else 0]", ge=0, le=232, side=SERVER)
     middleware: Annotated[str, one_of(lambda: ("", *MIDDLEWARES))] = option(
-        "", "cyclonedds, zenoh, rclpy [default: rclpy in a sourced ROS 2 environment]", side=SERVER
+        "", f"{', '.join(MIDDLEWARES)} [default: a sourced ROS 2's own, else the first installed]", side=SERVER
     )
     router: str = option(
         "",

@@ -22,13 +22,13 @@ from rclpy.qos import ReliabilityPolicy
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
+from s2a_bench.plugins.rclpy.client import RclpyActionClient
+from s2a_bench.plugins.rclpy.node import ONE_SUBSCRIPTION, RclpyWaiter, SpinningNode, Unserved, qos_profile
+from s2a_bench.plugins.rclpy.server import RclpyActionServer
+from s2a_bench.plugins.rclpy.types import from_ros, interface_class, message_class, to_ros
 from s2a_bench.ros import SERVICE_QOS, Offer, QoS, Tuning
 from s2a_bench.ros.config import CYCLONE_URI, LARGE_PICTURES, RMW_CYCLONE
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise
-from s2a_bench.ros.rclpy_client import RclpyActionClient
-from s2a_bench.ros.rclpy_node import ONE_SUBSCRIPTION, RclpyWaiter, SpinningNode, Unserved, qos_profile
-from s2a_bench.ros.rclpy_server import RclpyActionServer
-from s2a_bench.ros.rclpy_types import from_ros, interface_class, message_class, to_ros
 from s2a_bench.ros.service import appeared
 
 

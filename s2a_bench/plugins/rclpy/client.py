@@ -23,10 +23,10 @@ from rclpy.action.client import ClientGoalHandle
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
+from s2a_bench.plugins.rclpy.node import SpinningNode, Unserved, for_waitable, qos_profile, run_now
+from s2a_bench.plugins.rclpy.types import from_ros, installed_version, interface_class, to_ros
 from s2a_bench.ros import Accepted, ActionEvent, Feedback, QoS, Rejected, Result
 from s2a_bench.ros.messages import serialised_bytes
-from s2a_bench.ros.rclpy_node import SpinningNode, Unserved, for_waitable, qos_profile, run_now
-from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class, to_ros
 from s2a_bench.ros.service import appeared
 
 AT_ONCE = 10_000

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 from s2a_bench.errors import SimulatorError
+from s2a_bench.plugins.carla.world import MIDDLE_M, OPENDRIVE, ROAD_M
 from s2a_bench.scenario import LANE_WIDTH_M, open_simulator
-from s2a_bench.scenario.carla.world import MIDDLE_M, OPENDRIVE, ROAD_M
-from tests.scenario.carla.stand_in import CLASSES
+from tests.plugins.carla.stand_in import CLASSES
 
 carla: Any = pytest.importorskip("carla", reason="the client, pip install '.[carla]', is not installed")
 MM = 1e-3

@@ -14,14 +14,14 @@ import pytest
 
 import s2a_bench as s2a
 from s2a_bench.errors import MissingExtra, S2AError, SimulatorError, SourceError, UsageError
+from s2a_bench.plugins.carla.world import OPENDRIVE, CarlaWorld
 from s2a_bench.policy import Schedule
 from s2a_bench.scenario import EGO, LEAD, REAR, DriveCommand, State, open_simulator
-from s2a_bench.scenario.carla.world import OPENDRIVE, CarlaWorld
 from s2a_bench.scenario.ccrb.cars import Cars, braking_plan
 from s2a_bench.scenario.ccrb.drive import Driven, drive
 from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.testing.simulator import SPEED, START, SimulatorSuite, command, run
-from tests.scenario.carla.stand_in import LATE_S, SERVER, fresh
+from tests.plugins.carla.stand_in import LATE_S, SERVER, fresh
 
 TOWN = ("Town10HD_Opt", (False, None), [])
 """The stand-in's server before anything was done to it: map, settings, actors."""

@@ -29,9 +29,9 @@ from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.ros import ROS
 from s2a_bench.transport.ros.node import NodeApi
 from s2a_bench.types import Frame, Request
+from tests.plugins.rclpy.rclpy_stand_in import GRAPH, INTERFACES, PACKAGES, action, generated, modules
 from tests.ros.action_suite import NAME, ActionSuite
 from tests.ros.middleware_suite import Join, MiddlewareSuite, joining
-from tests.ros.rclpy_stand_in import GRAPH, INTERFACES, PACKAGES, action, generated, modules
 
 GLUE = ("client", "middleware", "node", "server", "types")
 
@@ -65,7 +65,7 @@ def join() -> Iterator[Join]:
 
 def test_a_goal_that_has_ended_goes_with_its_pictures_at_once() -> None:
     """Its handle's ends are no cycle, for which Python would look when it likes."""
-    from s2a_bench.ros.rclpy_server import RclpyServerGoal
+    from s2a_bench.plugins.rclpy.server import RclpyServerGoal
 
     goal = RclpyServerGoal(None, (None, SimpleNamespace(goal_id=SimpleNamespace(uuid=bytes(16)))))
     gone = weakref.ref(goal)
@@ -122,7 +122,7 @@ class TestRclpyGlue(MiddlewareSuite):
 class TestRclpyActionGlue(ActionSuite):
     @pytest.fixture(autouse=True)
     def release(self, monkeypatch: pytest.MonkeyPatch, old: bool) -> None:
-        monkeypatch.setattr("tests.ros.rclpy_stand_in.OLD_ENDS", [True] * old)
+        monkeypatch.setattr("tests.plugins.rclpy.rclpy_stand_in.OLD_ENDS", [True] * old)
 
 
 def test_an_image_is_published_as_ready_cdr_and_its_pixels_are_views_of_what_arrives(join: Join) -> None:

@@ -22,10 +22,10 @@ from rclpy.action import ActionServer, CancelResponse, GoalResponse
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import MissingInterface, TransportError
+from s2a_bench.plugins.rclpy.node import SpinningNode, Unserved, for_waitable, qos_profile, run_now
+from s2a_bench.plugins.rclpy.types import from_ros, installed_version, interface_class, to_ros
 from s2a_bench.ros.action import FEEDBACK_QOS, NEXT, Status
 from s2a_bench.ros.llama import images_of
-from s2a_bench.ros.rclpy_node import SpinningNode, Unserved, for_waitable, qos_profile, run_now
-from s2a_bench.ros.rclpy_types import from_ros, installed_version, interface_class, to_ros
 from s2a_bench.ros.service import WAIT_SLICE_NS
 
 PAUSE_S = 0.1

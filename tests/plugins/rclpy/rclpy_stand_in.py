@@ -4,7 +4,7 @@ It has the calls that the glue makes, with rclpy's signatures, its type checks o
 taken at a time, done callbacks run by the executor, wait sets, and the order of steps in rclpy's action server. Its
 generated classes and its CDR are rosbags'. So it cannot show: DDS, discovery and QoS; rclpy's serialiser and the fields
 of real generated classes; threads inside rclpy, its locks, teardown and time spent; exceptions of rcl; a Humble that
-differs from Jazzy. For these tests/ros/test_rclpy.py runs the same suites on the real one.
+differs from Jazzy. For these tests/plugins/rclpy/test_rclpy.py runs the same suites on the real one.
 """
 
 from __future__ import annotations
