@@ -10,7 +10,6 @@ gap behaviour is published on ``<namespace>/gap`` as std_msgs/msg/String: stop, 
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from threading import Lock, Thread
@@ -26,6 +25,7 @@ from s2a_bench.plan import Call, Gap, SkillSet
 from s2a_bench.ros import ActionClient, ActionEvent, Middleware, QoS, Rejected, Result, RosParameters
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
+from s2a_bench.ros.remap import ABSOLUTE
 from s2a_bench.ros.service import appeared
 from s2a_bench.types import Vector
 
@@ -37,7 +37,6 @@ STRING: Final = "std_msgs/msg/String"
 POLL_S: Final = 0.2
 FOR_ACTIONS: Final = ("topic", "type", "joints")
 FOR_SKILLS: Final = ("namespace",)
-_NAME: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +55,7 @@ class RosRobot(RosParameters, SkillKind, ActionKind):
 
     def __post_init__(self) -> None:
         for field in ("topic", "namespace"):
-            if not _NAME.fullmatch(value := getattr(self, field)):
+            if not ABSOLUTE.fullmatch(value := getattr(self, field)):
                 raise UsageError(f"{field} = '{value}' should look like /name or /name/name")
         if self.joints and self.type != "JointTrajectory":
             raise UsageError(f"joints = '{self.joints}': {self.type} has no names of joints")

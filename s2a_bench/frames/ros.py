@@ -10,7 +10,7 @@ from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.frames.messages import TYPES, ImageMessages
 from s2a_bench.policy.parameters import build
 from s2a_bench.ros import Offer, QoS, RosParameters
-from s2a_bench.ros.remap import NODE_NAME as NAME
+from s2a_bench.ros.remap import ABSOLUTE
 from s2a_bench.ros.service import appeared
 from s2a_bench.types import Frame, Pixels
 
@@ -29,7 +29,7 @@ class TopicCamera(ImageMessages):
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
         super().__init__(f"ros:{where}", width, height)
         self._topic = where.partition("?")[0]
-        if not NAME.fullmatch(self._topic):
+        if not ABSOLUTE.fullmatch(self._topic):
             raise UsageError(f"`source`: '{self.name}' should look like ros:/camera/image_raw, from the root")
         how = build(RosParameters, self.name, "source")
         self._wait_s = how.wait_s

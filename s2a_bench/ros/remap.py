@@ -15,11 +15,12 @@ from s2a_bench.ros import Middleware
 T = TypeVar("T")
 NAME: Final = r"(?:~/|/)?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*"
 RULE: Final = re.compile(f"({NAME}):=({NAME})")
-NODE_NAME: Final = re.compile(r"(/[A-Za-z_]\w*)+", re.ASCII)
+ABSOLUTE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
+"""ROS 2's rules for an absolute name: of a topic, a namespace, a node."""
 
 
 def check_node_name(name: str) -> None:
-    if not NODE_NAME.fullmatch(name):
+    if not ABSOLUTE.fullmatch(name):
         raise UsageError(f"node name '{name}': write it as /name or /namespace/name, letters, digits and _")
 
 

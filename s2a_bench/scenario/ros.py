@@ -17,6 +17,7 @@ from s2a_bench.policy import Floats
 from s2a_bench.policy.parameters import build, canonical
 from s2a_bench.ros import QoS, RosParameters
 from s2a_bench.ros import messages as ros
+from s2a_bench.ros.remap import ABSOLUTE
 from s2a_bench.ros.service import MATCH_POLL_S, appeared
 from s2a_bench.scenario import EGO, SIMULATORS, DriveCommand, Simulator, State
 
@@ -29,7 +30,7 @@ COMMANDS: Final = {
     ("bridge", "ackermann"): ("/carla/ego_vehicle/ackermann_cmd", DRIVE),
 }
 PICTURES: Final = {"native": "/carla/ego/front/image", "bridge": "/carla/ego_vehicle/rgb_front/image"}
-NAME: Final = r"^(/[A-Za-z_][A-Za-z0-9_]*)+$"
+NAME: Final = f"^{ABSOLUTE.pattern}$"
 FULL_THROTTLE_MPS2, FULL_BRAKE_MPS2, ROLLING_MPS2, AIR_PER_M, REST_MPS = 4.0, 9.0, 0.1, 0.0003, 0.1
 """Of no car in particular: what a car does instead is its error. Slower than the last, it is held by the brake."""
 

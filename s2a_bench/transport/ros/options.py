@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable, Mapping
 from itertools import count
 from secrets import token_hex
@@ -15,6 +14,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, one_of, option
 from s2a_bench.ros import MIDDLEWARES, MiddlewareKind, default_middleware
 from s2a_bench.ros.config import RMW_ZENOH
+from s2a_bench.ros.remap import ABSOLUTE
 from s2a_bench.ros.router import ROUTER, endpoint_of
 from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
 
@@ -22,8 +22,6 @@ NAMESPACE = "/s2a_bench"
 """The default namespace; servers of a run add a random suffix."""
 
 SCHEME = "ros://"
-NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
-"""ROS 2's rules for an absolute name."""
 BASE_NAME = r"^[A-Za-z_][A-Za-z0-9_]*$"
 """ROS 2's rules for the name of a node."""
 
@@ -115,14 +113,14 @@ class RosOptions(TransportOptions):
     @field_validator("namespace", "action", "camera_topic")
     @classmethod
     def _is_a_name(cls, text: str) -> str:
-        if text and not NAME.fullmatch(text):
+        if text and not ABSOLUTE.fullmatch(text):
             raise ValueError(f"'{text}' should look like /name or /name/name: letters, digits, underscores")
         return text
 
     @field_validator("url")
     @classmethod
     def _names_a_namespace(cls, url: str) -> str:
-        if url and not (url.startswith(SCHEME) and NAME.fullmatch(url.removeprefix(SCHEME))):
+        if url and not (url.startswith(SCHEME) and ABSOLUTE.fullmatch(url.removeprefix(SCHEME))):
             raise ValueError(f"'{url}' should look like {SCHEME}/llama, with the namespace of the server")
         return url
 
