@@ -268,6 +268,12 @@ def test_a_plan_that_stays_away_ends_the_run(fast_board: str, tmp_path: Path, mo
         run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
 
 
+def ends_interrupted(folder: Path, profile: str) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=profile)
+    assert not [each for each in threads() if each.name.startswith("world")]
+
+
 def test_ctrl_c_ends_the_world_with_the_request(
     fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -281,9 +287,7 @@ def test_ctrl_c_ends_the_world_with_the_request(
             yield token
 
     monkeypatch.setattr(LoopbackClient, "request", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
-    assert not [each for each in threads() if each.name.startswith("world")]
+    ends_interrupted(tmp_path, fast_board)
 
 
 def test_ctrl_c_before_the_request_is_an_interruption_too(
@@ -297,9 +301,7 @@ def test_ctrl_c_before_the_request_is_an_interruption_too(
         sleep(self, deadline_ns)
 
     monkeypatch.setattr(SystemClock, "sleep_until_ns", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
-    assert not [each for each in threads() if each.name.startswith("world")]
+    ends_interrupted(tmp_path, fast_board)
 
 
 def test_ctrl_c_while_a_whole_plan_is_driven_does_not_wait_for_its_end(
@@ -318,8 +320,7 @@ def test_ctrl_c_while_a_whole_plan_is_driven_does_not_wait_for_its_end(
 
     monkeypatch.setattr(ClosedLoop, "put", noted)
     monkeypatch.setattr(Future, "result", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run(tmp_path, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=fast_board)
+    ends_interrupted(tmp_path, fast_board)
     assert isinstance(seen[-1], AbortRequested)
 
 
