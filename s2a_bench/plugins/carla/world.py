@@ -134,7 +134,7 @@ class CarlaWorld:
             return CarlaCamera(sensor, width, height, self)
 
     def close(self) -> None:
-        """Restore in reverse order; after an error, what fails as well is not told."""
+        """Restore in reverse order; after an error, further failures are not reported."""
         with suppress(SimulatorError) if self._failed else ExitStack(), self._calls("restoring its settings"):
             self._undo.close()
 

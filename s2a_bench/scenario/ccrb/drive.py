@@ -133,7 +133,7 @@ class Drive(LockStep):
         return self.outcomes()
 
     def step(self, now_s: float) -> None:
-        """Let every driver decide, and simulate one step; before the request, at 0, nobody brakes."""
+        """Let every driver decide, and simulate one step; before the request, at 0, no car brakes."""
         self._decide(now_s)
         if self._every and now_s >= 0:
             if self._steps % self._every == 0:

@@ -171,8 +171,7 @@ def _stage_table(run: StoredRun) -> TextTable:
     groups, whole = requests.groups_present([cell]), ("residual", "ttft", "e2e")
     rows = []
     for policy in cells_of(run):
-        asked = cell.good["request_id"] == request_of(run, policy["cell"])
-        mine = replace(cell, good=cell.good[asked])
+        mine = replace(cell, good=cell.good[cell.good["request_id"] == request_of(run, policy["cell"])])
         values = (*map(mine.group_ms, groups), *map(mine.values_ms, whole))
         rows.append((policy["policy"], *(entries(each, "median")[0] for each in values)))
     title, header = "Each policy's request in ms, to its first token", ("policy", *groups, "residual", "TTFT", "e2e")
