@@ -105,22 +105,40 @@ def test_nobody_names_one_of_a_kind_but_where_it_is_allowed() -> None:
 PLUGINS = sorted(path.parent for path in (ROOT / "s2a_bench" / "plugins").glob("*/__init__.py"))
 
 
+def listed(heading: str) -> set[str]:
+    """Return the modules of a table of docs/library.md."""
+    page = (ROOT / "docs" / "library.md").read_text(encoding="utf-8")
+    section = page.partition(f"## {heading}\n")[2].partition("\n## ")[0]
+    return set(re.findall(r"^\| `(s2a_bench[\w.]+)` \|", section, re.MULTILINE))
+
+
+def is_module(name: str) -> bool:
+    path = ROOT / name.replace(".", "/")
+    return path.is_dir() or path.with_suffix(".py").is_file()
+
+
 @pytest.mark.parametrize("folder", [ROOT / "studies", *PLUGINS], ids=lambda path: path.name)
 def test_studies_and_plug_ins_import_the_documented_modules_alone(folder: Path) -> None:
-    page = (ROOT / "docs" / "library.md").read_text(encoding="utf-8")
-    public = re.findall(r"^\| `(s2a_bench\.\w+)` \|", page, re.MULTILINE)
+    public, for_plug_ins = listed("Modules for programs of your own"), listed("Modules for plug-ins")
     face = {"s2a_bench", *(f"s2a_bench.{name}" for name in s2a_bench.__all__)}
     mine = ".".join(folder.relative_to(ROOT).parts)
+    single = for_plug_ins if folder in PLUGINS else set()
     found = {
         f"{path.name}: {name}"
         for path in folder.rglob("*.py")
         for name in imports_of(path)
         if within(name, "s2a_bench")
-        and name not in face
+        and name not in face | single
         and not any(within(name, module) for module in (*public, mine))
+        and (name.rpartition(".")[0] not in single or is_module(name))
     }
-    assert {"s2a_bench.policy", "s2a_bench.store"} <= set(public)
+    assert {"s2a_bench.policy", "s2a_bench.store"} <= public
     assert not found, "docs/library.md does not list these modules"
+
+
+def test_the_modules_that_are_listed_exist() -> None:
+    every = listed("Modules for programs of your own") | listed("Modules for plug-ins")
+    assert {name for name in every if not is_module(name)} == set()
 
 
 def test_the_package_never_imports_the_studies() -> None:
