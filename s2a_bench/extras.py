@@ -1,6 +1,7 @@
 """Optional libraries: the extra of this package for each, and the one line about a missing one.
 
-No optional library is imported by a statement: ``gguf = extras.require("gguf", "model")``.
+No optional library is imported by a statement: ``gguf = extras.require("gguf", "model")``. Plug-ins say what their
+extras are for with entry points of the group ``s2a_bench.extras``, each a text.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from importlib.util import find_spec
 from typing import Any, Final
 
 from s2a_bench.errors import MissingExtra
+from s2a_bench.registry import Registry
 
-EXTRAS: Final = {
+_CORE: Final = {
     "model": "GGUF model files",
     "llama": "the llama engine",
     "llama-server": "llama.cpp's own server, without a compiler",
     "ccrb": "the embedded simulator",
-    "carla": "the driving scenario on a CARLA server",
     "nvidia": "load, memory and power of NVIDIA GPUs",
     "act": "the openvla dialect, /act",
     "ray": "sweeps, and fleets of robots, on a Ray cluster",
@@ -29,8 +30,13 @@ EXTRAS: Final = {
     "zmq": "policies over ZeroMQ, as GR00T serves them",
     "zenoh": "ROS 2 over Zenoh, as rmw_zenoh speaks it",
 }
-"""Extra -> its purpose."""
+_OFFERED: Final[Registry[str]] = Registry("extras", "extra", {})
 _NOTED: ContextVar[dict[str, None] | None] = ContextVar("extras that are missing", default=None)
+
+
+def purposes() -> dict[str, str]:
+    """Return what each extra is for."""
+    return {**_CORE, **dict(_OFFERED.loaded())}
 
 
 def installed(module: str) -> bool:
@@ -44,7 +50,7 @@ def need(extra: str, *modules: str) -> None:
         if (noted := _NOTED.get()) is not None:
             noted[extra] = None
             return
-        raise MissingExtra(f"{EXTRAS[extra]}: the package {missing[0]} is not installed; {how_to_install(extra)}")
+        raise MissingExtra(f"{purposes()[extra]}: the package {missing[0]} is not installed; {how_to_install(extra)}")
 
 
 @contextmanager
@@ -64,7 +70,7 @@ def require(module: str, extra: str) -> Any:
     try:
         return import_module(module)
     except (ImportError, OSError, RuntimeError) as error:
-        raise MissingExtra(f"{EXTRAS[extra]}: {module} does not load ({error}); {how_to_install(extra)}") from error
+        raise MissingExtra(f"{purposes()[extra]}: {module} does not load ({error}); {how_to_install(extra)}") from error
 
 
 def how_to_install(*extras: str) -> str:

@@ -241,7 +241,7 @@ def parse(words: list[str]) -> None:
 @pytest.mark.parametrize("block", BLOCKS, ids=str)
 def test_a_block_is_what_it_says(block: Block) -> None:
     assert block.language in {"console", "python", "sql", "toml", "json", "text", "latex"}
-    assert {*block.needs} <= {*NEEDS, *extras.EXTRAS, SERVER, CLIENT}
+    assert {*block.needs} <= {*NEEDS, *extras.purposes(), SERVER, CLIENT}
     assert CLIENT not in block.needs or block.server, "no server before it"
     assert SERVER not in block.needs or len(block.commands) == 1
     assert not any(COMMENT.sub("", command).rstrip().endswith("&") for command in block.commands), "a server's block"

@@ -79,7 +79,7 @@ def test_a_missing_library_is_one_line_with_the_command_and_leaves_nothing(
     monkeypatch.chdir(tmp_path)
     line = refused(*arguments, code=1)
     ending = f": the package {module} is not installed; pip install '.[{extra}]' in the clone of s2a-bench"
-    assert line == f"error: {extras.EXTRAS[extra]}{ending}"
+    assert line == f"error: {extras.purposes()[extra]}{ending}"
     assert not (tmp_path / "results").exists()
 
 
@@ -100,7 +100,7 @@ def test_a_server_without_a_library_says_so_in_one_line(transport: str, tmp_path
     done = without({"llama_cpp"}, tmp_path, "serve", transport)
     assert (done.returncode, done.stdout) == (1, "")
     (line,) = done.stderr.splitlines()
-    assert line.startswith(f"error: {extras.EXTRAS['llama']}: the package llama_cpp is not installed; pip install")
+    assert line.startswith(f"error: {extras.purposes()['llama']}: the package llama_cpp is not installed; pip install")
 
 
 @pytest.fixture(scope="module")
@@ -179,10 +179,10 @@ def test_the_core_has_22_requirements_at_most_beside_backports(machine: str) -> 
 def test_every_extra_is_described_and_in_all() -> None:
     offered = PROJECT["optional-dependencies"]
     older = {"lerobot": "grpc", "openvla": "act"}
-    assert offered.keys() == {*extras.EXTRAS, "all", "dev", *older}
+    assert offered.keys() == {*extras.purposes(), "all", "dev", *older}
     assert {name: offered[name] for name in older} == {name: [f"s2a-bench[{new}]"] for name, new in older.items()}
     (everything,) = (Requirement(text).extras for text in offered["all"])
-    assert everything | {"model"} == set(extras.EXTRAS)
+    assert everything | {"model"} == set(extras.purposes())
     (made,) = (Requirement(text).extras for text in offered["dev"] if text.startswith("s2a-bench"))
     assert made == everything - {"ray", "carla"}
 
@@ -220,4 +220,4 @@ def test_the_doctor_knows_which_extras_are_there(
 def test_no_message_names_an_extra_that_there_is_not() -> None:
     for path in (ROOT / "s2a_bench").rglob("*.py"):
         names = set(re.findall(r"how_to_install\([\"']([a-z-]+)[\"']", path.read_text()))
-        assert names <= extras.EXTRAS.keys(), path
+        assert names <= extras.purposes().keys(), path

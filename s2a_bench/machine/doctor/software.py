@@ -25,8 +25,8 @@ def packages(machine: Machine) -> Finding:  # noqa: ARG001 - the packages of thi
     except PackageNotFoundError:
         stated = []
     needed = [each for each in stated if _applies(each)]
-    missing = []
-    for extra in extras.EXTRAS:
+    missing, purposes = [], extras.purposes()
+    for extra in purposes:
         added = [each for each in stated if _applies(each, extra) and not _applies(each)]
         if all(installed(each.name) for each in added):
             needed += added
@@ -37,7 +37,7 @@ def packages(machine: Machine) -> Finding:  # noqa: ARG001 - the packages of thi
     message = f"{len(needed)} requirements, all met"
     if not missing:
         return Finding("packages", "state", message)
-    message += "; without the extras " + ", ".join(f"{extra} ({extras.EXTRAS[extra]})" for extra in missing)
+    message += "; without the extras " + ", ".join(f"{extra} ({purposes[extra]})" for extra in missing)
     return Finding("packages", "state", message, extras.how_to_install(*missing))
 
 

@@ -1,1 +1,3 @@
 """The driving scenario in CARLA."""
+
+EXTRA = "the driving scenario on a CARLA server"
