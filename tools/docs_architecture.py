@@ -1,4 +1,4 @@
-"""Draw docs/figures/architecture.png: the rooms of the package, floor by floor, and their imports.
+"""Draw docs/figures/architecture.png: the rooms of the core by floors, the plug-ins above them, and their imports.
 
 `.venv/bin/python tools/docs_architecture.py`. Floors come from the import-linter contract in pyproject.toml, rooms and
 arrows from the code, so the drawing cannot say what is not so.
@@ -30,23 +30,25 @@ PACKAGE = ROOT / "s2a_bench"
 DPI = 150
 WIDTH_IN, FLOOR_IN = 7.2, 0.78
 GROUND = "the ground"
+PLUGINS = "plugins"
 COLOURS = ("#56B4E9", "#E69F00", "#009E73", "#0072B2", "#CC79A7", "#D55E00", "#F0E442", "#999999")
 
 
 def floors() -> list[list[str]]:
-    """Return the rooms by floor, the top one first; the ground's modules are one room."""
+    """Return the rooms by floor, the top one first: the plug-ins; the ground's modules are one room."""
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
     layers = next(contract["layers"] for contract in contracts if contract["type"] == "layers")
     named = [
         [room.strip().removeprefix("s2a_bench.") for room in layer.replace(":", "|").split("|")] for layer in layers
     ]
-    return [*named[:-1], [GROUND]]
+    plug_ins = sorted(f"{PLUGINS}.{path.parent.name}" for path in (PACKAGE / PLUGINS).glob("*/__init__.py"))
+    return [plug_ins, *named[:-1], [GROUND]]
 
 
 def room_of(module: str, rooms: set[str]) -> str:
     """Return the room that a module of the package is in."""
-    first = module.split(".")[1] if "." in module else ""
-    return first if first in rooms else GROUND
+    _, *inside = module.split(".")
+    return next((room for room in (".".join(inside[:2]), *inside[:1]) if room in rooms), GROUND)
 
 
 def arrows(rooms: set[str]) -> tuple[Counter[tuple[str, str]], Counter[str]]:
@@ -67,11 +69,14 @@ def arrows(rooms: set[str]) -> tuple[Counter[tuple[str, str]], Counter[str]]:
 
 
 def draw() -> Figure:
-    """Draw rooms as boxes and imports as arrows, thicker where there are more of them; the ground's are left out."""
+    """Draw rooms as boxes and imports as arrows, thicker where there are more of them; the ground's are left out.
+
+    Plug-ins are dashed, and their arrows grey.
+    """
     plan = floors()
     rooms = {room for floor in plan for room in floor}
     imports, lines = arrows(rooms)
-    title = "Rooms and arrows: everything imports downwards"
+    title = "Rooms and arrows: everything imports downwards. Dashed: plug-ins, which nothing imports"
     figure = new_figure(FLOOR_IN * len(plan) + 0.3, (title,), WIDTH_IN)
     figure.suptitle(title, x=0.01, horizontalalignment="left")
     axes = figure.subplots()
@@ -85,7 +90,8 @@ def draw() -> Figure:
     for (here, there), count in sorted(imports.items()):
         if there == GROUND or place[here][1] <= place[there][1]:
             continue
-        colour = COLOURS[sorted(rooms).index(here) % len(COLOURS)]
+        plug_in = here.startswith(PLUGINS)
+        colour = "#BBBBBB" if plug_in else COLOURS[sorted(rooms).index(here) % len(COLOURS)]
         (x0, y0), (x1, y1) = place[here], place[there]
         axes.add_patch(
             FancyArrowPatch(
@@ -96,11 +102,12 @@ def draw() -> Figure:
                 linewidth=0.4 + 0.25 * min(count, 12) ** 0.5,
                 color=colour,
                 alpha=0.65,
-                zorder=1,
+                zorder=0 if plug_in else 1,
             )
         )
     for room, (x, y) in place.items():
-        width = 9.6 if room == GROUND else 1.7
+        plug_in = room.startswith(PLUGINS)
+        width = 9.6 if room == GROUND else 1.34 if plug_in else 1.7
         box = FancyBboxPatch(
             (x - width / 2, y - 0.22),
             width,
@@ -109,10 +116,12 @@ def draw() -> Figure:
             fc="white",
             ec="black",
             lw=0.7,
+            ls="--" if plug_in else "-",
             zorder=2,
         )
         axes.add_patch(box)
-        axes.text(x, y + 0.06, room, ha="center", va="center", fontsize=8, weight="bold", zorder=3)
+        name, size = room.removeprefix(f"{PLUGINS}."), 7 if plug_in else 8
+        axes.text(x, y + 0.06, name, ha="center", va="center", fontsize=size, weight="bold", zorder=3)
         axes.text(x, y - 0.12, f"{lines[room]:,} lines", ha="center", va="center", fontsize=6, zorder=3)
     return figure
 
