@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import os
+import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
+
+pytestmark = pytest.mark.slow
+ROOT = Path(__file__).parents[2]
 
 
 class Named(NamedTuple):
@@ -44,33 +49,62 @@ found = metadata.entry_points
 hidden = {hidden!r}
 metadata.entry_points = lambda **by: [point for point in found(**by) if not point.value.startswith(hidden)]
 """
+LIBRARY = """
+import s2a_bench as s2a
+run = s2a.timeline(policy="naive,wait-then-act", output="library")
+print(len(run.table("timelines")), s2a.__name__, not s2a.compare(run, run).table().empty)
+"""
 
 
-@pytest.mark.slow
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Install the package offline, as a wheel, into a folder of its own, which is returned."""
+    pytest.importorskip("setuptools", reason="builds the package")
+    source, target = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("site")
+    for name in ("s2a_bench", "profiles", "s2a_msgs"):
+        shutil.copytree(ROOT / name, source / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source / name)
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
+    subprocess.run([*pip, "--target", str(target), str(source)], check=True, timeout=300)
+    return target
+
+
 @pytest.mark.parametrize("hidden", [*((name,) for name in PLUGINS), tuple(PLUGINS)], ids=", ".join)
-def test_without_plug_ins_everything_else_works(hidden: tuple[str, ...], tmp_path: Path) -> None:
+def test_without_plug_ins_everything_else_works(hidden: tuple[str, ...], wheel: Path, tmp_path: Path) -> None:
     modules = tuple(f"s2a_bench.plugins.{name}{end}" for name in hidden for end in ".:")
     (tmp_path / "sitecustomize.py").write_text(HIDING.format(hidden=modules))
-    path = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH", ""))))
+    kept = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    path = os.pathsep.join([str(tmp_path), str(wheel), *(each for each in kept if each != str(ROOT))])
+    started = {"cwd": tmp_path, "env": {**os.environ, "PYTHONPATH": path, "COLUMNS": "200"}, "text": True}
 
-    def run(*arguments: str, code: int = 0) -> str:
-        done = subprocess.run(
-            [sys.executable, "-m", "s2a_bench", *arguments],
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": path, "COLUMNS": "200"},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+    def python(*arguments: str, code: int = 0) -> str:
+        done = subprocess.run([sys.executable, *arguments], capture_output=True, check=False, **started)
         assert done.returncode == code, done.stderr
         return done.stdout + done.stderr
 
+    def run(*arguments: str, code: int = 0) -> str:
+        return python("-m", "s2a_bench", *arguments, code=code)
+
+    assert str(wheel) in python("-c", "import s2a_bench; print(s2a_bench.__file__)")
     for plugin, names in PLUGINS.items():
         for name in names:
             assert (name.shown in run(*name.help)) == (plugin not in hidden)
             if plugin in hidden:
                 assert name.error in run(*name.use, code=2)
-    assert "loopback" in run("latency", "--quick", "--transport", "loopback", "--engine", "echo")
+    assert "loopback" in run("latency", "--quick", "--transport", "http,ros,loopback", "--engine", "echo")
     assert "no impact" in run("ccrb")
-    if len(hidden) == len(PLUGINS):
-        assert "middleware" in run("doctor")
+    assert "s2a_bench True" in python("-c", LIBRARY)
+    run("report", *map(str, (tmp_path / "results").iterdir()), "--output", "page.html")
+    assert "no impact" in (tmp_path / "page.html").read_text()
+    if len(hidden) < len(PLUGINS):
+        return
+    assert "tokens/s" in run("throughput", "--quick", "--engine", "replay", "--profile", "rtx-4080")
+    assert "naive" in run("timeline")
+    assert "8 of 8 cells finished" in run("sweep", "quick", "--output", "swept")
+    assert "middleware" in run("doctor")
+    line = [sys.executable, "-m", "s2a_bench", "serve", "http?port=0", "--engine", "echo"]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, **started) as server:
+        assert server.stdout
+        assert "http://127.0.0.1:" in server.stdout.readline()
+        server.send_signal(signal.SIGINT)
