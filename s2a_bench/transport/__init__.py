@@ -274,6 +274,16 @@ class Urls:
     """``module:function`` that returns counter -> cache hits that the server of a wiring has counted so far."""
 
 
+@dataclass(frozen=True, slots=True)
+class Sleep:
+    """How long a server of others may sleep after each request, unless it was started with care."""
+
+    fact: Fact
+    """How long the client waited for an answer, in ms."""
+    ms: float
+    advice: str
+
+
 class Transport(Generic[O]):
     """The declaration of a transport; subclass it, and make one instance."""
 
@@ -308,6 +318,7 @@ class Transport(Generic[O]):
     crosses_links: ClassVar[bool] = True
     """Whether its client reaches its server through the network, which can be emulated."""
     urls: ClassVar[Urls] = Urls()
+    sleep: ClassVar[Sleep | None] = None
     client_class: ClassVar[str] = ""
     server_class: ClassVar[str] = ""
     """``module:class`` of client and server, where `client` and `server` are not overridden."""

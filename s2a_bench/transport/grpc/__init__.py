@@ -9,14 +9,15 @@ from __future__ import annotations
 from typing import ClassVar
 
 from s2a_bench.errors import UsageError
-from s2a_bench.facts import GET_ACTIONS_MS, PAYLOAD_BYTES, RECONNECTS, Fact
+from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import option
-from s2a_bench.transport import Choice, Urls
+from s2a_bench.transport import Choice, Sleep, Urls
 from s2a_bench.transport.grpc.pickles import observation_of
 from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.policies import PolicyTransport, TemplateOptions
 
 LEROBOT = "lerobot"
+GET_ACTIONS_MS = Fact("get_actions_ms", "ms", "lerobot's call `GetActions`, which begins before the observation leaves")
 PAYLOAD_DOWN_BYTES = Fact("payload_down_bytes", "bytes", "what the chunk weighs on the wire")
 
 
@@ -45,6 +46,11 @@ class Grpc(PolicyTransport[GrpcOptions]):
     order = 24
     style = {LEROBOT: ("#01665E", "-")}
     packages = ("grpcio",)
+    sleep = Sleep(
+        GET_ACTIONS_MS,
+        1e3 / 30,
+        "start lerobot's server with --inference_latency=0; with that, its policy takes this time itself",
+    )
 
     def require(self, choice: Choice[GrpcOptions]) -> None:
         """Refuse a choice without a policy, and an observation that lerobot does not take."""
