@@ -109,9 +109,9 @@ class TransportOptions(base.Options):
         return None
 
     @property
-    def template_name(self) -> str:
-        """Return the template of its observations, empty where it makes none."""
-        return ""
+    def without_effect(self) -> set[str]:
+        """Return the given options that only a server at a `url` reads, where there is none."""
+        return set()
 
     @property
     def tuned(self) -> bool:
@@ -305,7 +305,7 @@ class Transport(Generic[O]):
     """Variant ("" for none) -> colour and line style, in every figure."""
     compared_with: ClassVar[tuple[str, ...]] = ("loopback",)
     """Transports whose cells are the denominators of its ratios."""
-    packages: ClassVar[tuple[str, ...]] = ()
+    packages: tuple[str, ...] = ()
     """Python packages whose versions are recorded with its results."""
     checks: ClassVar[Mapping[str, str]] = {}
     """Code -> ``module:function`` of the doctor's checks for it."""
