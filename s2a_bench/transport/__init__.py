@@ -363,9 +363,6 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "ros": "s2a_bench.transport.ros:ROS",
         "loopback": "s2a_bench.transport.loopback:LOOPBACK",
         "shm": "s2a_bench.transport.shm:SHM",
-        "websocket": "s2a_bench.transport.websocket:WEBSOCKET",
-        "zmq": "s2a_bench.transport.zmq:ZMQ",
-        "grpc": "s2a_bench.transport.grpc:GRPC",
     },
 )
 

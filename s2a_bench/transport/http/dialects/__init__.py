@@ -63,7 +63,6 @@ DIALECTS: Final[Registry[type[Dialect]]] = Registry(
         "ollama": "s2a_bench.transport.http.dialects.ollama:Ollama",
         "tgi": "s2a_bench.transport.http.dialects.tgi:Tgi",
         "gemini": "s2a_bench.transport.http.dialects.gemini:Gemini",
-        "openvla": "s2a_bench.transport.http.dialects.openvla:OpenVla",
     },
 )
 

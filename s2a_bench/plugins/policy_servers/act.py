@@ -15,14 +15,14 @@ import numpy as np
 
 from s2a_bench import extras
 from s2a_bench.facts import Fact
+from s2a_bench.plugins.policy_servers.observation import Template, template_of
+from s2a_bench.plugins.policy_servers.policies import PolicyTransport, TemplateOptions
 from s2a_bench.trace import Trace
 from s2a_bench.transport import ACTIONS
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http.dialects import Event
 from s2a_bench.transport.http.dialects.common import Dialect
 from s2a_bench.transport.http.dialects.framing import WholeBody
-from s2a_bench.transport.observation import Template, template_of
-from s2a_bench.transport.policies import PolicyTransport, TemplateOptions
 from s2a_bench.types import Pixels, Request
 
 FAILED = "error"
@@ -71,7 +71,7 @@ class OpenVla(Dialect):
         self, request: Request, payload: str, model: str, to_base64: Callable[[Pixels], str], trace: Trace
     ) -> dict[str, Any]:
         """Return the template's observation, OpenVLA's own without one, in the form of ``json_numpy.dumps``."""
-        from s2a_bench.transport.pictures import policy_picture
+        from s2a_bench.plugins.policy_servers.policy_client import policy_picture
 
         template, frames = self._template, request.images if self._template else request.images[:1]
         pictures = [policy_picture(frame, payload, trace) for frame in frames]

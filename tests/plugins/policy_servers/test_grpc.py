@@ -19,13 +19,13 @@ from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
+from s2a_bench.plugins.policy_servers.grpc import GET_ACTIONS_MS, GRPC, PAYLOAD_DOWN_BYTES, GrpcOptions
+from s2a_bench.plugins.policy_servers.grpc.pickles import OPCODES, chunk_in
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import Connect, TransportSuite, ask, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Choice, Client, Handler, Wiring, open_client
-from s2a_bench.transport.grpc import GET_ACTIONS_MS, GRPC, PAYLOAD_DOWN_BYTES, GrpcOptions
-from s2a_bench.transport.grpc.pickles import OPCODES, chunk_in
 from s2a_bench.types import Action, Frame, Request
 from tests.servers.lerobot import (
     PolicyServer,
