@@ -39,7 +39,7 @@ from tests.servers.lerobot import (
     timed_action,
 )
 
-GOLDEN = Path(__file__).parents[1] / "data" / "lerobot"
+GOLDEN = Path(__file__).with_name("data")
 CHUNK = np.arange(12, dtype=np.float32).reshape(4, 3) / 8
 STATE = (0.5, 1.5)
 
