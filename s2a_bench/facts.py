@@ -47,7 +47,6 @@ THINKING_N = Fact("thinking_n", "tokens", "what the model said to itself before 
 PAYLOAD_BYTES = Fact("payload_bytes", "bytes", "what the payload weighs on the wire")
 RECONNECTS = Fact("reconnects", "", "1 where the server had closed the kept connection")
 LATENCY_DRAWN_MS = Fact("latency_drawn_ms", "ms", "from the request to the whole answer, as `--latency` has it")
-GET_ACTIONS_MS = Fact("get_actions_ms", "ms", "lerobot's call `GetActions`, which begins before the observation leaves")
 INFER_MS = Fact("infer_ms", "ms", "what a policy server says that its policy took")
 CAMERA_FRAMES = Fact("camera_frames", "frames", "camera frames that the server had received when it answered")
 CAMERA_AGE_MS = Fact("camera_age_ms", "ms", "start of inference less reception, of the frame that the server had kept")

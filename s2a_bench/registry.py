@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
@@ -68,13 +69,16 @@ class Registry(Mapping[str, T], Generic[T]):
         return tuple(self._builtins)
 
     def loaded(self) -> Iterator[tuple[str, T]]:
-        """Yield every name with its implementation, leaving out packages that do not load."""
-        for name in self:
-            try:
-                yield name, self[name]
-            except UsageError:
-                if name in self._builtins:
-                    raise
+        """Yield every name with its implementation, built-ins first, the others by their ``order`` if they have one.
+
+        Packages that do not load are left out.
+        """
+        yield from ((name, self[name]) for name in self._builtins)
+        offered: list[tuple[str, T]] = []
+        for name in self._offered:
+            with suppress(UsageError):
+                offered.append((name, self[name]))
+        yield from sorted(offered, key=lambda each: getattr(each[1], "order", 0))
 
 
 def missing_entry_points(checkout: Path = Path(__file__).parent.parent) -> list[str]:

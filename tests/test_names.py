@@ -63,21 +63,23 @@ def named(path: Path) -> Iterator[str]:
     tree = ast.parse(path.read_text(encoding="utf-8"))
     nodes = list(ast.walk(tree))
     prose = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
-    modules = imported(nodes)
+    where = path.relative_to(ROOT).as_posix()
+    modules = set() if where.startswith("s2a_bench/plugins/") else imported(nodes)  # of a plug-in: the test below
     texts = {
         node.value
         for node in nodes
         if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in prose
     }
-    where = path.relative_to(ROOT).as_posix()
     for kind, (registry, home) in KINDS.items():
         declared = "s2a_bench/transport/__init__.py" if kind == "transport" else home
-        shipped = {name for name, point in registry._offered.items() if within(point.module, "s2a_bench.plugins")}
-        for name in (*registry.built_in(), *shipped):
-            homes = (f"s2a_bench/plugins/{name}/",) if name in shipped else (home.format(name), declared)
-            if where.startswith(homes):
+        shipped = {
+            name: point.value for name, point in registry._offered.items() if within(point.module, "s2a_bench.plugins")
+        }
+        for name, target in {**registry._builtins, **shipped}.items():
+            plug_in = "/".join(re.split("[.:]", target)[:3]) + "/"
+            if where.startswith((plug_in,) if name in shipped else (home.format(name), declared)):
                 continue
-            opened = registry[name].opens if kind == "middleware" else registry._builtins[name]
+            opened = registry[name].opens if kind == "middleware" else target
             module = opened.partition(":")[0]
             elsewhere = any(where.startswith(at) and name in kinds.built_in() for at, kinds in OTHERS.items())
             if any(within(each, module) for each in modules) or (

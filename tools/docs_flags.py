@@ -72,8 +72,8 @@ def flag_row(parameter: Any, name: str) -> str:
 
 def fact_page() -> str:
     """Return the page of the facts, in the order of their declarations."""
-    sources: dict[str, Sequence[Fact]] = {name: TRANSPORTS[name].facts for name in TRANSPORTS.built_in()}
-    sources |= {name: DIALECTS[name]().facts for name in DIALECTS.built_in()}
+    sources: dict[str, Sequence[Fact]] = {name: each.facts for name, each in TRANSPORTS.loaded()}
+    sources |= {name: kind.facts for name, kind in DIALECTS.loaded()}
     sources |= {name: ENGINES[name].declared_facts for name in ENGINES.built_in()}
     sources |= {"`--mode stream`": (FRAMES_PUBLISHED, FRAMES_LOST), "[resources](resources.md)": SPENT}
     lines = ["# Facts", "", f"{GENERATED} [results](results.md#facts) says where a run keeps them.", ""]

@@ -29,7 +29,7 @@ from s2a_bench.transport import (
     named_by,
     paths,
 )
-from s2a_bench.transport.defaults import ACTING, COMPARED
+from s2a_bench.transport.defaults import COMPARED, acting_over
 from s2a_bench.transport.pipeline import Pipeline, answer_over, carries_alone, pipelines, require_payload
 
 LARGEST = 16_384
@@ -68,7 +68,8 @@ class RequestsConfig(Options):
 
     transports: Names = option(
         COMPARED,
-        f"{', '.join(TRANSPORTS)}; several with commas, with /VARIANT and ?OPTION=VALUE: ros/topic?payload=yuyv",
+        f"{', '.join(dict(TRANSPORTS.loaded()))}; several with commas, with /VARIANT and ?OPTION=VALUE: "
+        "ros/topic?payload=yuyv",
         flag="transport",
         panel=TRANSPORT,
         first=True,
@@ -327,7 +328,7 @@ class RequestsConfig(Options):
             raise UsageError(f"`{name}`: in `mode` stream one camera runs, whose frames are sent as they are")
 
     def _check_unused(self) -> None:
-        """Refuse an external server or a template that no cell uses, and a model that no server loads."""
+        """Refuse an external server or its options that no cell uses, and a model that no server loads."""
         used = {(each.transport.name, each.options.external) for each in self.pipelines}
         for name, given in self.options:
             transport, field = TRANSPORTS[name], given.external
@@ -338,9 +339,10 @@ class RequestsConfig(Options):
                 raise UsageError(f"`{field}` needs {' or '.join(fit) or name} among `transport`")
         if self.wait_for_server and not any(each.options.external_address for each in self.pipelines):
             raise UsageError("`wait_for_server` is about a server that runs already; name it with `url`")
-        templates = [each.options for each in self.pipelines if "template" in each.options.model_fields_set]
-        if templates and not any(options.template_name for options in templates):
-            raise UsageError("`template` is about a server that runs already; name it with `url`")
+        chosen = [each.options for each in self.pipelines]
+        useful = {name for each in chosen for name in each.model_fields_set - each.without_effect}
+        if useless := {name for each in chosen for name in each.without_effect} - useful:
+            raise UsageError(f"`{min(useless)}` is about a server that runs already; name it with `url`")
         if (given := self.engine.of_model) and not self.reads_model:
             raise UsageError(f"`{given}`: no server of this run loads a model; leave it out with `{self.foreign}`")
 
@@ -385,9 +387,8 @@ class LiveRequests(FirstVariants):
     COUNTS_TOKENS: ClassVar[str] = ""
 
     transports: Names = option(
-        ACTING[:1] if all(map(extras.installed, TRANSPORTS[ACTING[0]].packages)) else ACTING[1:],
-        "transports as in latency; several with commas, each with every mode "
-        f"[default: {ACTING[0]}, {ACTING[1]} where its packages are not installed]",
+        (acting_over()[0],),
+        f"transports as in latency; several with commas, each with every mode [default: {acting_over()[1]}]",
         flag="transport",
     )
     engine: EngineConfig = group(EngineConfig, only=("name", "profile", "gaps", "action_dim"))

@@ -130,7 +130,8 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
             writer.update(link=link.facts() | probed(link))
         if plan.finds_model and extras.installed("gguf"):  # without gguf no file is read
             plan = replace(plan, engine=on_files(plan.engine, progress))
-        guard = SampleGuard({cell.name: cell.options.against_loss for cell in plan.cells})
+        sleeps = {cell.name: sleep for cell in plan.cells if (sleep := cell.transport.sleep)}
+        guard = SampleGuard({cell.name: cell.options.against_loss for cell in plan.cells}, sleeps)
         run = _Run(task, plan, sources, writer, progress, guard, link)
         if plan.record is not None:
             run.recorder = RunRecorder(plan.record, plan.namespace, live=plan.feed.stream)

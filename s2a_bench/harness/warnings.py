@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from s2a_bench.clock import realtime_offset_ns
-from s2a_bench.facts import FRAMES_LOST, GET_ACTIONS_MS, HEADERS_OFF_MS, RECONNECTS, STALE_FRAMES, USAGE_ZERO
+from s2a_bench.facts import FRAMES_LOST, HEADERS_OFF_MS, RECONNECTS, STALE_FRAMES, USAGE_ZERO
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Machine, examine, warnings_of
 from s2a_bench.machine.doctor.host import RMEM_WANTED
@@ -20,6 +20,7 @@ from s2a_bench.stats.change import change_of_ranks
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import RESIDUAL_LIMIT, budget
+from s2a_bench.transport import Sleep
 
 CLOCK_STEP_NS = 50_000_000
 LEVEL: Final = 0.01
@@ -27,8 +28,8 @@ LEVEL: Final = 0.01
 SURELY_OFF_MS, SURELY_OFF_SHARE = 20.0, 0.25
 """Beyond both, a llama-server's headers did not leave when its slot started."""
 
-SLEEP_MS, AWAKE_MS = 1e3 / 30, 2.0
-"""How long lerobot's server sleeps by default, and how much later its client sees the first of the answers."""
+AWAKE_MS = 2.0
+"""How much later than the end of a server's sleep its client sees the first of the answers."""
 PILE_MS, PILED = 0.5, 0.1
 """The width of the pile at the end of a sleep, and the share of answers in it that raises the warning."""
 
@@ -159,11 +160,6 @@ UNCOUNTED = Doubt(
     "answers came with a usage of zero tokens: it is left out, and the cached share is unknown",
     "a gateway may drop the counts: measure the server behind it",
 )
-ASLEEP = Doubt(
-    "padded-answers",
-    "no answers came earlier than 33 ms after the request, and these together just then: the server may have slept",
-    "start lerobot's server with --inference_latency=0; with that, its policy takes this time itself",
-)
 RECONNECTED = Doubt(
     "reconnects",
     "requests found the kept connection closed by the server: connecting again is in their times",
@@ -182,22 +178,33 @@ LOST = Doubt("lost-messages", "requests lost messages on the way")
 FAILED = Doubt("failed-samples", "requests failed", "see the column error of samples.csv")
 DOUBTS: Final = (
     *(REPEATED, CACHED, HITS, RESIDUAL, HEADERS_EARLY, HEADERS_LATE),
-    *(UNCOUNTED, ASLEEP, RECONNECTED, OVERTAKEN, STALE, LOST, FAILED),
+    *(UNCOUNTED, RECONNECTED, OVERTAKEN, STALE, LOST, FAILED),
 )
 """In the order of the warnings."""
 
 
-class SampleGuard:
-    """Checks the samples of a run as they arrive; ``against_loss`` is cell -> its transport's advice about loss."""
+def padded_by(sleep: Sleep) -> Doubt:
+    together = f"no answers came earlier than {sleep.ms:.0f} ms after the request, and these together just then"
+    return Doubt("padded-answers", f"{together}: the server may have slept", sleep.advice)
 
-    def __init__(self, against_loss: Mapping[str, str] | None = None) -> None:
+
+class SampleGuard:
+    """Checks the samples of a run as they arrive.
+
+    ``against_loss`` is cell -> its transport's advice about loss, ``sleeps`` cell -> how its server may sleep.
+    """
+
+    def __init__(
+        self, against_loss: Mapping[str, str] | None = None, sleeps: Mapping[str, Sleep] | None = None
+    ) -> None:
         self.succeeded: Counter[str] = Counter()
         """Samples that count, by cell."""
         self.in_a_row: defaultdict[str, Counter[int]] = defaultdict(Counter)
         """Failures of each client since the last success of any, by cell."""
         self.last_error: dict[str, str] = {}
         """The last error, by cell."""
-        self._against_loss = against_loss or {}
+        self._against_loss, self._sleeps = against_loss or {}, sleeps or {}
+        self._waits = {cell: sleep.fact for cell, sleep in self._sleeps.items()}
         self._counts: dict[Doubt, Counter[str]] = {doubt: Counter() for doubt in DOUBTS}
         self._frames: dict[tuple[str, int], str] = {}
         self._cached_share = 0.0
@@ -231,7 +238,7 @@ class SampleGuard:
         self.succeeded[cell] += 1
         self._launches.add(row.launch)
         counts[RECONNECTED][cell] += RECONNECTS in row.facts
-        self._waits_ms[cell].append(row.facts.get(GET_ACTIONS_MS, 0.0))
+        self._waits_ms[cell].append(row.facts.get(self._waits.get(cell, ""), 0.0))
         off_ms = row.facts.get(HEADERS_OFF_MS, 0.0)
         if abs(off_ms) > max(SURELY_OFF_MS, SURELY_OFF_SHARE * (row.server_prompt_ms or 0.0)):
             counts[HEADERS_EARLY if off_ms > 0 else HEADERS_LATE][cell] += 1
@@ -246,11 +253,12 @@ class SampleGuard:
 
     def warnings(self) -> list[RunWarning]:
         found = []
-        for cell, waits_ms in self._waits_ms.items():
+        for cell, sleep in self._sleeps.items():
+            waits_ms = self._waits_ms[cell] or [0.0]
             after_ms = np.array(waits_ms) - min(waits_ms)
             pile, beyond = (int(np.sum(after_ms // PILE_MS == place)) for place in (0, 1))
-            if 0 <= min(waits_ms) - SLEEP_MS < AWAKE_MS and pile > max(beyond, PILED * after_ms.size):
-                self._counts[ASLEEP][cell] = pile
+            if 0 <= min(waits_ms) - sleep.ms < AWAKE_MS and pile > max(beyond, PILED * after_ms.size):
+                self._counts.setdefault(padded_by(sleep), Counter())[cell] = pile
         for doubt, counts in self._counts.items():
             if doubt is FAILED:
                 found += self._odd_facts()

@@ -109,9 +109,9 @@ class TransportOptions(base.Options):
         return None
 
     @property
-    def template_name(self) -> str:
-        """Return the template of its observations, empty where it makes none."""
-        return ""
+    def without_effect(self) -> set[str]:
+        """Return the given options that only a server at a `url` reads, where there is none."""
+        return set()
 
     @property
     def tuned(self) -> bool:
@@ -274,6 +274,16 @@ class Urls:
     """``module:function`` that returns counter -> cache hits that the server of a wiring has counted so far."""
 
 
+@dataclass(frozen=True, slots=True)
+class Sleep:
+    """How long a server of others may sleep after each request, unless it was started with care."""
+
+    fact: Fact
+    """How long the client waited for an answer, in ms."""
+    ms: float
+    advice: str
+
+
 class Transport(Generic[O]):
     """The declaration of a transport; subclass it, and make one instance."""
 
@@ -295,7 +305,7 @@ class Transport(Generic[O]):
     """Variant ("" for none) -> colour and line style, in every figure."""
     compared_with: ClassVar[tuple[str, ...]] = ("loopback",)
     """Transports whose cells are the denominators of its ratios."""
-    packages: ClassVar[tuple[str, ...]] = ()
+    packages: tuple[str, ...] = ()
     """Python packages whose versions are recorded with its results."""
     checks: ClassVar[Mapping[str, str]] = {}
     """Code -> ``module:function`` of the doctor's checks for it."""
@@ -308,6 +318,7 @@ class Transport(Generic[O]):
     crosses_links: ClassVar[bool] = True
     """Whether its client reaches its server through the network, which can be emulated."""
     urls: ClassVar[Urls] = Urls()
+    sleep: ClassVar[Sleep | None] = None
     client_class: ClassVar[str] = ""
     server_class: ClassVar[str] = ""
     """``module:class`` of client and server, where `client` and `server` are not overridden."""
@@ -352,9 +363,6 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "ros": "s2a_bench.transport.ros:ROS",
         "loopback": "s2a_bench.transport.loopback:LOOPBACK",
         "shm": "s2a_bench.transport.shm:SHM",
-        "websocket": "s2a_bench.transport.websocket:WEBSOCKET",
-        "zmq": "s2a_bench.transport.zmq:ZMQ",
-        "grpc": "s2a_bench.transport.grpc:GRPC",
     },
 )
 

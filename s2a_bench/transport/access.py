@@ -1,4 +1,4 @@
-"""Access control of servers that a browser can reach, HTTP and WebSocket: by the headers, before a body is read.
+"""Access control of servers that a browser can reach: by the headers, before a body is read.
 
 A page in a browser on this machine can reach servers on loopback. Its requests carry `Origin` or, after DNS rebinding,
 the page's own name as `Host`.

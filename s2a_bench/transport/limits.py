@@ -16,7 +16,7 @@ KIB: Final = 1 << 10
 MIB: Final = 1 << 20
 SEEDS: Final = (1 << 32) - 1
 VALUES: Final = 20_000
-"""The most values of a JSON or MessagePack document from outside."""
+"""The most values of a document from outside."""
 
 STEP: Final = 1 << 16
 

@@ -63,17 +63,6 @@ def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
     return f"image/{payload}", data
 
 
-def policy_picture(frame: Frame, payload: str, trace: Trace) -> Pixels:
-    """Return a picture for a policy: (H, W, 3) RGB, or a file's (n,) bytes; marks as `encoded` does."""
-    if payload != "raw":
-        return encoded(frame, payload, trace)[1].reshape(-1)
-    if frame.encoding == "rgb8":
-        return frame.data
-    data = to_rgb(frame)
-    trace.mark("convert")
-    return data
-
-
 def decoded(media_type: str, data: bytes | memoryview, trace: Trace, limits: Limits = LIMITS) -> Frame:
     """Convert received bytes to an ``rgb8`` frame; marks `image_decode` or `channel_swap`. Raises RequestFailed."""
     try:

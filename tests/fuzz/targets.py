@@ -28,6 +28,11 @@ from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.plan.parser import Parser
 from s2a_bench.plan.skill_file import parse_skills
+from s2a_bench.plugins.policy_servers import observed
+from s2a_bench.plugins.policy_servers.observation import template_of
+from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
+from s2a_bench.plugins.policy_servers.zmq import layouts
+from s2a_bench.plugins.policy_servers.zmq import wire as gr00t
 from s2a_bench.report.compare.comparison import compare, metrics_of, open_comparison, warnings_of
 from s2a_bench.report.compare.shown import compare_json
 from s2a_bench.report.page.chapters import read_chapters
@@ -38,7 +43,6 @@ from s2a_bench.store.requests import TOKENS, TokenRow, samples_table
 from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.sweep.file import read_sweep_file
 from s2a_bench.trace import Remote, Trace
-from s2a_bench.transport import observed
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http.chat import of_json, of_picture
 from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
@@ -47,14 +51,10 @@ from s2a_bench.transport.http.fast import Head
 from s2a_bench.transport.http.native import PARAMETERS_HEADER, PATHS, Refused
 from s2a_bench.transport.http.server import Protocol, application
 from s2a_bench.transport.limits import LIMITS
-from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.pipeline import pipelines
 from s2a_bench.transport.ros import wire
 from s2a_bench.transport.serving import Core
-from s2a_bench.transport.websocket.codec import packb, unpackb
-from s2a_bench.transport.zmq import layouts
-from s2a_bench.transport.zmq import wire as gr00t
 from s2a_bench.types import Action, Frame, Request, Token
 from tests.made_runs import STAGES
 from tests.plan.test_parser import FORMATS
@@ -334,7 +334,8 @@ TARGETS = {
     ),
     "gr00t": Target(read_gr00t, gr00ts),
     "template": Target(
-        lambda data: template_of(str(as_file("t.toml", data))), tomls("s2a_bench/transport/templates/*.toml")
+        lambda data: template_of(str(as_file("t.toml", data))),
+        tomls("s2a_bench/plugins/policy_servers/templates/*.toml"),
     ),
     "template, JSON": Target(
         lambda data: template_of(str(as_file("t.json", data))),

@@ -20,10 +20,10 @@ from s2a_bench.errors import RequestFailed, ServerDied, TransportError, UsageErr
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.harness import rounds
+from s2a_bench.plugins.policy_servers.websocket.codec import packb
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import RecordingHandler
-from s2a_bench.transport.websocket.codec import packb
 from s2a_bench.types import Token
 from tests.servers.lerobot import PolicyServer, chunk, grpc_server
 from tests.servers.sockets import Received, head, serving

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from s2a_bench.facts import Fact
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.harness.warnings import Counters, SampleGuard
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import Mark
+from s2a_bench.transport import Sleep
 from tests.made_runs import row_of
 
 GOOD: list[Mark] = [("", 0), ("network", 90), ("", 91), ("inference", 500), ("return", 600)]
@@ -100,8 +102,10 @@ def computed_ms(mean: float, deviation: float) -> list[float]:
     ],
 )
 def test_a_server_that_sleeps_is_known_by_its_earliest_answers(waits_ms: list[float], slept: bool) -> None:
-    seen = [(row(str(at), facts={"get_actions_ms": wait_ms}), at) for at, wait_ms in enumerate(waits_ms)]
-    assert codes(*seen) == ["padded-answers"] * slept
+    guard = SampleGuard(sleeps={"ros/topic": Sleep(Fact("wait_ms"), 1e3 / 30, "wake it")})
+    for at, wait_ms in enumerate(waits_ms):
+        guard.see(row(str(at), facts={"wait_ms": wait_ms}), at)
+    assert [(each.code, each.advice) for each in guard.warnings()] == [("padded-answers", "wake it")] * slept
 
 
 def test_hits_that_servers_count_during_the_run_are_a_warning() -> None:

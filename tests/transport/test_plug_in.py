@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import pytest
 
-from s2a_bench import registry
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.metrics import latency_json
@@ -69,10 +68,10 @@ TOY = Toy()
 
 def offer(monkeypatch: pytest.MonkeyPatch, offered: object) -> None:
     """Offer an object as the transport ``toy``, as an installed package would."""
-    monkeypatch.setattr(EntryPoint, "load", lambda _point: offered)
-    point = EntryPoint("toy", "toy:TOY", TRANSPORTS.group)
-    monkeypatch.setattr(registry, "entry_points", lambda group: [point] if group == TRANSPORTS.group else [])
     forget()
+    load, point = EntryPoint.load, EntryPoint("toy", "toy:TOY", TRANSPORTS.group)
+    monkeypatch.setattr(EntryPoint, "load", lambda each: offered if each == point else load(each))
+    monkeypatch.setitem(vars(TRANSPORTS), "_offered", {**TRANSPORTS._offered, "toy": point})
 
 
 def forget() -> None:

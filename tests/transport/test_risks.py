@@ -11,9 +11,9 @@ import pytest
 
 from s2a_bench.errors import UsageError
 from s2a_bench.machine.doctor import Finding
+from s2a_bench.plugins.policy_servers.grpc.client import PREFACE
 from s2a_bench.testing.transport import RecordingHandler, served, wiring_of
 from s2a_bench.transport import risks
-from s2a_bench.transport.grpc.client import PREFACE
 from s2a_bench.transport.risks import examine, printable
 from tests.servers.sockets import Received, head, serving
 

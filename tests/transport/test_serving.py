@@ -10,11 +10,11 @@ import pytest
 import zmq
 
 from s2a_bench.errors import EngineError, RequestFailed, S2AError
+from s2a_bench.plugins.policy_servers.zmq.server import Marks
+from s2a_bench.plugins.policy_servers.zmq.watch import ConnectionWatch
 from s2a_bench.trace import Trace
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.serving import Core, Disconnected, Exchange, SharedSourceWorkers
-from s2a_bench.transport.zmq.server import Marks
-from s2a_bench.transport.zmq.watch import ConnectionWatch
 from s2a_bench.types import Piece, Request, Token
 
 

@@ -5,8 +5,12 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
+from typing import Any
+
+from pydantic import create_model
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
@@ -14,12 +18,14 @@ from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import need_program
 from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Handler, Server, Transport, Urls, Wiring
 from s2a_bench.transport.defaults import BESIDE
+from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
 from s2a_bench.transport.http.options import WHEEL, HttpOptions
 from s2a_bench.transport.listening import read_key
 
 VARIANTS = ("as-deployed", "best-effort", "binary", "llama-server")
 BINARY, LLAMA_SERVER = VARIANTS[2:]
 FAST = VARIANTS[1:3]
+PACKAGES = "fastapi", "httptools", "httpx", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"
 
 HEADERS_MS = Fact("headers_ms", "ms", "last byte packed to the headers of a black box's answer")
 THINKING_PIECES = Fact("thinking_pieces", "", "messages of the answer that were thinking")
@@ -35,7 +41,6 @@ def found_llama_server() -> Path | None:
 
 class Http(Transport[HttpOptions]):
     name = "http"
-    options = HttpOptions
     variants = VARIANTS
     payloads = ("jpeg", "jpeg-preencoded", "png", "raw")
     answer_kinds = (TOKENS, ACTIONS)
@@ -56,13 +61,22 @@ class Http(Transport[HttpOptions]):
         "llama-server": ("#8C510A", ":"),
     }
     compared_with = BESIDE
-    packages = "fastapi", "httptools", "httpx", "json-numpy", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"
     client_class = "s2a_bench.transport.http.client:HttpClient"
     urls = Urls(
         HttpOptions.SCHEMES,
         examine="s2a_bench.transport.http.detect:examine",
         cache_hits="s2a_bench.transport.http.detect:cache_hits",
     )
+
+    @cached_property
+    def options(self) -> type[HttpOptions]:  # type: ignore[override] # dialects, which import this package, have a part
+        """Return its options, with those that dialects declare."""
+        declared: Any = dict.fromkeys(each.options for _, each in DIALECTS.loaded() if each.options)
+        return create_model("HttpOptions", __base__=(HttpOptions, *declared))
+
+    @cached_property
+    def packages(self) -> tuple[str, ...]:  # type: ignore[override]
+        return tuple(sorted({*PACKAGES, *(name for _, each in DIALECTS.loaded() for name in each.packages)}))
 
     def server(self, wiring: Wiring[HttpOptions], handler: Handler) -> Server:
         kind = "fast:FastServer" if wiring.variant in FAST else "server:HttpServer"
@@ -91,10 +105,9 @@ class Http(Transport[HttpOptions]):
         if not options.external:
             return replace(can, payloads=jpeg) if choice.variant == LLAMA_SERVER else can
         from s2a_bench.transport.http.detect import OWNERS
-        from s2a_bench.transport.http.dialects import open_dialect
 
         possible = (options.spoken,) if options.spoken else ("openai", *OWNERS.values())
-        dialects = [open_dialect(name, options.template_name) for name in possible]
+        dialects = [open_dialect(name, options) for name in possible]
         return replace(
             can,
             payloads=jpeg if choice.variant == LLAMA_SERVER else dialects[0].payloads,
@@ -106,10 +119,8 @@ class Http(Transport[HttpOptions]):
 
     def require(self, choice: Choice[HttpOptions]) -> None:
         variant, options = choice.variant, choice.options
-        if options.template_name:
-            from s2a_bench.transport.http.dialects import open_dialect
-
-            open_dialect(options.dialect, options.template_name).check(choice.cameras, choice.state)
+        if options.dialect:
+            open_dialect(options.dialect, options).check(choice.cameras, choice.state)
         if options.url and variant in {BINARY, LLAMA_SERVER}:
             raise UsageError(f"`transport` {self.name}/{variant} needs our own server; leave it out with `url`")
         if variant == LLAMA_SERVER:

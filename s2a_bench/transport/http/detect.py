@@ -17,7 +17,7 @@ from s2a_bench.machine.doctor import Finding
 from s2a_bench.trace import FACT_LIMIT
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.http.clients import BoundedClient, HttpResponse
-from s2a_bench.transport.http.dialects import NATIVE, open_dialect
+from s2a_bench.transport.http.dialects import DIALECTS, NATIVE, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_LIST, NO_MODEL, Dialect, Get, endpoint, first_model
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.limits import Bounds
@@ -43,7 +43,7 @@ def met(base: str, key: str, options: HttpOptions) -> tuple[Dialect, str, str]:
         if not spoken:
             owner, first = first_model(base, getter(client, open_dialect("openai").authorization(key) if key else {}))
             spoken, model = OWNERS.get(owner, "openai"), model or first or NO_MODEL
-        dialect = open_dialect(spoken, options.template_name)
+        dialect = open_dialect(spoken, options)
         base, model = dialect.met(base, model, getter(client, dialect.authorization(key) if key else {}))
     return dialect, dialect.url(base, model), model
 
@@ -89,17 +89,18 @@ def examine(parts: SplitResult) -> Iterator[Finding | str]:
         if head.is_success and (head.http_version == "HTTP/1.0" or head.headers.get("connection") == "close"):
             what = "it closes the connection after each answer: each request connects first"
             yield Finding("connections", "advice", what, "let the server, or a proxy before it, keep connections")
-    if model or (not why and _acts(endpoint(url, "", "/act"))):
+    if model or (not why and _acts(url)):
         yield NO_KEY
     else:
         yield Finding("server", "state", f"it answers, and shows no list of models without a key{why}")
 
 
-def _acts(url: str) -> bool:
-    """Return whether a server takes POST alone, and from everybody an object whose refusal needs no model."""
-    with suppress(S2AError, httpx.HTTPError), probe(url) as client:
-        if client.get(url).status_code == httpx.codes.METHOD_NOT_ALLOWED:
-            return client.post(url, json={}).status_code in {200, 400, 500}
+def _acts(base: str) -> bool:
+    """Return whether a policy takes POST alone, and from everybody an object whose refusal needs no model."""
+    for url in (endpoint(base, "", each.path) for _, each in DIALECTS.loaded() if each.takes_task):
+        with suppress(S2AError, httpx.HTTPError), probe(url) as client:
+            if client.get(url).status_code == httpx.codes.METHOD_NOT_ALLOWED:
+                return client.post(url, json={}).status_code in {200, 400, 500}
     return False
 
 

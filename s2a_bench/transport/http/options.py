@@ -15,7 +15,6 @@ from s2a_bench.secrets import LONG, keep, secrets_in
 from s2a_bench.transport import PROGRAM, SERVING, Program
 from s2a_bench.transport.access import WebOptions
 from s2a_bench.transport.http.dialects import DIALECTS
-from s2a_bench.transport.policies import TemplateOptions
 
 WHEEL = Path("xllamacpp")
 """Stands for llama.cpp's server in the wheel of that name."""
@@ -56,7 +55,9 @@ def merged(target: Any, patch: Any) -> Any:
     return result
 
 
-class HttpOptions(WebOptions, TemplateOptions):
+class HttpOptions(WebOptions):
+    """HTTP's own options; `Http.options` has those that dialects declare, too."""
+
     SCHEMES: ClassVar[tuple[str, ...]] = ("http", "https")
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 8080}
     NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = ("api_docs",)
@@ -96,9 +97,13 @@ class HttpOptions(WebOptions, TemplateOptions):
         return "llama-server" if self.llama_server else self.dialect
 
     @property
-    def template_name(self) -> str:
-        """Return the template of requests to the url; our own server reads no observations."""
-        return self.template if self.url else ""
+    def of_dialects(self) -> set[str]:
+        """Return the given options that dialects declare."""
+        return self.model_fields_set.difference(HttpOptions.model_fields)
+
+    @property
+    def without_effect(self) -> set[str]:
+        return set() if self.url else self.of_dialects
 
     @property
     def program(self) -> Program | None:

@@ -11,7 +11,7 @@ import numpy as np
 from websockets.frames import Frame, Opcode
 from websockets.utils import accept_key
 
-from s2a_bench.transport.websocket.codec import OURS
+from s2a_bench.plugins.policy_servers.websocket.codec import OURS
 from tests.hostile.suite import FAILED, Attack, Case, Trap
 from tests.hostile.tcp import CLIENTS as ANY_CLIENT
 from tests.hostile.tcp import NOISE, Block, answers, crowd, sends, sends_made, servers
@@ -76,7 +76,7 @@ FLOODS = {
 }
 NO_MESSAGE = "that are no message"
 OBJECTS = array(dtype="|O")
-"""One of the arrays that `tests/transport/test_websocket_codec.py` tries."""
+"""One of the arrays that `tests/plugins/policy_servers/test_websocket_codec.py` tries."""
 
 CLIENTS: tuple[Case[Attack], ...] = (
     *ANY_CLIENT,

@@ -6,16 +6,18 @@ client sends, marks stages and reports errors.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from s2a_bench.errors import UsageError
 from s2a_bench.registry import Registry
 from s2a_bench.trace import Remote
 from s2a_bench.types import Action
 
 if TYPE_CHECKING:
     from s2a_bench.transport.http.dialects.common import Dialect
+    from s2a_bench.transport.http.options import HttpOptions
 
 NATIVE = "s2a"
 """The dialect of our server, in all its variants."""
@@ -50,7 +52,7 @@ class Event:
     """The HTTP status of the error if it had come before the stream, 0 if unknown."""
 
 
-DIALECTS: Final[Registry[Callable[[], Dialect]]] = Registry(
+DIALECTS: Final[Registry[type[Dialect]]] = Registry(
     "dialects",
     "dialect",
     {
@@ -61,17 +63,21 @@ DIALECTS: Final[Registry[Callable[[], Dialect]]] = Registry(
         "ollama": "s2a_bench.transport.http.dialects.ollama:Ollama",
         "tgi": "s2a_bench.transport.http.dialects.tgi:Tgi",
         "gemini": "s2a_bench.transport.http.dialects.gemini:Gemini",
-        "openvla": "s2a_bench.transport.http.dialects.openvla:OpenVla",
     },
 )
 
 
-def open_dialect(name: str, template: str = "") -> Dialect:
-    """Return a new adapter, with the template of its requests; raises UsageError for a name or template unknown to it.
+def open_dialect(name: str, options: HttpOptions | None = None) -> Dialect:
+    """Return a new adapter that has read the options, if any.
 
-    A template is that of `transport.observation`, by its name.
+    Raises UsageError for an unknown name and for an option of another dialect, MissingExtra.
     """
     dialect = DIALECTS[name]()
-    if template:
-        dialect.describe(template)
+    if options is not None:
+        own = dialect.options.model_fields if dialect.options else {}
+        for field in options.of_dialects.difference(own, options.without_effect):
+            takers = [each for each, kind in DIALECTS.loaded() if kind.options and field in kind.options.model_fields]
+            choice = f"leave it out, or choose `dialect` {' or '.join(takers)}"
+            raise UsageError(f"`{field}`: the dialect '{name}' takes none; {choice}")
+        dialect.configure(options)
     return dialect

@@ -10,10 +10,9 @@ from urllib.parse import urlsplit, urlunsplit
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CACHE_N, PROMPT_N, USAGE_ZERO, Fact
 from s2a_bench.trace import FACT_LIMIT, Trace
-from s2a_bench.transport import TOKENS
+from s2a_bench.transport import TOKENS, TransportOptions
 from s2a_bench.transport.http.dialects import EncodedPicture, Event
 from s2a_bench.transport.http.dialects.framing import Framing, ServerSentEvents
-from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Pixels, Request
 
 TEMPERATURE, TOP_P = 0.7, 0.8
@@ -46,10 +45,13 @@ class Dialect:
     answer_kinds: tuple[str, ...] = (TOKENS,)
     accepts_state = False
     takes_task = False
+    options: type[TransportOptions] | None = None
+    """Options that the transport gets from it, which only this dialect reads."""
+    packages: Sequence[str] = ()
+    """Python packages whose versions are recorded with results."""
 
-    def describe(self, template: str) -> None:  # noqa: ARG002 - that of a policy server
-        """Make requests from a template, by its name; raises UsageError if the dialect takes none."""
-        raise UsageError(f"`template`: the dialect '{self.name}' takes none; leave it out, or choose `dialect` openvla")
+    def configure(self, options: Any) -> None:
+        """Read the transport's options, with its own; raises UsageError, MissingExtra."""
 
     def check(self, cameras: int, state: int) -> None:
         """Raise UsageError if a request cannot have so many pictures, or numbers of the state."""
@@ -70,6 +72,8 @@ class Dialect:
     def fields(
         self, request: Request, payload: str, model: str, to_base64: Callable[[Pixels], str], trace: Trace
     ) -> dict[str, Any]:
+        from s2a_bench.transport.pictures import encoded
+
         pictures = []
         for frame in request.images:
             media_type, data = encoded(frame, payload, trace)

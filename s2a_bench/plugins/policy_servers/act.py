@@ -15,18 +15,15 @@ import numpy as np
 
 from s2a_bench import extras
 from s2a_bench.facts import Fact
+from s2a_bench.plugins.policy_servers.observation import Template, template_of
+from s2a_bench.plugins.policy_servers.policies import PolicyTransport, TemplateOptions
 from s2a_bench.trace import Trace
 from s2a_bench.transport import ACTIONS
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http.dialects import Event
 from s2a_bench.transport.http.dialects.common import Dialect
 from s2a_bench.transport.http.dialects.framing import WholeBody
-from s2a_bench.transport.observation import Template, template_of
-from s2a_bench.transport.pictures import policy_picture
-from s2a_bench.transport.policies import PolicyTransport
 from s2a_bench.types import Pixels, Request
-
-json_numpy = extras.require("json_numpy", "act")
 
 FAILED = "error"
 """The body of a failure, with status 200 (``vla-scripts/deploy.py``)."""
@@ -50,12 +47,17 @@ class OpenVla(Dialect):
     payloads: tuple[str, ...] = ("raw",)
     framing = WholeBody
     facts = (ACTION_N,)
+    options = TemplateOptions
+    packages = ("json-numpy",)
 
     def __init__(self) -> None:
         self._template: Template | None = None
 
-    def describe(self, template: str) -> None:
-        self._template = made = template_of(template)
+    def configure(self, options: Any) -> None:
+        extras.require("json_numpy", "act")
+        if not options.template:
+            return
+        self._template = made = template_of(options.template)
         made.check_server(self.name, ("path", "answer", "arrays_as_text", "arrays_as_lists"))
         self.path = made.server.path or self.path
         self.answer_kinds, self.accepts_state = (ACTIONS,), made.accepts_state
@@ -69,6 +71,8 @@ class OpenVla(Dialect):
         self, request: Request, payload: str, model: str, to_base64: Callable[[Pixels], str], trace: Trace
     ) -> dict[str, Any]:
         """Return the template's observation, OpenVLA's own without one, in the form of ``json_numpy.dumps``."""
+        from s2a_bench.plugins.policy_servers.policy_client import policy_picture
+
         template, frames = self._template, request.images if self._template else request.images[:1]
         pictures = [policy_picture(frame, payload, trace) for frame in frames]
         filled: dict[str, Any] = {"instruction": request.prompt} | ({"image": pictures[0]} if pictures else {})
@@ -123,4 +127,4 @@ def _arrays_in(value: Any) -> Any:
         return {key: _arrays_in(each) for key, each in value.items()}
     if not NUMBERS.fullmatch(value["dtype"]):
         raise ValueError(f"an action of type {value['dtype']}")
-    return json_numpy.object_hook(value)
+    return extras.require("json_numpy", "act").object_hook(value)

@@ -18,10 +18,10 @@ from typing import Any, Final
 import numpy as np
 
 from s2a_bench.errors import RequestFailed
+from s2a_bench.plugins.policy_servers.observation import EXTENSION
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import chunks
 from s2a_bench.transport.limits import Limits, check_pixels, text
-from s2a_bench.transport.observation import EXTENSION
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.types import Frame, Request
 

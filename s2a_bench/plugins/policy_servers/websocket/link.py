@@ -19,9 +19,9 @@ from websockets.uri import parse_uri
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, S2AError, ServerDied, TransportError
+from s2a_bench.plugins.policy_servers.websocket import codec
 from s2a_bench.secrets import struck
 from s2a_bench.transport.limits import Bounds
-from s2a_bench.transport.websocket import codec
 
 MESSAGE_BYTES: Final = 1 << 26
 """No answer is larger; the bounds of a request are tighter."""

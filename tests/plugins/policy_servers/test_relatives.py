@@ -21,14 +21,14 @@ from websockets.sync.server import serve
 
 from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.frames.convert import yuyv_to_rgb
+from s2a_bench.plugins.policy_servers.observation import template_of
+from s2a_bench.plugins.policy_servers.websocket import client as websocket_client
+from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import budget
 from s2a_bench.transport import TRANSPORTS, Choice, Client, open_client
-from s2a_bench.transport.observation import template_of
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.risks import examine
-from s2a_bench.transport.websocket import client as websocket_client
-from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.types import Request
 from tests.waiting import until
 

@@ -24,6 +24,8 @@ from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.frames.convert import yuyv_to_rgb
+from s2a_bench.plugins.policy_servers.zmq.layouts import modalities_in, template_of
+from s2a_bench.plugins.policy_servers.zmq.watch import ConnectionWatch
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
@@ -32,8 +34,6 @@ from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.risks import examine
-from s2a_bench.transport.zmq.layouts import modalities_in, template_of
-from s2a_bench.transport.zmq.watch import ConnectionWatch
 from s2a_bench.types import Action, Piece, Request
 from tests.waiting import until
 
@@ -270,7 +270,7 @@ class TestClientsOfOthers:
             assert "choose `answer` actions" in call("get_action", flat())["error"]
 
     def test_marks_are_computed_when_they_are_requested(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("s2a_bench.transport.zmq.server.WANTED_S", 20)
+        monkeypatch.setattr("s2a_bench.plugins.policy_servers.zmq.server.WANTED_S", 20)
         arrived, recording = Event(), RecordingHandler(list(CHUNK))
 
         def handler(request: Request, trace: Trace) -> Generator[Piece, None, None]:

@@ -7,17 +7,29 @@ from collections.abc import Callable, Iterator
 from typing import Any, Final, Generic
 
 from s2a_bench.errors import RequestFailed
+from s2a_bench.frames.convert import to_rgb
+from s2a_bench.plugins.policy_servers.observation import template_of
+from s2a_bench.plugins.policy_servers.policies import P
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Client, Wiring
 from s2a_bench.transport.limits import Bounds
-from s2a_bench.transport.observation import template_of
-from s2a_bench.transport.pictures import policy_picture
-from s2a_bench.transport.policies import P
+from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Frame, Piece, Pixels, Request
 
 QUOTED: Final = 500
 """Letters shown of a server's error: its end, as a traceback's reason comes last."""
+
+
+def policy_picture(frame: Frame, payload: str, trace: Trace) -> Pixels:
+    """Return a picture for a policy: (H, W, 3) RGB, or a file's (n,) bytes; marks as `encoded` does."""
+    if payload != "raw":
+        return encoded(frame, payload, trace)[1].reshape(-1)
+    if frame.encoding == "rgb8":
+        return frame.data
+    data = to_rgb(frame)
+    trace.mark("convert")
+    return data
 
 
 class PolicyClient(Client, Generic[P]):

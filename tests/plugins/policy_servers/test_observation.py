@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import RequestFailed, UsageError
-from s2a_bench.transport.observation import DEFAULT, Template, names, template_of
+from s2a_bench.plugins.policy_servers.observation import DEFAULT, Template, names, template_of
 
 FIRST, SECOND = (np.full((4, 6, 3), number, np.uint8) for number in (1, 2))
 STATE = tuple(float(number) for number in range(8))

@@ -28,12 +28,13 @@ from websockets.server import ServerProtocol
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, EngineError, S2AError, TooLarge
 from s2a_bench.facts import INFER_MS
-from s2a_bench.transport import Handler, Wiring, observed
+from s2a_bench.plugins.policy_servers import observed
+from s2a_bench.plugins.policy_servers.websocket import PREV_TOTAL_MS, STREAM_PATH, WebsocketOptions, codec
+from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
+from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.access import Access, WebServer
 from s2a_bench.transport.connections import LINGER_S, Connections, Wire
 from s2a_bench.transport.serving import Core, Disconnected, Exchange, Queued
-from s2a_bench.transport.websocket import PREV_TOTAL_MS, STREAM_PATH, WebsocketOptions, codec
-from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.types import Action, Piece, Request
 
 PIECE: Final = 1 << 16

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.transport.websocket.codec import packb, unpackb
+from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
 
 DTYPES = [
     *("bool", "int8", "uint8", "int16", ">u2", "int32", "uint32", "int64", "uint64"),

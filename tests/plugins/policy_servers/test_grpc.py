@@ -17,15 +17,15 @@ import pytest
 from s2a_bench.errors import EngineError, RequestFailed, ServerDied, UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
-from s2a_bench.facts import GET_ACTIONS_MS, PAYLOAD_BYTES, RECONNECTS
+from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
+from s2a_bench.plugins.policy_servers.grpc import GET_ACTIONS_MS, GRPC, PAYLOAD_DOWN_BYTES, GrpcOptions
+from s2a_bench.plugins.policy_servers.grpc.pickles import OPCODES, chunk_in
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import Connect, TransportSuite, ask, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Choice, Client, Handler, Wiring, open_client
-from s2a_bench.transport.grpc import GRPC, PAYLOAD_DOWN_BYTES, GrpcOptions
-from s2a_bench.transport.grpc.pickles import OPCODES, chunk_in
 from s2a_bench.types import Action, Frame, Request
 from tests.servers.lerobot import (
     PolicyServer,
@@ -39,7 +39,7 @@ from tests.servers.lerobot import (
     timed_action,
 )
 
-GOLDEN = Path(__file__).parents[1] / "data" / "lerobot"
+GOLDEN = Path(__file__).with_name("data")
 CHUNK = np.arange(12, dtype=np.float32).reshape(4, 3) / 8
 STATE = (0.5, 1.5)
 

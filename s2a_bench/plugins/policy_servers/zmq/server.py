@@ -22,13 +22,14 @@ from typing import Any, Final, NamedTuple
 import zmq
 
 from s2a_bench.errors import Busy, RequestFailed, S2AError, TransportError
+from s2a_bench.plugins.policy_servers import observed
+from s2a_bench.plugins.policy_servers.zmq import ZmqOptions, layouts
+from s2a_bench.plugins.policy_servers.zmq.watch import Connection, ConnectionWatch
+from s2a_bench.plugins.policy_servers.zmq.wire import pack, read
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler, Wiring, observed
+from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.listening import cannot_bind, in_url, key_for, split_address
 from s2a_bench.transport.serving import RETRY_AFTER_S, Core, Exchange, SharedSourceWorkers, client_error
-from s2a_bench.transport.zmq import ZmqOptions, layouts
-from s2a_bench.transport.zmq.watch import Connection, ConnectionWatch
-from s2a_bench.transport.zmq.wire import pack, read
 from s2a_bench.types import Piece, Request
 
 POLL_MS: Final = 100

@@ -26,6 +26,8 @@ from websockets.sync.server import serve as plain_serve
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.inference import EngineConfig
+from s2a_bench.plugins.policy_servers.websocket import server as websocket_server
+from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
 from s2a_bench.provenance import Provenance
 from s2a_bench.testing.transport import Connect, RecordingHandler, ask, connector, served, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
@@ -33,8 +35,6 @@ from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.risks import examine
 from s2a_bench.transport.serving import Queued
-from s2a_bench.transport.websocket import server as websocket_server
-from s2a_bench.transport.websocket.codec import packb, unpackb
 from s2a_bench.types import Action, Piece, Request
 from tests.waiting import until
 

@@ -20,17 +20,18 @@ from s2a_bench.errors import RequestFailed, ServerDied, TransportError
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
 from s2a_bench.machine.doctor import Finding
+from s2a_bench.plugins.policy_servers import observed
+from s2a_bench.plugins.policy_servers.observation import EXTENSION, template_of
+from s2a_bench.plugins.policy_servers.policy_client import PolicyClient
+from s2a_bench.plugins.policy_servers.zmq import ZmqOptions, layouts
+from s2a_bench.plugins.policy_servers.zmq.npy import PictureFile
+from s2a_bench.plugins.policy_servers.zmq.watch import ConnectionWatch
+from s2a_bench.plugins.policy_servers.zmq.wire import pack, read
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring, observed
+from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import in_url, read_key
-from s2a_bench.transport.observation import EXTENSION, template_of
-from s2a_bench.transport.policy_client import PolicyClient
 from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, UNPICKLES, printable
-from s2a_bench.transport.zmq import ZmqOptions, layouts
-from s2a_bench.transport.zmq.npy import PictureFile
-from s2a_bench.transport.zmq.watch import ConnectionWatch
-from s2a_bench.transport.zmq.wire import pack, read
 from s2a_bench.types import Frame, Piece, Pixels, Request
 
 ANSWER_BYTES: Final = 16 << 20

@@ -19,7 +19,7 @@ import msgpack
 import numpy as np
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.transport.messagepack import array_in, unpacked
+from s2a_bench.plugins.policy_servers.messagepack import array_in, unpacked
 
 MARKS_HEADER: Final = "S2A-Marks"
 OURS: Final = "s2a-bench"

@@ -15,7 +15,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.transport.messagepack import array_in
+from s2a_bench.plugins.policy_servers.messagepack import array_in
 from s2a_bench.types import Pixels
 
 HEAD: Final = 4096

@@ -9,10 +9,8 @@ import pytest
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.convert import encode_png
-from s2a_bench.trace import Remote, Trace
-from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.transport.observation import EXTENSION
-from s2a_bench.transport.observed import (
+from s2a_bench.plugins.policy_servers.observation import EXTENSION
+from s2a_bench.plugins.policy_servers.observed import (
     extension_of,
     read_observation,
     remote_message,
@@ -20,6 +18,8 @@ from s2a_bench.transport.observed import (
     request_of,
     take_extension,
 )
+from s2a_bench.trace import Remote, Trace
+from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.types import Request
 
 PICTURE = np.random.default_rng(1).integers(0, 256, (4, 6, 3), np.uint8)

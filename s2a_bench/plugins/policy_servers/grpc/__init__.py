@@ -9,14 +9,15 @@ from __future__ import annotations
 from typing import ClassVar
 
 from s2a_bench.errors import UsageError
-from s2a_bench.facts import GET_ACTIONS_MS, PAYLOAD_BYTES, RECONNECTS, Fact
+from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import option
-from s2a_bench.transport import Choice, Urls
-from s2a_bench.transport.grpc.pickles import observation_of
-from s2a_bench.transport.observation import template_of
-from s2a_bench.transport.policies import PolicyTransport, TemplateOptions
+from s2a_bench.plugins.policy_servers.grpc.pickles import observation_of
+from s2a_bench.plugins.policy_servers.observation import template_of
+from s2a_bench.plugins.policy_servers.policies import PolicyTransport, TemplateOptions
+from s2a_bench.transport import Choice, Sleep, Urls
 
 LEROBOT = "lerobot"
+GET_ACTIONS_MS = Fact("get_actions_ms", "ms", "lerobot's call `GetActions`, which begins before the observation leaves")
 PAYLOAD_DOWN_BYTES = Fact("payload_down_bytes", "bytes", "what the chunk weighs on the wire")
 
 
@@ -38,13 +39,18 @@ class Grpc(PolicyTransport[GrpcOptions]):
     serves = False
     payloads = ("raw",)
     stages: ClassVar[dict[str, str]] = {"pickle_pack": "pack", "send": "network", "pickle_parse": "parse"}
-    urls = Urls(GrpcOptions.SCHEMES, examine="s2a_bench.transport.grpc.client:examine")
+    urls = Urls(GrpcOptions.SCHEMES, examine="s2a_bench.plugins.policy_servers.grpc.client:examine")
     needs = ("grpc", "grpc")
-    client_class = "s2a_bench.transport.grpc.client:GrpcClient"
+    client_class = "s2a_bench.plugins.policy_servers.grpc.client:GrpcClient"
     facts = (PAYLOAD_BYTES, PAYLOAD_DOWN_BYTES, RECONNECTS, GET_ACTIONS_MS)
     order = 24
     style = {LEROBOT: ("#01665E", "-")}
     packages = ("grpcio",)
+    sleep = Sleep(
+        GET_ACTIONS_MS,
+        1e3 / 30,
+        "start lerobot's server with --inference_latency=0; with that, its policy takes this time itself",
+    )
 
     def require(self, choice: Choice[GrpcOptions]) -> None:
         """Refuse a choice without a policy, and an observation that lerobot does not take."""

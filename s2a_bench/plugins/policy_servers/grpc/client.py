@@ -17,15 +17,15 @@ import grpc
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, TransportError
-from s2a_bench.facts import GET_ACTIONS_MS, PAYLOAD_BYTES, RECONNECTS
+from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.machine.doctor import Finding
+from s2a_bench.plugins.policy_servers.grpc import GET_ACTIONS_MS, PAYLOAD_DOWN_BYTES, GrpcOptions
+from s2a_bench.plugins.policy_servers.grpc.pickles import chunk_in, observation_of, pickled
+from s2a_bench.plugins.policy_servers.policy_client import PolicyClient
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.chunks import actions_of
-from s2a_bench.transport.grpc import PAYLOAD_DOWN_BYTES, GrpcOptions
-from s2a_bench.transport.grpc.pickles import chunk_in, observation_of, pickled
 from s2a_bench.transport.limits import MIB, Bounds
-from s2a_bench.transport.policy_client import PolicyClient
 from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, UNPICKLES
 from s2a_bench.types import Piece, Request
 

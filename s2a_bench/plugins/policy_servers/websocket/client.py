@@ -22,20 +22,20 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, S2AError, ServerDied, UsageError
 from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.machine.doctor import Finding
+from s2a_bench.plugins.policy_servers import observed
+from s2a_bench.plugins.policy_servers.observation import CAMERAS, EXTENSION, ExternalServer, names, template_of
+from s2a_bench.plugins.policy_servers.policy_client import PolicyClient, policy_picture
+from s2a_bench.plugins.policy_servers.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
+from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
+from s2a_bench.plugins.policy_servers.websocket.link import REFUSED, BoundedConnection, Broken
 from s2a_bench.provenance import Provenance
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring, observed
+from s2a_bench.transport import Wiring
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.observation import CAMERAS, EXTENSION, ExternalServer, names, template_of
-from s2a_bench.transport.pictures import policy_picture
-from s2a_bench.transport.policy_client import PolicyClient
 from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, idle_cut
-from s2a_bench.transport.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
-from s2a_bench.transport.websocket.codec import packb, unpackb
-from s2a_bench.transport.websocket.link import REFUSED, BoundedConnection, Broken
 from s2a_bench.types import Action, Frame, Piece, Request
 
 

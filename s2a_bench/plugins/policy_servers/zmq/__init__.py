@@ -1,7 +1,7 @@
 """ZeroMQ and MessagePack as GR00T's policy servers speak it: an observation goes up, a chunk of actions comes back.
 
 Our server answers all layouts, N1.5 to N1.7, and GR00T's own clients; our client also queries foreign servers, with
-observations from a template (`transport.observation`). GR00T N1 unpickled what it received, and early N1.7 servers
+observations from a template (`observation`). GR00T N1 unpickled what it received, and early N1.7 servers
 unpickle arrays of kind O, so that a client can run any code in them. Nothing here unpickles, and such a server belongs
 where no other client reaches it.
 """
@@ -13,9 +13,9 @@ from typing import Any, ClassVar, Literal
 
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.options import option
+from s2a_bench.plugins.policy_servers.policies import PolicyTransport, TemplateOptions
 from s2a_bench.transport import SERVER, Urls, Wiring
 from s2a_bench.transport.listening import ListeningOptions
-from s2a_bench.transport.policies import PolicyTransport, TemplateOptions
 
 GR00T = "gr00t"
 PACKAGES = ("msgpack", "zmq")
@@ -42,10 +42,10 @@ class Zmq(PolicyTransport[ZmqOptions]):
     name = "zmq"
     options = ZmqOptions
     variants = (GR00T,)
-    urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.transport.zmq.client:examine")
+    urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.plugins.policy_servers.zmq.client:examine")
     needs = ("zmq", *PACKAGES)
-    client_class = "s2a_bench.transport.zmq.client:ZmqClient"
-    server_class = "s2a_bench.transport.zmq.server:ZmqServer"
+    client_class = "s2a_bench.plugins.policy_servers.zmq.client:ZmqClient"
+    server_class = "s2a_bench.plugins.policy_servers.zmq.server:ZmqServer"
     facts = (PAYLOAD_BYTES, RECONNECTS)
     order = 22
     style = {GR00T: ("#8C510A", "-")}

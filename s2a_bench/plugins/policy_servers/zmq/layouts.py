@@ -18,8 +18,8 @@ from typing import Any, Final
 import numpy as np
 
 from s2a_bench.errors import EngineError, RequestFailed
+from s2a_bench.plugins.policy_servers.observation import EXTENSION, VALUES, Template
 from s2a_bench.transport.chunks import actions_of
-from s2a_bench.transport.observation import EXTENSION, VALUES, Template
 from s2a_bench.types import Action, Piece
 
 MARKS: Final = "s2a_marks"

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.transport.messagepack import MAP, VALUES
-from s2a_bench.transport.websocket.codec import packb, unpackb
-from s2a_bench.transport.zmq import wire
-from s2a_bench.transport.zmq.wire import pack
+from s2a_bench.plugins.policy_servers.messagepack import MAP, VALUES
+from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
+from s2a_bench.plugins.policy_servers.zmq import wire
+from s2a_bench.plugins.policy_servers.zmq.wire import pack
 
 HOSTILE = {
     "nothing": b"",

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar, TypeVar
 
 from s2a_bench.options import option
+from s2a_bench.plugins.policy_servers.observation import DEFAULT, TemplateName, names, template_of
 from s2a_bench.transport import ACTIONS, Capabilities, Choice, Transport
 from s2a_bench.transport.defaults import BESIDE
 from s2a_bench.transport.listening import UrlOptions, read_key
-from s2a_bench.transport.observation import DEFAULT, TemplateName, names, template_of
 
 
 class TemplateOptions(UrlOptions):

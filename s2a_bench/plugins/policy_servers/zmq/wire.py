@@ -15,9 +15,9 @@ import msgpack
 import numpy as np
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.transport.messagepack import array_in, unpacked
-from s2a_bench.transport.zmq.layouts import CONFIG_MARKS, N1_5, N1_6, N1_7, OURS
-from s2a_bench.transport.zmq.npy import PictureFile, array_of, file_of
+from s2a_bench.plugins.policy_servers.messagepack import array_in, unpacked
+from s2a_bench.plugins.policy_servers.zmq.layouts import CONFIG_MARKS, N1_5, N1_6, N1_7, OURS
+from s2a_bench.plugins.policy_servers.zmq.npy import PictureFile, array_of, file_of
 
 ARRAY, FILE = "__ndarray_class__", "as_npy"
 ND, TYPE, KIND, SHAPE, BYTES = "nd", "type", "kind", "shape", "data"

@@ -2,7 +2,7 @@
 
 ``openpi`` answers with the chunk as a whole, ``openpi-stream`` with its actions as they are ready (partial frames, then
 the final one). Our server serves both, and openpi's own clients; our client also queries foreign servers, with
-observations from a template (`transport.observation`).
+observations from a template (`observation`).
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS, Fact
+from s2a_bench.plugins.policy_servers.policies import PolicyTransport, TemplateOptions
 from s2a_bench.transport import Urls, Wiring
 from s2a_bench.transport.access import WebOptions
-from s2a_bench.transport.policies import PolicyTransport, TemplateOptions
 
 VARIANTS = ("openpi", "openpi-stream")
 OPENPI, STREAM = VARIANTS
@@ -36,10 +36,10 @@ class Websocket(PolicyTransport[WebsocketOptions]):
     name = "websocket"
     options = WebsocketOptions
     variants = VARIANTS
-    urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.transport.websocket.client:examine")
+    urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.plugins.policy_servers.websocket.client:examine")
     needs = ("websocket", *PACKAGES)
-    client_class = "s2a_bench.transport.websocket.client:WebsocketClient"
-    server_class = "s2a_bench.transport.websocket.server:WebsocketServer"
+    client_class = "s2a_bench.plugins.policy_servers.websocket.client:WebsocketClient"
+    server_class = "s2a_bench.plugins.policy_servers.websocket.server:WebsocketServer"
     reads_server = ("path", "greets", "text_keys", "answer", "reset", "idle_s", "image_maps")
     facts = (PAYLOAD_BYTES, RECONNECTS, INFER_MS, PREV_TOTAL_MS)
     order = 20
