@@ -11,6 +11,7 @@ import select
 import signal
 import subprocess
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from errno import EAGAIN, EDQUOT, EMFILE, ENFILE, ENOMEM, ENOSPC
 from typing import Any, ClassVar, Final
@@ -22,6 +23,7 @@ from s2a_bench.cli.adapter import with_flags
 from s2a_bench.cli.experiment import PLAIN, Commands, ParseError
 from s2a_bench.cli.output import print_error
 from s2a_bench.cli.ros_args import folded
+from s2a_bench.commands import COMMANDS
 from s2a_bench.errors import NotPermitted, S2AError
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.machine import tuning
@@ -32,17 +34,12 @@ AGAIN_S: Final = 0.01
 
 
 class TopCommands(Commands):
-    """All commands: those listed below, and the experiments."""
+    """All commands: those listed below, those of other packages, and the experiments."""
 
     experiments = EXPERIMENTS
-    lazy: ClassVar[dict[str, tuple[str, str]]] = {
+    lazy: ClassVar[Mapping[str, tuple[str, str]]] = {
         name: (f"s2a_bench.cli.{where}", about)
         for name, where, about in (
-            (
-                "advise",
-                "report:advise",
-                "Advise on a transport for a link, from a sweep of transports: what is fastest.",
-            ),
             (
                 "compare",
                 "report:compare",
@@ -63,7 +60,7 @@ class TopCommands(Commands):
             ),
             ("sweep", "sweep:sweep", "Run a command for every cell of a grid; an interrupted sweep can be resumed."),
         )
-    }
+    } | dict(COMMANDS.loaded())
 
 
 app = typer.Typer(

@@ -11,10 +11,10 @@ from select import select
 from statistics import median
 from typing import Any, Final
 
-from s2a_bench.boards.links import DELAY_OFF_MS, OFF, Direction
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.links import CLIENT, SERVER, EmulatedLink
+from s2a_bench.plugins.two_hosts.links import CLIENT, SERVER, EmulatedLink
+from s2a_bench.plugins.two_hosts.profiles import DELAY_OFF_MS, OFF, Direction
 
 ATTEMPTS: Final = 3
 RATE_S: Final = 1.0

@@ -20,9 +20,9 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
-from s2a_bench.boards.links import Direction, LinkProfile
 from s2a_bench.errors import NotPermitted, UsageError
 from s2a_bench.harness.processes import OwnProcess
+from s2a_bench.plugins.two_hosts.profiles import Direction, LinkProfile
 
 SERVER, CLIENT = "127.0.0.1", "127.0.0.2"
 DEVICE: Final = b"link"
@@ -89,7 +89,7 @@ def emulated(profile: LinkProfile) -> Iterator[EmulatedLink]:
                     f"`link` needs a TUN device: {error}; `modprobe tun`, or in a container --device /dev/net/tun"
                 ) from None
         job = json.dumps({"devices": devices[::-1], "directions": directions})
-        relay = OwnProcess("relay", "s2a_bench.harness.links.relay", job, None, devices)
+        relay = OwnProcess("relay", "s2a_bench.plugins.two_hosts.links.relay", job, None, devices)
         stack.enter_context(relay)
         relay.wait_ready()
         stack.callback(os.environ.update, {name: os.environ[name] for name in PEERS if name in os.environ})

@@ -1,0 +1,1 @@
+"""Advice on a transport for a link."""
