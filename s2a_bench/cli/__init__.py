@@ -23,14 +23,15 @@ from s2a_bench.cli.adapter import with_flags
 from s2a_bench.cli.experiment import PLAIN, Commands, ParseError
 from s2a_bench.cli.output import print_error
 from s2a_bench.cli.ros_args import folded
-from s2a_bench.commands import COMMANDS
 from s2a_bench.errors import NotPermitted, S2AError
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.machine import tuning
-from s2a_bench.registry import missing_entry_points
+from s2a_bench.registry import Registry, missing_entry_points
 
 INTERRUPTED: Final = 130
 AGAIN_S: Final = 0.01
+COMMANDS: Final[Registry[tuple[str, str]]] = Registry("commands", "command", {})
+"""Commands of installed packages, declared as in `Commands.lazy`: declarations import nothing."""
 
 
 class TopCommands(Commands):

@@ -39,7 +39,7 @@ from s2a_bench.store.schema import Count, about, with_fields
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
 from s2a_bench.transport import PAYLOADS, declared_transport
 from s2a_bench.transport.pipeline import without
-from s2a_bench.transport.surroundings import SURROUNDINGS
+from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import summaries, summaries_of_ends
 from s2a_bench.writers.tables import DUMMY, EMULATED, PAPERS, Note
@@ -380,8 +380,8 @@ def split(runs: Iterable[StoredRun]) -> Split:
 
 def _cells(run: StoredRun, samples: pd.DataFrame) -> list[RequestCell]:
     tokens, stages = run.tokens, run.stages
-    for _, around in SURROUNDINGS.loaded():
-        samples = around.columns(run, samples)
+    for with_columns in shown("columns"):
+        samples = with_columns(run, samples)
     mixed = any("payload=" in name for name in run.manifest["configuration"].get("transports", ()))
     cells = []
     for name in map(str, samples["cell"].unique()):

@@ -1,27 +1,22 @@
 """What surrounds a run of requests, of installed packages alone: a network between its ends, another host's clock.
 
 The options of each kind are fields of every configuration of requests. `Surroundings.of` makes of them an object with
-what a run is within; a view calls the methods of the class on runs that are kept, within it or not.
+what a run is within; views show what each kind knows of a kept run, within it or not.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Final, Protocol, TypeAlias
+from pkgutil import resolve_name
+from typing import Any, ClassVar, Final, Protocol, TypeAlias
 
 from s2a_bench.options import Options
 from s2a_bench.provenance import Provenance
 from s2a_bench.registry import Registry
 from s2a_bench.trace import Trace
 from s2a_bench.transport.pipeline import Pipeline
-
-if TYPE_CHECKING:
-    import pandas as pd
-    from matplotlib.figure import Figure
-
-    from s2a_bench.store.run import StoredRun
 
 Exchange: TypeAlias = Callable[[str], Trace]
 """Makes a request that our server answers without its engine, for its marks; raises S2AError.
@@ -80,8 +75,12 @@ class Surroundings:
 
     options: ClassVar[type[Options]]
     """A run's; each names its ``panel``."""
+    columns: ClassVar[str] = ""
+    """A function of a kept run and its samples, which returns these with further columns; as "module:attribute"."""
     metrics: ClassVar[str] = ""
-    """The `RequestMetric`s that `columns` brings, as "module:attribute"."""
+    """The `RequestMetric`s of these columns."""
+    figures: ClassVar[str] = ""
+    """A function of a kept run that returns, by name, what draws the figures that latency also has."""
 
     @classmethod
     def of(cls, config: Any, pipelines: Sequence[Pipeline]) -> Surroundings | None:
@@ -103,17 +102,12 @@ class Surroundings:
         del exchange, shared
         return None
 
-    @classmethod
-    def columns(cls, run: StoredRun, samples: pd.DataFrame) -> pd.DataFrame:
-        """Return the samples of a run with further columns."""
-        del run
-        return samples
-
-    @classmethod
-    def figures(cls, run: StoredRun) -> Mapping[str, Callable[[], Figure]]:
-        """Return what draws the figures that a run of latency also has, by name."""
-        del run
-        return {}
-
 
 SURROUNDINGS: Final[Registry[type[Surroundings]]] = Registry("surroundings", "surroundings", {})
+
+
+def shown(what: str) -> Iterator[Any]:
+    """Yield the ``columns``, ``metrics`` or ``figures`` of each kind that has them."""
+    for _, each in SURROUNDINGS.loaded():
+        if name := getattr(each, what):
+            yield resolve_name(name)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from pkgutil import resolve_name
+from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.experiments.requests import (
@@ -24,7 +24,7 @@ from s2a_bench.experiments.requests import (
 from s2a_bench.stats import Summary, SummaryEnds, summary_of
 from s2a_bench.store.schema import Count, about
 from s2a_bench.trace import GROUPS
-from s2a_bench.transport.surroundings import SURROUNDINGS
+from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 from s2a_bench.writers.json import frame, ratio_entry, summaries, summaries_of_ends
 
@@ -32,9 +32,7 @@ if TYPE_CHECKING:
     from s2a_bench.stats import Ratio
     from s2a_bench.store.run import StoredRun
 
-AROUND: Final[tuple[RequestMetric, ...]] = tuple(
-    metric for _, each in SURROUNDINGS.loaded() if each.metrics for metric in resolve_name(each.metrics)
-)
+AROUND: Final[tuple[RequestMetric, ...]] = tuple(chain.from_iterable(shown("metrics")))
 """What is known of a request by what surrounds its run, beside e2e without inference."""
 METRICS: Final = (
     RequestMetric(

@@ -25,8 +25,8 @@ import numpy as np
 
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import ClockMoved, RequestFailed, S2AError
-from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS
-from s2a_bench.plugins.two_hosts.wall_clocks import FRESH_NS, wall_clock
+from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WALL_CLOCKS
+from s2a_bench.plugins.two_hosts.wall_clocks import FRESH_NS
 from s2a_bench.trace import Trace
 from s2a_bench.transport.surroundings import Joined
 
@@ -197,7 +197,7 @@ class RemoteClock:
 
         Without ``offsets`` nothing is exchanged, and the requests alone bound the offset, more widely.
 
-        ``exchange`` raises S2AError; its argument is ``system``, one of `wall_clocks.COMMANDS` or "", where the
+        ``exchange`` raises S2AError; its argument is ``system``, one of `WALL_CLOCKS` or "", where the
         server's wall clock is wanted.
         """
         self._exchange, self._system = exchange, system
@@ -246,7 +246,7 @@ class RemoteClock:
 
     def _compare_wall_clocks(self) -> None:
         """Bound the offset by what both hosts know of their wall clocks' errors; raises S2AError."""
-        trace, ours = self._exchange(self._system), wall_clock(self._system)
+        trace, ours = self._exchange(self._system), WALL_CLOCKS[self._system]()
         if not trace.facts.keys() >= {REALTIME_MS, REALTIME_ERROR_MS}:
             raise RequestFailed(f"`clock` {self._system}: the server does not tell its wall clock; leave it out")
         theirs_ns, error_ns = (round(trace.facts[name] * 1e6) for name in (REALTIME_MS, REALTIME_ERROR_MS))

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, option
 from s2a_bench.plugins.two_hosts.profiles import LinkProfile, load_link, published
-from s2a_bench.provenance import Provenance
 from s2a_bench.transport import TRANSPORT
 from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.transport.surroundings import Around, Exchange, OtherClock, Surroundings
-
-if TYPE_CHECKING:
-    import pandas as pd
-    from matplotlib.figure import Figure
-
-    from s2a_bench.plugins.two_hosts.links import EmulatedLink
-    from s2a_bench.store.run import StoredRun
 
 
 class LinkOptions(Options):
@@ -33,34 +25,14 @@ class LinkOptions(Options):
     )
 
 
-class AroundLink(Around):
-    """A run over a link."""
-
-    def __init__(self, link: EmulatedLink) -> None:
-        self._link = link
-
-    def facts(self, say: Callable[[str], None]) -> Mapping[str, Any]:
-        from s2a_bench.plugins.two_hosts.links.probe import probed
-
-        say(f"probing the link {self._link.profile.name}")
-        return {"link": self._link.facts() | probed(self._link)}
-
-    def server_side(self) -> AbstractContextManager[None]:
-        return self._link.server_side()
-
-    def origin(self, origin: Provenance) -> Provenance:
-        return replace(origin, link="emulated", link_profile=self._link.profile.about)
-
-    def totals(self) -> Mapping[str, Any]:
-        return {"link": {"relay": self._link.statistics()}}
-
-
 @dataclass(frozen=True, slots=True)
 class Link(Surroundings):
     profile: LinkProfile
 
     options: ClassVar[type[Options]] = LinkOptions
+    columns: ClassVar[str] = "s2a_bench.plugins.two_hosts.view:bounded"
     metrics: ClassVar[str] = "s2a_bench.plugins.two_hosts.view:METRICS"
+    figures: ClassVar[str] = "s2a_bench.plugins.two_hosts.view:figures"
 
     @classmethod
     def of(cls, config: LinkOptions, pipelines: Sequence[Pipeline]) -> Link | None:
@@ -73,24 +45,10 @@ class Link(Surroundings):
             raise UsageError(f"`link`: {', '.join(local)} sends nothing over a network; leave it out of `transport`")
         return cls(profile)
 
-    @contextmanager
-    def around(self) -> Iterator[Around]:
+    def around(self) -> AbstractContextManager[Around]:
         from s2a_bench.plugins.two_hosts.links import emulated
 
-        with emulated(self.profile) as link:
-            yield AroundLink(link)
-
-    @classmethod
-    def columns(cls, run: StoredRun, samples: pd.DataFrame) -> pd.DataFrame:
-        from s2a_bench.plugins.two_hosts.view import bounded
-
-        return bounded(samples, run.manifest.get("link") or {})
-
-    @classmethod
-    def figures(cls, run: StoredRun) -> Mapping[str, Callable[[], Figure]]:
-        from s2a_bench.plugins.two_hosts.view import figures
-
-        return figures(run)
+        return emulated(self.profile)
 
 
 class ClockOptions(Options):
@@ -105,7 +63,7 @@ class ClockOptions(Options):
 @dataclass(frozen=True, slots=True)
 class HostClock(Surroundings):
     system: str
-    """What bounds the wall clocks of both hosts, one of `wall_clocks.COMMANDS`, or nothing."""
+    """What bounds the wall clocks of both hosts, one of `WALL_CLOCKS`, or nothing."""
 
     options: ClassVar[type[Options]] = ClockOptions
 

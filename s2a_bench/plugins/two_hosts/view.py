@@ -34,8 +34,9 @@ METRICS: Final = (
 )
 
 
-def bounded(samples: pd.DataFrame, link: Mapping[str, Any]) -> pd.DataFrame:
+def bounded(run: StoredRun, samples: pd.DataFrame) -> pd.DataFrame:
     """Add the column ``bound_ns`` to requests on an emulated link that bring their pictures."""
+    link = run.manifest.get("link") or {}
     if "directions" not in link:
         return samples
     up, down = (Direction.from_facts(facts) for facts in link["directions"])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from dataclasses import dataclass
 from platform import node
 from typing import Final
 
@@ -11,37 +12,38 @@ from s2a_bench.clock import now_ns, realtime_offset_ns
 from s2a_bench.errors import RequestFailed
 from s2a_bench.machine.clocks import WallClock
 
-COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
-    "chrony": ("chronyc", "-c", "tracking"),
-    "ptp": ("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET"),
-}
 PATIENCE_S: Final = 3.0
 FRESH_NS: Final = 10**9
 """A reading is used again for so long, whatever clients request."""
 
 
-_read: dict[str, WallClock] = {}
+@dataclass(slots=True)
+class Asked:
+    """A program that knows the error of the wall clock."""
 
+    system: str
+    command: tuple[str, ...]
+    error_s: Callable[[str], float]
+    """Reads the error off its output."""
+    known: WallClock | None = None
 
-def wall_clock(system: str) -> WallClock:
-    """Read the wall clock, and its error by a ``system`` of `COMMANDS`; raises RequestFailed if it tells none."""
-    known = _read.get(system)
-    if known and now_ns() - known.read_ns < FRESH_NS:
-        return known
-    command = COMMANDS[system]
-    try:
-        done = subprocess.run(  # noqa: S603 - one of two fixed commands
-            command, capture_output=True, text=True, timeout=PATIENCE_S, check=True
-        )
-        error_s = ERRORS[system](done.stdout)
-    except (OSError, subprocess.SubprocessError, ValueError, LookupError) as error:
-        raise RequestFailed(
-            f"`clock` {system}: '{' '.join(command)}' tells no bound on the host {node()}: {error}"
-        ) from error
-    began_ns, offset_ns = now_ns(), realtime_offset_ns()
-    ended_ns = now_ns()
-    _read[system] = WallClock(offset_ns, round(error_s * 1e9) + ended_ns - began_ns, ended_ns)
-    return _read[system]
+    def __call__(self) -> WallClock:
+        """Read the wall clock, and ask for its error; raises RequestFailed if that is not told."""
+        if self.known and now_ns() - self.known.read_ns < FRESH_NS:
+            return self.known
+        try:
+            done = subprocess.run(  # noqa: S603 - one of two fixed commands
+                self.command, capture_output=True, text=True, timeout=PATIENCE_S, check=True
+            )
+            error_s = self.error_s(done.stdout)
+        except (OSError, subprocess.SubprocessError, ValueError, LookupError) as error:
+            raise RequestFailed(
+                f"`clock` {self.system}: '{' '.join(self.command)}' tells no bound on the host {node()}: {error}"
+            ) from error
+        began_ns, offset_ns = now_ns(), realtime_offset_ns()
+        ended_ns = now_ns()
+        self.known = WallClock(offset_ns, round(error_s * 1e9) + ended_ns - began_ns, ended_ns)
+        return self.known
 
 
 def chrony_error_s(csv: str) -> float:
@@ -59,12 +61,5 @@ def ptp_error_s(text: str) -> float:
     return (abs(offset_ns) + delay_ns) / 1e9
 
 
-ERRORS: Final[Mapping[str, Callable[[str], float]]] = {"chrony": chrony_error_s, "ptp": ptp_error_s}
-
-
-def chrony() -> WallClock:
-    return wall_clock("chrony")
-
-
-def ptp() -> WallClock:
-    return wall_clock("ptp")
+CHRONY: Final = Asked("chrony", ("chronyc", "-c", "tracking"), chrony_error_s)
+PTP: Final = Asked("ptp", ("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET"), ptp_error_s)

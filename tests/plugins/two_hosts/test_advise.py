@@ -18,8 +18,8 @@ import pytest
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments import Experiment
 from s2a_bench.experiments.latency.view.against_bytes import FittedPipeline
+from s2a_bench.plugins.two_hosts.advise import AdviseConfig
 from s2a_bench.plugins.two_hosts.advise import prediction as room
-from s2a_bench.plugins.two_hosts.advise.config import AdviseConfig
 from s2a_bench.plugins.two_hosts.advise.prediction import (
     Advice,
     Tcp,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import chain
 from statistics import median
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from s2a_bench.experiments.requests import (
     observation_of,
     titles,
 )
-from s2a_bench.transport.surroundings import SURROUNDINGS
+from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.figures import (
     WHISKERS,
     WIDE_SPREAD,
@@ -126,7 +127,7 @@ def latency_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str,
         "latency_bars": lambda: build_latency_bars(run, against_paper=against_paper),
         "stages": lambda: build_stage_breakdown(run),
         "distribution": lambda: build_latency_distribution(run),
-        **{name: figure for _, each in SURROUNDINGS.loaded() for name, figure in each.figures(run).items()},
+        **dict(chain.from_iterable(figures(run).items() for figures in shown("figures"))),
     }
 
 

@@ -12,7 +12,7 @@ from s2a_bench.cli.output import Json, print_json, print_line, print_table
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.requests import cells_of
 from s2a_bench.inference import STAND_IN
-from s2a_bench.plugins.two_hosts.advise.config import CHECKED, LONGEST_PAUSE_S, AdviseConfig
+from s2a_bench.plugins.two_hosts.advise import CHECKED, LONGEST_PAUSE_S, AdviseConfig
 from s2a_bench.store.run import read_run
 from s2a_bench.transport import ACTIONS
 
