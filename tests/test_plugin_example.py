@@ -299,6 +299,21 @@ def test_its_experiment_is_a_command_and_a_function(
     assert done.stdout.strip() == "1", done.stderr
 
 
+def test_its_surroundings_are_options_manifest_and_columns(command: Command, tmp_path: Path) -> None:
+    done = command("latency", "--transport", "loopback", "--toy-room", "34.3", *SMALL, "--json")
+    assert json.loads(done.stdout)["cells"][0]["toy_walk_ms"]["median"] == 100
+    manifest = json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())
+    assert (manifest["toy_room"], manifest["configuration"]["toy_room"]) == (34.3, 34.3)
+    assert "entering the room" in done.stderr
+    assert "--toy-room has place for three" in command("latency", "--toy-room", "1", *SMALL, code=2).stderr
+
+
+def test_its_command_is_one_of_the_commands(command: Command) -> None:
+    assert re.search("toy-hello +Greet somebody.", command("--help").stdout)
+    assert command("toy-hello", "--name", "you").stdout == "hello, you\n"
+    assert json.loads(command("toy-hello", "--json").stdout) == {"hello": "robot"}
+
+
 def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
     installed: dict[str, str], tmp_path: Path
 ) -> None:
@@ -306,6 +321,7 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
     broken.mkdir(parents=True)
     (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: s2a-broken\nVersion: 1.0\n")
     kinds = ("transports", "experiments", "policies", "dialects", "engines", "frame_sources", "middlewares")
+    kinds += ("surroundings", "commands")
     (broken / "entry_points.txt").write_text(
         "".join(f"[s2a_bench.{kind}]\nbroken = s2a_broken:THING\n" for kind in kinds)
     )

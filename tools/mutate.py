@@ -49,12 +49,9 @@ TESTS = {
     "library.py": ["tests/test_library.py"],
     "transport": ["tests/transport", "tests/harness/test_serving.py", "tests/machine/test_doctor.py"],
     "report/claims": [f"tests/report/test_claim{part}.py" for part in ("_rules", "_texts", "s", "_cases")],
-    "report/advise": ["tests/report/test_advise.py"],
     "report/compare/gates.py": ["tests/report/test_compare.py"],
     "experiments/capacity": ["tests/experiments/capacity"],
-    "harness/clocks.py": ["tests/harness/test_clocks.py"],
-    "harness/links": ["tests/harness/links"],
-    "boards/links.py": ["tests/boards/test_links.py"],
+    "plugins/two_hosts": ["tests/plugins/two_hosts"],
 }
 """Package -> the tests that belong to it."""
 WITH_ARGUMENTS = ("VariableReplacer", "VariableInserter")

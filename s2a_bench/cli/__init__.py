@@ -11,6 +11,7 @@ import select
 import signal
 import subprocess
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from errno import EAGAIN, EDQUOT, EMFILE, ENFILE, ENOMEM, ENOSPC
 from typing import Any, ClassVar, Final
@@ -25,24 +26,21 @@ from s2a_bench.cli.ros_args import folded
 from s2a_bench.errors import NotPermitted, S2AError
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.machine import tuning
-from s2a_bench.registry import missing_entry_points
+from s2a_bench.registry import Registry, missing_entry_points
 
 INTERRUPTED: Final = 130
 AGAIN_S: Final = 0.01
+COMMANDS: Final[Registry[tuple[str, str]]] = Registry("commands", "command", {})
+"""Commands of installed packages, declared as in `Commands.lazy`: declarations import nothing."""
 
 
 class TopCommands(Commands):
-    """All commands: those listed below, and the experiments."""
+    """All commands: those listed below, those of other packages, and the experiments."""
 
     experiments = EXPERIMENTS
-    lazy: ClassVar[dict[str, tuple[str, str]]] = {
+    lazy: ClassVar[Mapping[str, tuple[str, str]]] = {
         name: (f"s2a_bench.cli.{where}", about)
         for name, where, about in (
-            (
-                "advise",
-                "report:advise",
-                "Advise on a transport for a link, from a sweep of transports: what is fastest.",
-            ),
             (
                 "compare",
                 "report:compare",
@@ -63,7 +61,7 @@ class TopCommands(Commands):
             ),
             ("sweep", "sweep:sweep", "Run a command for every cell of a grid; an interrupted sweep can be resumed."),
         )
-    }
+    } | dict(COMMANDS.loaded())
 
 
 app = typer.Typer(

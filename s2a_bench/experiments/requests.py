@@ -15,7 +15,6 @@ from functools import cached_property
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
-from s2a_bench.boards.links import Direction, bound_s
 from s2a_bench.experiments import Comparable, Metric, Subject, by_name
 from s2a_bench.facts import (
     END_N,
@@ -40,6 +39,7 @@ from s2a_bench.store.schema import Count, about, with_fields
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
 from s2a_bench.transport import PAYLOADS, declared_transport
 from s2a_bench.transport.pipeline import without
+from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import summaries, summaries_of_ends
 from s2a_bench.writers.tables import DUMMY, EMULATED, PAPERS, Note
@@ -380,7 +380,8 @@ def split(runs: Iterable[StoredRun]) -> Split:
 
 def _cells(run: StoredRun, samples: pd.DataFrame) -> list[RequestCell]:
     tokens, stages = run.tokens, run.stages
-    samples = _bounded(samples, run.manifest.get("link") or {})
+    for with_columns in shown("columns"):
+        samples = with_columns(run, samples)
     mixed = any("payload=" in name for name in run.manifest["configuration"].get("transports", ()))
     cells = []
     for name in map(str, samples["cell"].unique()):
@@ -391,15 +392,6 @@ def _cells(run: StoredRun, samples: pd.DataFrame) -> list[RequestCell]:
         warmups, errors = int(mine["warmup"].sum()), int((failed & ~mine["warmup"]).sum())
         cells.append(RequestCell(name, about, good, streamed, warmups, errors, stages, origin.emulated, mixed, sends))
     return sorted(cells, key=_place)
-
-
-def _bounded(samples: pd.DataFrame, link: Mapping[str, Any]) -> pd.DataFrame:
-    """Add the column ``bound_ns`` to requests on an emulated link that bring their pictures."""
-    if "directions" not in link:
-        return samples
-    up, down = (Direction.from_facts(facts) for facts in link["directions"])
-    sent = samples["payload_bytes"].where(samples["mode"] == "request").astype("float64")
-    return samples.assign(bound_ns=sent.map(lambda size: 1e9 * bound_s((up, down), size), na_action="ignore"))
 
 
 def payloads_of(cells: Iterable[RequestCell]) -> list[str]:

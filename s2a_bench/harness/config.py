@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
 from pydantic import create_model
 
 from s2a_bench import extras
-from s2a_bench.boards.links import LinkProfile, load_link, published
 from s2a_bench.errors import UsageError
 from s2a_bench.frames import SOURCES
 from s2a_bench.harness import RECORD
@@ -31,6 +30,7 @@ from s2a_bench.transport import (
 )
 from s2a_bench.transport.defaults import COMPARED, acting_over
 from s2a_bench.transport.pipeline import Pipeline, answer_over, carries_alone, pipelines, require_payload
+from s2a_bench.transport.surroundings import SURROUNDINGS, Surroundings
 
 LARGEST = 16_384
 
@@ -55,16 +55,8 @@ else:  # a group of options for each transport; options that only `serve` has ar
     )
 
 
-class RequestsConfig(Options):
-    PANEL: ClassVar[str] = "Requests"
-    QUICK: ClassVar[dict[str, int]] = {"requests": 10, "warmup": 2, "max_tokens": 8}
-    """The defaults under ``quick``."""
-    COUNTS_TOKENS: ClassVar[str] = "this command counts tokens"
-    """Why the command refuses answers of actions; empty: it accepts them."""
-    EVERY_VARIANT: ClassVar[bool] = True
-    """Whether a transport named without a variant stands for all its default variants; else for its first."""
-    OF_ENGINE: ClassVar[tuple[str, ...]] = ()
-    """The engine's options that names of pipelines may set, so that cells of one run have different engines."""
+class SentConfig(Options):
+    """What is sent, and how."""
 
     transports: Names = option(
         COMPARED,
@@ -108,19 +100,26 @@ class RequestsConfig(Options):
         panel=TRANSPORT,
         first=True,
     )
-    link: str = option(
-        "",
-        f"emulated link between client and servers: {', '.join(published())}, a FILE (TOML, a trace as CSV), or "
-        "rate=UP/DOWN,delay=MS,jitter=MS,loss=SHARE, also after a name [default: none]",
-        panel=TRANSPORT,
-        names=published,
-    )
-    clock: Literal["", "chrony", "ptp"] = option(
-        "",
-        "with a server of ours on another host: chrony, ptp also bound the clocks' offset, if they run on both hosts "
-        "[default: exchanges alone]",
-        panel=TRANSPORT,
-    )
+
+
+if TYPE_CHECKING:
+    Surrounded: TypeAlias = SentConfig
+else:  # with the options of everything that may surround a run
+    SURROUNDING = dict.fromkeys(each.options for _, each in SURROUNDINGS.loaded())
+    Surrounded = create_model("Surrounded", __base__=(*reversed(SURROUNDING), SentConfig))
+
+
+class RequestsConfig(Surrounded):
+    PANEL: ClassVar[str] = "Requests"
+    QUICK: ClassVar[dict[str, int]] = {"requests": 10, "warmup": 2, "max_tokens": 8}
+    """The defaults under ``quick``."""
+    COUNTS_TOKENS: ClassVar[str] = "this command counts tokens"
+    """Why the command refuses answers of actions; empty: it accepts them."""
+    EVERY_VARIANT: ClassVar[bool] = True
+    """Whether a transport named without a variant stands for all its default variants; else for its first."""
+    OF_ENGINE: ClassVar[tuple[str, ...]] = ()
+    """The engine's options that names of pipelines may set, so that cells of one run have different engines."""
+
     engine: EngineConfig = group(EngineConfig)
     requests: int = option(50, "requests a pipeline [default: 50, quick: 10]", ge=1, le=10**9, first=True)
     warmup: int = option(5, "warm-ups a pipeline, kept and marked [default: 5, quick: 2]", ge=0, le=10**9)
@@ -188,8 +187,9 @@ class RequestsConfig(Options):
         )
 
     @cached_property
-    def link_profile(self) -> LinkProfile | None:
-        return load_link(self.link) if self.link else None
+    def surroundings(self) -> tuple[Surroundings, ...]:
+        asked = (each.of(self, self.pipelines) for _, each in SURROUNDINGS.loaded())
+        return tuple(each for each in asked if each)
 
     @property
     def usual_payloads(self) -> tuple[str, ...]:
@@ -284,13 +284,7 @@ class RequestsConfig(Options):
         if self.engine.latency and self.foreign:
             raise UsageError(f"`latency` is about our own servers; leave out `{self.foreign}`")
         self._check_unused()
-        running = next((each.options.external for each in self.pipelines if each.options.external_address), "")
-        if self.clock and not running:
-            raise UsageError("`clock` is about a server of ours on another host; name it with `url`")
-        if self.link_profile and running:
-            raise UsageError(f"`link`: a server that runs already is not behind it; leave out `{running}`")
-        if self.link_profile and (local := [each.name for each in self.pipelines if not each.transport.crosses_links]):
-            raise UsageError(f"`link`: {', '.join(local)} sends nothing over a network; leave it out of `transport`")
+        _ = self.surroundings  # raises UsageError
 
     def _check(self, pipeline: Pipeline) -> None:
         if self.resize and pipeline.payload in {"yuyv", "jpeg-preencoded"}:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from s2a_bench import extras
-from s2a_bench.boards.links import LinkProfile
 from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, facts_json
 from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.frames.stamp import new_nonce
@@ -19,6 +18,7 @@ from s2a_bench.machine.resources import SPENT
 from s2a_bench.trace import path_of
 from s2a_bench.transport import ACTIONS
 from s2a_bench.transport.pipeline import Pipeline
+from s2a_bench.transport.surroundings import Surroundings
 
 LARGE_PICTURE = 640 * 480
 """Pixels above which UDP needs more receive buffer than Linux gives by default."""
@@ -71,8 +71,7 @@ class RequestPlan:
     size: str
     stages: Mapping[str, str]
     """Stage -> group of all transports, in the order of the path."""
-    clock: str = ""
-    """What bounds the wall clocks of two hosts, one of `machine.clocks.COMMANDS`, or nothing."""
+    surroundings: tuple[Surroundings, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +80,6 @@ class RunPlan:
     blocks: BlocksPlan
     feed: FeedPlan
     request: RequestPlan
-    link: LinkProfile | None
-    """Emulated between client and servers."""
     engine: EngineConfig
     """Of all cells; a cell's name may change some of its options."""
     tuned: bool
@@ -136,9 +133,16 @@ def resolve(config: RequestsConfig) -> RunPlan:
         blocks=BlocksPlan(config.requests, config.warmup, config.launches, seed),
         feed=FeedPlan(config.source, config.size, config.fps, seed, nonce, stream, config.cameras, config.resize),
         request=RequestPlan(
-            config.sent_prompt, config.grammar, max_pieces, seed, config.state, config.mode, size, stages, config.clock
+            config.sent_prompt,
+            config.grammar,
+            max_pieces,
+            seed,
+            config.state,
+            config.mode,
+            size,
+            stages,
+            config.surroundings,
         ),
-        link=config.link_profile,
         engine=engine,
         tuned=config.tuned,
         timeout_s=config.timeout_s,

@@ -17,10 +17,7 @@ from s2a_bench.clock import Clock, SystemClock, now_ns
 from s2a_bench.errors import TransportError
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
-from s2a_bench.harness.clocks import Offset
 from s2a_bench.harness.feed import Camera, Feed, RequestFeed, StreamFeed
-from s2a_bench.harness.links import EmulatedLink, emulated
-from s2a_bench.harness.links.probe import probed
 from s2a_bench.harness.plan import BlocksPlan, FeedPlan, RunPlan
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.servers import ServerSet, on_files
@@ -38,6 +35,7 @@ from s2a_bench.store.schema import Table
 from s2a_bench.trace import Trace, mark_cost_ns
 from s2a_bench.transport import Client, Wiring
 from s2a_bench.transport.pipeline import Pipeline
+from s2a_bench.transport.surroundings import Around
 from s2a_bench.types import Request
 
 GIVE_UP_AFTER = 5
@@ -116,7 +114,7 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
         "process": is_allowed(),
     }
     with ExitStack() as stack:
-        link = stack.enter_context(emulated(plan.link)) if plan.link else None
+        around = [stack.enter_context(each.around()) for each in plan.request.surroundings]
         sources = _Sources(task, plan.feed, stack)
         packages = [package for cell in plan.cells for package in cell.transport.packages]
         facts = {"environment": environment.collect(packages), "mark_cost_ns": round(mark_cost_ns(), 1)}
@@ -125,14 +123,13 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
         for table in task.tables:
             writer.append(table, [])
         progress.opened(writer.path)
-        if link:
-            progress.stage(f"probing the link {link.profile.name}")
-            writer.update(link=link.facts() | probed(link))
+        for each in around:
+            writer.update(**each.facts(progress.stage))
         if plan.finds_model and extras.installed("gguf"):  # without gguf no file is read
             plan = replace(plan, engine=on_files(plan.engine, progress))
         sleeps = {cell.name: sleep for cell in plan.cells if (sleep := cell.transport.sleep)}
         guard = SampleGuard({cell.name: cell.options.against_loss for cell in plan.cells}, sleeps)
-        run = _Run(task, plan, sources, writer, progress, guard, link)
+        run = _Run(task, plan, sources, writer, progress, guard, around)
         if plan.record is not None:
             run.recorder = RunRecorder(plan.record, plan.namespace, live=plan.feed.stream)
             stack.enter_context(run.recorder)
@@ -176,7 +173,7 @@ class _Run:
     writer: RunWriter
     progress: Progress
     guard: SampleGuard
-    link: EmulatedLink | None = None
+    around: Sequence[Around]
     recorder: RunRecorder | None = None
     warnings: list[RunWarning] = field(default_factory=list)
 
@@ -203,7 +200,7 @@ class _Run:
 
     def _launch(self, number: int, stack: ExitStack) -> None:
         writer = self.writer
-        servers = ServerSet(self.plan, stack, writer.path, number, self.link)
+        servers = ServerSet(self.plan, stack, writer.path, number, self.around)
         if servers.count:
             self.progress.stage(f"starting {servers.count} server{'s' if servers.count > 1 else ''}")
         facts = servers.start()
@@ -245,8 +242,8 @@ class _Run:
         finally:
             sampler.flush(writer)
             writer.update(resources=sampler.describe())
-            if self.link:
-                writer.update(link={"relay": self.link.statistics()})
+            for each in self.around:
+                writer.update(**each.totals())
 
     def _wait_for(self, servers: ServerSet, cell: Pipeline) -> None:
         """Return when the server answers a request that is not measured, be it with an error that the run meets too."""
@@ -274,7 +271,7 @@ class _Run:
         plan, recorder = self.plan.feed, self.recorder
         clients = stack.enter_context(ExitStack())  # closed after the camera, which publishes through them, has stopped
         camera: Camera | None = None
-        offsets: dict[str, Offset] = {}
+        clocks: dict[str, Any] = {}
         if plan.stream:
             source = self.sources.of("camera", "camera")
             camera = Camera(source, plan.fps, on_frame=recorder.frame if recorder else None)
@@ -294,7 +291,7 @@ class _Run:
                 source = self.sources.of(user, user if cell.black_box or place else "")
                 preencoded = cell.payload == "jpeg-preencoded"
                 feed = RequestFeed(source, preencoded=preencoded, cameras=plan.cameras, size=plan.resize)
-            about = self.plan.request, recorder, sampler, servers.origin(cell), offsets
+            about = self.plan.request, recorder, sampler, servers.origin(cell), clocks
             made.append(Session(cell, client, feed, *about))
             yield made[0]
 

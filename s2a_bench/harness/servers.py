@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from pkgutil import resolve_name
 from threading import Thread
@@ -13,7 +13,6 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from s2a_bench.errors import ServerDied
-from s2a_bench.harness.links import EmulatedLink
 from s2a_bench.harness.plan import RunPlan
 from s2a_bench.harness.processes import OwnServer, ServerProcess, start_program
 from s2a_bench.harness.serving import ServerJob, engine_handler
@@ -26,6 +25,7 @@ from s2a_bench.transport import Client, Wiring, open_client, open_server
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.transport.risks import is_local
+from s2a_bench.transport.surroundings import Around
 
 LAST_MOMENT_S = 0.5
 """A killed process breaks its connections before the kernel reports its end: on a busy machine, long before."""
@@ -54,10 +54,10 @@ class ServerSet:
     """The servers of a run; cells whose server would get the same settings share one."""
 
     def __init__(
-        self, plan: RunPlan, stack: ExitStack, folder: Path, launch: int = 0, link: EmulatedLink | None = None
+        self, plan: RunPlan, stack: ExitStack, folder: Path, launch: int = 0, around: Sequence[Around] = ()
     ) -> None:
         """Prepare; ``stack`` stops the servers. The names of servers of a later launch than 0 contain its number."""
-        self._link = link
+        self._around = around
         self._plan = plan
         self._suffix = f"-launch-{launch + 1}" if launch else ""
         self._stack = stack
@@ -73,7 +73,9 @@ class ServerSet:
 
     def start(self) -> dict[str, Any]:
         """Start all servers and wait until they are ready; return the facts that each reports."""
-        with self._link.server_side() if self._link else nullcontext():
+        with ExitStack() as side:
+            for each in self._around:
+                side.enter_context(each.server_side())
             for pipeline in self._plan.cells:
                 if pipeline.server not in self._servers:
                     self._servers[pipeline.server] = self._launch(pipeline)
@@ -147,8 +149,9 @@ class ServerSet:
             return Provenance.of_engine(self._local_facts, link=NONE)
         if server.process:
             origin = Provenance.of_engine(server.process.facts.get("engine", {}), link="real")
-            link = self._link and self._link.profile
-            return replace(origin, link="emulated", link_profile=link.about) if link else origin
+            for each in self._around:
+                origin = each.origin(origin)
+            return origin
         return Provenance(link="real" if is_local(urlsplit(server.address).hostname or "") else UNKNOWN)
 
     def client(self, pipeline: Pipeline) -> Client:

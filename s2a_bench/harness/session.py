@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 from s2a_bench.act.events import PlanFeed
 from s2a_bench.clock import clock_id, now_ns
@@ -30,7 +31,6 @@ from s2a_bench.facts import (
     PROMPT_N,
 )
 from s2a_bench.frames import open_source
-from s2a_bench.harness.clocks import Joined, Offset, RemoteClock
 from s2a_bench.harness.feed import Feed, RequestFeed, StreamedFrame, StreamFeed
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint, together
 from s2a_bench.harness.plan import RequestPlan
@@ -44,6 +44,7 @@ from s2a_bench.trace import STAGES, Mark, Trace
 from s2a_bench.transport import LOSSLESS, Client
 from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.transport.serving import CLOCK_PROMPT
+from s2a_bench.transport.surroundings import Joined
 from s2a_bench.types import Frame, Piece, Request, Token
 
 FATAL = (ServerDied, SourceError, UsageError, EngineError)
@@ -114,11 +115,11 @@ class Session:
         recorder: RunRecorder | None = None,
         sampler: ResourceSampler | None = None,
         origin: Provenance = UNKNOWN_ORIGIN,
-        offsets: dict[str, Offset] | None = None,
+        clocks: dict[str, Any] | None = None,
     ) -> None:
         """Measure ``cell`` with an open client. ``origin`` is replaced by the provenance that an answer carries.
 
-        ``offsets`` of other hosts' clocks are shared by sessions; see `RemoteClock` for none.
+        ``clocks`` is what sessions share of other hosts' clocks; see `Surroundings.clock` for none.
         """
         self.origin = origin
         self.cell = cell
@@ -128,7 +129,8 @@ class Session:
         self._recorder = recorder
         self._sampler = sampler or ResourceSampler({}, 1)
         self._frames: dict[int, StreamedFrame] = {}
-        self._clock = RemoteClock(self._exchange, offsets, request.clock)
+        others = (each.clock(self._exchange, clocks) for each in request.surroundings)
+        self._clock = next(filter(None, others), None)
         self._pictures = 0
         """Of the last request."""
         self._absent, self.answered = 0, False
@@ -142,7 +144,8 @@ class Session:
         """Make one request; a failure becomes a row with its error, and `Measured.fatal` if it ends the run."""
         self.busy = True
         try:
-            self._clock.refresh()
+            if self._clock:
+                self._clock.refresh()
             return self._measure(place, context)
         finally:
             self.busy = False
@@ -264,7 +267,7 @@ class Session:
         error = error or self._doubt(trace, rgb_source, rgb_engine)
         started_ns = inference_start_ns(trace)
         age_ns = started_ns - captured_ns if started_ns is not None and captured_ns >= 0 else None
-        if joined:
+        if joined or (trace.remote and trace.remote.clock != clock_id()):
             facts.pop(CAMERA_STAMP_AGE_MS, None)  # the difference of two hosts' wall clocks
         self.prompt_n = _whole(facts.get(PROMPT_N)) or self.prompt_n
         sample = SampleRow(
@@ -315,7 +318,7 @@ class Session:
 
     def _joined(self, trace: Trace, seen: list[tuple[Piece, int]]) -> tuple[Joined | None, TransportError | None]:
         """Put the report of a server on another host on this host's clock, or return why that cannot be done."""
-        if trace.remote is None or trace.remote.clock == clock_id():
+        if self._clock is None or trace.remote is None or trace.remote.clock == clock_id():
             return None, None
         try:
             return self._clock.join(trace, seen[-1][1]), None

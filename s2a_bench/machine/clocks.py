@@ -1,22 +1,14 @@
-"""The wall clock's error as chrony or PTP bounds it, for `--clock`."""
+"""The wall clock, and how far it may be off, as programs of this host know that installed packages ask."""
 
 from __future__ import annotations
 
-import subprocess
-from collections.abc import Callable, Mapping
-from platform import node
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
-from s2a_bench.clock import now_ns, realtime_offset_ns
-from s2a_bench.errors import RequestFailed
+from s2a_bench.registry import Registry
 
-COMMANDS: Final[Mapping[str, tuple[str, ...]]] = {
-    "chrony": ("chronyc", "-c", "tracking"),
-    "ptp": ("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET"),
-}
-PATIENCE_S: Final = 3.0
-FRESH_NS: Final = 10**9
-"""A reading is used again for so long, whatever clients request."""
+REALTIME_MS, REALTIME_ERROR_MS = "realtime_ms", "realtime_error_ms"
+"""Facts: CLOCK_REALTIME less CLOCK_MONOTONIC, and the most that the former is off."""
 
 
 class WallClock(NamedTuple):
@@ -27,43 +19,5 @@ class WallClock(NamedTuple):
     read_ns: int
 
 
-_read: dict[str, WallClock] = {}
-
-
-def wall_clock(system: str) -> WallClock:
-    """Read the wall clock, and its error by a ``system`` of `COMMANDS`; raises RequestFailed if it tells none."""
-    known = _read.get(system)
-    if known and now_ns() - known.read_ns < FRESH_NS:
-        return known
-    command = COMMANDS[system]
-    try:
-        done = subprocess.run(  # noqa: S603 - one of two fixed commands
-            command, capture_output=True, text=True, timeout=PATIENCE_S, check=True
-        )
-        error_s = ERRORS[system](done.stdout)
-    except (OSError, subprocess.SubprocessError, ValueError, LookupError) as error:
-        raise RequestFailed(
-            f"`clock` {system}: '{' '.join(command)}' tells no bound on the host {node()}: {error}"
-        ) from error
-    began_ns, offset_ns = now_ns(), realtime_offset_ns()
-    ended_ns = now_ns()
-    _read[system] = WallClock(offset_ns, round(error_s * 1e9) + ended_ns - began_ns, ended_ns)
-    return _read[system]
-
-
-def chrony_error_s(csv: str) -> float:
-    """Return |offset| + root dispersion + root delay / 2 of ``chronyc -c tracking``, RFC 5905's root distance."""
-    fields = csv.strip().split(",")
-    if fields[13] != "Normal":
-        raise ValueError(f"chronyd is not synchronised ({fields[13]})")
-    return abs(float(fields[4])) + float(fields[11]) + float(fields[10]) / 2
-
-
-def ptp_error_s(text: str) -> float:
-    """Return |offset| + mean path delay of pmc's CURRENT_DATA_SET: the path may be as asymmetric as it is long."""
-    words = text.split()
-    offset_ns, delay_ns = (float(words[words.index(name) + 1]) for name in ("offsetFromMaster", "meanPathDelay"))
-    return (abs(offset_ns) + delay_ns) / 1e9
-
-
-ERRORS: Final[Mapping[str, Callable[[str], float]]] = {"chrony": chrony_error_s, "ptp": ptp_error_s}
+WALL_CLOCKS: Final[Registry[Callable[[], WallClock]]] = Registry("wall_clocks", "clock", {})
+"""What knows the error -> a function that reads both; it raises RequestFailed if there is nothing to be known."""

@@ -34,6 +34,11 @@ PLUGINS = {
             "longitudinal, embedded, carla",
         )
     ],
+    "two_hosts": [
+        Named(("latency", "--link", "4g"), "No such option: --link", ("latency", "--help-all"), "--link "),
+        Named(("latency", "--clock", "ptp"), "No such option: --clock", ("latency", "--help-all"), "--clock "),
+        Named(("advise", "--link", "4g"), "No such command 'advise'", ("--help",), "advise  "),
+    ],
     "rclpy": [
         Named(
             ("latency", "--middleware", "rclpy"),

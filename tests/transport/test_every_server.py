@@ -15,7 +15,7 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import PortInUse, RequestFailed, TransportError, UsageError
-from s2a_bench.harness.clocks import Exchange
+from s2a_bench.plugins.two_hosts.clocks import Exchange
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import ACTIONS, TOKENS, Client, Handler, open_client, open_server, risks

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.experiments.requests import (
@@ -23,6 +24,7 @@ from s2a_bench.experiments.requests import (
 from s2a_bench.stats import Summary, SummaryEnds, summary_of
 from s2a_bench.store.schema import Count, about
 from s2a_bench.trace import GROUPS
+from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 from s2a_bench.writers.json import frame, ratio_entry, summaries, summaries_of_ends
 
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
     from s2a_bench.stats import Ratio
     from s2a_bench.store.run import StoredRun
 
+AROUND: Final[tuple[RequestMetric, ...]] = tuple(chain.from_iterable(shown("metrics")))
+"""What is known of a request by what surrounds its run, beside e2e without inference."""
 METRICS: Final = (
     RequestMetric(
         "e2e_without_inference",
@@ -55,19 +59,7 @@ METRICS: Final = (
     RequestMetric(
         "frame_age", "ms", about="Age of the frame when inference starts.", ends=lambda cell: cell.ends("frame_age")
     ),
-    RequestMetric(
-        "bound",
-        "ms",
-        "neither",
-        title="bound",
-        about="The least time on the run's emulated link: the payload up at its rate, and both delays.",
-    ),
-    RequestMetric(
-        "bound_ratio",
-        title="measured / bound",
-        about="e2e without inference over the bound: what a better transport could still win.",
-        of=lambda cell: cell.column("e2e_without_inference") / cell.column("bound"),
-    ),
+    *AROUND,
     *TOKEN_METRICS,
     RequestMetric("residual", "ms", title="residual", about="The time between the stages."),
     RequestMetric("residual_share", about="The residual as a share of e2e without inference."),

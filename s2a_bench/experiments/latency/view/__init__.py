@@ -8,7 +8,7 @@ from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments import Shown, Tables
-from s2a_bench.experiments.latency.metrics import METRICS, latency_csv, latency_json
+from s2a_bench.experiments.latency.metrics import AROUND, METRICS, latency_csv, latency_json
 from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.requests import (
     Ends,
@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from s2a_bench.stats import Ratio
     from s2a_bench.store.run import StoredRun
 
-BOUNDS = {"e2e_without_inference": ("bound", "bound_ratio")}
+BESIDE = {"e2e_without_inference": tuple(each.name for each in AROUND)}
 _STAGE_CELLS = 5
 """With more cells than this a narrow table has the cells as rows."""
 _MOST = 6
@@ -182,7 +182,7 @@ def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> Text
     bounds = [
         each
         for each in METRICS
-        if each.name in BOUNDS.get(metric, ()) and any(cell.values(each).size for cell in cells)
+        if each.name in BESIDE.get(metric, ()) and any(cell.values(each).size for cell in cells)
     ]
     rows = []
     found: list[Ratio] = []

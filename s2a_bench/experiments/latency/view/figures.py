@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import chain
 from statistics import median
 from typing import TYPE_CHECKING
 
-from s2a_bench.boards.links import LinkProfile
 from s2a_bench.experiments.paper import CAVEAT, LABEL, paper_latency
 from s2a_bench.experiments.requests import (
     RequestCell,
@@ -18,6 +18,7 @@ from s2a_bench.experiments.requests import (
     observation_of,
     titles,
 )
+from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.figures import (
     WHISKERS,
     WIDE_SPREAD,
@@ -119,35 +120,14 @@ def build_latency_distribution(run: StoredRun) -> Figure:
     return build_distribution(_caption(run, cells, "Distribution", metric), lines, "samples", _axis_label(metric))
 
 
-def build_link(run: StoredRun) -> Figure:
-    """Draw what a probe measured of the emulated link, as a share of its profile, with the tolerance."""
-    link = run.manifest["link"]
-    about = LinkProfile.model_construct(**link["profile"])  # runs of older versions lack defaults
-    bars, others = [], []
-    for found in link["probe"]["quantities"]:
-        what, profile, measured = found["what"], found["profile"], found["measured"]
-        if found["tolerance"] < profile:
-            band = tuple(100 * (1 + sign * found["tolerance"] / profile) for sign in (-1, 1))
-            bars.append(Bar(what, 100 * measured / profile, band, f"{number(measured)} {found['unit']}".rstrip()))
-        else:
-            others.append(f"{what}: {number(measured)} of {number(profile)} {found['unit']}".rstrip())
-    notes = (f"The line is what the probe allows{''.join(f'; {each}' for each in others)}.", about.source)
-    return build_bars((f"Emulated link {about.name}, probed before the run", *notes), bars, "share (%)")
-
-
 def latency_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
     if not _shown(run)[0]:
         return {}
-    probe = (run.manifest.get("link") or {}).get("probe") or {}
     return {
         "latency_bars": lambda: build_latency_bars(run, against_paper=against_paper),
         "stages": lambda: build_stage_breakdown(run),
         "distribution": lambda: build_latency_distribution(run),
-        **(
-            {"link": lambda: build_link(run)}
-            if any(each["tolerance"] < each["profile"] for each in probe.get("quantities", ()))
-            else {}
-        ),
+        **dict(chain.from_iterable(figures(run).items() for figures in shown("figures"))),
     }
 
 

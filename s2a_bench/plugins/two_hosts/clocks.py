@@ -19,15 +19,16 @@ from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise, product
 from math import ceil, floor
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import ClockMoved, RequestFailed, S2AError
-from s2a_bench.machine.clocks import FRESH_NS, wall_clock
+from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WALL_CLOCKS
+from s2a_bench.plugins.two_hosts.wall_clocks import FRESH_NS
 from s2a_bench.trace import Trace
-from s2a_bench.transport.serving import REALTIME_ERROR_MS, REALTIME_MS
+from s2a_bench.transport.surroundings import Joined
 
 WINDOW_NS: Final = 60 * 10**9
 KEPT: Final = 2000
@@ -188,31 +189,20 @@ def _lower_hull(points: Iterable[Point]) -> list[Point]:
     return hull[:: len(hull) // VERTICES + 1]
 
 
-@dataclass(frozen=True, slots=True)
-class Joined:
-    """How far the stamps of a report may be off, once they are on this host's clock."""
-
-    error_ns: int
-    """From the last byte packed to the first piece, either way."""
-    early_ns: int
-    late_ns: int
-    """From the reception of the frame to the last piece: how much earlier and later the true times may be."""
-
-
 class RemoteClock:
     """The offset of one server's clock; nothing is exchanged before `join` has met it."""
 
-    def __init__(self, exchange: Callable[[str], Trace], offsets: dict[str, Offset] | None, system: str = "") -> None:
+    def __init__(self, exchange: Callable[[str], Trace], offsets: dict[str, Any] | None, system: str = "") -> None:
         """``exchange`` makes a request for its marks alone; ``offsets``, by clock, are those that others estimate too.
 
         Without ``offsets`` nothing is exchanged, and the requests alone bound the offset, more widely.
 
-        ``exchange`` raises S2AError; its argument is ``system``, one of `machine.clocks.COMMANDS` or "", where the
+        ``exchange`` raises S2AError; its argument is ``system``, one of `WALL_CLOCKS` or "", where the
         server's wall clock is wanted.
         """
         self._exchange, self._system = exchange, system
         self._exchanges = offsets is not None
-        self._offsets = {} if offsets is None else offsets
+        self._offsets: dict[str, Offset] = {} if offsets is None else offsets
         self._id = ""
         self._last_ns = 0
 
@@ -256,7 +246,7 @@ class RemoteClock:
 
     def _compare_wall_clocks(self) -> None:
         """Bound the offset by what both hosts know of their wall clocks' errors; raises S2AError."""
-        trace, ours = self._exchange(self._system), wall_clock(self._system)
+        trace, ours = self._exchange(self._system), WALL_CLOCKS[self._system]()
         if not trace.facts.keys() >= {REALTIME_MS, REALTIME_ERROR_MS}:
             raise RequestFailed(f"`clock` {self._system}: the server does not tell its wall clock; leave it out")
         theirs_ns, error_ns = (round(trace.facts[name] * 1e6) for name in (REALTIME_MS, REALTIME_ERROR_MS))

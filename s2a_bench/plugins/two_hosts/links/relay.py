@@ -1,8 +1,8 @@
 """The relay of an emulated link: packets between two TUN devices, held in a heap until they are due.
 
-``python -m s2a_bench.harness.links.relay`` reads one JSON line from standard input: the devices' descriptors, and both
-directions. It answers each further line with its statistics, and ends with its input. It carries about 1 Gbit/s, so
-that neither tc nor netem is needed, which not every kernel has.
+``python -m s2a_bench.plugins.two_hosts.links.relay`` reads one JSON line from standard input: the devices'
+descriptors, and both directions. It answers each further line with its statistics, and ends with its input. It
+carries about 1 Gbit/s, so that neither tc nor netem is needed, which not every kernel has.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from select import select
 from statistics import median
 from typing import Any, Final
 
-from s2a_bench.boards.links import Direction, Step
 from s2a_bench.clock import now_ns
+from s2a_bench.plugins.two_hosts.profiles import Direction, Step
 
 PACKET_BYTES: Final = 2048
 AT_ONCE: Final = 64

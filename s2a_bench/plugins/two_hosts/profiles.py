@@ -19,12 +19,11 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
-from s2a_bench.boards.profile import SHIPPED
 from s2a_bench.errors import UsageError
 from s2a_bench.text import none_of
 from s2a_bench.toml_file import Line, TomlTable, checked, loads, read
 
-PUBLISHED: Final = SHIPPED / "links" / "published.toml"
+PUBLISHED: Final = Path(__file__).with_name("published.toml")
 OPPORTUNITY_BYTES: Final = 1500
 """Bytes of a delivery opportunity in mahimahi's traces."""
 MOST_STEPS: Final = 1_000_000

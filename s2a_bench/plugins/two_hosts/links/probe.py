@@ -9,13 +9,17 @@ from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
 from select import select
 from statistics import median
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.boards.links import DELAY_OFF_MS, OFF, Direction
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.links import CLIENT, SERVER, EmulatedLink
+from s2a_bench.plugins.two_hosts.profiles import DELAY_OFF_MS, OFF, Direction
 
+if TYPE_CHECKING:
+    from s2a_bench.plugins.two_hosts.links import EmulatedLink
+
+SERVER, CLIENT = "127.0.0.1", "127.0.0.2"
+"""Addresses of the two sides."""
 ATTEMPTS: Final = 3
 RATE_S: Final = 1.0
 OFFERED: Final = 1.15

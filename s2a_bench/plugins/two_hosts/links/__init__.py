@@ -14,17 +14,19 @@ import json
 import os
 import socket
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
-from s2a_bench.boards.links import Direction, LinkProfile
 from s2a_bench.errors import NotPermitted, UsageError
 from s2a_bench.harness.processes import OwnProcess
+from s2a_bench.plugins.two_hosts.links.probe import CLIENT, SERVER, probed
+from s2a_bench.plugins.two_hosts.profiles import Direction, LinkProfile
+from s2a_bench.provenance import Provenance
+from s2a_bench.transport.surroundings import Around
 
-SERVER, CLIENT = "127.0.0.1", "127.0.0.2"
 DEVICE: Final = b"link"
 PEERS: Final = {"ROS_STATIC_PEERS": f"{SERVER};{CLIENT}", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 """The environment in which DDS finds the other side; it is on no loopback interface."""
@@ -38,7 +40,7 @@ QUEUE_PACKETS: Final = 10_000
 _libc = ctypes.CDLL(None, use_errno=True)
 
 
-class EmulatedLink:
+class EmulatedLink(Around):
     """A running link; the thread that made it is on the client's side."""
 
     def __init__(self, profile: LinkProfile, server: int, client: int, relay: OwnProcess) -> None:
@@ -55,14 +57,19 @@ class EmulatedLink:
         finally:
             _join(self._client)
 
-    def facts(self) -> dict[str, Any]:
-        """Return what the manifest records of the profile."""
+    def facts(self, say: Callable[[str], None]) -> dict[str, Any]:
+        """Probe the link; return what the manifest records of the profile and the probe."""
+        say(f"probing the link {self.profile.name}")
         directions = [asdict(replace(way, steps=())) for way in self.directions]
-        return {"profile": self.profile.model_dump(exclude_none=True), "directions": directions}
+        described = {"profile": self.profile.model_dump(exclude_none=True), "directions": directions}
+        return {"link": described | probed(self)}
 
-    def statistics(self) -> dict[str, Any]:
+    def origin(self, origin: Provenance) -> Provenance:
+        return replace(origin, link="emulated", link_profile=self.profile.about)
+
+    def totals(self) -> dict[str, Any]:
         """Return what the relay carried and lost, and how late it was."""
-        return self._relay.ask()
+        return {"link": {"relay": self._relay.ask()}}
 
 
 @contextmanager
@@ -89,7 +96,7 @@ def emulated(profile: LinkProfile) -> Iterator[EmulatedLink]:
                     f"`link` needs a TUN device: {error}; `modprobe tun`, or in a container --device /dev/net/tun"
                 ) from None
         job = json.dumps({"devices": devices[::-1], "directions": directions})
-        relay = OwnProcess("relay", "s2a_bench.harness.links.relay", job, None, devices)
+        relay = OwnProcess("relay", "s2a_bench.plugins.two_hosts.links.relay", job, None, devices)
         stack.enter_context(relay)
         relay.wait_ready()
         stack.callback(os.environ.update, {name: os.environ[name] for name in PEERS if name in os.environ})

@@ -67,7 +67,7 @@ def measured(folder: Path, serve: str, measure: str) -> Path:
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
         "CLOCK": f"{OFFSET_NS} {PPM}",
         "ANOTHER_CLOCK": str(HERE / "another_clock"),
-        "PYTHONPATH": str(HERE.parent.parent),
+        "PYTHONPATH": os.pathsep.join((str(HERE.parents[2]), os.environ.get("PYTHONPATH", ""))),
         "S2A_TEST_MARKS": str(folder / "marks.jsonl"),
     }
     command = [*NAMESPACES, "bash", "-c", VETH + RUN]

@@ -15,14 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from s2a_bench.boards.links import Direction, load_link
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments import Experiment
 from s2a_bench.experiments.latency.view.against_bytes import FittedPipeline
-from s2a_bench.harness.links.relay import Shaper
-from s2a_bench.report.advise import AdviseConfig
-from s2a_bench.report.advise import prediction as room
-from s2a_bench.report.advise.prediction import (
+from s2a_bench.plugins.two_hosts.advise import AdviseConfig
+from s2a_bench.plugins.two_hosts.advise import prediction as room
+from s2a_bench.plugins.two_hosts.advise.prediction import (
     Advice,
     Tcp,
     advice_json,
@@ -33,6 +31,8 @@ from s2a_bench.report.advise.prediction import (
     tcp_adds_ms,
     waiting_ms,
 )
+from s2a_bench.plugins.two_hosts.links.relay import Shaper
+from s2a_bench.plugins.two_hosts.profiles import Direction, load_link
 from s2a_bench.stats.line import Estimate, Line
 from s2a_bench.writers.tables import ABSENT
 from tests.cli.program import called
@@ -40,7 +40,7 @@ from tests.cli.program import called
 LINK = "rate=12/24,delay=5"
 CUBIC, BBR = Tcp("cubic", slow_start_after_idle=True), Tcp("bbr", slow_start_after_idle=True)
 FITTED = room.fitted
-REFERENCE = Path(__file__).parents[2] / "results" / "reference" / "transports"
+REFERENCE = Path(__file__).parents[3] / "results" / "reference" / "transports"
 
 
 @pytest.fixture(scope="module", autouse=True)

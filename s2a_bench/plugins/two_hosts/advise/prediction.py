@@ -13,12 +13,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from s2a_bench.boards.links import DELAY_OFF_MS, OFF, Direction, LinkProfile, bound_s, load_link
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.view.against_bytes import FittedPipeline, against_bytes
 from s2a_bench.experiments.requests import split
+from s2a_bench.plugins.two_hosts.advise import MB, AdviseConfig
+from s2a_bench.plugins.two_hosts.profiles import DELAY_OFF_MS, OFF, Direction, LinkProfile, bound_s, load_link
 from s2a_bench.provenance import joined
-from s2a_bench.report.advise import MB, AdviseConfig
 from s2a_bench.stats.line import Line
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.store.sweep import is_sweep, read_sweep

@@ -16,7 +16,8 @@ from scipy.optimize import linprog
 
 from s2a_bench.clock import VirtualClock, clock_id
 from s2a_bench.errors import ClockMoved, RequestFailed
-from s2a_bench.harness.clocks import (
+from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WallClock
+from s2a_bench.plugins.two_hosts.clocks import (
     KEPT,
     RATE,
     WINDOW_NS,
@@ -27,9 +28,7 @@ from s2a_bench.harness.clocks import (
     RemoteClock,
     interval_at,
 )
-from s2a_bench.machine.clocks import WallClock
 from s2a_bench.trace import Remote, Trace
-from s2a_bench.transport.serving import REALTIME_ERROR_MS, REALTIME_MS
 
 SECOND_NS, MS_NS = 10**9, 10**6
 UP_NS, DOWN_NS = 10 * MS_NS, MS_NS
@@ -270,8 +269,8 @@ class Elsewhere:
 @pytest.fixture
 def virtual(monkeypatch: pytest.MonkeyPatch) -> VirtualClock:
     clock = VirtualClock(100 * SECOND_NS)
-    monkeypatch.setattr("s2a_bench.harness.clocks.now_ns", clock.now_ns)
-    monkeypatch.setattr("s2a_bench.harness.clocks.SystemClock", lambda: clock)
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.now_ns", clock.now_ns)
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.SystemClock", lambda: clock)
     return clock
 
 
@@ -326,7 +325,7 @@ def test_wall_clocks_that_are_off_by_all_that_they_say_still_hold_the_offset(
     ours, theirs, wander = 300_000, 200_000, 10_000
     server = Elsewhere(virtual, 10**12, 0.0, -off * (theirs + wander), theirs)
     mine = WallClock(REAL_NS + off * (ours + wander), ours, 0)
-    monkeypatch.setattr("s2a_bench.harness.clocks.wall_clock", lambda _: mine)
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.wall_clock", lambda _: mine)
     offsets: dict[str, Offset] = {}
     remote = RemoteClock(server.exchange, offsets, "chrony")
     for _ in range(3):
@@ -369,7 +368,7 @@ def test_a_server_that_tells_less_than_its_wall_clock_or_no_marks_is_refused(
     virtual: VirtualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = Elsewhere(virtual)
-    monkeypatch.setattr("s2a_bench.harness.clocks.wall_clock", lambda _: WallClock(REAL_NS, 1, 0))
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.wall_clock", lambda _: WallClock(REAL_NS, 1, 0))
     remote = RemoteClock(lambda _: server.exchange(), {}, "ptp")
     with pytest.raises(RequestFailed, match="`clock` ptp: the server does not tell its wall clock"):
         remote.join(server.exchange(), virtual.now_ns())

@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.boards.links import Direction, Step, load_link
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.links import CLIENT, SERVER
-from s2a_bench.harness.links import probe as room
-from s2a_bench.harness.links.probe import Found, probed
-from s2a_bench.harness.links.relay import Shaper
+from s2a_bench.plugins.two_hosts.links import CLIENT, SERVER
+from s2a_bench.plugins.two_hosts.links import probe as room
+from s2a_bench.plugins.two_hosts.links.probe import Found, probed
+from s2a_bench.plugins.two_hosts.links.relay import Shaper
+from s2a_bench.plugins.two_hosts.profiles import Direction, Step, load_link
 
 LOCAL_MS = 0.05
 """What a packet within one side takes."""

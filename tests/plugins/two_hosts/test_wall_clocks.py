@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.machine import clocks
+from s2a_bench.plugins.two_hosts import wall_clocks as clocks
 
 CHRONY = (
     "01020304,a.b.c,3,1328281229.000000000,-0.000001501,-0.000001632,0.000002360,331.898,0.004,0.154,"

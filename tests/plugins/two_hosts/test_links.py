@@ -21,13 +21,13 @@ from typing import Any
 import pytest
 
 import s2a_bench as s2a
-from s2a_bench.boards.links import bound_s, load_link
 from s2a_bench.clock import SystemClock
 from s2a_bench.errors import NotPermitted, UsageError
 from s2a_bench.harness.config import RequestsConfig
-from s2a_bench.harness.links import CLIENT, SERVER, EmulatedLink, emulated
-from s2a_bench.harness.links.probe import Found, probed
-from s2a_bench.report.advise.prediction import HEADERS, Tcp, tcp_adds_ms
+from s2a_bench.plugins.two_hosts.advise.prediction import HEADERS, Tcp, tcp_adds_ms
+from s2a_bench.plugins.two_hosts.links import CLIENT, SERVER, EmulatedLink, emulated
+from s2a_bench.plugins.two_hosts.links.probe import Found, probed
+from s2a_bench.plugins.two_hosts.profiles import bound_s, load_link
 from tests.cli.program import called
 
 SIOCGIFTXQLEN = 0x8942
@@ -113,8 +113,8 @@ def test_the_kernel_starts_slowly_after_idle_as_advice_predicts(name: str) -> No
 
 def test_a_probe_that_is_off_names_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     found = [Found("rate up", "Mbit/s", 100, 96, 5), Found("rate down", "Mbit/s", 100, 90, 5)]
-    monkeypatch.setattr("s2a_bench.harness.links.probe._Probe.__init__", lambda *_: None)
-    monkeypatch.setattr("s2a_bench.harness.links.probe._Probe.measure", lambda _: iter(found))
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.links.probe._Probe.__init__", lambda *_: None)
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.links.probe._Probe.measure", lambda _: iter(found))
     with pytest.raises(UsageError, match=r"does not carry 4g within 5%: rate down 90 instead of 100 Mbit/s;"):
         probed(type("Link", (), {"profile": load_link("4g")})())  # type: ignore[arg-type]
 
@@ -164,8 +164,8 @@ def test_the_servers_side_has_the_usual_address_and_the_thread_returns_home(monk
 HOLD = """
 import sys
 import s2a_bench as s2a
-from s2a_bench.boards.links import load_link
-from s2a_bench.harness.links import emulated
+from s2a_bench.plugins.two_hosts.profiles import load_link
+from s2a_bench.plugins.two_hosts.links import emulated
 with emulated(load_link("delay=1")) as link:
     print(link._relay.pid, flush=True)
     sys.stdin.read()

@@ -9,10 +9,10 @@ from typing import Annotated, Final
 
 from pydantic import AfterValidator
 
-from s2a_bench.boards.links import published
 from s2a_bench.options import Options, Size, option
+from s2a_bench.plugins.two_hosts.profiles import published
 
-REFERENCE: Final = Path(__file__).resolve().parents[3] / "results" / "reference" / "transports"
+REFERENCE: Final = Path(__file__).resolve().parents[4] / "results" / "reference" / "transports"
 CHECKED: Final = 2
 """Pipelines that `check` measures."""
 LONGEST_PAUSE_S: Final = 5.0
@@ -47,6 +47,7 @@ class AdviseConfig(Options):
     measure: bool = option(
         False, f"also measure the first {CHECKED} on the emulated link, beside the prediction", flag="check"
     )
+    output: Path = option(Path("results"), "folder for the runs of `check`")
 
     @property
     def deadline_ms(self) -> float:

@@ -10,8 +10,17 @@ from statistics import correlation, fmean, pstdev
 
 import pytest
 
-from s2a_bench.boards.links import DELAY_OFF_MS, OFF, Direction, LinkProfile, Step, bound_s, load_link, published
 from s2a_bench.errors import UsageError
+from s2a_bench.plugins.two_hosts.profiles import (
+    DELAY_OFF_MS,
+    OFF,
+    Direction,
+    LinkProfile,
+    Step,
+    bound_s,
+    load_link,
+    published,
+)
 
 
 def test_every_published_profile_has_a_source_and_two_directions() -> None:

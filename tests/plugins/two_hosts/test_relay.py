@@ -16,9 +16,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.boards.links import Direction, Step
-from s2a_bench.harness.links import relay as room
-from s2a_bench.harness.links.relay import Relay, Shaper
+from s2a_bench.plugins.two_hosts.links import relay as room
+from s2a_bench.plugins.two_hosts.links.relay import Relay, Shaper
+from s2a_bench.plugins.two_hosts.profiles import Direction, Step
 
 
 def test_packets_queue_for_the_rate_and_then_take_the_delay() -> None:
@@ -227,7 +227,7 @@ def test_the_program_carries_packets_in_its_order_and_ends_with_its_input() -> N
     with client, server, one, two:
         devices = [one.fileno(), two.fileno()]
         with subprocess.Popen(
-            [sys.executable, "-m", "s2a_bench.harness.links.relay"],
+            [sys.executable, "-m", "s2a_bench.plugins.two_hosts.links.relay"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=devices, text=True,
         ) as program:  # fmt: skip
             assert program.stdin

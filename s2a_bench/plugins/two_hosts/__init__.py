@@ -1,0 +1,6 @@
+"""A client and servers on two hosts: an emulated link between them, the server's clock, advice on a transport."""
+
+ADVISE = (
+    "s2a_bench.plugins.two_hosts.advise.command:advise",
+    "Advise on a transport for a link, from a sweep of transports: what is fastest.",
+)
