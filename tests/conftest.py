@@ -17,6 +17,7 @@ from hypothesis import settings
 
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.smoke import smoke_test
+from s2a_bench.ros import MIDDLEWARES
 from tests.made_runs import black_box, fast_board, make_row, make_run, plausible  # noqa: F401 - fixtures
 
 os.environ.pop("COLUMNS", None)  # tables are as wide as where nobody says
@@ -40,6 +41,13 @@ def from_pypi(request: pytest.FixtureRequest) -> str:
     """Each middleware that comes from PyPI."""
     pytest.importorskip(request.param, reason=f"{request.param} is not installed")
     return str(request.param)
+
+
+@pytest.fixture
+def place(from_pypi: str) -> str:
+    """Where nodes of the middleware can meet, a free place; "" for nodes that find each other."""
+    at = MIDDLEWARES[from_pypi].meeting_place
+    return at.to_host("") if at else ""
 
 
 @pytest.fixture(scope="session")

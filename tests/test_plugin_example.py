@@ -150,9 +150,9 @@ def test_its_middleware_carries_the_ros_transport(command: Command, tmp_path: Pa
     assert "ros/topic?middleware=toy-dds" in set(samples["cell"])
     assert samples["error"].isna().all()
     unknown = command("latency", "--transport", "ros", "--middleware", "toy", *SMALL, code=2)
-    assert "--middleware: 'toy' is none of cyclonedds, zenoh, rclpy, toy-dds" in unknown.stderr
+    assert "--middleware: 'toy' is none of cyclonedds, rclpy, toy-dds, zenoh" in unknown.stderr
     absent = command("latency", "--transport", "loopback", "--source", "ros:/no_camera?middleware=toy", code=2)
-    assert "middleware = 'toy' is none of cyclonedds, zenoh, rclpy, toy-dds" in absent.stderr
+    assert "middleware = 'toy' is none of cyclonedds, rclpy, toy-dds, zenoh" in absent.stderr
 
 
 def test_its_policy_takes_its_parameter(command: Command) -> None:

@@ -22,9 +22,10 @@ from s2a_bench.act import ActionKind, ActionRobot, Report, Running, SkillKind
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RobotError, S2AError, TransportError, UsageError
 from s2a_bench.plan import Call, Gap, SkillSet
-from s2a_bench.ros import ActionClient, ActionEvent, Middleware, QoS, Rejected, Result, RosParameters
+from s2a_bench.ros import ActionClient, ActionEvent, Middleware, QoS, Rejected, Result
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
+from s2a_bench.ros.join import RosParameters
 from s2a_bench.ros.remap import ABSOLUTE
 from s2a_bench.ros.service import appeared
 from s2a_bench.types import Vector

@@ -9,7 +9,8 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.frames.messages import TYPES, ImageMessages
 from s2a_bench.policy.parameters import build
-from s2a_bench.ros import Offer, QoS, RosParameters
+from s2a_bench.ros import Offer, QoS
+from s2a_bench.ros.join import RosParameters
 from s2a_bench.ros.remap import ABSOLUTE
 from s2a_bench.ros.service import appeared
 from s2a_bench.types import Frame, Pixels

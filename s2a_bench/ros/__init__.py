@@ -11,19 +11,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pkgutil import resolve_name
-from typing import Annotated, Any, Final, Literal, Protocol, TypeAlias, TypeVar
+from typing import Any, Final, Literal, Protocol, TypeAlias
 
-from pydantic import Field
-
-from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.errors import TransportError
 from s2a_bench.extras import how_to_install
 from s2a_bench.registry import Registry
 from s2a_bench.ros import config
-from s2a_bench.ros.router import ROUTER, Router, endpoint_of
-from s2a_bench.text import none_of
 
 Tuning: TypeAlias = Literal["tuned", "default"]
-T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,19 +266,37 @@ class Middleware(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
+class MeetingPlace:
+    """Where the nodes of a middleware meet, if they do not find each other; an option or parameter names it."""
+
+    option: str
+    about: str
+    """The option's help."""
+    title: str
+    """What is there, in a sentence."""
+    default: str
+    check: Callable[[str], object]
+    """Raises UsageError for a text that names no place."""
+    to_host: Callable[[str], str]
+    """Returns the place that a new server is itself, from what the option says; "" if it joins one that is there."""
+
+
+@dataclass(frozen=True, slots=True)
 class MiddlewareKind:
     """The declaration of a middleware, which is also read where its packages are not installed."""
 
     opens: str
-    """``module:class``, built as ``Class(domain_id, tuning, node_name)``; if `routed`, with a `Router` behind that."""
+    """``module:class``, built as ``Class(domain_id, tuning, node_name)``; with a `meeting_place` that and whether this
+    node hosts it follow."""
     module: str
     """The top-level module without which it is not installed."""
     way_out: str
-    """What to do then."""
+    """What to do then, beside choosing another."""
     dds: str
     """What carries its messages: an RMW or its own name; empty for the library of a sourced ROS 2, which has an RMW."""
-    routed: bool = False
-    """Whether its nodes meet at a router."""
+    meeting_place: MeetingPlace | None = None
+    against_loss: str = ""
+    """What helps where messages are lost; empty if they are UDP datagrams, for which the DDS in use has an advice."""
     extra: str = ""
     """The extra of s2a-bench that installs it."""
     packages: tuple[str, ...] = ()
@@ -295,6 +308,10 @@ class MiddlewareKind:
     def dds_in(self, environ: Mapping[str, str]) -> str:
         return self.dds or environ.get("RMW_IMPLEMENTATION") or config.DEFAULT_RMW
 
+    def place_in(self, options: object) -> str:
+        """Return what options or parameters say about its meeting place; "" for nothing, or if it has none."""
+        return str(getattr(options, self.meeting_place.option)) if self.meeting_place else ""
+
     def builds(self, action: str) -> bool:
         return not self.has_action or bool(resolve_name(self.has_action)(action))
 
@@ -302,25 +319,13 @@ class MiddlewareKind:
 CYCLONEDDS = MiddlewareKind(
     "s2a_bench.ros.cyclone:CycloneMiddleware",
     "cyclonedds",
-    f"it has wheels for x86-64 only: elsewhere use --middleware zenoh ({how_to_install('zenoh')}), "
-    "or the rclpy of a ROS 2 (source /opt/ros/<distribution>/setup.bash), or leave ros out of --transport",
+    "it has wheels for x86-64 only: elsewhere source a ROS 2 (/opt/ros/<distribution>/setup.bash), "
+    "or leave ros out of --transport",
     config.CYCLONE,
     packages=("cyclonedds",),
 )
-ZENOH = MiddlewareKind(
-    "s2a_bench.ros.zenoh_middleware:ZenohMiddleware",
-    "zenoh",
-    f"{how_to_install('zenoh')}, or use --middleware cyclonedds",
-    config.RMW_ZENOH,
-    routed=True,
-    extra="zenoh",
-    packages=("eclipse-zenoh",),
-    checks={"zenoh": "s2a_bench.transport.ros.checks:zenoh"},
-)
 MIDDLEWARES: Final[Registry[MiddlewareKind]] = Registry(
-    "middlewares",
-    "middleware",
-    {"cyclonedds": "s2a_bench.ros:CYCLONEDDS", "zenoh": "s2a_bench.ros:ZENOH"},
+    "middlewares", "middleware", {"cyclonedds": "s2a_bench.ros:CYCLONEDDS"}
 )
 
 
@@ -331,17 +336,39 @@ def default_middleware(environ: Mapping[str, str]) -> str:
     return min(kinds, key=lambda name: bool(kinds[name].dds), default=next(iter(MIDDLEWARES)))
 
 
+def chosen(name: str = "") -> MiddlewareKind:
+    """Return the middleware of a name, `default_middleware` without; raises UsageError."""
+    return MIDDLEWARES[name or default_middleware(os.environ)]
+
+
+def way_out(kind: MiddlewareKind) -> str:
+    """Return what to do where a middleware is not installed: also each other one that pip installs."""
+    others = (
+        f"--middleware {name} ({how_to_install(other.extra)})"
+        for name, other in MIDDLEWARES.loaded()
+        if other.extra and other != kind
+    )
+    return ", or ".join((kind.way_out, *others))
+
+
+def loss_advice(dds: str) -> str:
+    """Return what the middleware that speaks like ``dds`` says against loss; "" for datagrams."""
+    return next((kind.against_loss for _, kind in MIDDLEWARES.loaded() if kind.dds == dds), "")
+
+
 def open_middleware(
     name: str = "",
     *,
     domain_id: int | None = None,
     tuning: Tuning = "tuned",
     node_name: str = "/s2a_bench",
-    router: Router | None = None,
+    place: str = "",
+    host: bool = False,
 ) -> Middleware:
     """Join a ROS 2 domain as the node ``node_name``, its namespace included; `default_middleware` without a name.
 
-    Without ``domain_id`` the domain is ROS_DOMAIN_ID, else 0.
+    Without ``domain_id`` the domain is ROS_DOMAIN_ID, else 0. Nodes of a middleware with a `MeetingPlace` meet at
+    ``place``, or its default; as ``host`` this node is that place.
 
     Raises UsageError for an unknown name or domain, TransportError when the domain cannot be joined.
     """
@@ -350,32 +377,8 @@ def open_middleware(
     try:
         implementation = resolve_name(kind.opens)
     except ModuleNotFoundError as error:
-        way = f"{kind.way_out}; of a source, robot or ego with ?middleware="
+        way = f"{way_out(kind)}; of a source, robot or ego with ?middleware="
         raise TransportError(f"middleware {name} is not installed ({error}); {way}") from error
-    more = (router or Router(),) if kind.routed else ()
+    more = (place or kind.meeting_place.default, host) if kind.meeting_place else ()
     middleware: Middleware = implementation(config.domain_id(os.environ, domain_id), tuning, node_name, *more)
     return middleware
-
-
-@dataclass(frozen=True, slots=True)
-class RosParameters:
-    """How to join a domain, the defaults as of the ROS transport; a peer is waited for ``wait_s``."""
-
-    middleware: str = ""
-    domain_id: Annotated[int, Field(ge=0, le=232)] | None = None
-    router: str = ROUTER
-    wait_s: Annotated[float, Field(gt=0, le=3600)] = 10.0
-
-    def __post_init__(self) -> None:
-        if self.middleware and self.middleware not in MIDDLEWARES:
-            raise UsageError(f"middleware = {none_of(self.middleware, MIDDLEWARES)}")
-        endpoint_of(self.router)
-
-    def join(self, name: str, opened: Callable[[Middleware], T]) -> T:
-        """Return what ``opened`` makes of a node called ``name``; if it raises, the node leaves."""
-        node = open_middleware(self.middleware, domain_id=self.domain_id, node_name=name, router=Router(self.router))
-        try:
-            return opened(node)
-        except BaseException:
-            node.close()
-            raise

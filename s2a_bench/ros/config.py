@@ -25,7 +25,7 @@ TUNED_INTERNAL = '<Internal><SocketReceiveBufferSize max="16MB"/></Internal>'
 """Fragments of nearly the largest UDP datagram, and the receive buffer the kernel allows: half the time for a VGA
 image, and no lost fragments at 1920x1080."""
 CYCLONE_URI = "CYCLONEDDS_URI"
-CYCLONE, RMW_CYCLONE, RMW_FAST, RMW_ZENOH = "cyclonedds", "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_zenoh_cpp"
+CYCLONE, RMW_CYCLONE, RMW_FAST = "cyclonedds", "rmw_cyclonedds_cpp", "rmw_fastrtps_cpp"
 """What carries messages: Cyclone DDS from PyPI, and RMWs of an installed ROS 2."""
 DEFAULT_RMW = RMW_FAST
 """Of Humble and Jazzy, where RMW_IMPLEMENTATION says nothing."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
@@ -15,8 +15,9 @@ from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.frames.ros import TopicCamera
 from s2a_bench.policy import Floats
 from s2a_bench.policy.parameters import build, canonical
-from s2a_bench.ros import QoS, RosParameters
+from s2a_bench.ros import QoS
 from s2a_bench.ros import messages as ros
+from s2a_bench.ros.join import RosParameters
 from s2a_bench.ros.remap import ABSOLUTE
 from s2a_bench.ros.service import MATCH_POLL_S, appeared
 from s2a_bench.scenario import EGO, SIMULATORS, DriveCommand, Simulator, State
@@ -133,7 +134,8 @@ class RosEgo(Simulator):
         self._sensors.append(self._world.camera(width, height))
         self.place(np.array([[40.0], [0.0], [-40.0]]), np.zeros((3, 1)))
         where, how = self._how.picture or PICTURES[self._how.preset], self._how
-        where = canonical(where, RosParameters(how.middleware, how.domain_id, how.router, how.wait_s))
+        shared = {each.name: getattr(how, each.name) for each in fields(RosParameters)}
+        where = canonical(where, RosParameters(**shared))
         with ThreadPoolExecutor(1) as threads:
             opening = threads.submit(lambda: self._cameras.append(EgoCamera(where, width, height)))
             while not wait([opening], MATCH_POLL_S).done:

@@ -10,11 +10,9 @@ import numpy as np
 import pytest
 
 from s2a_bench.act import ActionKind, kind, open_robot
-from s2a_bench.act.ros import TRAJECTORY, RosRobot
+from s2a_bench.act.ros import RosRobot
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RobotError, UsageError
-from s2a_bench.ros import QoS, open_middleware
-from s2a_bench.ros.router import Router, free_endpoint
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
@@ -101,19 +99,6 @@ def test_joints_have_the_names_that_are_given(dds_domain: int) -> None:
     robot.close()
 
 
-def test_over_zenoh_nodes_meet_at_a_router(dds_domain: int) -> None:
-    pytest.importorskip("zenoh")
-    endpoint = free_endpoint()
-    controller = open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint, host=True))
-    listener = controller.subscription("/arm", TRAJECTORY, QoS())
-    robot = open_robot(f"ros?topic=/arm&middleware=zenoh&router={endpoint}", 2, 20_000_000)
-    robot.send(np.array([1, 2], np.float32), now_ns())
-    message = listener.unpack(listener.take(WAIT_S))
-    assert message.points[0].positions.tolist() == [1, 2]
-    robot.close()
-    controller.close()
-
-
 def test_a_robot_that_nobody_listens_to_is_no_robot(dds_domain: int) -> None:
     with pytest.raises(RobotError, match=r"`robot`: ros: no subscription to /nowhere \(trajectory_msgs/msg/Joint"):
         open_robot(f"ros?topic=/nowhere&wait_s=0.2&domain_id={dds_domain}", 2, 20_000_000)
@@ -127,9 +112,8 @@ def test_a_robot_that_nobody_listens_to_is_no_robot(dds_domain: int) -> None:
         ("ros?type=Twist", "`robot`: ros: type = 'Twist': input should be 'JointTrajectory' or 'Float64MultiArray'"),
         ("ros?joints=a:b:a", "`robot`: ros: joints = 'a:b:a' names one twice"),
         ("ros?joints=a:b&type=Float64MultiArray", "Float64MultiArray has no names of joints"),
-        ("ros?middleware=opendds", "middleware = 'opendds' is none of cyclonedds, zenoh, rclpy"),
+        ("ros?middleware=opendds", "middleware = 'opendds' is none of cyclonedds, rclpy, zenoh"),
         ("ros?domain_id=300", "`robot`: ros: domain_id = '300': input should be less than or equal to 232"),
-        ("ros?router=here", "router: 'here' should look like tcp/127.0.0.1:7447"),
     ],
 )
 def test_what_makes_no_sense_is_refused_by_its_parameter(written: str, message: str) -> None:

@@ -11,7 +11,6 @@ import subprocess
 import sys
 from collections import Counter
 from contextlib import ExitStack, closing
-from importlib.util import find_spec
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -24,7 +23,6 @@ from s2a_bench.experiments.requests import cells_of
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.router import Router, free_endpoint
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.trace import budget
 from s2a_bench.types import Frame
@@ -70,18 +68,6 @@ def test_one_run_compares_all_pipelines(whole: tuple[StoredRun, str]) -> None:
         assert (kept.path / name).stat().st_size > 0
     assert len(list((kept.path / "figures").glob("*.png"))) == 3
     assert len(list((kept.path / "figures").glob("*.pdf"))) == 3
-
-
-@pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh is not installed")
-def test_two_servers_of_a_run_are_each_the_zenoh_router_of_their_clients(tmp_path: Path) -> None:
-    cells = "ros/topic?middleware=zenoh,ros/action?middleware=zenoh,ros/topic?middleware=zenoh&qos=sensor_data"
-    run(*SMALL, "--transport", cells, "--mode", "stream", output=tmp_path)
-    kept = only_run(tmp_path)
-    assert (kept.samples["error"] == "").all()
-    assert len(set(kept.samples["cell"])) == 3
-    servers = [server["transport"] for server in kept.manifest["servers"].values()]
-    assert [server["router_is"] for server in servers] == ["this process"] * 2
-    assert len({server["router"] for server in servers}) == 2
 
 
 def test_a_server_whose_latencies_are_known_answers_after_them_and_is_emulated_in_every_place(tmp_path: Path) -> None:
@@ -379,11 +365,10 @@ def test_a_run_is_recorded_and_its_frames_are_a_source(tmp_path: Path, mode: str
     assert (only_run(tmp_path / "again").samples["error"] == "").all()
 
 
-def test_a_ros_topic_is_a_source(tmp_path: Path, from_pypi: str, stack: ExitStack) -> None:
+def test_a_ros_topic_is_a_source(tmp_path: Path, from_pypi: str, place: str, stack: ExitStack) -> None:
     import numpy as np
 
-    router = Router(free_endpoint(), host=True)
-    node = stack.enter_context(closing(open_middleware(from_pypi, node_name="/camera", router=router)))
+    node = stack.enter_context(closing(open_middleware(from_pypi, node_name="/camera", place=place, host=True)))
     publisher = node.publisher("/camera/image_raw", ros.IMAGE, QoS(1, reliable=False))
     picture = Frame(0, 0, 64, 48, "rgb8", np.full((48, 64, 3), 99, np.uint8))
     packed = publisher.pack(ros.image_message(picture, 1, "camera"))
@@ -397,7 +382,7 @@ def test_a_ros_topic_is_a_source(tmp_path: Path, from_pypi: str, stack: ExitStac
     thread.start()
     stack.callback(thread.join)
     stack.callback(ended.set)
-    source = f"ros:/camera/image_raw?middleware={from_pypi}&router={router.endpoint}"
+    source = f"ros:/camera/image_raw?middleware={from_pypi}" + f"&router={place}" * bool(place)
     run(*SMALL, "--source", source, "--transport", "http/binary,loopback", output=tmp_path / "results")
     kept = only_run(tmp_path / "results")
     assert (kept.samples["error"] == "").all()

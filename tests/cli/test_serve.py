@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import httpx
@@ -21,7 +20,6 @@ from s2a_bench.cli.adapter import distinct, flags_of
 from s2a_bench.cli.serve import _config as serve_config
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.router import free_endpoint
 from s2a_bench.store.run import read_run
 from s2a_bench.testing.transport import ask, wiring_of, yuyv_frame
 from s2a_bench.transport import open_client
@@ -214,24 +212,6 @@ def test_latency_drives_a_node_that_runs_already(start: Start, tmp_path: Path) -
     assert (samples["n_tokens"] == 4).all()
     assert samples["server_ns"].notna().all()
     assert samples["e2e_without_inference_ns"].isna().all()
-
-
-@pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh is not installed")
-def test_two_servers_and_a_black_box_meet_at_one_zenoh_router(start: Start, dds_domain: int, tmp_path: Path) -> None:
-    over = ("--engine", "echo", "--middleware", "zenoh", "--router", router := free_endpoint())
-    over += ("--max-tokens", "50", *ONE_BY_ONE)
-    _, line = start("ros", *over, "--namespace", "/first")
-    assert f"in domain {dds_domain} of the Zenoh router {router}, which this server is; engine" in line
-    _, line = start("ros", *over, "--namespace", "/second")
-    assert f"in domain {dds_domain} of the Zenoh router {router}; engine" in line
-    arguments = ["latency", "--transport", f"ros?middleware=zenoh&router={router}&action=/second/generate_response"]
-    arguments += ["--engine", "echo", "--requests", "3", "--warmup", "1", "--max-tokens", "4", "--size", "64x48"]
-    arguments += ["--data-only", "--output", str(tmp_path)]
-    subprocess.run([sys.executable, "-m", "s2a_bench", *arguments], check=True, timeout=120, capture_output=True)
-    (folder,) = tmp_path.iterdir()
-    samples = read_run(folder).samples
-    assert (samples["error"] == "").all()
-    assert (samples["n_tokens"] == 4).all()
 
 
 def test_ros_args_name_the_node_its_topics_and_its_parameters(start: Start, dds_domain: int, tmp_path: Path) -> None:

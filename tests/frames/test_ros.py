@@ -24,7 +24,6 @@ from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.frames.ros import TopicCamera
 from s2a_bench.ros import Middleware, QoS, config, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.router import Router, free_endpoint
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 from s2a_bench.types import Pixels
 from tests.waiting import until
@@ -64,11 +63,10 @@ class Camera:
 
 
 @pytest.fixture
-def camera(from_pypi: str, stack: ExitStack) -> Camera:
-    """A camera over each middleware that comes from PyPI; over Zenoh it is the router, too."""
-    router = Router(free_endpoint(), host=True)
-    node = stack.enter_context(closing(open_middleware(from_pypi, node_name="/camera", router=router)))
-    return Camera(node, f"&middleware={from_pypi}" + f"&router={router.endpoint}" * (from_pypi == "zenoh"))
+def camera(from_pypi: str, place: str, stack: ExitStack) -> Camera:
+    """A camera over each middleware that comes from PyPI; where nodes meet at a place, it is that, too."""
+    node = stack.enter_context(closing(open_middleware(from_pypi, node_name="/camera", place=place, host=True)))
+    return Camera(node, f"&middleware={from_pypi}" + f"&router={place}" * bool(place))
 
 
 @pytest.fixture
@@ -240,19 +238,12 @@ def test_frames_of_another_size_are_scaled_and_another_format_is_refused(camera:
         ("/camera?domain_id=500", "domain_id = '500'"),
         ("/camera?middleware=zmq", "middleware = 'zmq'"),
         ("/camera?wait_s=0", "wait_s = '0'"),
-        ("/camera?router=here", "router: 'here'"),
     ],
 )
 def test_what_is_no_topic_or_parameter_is_one_line(where: str, says: str) -> None:
     with pytest.raises(UsageError, match=r"^`source`: ") as error:
         TopicCamera(where, 64, 48)
     assert says in str(error.value)
-
-
-def test_no_router_is_one_line() -> None:
-    pytest.importorskip("zenoh")
-    with pytest.raises(SourceError, match=r"^`source`: ros:/c.*: no Zenoh router answers at .* with \?router=$"):
-        TopicCamera(f"/c?middleware=zenoh&router={free_endpoint()}", 64, 48)
 
 
 @pytest.fixture

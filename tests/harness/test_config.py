@@ -243,7 +243,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"mode": "x"}, "`mode`: 'x'"),
         ({"options": {"ros": {"dds_tuning": "x"}}}, "`dds_tuning`: 'x'"),
         ({"options": {"ros": {"qos": "x"}}}, "`qos`: 'x' should be 'reliable' or 'sensor_data'"),
-        ({"options": {"ros": {"middleware": "x"}}}, "`middleware`: 'x' is none of cyclonedds, zenoh, rclpy"),
+        ({"options": {"ros": {"middleware": "x"}}}, "`middleware`: 'x' is none of cyclonedds, rclpy, zenoh"),
         ({"options": {"ros": {"result_timeout": -1}}}, "`result_timeout`: -1 should be greater than or equal to 0"),
         ({"options": {"http": {"port": "many"}}}, "`port`: 'many' should be a valid integer"),
         ({"requests": 0}, "`requests`: 0 should be greater than or equal to 1"),

@@ -12,10 +12,8 @@ WORDS = [f"word{number}" for number in range(200)]
 SERVER = """
 import sys
 from s2a_bench.ros import llama, open_middleware
-from s2a_bench.ros.router import Router
-name, domain_id, action, *endpoint = sys.argv[1:]
-router = Router(*endpoint, host=True) if endpoint else None
-middleware = open_middleware(name, domain_id=int(domain_id), router=router)
+name, domain_id, action, *places = sys.argv[1:]
+middleware = open_middleware(name, domain_id=int(domain_id), place="".join(places), host=True)
 server = middleware.action_server(action, llama.GENERATE_RESPONSE)
 goal = server.next_goal(60)
 goal.accept()
@@ -29,9 +27,9 @@ middleware.close()
 """
 
 
-def served(middleware: str, domain_id: int, *endpoint: str) -> subprocess.Popen[bytes]:
-    """Start the server, which ends with its standard input; at an ``endpoint`` it is the router too."""
-    command = [sys.executable, "-c", SERVER, middleware, str(domain_id), NAME, *endpoint]
+def served(middleware: str, domain_id: int, *place: str) -> subprocess.Popen[bytes]:
+    """Start the server, which ends with its standard input; at a ``place`` it is where nodes meet, too."""
+    command = [sys.executable, "-c", SERVER, middleware, str(domain_id), NAME, *place]
     return subprocess.Popen(command, stdin=subprocess.PIPE)
 
 

@@ -19,7 +19,6 @@ from s2a_bench.policy.parameters import build
 from s2a_bench.policy.wait_then_act import Clairvoyant, WaitThenAct
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros import open_middleware
-from s2a_bench.ros.router import Router, free_endpoint
 from s2a_bench.scenario import LEAD, Simulator
 from s2a_bench.scenario.ccrb.cars import Cars, braking_plan
 from s2a_bench.scenario.ccrb.drive import Driven, drive
@@ -56,14 +55,14 @@ class Meeting:
 
     stack: ExitStack
     middleware: str
-    router: Router
+    place: str
 
     def world(self, type_name: str = CONTROL, *topics: str, **more: Any) -> RosWorld:
-        node = open_middleware(self.middleware, node_name="/carla", router=self.router)
+        node = open_middleware(self.middleware, node_name="/carla", place=self.place)
         return RosWorld(node, type_name, *(topics or NATIVE), **more)
 
     def parameters(self, more: str = "", wait_s: float = 20) -> EgoParameters:
-        router = f"&router={self.router.endpoint}" * (self.middleware == "zenoh")
+        router = f"&router={self.place}" * bool(self.place)
         return build(EgoParameters, f"ros?middleware={self.middleware}{router}&wait_s={wait_s}{more}", "ego")
 
     def ego(self, world: Simulator, more: str = "", wait_s: float = 20) -> RosEgo:
@@ -71,13 +70,12 @@ class Meeting:
 
 
 @pytest.fixture
-def meeting(from_pypi: str, stack: ExitStack) -> Meeting:
-    """Each middleware that comes from PyPI; over Zenoh a node of its own is the router, as worlds come and go."""
-    router = Router(free_endpoint())
-    if from_pypi == "zenoh":
-        host = open_middleware(from_pypi, node_name="/router", router=Router(router.endpoint, host=True))
+def meeting(from_pypi: str, place: str, stack: ExitStack) -> Meeting:
+    """Each middleware that comes from PyPI; where nodes meet at a place, one more is that, as worlds come and go."""
+    if place:
+        host = open_middleware(from_pypi, node_name="/router", place=place, host=True)
         stack.enter_context(closing(host))
-    return Meeting(stack, from_pypi, router)
+    return Meeting(stack, from_pypi, place)
 
 
 def driven(world: Simulator, policy: Policy) -> Driven:
@@ -236,13 +234,6 @@ def test_a_world_that_breaks_while_the_camera_opens_says_so(meeting: Meeting) ->
         meeting.ego(world, wait_s=0.5).camera(64, 48)
 
 
-def test_no_router_is_one_line() -> None:
-    pytest.importorskip("zenoh")
-    how = build(EgoParameters, f"ros?middleware=zenoh&router={free_endpoint()}", "ego")
-    with pytest.raises(TransportError, match=r"^`ego`: ros: no Zenoh router answers at .* with \?router=$"):
-        RosEgo(Embedded(), how)
-
-
 @pytest.mark.parametrize(
     ("written", "says"),
     [
@@ -250,8 +241,7 @@ def test_no_router_is_one_line() -> None:
         ("ros?message=twist", "message = 'twist': input should be 'control' or 'ackermann'"),
         ("ros?command=go", "command = 'go': string should match pattern '^(/"),
         ("ros?picture=/a b", "picture = '/a b': string should match pattern '^(/"),
-        ("ros?middleware=opendds", "middleware = 'opendds' is none of cyclonedds, zenoh, rclpy"),
-        ("ros?router=here", "router: 'here' should look like tcp/127.0.0.1:7447"),
+        ("ros?middleware=opendds", "middleware = 'opendds' is none of cyclonedds, rclpy, zenoh"),
         ("ros?wait_s=0", "wait_s = '0'"),
         ("ros?topic=/a", "'topic' is no parameter; its parameters are middleware, domain_id, router, wait_s, preset, "),
     ],

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-from typing import Any, ClassVar, Final
+from typing import Any, Final
 
 import pytest
 
@@ -58,25 +57,3 @@ class TestZmqLayouts(TransportSuite):
     @pytest.fixture
     def wiring(self, layout: str, payload: str) -> Wiring[Any]:
         return wiring_of("zmq/gr00t", layout=layout, payload=payload)
-
-
-needs_zenoh = pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh is not installed")
-
-
-@needs_zenoh
-@pytest.mark.parametrize("payload", ["raw", "yuyv", "png"])
-class TestRosTopicOverZenoh(TransportSuite):
-    lacks: ClassVar[frozenset[str]] = OF_ACTIONS
-
-    @pytest.fixture
-    def wiring(self, dds_domain: int, payload: str) -> Wiring[Any]:
-        return wiring_of("ros/topic?middleware=zenoh", domain_id=dds_domain, payload=payload)
-
-
-@needs_zenoh
-class TestRosActionOverZenoh(TransportSuite):
-    carries_id_and_limit = False
-
-    @pytest.fixture
-    def wiring(self, dds_domain: int) -> Wiring[Any]:
-        return wiring_of("ros/action?middleware=zenoh", domain_id=dds_domain, max_tokens=2000)

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.transport import Choice
 from s2a_bench.transport.pipeline import one_pipeline, pipelines
 
 
@@ -61,7 +60,6 @@ def test_options_hold_for_every_variant_that_is_meant() -> None:
         ("ros/topic?wire=bgr", "ros has no option 'wire'; it has payload, action, url, namespace"),
         ("ros?payload", "'ros?payload' should look like ros?option=value"),
         ("http?port=x", "`port`: 'x' should be a valid integer"),
-        ("ros?router=7447", "'7447' should look like tcp/127.0.0.1:7447"),
         ("http?port=-1", "`port`: '-1' should be greater than or equal to 0"),
         ("ros?publish_tokens=maybe", "`publish_tokens`: 'maybe' should be a valid boolean"),
         ("", "`transport`: '' is none of http, ros, loopback"),
@@ -76,12 +74,6 @@ def test_what_a_name_cannot_say_is_one_line(text: str, message: str) -> None:
 def test_cells_share_a_server_unless_it_would_be_told_something_else() -> None:
     one, two, three = pipelines(["ros/topic", "ros/action?payload=yuyv", "ros/topic?dds_tuning=default"])
     assert one.server == two.server != three.server
-
-
-def test_a_router_is_zenohs() -> None:
-    ros = one_pipeline("ros?middleware=cyclonedds&router=tcp/127.0.0.1:7447")
-    with pytest.raises(UsageError, match="`router` is Zenoh's: choose `middleware` zenoh, or leave it out"):
-        ros.transport.require(Choice(ros.options, "topic", mode="request", engine="echo"))
 
 
 def test_two_servers_of_one_transport_do_not_collide() -> None:

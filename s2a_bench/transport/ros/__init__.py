@@ -77,8 +77,7 @@ class Ros(Transport[RosOptions]):
         domain_id(os.environ)
         if options.kind.extra:
             extras.need(options.kind.extra, options.kind.module)
-        if options.router and not options.kind.routed:
-            raise UsageError("`router` is Zenoh's: choose `middleware` zenoh, or leave it out")
+        options.refuse_places_of_others()
         if options.action and variant != ACTION:
             raise UsageError(f"`action` is spoken by ros/{ACTION}, not by ros/{variant}")
         if options.action and mode == "stream":

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping
 
 from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.machine.doctor.host import RMEM_WANTED
-from s2a_bench.ros import MIDDLEWARES, default_middleware
-from s2a_bench.ros.config import CYCLONE, LARGE_PICTURES, RMW_CYCLONE, RMW_FAST, RMW_ZENOH
+from s2a_bench.ros import MIDDLEWARES, default_middleware, loss_advice
+from s2a_bench.ros.config import CYCLONE, LARGE_PICTURES, RMW_CYCLONE, RMW_FAST
 
 KERNEL = f"sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}"
 LARGE_DATA = "export FASTDDS_BUILTIN_TRANSPORTS=LARGE_DATA"
@@ -24,11 +24,9 @@ def against_loss(dds: str, environ: Mapping[str, str]) -> str:
         return f"--qos reliable, and on both sides: {cyclone_line(environ)}; {KERNEL}"
     if dds == CYCLONE:
         return f"--qos reliable, --dds-tuning tuned, and {KERNEL}"
-    if dds == RMW_ZENOH:
-        return "--qos reliable: what is best effort is dropped where Zenoh's link is busy"
     if dds == RMW_FAST:
         return f"--qos reliable, and on both sides: {fast_line(environ)}; {KERNEL}"
-    return f"--qos reliable, larger receive buffers for {dds}, and {KERNEL}"
+    return loss_advice(dds) or f"--qos reliable, larger receive buffers for {dds}, and {KERNEL}"
 
 
 def cyclone_line(environ: Mapping[str, str]) -> str:

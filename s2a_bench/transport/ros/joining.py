@@ -15,7 +15,6 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.llama import GENERATE_RESPONSE
 from s2a_bench.ros.remap import Remapped, table
-from s2a_bench.ros.router import ROUTER, Router, free_endpoint, listens, may_host
 from s2a_bench.ros.service import appeared
 from s2a_bench.transport import Client, Wiring
 from s2a_bench.transport.limits import Bounds
@@ -24,7 +23,7 @@ from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
 T = TypeVar("T")
 AT = "@"
-"""In an address, between the namespace and the router that the server is itself."""
+"""In an address, between the namespace and the meeting place that the server is itself."""
 MATCH_TIMEOUT_S = 15.0
 SETTLE_S = 0.3
 """Time to discover a server that is there already."""
@@ -41,27 +40,26 @@ def domain_of(wiring: Wiring[RosOptions]) -> int:
     return domain_id(os.environ, wiring.options.domain_id)
 
 
-def router_of(wiring: Wiring[RosOptions]) -> str:
-    """Return the endpoint of the router: the server's own, else the option's, else rmw_zenoh's."""
-    return wiring.address.partition(AT)[2] or wiring.options.router or ROUTER
+def meeting_place(wiring: Wiring[RosOptions]) -> str:
+    """Return where nodes meet: at the server, else where the option says; "" is the middleware's default."""
+    return wiring.address.partition(AT)[2] or wiring.options.kind.place_in(wiring.options)
 
 
 def place_of(wiring: Wiring[RosOptions]) -> str:
     domain = f"domain {domain_of(wiring)}"
-    return f"{domain} of the Zenoh router {router_of(wiring)}" if wiring.options.kind.routed else f"DDS {domain}"
+    at = wiring.options.kind.meeting_place
+    return f"{domain} of the {at.title} {meeting_place(wiring) or at.default}" if at else f"DDS {domain}"
 
 
 def settled(wiring: Wiring[RosOptions]) -> tuple[Wiring[RosOptions], bool]:
-    """Return a server's wiring, and whether it is to be the router itself, which is then in its address.
+    """Return a server's wiring, and whether it is to be the meeting place itself, which is then in its address.
 
-    It is without `router`, so that each server of a run has its own, and where none listens at a loopback `router`.
+    Without an option that names one, each server of a run is its own.
     """
-    if not wiring.options.kind.routed:
+    at = wiring.options.kind.meeting_place
+    if not (place := at and at.to_host(meeting_place(wiring))):
         return wiring, False
-    endpoint = wiring.address.partition(AT)[2] or wiring.options.router
-    if endpoint and (listens(endpoint) or not may_host(endpoint)):
-        return wiring, False
-    return replace(wiring, address=f"{namespace_of(wiring)}{AT}{endpoint or free_endpoint()}"), True
+    return replace(wiring, address=f"{namespace_of(wiring)}{AT}{place}"), True
 
 
 def server_name(wiring: Wiring[RosOptions]) -> str:
@@ -69,7 +67,7 @@ def server_name(wiring: Wiring[RosOptions]) -> str:
 
 
 def join(wiring: Wiring[RosOptions], role: str, *, host: bool = False) -> Middleware:
-    """Join the wiring's domain as the node ``<namespace>/<role>``, the server under its own name; or be its router."""
+    """Join the domain as the node ``<namespace>/<role>``, the server under its own; ``host``: where all meet."""
     tuning: Tuning = wiring.options.dds_tuning
     name = server_name(wiring) if role == "server" else f"{namespace_of(wiring)}/{role}"
     joined = open_middleware(
@@ -77,7 +75,8 @@ def join(wiring: Wiring[RosOptions], role: str, *, host: bool = False) -> Middle
         domain_id=domain_of(wiring),
         tuning=tuning,
         node_name=name,
-        router=Router(router_of(wiring), host),
+        place=meeting_place(wiring),
+        host=host,
     )
     names = remapped(wiring)
     return Remapped(joined, names) if names else joined

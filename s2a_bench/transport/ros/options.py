@@ -6,16 +6,15 @@ import os
 from collections.abc import Iterable, Mapping
 from itertools import count
 from secrets import token_hex
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import field_validator
+from pydantic import create_model, field_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, one_of, option
-from s2a_bench.ros import MIDDLEWARES, MiddlewareKind, default_middleware
-from s2a_bench.ros.config import RMW_ZENOH
+from s2a_bench.ros import MIDDLEWARES, MiddlewareKind, chosen, loss_advice
+from s2a_bench.ros.join import PLACES
 from s2a_bench.ros.remap import ABSOLUTE
-from s2a_bench.ros.router import ROUTER, endpoint_of
 from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
 
 NAMESPACE = "/s2a_bench"
@@ -26,21 +25,10 @@ BASE_NAME = r"^[A-Za-z_][A-Za-z0-9_]*$"
 """ROS 2's rules for the name of a node."""
 
 
-class RosOptions(TransportOptions):
+class DomainOptions(TransportOptions):
+    """Where a server is; the meeting places of middlewares follow."""
+
     PANEL: ClassVar[str] = "ROS 2"
-    SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {
-        "namespace": "/llama",
-        "router": ROUTER,
-        "qos": "sensor_data",  # matches reliable cameras as well as best-effort ones
-        "feedback_interval": 0.002,
-        "max_tokens": 512,
-        "publish_tokens": True,
-        "node_api": True,
-    }
-    NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = (
-        *("qos", "dds_tuning", "result_timeout", "feedback_interval", "publish_tokens"),
-        *("remap", "node_api", "log_level", "max_frame_age", "use_sim_time"),
-    )
 
     action: str = option(
         "",
@@ -53,12 +41,30 @@ class RosOptions(TransportOptions):
     middleware: Annotated[str, one_of(lambda: ("", *MIDDLEWARES))] = option(
         "", f"{', '.join(MIDDLEWARES)} [default: a sourced ROS 2's own, else the first installed]", side=SERVER
     )
-    router: str = option(
-        "",
-        f"Zenoh's router, as {ROUTER}; a server starts it on loopback [default: one of the run's own]",
-        side=SERVER,
-        risk="url",
+
+
+if TYPE_CHECKING:
+    PlaceOptions = DomainOptions
+else:
+    named = {name: (str, option("", at.about, side=SERVER, risk="url")) for name, at in PLACES.items()}
+    PlaceOptions = create_model("PlaceOptions", __base__=DomainOptions, __module__=__name__, **named)
+
+
+class RosOptions(PlaceOptions):
+    SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {
+        "namespace": "/llama",
+        **{name: at.default for name, at in PLACES.items()},
+        "qos": "sensor_data",  # matches reliable cameras as well as best-effort ones
+        "feedback_interval": 0.002,
+        "max_tokens": 512,
+        "publish_tokens": True,
+        "node_api": True,
+    }
+    NOT_SERVE_FLAGS: ClassVar[tuple[str, ...]] = (
+        *("qos", "dds_tuning", "result_timeout", "feedback_interval", "publish_tokens"),
+        *("remap", "node_api", "log_level", "max_frame_age", "use_sim_time"),
     )
+
     qos: Literal["reliable", "sensor_data"] = option(
         "reliable", "the camera topic's: reliable, sensor_data (best effort)", side=SERVER
     )
@@ -125,8 +131,9 @@ class RosOptions(TransportOptions):
         return url
 
     def check(self) -> None:
-        if self.router:
-            endpoint_of(self.router)
+        for name, at in PLACES.items():
+            if place := getattr(self, name):
+                at.check(place)
         if self.url and self.action:
             raise UsageError("`url` and `action` name two servers; give one of them")
 
@@ -141,11 +148,19 @@ class RosOptions(TransportOptions):
 
     @property
     def kind(self) -> MiddlewareKind:
-        return MIDDLEWARES[self.middleware or default_middleware(os.environ)]
+        return chosen(self.middleware)
+
+    def refuse_places_of_others(self) -> None:
+        """Raise UsageError for a meeting place that the middleware does not have."""
+        own = self.kind.meeting_place
+        for given in (name for name in PLACES if getattr(self, name) and not (own and own.option == name)):
+            places = ((name, kind.meeting_place) for name, kind in MIDDLEWARES.loaded())
+            owner = next(name for name, at in places if at and at.option == given)
+            raise UsageError(f"`{given}` is {owner.title()}'s: choose `middleware` {owner}, or leave it out")
 
     @property
     def datagrams(self) -> bool:
-        return self.kind.dds_in(os.environ) != RMW_ZENOH
+        return not loss_advice(self.kind.dds_in(os.environ))
 
     @property
     def against_loss(self) -> str:

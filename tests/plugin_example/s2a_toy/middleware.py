@@ -5,6 +5,6 @@ from s2a_bench.ros import MiddlewareKind
 TOY_DDS = MiddlewareKind(
     opens="s2a_bench.ros.cyclone:CycloneMiddleware",
     module="cyclonedds",
-    way_out="it has wheels for x86-64 only: use --middleware zenoh",
+    way_out="it has wheels for x86-64 only",
     dds="cyclonedds",
 )

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.plugins.zenoh.router import endpoint_of, may_host
 from s2a_bench.ros import QoS
-from s2a_bench.ros.router import endpoint_of, may_host
 
 names = pytest.importorskip(
-    "s2a_bench.ros.zenoh_names", reason="the extra zenoh is not installed", exc_type=ImportError
+    "s2a_bench.plugins.zenoh.names", reason="the extra zenoh is not installed", exc_type=ImportError
 )
 
 SESSION = "8b20917502ee955ac4476e0266340d5c"

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from s2a_bench.errors import TransportError
+from s2a_bench.plugins.zenoh.router import endpoint_of, free_endpoint, listens
 from s2a_bench.ros import REQUEST_BYTES, QoS, Rejected, Result, llama, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.router import Router, endpoint_of, free_endpoint, listens
 from tests.ros.action_suite import NAME, ActionSuite, event, offer, receive, start
 from tests.ros.middleware_suite import (
     GET_TYPES,
@@ -40,7 +40,7 @@ def endpoint() -> str:
 def router_inside(endpoint: str, domain: int) -> AbstractContextManager[Join]:
     """Join sessions of which the first is the router."""
     first = iter([True])
-    return joining(lambda: open_middleware("zenoh", domain_id=domain, router=Router(endpoint, host=next(first, False))))
+    return joining(lambda: open_middleware("zenoh", domain_id=domain, place=endpoint, host=next(first, False)))
 
 
 @contextmanager
@@ -74,7 +74,7 @@ class TestZenohActions(ActionSuite):
 @pytest.fixture
 def stranger(routed: Join, endpoint: str) -> Iterator[Any]:
     """A session that is no ROS node."""
-    from s2a_bench.ros.zenoh_node import open_session
+    from s2a_bench.plugins.zenoh.node import open_session
 
     del routed
     session = open_session(endpoint, host=False)
@@ -88,7 +88,7 @@ def tokens_of(session: Any, domain: int) -> list[str]:
 
 
 def test_peers_see_our_node_and_its_endpoints_until_it_leaves(stranger: Any, endpoint: str, dds_domain: int) -> None:
-    named = open_middleware("zenoh", domain_id=dds_domain, node_name="/robot/brain", router=Router(endpoint))
+    named = open_middleware("zenoh", domain_id=dds_domain, node_name="/robot/brain", place=endpoint)
     ends = (
         named.publisher("/camera", ros.IMAGE, QoS(depth=1)),
         named.subscription("/camera", ros.IMAGE, QoS(depth=5, reliable=False)),
@@ -179,7 +179,7 @@ def test_a_message_without_its_attachment_is_dropped_and_told_once(
 
 
 def test_a_message_past_its_lifespan_is_not_delivered(routed: Join, stranger: Any) -> None:
-    from s2a_bench.ros.zenoh_names import ATTACHMENT
+    from s2a_bench.plugins.zenoh.names import ATTACHMENT
 
     publisher = routed().publisher("/brief", STRING, QoS(lifespan_s=10))
     subscription = routed().subscription("/brief", STRING, QoS(0, lifespan_s=10))
@@ -192,7 +192,7 @@ def test_a_message_past_its_lifespan_is_not_delivered(routed: Join, stranger: An
 
 @pytest.mark.parametrize("payload", [b"", b"\0", b"\0\1\0\0", b"\0\1\0\0" + b"\xff" * 64, b"\0\1\0\0" + b"\x7f" * 5000])
 def test_a_damaged_message_is_an_error_of_ours(routed: Join, stranger: Any, payload: bytes) -> None:
-    from s2a_bench.ros.zenoh_names import ATTACHMENT
+    from s2a_bench.plugins.zenoh.names import ATTACHMENT
 
     subscription = routed().subscription("/topic", ros.IMAGE, QoS(0))
     stamp = ATTACHMENT.pack(1, time.time_ns(), 16, bytes(16))
@@ -209,7 +209,7 @@ def test_a_damaged_message_is_an_error_of_ours(routed: Join, stranger: Any, payl
 def test_garbage_to_a_service_is_dropped_and_told_once(
     routed: Join, stranger: Any, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from s2a_bench.ros.zenoh_names import ATTACHMENT
+    from s2a_bench.plugins.zenoh.names import ATTACHMENT
 
     routed().service("/ask", GET_TYPES, lambda asked: ros.default(GET_TYPES + "_Response", types=[len(asked.names)]))
     client = routed().service_client("/ask", GET_TYPES)
@@ -227,7 +227,7 @@ def test_garbage_to_a_service_is_dropped_and_told_once(
 
 
 def test_malformed_requests_leave_an_action_up(routed: Join, stranger: Any, caplog: pytest.LogCaptureFixture) -> None:
-    from s2a_bench.ros.zenoh_names import ATTACHMENT
+    from s2a_bench.plugins.zenoh.names import ATTACHMENT
 
     action = offer(routed)
     stamp = ATTACHMENT.pack(1, 0, 16, bytes(16))
@@ -267,13 +267,13 @@ def test_versions_of_llama_msgs_that_differ_are_told_on_both_sides(
 
 def test_without_a_router_one_line_says_where_to_get_one(endpoint: str) -> None:
     with pytest.raises(TransportError, match=rf"no Zenoh router answers at {endpoint} .*: start one \(ros2 run"):
-        open_middleware("zenoh", router=Router(endpoint))
+        open_middleware("zenoh", place=endpoint)
 
 
 def test_a_router_that_says_nothing_is_given_up(endpoint: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.ros.zenoh_node.OPEN_MS", 100)
+    monkeypatch.setattr("s2a_bench.plugins.zenoh.node.OPEN_MS", 100)
     with socket.create_server(("127.0.0.1", endpoint_of(endpoint)[2])), pytest.raises(TransportError, match="no Zenoh"):
-        open_middleware("zenoh", router=Router(endpoint))
+        open_middleware("zenoh", place=endpoint)
 
 
 def test_a_port_that_is_taken_is_named(endpoint: str) -> None:
@@ -281,7 +281,7 @@ def test_a_port_that_is_taken_is_named(endpoint: str) -> None:
         socket.create_server(("127.0.0.1", endpoint_of(endpoint)[2])),
         pytest.raises(TransportError, match=r"cannot be the Zenoh router .*`router`"),
     ):
-        open_middleware("zenoh", router=Router(endpoint, host=True))
+        open_middleware("zenoh", place=endpoint, host=True)
 
 
 def test_noise_at_the_routers_port_does_no_harm(join: Join, endpoint: str) -> None:
@@ -298,18 +298,18 @@ def test_noise_at_the_routers_port_does_no_harm(join: Join, endpoint: str) -> No
 def test_an_inbox_is_bounded_and_says_once_that_it_is_full(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from s2a_bench.ros import zenoh_node
+    from s2a_bench.plugins.zenoh import node
 
-    monkeypatch.setattr(zenoh_node, "HELD_BYTES", 10_000)
-    inbox: Any = zenoh_node.SampleQueue("/x", zenoh_node.Bell())
+    monkeypatch.setattr(node, "HELD_BYTES", 10_000)
+    inbox: Any = node.SampleQueue("/x", node.Bell())
     took = [inbox.put(number, 1000) for number in range(9)]
     assert took == [True] * 4 + [False] * 5
     assert [*inbox.arrived()] == [0, 1, 2, 3]
     assert inbox.put(9, 1000)
     assert caplog.messages == ["/x: messages are dropped: 0 MiB wait to be taken"]
-    small: Any = zenoh_node.SampleQueue("/y", zenoh_node.Bell(), most_bytes=5000)
+    small: Any = node.SampleQueue("/y", node.Bell(), most_bytes=5000)
     assert [small.put(number, 1000) for number in range(3)] == [True, True, False]
-    last: Any = zenoh_node.SampleQueue("/x", zenoh_node.Bell(), depth=2)
+    last: Any = node.SampleQueue("/x", node.Bell(), depth=2)
     assert all(last.put(number, 1000) for number in range(9))
     assert [*last.arrived()] == [7, 8]
 
@@ -317,7 +317,7 @@ def test_an_inbox_is_bounded_and_says_once_that_it_is_full(
 def test_a_message_that_is_too_large_is_dropped_and_the_next_arrives(
     monkeypatch: pytest.MonkeyPatch, endpoint: str, dds_domain: int
 ) -> None:
-    monkeypatch.setattr("s2a_bench.ros.zenoh_node.MESSAGE_BYTES", 1 << 20)
+    monkeypatch.setattr("s2a_bench.plugins.zenoh.node.MESSAGE_BYTES", 1 << 20)
     with router_inside(endpoint, dds_domain) as join:
         subscription, publisher = join().subscription("/x", STRING, QoS(0)), join().publisher("/x", STRING, QoS())
         wait_matched(publisher, subscription)
@@ -329,7 +329,7 @@ def test_a_message_that_is_too_large_is_dropped_and_the_next_arrives(
 def test_a_server_that_was_the_router_may_die_and_come_back(endpoint: str, dds_domain: int) -> None:
     with served("zenoh", dds_domain, endpoint) as server:
         until(lambda: listens(endpoint))
-        middleware = open_middleware("zenoh", domain_id=dds_domain, router=Router(endpoint))
+        middleware = open_middleware("zenoh", domain_id=dds_domain, place=endpoint)
         client = middleware.action_client(NAME, llama.GENERATE_RESPONSE)
         hears_them(client, WAIT_S)
         server.kill()

@@ -18,13 +18,12 @@ import zenoh
 from zenoh import ext
 
 from s2a_bench.errors import TransportError
+from s2a_bench.plugins.zenoh import names
+from s2a_bench.plugins.zenoh.node import Bell, Node, SampleQueue, direct, give_way, open_session, refusals
 from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, Offer, QoS, Tuning
-from s2a_bench.ros import zenoh_names as names
 from s2a_bench.ros.action import ActionNode
 from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, serialise
-from s2a_bench.ros.router import Router
 from s2a_bench.ros.service import ClientEnd, LogOnce, ServiceEnd, awaited
-from s2a_bench.ros.zenoh_node import Bell, Node, SampleQueue, direct, give_way, open_session, refusals
 
 CACHED_AT_MOST: Final = 1000
 """What a latched topic that keeps all keeps."""
@@ -285,10 +284,10 @@ class ZenohServiceClient(ClientEnd):
 
 
 class ZenohMiddleware(ActionNode[QueryOrigin, Bell]):
-    def __init__(self, domain_id: int, tuning: Tuning, node_name: str, router: Router) -> None:
+    def __init__(self, domain_id: int, tuning: Tuning, node_name: str, router: str, host: bool) -> None:
         """Join ``domain_id`` as the node ``/namespace/name``; raises TransportError where no router answers."""
-        self._domain_id, self._tuning, self._router = domain_id, tuning, router
-        self._session = open_session(router.endpoint, host=router.host, tuning=tuning)
+        self._domain_id, self._tuning, self._router, self._host = domain_id, tuning, router, host
+        self._session = open_session(router, host=host, tuning=tuning)
         super().__init__()
         try:
             self._node = Node(self._session, domain_id, node_name)
@@ -327,8 +326,8 @@ class ZenohMiddleware(ActionNode[QueryOrigin, Bell]):
             "version": package_version("eclipse-zenoh"),
             "domain_id": self._domain_id,
             "tuning": self._tuning,
-            "router": self._router.endpoint,
-            "router_is": "this process" if self._router.host else "another process",
+            "router": self._router,
+            "router_is": "this process" if self._host else "another process",
         }
 
     def leave(self) -> None:

@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 
 from s2a_bench.frames import open_source
+from s2a_bench.plugins.zenoh.router import endpoint_of, free_endpoint
 from s2a_bench.ros import Middleware, QoS, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.router import Router, endpoint_of, free_endpoint
 from s2a_bench.types import Frame
+from tests.plugins.zenoh.zenoh_peer import write_definitions
 from tests.ros.middleware_suite import GET_TYPES, STRING, WAIT_S, text, until
-from tests.ros.zenoh_peer import write_definitions
 
 pytestmark = pytest.mark.skipif(
     not (find_spec("zenoh") and find_spec("zenoh_ros2_sdk")), reason="zenoh-ros2-sdk, a peer, is not installed"
@@ -34,8 +34,10 @@ NAME = "/robot/node/get_parameter_types"
 @pytest.fixture
 def ours(stack: ExitStack) -> Middleware:
     """Our node, which is the router too."""
-    router = Router(free_endpoint(), host=True)
-    middleware = open_middleware("zenoh", domain_id=0, router=router, node_name="/robot/ours")  # the SDK's domain
+    place = free_endpoint()
+    middleware = open_middleware(
+        "zenoh", domain_id=0, place=place, host=True, node_name="/robot/ours"
+    )  # the SDK's domain
     stack.callback(middleware.close)
     return middleware
 

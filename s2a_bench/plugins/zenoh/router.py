@@ -1,4 +1,4 @@
-"""The router at which the nodes of some middlewares meet: where it is, and whether it is there. No Zenoh needed."""
+"""The router at which nodes meet: where it is, and whether it is there. No Zenoh needed."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import ipaddress
 import re
 import socket
 from contextlib import closing
-from dataclasses import dataclass
 from typing import Final
 
 from s2a_bench.errors import UsageError
@@ -15,14 +14,6 @@ ROUTER: Final = "tcp/127.0.0.1:7447"
 """Where rmw_zenoh's nodes look for their router."""
 ENDPOINT: Final = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):([0-9]{1,5})")
 LOOK_S: Final = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class Router:
-    """Where nodes meet; ``host``: our session is the router itself."""
-
-    endpoint: str = ROUTER
-    host: bool = False
 
 
 def endpoint_of(text: str) -> tuple[str, str, int]:
@@ -52,6 +43,13 @@ def may_host(endpoint: str) -> bool:
         return protocol == "tcp" and (host == "localhost" or ipaddress.ip_address(host).is_loopback)
     except ValueError:
         return False
+
+
+def to_host(endpoint: str) -> str:
+    """Return where a new server of ours is the router: at a free port without ``endpoint``, "" if it is a client."""
+    if not endpoint:
+        return free_endpoint()
+    return "" if listens(endpoint) or not may_host(endpoint) else endpoint
 
 
 def free_endpoint() -> str:
