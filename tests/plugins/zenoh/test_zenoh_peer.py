@@ -34,10 +34,8 @@ NAME = "/robot/node/get_parameter_types"
 @pytest.fixture
 def ours(stack: ExitStack) -> Middleware:
     """Our node, which is the router too."""
-    place = free_endpoint()
-    middleware = open_middleware(
-        "zenoh", domain_id=0, place=place, host=True, node_name="/robot/ours"
-    )  # the SDK's domain
+    router = free_endpoint()
+    middleware = open_middleware("zenoh", domain_id=0, place=router, host=True, node_name="/robot/ours")  # as the SDK's
     stack.callback(middleware.close)
     return middleware
 
