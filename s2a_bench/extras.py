@@ -28,7 +28,6 @@ _CORE: Final = {
     "grpc": "policies over gRPC, as lerobot serves them",
     "websocket": "policies over WebSocket, as openpi serves them",
     "zmq": "policies over ZeroMQ, as GR00T serves them",
-    "zenoh": "ROS 2 over Zenoh, as rmw_zenoh speaks it",
 }
 _OFFERED: Final[Registry[str]] = Registry("extras", "extra", {})
 _NOTED: ContextVar[dict[str, None] | None] = ContextVar("extras that are missing", default=None)

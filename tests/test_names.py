@@ -72,9 +72,10 @@ def named(path: Path) -> Iterator[str]:
     where = path.relative_to(ROOT).as_posix()
     for kind, (registry, home) in KINDS.items():
         declared = "s2a_bench/transport/__init__.py" if kind == "transport" else home
-        shipped = (name for name, point in registry._offered.items() if within(point.module, "s2a_bench.plugins"))
+        shipped = {name for name, point in registry._offered.items() if within(point.module, "s2a_bench.plugins")}
         for name in (*registry.built_in(), *shipped):
-            if where.startswith((home.format(name), declared, f"s2a_bench/plugins/{name}/")):
+            homes = (f"s2a_bench/plugins/{name}/",) if name in shipped else (home.format(name), declared)
+            if where.startswith(homes):
                 continue
             opened = registry[name].opens if kind == "middleware" else registry._builtins[name]
             module = opened.partition(":")[0]

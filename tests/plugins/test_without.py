@@ -42,6 +42,20 @@ PLUGINS = {
             "rclpy",
         )
     ],
+    "zenoh": [
+        Named(
+            ("latency", "--middleware", "zenoh"),
+            "--middleware: 'zenoh' is none of ",
+            ("latency", "--help-all"),
+            "zenoh",
+        ),
+        Named(
+            ("latency", "--router", "tcp/127.0.0.1:7447"),
+            "No such option: --router",
+            ("latency", "--help-all"),
+            "--router",
+        ),
+    ],
 }
 HIDING = """
 import importlib.metadata as metadata

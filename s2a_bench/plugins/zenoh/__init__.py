@@ -4,6 +4,7 @@ from s2a_bench.extras import how_to_install
 from s2a_bench.plugins.zenoh.router import ROUTER, endpoint_of, to_host
 from s2a_bench.ros import MeetingPlace, MiddlewareKind
 
+EXTRA = "ROS 2 over Zenoh, as rmw_zenoh speaks it"
 ZENOH = MiddlewareKind(
     "s2a_bench.plugins.zenoh.middleware:ZenohMiddleware",
     "zenoh",
