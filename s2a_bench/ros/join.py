@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Final, TypeVar
 from pydantic import Field
 
 from s2a_bench.errors import UsageError
-from s2a_bench.ros import MIDDLEWARES, MeetingPlace, Middleware, chosen, open_middleware
+from s2a_bench.ros import MIDDLEWARES, Middleware, chosen, open_middleware
 from s2a_bench.text import none_of
 
 T = TypeVar("T")
-PLACES: Final[dict[str, MeetingPlace]] = {
-    kind.meeting_place.option: kind.meeting_place for _, kind in MIDDLEWARES.loaded() if kind.meeting_place
-}
-"""Option -> the meeting place that it names."""
+PLACES: Final = {name: kind.meeting_place for name, kind in MIDDLEWARES.loaded() if kind.meeting_place}
+"""Middleware -> where its nodes meet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,8 +26,10 @@ class DomainParameters:
 if TYPE_CHECKING:
     PlaceParameters = DomainParameters
 else:
-    fields = [(name, str, place.default) for name, place in PLACES.items()]
-    PlaceParameters = make_dataclass("PlaceParameters", fields, bases=(DomainParameters,), frozen=True, slots=True)
+    named = {at.option: (at.option, str, at.default) for at in PLACES.values()}
+    PlaceParameters = make_dataclass(
+        "PlaceParameters", named.values(), bases=(DomainParameters,), frozen=True, slots=True
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,8 +41,8 @@ class RosParameters(PlaceParameters):
     def __post_init__(self) -> None:
         if self.middleware and self.middleware not in MIDDLEWARES:
             raise UsageError(f"middleware = {none_of(self.middleware, MIDDLEWARES)}")
-        for name, place in PLACES.items():
-            place.check(getattr(self, name))
+        for at in PLACES.values():
+            at.check(getattr(self, at.option))
 
     def join(self, name: str, opened: Callable[[Middleware], T]) -> T:
         """Return what ``opened`` makes of a node called ``name``; if it raises, the node leaves."""

@@ -21,5 +21,5 @@ ZENOH = MiddlewareKind(
     against_loss="--qos reliable: what is best effort is dropped where Zenoh's link is busy",
     extra="zenoh",
     packages=("eclipse-zenoh",),
-    checks={"zenoh": "s2a_bench.plugins.zenoh.checks:zenoh"},
+    checks={"zenoh": "s2a_bench.plugins.zenoh.router:check"},
 )

@@ -6,14 +6,21 @@ import ipaddress
 import re
 import socket
 from contextlib import closing
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UsageError
+from s2a_bench.extras import how_to_install
+
+if TYPE_CHECKING:
+    from s2a_bench.machine.doctor import Finding, Machine
 
 ROUTER: Final = "tcp/127.0.0.1:7447"
 """Where rmw_zenoh's nodes look for their router."""
 ENDPOINT: Final = re.compile(r"(tcp|udp|tls|quic|ws)/(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+):([0-9]{1,5})")
 LOOK_S: Final = 1.0
+STATE_AT: Final = 3
+"""The column of /proc/net/tcp that holds a socket's state."""
+LISTEN: Final = "0A"
 
 
 def endpoint_of(text: str) -> tuple[str, str, int]:
@@ -56,3 +63,16 @@ def free_endpoint() -> str:
     with closing(socket.socket()) as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def check(machine: Machine) -> Finding:
+    """Return whether Zenoh can be spoken, and whether a router listens where rmw_zenoh's nodes look for one."""
+    from s2a_bench.machine.doctor import Finding
+
+    if not machine.finds("zenoh"):
+        return Finding("zenoh", "state", "not installed", how_to_install("zenoh"))
+    port = f":{endpoint_of(ROUTER)[2]:04X}"
+    lines = [line.split() for name in ("tcp", "tcp6") for line in (machine.read(f"proc/net/{name}") or "").splitlines()]
+    there = any(len(line) > STATE_AT and line[1].endswith(port) and line[STATE_AT] == LISTEN for line in lines)
+    absent = f"no router listens at {ROUTER}: serve ros --middleware zenoh starts it"
+    return Finding("zenoh", "state", f"a router listens at {ROUTER}" if there else absent)

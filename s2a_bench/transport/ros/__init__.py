@@ -12,6 +12,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.facts import CAMERA_FACTS, PAYLOAD_BYTES, Fact
 from s2a_bench.ros import MIDDLEWARES
 from s2a_bench.ros.config import domain_id
+from s2a_bench.ros.join import PLACES
 from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Client, Transport, Urls, Wiring
 from s2a_bench.transport.ros.options import RosOptions
 
@@ -77,7 +78,10 @@ class Ros(Transport[RosOptions]):
         domain_id(os.environ)
         if options.kind.extra:
             extras.need(options.kind.extra, options.kind.module)
-        options.refuse_places_of_others()
+        own = options.kind.meeting_place
+        for name, at in PLACES.items():
+            if getattr(options, at.option) and not (own and own.option == at.option):
+                raise UsageError(f"`{at.option}` is {name.title()}'s: choose `middleware` {name}, or leave it out")
         if options.action and variant != ACTION:
             raise UsageError(f"`action` is spoken by ros/{ACTION}, not by ros/{variant}")
         if options.action and mode == "stream":

@@ -46,14 +46,14 @@ class DomainOptions(TransportOptions):
 if TYPE_CHECKING:
     PlaceOptions = DomainOptions
 else:
-    named = {name: (str, option("", at.about, side=SERVER, risk="url")) for name, at in PLACES.items()}
+    named = {at.option: (str, option("", at.about, side=SERVER, risk="url")) for at in PLACES.values()}
     PlaceOptions = create_model("PlaceOptions", __base__=DomainOptions, __module__=__name__, **named)
 
 
 class RosOptions(PlaceOptions):
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {
         "namespace": "/llama",
-        **{name: at.default for name, at in PLACES.items()},
+        **{at.option: at.default for at in PLACES.values()},
         "qos": "sensor_data",  # matches reliable cameras as well as best-effort ones
         "feedback_interval": 0.002,
         "max_tokens": 512,
@@ -131,8 +131,8 @@ class RosOptions(PlaceOptions):
         return url
 
     def check(self) -> None:
-        for name, at in PLACES.items():
-            if place := getattr(self, name):
+        for at in PLACES.values():
+            if place := getattr(self, at.option):
                 at.check(place)
         if self.url and self.action:
             raise UsageError("`url` and `action` name two servers; give one of them")
@@ -149,14 +149,6 @@ class RosOptions(PlaceOptions):
     @property
     def kind(self) -> MiddlewareKind:
         return chosen(self.middleware)
-
-    def refuse_places_of_others(self) -> None:
-        """Raise UsageError for a meeting place that the middleware does not have."""
-        own = self.kind.meeting_place
-        for given in (name for name in PLACES if getattr(self, name) and not (own and own.option == name)):
-            places = ((name, kind.meeting_place) for name, kind in MIDDLEWARES.loaded())
-            owner = next(name for name, at in places if at and at.option == given)
-            raise UsageError(f"`{given}` is {owner.title()}'s: choose `middleware` {owner}, or leave it out")
 
     @property
     def datagrams(self) -> bool:
