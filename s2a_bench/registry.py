@@ -91,4 +91,5 @@ def missing_entry_points(checkout: Path = Path(__file__).parent.parent) -> list[
         installed = {(point.group, point.name) for point in distribution("s2a-bench").entry_points}
     except PackageNotFoundError:
         installed = set()
-    return [name for group, points in declared.items() for name in points if (group, name) not in installed]
+    missing = (name for group, points in declared.items() for name in points if (group, name) not in installed)
+    return [*dict.fromkeys(missing)]

@@ -343,11 +343,8 @@ def chosen(name: str = "") -> MiddlewareKind:
 
 def way_out(kind: MiddlewareKind) -> str:
     """Return what to do where a middleware is not installed: also each other one that pip installs."""
-    others = (
-        f"--middleware {name} ({how_to_install(other.extra)})"
-        for name, other in MIDDLEWARES.loaded()
-        if other.extra and other != kind
-    )
+    extras = {name: other.extra for name, other in MIDDLEWARES.loaded() if other != kind and other.extra}
+    others = (f"--middleware {name} ({how_to_install(extra)})" for name, extra in extras.items())
     return ", or ".join((kind.way_out, *others))
 
 
