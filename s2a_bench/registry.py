@@ -69,12 +69,9 @@ class Registry(Mapping[str, T], Generic[T]):
         return tuple(self._builtins)
 
     def loaded(self) -> Iterator[tuple[str, T]]:
-        """Yield every name with its implementation, built-ins first, the others by their ``order`` if they have one.
-
-        Packages that do not load are left out.
-        """
+        """Yield every name with its implementation: built-ins, then those of packages that load, by any ``order``."""
         yield from ((name, self[name]) for name in self._builtins)
-        offered: list[tuple[str, T]] = []
+        offered = list[tuple[str, T]]()
         for name in self._offered:
             with suppress(UsageError):
                 offered.append((name, self[name]))

@@ -38,7 +38,7 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     target = tmp_path_factory.mktemp("site")
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--no-index"]
     subprocess.run([*pip, "--target", str(target), str(source)], check=True, timeout=120)
-    return os.environ | {"PYTHONPATH": os.pathsep.join([str(target), str(ROOT)])}
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(target), str(ROOT), os.environ.get("PYTHONPATH", "")])}
 
 
 @pytest.fixture
@@ -276,6 +276,10 @@ def test_its_dialect_is_known_by_name(command: Command) -> None:
     spoken = ["--dialect", "toy-chat", "--served-model", "toy"]
     done = command("latency", "--url", "http://127.0.0.1:9", *spoken, "--transport", "http", *SMALL, code=1)
     assert "nothing answers at http://127.0.0.1:9/toy/chat" in done.stderr
+    closed = ("latency", "--url", "http://127.0.0.1:9", "--transport", "http", "--toy-room", "blue", *SMALL)
+    assert "nothing answers at http://127.0.0.1:9/toy/chat/blue" in command(*closed, *spoken, code=1).stderr
+    refused = command(*closed, "--dialect", "openai", code=2).stderr
+    assert "--toy-room: the dialect 'openai' takes none; leave it out, or choose --dialect toy-chat" in refused
 
 
 def test_its_experiment_is_a_command_and_a_function(

@@ -24,13 +24,9 @@ BESIDE: Final = ("ros", LOOPBACK)
 
 
 def acting_over() -> tuple[str, str]:
-    """Return the transport of a control loop, and the default in words.
-
-    It is the first, by `order`, that has a server of ours and answers with actions alone.
-    """
-    able = [each for _, each in TRANSPORTS.loaded() if each.serves and each.answer_kinds == (ACTIONS,)]
-    if not able:
-        return ACTING, ACTING
-    first = min(able, key=lambda each: each.order)
-    installed = all(map(extras.installed, first.needs[1:]))
-    return first.name if installed else ACTING, f"{first.name}, {ACTING} where its packages are not installed"
+    """Return the transport of a control loop, and in words: the first that serves actions alone, in their order."""
+    for name, each in TRANSPORTS.loaded():
+        if each.serves and each.answer_kinds == (ACTIONS,):
+            installed = all(map(extras.installed, each.needs[1:]))
+            return name if installed else ACTING, f"{name}, {ACTING} where its packages are not installed"
+    return ACTING, ACTING

@@ -39,6 +39,26 @@ PLUGINS = {
         Named(("latency", "--clock", "ptp"), "No such option: --clock", ("latency", "--help-all"), "--clock "),
         Named(("advise", "--link", "4g"), "No such command 'advise'", ("--help",), "advise  "),
     ],
+    "policy_servers": [
+        Named(
+            ("latency", "--transport", "websocket"),
+            "--transport: 'websocket' is none of ",
+            ("latency", "--help-all"),
+            "shm, websocket, zmq, grpc",
+        ),
+        Named(
+            ("latency", "--url", "http://127.0.0.1:9", "--dialect", "openvla"),
+            "--dialect: 'openvla' is none of ",
+            ("latency", "--help-all"),
+            "--template",
+        ),
+        Named(
+            ("chunks", "--live", "--transport", "grpc"),
+            "--transport: 'grpc' is none of ",
+            ("chunks", "--help-all"),
+            "[default: websocket",
+        ),
+    ],
     "rclpy": [
         Named(
             ("latency", "--middleware", "rclpy"),
