@@ -305,7 +305,7 @@ def test_its_experiment_is_a_command_and_a_function(
 
 def test_its_surroundings_are_options_manifest_and_columns(command: Command, tmp_path: Path) -> None:
     done = command("latency", "--transport", "loopback", "--toy-room", "34.3", *SMALL, "--json")
-    assert json.loads(done.stdout)["cells"][0]["toy_walk_ms"]["median"] == 100
+    assert json.loads(done.stdout)["cells"][0]["toy_walk_ms"]["median"] == pytest.approx(100)
     manifest = json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())
     assert (manifest["toy_room"], manifest["configuration"]["toy_room"]) == (34.3, 34.3)
     assert "entering the room" in done.stderr

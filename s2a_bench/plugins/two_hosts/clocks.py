@@ -75,6 +75,11 @@ class Exchange:
             raise RequestFailed("the server reported no marks, so that its clock cannot be compared with this host's")
         return Exchange(trace.marks[-2][1], remote.marks[0][1], remote.marks[-1][1], trace.marks[-1][1])
 
+    @staticmethod
+    def bounded(at_ns: int, middle_ns: int, error_ns: int) -> Exchange:
+        """Return an exchange in no time, for an offset as both wall clocks and the bounds of their errors give it."""
+        return Exchange(at_ns, at_ns + middle_ns + error_ns, at_ns + middle_ns - error_ns, at_ns)
+
     @property
     def upper(self) -> Point:
         return self.sent_ns, self.received_ns - self.sent_ns
@@ -82,24 +87,6 @@ class Exchange:
     @property
     def lower(self) -> Point:
         return self.seen_ns, self.answered_ns - self.seen_ns
-
-
-@dataclass(frozen=True, slots=True)
-class Bounded:
-    """The offset at one instant as both hosts' wall clocks and the bounds of their errors give it."""
-
-    sent_ns: int
-    seen_ns: int
-    middle_ns: int
-    error_ns: int
-
-    @property
-    def upper(self) -> Point:
-        return self.seen_ns, self.middle_ns + self.error_ns
-
-    @property
-    def lower(self) -> Point:
-        return self.seen_ns, self.middle_ns - self.error_ns
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,9 +113,9 @@ class Offset:
     """The offset of another clock from this host's, the other minus this one."""
 
     def __init__(self) -> None:
-        self._exchanges: deque[Exchange | Bounded] = deque(maxlen=KEPT)
+        self._exchanges: deque[Exchange] = deque(maxlen=KEPT)
 
-    def add(self, exchange: Exchange | Bounded) -> None:
+    def add(self, exchange: Exchange) -> None:
         """Add an exchange, or what the wall clocks say, on any thread."""
         self._exchanges.append(exchange)
 
@@ -144,12 +131,12 @@ class Offset:
         near = self._until(min(at_ns + WINDOW_NS // 2, last_ns))
         return interval_at(at_ns, near or self._until(last_ns))  # a frame may be far older than all exchanges
 
-    def _until(self, end_ns: int) -> list[Exchange | Bounded]:
+    def _until(self, end_ns: int) -> list[Exchange]:
         """Return the exchanges within `WINDOW_NS` before a time."""
         return [e for e in [*self._exchanges] if e.seen_ns >= end_ns - WINDOW_NS and e.sent_ns <= end_ns]
 
 
-def interval_at(at_ns: int, exchanges: Sequence[Exchange | Bounded]) -> Interval:
+def interval_at(at_ns: int, exchanges: Sequence[Exchange]) -> Interval:
     """Return the interval of the offset at an instant; raises ClockMoved if no line passes between the exchanges.
 
     The least and the greatest value are those of vertices of the polygon: of lines through two of the bounds, or
@@ -250,6 +237,5 @@ class RemoteClock:
         if not trace.facts.keys() >= {REALTIME_MS, REALTIME_ERROR_MS}:
             raise RequestFailed(f"`clock` {self._system}: the server does not tell its wall clock; leave it out")
         theirs_ns, error_ns = (round(trace.facts[name] * 1e6) for name in (REALTIME_MS, REALTIME_ERROR_MS))
-        sent_ns, seen_ns = Exchange.of(trace).sent_ns, now_ns()
         error_ns += ours.error_ns + FLOAT_NS + round(2 * FRESH_NS * WANDER)
-        self._offsets[self._id].add(Bounded(sent_ns, seen_ns, ours.offset_ns - theirs_ns, error_ns))
+        self._offsets[self._id].add(Exchange.bounded(now_ns(), ours.offset_ns - theirs_ns, error_ns))

@@ -1,9 +1,9 @@
-"""What surrounds a run: a link that is emulated between client and servers; a host with another clock."""
+"""Two hosts: a link that is emulated between client and servers, or a server whose host has another clock."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -15,70 +15,52 @@ from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.transport.surroundings import Around, Exchange, OtherClock, Surroundings
 
 
-class LinkOptions(Options):
+class HostOptions(Options):
+    PANEL: ClassVar[str] = TRANSPORT
+
     link: str = option(
         "",
         f"emulated link between client and servers: {', '.join(published())}, a FILE (TOML, a trace as CSV), or "
         "rate=UP/DOWN,delay=MS,jitter=MS,loss=SHARE, also after a name [default: none]",
-        panel=TRANSPORT,
         names=published,
+    )
+    clock: Literal["", "chrony", "ptp"] = option(
+        "",
+        "with a server of ours on another host: chrony, ptp also bound the clocks' offset, if they run on both hosts "
+        "[default: exchanges alone]",
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Link(Surroundings):
-    profile: LinkProfile
+@dataclass(frozen=True)
+class TwoHosts(Surroundings):
+    profile: LinkProfile | None = None
+    """Of the link, if one is emulated."""
+    system: str = ""
+    """What bounds the wall clocks of both hosts, one of `WALL_CLOCKS`, or nothing."""
 
-    options: ClassVar[type[Options]] = LinkOptions
+    options: ClassVar[type[Options]] = HostOptions
     columns: ClassVar[str] = "s2a_bench.plugins.two_hosts.view:bounded"
     metrics: ClassVar[str] = "s2a_bench.plugins.two_hosts.view:METRICS"
     figures: ClassVar[str] = "s2a_bench.plugins.two_hosts.view:figures"
 
     @classmethod
-    def of(cls, config: LinkOptions, pipelines: Sequence[Pipeline]) -> Link | None:
-        if not config.link:
-            return None
-        profile = load_link(config.link)
-        if running := running_server(pipelines):
+    def of(cls, config: HostOptions, pipelines: Sequence[Pipeline]) -> TwoHosts:
+        running = next((each.options.external for each in pipelines if each.options.external_address), "")
+        if config.clock and not running:
+            raise UsageError("`clock` is about a server of ours on another host; name it with `url`")
+        profile = load_link(config.link) if config.link else None
+        if profile and running:
             raise UsageError(f"`link`: a server that runs already is not behind it; leave out `{running}`")
-        if local := [each.name for each in pipelines if not each.transport.crosses_links]:
+        if profile and (local := [each.name for each in pipelines if not each.transport.crosses_links]):
             raise UsageError(f"`link`: {', '.join(local)} sends nothing over a network; leave it out of `transport`")
-        return cls(profile)
+        return cls(profile, config.clock)
 
     def around(self) -> AbstractContextManager[Around]:
         from s2a_bench.plugins.two_hosts.links import emulated
 
-        return emulated(self.profile)
-
-
-class ClockOptions(Options):
-    clock: Literal["", "chrony", "ptp"] = option(
-        "",
-        "with a server of ours on another host: chrony, ptp also bound the clocks' offset, if they run on both hosts "
-        "[default: exchanges alone]",
-        panel=TRANSPORT,
-    )
-
-
-@dataclass(frozen=True, slots=True)
-class HostClock(Surroundings):
-    system: str
-    """What bounds the wall clocks of both hosts, one of `WALL_CLOCKS`, or nothing."""
-
-    options: ClassVar[type[Options]] = ClockOptions
-
-    @classmethod
-    def of(cls, config: ClockOptions, pipelines: Sequence[Pipeline]) -> HostClock:
-        if config.clock and not running_server(pipelines):
-            raise UsageError("`clock` is about a server of ours on another host; name it with `url`")
-        return cls(config.clock)
+        return emulated(self.profile) if self.profile else nullcontext(Around())
 
     def clock(self, exchange: Exchange, shared: dict[str, Any] | None) -> OtherClock:
         from s2a_bench.plugins.two_hosts.clocks import RemoteClock
 
         return RemoteClock(exchange, shared, self.system)
-
-
-def running_server(pipelines: Sequence[Pipeline]) -> str:
-    """Return the first option that names a server which runs already, or nothing."""
-    return next((each.options.external for each in pipelines if each.options.external_address), "")

@@ -21,7 +21,6 @@ from s2a_bench.plugins.two_hosts.clocks import (
     KEPT,
     RATE,
     WINDOW_NS,
-    Bounded,
     Exchange,
     Interval,
     Offset,
@@ -154,7 +153,7 @@ def test_far_from_its_exchange_an_offset_may_have_drifted_at_the_limit_of_the_ra
     assert (before.lo_ns, before.hi_ns) == pytest.approx((-1500 - drift_ns - 200, 500 + drift_ns), abs=2)
 
 
-def best(at_ns: int, exchanges: Sequence[Exchange | Bounded], slack_ns: float) -> tuple[float, float] | None:
+def best(at_ns: int, exchanges: Sequence[Exchange], slack_ns: float) -> tuple[float, float] | None:
     """Return the least and the greatest a + b t over all lines between the bounds, by linear programming."""
     rows = [((1, (time - at_ns) / 1e6), bound + slack_ns) for time, bound in (each.upper for each in exchanges)]
     rows += [((-1, (at_ns - time) / 1e6), slack_ns - bound) for time, bound in (each.lower for each in exchanges)]
@@ -166,7 +165,7 @@ def best(at_ns: int, exchanges: Sequence[Exchange | Bounded], slack_ns: float) -
 
 ONE = st.builds(
     lambda sent, wide, offset, up, bounded: (
-        Bounded((sent + wide) * 1000, (sent + wide) * 1000, offset, up)
+        Exchange.bounded((sent + wide) * 1000, offset, up)
         if bounded
         else Exchange(sent * 1000, sent * 1000 + offset + up, sent * 1000 + offset + up, (sent + wide) * 1000)
     ),
@@ -183,7 +182,7 @@ ONE = st.builds(
 @example([Exchange(0, 100, 100, 200), Exchange(1000, 1250, 1250, 1200)], 0)
 @example([Exchange(0, 100, 100, 200), Exchange(1000, 950, 950, 1200)], 0)
 @example([Exchange(-1000, 9000, 9000, -900), Exchange(0, 10_000 - 300, 9800, 100)], 500)
-def test_an_interval_is_that_of_every_line_between_the_bounds(exchanges: list[Exchange | Bounded], at_us: int) -> None:
+def test_an_interval_is_that_of_every_line_between_the_bounds(exchanges: list[Exchange], at_us: int) -> None:
     """At most what floats lose is added; without such a line it is an error."""
     inner, outer = (best(at_us * 1000, exchanges, slack_ns) for slack_ns in (0, 0.5 + 1e-3))
     try:
@@ -325,7 +324,7 @@ def test_wall_clocks_that_are_off_by_all_that_they_say_still_hold_the_offset(
     ours, theirs, wander = 300_000, 200_000, 10_000
     server = Elsewhere(virtual, 10**12, 0.0, -off * (theirs + wander), theirs)
     mine = WallClock(REAL_NS + off * (ours + wander), ours, 0)
-    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.wall_clock", lambda _: mine)
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.WALL_CLOCKS", {"chrony": lambda: mine})
     offsets: dict[str, Offset] = {}
     remote = RemoteClock(server.exchange, offsets, "chrony")
     for _ in range(3):
@@ -368,7 +367,7 @@ def test_a_server_that_tells_less_than_its_wall_clock_or_no_marks_is_refused(
     virtual: VirtualClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server = Elsewhere(virtual)
-    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.wall_clock", lambda _: WallClock(REAL_NS, 1, 0))
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.WALL_CLOCKS", {"ptp": lambda: WallClock(REAL_NS, 1, 0)})
     remote = RemoteClock(lambda _: server.exchange(), {}, "ptp")
     with pytest.raises(RequestFailed, match="`clock` ptp: the server does not tell its wall clock"):
         remote.join(server.exchange(), virtual.now_ns())

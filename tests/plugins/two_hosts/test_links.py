@@ -119,9 +119,11 @@ def test_a_probe_that_is_off_names_what_was_measured(monkeypatch: pytest.MonkeyP
         probed(type("Link", (), {"profile": load_link("4g")})())  # type: ignore[arg-type]
 
 
-def test_the_manifest_has_both_directions_without_their_steps() -> None:
-    profile = load_link("rate=9,rate_cv=0.3,delay=4,seed=5")
-    facts = EmulatedLink(profile, 0, 0, None).facts()  # type: ignore[arg-type]
+def test_the_manifest_has_both_directions_without_their_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    profile, said = load_link("rate=9,rate_cv=0.3,delay=4,seed=5"), list[str]()
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.links.probed", lambda _: {"probe": {}})
+    facts = EmulatedLink(profile, 0, 0, None).facts(said.append)["link"]  # type: ignore[arg-type]
+    assert (said, facts["probe"]) == ([f"probing the link {profile.name}"], {})
     up, down = facts["directions"]
     assert (up["steps"], down["steps"]) == ((), ())
     assert (up["delay_ms"], up["seed"], down["seed"]) == (4, 10, 11)
@@ -150,7 +152,7 @@ def test_the_servers_side_has_the_usual_address_and_the_thread_returns_home(monk
             seen["client"] = client.getsockname()[0]
         assert os.environ["ROS_STATIC_PEERS"] == "127.0.0.1;127.0.0.2"
         assert os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
-        assert link.statistics()["packets"] > 0
+        assert link.totals()["link"]["relay"]["packets"] > 0
 
     on_link("delay=1", use)
     assert seen["client"] == CLIENT

@@ -15,8 +15,8 @@ from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WallClock
-from s2a_bench.plugins.two_hosts.clocks import Bounded, Exchange, Offset
-from s2a_bench.plugins.two_hosts.surroundings import HostClock
+from s2a_bench.plugins.two_hosts.clocks import Exchange, Offset
+from s2a_bench.plugins.two_hosts.surroundings import TwoHosts
 from s2a_bench.store.requests import samples_table
 from s2a_bench.trace import STAGES as COMMON
 from s2a_bench.trace import Remote, Trace
@@ -117,14 +117,13 @@ def with_wall_clocks(
 ) -> Measured:
     """Measure where both wall clocks are known to 20 us, the server's after all off by ``off_ms``."""
     ours = WallClock(17 * 10**17, 20_000, 0)
-    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.wall_clock", lambda _: ours)
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.WALL_CLOCKS", {"chrony": lambda: ours})
     theirs_ms = (ours.offset_ns - client.ahead_ns) / 1e6 + off_ms
     client.facts = {REALTIME_MS: theirs_ms, REALTIME_ERROR_MS: ours.error_ns / 1e6} if tells else {}
     source, plan = open_source("synthetic", 64, 48, fps=30.0, seed=0), resolve(RequestsConfig()).request
     feed = RequestFeed(source, preencoded=False)
-    session = Session(
-        one_pipeline("http/as-deployed"), client, feed, replace(plan, surroundings=(HostClock("chrony"),)), clocks={}
-    )
+    plan = replace(plan, surroundings=(TwoHosts(system="chrony"),))
+    session = Session(one_pipeline("http/as-deployed"), client, feed, plan, clocks={})
     measured = session.measure(Place(0, 0, warmup=False))
     source.close()
     return measured
@@ -138,7 +137,7 @@ def test_bounds_of_the_wall_clocks_narrow_the_interval(monkeypatch: pytest.Monke
     offset = Offset()
     offset.add(Exchange(0, 5_000_000, 5_000_000, 2_000_000))
     exchanged = offset.over(2_000_000)
-    offset.add(Bounded(1_000_000, 2_000_000, middle_ns=4_000_000, error_ns=50_000))
+    offset.add(Exchange.bounded(2_000_000, middle_ns=4_000_000, error_ns=50_000))
     both = offset.over(2_000_000)
     assert (both.lo_ns, both.hi_ns) == (pytest.approx(3_950_000, abs=2), pytest.approx(4_050_000, abs=2))
     assert both.hi_ns - both.lo_ns < exchanged.hi_ns - exchanged.lo_ns

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from s2a_bench.errors import RequestFailed
+from s2a_bench.machine.clocks import WALL_CLOCKS
 from s2a_bench.plugins.two_hosts import wall_clocks as clocks
 
 CHRONY = (
@@ -24,7 +25,8 @@ PTP = """sending: GET CURRENT_DATA_SET
 
 @pytest.fixture(autouse=True)
 def nothing_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clocks, "_read", {})
+    for each in (clocks.CHRONY, clocks.PTP):
+        monkeypatch.setattr(each, "known", None)
 
 
 def test_chronys_bound_is_the_root_distance_and_the_offset() -> None:
@@ -54,7 +56,7 @@ def test_a_system_without_a_bound_is_one_line(
 
     monkeypatch.setattr(clocks.subprocess, "run", run)
     with pytest.raises(RequestFailed, match="`clock` ") as error:
-        clocks.wall_clock(system)
+        WALL_CLOCKS[system]()
     assert message in str(error.value)
 
 
@@ -67,7 +69,7 @@ def test_a_reading_is_used_for_a_second(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(clocks.subprocess, "run", run)
     monkeypatch.setattr(clocks, "FRESH_NS", 10**15)
-    first = clocks.wall_clock("ptp")
-    assert clocks.wall_clock("ptp") is first
-    assert runs == [clocks.COMMANDS["ptp"]]
+    first = clocks.PTP()
+    assert clocks.PTP() is first
+    assert runs == [("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET")]
     assert first.error_ns >= 9452
