@@ -59,11 +59,6 @@ def paper_throughput() -> tuple[PaperThroughput, ...]:
     )
 
 
-def paper_colours() -> dict[str, str]:
-    """Return policy -> the name of its colour in the paper's figure 5."""
-    return dict(_reference()["timeline"]["colours"])
-
-
 def _reference() -> dict[str, Any]:
     file = files("s2a_bench.experiments").joinpath("paper_reference.toml")
     return loads(file.read_text(encoding="utf-8"), file.name)
