@@ -1,64 +1,54 @@
-"""The paper's claims, as data; drawn only on request, and never as a measurement of ours."""
+"""The paper's figures, as data; drawn only on request, and never as a measurement of ours."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib.resources import files
-from typing import Any
+from typing import Final
 
-from s2a_bench.errors import UsageError
-from s2a_bench.options import Options, option
+from s2a_bench.experiments.references import GreyBars, Reference
 from s2a_bench.toml_file import loads
+from s2a_bench.writers.figures import Bar
 
-
-class AgainstPaper(Options):
-    against: str = option("", "paper: draw the paper's values beside ours")
-
-    def check(self) -> None:
-        if self.against not in {"", "paper"}:
-            raise UsageError(f"`against`: '{self.against}' should be paper")
-
-
-LABEL = "paper (Jetson AGX Orin), another machine"
-CAVEAT = "The paper does not say that inference is left out; its figures allow nothing else."
-
-
-@dataclass(frozen=True, slots=True)
-class PaperLatency:
-    """One bar of the paper's figure 4: mean and standard deviation over its runs."""
-
-    name: str
-    mean_ms: float
-    sd_ms: float
+PAPER = Reference(
+    title="the paper",
+    source="the Stream-to-Act paper",
+    bars={
+        "latency_bars": "s2a_bench.experiments.paper:LATENCY",
+        "throughput_bars": "s2a_bench.experiments.paper:THROUGHPUT",
+    },
+    claims="s2a_bench.report.claims.table:judge_claims",
+    note="Times of the paper are of its Jetson AGX Orin unless it names another board.",
+)
 
 
 @dataclass(frozen=True, slots=True)
-class PaperThroughput:
-    """One row of the paper's table II: tokens/s, the mean of 10 runs, on a board."""
+class Published:
+    """A mean of the paper over its runs, and its standard deviation if there is one."""
 
     name: str
-    tokens_per_s: float
+    mean: float
+    sd: float | None = None
+
+    @property
+    def bar(self) -> Bar:
+        name, text = f"paper:\n{self.name}", f"{self.mean:g}"
+        if self.sd is None:
+            return Bar(name, self.mean, None, text)
+        return Bar(name, self.mean, (self.mean - self.sd, self.mean + self.sd), f"{text} ± {self.sd:.1f}")
 
 
-def paper_latency() -> tuple[PaperLatency, PaperLatency]:
-    """Return HTTP/JSON and ROS-native as claimed in section V-B."""
-    orin = _reference()["latency"]["orin_agx"]
-    return (
-        PaperLatency("HTTP/JSON", orin["http_json_mean_ms"], orin["http_json_sd_ms"]),
-        PaperLatency("ROS-native", orin["ros_native_mean_ms"], orin["ros_native_sd_ms"]),
-    )
-
-
-def paper_throughput() -> tuple[PaperThroughput, ...]:
-    """Return the three boards of table II (section V-D); no spread is given there."""
-    table = _reference()["throughput"]
-    return (
-        PaperThroughput("RTX 4080", table["rtx_4080"]),
-        PaperThroughput("Jetson AGX Orin", table["jetson_agx_orin"]),
-        PaperThroughput("Jetson Orin Nano", table["jetson_orin_nano"]),
-    )
-
-
-def _reference() -> dict[str, Any]:
-    file = files("s2a_bench.experiments").joinpath("paper_reference.toml")
-    return loads(file.read_text(encoding="utf-8"), file.name)
+_FILE: Final = files("s2a_bench.experiments").joinpath("paper_reference.toml")
+_FOUND: Final = loads(_FILE.read_text(encoding="utf-8"), _FILE.name)
+_ORIN, _RATES = _FOUND["latency"]["orin_agx"], _FOUND["throughput"]
+HTTP: Final = Published("HTTP/JSON", _ORIN["http_json_mean_ms"], _ORIN["http_json_sd_ms"])
+ROS: Final = Published("ROS-native", _ORIN["ros_native_mean_ms"], _ORIN["ros_native_sd_ms"])
+"""The means of section V-B, in ms."""
+RTX: Final = Published("RTX 4080", _RATES["rtx_4080"])
+ORIN: Final = Published("Jetson AGX Orin", _RATES["jetson_agx_orin"])
+NANO: Final = Published("Jetson Orin Nano", _RATES["jetson_orin_nano"])
+"""The tokens/s of the boards of table II (section V-D); no spread is given there."""
+LABEL: Final = "paper (Jetson AGX Orin), another machine"
+_CAVEAT: Final = "The paper does not say that inference is left out; its figures allow nothing else."
+LATENCY: Final = GreyBars(LABEL, (HTTP.bar, ROS.bar), (f"Grey: {LABEL}, mean ± sd; {_CAVEAT}.",))
+THROUGHPUT: Final = GreyBars("the paper's claim (table II), other machines", (RTX.bar, ORIN.bar, NANO.bar))

@@ -16,7 +16,6 @@ import pytest
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
 from s2a_bench.provenance import Origins
-from s2a_bench.report.claims import claim_table
 from s2a_bench.report.claims.table import judge_claims
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import StoredRun, read_run
@@ -31,11 +30,8 @@ SENT = {"convert": 10, "inference": 5, "return": 0}
 
 def claim_lines(*runs: StoredRun) -> list[str]:
     """Return the text of every claim that these runs can judge, or nearly so."""
-    judged = [each for each in judge_claims(runs) if each.findings]
-    texts = []
-    for row in claim_table(judged).rows:
-        where, claim, _, verdict, required, evidence = map(str, row)
-        texts.append(f"- **{where}: {claim}**: {verdict}. {evidence} *{required}*")
+    judged = [each for each in judge_claims(runs) if each.evidence]
+    texts = [f"- **{each.where}: {each.claim}**: {each.verdict}. {each.text} *{each.required}*" for each in judged]
     names = sorted({run.path.name for run in runs}, key=len, reverse=True)
     return [re.sub("|".join(map(re.escape, names)), "RUN", text) for text in texts]
 
