@@ -48,7 +48,7 @@ TESTS = {
     "store": ["tests/store", "tests/sweep/test_sweep.py"],
     "library.py": ["tests/test_library.py"],
     "transport": ["tests/transport", "tests/harness/test_serving.py", "tests/machine/test_doctor.py"],
-    "report/claims": [f"tests/report/test_claim{part}.py" for part in ("_rules", "_texts", "s", "_cases")],
+    "plugins/paper/claims": ["tests/plugins/paper"],
     "report/advise": ["tests/report/test_advise.py"],
     "report/compare/gates.py": ["tests/report/test_compare.py"],
     "experiments/capacity": ["tests/experiments/capacity"],

@@ -43,9 +43,7 @@ class Reference:
     """A note below the table of its claims."""
 
 
-REFERENCES: Final[Registry[Reference]] = Registry(
-    "references", "against", {"paper": "s2a_bench.experiments.paper:PAPER"}
-)
+REFERENCES: Final[Registry[Reference]] = Registry("references", "against", {})
 
 
 def against(about: str) -> str:

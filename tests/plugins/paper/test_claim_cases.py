@@ -14,11 +14,11 @@ from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.harness.timelines.config import TimelineConfig
+from s2a_bench.plugins.paper.claims import CONTRADICTED, REPRODUCED, SUPPORTED, UNDECIDED
+from s2a_bench.plugins.paper.claims.plans import after, timelines
+from s2a_bench.plugins.paper.claims.requests import change
+from s2a_bench.plugins.paper.claims.table import judge_claims
 from s2a_bench.provenance import Origins, Provenance
-from s2a_bench.report.claims import CONTRADICTED, REPRODUCED, SUPPORTED, UNDECIDED
-from s2a_bench.report.claims.plans import after, timelines
-from s2a_bench.report.claims.requests import change
-from s2a_bench.report.claims.table import judge_claims
 from s2a_bench.report.verdicts import ClaimVerdict
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.provenance import Provenance
-from s2a_bench.report.claims import (
+from s2a_bench.plugins.paper.claims import (
     CONTRADICTED,
     REPRODUCED,
     SUPPORTED,
@@ -21,8 +20,9 @@ from s2a_bench.report.claims import (
     combine,
     within,
 )
-from s2a_bench.report.claims.requests import PAPERS_MODEL, facts_of, on_board
-from s2a_bench.report.claims.table import CLAIMS
+from s2a_bench.plugins.paper.claims.requests import PAPERS_MODEL, facts_of, on_board
+from s2a_bench.plugins.paper.claims.table import CLAIMS
+from s2a_bench.provenance import Provenance
 from s2a_bench.report.verdicts import Met
 from s2a_bench.stats import Ratio
 from s2a_bench.store.run import StoredRun

@@ -6,20 +6,9 @@ from dataclasses import dataclass
 from importlib.resources import files
 from typing import Final
 
-from s2a_bench.experiments.references import GreyBars, Reference
+from s2a_bench.experiments.references import GreyBars
 from s2a_bench.toml_file import loads
 from s2a_bench.writers.figures import Bar
-
-PAPER = Reference(
-    title="the paper",
-    source="the Stream-to-Act paper",
-    bars={
-        "latency_bars": "s2a_bench.experiments.paper:LATENCY",
-        "throughput_bars": "s2a_bench.experiments.paper:THROUGHPUT",
-    },
-    claims="s2a_bench.report.claims.table:judge_claims",
-    note="Times of the paper are of its Jetson AGX Orin unless it names another board.",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +27,7 @@ class Published:
         return Bar(name, self.mean, (self.mean - self.sd, self.mean + self.sd), f"{text} ± {self.sd:.1f}")
 
 
-_FILE: Final = files("s2a_bench.experiments").joinpath("paper_reference.toml")
+_FILE: Final = files("s2a_bench.plugins.paper").joinpath("paper_reference.toml")
 _FOUND: Final = loads(_FILE.read_text(encoding="utf-8"), _FILE.name)
 _ORIN, _RATES = _FOUND["latency"]["orin_agx"], _FOUND["throughput"]
 HTTP: Final = Published("HTTP/JSON", _ORIN["http_json_mean_ms"], _ORIN["http_json_sd_ms"])

@@ -22,14 +22,23 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     share_of,
     tokens_line,
 )
-from s2a_bench.experiments.paper import ORIN, Published
 from s2a_bench.experiments.timeline.view.cells import Timelines, timelines_of
 from s2a_bench.plan.skillset import GAPS
+from s2a_bench.plugins.paper.claims import Check, Need, RunPart, Trial
+from s2a_bench.plugins.paper.claims.requests import (
+    NEAR,
+    PAPERS_MODEL,
+    change,
+    emulated,
+    exact,
+    facts_of,
+    on_board,
+    one_of,
+)
+from s2a_bench.plugins.paper.figures import ORIN, Published
 from s2a_bench.policy import TOLERANCE_S, Floats, Plans
 from s2a_bench.policy.schedule import elastic, safe_start, work_conserving
 from s2a_bench.provenance import UNKNOWN
-from s2a_bench.report.claims import Check, Need, RunPart, Trial
-from s2a_bench.report.claims.requests import NEAR, PAPERS_MODEL, change, emulated, exact, facts_of, on_board, one_of
 from s2a_bench.report.verdicts import Met
 from s2a_bench.scenario.ccrb.labels import OUTCOME_LABELS, PAPER, law
 from s2a_bench.scenario.ccrb.options import CcrbOptions

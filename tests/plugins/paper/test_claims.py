@@ -21,7 +21,7 @@ from s2a_bench.experiments.references import REFERENCES
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.harness.timelines.config import TimelineConfig
-from s2a_bench.report.claims import (
+from s2a_bench.plugins.paper.claims import (
     CONTRADICTED,
     IDENTITY,
     REPRODUCED,
@@ -32,8 +32,8 @@ from s2a_bench.report.claims import (
     Trial,
     judge,
 )
-from s2a_bench.report.claims.plans import CHOSEN, PLANE, PLANS
-from s2a_bench.report.claims.table import CLAIMS, judge_claims
+from s2a_bench.plugins.paper.claims.plans import CHOSEN, PLANE, PLANS
+from s2a_bench.plugins.paper.claims.table import CLAIMS, judge_claims
 from s2a_bench.report.verdicts import ClaimVerdict, Verdicts
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import StoredRun, read_run
@@ -77,7 +77,7 @@ def test_without_runs_each_claim_says_what_to_run() -> None:
     assert [each.text for each in judged] == [f"Run: {claim.trial.run}" for claim in CLAIMS]
     assert all(not each.tested and each.rule.endswith(".") for each in judged)
     assert all(claim.trial.command in EXPERIMENTS for claim in CLAIMS)
-    docs = (Path(__file__).parents[2] / "docs" / "report.md").read_text(encoding="utf-8")
+    docs = (Path(__file__).parents[3] / "docs" / "report.md").read_text(encoding="utf-8")
     for each in judged:
         assert f"| {each.where} | {each.claim} | {each.rule} | {each.required} |" in docs
     table = Verdicts(REFERENCES["paper"], judged).table()
