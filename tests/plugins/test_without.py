@@ -29,6 +29,14 @@ PLUGINS = {
             "longitudinal, embedded, carla",
         )
     ],
+    "paper": [
+        Named(
+            ("report", "results", "--against", "paper"),
+            "--against: 'paper' should be left out",
+            ("report", "--help"),
+            "paper: add",
+        )
+    ],
     "rclpy": [
         Named(
             ("latency", "--middleware", "rclpy"),
