@@ -318,6 +318,26 @@ def test_its_command_is_one_of_the_commands(command: Command) -> None:
     assert json.loads(command("toy-hello", "--json").stdout) == {"hello": "robot"}
 
 
+def test_its_reference_stands_beside_measurements_and_its_claim_is_judged(
+    measured: Path, command: Command, tmp_path: Path
+) -> None:
+    assert "toy-study: draw the toy study's values beside ours" in " ".join(
+        command("latency", "--help-all").stdout.split()
+    )
+    done = command("latency", "--transport", "loopback", "--against", "toy-study", *SMALL)
+    assert "Grey: of toys." in (folder_of(done, tmp_path) / "figures" / "captions.md").read_text()
+    outputs = ("--output", "page.html", "--csv", "csv", "--markdown", "all.md", "--latex", "tex")
+    done = command("report", str(measured), "--against", "toy-study", *outputs)
+    assert done.stdout.startswith("the toy study's claims: 1 supported")
+    (row,) = pd.read_csv(tmp_path / "csv" / "claims.csv").to_dict("records")
+    assert (row["verdict"], row["claim"], row["evidence"]) == ("supported", "Toys end", f"{measured.name} is finished.")
+    page = (tmp_path / "page.html").read_text()
+    assert "1 claims of a study of toys: 1 supported." in page
+    assert "met, state: finished" in page
+    assert "## The toy study's claims" in (tmp_path / "all.md").read_text()
+    assert "Toys end" in (tmp_path / "tex" / "claims.tex").read_text()
+
+
 def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
     installed: dict[str, str], tmp_path: Path
 ) -> None:
@@ -325,7 +345,7 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
     broken.mkdir(parents=True)
     (broken / "METADATA").write_text("Metadata-Version: 2.1\nName: s2a-broken\nVersion: 1.0\n")
     kinds = ("transports", "experiments", "policies", "dialects", "engines", "frame_sources", "middlewares")
-    kinds += ("surroundings", "commands")
+    kinds += ("surroundings", "commands", "references")
     (broken / "entry_points.txt").write_text(
         "".join(f"[s2a_bench.{kind}]\nbroken = s2a_broken:THING\n" for kind in kinds)
     )
@@ -341,7 +361,8 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
     assert run("boundary", "--points", "3").returncode == 0
     middleware = ("latency", "--transport", "ros?middleware=broken", *SMALL)
     transport = ("latency", "--transport", "broken", *SMALL)
-    for args in (("broken",), transport, middleware, ("timeline", "--policy", "broken")):
+    reference = ("latency", "--against", "broken", *SMALL)
+    for args in (("broken",), transport, middleware, reference, ("timeline", "--policy", "broken")):
         done = run(*args)
         assert done.returncode == 2
         assert "the package s2a-broken does not load: ModuleNotFoundError" in done.stderr

@@ -227,10 +227,10 @@ def test_every_table_csv_figure_page_and_json_of_every_experiment_has_it(
         if path.stem != "resources":
             assert {row[PROVENANCE] for row in csv.DictReader(io.StringIO(path.read_text()))} <= codes, path
     assert shown.json()["provenance"] == stored.origins.to_manifest()
-    chapters = read_chapters([run.path], against_paper=False)
+    chapters = read_chapters([run.path])
     page, csvs = tmp_path / "page.html", tmp_path / "csv"
     write_report(
-        make_report(chapters, against_paper=False),
+        make_report(chapters),
         ReportConfig(runs=[run.path], output=page, csv=csvs, latex=tmp_path / "tex"),
     )
     assert line.removesuffix(".") in page.read_text()

@@ -47,16 +47,14 @@ compare = command(_compare, CompareConfig)
 def _report(config: ReportConfig) -> None:
     from s2a_bench.report.page.chapters import read_chapters
     from s2a_bench.report.page.files import make_report, write_report
-    from s2a_bench.report.page.page import tally
 
-    against_paper = bool(config.against)
-    found = make_report(read_chapters(config.runs, against_paper=against_paper), against_paper=against_paper)
+    found = make_report(read_chapters(config.runs, against=config.against), against=config.against)
     written = write_report(found, config)
     of_chapters = (f"{chapter.title}: {caveat}" for chapter in found.chapters for caveat in chapter.every_caveat)
     for caveat in (*found.caveats, *of_chapters):
         print_error(f"warning: {caveat}")
     if found.judged:
-        print_line(f"the paper's claims: {tally(found.judged)}")
+        print_line(f"{found.judged.of.title}'s claims: {found.judged.tally}")
     outputs = {"page": config.page, "Markdown": config.markdown, "LaTeX": config.latex, "CSV": config.csv}
     for what, path in outputs.items():
         if path is not None:

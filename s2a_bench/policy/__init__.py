@@ -117,6 +117,8 @@ class Policy(Protocol):
     """Whether a robot that has begun may have to wait for a skill."""
     learns: ClassVar[bool] = False
     """Whether it uses a prior and a lambda learned from other plans, which `informed` sets."""
+    colour: ClassVar[str] = ""
+    """Colour of its skills in timelines (Okabe and Ito's palette); empty: one is chosen."""
 
     @property
     def name(self) -> str:

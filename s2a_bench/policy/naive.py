@@ -16,6 +16,7 @@ class Naive(Policy):
     """s_1 = t_1 and s_i = max(t_i, e_{i-1}) at nominal durations (the paper's naive streaming, section IV-F)."""
 
     name: ClassVar[str] = "naive"
+    colour: ClassVar[str] = "#E69F00"
 
     def schedule(self, plans: Plans) -> Schedule:
         return Schedule(work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[0]), plans.nominal_s)

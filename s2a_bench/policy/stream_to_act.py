@@ -70,6 +70,7 @@ class StreamToAct(Policy):
     """The online rule; ``prior`` comes from the hardware profile, ``caution`` (lambda) from `conformal.calibrate`."""
 
     name: ClassVar[str] = "stream-to-act"
+    colour: ClassVar[str] = "#009E73"
     learns: ClassVar[bool] = True
 
     prior: GapPrior = VAGUE
@@ -124,6 +125,7 @@ class EarlyStart(StreamToAct):
     """Start as soon as the cautious forecast meets the stretched durations: stretching allows an early start."""
 
     name: ClassVar[str] = "stream-to-act-early"
+    colour: ClassVar[str] = ""
 
     spend: Annotated[float, Field(ge=0, le=1)] = 1.0
     within: Annotated[float, Field(ge=0)] = math.inf
@@ -143,6 +145,7 @@ class MeanStart(StreamToAct):
     """The simple online rule, for study: start when the mean forecast meets the nominal durations, never stretch."""
 
     name: ClassVar[str] = "s2a-mean"
+    colour: ClassVar[str] = ""
 
     caution: Caution | None = 0.0
 

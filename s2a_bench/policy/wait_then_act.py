@@ -17,6 +17,7 @@ class WaitThenAct(Policy):
     """s_1 = t_N, then back to back at nominal durations: no stalls, and the latest start."""
 
     name: ClassVar[str] = "wait-then-act"
+    colour: ClassVar[str] = "#0072B2"
     stalls: ClassVar[bool] = False
 
     def schedule(self, plans: Plans) -> Schedule:

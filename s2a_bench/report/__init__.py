@@ -1,1 +1,1 @@
-"""Reports on runs of all experiments: the page, comparisons, and the paper's claims."""
+"""Reports on runs of all experiments: the page, comparisons, and verdicts on claims."""

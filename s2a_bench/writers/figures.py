@@ -107,15 +107,15 @@ class Bar:
 
 
 def build_bars(
-    caption: Iterable[str], bars: Sequence[Bar], label: str, paper: str = "", *, scaled: bool = False
+    caption: Iterable[str], bars: Sequence[Bar], label: str, others: str = "", *, scaled: bool = False
 ) -> Figure:
-    """Draw one row a bar, from zero; ``paper`` is the legend of the grey ones.
+    """Draw one row a bar, from zero; ``others`` is the legend of the grey ones.
 
     If ``scaled``, values that spread by more than `WIDE_SPREAD` become points on a logarithmic axis.
     """
     from matplotlib.patches import Patch
 
-    figure = new_figure(0.75 + 0.34 * len(bars) + (0.2 if paper else 0), caption)
+    figure = new_figure(0.75 + 0.34 * len(bars) + (0.2 if others else 0), caption)
     axes = figure.subplots()
     values = [bar.value for bar in bars]
     wide = scaled and max(values) > WIDE_SPREAD * min(values)
@@ -137,8 +137,8 @@ def build_bars(
     else:
         axes.set_xlim(left=0)
     axes.set_xlabel(label)
-    if paper:
-        handle = Patch(facecolor=GREY, edgecolor="black", linewidth=0.5, label=paper)
+    if others:
+        handle = Patch(facecolor=GREY, edgecolor="black", linewidth=0.5, label=others)
         figure.legend(handles=[handle], loc="outside lower left")
     return figure
 

@@ -17,7 +17,7 @@ WIDE_IN: Final = 7.16
 STALL_STYLE: Final[dict[str, Any]] = {"facecolor": "white", "edgecolor": "#444444", "hatch": "//////", "linewidth": 0.4}
 
 GREY: Final = "#BBBBBB"
-"""The colour of the paper's values."""
+"""The colour of a reference's values."""
 
 GROUP_FILLS: Final = {
     "capture": ("#56B4E9", ""),

@@ -21,7 +21,7 @@ from s2a_bench.boards.profile import (
     to_toml,
 )
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments import paper
+from s2a_bench.plugins import paper
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -211,7 +211,7 @@ def read_manifest(data: bytes) -> None:
         for path in reference.glob("*.parquet"):
             (folder / path.name).write_bytes(path.read_bytes())
     (folder / "manifest.json").write_bytes(data)
-    make_report(read_chapters([folder], against_paper=True), against_paper=True)
+    make_report(read_chapters([folder], against="paper"), against="paper")
     compared = open_comparison([read_run(reference)], [read_run(folder)], unlike=True, least=0.05)
     compared = compare(compared, metrics_of(compared, ())[:1])
     compare_json(compared, [], warnings_of(compared))

@@ -59,6 +59,14 @@ PLUGINS = {
             "[default: websocket",
         ),
     ],
+    "paper": [
+        Named(
+            ("report", "results", "--against", "paper"),
+            "--against: 'paper' should be left out",
+            ("report", "--help"),
+            "paper: add",
+        )
+    ],
     "rclpy": [
         Named(
             ("latency", "--middleware", "rclpy"),

@@ -47,7 +47,7 @@ def test_a_panel_is_a_source_and_a_bar_a_chunk_or_a_stall(run: StoredRun) -> Non
 
 def test_the_page_draws_them_and_says_what_bars_are(run: StoredRun, tmp_path: Path) -> None:
     page = tmp_path / "page.html"
-    report = make_report(read_chapters([run.path], against_paper=False), against_paper=False)
+    report = make_report(read_chapters([run.path]))
     write_report(report, ReportConfig(runs=[run.path], output=page))
     text = page.read_text()
     assert text.count('<figure class="panel"') == 2

@@ -93,9 +93,9 @@ def computed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return timeline(tmp_path_factory.mktemp("timeline"), profiles=("jetson-agx-orin",), tokens_per_skill=(6, 4))
 
 
-def page_of(*paths: Path, against_paper: bool = False) -> str:
+def page_of(*paths: Path, against: str = "") -> str:
     output = paths[0].parent / "page.html"
-    report = make_report(read_chapters(paths, against_paper=against_paper), against_paper=against_paper)
+    report = make_report(read_chapters(paths, against=against), against=against)
     assert write_report(report, ReportConfig(runs=paths, output=output)) == [output]
     return output.read_text()
 
@@ -224,7 +224,7 @@ def test_a_sweep_of_timelines_is_shown_as_the_one_run_that_it_amounts_to(tmp_pat
     ]
     folder = sweep_of(tmp_path / "sweeps", cells)
     whole = read_run(timeline(tmp_path, profiles=boards, tokens_per_skill=(6, 1)))
-    overview, pooled = read_chapters([folder], against_paper=False)
+    overview, pooled = read_chapters([folder])
     assert pooled.content.tables["timelines"] == replace(execution_table(whole), provenance=whole.origins.line)
     assert pooled.content.csvs == timeline_csv(whole)
     assert pooled.run.origins == whole.origins
@@ -239,7 +239,7 @@ def test_a_sweep_of_timelines_is_shown_as_the_one_run_that_it_amounts_to(tmp_pat
 def test_cells_of_one_name_are_not_made_one(tmp_path: Path) -> None:
     same: dict[str, Any] = {"profiles": ("rtx-4080",), "tokens_per_skill": (6,)}
     folder = sweep_of(tmp_path / "sweeps", [({"n": n}, timeline(tmp_path, **same)) for n in (1, 2)])
-    _, first, second = read_chapters([folder], against_paper=False)
+    _, first, second = read_chapters([folder])
     assert first.content.tables == second.content.tables
     assert [len(chapter.content.lanes) for chapter in (first, second)] == [3, 3]
     assert first.name != second.name
@@ -248,14 +248,14 @@ def test_cells_of_one_name_are_not_made_one(tmp_path: Path) -> None:
 def test_timelines_of_other_settings_are_kept_apart(tmp_path: Path) -> None:
     same: dict[str, Any] = {"profiles": ("rtx-4080",), "tokens_per_skill": (6,), "policies": ("naive",)}
     runs = [({"t-max": most}, timeline(tmp_path, t_max=most, **same)) for most in (1.0, 2.0)]
-    assert len(read_chapters([sweep_of(tmp_path / "sweeps", runs)], against_paper=False)) == 3
+    assert len(read_chapters([sweep_of(tmp_path / "sweeps", runs)])) == 3
 
 
 @pytest.mark.slow
 def test_measured_cells_stand_side_by_side_and_are_not_pooled(tmp_path: Path, make_run: MakeRun) -> None:
     runs = [({"runs": n}, make_run(n=n).path) for n in range(2, MOST_CHAPTERS + 4)]
     folder = sweep_of(tmp_path / "sweeps", [*runs, ({"runs": 99}, tmp_path / "no-such")])
-    overview, *chapters = read_chapters([folder], against_paper=False)
+    overview, *chapters = read_chapters([folder])
     assert len(chapters) == MOST_CHAPTERS
     rows = overview.content.tables["overview"].rows
     assert len(rows) == len(runs) * 5
@@ -275,13 +275,13 @@ def test_measured_cells_stand_side_by_side_and_are_not_pooled(tmp_path: Path, ma
 def test_an_unfinished_run_is_shown_and_told(make_run: MakeRun, state: str, error: str | None, caveat: str) -> None:
     run = make_run(n=3)
     (run.path / "manifest.json").write_text(json.dumps({**run.manifest, "state": state, "error": error}))
-    (chapter,) = read_chapters([run.path], against_paper=False)
+    (chapter,) = read_chapters([run.path])
     assert caveat in chapter.caveats[0]
     assert caveat in Page(page_of(run.path)).text
 
 
 def test_a_run_without_rows_is_told(make_run: MakeRun) -> None:
-    (chapter,) = read_chapters([make_run({}).path], against_paper=False)
+    (chapter,) = read_chapters([make_run({}).path])
     assert chapter.content.sentences == ("The run has no rows: it ended before anything was measured.",)
 
 
@@ -292,7 +292,7 @@ def test_a_timeline_that_was_cut_off_does_not_hide_the_others(computed: Path, tm
     (cut / "manifest.json").write_text(json.dumps({**manifest, "state": "running"}))
     (cut / "skills.parquet").unlink()
     (cut / "skills.csv").unlink()
-    chapters = read_chapters([cut, computed], against_paper=False)
+    chapters = read_chapters([cut, computed])
     assert len(chapters) == 2
     assert chapters[0].caveats
     assert not chapters[1].caveats
@@ -301,7 +301,7 @@ def test_a_timeline_that_was_cut_off_does_not_hide_the_others(computed: Path, tm
 def test_rows_that_their_manifest_does_not_fit_fail_alone(computed: Path, tmp_path: Path) -> None:
     odd = shutil.copytree(computed, tmp_path / "odd")
     (odd / "manifest.json").write_text(json.dumps({**read_run(odd).manifest, "boards": [{"name": "x"}]}))
-    chapters = read_chapters([odd, computed], against_paper=False)
+    chapters = read_chapters([odd, computed])
     assert chapters[0].content.failures
     assert not chapters[1].content.failures
     assert set(chapters[0].content.tables) < set(chapters[1].content.tables)
@@ -310,7 +310,7 @@ def test_rows_that_their_manifest_does_not_fit_fail_alone(computed: Path, tmp_pa
 @pytest.mark.slow
 def test_runs_of_unlike_machines_are_told_apart(make_run: MakeRun) -> None:
     runs = [make_run(n=2, manifest={"environment": {"cpu": cpu, "cores": 2}}).path for cpu in ("A", "B", "A")]
-    report = make_report(read_chapters(runs, against_paper=False), against_paper=False)
+    report = make_report(read_chapters(runs))
     assert len(report.caveats) == 1
     assert "cpu: A against B" in report.caveats[0]
     assert report.caveats[0] in Page(page_of(*runs)).text
@@ -323,17 +323,17 @@ def test_another_version_or_setting_is_no_other_machine_and_one_line_for_all_run
         facts["environment"] |= {"governor": governor, "packages": {"numpy": str(place)}}
         settings = {"configuration": {"seed": place}, "tuning": {"process": place > 0}}
         runs.append(make_run(n=2, manifest={**facts, **settings}).path)
-    report = make_report(read_chapters(runs, against_paper=False), against_paper=False)
+    report = make_report(read_chapters(runs))
     caveat = "The runs differ in governor, tuning process, package numpy, configuration seed."
     assert report.caveats == [caveat]
 
 
 def test_a_folder_given_twice_is_one_chapter(computed: Path) -> None:
-    assert len(read_chapters([computed, computed / ".." / computed.name], against_paper=False)) == 1
+    assert len(read_chapters([computed, computed / ".." / computed.name])) == 1
 
 
 def test_every_verdict_has_its_evidence_on_the_page(computed: Path) -> None:
-    text = page_of(computed, against_paper=True)
+    text = page_of(computed, against="paper")
     page = Page(text)
     assert "AGX Orin: naive shows intermittent stalls" in page.text
     assert "Rule: At some L between 10 and 90 % of the gaps" in page.text
@@ -345,7 +345,7 @@ def test_every_verdict_has_its_evidence_on_the_page(computed: Path) -> None:
 
 def test_what_a_report_wrote_may_be_replaced_and_nothing_else(tmp_path: Path, computed: Path) -> None:
     page, other = tmp_path / "page.html", tmp_path / "mine.html"
-    report = make_report(read_chapters([computed], against_paper=False), against_paper=False)
+    report = make_report(read_chapters([computed]))
     for _ in range(2):
         write_report(report, ReportConfig(runs=[computed], output=page, markdown=tmp_path / "page.md"))
     other.write_text("<html>mine</html>")
@@ -358,7 +358,7 @@ def test_what_a_report_wrote_may_be_replaced_and_nothing_else(tmp_path: Path, co
 
 def test_files_lie_in_a_folder_a_run(tmp_path: Path, computed: Path, make_run: MakeRun) -> None:
     runs = [computed, make_run(n=2).path]
-    report = make_report(read_chapters(runs, against_paper=True), against_paper=True)
+    report = make_report(read_chapters(runs, against="paper"), against="paper")
     config = ReportConfig(runs=runs, latex=tmp_path / "tex", csv=tmp_path / "csv", markdown=tmp_path / "all.md")
     written = {str(path.relative_to(tmp_path)) for path in write_report(report, config)}
     one, other = (path.name for path in runs)
@@ -377,7 +377,7 @@ def test_the_provenance_of_every_cell_is_on_the_page_in_the_claims_and_in_csv(
     cells = {"http/as-deployed": replayed, "ros/topic": replace(REAL, weights="dummy")}
     stages = {"convert": 10.0, "inference": 5.0, "return": 0.0}
     run = beside(dict.fromkeys(cells, stages), origins=cells).path
-    report = make_report(read_chapters([run, computed], against_paper=True), against_paper=True)
+    report = make_report(read_chapters([run, computed], against="paper"), against="paper")
     page = tmp_path / "page.html"
     write_report(report, ReportConfig(runs=[run], output=page, csv=tmp_path / "csv"))
 
@@ -397,8 +397,8 @@ def test_the_provenance_of_every_cell_is_on_the_page_in_the_claims_and_in_csv(
 
 
 def test_a_figures_caption_stands_below_it_on_the_page_and_in_latex(tmp_path: Path, computed: Path) -> None:
-    chapters = read_chapters([computed], against_paper=False)
-    report = make_report(chapters, against_paper=False)
+    chapters = read_chapters([computed])
+    report = make_report(chapters)
     write_report(report, ReportConfig(runs=[computed], output=tmp_path / "page.html", latex=tmp_path / "tex"))
     with paper_column():
         title, *notes = caption_of(chapters[0].content.figures["timeline"]())
@@ -452,7 +452,7 @@ def test_no_text_is_a_command_to_latex(text: str) -> None:
 def tables_of(make_run: MakeRun) -> Iterator[TextTable]:
     rows: list[tuple[str, ...]] = [(HOSTILE, "1.5 ± 0.2"), ("[x]", ABSENT)]
     yield TextTable(HOSTILE, (HOSTILE, "n"), rows, 1, notes=(HOSTILE, "λ ≥ 2 → ☃"), provenance=HOSTILE)
-    (chapter,) = read_chapters([make_run(n=3).path], against_paper=True)
+    (chapter,) = read_chapters([make_run(n=3).path], against="paper")
     yield from chapter.content.tables.values()
 
 
@@ -463,7 +463,7 @@ def test_the_latex_compiles(tmp_path: Path, computed: Path, make_run: MakeRun) -
         if subprocess.run(["kpsewhich", package], capture_output=True, check=False).returncode:
             pytest.skip(f"TeX has no {package}")
     odd = shutil.copytree(computed, tmp_path / "50 % of_a #run {x}")
-    report = make_report(read_chapters([odd, make_run(n=3).path], against_paper=True), against_paper=True)
+    report = make_report(read_chapters([odd, make_run(n=3).path], against="paper"), against="paper")
     write_report(report, ReportConfig(runs=[odd], latex=tmp_path / "tex"))
     texts = [to_siunitx(table, long=long) for table in tables_of(make_run) for long in (False, True)]
     (tmp_path / "tex" / "hard.tex").write_text(document(HOSTILE, texts))
@@ -480,5 +480,5 @@ def test_the_latex_compiles(tmp_path: Path, computed: Path, make_run: MakeRun) -
 def test_a_chapter_of_another_command_is_named_and_not_guessed_at(make_run: MakeRun) -> None:
     run = make_run(n=2)
     (run.path / "manifest.json").write_text(json.dumps({**run.manifest, "command": "dance"}))
-    (chapter,) = read_chapters([run.path], against_paper=False)
+    (chapter,) = read_chapters([run.path])
     assert chapter.content.sentences[0].startswith("There is no view of dance runs; this one has samples (")

@@ -113,7 +113,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
         run_ccrb(CcrbConfig(), folder, done),
     ]
     output = folder / "page.html"
-    report = make_report(read_chapters(paths, against_paper=True), against_paper=True)
+    report = make_report(read_chapters(paths, against="paper"), against="paper")
     write_report(report, ReportConfig(runs=paths, output=output))
     return output.as_uri()
 

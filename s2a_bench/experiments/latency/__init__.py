@@ -10,6 +10,6 @@ EXPERIMENT = Experiment(
     run="s2a_bench.experiments.latency.run:run_latency",
     view="s2a_bench.experiments.latency.view:show",
     cell="s2a_bench.experiments.latency.metrics:LatencyCell",
-    view_options="s2a_bench.experiments.paper:AgainstPaper",
+    view_options="s2a_bench.experiments.references:AgainstReference",
     compared="s2a_bench.experiments.latency.metrics:COMPARED",
 )

@@ -9,6 +9,6 @@ EXPERIMENT = Experiment(
     run="s2a_bench.experiments.throughput.run:run_throughput",
     view="s2a_bench.experiments.throughput.view:show",
     cell="s2a_bench.experiments.throughput.metrics:ThroughputCell",
-    view_options="s2a_bench.experiments.paper:AgainstPaper",
+    view_options="s2a_bench.experiments.references:AgainstReference",
     compared="s2a_bench.experiments.throughput.metrics:COMPARED",
 )

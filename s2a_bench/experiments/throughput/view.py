@@ -1,4 +1,4 @@
-"""The tables and figures of a throughput run: rates, the prompt, gaps, rates by position; the paper's table II."""
+"""The tables and figures of a throughput run: rates, the prompt, gaps, rates by position."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.experiments import Shown
-from s2a_bench.experiments.paper import paper_throughput
+from s2a_bench.experiments.references import bars_of
 from s2a_bench.experiments.requests import (
     OF_ANSWERS,
     caption_for,
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from s2a_bench.experiments.requests import Floats, RequestCell
     from s2a_bench.store.run import StoredRun
 
-PAPER_LABEL: Final = "the paper's claim (table II), other machines"
 _REFERENCE_FILL: Final = "#FFFFFF"
 
 
@@ -57,7 +56,7 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
         },
         main=["throughput", "prompt"],
         csvs=lambda: throughput_csv(run),
-        figures=lambda: throughput_figures(run, against_paper=against == "paper"),
+        figures=lambda: throughput_figures(run, against),
         json=lambda: throughput_json(run),
     )
 
@@ -174,17 +173,17 @@ def _notes(run: StoredRun, cells: list[RequestCell], launches: tuple[str, ...]) 
     return notes
 
 
-def throughput_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
+def throughput_figures(run: StoredRun, against: str = "") -> dict[str, Callable[[], Figure]]:
     if not any(cell.values(RATIO_METRIC).size for cell in throughput_cells(run)):
         return {}
     return {
-        "throughput_bars": lambda: build_throughput_bars(run, against_paper=against_paper),
+        "throughput_bars": lambda: build_throughput_bars(run, against),
         "gaps": lambda: build_gap_distribution(run),
         "positions": lambda: build_rate_by_position(run),
     }
 
 
-def build_throughput_bars(run: StoredRun, *, against_paper: bool = False) -> Figure:
+def build_throughput_bars(run: StoredRun, against: str = "") -> Figure:
     """Draw medians of N / T_eval, a row a cell (the paper's table II), and llama-bench's decode rate.
 
     Bars from zero; points on a logarithmic axis if the rates differ too much.
@@ -194,13 +193,9 @@ def build_throughput_bars(run: StoredRun, *, against_paper: bool = False) -> Fig
     bars = [Bar.of(cell.name, cell.values(ENGINE_METRIC), styles[cell.name][0]) for cell in cells]
     if reference := reference_values(run):
         bars.append(Bar.of(f"{LLAMA_BENCH}\n(decode)", np.array(reference), _REFERENCE_FILL))
-    if against_paper:
-        bars += [
-            Bar(f"paper:\n{claim.name}", claim.tokens_per_s, None, f"{claim.tokens_per_s:g}")
-            for claim in paper_throughput()
-        ]
-    caption = _caption(run, cells, "Tokens a second, medians", WHISKERS)
-    return build_bars(caption, bars, "tokens/s", PAPER_LABEL if against_paper else "", scaled=True)
+    others = bars_of(against, "throughput_bars")
+    caption = _caption(run, cells, "Tokens a second, medians", WHISKERS, *others.notes)
+    return build_bars(caption, [*bars, *others.bars], "tokens/s", others.label, scaled=True)
 
 
 def build_gap_distribution(run: StoredRun) -> Figure:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from s2a_bench.errors import UsageError
+from s2a_bench.experiments.references import against, check_name
 from s2a_bench.options import Options, option
 
 GENERATOR = "s2a-bench report"
@@ -21,7 +22,7 @@ class ReportConfig(Options):
     latex: Path | None = option(None, "folder for LaTeX tables (booktabs, siunitx) and figures as PDF")
     csv: Path | None = option(None, "folder for CSV tables with every digit")
     markdown: Path | None = option(None, "all tables as one Markdown file")
-    against: str = option("", "paper: add the paper's claims, each with a verdict and its evidence")
+    against: str = against("add {}'s claims, each with a verdict and its evidence")
 
     @property
     def page(self) -> Path | None:
@@ -29,10 +30,7 @@ class ReportConfig(Options):
 
     def check(self) -> None:
         """Raise UsageError if an output would overwrite a file that no report wrote."""
-        if self.against not in {"", "paper"}:
-            raise UsageError(
-                f"`against`: '{self.against}' should be paper; two runs are compared with s2a-bench compare"
-            )
+        check_name(self.against, "; two runs are compared with s2a-bench compare")
         for name, path in (("output", self.page), ("markdown", self.markdown)):
             if path is not None:
                 _check_file(f"`{name}`", path)

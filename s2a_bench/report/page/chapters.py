@@ -41,15 +41,15 @@ class Chapter:
         return self.run.manifest
 
 
-def read_chapters(paths: Sequence[Path], *, against_paper: bool) -> list[Chapter]:
-    """Read run folders and sweeps, each once, in order; raises StoreError for a damaged one."""
+def read_chapters(paths: Sequence[Path], *, against: str = "") -> list[Chapter]:
+    """Read run folders and sweeps, each once, in order, beside a reference; raises StoreError for a damaged one."""
     found: list[Chapter] = []
     for path in dict.fromkeys(path.resolve() for path in paths):
         run = read_run(path)
         if is_sweep(run.manifest):
-            found += _sweep(read_sweep(path), against_paper)
+            found += _sweep(read_sweep(path), against)
         else:
-            found.append(_chapter(run, title_of(run.manifest), against_paper))
+            found.append(_chapter(run, title_of(run.manifest), against))
     return [_named(chapter, place, found) for place, chapter in enumerate(found)]
 
 
@@ -85,12 +85,12 @@ def differences_of(chapters: Sequence[Chapter]) -> list[str]:
     return [*lines, f"The runs differ in {names}."] if names else lines
 
 
-def _chapter(run: StoredRun, title: str, against_paper: bool, command: str = "") -> Chapter:
+def _chapter(run: StoredRun, title: str, against: str, command: str = "") -> Chapter:
     """Make the chapter of a run; an unfinished one may lack the rows of its tables."""
     manifest = run.manifest
     caveats = list(_unfinished(manifest))
     with fits(run):
-        content = content_of(run, against_paper=against_paper)
+        content = content_of(run, against)
     return Chapter(_slug(run.path.name), title, run, content, command or repeat_command(manifest), caveats)
 
 
@@ -107,7 +107,7 @@ def _unfinished(manifest: Mapping[str, Any]) -> Iterator[str]:
         yield f"This run ended early ({state}{why}). The following are its rows until then."
 
 
-def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
+def _sweep(sweep: Sweep, against: str) -> Iterator[Chapter]:
     manifest, runs = sweep.manifest, list(sweep.runs())
     head = StoredRun(sweep.path, {**manifest, "provenance": sweep.origins.to_manifest()})
     copy = sweep.path / "sweep.toml"
@@ -125,9 +125,9 @@ def _sweep(sweep: Sweep, against_paper: bool) -> Iterator[Chapter]:
     yield Chapter(_slug(sweep.path.name), title_of(manifest), head, content, command, caveats, attached)
     for place, run in enumerate(pools, 1):
         what = f"{run.manifest['command']}s of the sweep" + (f", part {place}" if len(pools) > 1 else "")
-        yield _chapter(run, what, against_paper, command=command)
+        yield _chapter(run, what, against, command=command)
     for settings, run in single[:MOST_CHAPTERS]:
-        yield _chapter(run, f"{run.manifest['command']}: {settings_text(settings)}", against_paper)
+        yield _chapter(run, f"{run.manifest['command']}: {settings_text(settings)}", against)
 
 
 def _named(chapter: Chapter, place: int, chapters: Sequence[Chapter]) -> Chapter:
@@ -137,11 +137,11 @@ def _named(chapter: Chapter, place: int, chapters: Sequence[Chapter]) -> Chapter
     return chapter if len(same) == 1 or number == 1 else replace(chapter, name=f"{chapter.name}-{number}")
 
 
-def content_of(run: StoredRun, *, against_paper: bool) -> Shown:
+def content_of(run: StoredRun, against: str) -> Shown:
     """Return the content of a run; for an unknown command it is the names of its tables."""
     if not run.row_counts():
         return Shown(("The run has no rows: it ended before anything was measured.",))
     if (experiment := experiment_of(str(run.manifest["command"]))) is not None:
-        return experiment.show(run, against="paper" if against_paper else "")
+        return experiment.show(run, against=against)
     rows = [f"{name} ({count} rows)" for name, count in run.row_counts().items()]
     return Shown((f"There is no view of {run.manifest['command']} runs; this one has {', '.join(rows)}.",))

@@ -5,25 +5,24 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments import Shown
 from s2a_bench.provenance import Origins, joined
-from s2a_bench.report.claims import Judged, claim_table
-from s2a_bench.report.claims.table import judge_claims
 from s2a_bench.report.page import GENERATOR, ReportConfig
 from s2a_bench.report.page.chapters import Chapter, differences_of
-from s2a_bench.report.page.page import render, tally
+from s2a_bench.report.page.page import render
+from s2a_bench.report.verdicts import Verdicts, judge
 from s2a_bench.store.run import fits
 from s2a_bench.text import visible
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.latex import document, escape, to_siunitx
 from s2a_bench.writers.style import WIDTH_IN, paper_column
-from s2a_bench.writers.tables import TextTable, markdown_text, to_markdown
+from s2a_bench.writers.tables import markdown_text, to_markdown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -86,10 +85,10 @@ _LONG_ROWS = 30
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A report: its chapters, the claims judged by their runs, and the caveats."""
+    """A report: its chapters, the verdicts of their runs on a reference's claims, and the caveats."""
 
     chapters: Sequence[Chapter]
-    judged: Sequence[Judged]
+    judged: Verdicts | None
     caveats: Sequence[str]
 
     @property
@@ -97,11 +96,11 @@ class Report:
         return joined(chapter.run.origins for chapter in self.chapters)
 
 
-def make_report(chapters: Sequence[Chapter], *, against_paper: bool) -> Report:
-    """Judge the claims if ``against_paper``, and find the differences between the runs."""
+def make_report(chapters: Sequence[Chapter], *, against: str = "") -> Report:
+    """Judge the claims of a reference, if one is named, and find the differences between the runs."""
     runs = [chapter.run for chapter in chapters]
     with fits(*runs):
-        judged = judge_claims(runs) if against_paper else []
+        judged = judge(against, runs)
     return Report(chapters, judged, differences_of(chapters))
 
 
@@ -134,7 +133,7 @@ def write_report(report: Report, config: ReportConfig) -> list[Path]:
 def _latex(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> Iterator[tuple[str, str | bytes]]:
     sections = []
     if report.judged:
-        table = _claims(report)
+        table = report.judged.table(report.origins.line)
         yield "claims.tex", to_siunitx(table, ("18mm", "34mm", "44mm", "20mm", "46mm", "78mm"), long=True)
         sections.append(r"\input{claims}")
     for chapter in report.chapters:
@@ -154,7 +153,7 @@ def _latex(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> Iterator
 
 def _csv(report: Report) -> Iterator[tuple[str, str]]:
     if report.judged:
-        rows = [(row[3], *row[:3], *row[4:]) for row in _claims(report).rows]
+        rows = [(row[3], *row[:3], *row[4:]) for row in report.judged.table().rows]
         header = ("verdict", "where", "claim", "rule", "required", "evidence")
         yield "claims.csv", CsvTable.of(header, rows).text(report.origins)
     for chapter in report.chapters:
@@ -162,14 +161,11 @@ def _csv(report: Report) -> Iterator[tuple[str, str]]:
             yield f"{chapter.name}/{name}", table.text(chapter.run.origins)
 
 
-def _claims(report: Report) -> TextTable:
-    return replace(claim_table(report.judged), provenance=report.origins.line)
-
-
 def _markdown(report: Report) -> str:
     blocks = [_MARK, *(f"> {markdown_text(caveat)}" for caveat in report.caveats)]
     if report.judged:
-        blocks += [f"## The paper's claims\n\n{tally(report.judged)}.", to_markdown(_claims(report))]
+        blocks.append(f"## {report.judged.title}'s claims\n\n{report.judged.tally}.")
+        blocks.append(to_markdown(report.judged.table(report.origins.line)))
     for chapter in report.chapters:
         blocks.append(f"## {markdown_text(chapter.title)}")
         blocks += [f"> {markdown_text(caveat)}" for caveat in chapter.every_caveat]

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from s2a_bench import __version__
 from s2a_bench.experiments.chunks.view.figures import CellTicks as ChunkLane
-from s2a_bench.report.claims import Judged
 from s2a_bench.report.page import GENERATOR
 from s2a_bench.report.page.chapters import when
 from s2a_bench.report.page.lanes import MOST_PANELS, panels_of, panels_of_chunks
@@ -20,12 +19,13 @@ from s2a_bench.writers.tables import Note
 if TYPE_CHECKING:
     from s2a_bench.report.page.chapters import Chapter
     from s2a_bench.report.page.files import DrawnFigure
+    from s2a_bench.report.verdicts import Verdicts
 
 
 def render(
     chapters: Sequence[Chapter],
     figures: dict[str, dict[str, DrawnFigure]],
-    judged: Sequence[Judged],
+    judged: Verdicts | None,
     caveats: Sequence[str],
 ) -> str:
     """Return the page; ``figures`` are by the name of the chapter. Every text of a run is escaped."""
@@ -53,7 +53,6 @@ def render(
         title=title_of_page(chapters),
         chapters=shown,
         judged=judged,
-        tally=tally(judged),
         caveats=caveats,
     )
 
@@ -64,11 +63,6 @@ def title_of_page(chapters: Sequence[Chapter]) -> str:
     folders = [chapter for chapter in chapters if sweeps.isdisjoint(chapter.run.path.parents)]
     names = {chapter.run.path: chapter.title for chapter in reversed(folders)}
     return next(iter(names.values())) if len(names) == 1 else f"{len(names)} runs, side by side"
-
-
-def tally(judged: Sequence[Judged]) -> str:
-    verdicts = [each.verdict for each in judged]
-    return ", ".join(f"{verdicts.count(each)} {each}" for each in dict.fromkeys(verdicts))
 
 
 def _view(chapter: Chapter, figures: dict[str, DrawnFigure]) -> dict[str, Any]:

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from pkgutil import resolve_name
 from typing import Any, Final
 
+from s2a_bench.policy import COMPARED
 from s2a_bench.scenario.ccrb import FOLLOWERS
 
-PAPER: Final = {"naive": "rear", "wait-then-act": "front", "stream-to-act": "none"}
+NAIVE, WAIT, STREAM_TO_ACT = COMPARED
+PAPER: Final = {NAIVE: "rear", WAIT: "front", STREAM_TO_ACT: "none"}
 """The paper's outcomes (section V-F)."""
-NAIVE, WAIT, STREAM_TO_ACT = PAPER
 ORDERING: Final = "The paper's ordering: naive hit from behind, wait-then-act hits the lead, stream-to-act nobody."
 NO_SCORE: Final = "The scenario is in the manner of Euro NCAP's CCRb; nothing here is an NCAP score."
 MARK: Final = "\N{DAGGER}"

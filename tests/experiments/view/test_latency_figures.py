@@ -16,7 +16,6 @@ from s2a_bench.experiments.latency.view.figures import (
     build_latency_distribution,
     build_stage_breakdown,
 )
-from s2a_bench.experiments.paper import LABEL
 from s2a_bench.store.run import StoredRun
 from s2a_bench.trace import GROUPS
 from s2a_bench.writers.figures import Bar, caption_of
@@ -76,12 +75,12 @@ def test_the_caption_says_how_many_and_what_did_not_really_answer(make_run: Make
 def test_the_papers_values_appear_only_when_asked_for_and_as_another_machines(make_run: MakeRun) -> None:
     run = make_run(HAND, n=4, spread=0)
     assert "paper" not in "".join(row_names(build_latency_bars(run)))
-    figure = build_latency_bars(run, against_paper=True)
+    figure = build_latency_bars(run, against="paper")
     assert row_names(figure)[2:] == ["paper:\nHTTP/JSON", "paper:\nROS-native"]
     assert [bar.get_width() for bar in bars(figure)][2:] == [101.8, 15.5]
     assert {mpl.colors.to_hex(bar.get_facecolor()).upper() for bar in bars(figure)[2:]} == {GREY}
     assert texts(figure)[2:] == ["101.8 ± 8.6", "15.5 ± 1.0"]
-    assert legend(figure) == [LABEL] == ["paper (Jetson AGX Orin), another machine"]
+    assert legend(figure) == ["paper (Jetson AGX Orin), another machine"]
     assert any("does not say that inference is left out" in note for note in caption_of(figure))
 
 
@@ -152,7 +151,7 @@ def test_no_text_is_clipped_or_smaller_than_seven_points(
     make_run: MakeRun, plausible: dict[str, Any], count: int
 ) -> None:
     run = make_run(dict(list(plausible.items())[:count]), n=10)
-    drawn = build_latency_bars(run, against_paper=True), build_stage_breakdown(run), build_latency_distribution(run)
+    drawn = build_latency_bars(run, against="paper"), build_stage_breakdown(run), build_latency_distribution(run)
     for figure in drawn:
         figure.draw_without_rendering()
         inked = figure.get_tightbbox()

@@ -54,7 +54,7 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
         tables=latency_tables(run),
         main=["stages", "summary", "summary-model"],
         csvs=lambda: latency_csv(run),
-        figures=lambda: latency_figures(run, against_paper=against == "paper"),
+        figures=lambda: latency_figures(run, against),
         json=lambda: latency_json(run),
     )
 

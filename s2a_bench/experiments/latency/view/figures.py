@@ -7,7 +7,7 @@ from itertools import chain
 from statistics import median
 from typing import TYPE_CHECKING
 
-from s2a_bench.experiments.paper import CAVEAT, LABEL, paper_latency
+from s2a_bench.experiments.references import bars_of
 from s2a_bench.experiments.requests import (
     RequestCell,
     action_shape,
@@ -40,25 +40,14 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 
-def build_latency_bars(run: StoredRun, *, against_paper: bool = False) -> Figure:
+def build_latency_bars(run: StoredRun, against: str = "") -> Figure:
     """Draw medians of e2e without inference, a bar a cell (the paper's figure 4), from zero on a linear axis."""
     cells, metric = _shown(run)
     styles = cell_styles({cell.name: cell.path for cell in cells})
     bars = [Bar.of(_label(cell), cell.values_ms(metric), styles[cell.name][0]) for cell in cells]
-    notes = [WHISKERS]
-    if against_paper:
-        notes.append(f"Grey: {LABEL}, mean ± sd; {CAVEAT}.")
-        bars += [
-            Bar(
-                f"paper:\n{claim.name}",
-                claim.mean_ms,
-                (claim.mean_ms - claim.sd_ms, claim.mean_ms + claim.sd_ms),
-                f"{claim.mean_ms:g} ± {claim.sd_ms:.1f}",
-            )
-            for claim in paper_latency()
-        ]
-    caption = _caption(run, cells, "Medians", metric, *notes)
-    return build_bars(caption, bars, _axis_label(metric), LABEL if against_paper else "")
+    others = bars_of(against, "latency_bars")
+    caption = _caption(run, cells, "Medians", metric, WHISKERS, *others.notes)
+    return build_bars(caption, [*bars, *others.bars], _axis_label(metric), others.label)
 
 
 def build_stage_breakdown(run: StoredRun) -> Figure:
@@ -120,11 +109,11 @@ def build_latency_distribution(run: StoredRun) -> Figure:
     return build_distribution(_caption(run, cells, "Distribution", metric), lines, "samples", _axis_label(metric))
 
 
-def latency_figures(run: StoredRun, *, against_paper: bool = False) -> dict[str, Callable[[], Figure]]:
+def latency_figures(run: StoredRun, against: str = "") -> dict[str, Callable[[], Figure]]:
     if not _shown(run)[0]:
         return {}
     return {
-        "latency_bars": lambda: build_latency_bars(run, against_paper=against_paper),
+        "latency_bars": lambda: build_latency_bars(run, against),
         "stages": lambda: build_stage_breakdown(run),
         "distribution": lambda: build_latency_distribution(run),
         **dict(chain.from_iterable(figures(run).items() for figures in shown("figures"))),

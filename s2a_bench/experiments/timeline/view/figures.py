@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.experiments.paper import paper_colours
 from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, panels, timelines_of
+from s2a_bench.policy import POLICIES
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.style import STALL_STYLE, WIDE_IN, WIDTH_IN, ink_on
 
@@ -18,9 +18,6 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 _LEGEND_COLUMNS: Final = {WIDTH_IN: 3, WIDE_IN: 6}
-
-_SHADES: Final = {"blue": "#0072B2", "orange": "#E69F00", "green": "#009E73"}
-"""The paper's colours in Okabe and Ito's palette, distinct to all eyes and in grey."""
 _OTHERS: Final = ("#56B4E9", "#CC79A7", "#D55E00", "#999999")
 _VISIBLE_NS: Final = 20_000_000
 """Shorter stalls and stretches are rounding or jitter, and too narrow to see."""
@@ -28,8 +25,8 @@ _LANE: Final = 0.7
 
 
 def policy_colours(policies: Sequence[str]) -> dict[str, str]:
-    """Return a colour for every policy, the paper's if it has one."""
-    known = {name: _SHADES[colour] for name, colour in paper_colours().items()}
+    """Return a colour for every policy, the one that it declares if there is one."""
+    known = {name: colour for name, made in POLICIES.loaded() if (colour := getattr(made, "colour", ""))}
     others = [name for name in policies if name not in known]
     return known | {name: _OTHERS[place % len(_OTHERS)] for place, name in enumerate(others)}
 

@@ -14,11 +14,12 @@ from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.harness.timelines.config import TimelineConfig
+from s2a_bench.plugins.paper.claims import CONTRADICTED, REPRODUCED, SUPPORTED, UNDECIDED
+from s2a_bench.plugins.paper.claims.plans import after, timelines
+from s2a_bench.plugins.paper.claims.requests import change
+from s2a_bench.plugins.paper.claims.table import judge_claims
 from s2a_bench.provenance import Origins, Provenance
-from s2a_bench.report.claims import CONTRADICTED, REPRODUCED, SUPPORTED, UNDECIDED, Judged
-from s2a_bench.report.claims.plans import after, timelines
-from s2a_bench.report.claims.requests import change
-from s2a_bench.report.claims.table import judge_claims
+from s2a_bench.report.verdicts import ClaimVerdict
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from tests.report.conftest import REAL
@@ -111,8 +112,8 @@ def kit(tmp_path: Path, beside: MakeRun, spoken: MakeRun) -> Kit:
     return Kit(tmp_path, beside, spoken)
 
 
-def verdicts(*runs: StoredRun) -> dict[str, Judged]:
-    return {each.claim.text: each for each in judge_claims(runs)}
+def verdicts(*runs: StoredRun) -> dict[str, ClaimVerdict]:
+    return {each.claim: each for each in judge_claims(runs)}
 
 
 NO_EVIDENCE: dict[str, tuple[Made, str, str]] = {
@@ -315,12 +316,12 @@ NO_EVIDENCE: dict[str, tuple[Made, str, str]] = {
 @pytest.mark.parametrize("case", NO_EVIDENCE)
 def test_what_is_no_evidence_decides_nothing_and_says_what_is_missing(kit: Kit, case: str) -> None:
     make, claims, missing = NO_EVIDENCE[case]
-    found = {text: each for text, each in verdicts(make(kit)).items() if claims in text and each.findings}
+    found = {text: each for text, each in verdicts(make(kit)).items() if claims in text and each.evidence}
     assert found
     for each in found.values():
-        assert each.verdict == UNDECIDED, each.claim.text
-        assert not each.verdicts
-        (finding,) = each.findings
+        assert each.verdict == UNDECIDED, each.claim
+        assert not each.tested
+        (finding,) = each.evidence
         assert missing in "; ".join(need.text for need in finding.needs if not need.met), each.required
 
 
@@ -433,11 +434,11 @@ def test_plans_with_other_settings_than_the_chosen_are_measured_and_not_judged(
     concerned = [each for text, each in found.items() if text.startswith("AGX Orin: ") or "fast and smooth" in text]
     assert len(concerned) == 4
     for each in concerned:
-        (finding,) = each.findings
-        assert (each.verdict, each.verdicts) == (UNDECIDED, set())
+        (finding,) = each.evidence
+        assert (each.verdict, each.tested) == (UNDECIDED, False)
         assert [need.text.partition(" (needs ")[0] for need in finding.needs if not need.met] == [f"settings: {shown}"]
-        assert finding.evidence.startswith("At your settings, no verdict: ")
-        assert " at L = 6" in finding.evidence or "no plan stalls" in finding.evidence
+        assert finding.text.startswith("At your settings, no verdict: ")
+        assert " at L = 6" in finding.text or "no plan stalls" in finding.text
 
 
 @pytest.mark.parametrize(
@@ -473,17 +474,17 @@ def test_runs_that_disagree_are_undecided_and_both_are_listed_in_any_order(kit: 
     for runs in ((one, other), (other, one)):
         judged = verdicts(*runs)["101.8 against 15.5 ms: 6.57 times as long, on a Jetson AGX Orin"]
         assert judged.verdict == UNDECIDED
-        assert len(judged.verdicts) == 2
-        assert judged.evidence[-1].startswith("Runs disagree")
-        assert {SUPPORTED, CONTRADICTED} == {finding.verdict for finding in judged.findings}
-        assert all(run.path.name in " ".join(judged.evidence) for run in runs)
+        assert judged.tested
+        assert judged.notes[-1].startswith("Runs disagree")
+        assert {"Supported", "Contradicted"} == {finding.text.partition(":")[0] for finding in judged.evidence}
+        assert all(run.path.name in judged.text for run in runs)
 
 
 def test_what_a_llama_server_does_not_show_is_not_judged_by_stages(kit: Kit) -> None:
     found = verdicts(kit.beside_llama_server())
-    (finding,) = found["ROS latency is dominated by lightweight colour conversions"].findings
+    (finding,) = found["ROS latency is dominated by lightweight colour conversions"].evidence
     assert [need.text for need in finding.needs if not need.met] == ["stages: hidden by http/llama-server (needs seen)"]
-    assert found["HTTP/JSON takes longer end to end than ROS 2-native"].findings
+    assert found["HTTP/JSON takes longer end to end than ROS 2-native"].evidence
 
 
 def test_cells_of_one_run_are_judged_each(kit: Kit) -> None:

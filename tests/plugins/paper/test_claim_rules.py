@@ -8,22 +8,22 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.provenance import Provenance
-from s2a_bench.report.claims import (
+from s2a_bench.plugins.paper.claims import (
     CONTRADICTED,
     REPRODUCED,
     SUPPORTED,
     UNDECIDED,
     Check,
     ClaimFinding,
-    Judged,
-    Met,
     RunPart,
     all_of,
+    combine,
     within,
 )
-from s2a_bench.report.claims.requests import PAPERS_MODEL, facts_of, on_board
-from s2a_bench.report.claims.table import CLAIMS
+from s2a_bench.plugins.paper.claims.requests import PAPERS_MODEL, facts_of, on_board
+from s2a_bench.plugins.paper.claims.table import CLAIMS
+from s2a_bench.provenance import Provenance
+from s2a_bench.report.verdicts import Met
 from s2a_bench.stats import Ratio
 from s2a_bench.store.run import StoredRun
 
@@ -133,9 +133,9 @@ def test_runs_that_can_tell_have_to_agree_and_no_other_counts(
     findings = [ClaimFinding(verdict, str(place), (Met("board: it", True),)) for place, verdict in enumerate(testable)]
     findings += [ClaimFinding(verdict, "", (Met("board: another (needs it)", False),)) for verdict in others]
     for order in (findings, findings[::-1]):
-        judged = Judged(CLAIMS[0], dict.fromkeys(order, ("run",)))
+        judged = combine(CLAIMS[0], dict.fromkeys(order, ("run",)))
         assert judged.verdict == verdict
-        assert judged.verdicts == set(testable)
+        assert judged.tested == bool(testable)
         assert any("disagree" in note for note in judged.notes) == (len(set(testable)) > 1)
         assert any(note.startswith("Run: ") for note in judged.notes) == (not testable)
 

@@ -15,27 +15,23 @@ import pytest
 
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
+from s2a_bench.plugins.paper.claims.table import judge_claims
 from s2a_bench.provenance import Origins
-from s2a_bench.report.claims import claim_table
-from s2a_bench.report.claims.table import judge_claims
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
+from tests.plugins.paper.test_claim_cases import DUMMY, GPU, ORIN, REPLAY, RTX, Kit, MakeRun, stalling
 from tests.report.conftest import REAL
-from tests.report.test_claim_cases import DUMMY, GPU, ORIN, REPLAY, RTX, Kit, MakeRun, stalling
 
-PAGE = Path(__file__).parents[1] / "data" / "claims.md"
+PAGE = Path(__file__).parents[2] / "data" / "claims.md"
 MakeRow = Callable[..., SampleRow]
 SENT = {"convert": 10, "inference": 5, "return": 0}
 
 
 def claim_lines(*runs: StoredRun) -> list[str]:
     """Return the text of every claim that these runs can judge, or nearly so."""
-    judged = [each for each in judge_claims(runs) if each.findings]
-    texts = []
-    for row in claim_table(judged).rows:
-        where, claim, _, verdict, required, evidence = map(str, row)
-        texts.append(f"- **{where}: {claim}**: {verdict}. {evidence} *{required}*")
+    judged = [each for each in judge_claims(runs) if each.evidence]
+    texts = [f"- **{each.where}: {each.claim}**: {each.verdict}. {each.text} *{each.required}*" for each in judged]
     names = sorted({run.path.name for run in runs}, key=len, reverse=True)
     return [re.sub("|".join(map(re.escape, names)), "RUN", text) for text in texts]
 

@@ -22,14 +22,24 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     share_of,
     tokens_line,
 )
-from s2a_bench.experiments.paper import PaperThroughput, paper_throughput
 from s2a_bench.experiments.timeline.view.cells import Timelines, timelines_of
 from s2a_bench.plan.skillset import GAPS
+from s2a_bench.plugins.paper.claims import Check, Need, RunPart, Trial
+from s2a_bench.plugins.paper.claims.requests import (
+    NEAR,
+    PAPERS_MODEL,
+    change,
+    emulated,
+    exact,
+    facts_of,
+    on_board,
+    one_of,
+)
+from s2a_bench.plugins.paper.figures import ORIN, Published
 from s2a_bench.policy import TOLERANCE_S, Floats, Plans
 from s2a_bench.policy.schedule import elastic, safe_start, work_conserving
 from s2a_bench.provenance import UNKNOWN
-from s2a_bench.report.claims import Check, Met, Need, RunPart, Trial
-from s2a_bench.report.claims.requests import NEAR, PAPERS_MODEL, change, emulated, exact, facts_of, on_board, one_of
+from s2a_bench.report.verdicts import Met
 from s2a_bench.scenario.ccrb.labels import OUTCOME_LABELS, PAPER, law
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.stats import Ratio
@@ -37,7 +47,6 @@ from s2a_bench.stats.change import Change
 from s2a_bench.store.run import StoredRun
 
 NAIVE, WAIT, STREAM = "naive", "wait-then-act", "stream-to-act"
-RTX, ORIN, NANO = paper_throughput()
 _LENGTHS: Final = ("6", "4", "2", "1")
 _PROMISED: Final = 0.01
 AS_CHOSEN: Final = "as chosen"
@@ -142,9 +151,9 @@ WAITS: Final = more("S0 after the first arrival in s", TOLERANCE_S)
 STRETCHABLE: Final = more("T_max / T_nom", 1)
 
 
-def figure_5(board: PaperThroughput, *policies: str) -> Trial:
+def figure_5(board: Published, *policies: str) -> Trial:
     """Return the trial of a board: tokens at the rate of table II, or of the paper's model on it, and all four L."""
-    profile, rate = board.name.lower().replace(" ", "-"), board.tokens_per_s
+    profile, rate = board.name.lower().replace(" ", "-"), board.mean
     like = Need("tokens/s", f"within {NEAR:.0%} of {rate:g}", lambda found: abs(found / rate - 1) <= NEAR)
     measured = on_board(board.name), *PAPERS_MODEL, like
     either = f"{emulated(profile, rate)}; or {', '.join(f'{need.name} {need.wanted}' for need in measured)}"
@@ -295,7 +304,7 @@ def drives(run: StoredRun) -> Iterator[RunPart]:
 
 
 POINT, DIAGRAM = (Need(name, AS_CHOSEN, AS_CHOSEN.__eq__, chosen=True) for name in ("point", "diagram"))
-BOARD: Final = one_of("source", emulated("jetson-agx-orin", ORIN.tokens_per_s))
+BOARD: Final = one_of("source", emulated("jetson-agx-orin", ORIN.mean))
 
 
 def outcome(policy: str, part: RunPart) -> tuple[list[Ratio], str]:

@@ -10,11 +10,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import compress
 from math import inf
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 from s2a_bench.provenance import Origins, Provenance, joined
+from s2a_bench.report.verdicts import ClaimVerdict, Evidence, Met
 from s2a_bench.stats import Ratio
-from s2a_bench.writers.tables import TextTable
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
@@ -38,13 +38,6 @@ class RunPart:
     launches: int = 0  # none if all is computed
     cells: Any = None
     about: str = ""
-
-
-class Met(NamedTuple):
-    """A fact of a part beside its need, as text."""
-
-    text: str
-    met: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,72 +153,48 @@ class ClaimFinding:
     origins: tuple[Provenance, ...] = ()
     launches: int = 0
 
-    @property
-    def origin(self) -> Origins:
-        return joined(map(Origins, self.origins))
-
-    def basis(self, runs: Iterable[str]) -> str:
-        """Return the runs, the launches, and the origin of the numbers."""
+    def told(self, runs: Iterable[str], *, with_verdict: bool) -> Evidence:
+        """Return the evidence, and its basis: the runs, the launches, and the origin of the numbers."""
+        origin = joined(map(Origins, self.origins))
         launches = [f"{self.launches} launch{'es' * (self.launches > 1)}"] if self.launches else []
-        return f"Basis: {', '.join((*runs, *launches))}. {self.origin.line}"
+        verdict = f"{self.verdict.capitalize()}: " if with_verdict else ""
+        text = f"{verdict}{self.evidence} Basis: {', '.join((*runs, *launches))}. {origin.line}"
+        return Evidence(text, origin.labels, self.needs)
 
     @property
     def testable(self) -> bool:
         return all(need.met for need in self.needs)
 
 
-@dataclass(frozen=True, slots=True)
-class Judged:
-    """A claim with its findings, the testable ones first, and the names of the runs of each."""
-
-    claim: Claim
-    findings: dict[ClaimFinding, tuple[str, ...]]
-
-    @property
-    def verdicts(self) -> frozenset[str]:
-        """The verdicts of the runs that meet all needs; other runs do not count."""
-        return frozenset(finding.verdict for finding in self.findings if finding.testable)
-
-    @property
-    def verdict(self) -> str:
-        """The verdict of all testable runs; undecided if there is none, or if they disagree."""
-        return next(iter(self.verdicts)) if len(self.verdicts) == 1 else UNDECIDED
-
-    @property
-    def texts(self) -> list[tuple[str, ClaimFinding]]:
-        """A text of each finding, with its verdict if there are several findings, and its basis with the runs."""
-        several = len(self.findings) > 1
-        return [
-            ((f"{each.verdict.capitalize()}: " if several else "") + f"{each.evidence} {each.basis(runs)}", each)
-            for each, runs in self.findings.items()
-        ]
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """A note that the findings disagree, or the command to run if none is testable."""
-        if len(self.verdicts) > 1:
-            return ("Runs disagree: each is listed, none counts more.",)
-        return (f"Run: {self.claim.trial.run}",) if not self.verdicts else ()
-
-    @property
-    def evidence(self) -> tuple[str, ...]:
-        return (*(text for text, _ in self.texts), *self.notes)
-
-    @property
-    def required(self) -> str:
-        if not self.findings:
-            return "; ".join(f"{need.name}: {need.wanted}" for need in self.claim.trial.needs)
-        return " | ".join(dict.fromkeys("; ".join(need.text for need in finding.needs) for finding in self.findings))
-
-
-def judge(claim: Claim, runs: Iterable[StoredRun]) -> Judged:
+def judge(claim: Claim, runs: Iterable[StoredRun]) -> ClaimVerdict:
     """Judge one claim by each run; the order of the runs changes only the order of the evidence."""
     found: dict[ClaimFinding, tuple[str, ...]] = {}
     for run in runs:
         if run.manifest.get("command") == claim.trial.command:
             for finding in _findings(claim, run):
                 found[finding] = tuple(dict.fromkeys((*found.get(finding, ()), run.path.name)))
-    return Judged(claim, dict(sorted(found.items(), key=lambda item: not item[0].testable)))
+    return combine(claim, found)
+
+
+def combine(claim: Claim, found: Mapping[ClaimFinding, Sequence[str]]) -> ClaimVerdict:
+    """Return the verdict of the findings that meet all needs, each with the names of its runs.
+
+    It is undecided if there is none, or if they disagree. The evidence has the testable ones first.
+    """
+    findings = sorted(found, key=lambda finding: not finding.testable)
+    verdicts = {finding.verdict for finding in findings if finding.testable}
+    notes = () if verdicts else (f"Run: {claim.trial.run}",)
+    required = dict.fromkeys("; ".join(need.text for need in finding.needs) for finding in findings)
+    return ClaimVerdict(
+        claim.where,
+        claim.text,
+        claim.rule,
+        next(iter(verdicts)) if len(verdicts) == 1 else UNDECIDED,
+        " | ".join(required) or "; ".join(f"{need.name}: {need.wanted}" for need in claim.trial.needs),
+        [each.told(found[each], with_verdict=len(findings) > 1) for each in findings],
+        notes if len(verdicts) < 2 else ("Runs disagree: each is listed, none counts more.",),  # noqa: PLR2004
+        tested=bool(verdicts),
+    )
 
 
 def _findings(claim: Claim, run: StoredRun) -> Iterator[ClaimFinding]:
@@ -242,13 +211,3 @@ def _findings(claim: Claim, run: StoredRun) -> Iterator[ClaimFinding]:
     if every and not free:
         part, needs = min(every, key=lambda each: sum(not need.met for need in each[1]))
         yield ClaimFinding(UNDECIDED, "Not testable with this run.", needs, tuple(part.origins), part.launches)
-
-
-def claim_table(judged: Sequence[Judged]) -> TextTable:
-    rows: list[tuple[str, ...]] = [
-        (each.claim.where, each.claim.text, each.claim.rule, each.verdict, each.required, " ".join(each.evidence))
-        for each in judged
-    ]
-    header = ("where", "the paper's claim", "rule", "verdict", "required", "evidence")
-    notes = ("Times of the paper are of its Jetson AGX Orin unless it names another board.",)
-    return TextTable("The paper's claims beside ours", header, rows, 6, notes=notes)

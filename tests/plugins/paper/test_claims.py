@@ -17,24 +17,24 @@ from s2a_bench.experiments.boundary.run import run_boundary
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
+from s2a_bench.experiments.references import REFERENCES
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.harness.timelines.config import TimelineConfig
-from s2a_bench.report.claims import (
+from s2a_bench.plugins.paper.claims import (
     CONTRADICTED,
     IDENTITY,
     REPRODUCED,
     SUPPORTED,
     UNDECIDED,
-    Judged,
     Need,
     RunPart,
     Trial,
-    claim_table,
     judge,
 )
-from s2a_bench.report.claims.plans import CHOSEN, PLANE, PLANS
-from s2a_bench.report.claims.table import CLAIMS, judge_claims
+from s2a_bench.plugins.paper.claims.plans import CHOSEN, PLANE, PLANS
+from s2a_bench.plugins.paper.claims.table import CLAIMS, judge_claims
+from s2a_bench.report.verdicts import ClaimVerdict, Verdicts
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
@@ -49,8 +49,8 @@ EVEN: dict[str, dict[str, float]] = {
 }
 
 
-def claim_of(text: str, *runs: StoredRun) -> Judged:
-    (found,) = [judged for judged in judge_claims(runs) if text in judged.claim.text]
+def claim_of(text: str, *runs: StoredRun) -> ClaimVerdict:
+    (found,) = [judged for judged in judge_claims(runs) if text in judged.claim]
     return found
 
 
@@ -74,16 +74,16 @@ def test_without_runs_each_claim_says_what_to_run() -> None:
     judged = judge_claims([])
     assert len(judged) == len(CLAIMS) > 20
     assert {each.verdict for each in judged} == {UNDECIDED}
-    assert all(each.evidence == (f"Run: {each.claim.trial.run}",) for each in judged)
-    assert all(not each.verdicts and each.claim.rule.endswith(".") for each in judged)
-    assert all(each.claim.trial.command in EXPERIMENTS for each in judged)
-    docs = (Path(__file__).parents[2] / "docs" / "report.md").read_text(encoding="utf-8")
+    assert [each.text for each in judged] == [f"Run: {claim.trial.run}" for claim in CLAIMS]
+    assert all(not each.tested and each.rule.endswith(".") for each in judged)
+    assert all(claim.trial.command in EXPERIMENTS for claim in CLAIMS)
+    docs = (Path(__file__).parents[3] / "docs" / "report.md").read_text(encoding="utf-8")
     for each in judged:
-        assert f"| {each.claim.where} | {each.claim.text} | {each.claim.rule} | {each.required} |" in docs
-    table = claim_table(judged)
+        assert f"| {each.where} | {each.claim} | {each.rule} | {each.required} |" in docs
+    table = Verdicts(REFERENCES["paper"], judged).table()
     assert len(table.rows) == len(CLAIMS)
     assert {row[3] for row in table.rows} == {UNDECIDED}
-    assert [row[2] for row in table.rows] == [each.claim.rule for each in judged]
+    assert [row[2] for row in table.rows] == [claim.rule for claim in CLAIMS]
 
 
 @pytest.mark.parametrize(("http_ms", "verdict"), [(65.7, SUPPORTED), (3.0, CONTRADICTED), (10.0, UNDECIDED)])
@@ -97,15 +97,15 @@ def test_pipelines_that_never_succeeded_in_one_block_are_not_compared(beside: Ma
     rows = run.samples
     odd, http = rows["block"] % 2 == 1, rows["pipeline"] == "http"
     judged = claim_of("HTTP/JSON takes longer", changed(run, samples=rows[odd == http]))
-    assert not judged.verdicts
+    assert not judged.tested
     assert "launches: 0 (needs 3 or more)" in judged.required
 
 
 def test_a_sample_a_launch_is_too_few_for_the_share_of_a_stage(beside: MakeRun) -> None:
     judged = claim_of("Most HTTP overhead", beside(EVEN, n=3))
     assert judged.verdict == UNDECIDED
-    assert "Too few samples for an interval" in judged.evidence[0]
-    assert judged.verdicts
+    assert "Too few samples for an interval" in judged.evidence[0].text
+    assert judged.tested
 
 
 @pytest.mark.parametrize(
@@ -120,8 +120,8 @@ def test_serialisation_is_judged_with_the_network_and_without(
     run = beside({**EVEN, "http/as-deployed": stages | {"return": 0}}, spread=0.01)
     judged = claim_of("Most HTTP overhead", run)
     assert judged.verdict == verdict
-    assert re.search(rf"{network_ms + pack_ms + 5}% \[.*\] with the network", judged.evidence[0])
-    assert re.search(rf"{pack_ms + 5}% \[.*\] without it", judged.evidence[0])
+    assert re.search(rf"{network_ms + pack_ms + 5}% \[.*\] with the network", judged.evidence[0].text)
+    assert re.search(rf"{pack_ms + 5}% \[.*\] without it", judged.evidence[0].text)
 
 
 @pytest.mark.parametrize(
@@ -144,7 +144,7 @@ def test_ros_is_dominated_by_conversions_or_not(
     judged = claim_of("colour conversions", beside({**EVEN, "ros/topic": stages}, spread=0))
     assert judged.verdict == verdict
     computing = convert_ms / (convert_ms + pack_ms)
-    assert re.search(rf"take {10 * convert_ms:.0f}%.* of the whole, {computing:.0%}.* of encode", judged.evidence[0])
+    assert re.search(rf"take {10 * convert_ms:.0f}%.* of the whole, {computing:.0%}.* of encode", judged.text)
 
 
 def bodies(make_run: MakeRun, make_row: MakeRow, plain: int, coded: int) -> StoredRun:
@@ -162,12 +162,12 @@ def test_base64_is_judged_by_what_the_bodies_weigh(
     make_run: MakeRun, make_row: MakeRow, plain: int, coded: int, verdict: str
 ) -> None:
     assert claim_of("1.3333", bodies(make_run, make_row, plain, coded)).verdict == verdict
-    assert not claim_of("1.3333", make_run(EVEN)).findings  # no binary cell to compare with
+    assert not claim_of("1.3333", make_run(EVEN)).evidence  # no binary cell to compare with
 
 
 def test_small_pictures_do_not_count_for_what_base64_adds(make_run: MakeRun, make_row: MakeRow) -> None:
     small, large = (bodies(make_run, make_row, *sizes) for sizes in ((49_999, 66_666), (50_000, 66_667)))
-    assert not claim_of("1.3333", small).verdicts
+    assert not claim_of("1.3333", small).tested
     assert "bytes a picture: 49999 (needs 50000 or more" in claim_of("1.3333", small).required
     assert claim_of("1.3333", small, large).verdict == SUPPORTED
 
@@ -177,7 +177,7 @@ def test_bodies_of_unlike_pictures_are_not_compared(make_run: MakeRun, make_row:
         make_row(name, EVEN["ros/topic"], 1, payload_bytes=size, payload=payload, request_id=name)
         for name, size, payload in (("http/as-deployed", 120_000, "jpeg"), ("http/binary", 90_000, "png"))
     ]
-    assert not claim_of("1.3333", make_run({}, extra=tuple(rows))).findings
+    assert not claim_of("1.3333", make_run({}, extra=tuple(rows))).evidence
 
 
 def test_a_run_whose_parts_all_lack_something_says_what_the_nearest_lacks(make_run: MakeRun) -> None:
@@ -193,7 +193,7 @@ def test_a_run_whose_parts_all_lack_something_says_what_the_nearest_lacks(make_r
         return [RunPart(run, each, ()) for each in facts]
 
     claim = replace(CLAIMS[0], trial=Trial("s2a-bench latency", split, needs))
-    (finding,) = judge(claim, [make_run({}, manifest={})]).findings
+    (finding,) = judge(claim, [make_run({}, manifest={})]).evidence
     assert (
         "; ".join(need.text for need in finding.needs)
         == "board: right, near; mode: right, near; model: wrong, near (needs right)"
@@ -201,7 +201,7 @@ def test_a_run_whose_parts_all_lack_something_says_what_the_nearest_lacks(make_r
 
 
 def test_the_timelines_of_table_ii_bear_the_papers_findings_out(timelines: StoredRun) -> None:
-    verdicts = {judged.claim.text.split(" (")[0]: judged for judged in judge_claims([timelines])}
+    verdicts = {judged.claim.split(" (")[0]: judged for judged in judge_claims([timelines])}
     for text in (
         "RTX 4080: all policies run smoothly with no noticeable stalls",
         "AGX Orin: wait-then-act avoids stalls but ends later",
@@ -213,15 +213,15 @@ def test_the_timelines_of_table_ii_bear_the_papers_findings_out(timelines: Store
         "S0 is minimal: with fixed durations any earlier start stalls",
     ):
         assert verdicts[text].verdict == (IDENTITY if "S0 known" in text or "minimal" in text else SUPPORTED), text
-        assert "EMULATED" in verdicts[text].evidence[-1]
-        assert "assumption" in verdicts[text].evidence[-1]
-    assert len(verdicts["AGX Orin: stream-to-act eliminates stalls"].findings) == 1  # other boards are not its business
+        assert "EMULATED" in verdicts[text].evidence[-1].text
+        assert "assumption" in verdicts[text].evidence[-1].text
+    assert len(verdicts["AGX Orin: stream-to-act eliminates stalls"].evidence) == 1  # other boards are not its business
 
 
 def test_always_and_never_are_not_intermittent(timelines: StoredRun) -> None:
     judged = claim_of("intermittent", timelines)
     assert judged.verdict == UNDECIDED
-    assert "Naive stalls at 100% at L = 6, 0% at L = 4, 0% at L = 2, 0% at L = 1 of the gaps" in judged.evidence[0]
+    assert "Naive stalls at 100% at L = 6, 0% at L = 4, 0% at L = 2, 0% at L = 1 of the gaps" in judged.evidence[0].text
 
 
 @pytest.mark.parametrize(
@@ -233,7 +233,7 @@ def test_a_tenth_of_the_gaps_and_nine_tenths_are_intermittent(tmp_path: Path, st
     run = read_run(run_timeline(config, tmp_path, NullProgress()))
     judged = claim_of("intermittent", changed(run, timelines=run.table(TIMELINES).assign(stalls=stalls)))
     assert judged.verdict == intermittent
-    assert f"Naive stalls at {stalls / 7:.0%} at L = 6" in judged.evidence[0]
+    assert f"Naive stalls at {stalls / 7:.0%} at L = 6" in judged.evidence[0].text
 
 
 def test_half_of_the_gaps_are_not_frequent(tmp_path: Path) -> None:
@@ -276,19 +276,19 @@ def test_more_tokens_more_stalls_needs_a_strict_increase(
 def test_what_has_no_threshold_in_the_paper_is_stated_and_not_judged(timelines: StoredRun) -> None:
     excessive = claim_of("excessive delays", timelines)
     assert excessive.verdict == UNDECIDED
-    assert "no threshold" in excessive.evidence[0]
-    assert "wait-then-act's end after stream-to-act's: +7.00 s (+8.1%) at L = 6" in excessive.evidence[0]
+    assert "no threshold" in excessive.evidence[0].text
+    assert "wait-then-act's end after stream-to-act's: +7.00 s (+8.1%) at L = 6" in excessive.evidence[0].text
     first = claim_of("at the first action", timelines)
     assert first.verdict == UNDECIDED
-    assert "stream-to-act's start after naive's: +1.75 s (+100.0%) at L = 6" in " ".join(first.evidence)
+    assert "stream-to-act's start after naive's: +1.75 s (+100.0%) at L = 6" in first.text
     end = claim_of("at the end, S0 known", timelines)
-    assert "+0.00 s (+0.0%) at L = 6" in end.evidence[0]
+    assert "+0.00 s (+0.0%) at L = 6" in end.evidence[0].text
 
 
 def test_fast_and_smooth_means_against_waiting(timelines: StoredRun) -> None:
     fast = claim_of("preferable for fast and smooth control", timelines)
     assert fast.verdict == SUPPORTED
-    assert all("no plan stalls" in text for text in fast.evidence)
+    assert all("no plan stalls" in each.text for each in fast.evidence)
 
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1.005, IDENTITY), (1.02, CONTRADICTED), (0.9, IDENTITY)])
@@ -332,18 +332,18 @@ def test_s0_is_minimal_with_fixed_durations_and_not_with_elastic_ones(timelines:
     elastic = claim_of("up to T_max", timelines)
     assert elastic.verdict == CONTRADICTED
     # Q_7 = 7 * 1.5 s instead of P_7 = 7 s after S0 = 78.76 s.
-    assert "75.26 s instead of S0 = 78.76 s" in " ".join(elastic.evidence)
+    assert "75.26 s instead of S0 = 78.76 s" in elastic.text
 
 
 def test_where_nothing_can_be_stretched_only_fixed_durations_are_judged(tmp_path: Path) -> None:
     run = read_run(run_timeline(TimelineConfig(t_max=1.0), tmp_path, NullProgress()))
     assert claim_of("with fixed durations", run).verdict == IDENTITY
-    assert not claim_of("up to T_max", run).verdicts
+    assert not claim_of("up to T_max", run).tested
 
 
 def test_timelines_at_other_rates_say_nothing_of_the_papers_boards(tmp_path: Path) -> None:
     run = read_run(run_timeline(TimelineConfig(profiles=(), rates=(9.0,)), tmp_path, NullProgress()))
-    assert not claim_of("AGX Orin: naive", run).verdicts
+    assert not claim_of("AGX Orin: naive", run).tested
     assert claim_of("at the end, S0 known", run).verdict == IDENTITY
 
 
@@ -355,10 +355,10 @@ def test_runs_that_disagree_decide_nothing(timelines: StoredRun) -> None:
     worse = changed(timelines, timelines=rows)
     judged = claim_of("Orin Nano: stream-to-act", worse)
     assert judged.verdict == CONTRADICTED
-    assert "stream-to-act at L = 6: 1 of 1 plans stall, 3.00 s in the mean" in judged.evidence[0]
+    assert "stream-to-act at L = 6: 1 of 1 plans stall, 3.00 s in the mean" in judged.evidence[0].text
     for runs in ((timelines, worse), (worse, timelines)):
         both = claim_of("Orin Nano: stream-to-act", *runs)
-        assert (both.verdict, len(both.verdicts), len(both.findings)) == (UNDECIDED, 2, 2)
+        assert (both.verdict, len(both.notes), len(both.evidence)) == (UNDECIDED, 1, 2)
 
 
 def test_the_boundary_has_a_safe_side_and_one_that_is_not_always_unsafe(tmp_path: Path) -> None:
@@ -366,8 +366,8 @@ def test_the_boundary_has_a_safe_side_and_one_that_is_not_always_unsafe(tmp_path
     assert claim_of("suffices", run).verdict == IDENTITY
     below = claim_of("Below R", run)
     assert below.verdict == CONTRADICTED
-    assert "the line is R = L/T_nom" in below.evidence[0]
-    assert "Provenance: no engine, tokens EMULATED, virtual time." in below.evidence[0]  # of the grid, without boards
+    assert "the line is R = L/T_nom" in below.evidence[0].text
+    assert "Provenance: no engine, tokens EMULATED, virtual time." in below.text  # of the grid, without boards
     jitter = BoundaryConfig(jitter="lognormal:cv=0.2", plans=50, points=10)
     assert claim_of("Below R", read_run(run_boundary(jitter, tmp_path, NullProgress()))).verdict == UNDECIDED
 
@@ -381,8 +381,8 @@ def test_at_another_t_min_than_the_chosen_the_papers_line_is_tried_without_a_ver
     older = replace(run, manifest=run.manifest | {"configuration": {}})
     for each, missing in ((run, f"t_min {t_min}"), (older, "t_min unknown")):
         below = claim_of("Below R", each)
-        assert not below.verdicts
-        assert below.evidence[0].startswith("At your settings, no verdict: Naive stalls at 95 of 95 points below")
+        assert not below.tested
+        assert below.evidence[0].text.startswith("At your settings, no verdict: Naive stalls at 95 of 95 points below")
         assert missing in below.required
 
 
@@ -390,12 +390,12 @@ def test_the_operating_point_is_reproduced_and_the_diagram_does_not_bear_all_of_
     for text in ("hit from behind", "hits the car ahead", "hits nobody"):
         judged = claim_of(f"{text}", ccrb)
         assert judged.verdict == REPRODUCED
-        assert "of the diagram" in judged.evidence[0]
-        assert "careful follower" in judged.evidence[0]
+        assert "of the diagram" in judged.evidence[0].text
+        assert "careful follower" in judged.evidence[0].text
     assert claim_of("Waiting is less safe", ccrb).verdict == SUPPORTED
     naive = claim_of("Naive is less safe", ccrb)
     assert naive.verdict == CONTRADICTED
-    assert all(gap in naive.evidence[0] for gap in ("stop", "coast", "hold", "cruise"))
+    assert all(gap in naive.evidence[0].text for gap in ("stop", "coast", "hold", "cruise"))
 
 
 def test_the_chosen_point_is_the_default_of_the_command() -> None:

@@ -7,9 +7,7 @@ from functools import partial
 from math import inf, nextafter
 from typing import Final
 
-from s2a_bench.experiments.paper import paper_latency, paper_throughput
-from s2a_bench.policy import TOLERANCE_S
-from s2a_bench.report.claims import (
+from s2a_bench.plugins.paper.claims import (
     CONTRADICTED,
     IDENTITY,
     REPRODUCED,
@@ -17,18 +15,19 @@ from s2a_bench.report.claims import (
     UNDECIDED,
     Check,
     Claim,
-    Judged,
     Trial,
     judge,
 )
-from s2a_bench.report.claims import plans as of
-from s2a_bench.report.claims import requests as timed
-from s2a_bench.report.claims.plans import NAIVE, NANO, ORIN, RTX, STREAM, WAIT, figure_5, listed
-from s2a_bench.report.claims.requests import COMPARED, NEAR, on_board, one_of
+from s2a_bench.plugins.paper.claims import plans as of
+from s2a_bench.plugins.paper.claims import requests as timed
+from s2a_bench.plugins.paper.claims.plans import NAIVE, STREAM, WAIT, figure_5, listed
+from s2a_bench.plugins.paper.claims.requests import COMPARED, NEAR, on_board, one_of
+from s2a_bench.plugins.paper.figures import HTTP, NANO, ORIN, ROS, RTX
+from s2a_bench.policy import TOLERANCE_S
+from s2a_bench.report.verdicts import ClaimVerdict
 from s2a_bench.store.run import StoredRun
 
-_HTTP, _ROS = paper_latency()
-_RATIO: Final = _HTTP.mean_ms / _ROS.mean_ms
+_RATIO: Final = HTTP.mean / ROS.mean
 _BESIDE: Final = "s2a-bench latency --launches 3 --transport http?payload=jpeg-preencoded,ros"
 _SETTING: Final = (
     "pre-encoded JPEG over HTTP, colours converted for ROS, inference left out (beside llama-server the model alone)"
@@ -63,7 +62,7 @@ CLAIMS: Final[tuple[Claim, ...]] = (
     ),
     Claim(
         "V-B, figure 4",
-        f"{_HTTP.mean_ms} against {_ROS.mean_ms} ms: {_RATIO:.2f} times as long, on a Jetson AGX Orin",
+        f"{HTTP.mean} against {ROS.mean} ms: {_RATIO:.2f} times as long, on a Jetson AGX Orin",
         f"The 95 % interval of the ratio of means lies within {NEAR:.0%} of {_RATIO:.2f} (supported) or wholly outside "
         f"(contradicted); {_SETTING}.",
         Trial(f"{_BESIDE} (on a Jetson AGX Orin)", timed.pairs, (on_board("Jetson AGX Orin"), *COMPARED)),
@@ -100,7 +99,7 @@ CLAIMS: Final[tuple[Claim, ...]] = (
     *(
         Claim(
             "V-D, table II",
-            f"{board.name}: {board.tokens_per_s:g} tokens/s",
+            f"{board.name}: {board.mean:g} tokens/s",
             f"The 95 % interval of our mean N / T_eval lies within {NEAR:.0%} of the paper's (which gives no spread). "
             f"Contradicted where it is below with {timed.FEWEST_BITS} bits a weight or fewer, or above with "
             f"{timed.MOST_BITS} or more; else another rate is undecided, as more bits take longer and the paper does "
@@ -110,9 +109,9 @@ CLAIMS: Final[tuple[Claim, ...]] = (
                 timed.speeds,
                 (on_board(board.name), *timed.PAPERS_MODEL, timed.KNOWN, one_of("T_eval", "the engine's")),
             ),
-            (Check(f"{{}}; the paper: {board.tokens_per_s:g}.", partial(timed.speed_over, board), 1 - NEAR, 1 + NEAR),),
+            (Check(f"{{}}; the paper: {board.mean:g}.", partial(timed.speed_over, board), 1 - NEAR, 1 + NEAR),),
         )
-        for board in paper_throughput()
+        for board in (RTX, ORIN, NANO)
     ),
     Claim(
         "IV-F, figure 2",
@@ -291,5 +290,5 @@ CLAIMS: Final[tuple[Claim, ...]] = (
 )
 
 
-def judge_claims(runs: Sequence[StoredRun]) -> list[Judged]:
+def judge_claims(runs: Sequence[StoredRun]) -> list[ClaimVerdict]:
     return [judge(claim, runs) for claim in CLAIMS]

@@ -10,12 +10,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.paper import PaperThroughput
 from s2a_bench.experiments.requests import RequestCell, cells_of
 from s2a_bench.experiments.throughput.metrics import throughput_cells
+from s2a_bench.plugins.paper.claims import Need, RunPart
+from s2a_bench.plugins.paper.figures import Published
 from s2a_bench.policy import Floats
 from s2a_bench.provenance import NONE, UNKNOWN, Provenance
-from s2a_bench.report.claims import Need, RunPart
 from s2a_bench.stats import Ratio, summarise, summary_of
 from s2a_bench.stats.change import FEWEST_LAUNCHES, Blocks, Change, change_between, ratio_of_launches
 from s2a_bench.store.run import StoredRun
@@ -267,13 +267,13 @@ def speeds(run: StoredRun) -> Iterator[RunPart]:
 KNOWN: Final = Need("quantisation", "known (the paper does not say which it used)", lambda found: found != UNKNOWN)
 
 
-def speed_over(board: PaperThroughput, part: RunPart) -> tuple[list[Ratio], str]:
+def speed_over(board: Published, part: RunPart) -> tuple[list[Ratio], str]:
     """Measure the ratio of tokens a second to those of the paper's board.
 
     Fewer bits a weight take less time: the interval is open where the paper's quantisation may explain the difference.
     """
     values = part.cells.values("tokens_per_s")
-    ratio = change(values, np.full(len(values), board.tokens_per_s), part.run.bootstrap_seed).ratio
+    ratio = change(values, np.full(len(values), board.mean), part.run.bootstrap_seed).ratio
     rate, quantisation = summarise(values), part.facts["quantisation"]
     bits = int(found[1]) if (found := _BITS.search(quantisation)) else (FEWEST_BITS + MOST_BITS) // 2
     if ratio.high is not None and ratio.high < 1 - NEAR and bits > FEWEST_BITS:
