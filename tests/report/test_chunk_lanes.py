@@ -9,10 +9,10 @@ import pytest
 from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.experiments.chunks.run import run_chunks
 from s2a_bench.experiments.chunks.view.figures import COLOURS, lanes_of
+from s2a_bench.experiments.chunks.view.lanes import page_lanes
 from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import read_chapters
 from s2a_bench.report.page.files import make_report, write_report
-from s2a_bench.report.page.lanes import panels_of_chunks
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 
@@ -24,7 +24,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
 
 
 def test_a_panel_is_a_source_and_a_bar_a_chunk_or_a_stall(run: StoredRun) -> None:
-    first, second = panels_of_chunks(lanes_of(run))
+    first, second = page_lanes(lanes_of(run)).panels
     assert (first.title, second.title) == ("Latency 60", "Latency 100")
     assert first.end_s == pytest.approx(60 * 0.02)
     sync, replace = first.lanes

@@ -110,7 +110,7 @@ def test_a_live_run_is_shown_and_its_latencies_are_a_source(tmp_path: Path, monk
     shown = show(read_run(folder))
     assert "loop" in shown.tables
     assert {"lanes", "reactions"} <= set(shown.figures)
-    assert {len(lane.ticks) for lane in shown.lanes} == {20}
+    assert [panel.end_s for panel in shown.lanes.panels] == pytest.approx([20 * 0.02])
     assert not any("EMULATED" in str(note) for name in shown.main for note in shown.tables[name].notes)
     cell = json.loads(json.dumps(shown.json()))["cells"][0]
     assert cell["emulated"] is False

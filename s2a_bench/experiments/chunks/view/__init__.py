@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.chunks.view.figures import chunk_figures, lanes_of
+from s2a_bench.experiments.chunks.view.lanes import page_lanes
 from s2a_bench.experiments.chunks.view.tables import (
     Row,
     chunk_csv,
@@ -31,7 +32,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
         csvs=lambda: chunk_csv(run),
         figures=lambda: chunk_figures(run),
         json=lambda: chunk_json(run),
-        lanes=lambda: lanes_of(run),
+        lanes=lambda: page_lanes(lanes_of(run)),
     )
 
 
