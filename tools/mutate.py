@@ -51,7 +51,7 @@ TESTS = {
     "report/claims": [f"tests/report/test_claim{part}.py" for part in ("_rules", "_texts", "s", "_cases")],
     "report/advise": ["tests/report/test_advise.py"],
     "report/compare/gates.py": ["tests/report/test_compare.py"],
-    "experiments/capacity": ["tests/experiments/capacity"],
+    "plugins/chunks": ["tests/plugins/chunks"],
     "harness/clocks.py": ["tests/harness/test_clocks.py"],
     "harness/links": ["tests/harness/links"],
     "boards/links.py": ["tests/boards/test_links.py"],

@@ -237,9 +237,7 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
     "command",
     {
         "boundary": "s2a_bench.experiments.boundary:EXPERIMENT",
-        "capacity": "s2a_bench.experiments.capacity:EXPERIMENT",
         "ccrb": "s2a_bench.experiments.ccrb:EXPERIMENT",
-        "chunks": "s2a_bench.experiments.chunks:EXPERIMENT",
         "latency": "s2a_bench.experiments.latency:EXPERIMENT",
         "throughput": "s2a_bench.experiments.throughput:EXPERIMENT",
         "timeline": "s2a_bench.experiments.timeline:EXPERIMENT",

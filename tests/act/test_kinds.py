@@ -12,9 +12,9 @@ import pytest
 
 from s2a_bench.act import ROBOTS, ActionKind, ActionRobot, SkillKind, SkillRobot, kind, open_robot
 from s2a_bench.act.call import CallableRobot
-from s2a_bench.act.plant import Plant
 from s2a_bench.errors import UsageError
 from s2a_bench.plan import SkillSet, load_skills
+from s2a_bench.plugins.chunks.plant import Plant
 
 
 @pytest.fixture

@@ -29,6 +29,12 @@ PLUGINS = {
             "longitudinal, embedded, carla",
         )
     ],
+    "chunks": [
+        Named(("chunks",), "No such command 'chunks'", ("--help",), "chunks "),
+        Named(
+            ("timeline", "--live", "--robot", "plant"), "'plant' is none of timed, ros, call", ("--help",), "capacity "
+        ),
+    ],
     "rclpy": [
         Named(
             ("latency", "--middleware", "rclpy"),
