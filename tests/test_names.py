@@ -35,8 +35,8 @@ HOMES = {
 """The packages of experiments."""
 COMMON = {"queue", "replace"}
 """Modes whose names are words of other things too (a stage, an error handler): seen where they are imported only."""
-OTHERS = {"s2a_bench/act/": ROBOTS, "s2a_bench/frames/": SOURCES}
-"""Where a name is a robot's or a camera's, whatever else is called so."""
+OTHERS = {"s2a_bench/act/": ROBOTS, "s2a_bench/frames/": SOURCES, "s2a_bench/plugins/chunks/modes/": POLICIES}
+"""Where a name is a robot's, a camera's or a parameter's value, whatever else is called so."""
 KINDS = {
     "policy": (POLICIES, "s2a_bench/policy/"),
     "mode": (MODES, "s2a_bench/plugins/chunks/"),
