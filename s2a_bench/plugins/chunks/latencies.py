@@ -15,14 +15,13 @@ from s2a_bench.boards.gaps import Gaps
 from s2a_bench.boards.latency import draw_ns, read_latency, whole_ns
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.provenance import Provenance
-from s2a_bench.store.run import fits, read_run
+from s2a_bench.store.run import StoredRun, fits, read_run
 
 if TYPE_CHECKING:
     import numpy as np
     import pandas as pd
 
     from s2a_bench.plugins.chunks.modes import ControlSetting, Ints, Mode
-    from s2a_bench.store.run import StoredRun
     from s2a_bench.trace import Mark
 
 _PARAMETER: Final = re.compile(r"\s*\w+\s*=")

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, Any, ClassVar, Final, Literal
 
 from pydantic import BeforeValidator
 
@@ -16,11 +16,8 @@ from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import LiveRequests
 from s2a_bench.inference import STAND_IN, EngineConfig
 from s2a_bench.options import Names, Options, group, option
-from s2a_bench.plugins.chunks.modes import MODES, ControlSetting, Rounding, modes
+from s2a_bench.plugins.chunks.modes import MODES, ControlSetting, Mode, Rounding, modes
 from s2a_bench.transport import ACTIONS, TOKENS
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.modes import Mode
 
 SHOWN: Final = (
     *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),

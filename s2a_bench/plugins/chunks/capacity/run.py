@@ -14,12 +14,12 @@ from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
-from s2a_bench.harness.session import Place
+from s2a_bench.harness.session import Place, Session
 from s2a_bench.inference import STAND_IN
 from s2a_bench.machine.cluster import connect
 from s2a_bench.machine.resources import POWER_W
 from s2a_bench.plugins.chunks.capacity.generator import STRIDE, Fleet, FleetOnRay, FleetPlan, FleetProcess
-from s2a_bench.plugins.chunks.capacity.metrics import measures
+from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace, measures
 from s2a_bench.plugins.chunks.capacity.predict import Prediction, Service, run_predicted
 from s2a_bench.plugins.chunks.capacity.rows import (
     FLEETS,
@@ -41,9 +41,7 @@ from s2a_bench.transport.defaults import LOOPBACK
 from s2a_bench.transport.pipeline import Pipeline, pipelines
 
 if TYPE_CHECKING:
-    from s2a_bench.harness.session import Session
     from s2a_bench.plugins.chunks.capacity.config import CapacityConfig
-    from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
     from s2a_bench.progress import Progress
     from s2a_bench.store.run import RunWriter
 

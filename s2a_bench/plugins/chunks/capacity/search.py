@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from s2a_bench.plugins.chunks.capacity.metrics import cycle_ns, share_interval
+from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace, cycle_ns, share_interval
 
 if TYPE_CHECKING:
     from s2a_bench.plugins.chunks.capacity.config import Limit
-    from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
     from s2a_bench.plugins.chunks.capacity.rows import Verdict
     from s2a_bench.plugins.chunks.modes import Ints
 

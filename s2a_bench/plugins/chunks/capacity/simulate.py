@@ -11,16 +11,13 @@ import heapq
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
-from s2a_bench.plugins.chunks.modes import Ticks
+from s2a_bench.plugins.chunks.modes import ControlSetting, Mode, Pace, Ticks
 from s2a_bench.plugins.chunks.modes.cycles import drive
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.modes import ControlSetting, Mode, Pace
 
 UNKNOWN: Final = -1
 

@@ -6,25 +6,20 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
 
 from pydantic import BeforeValidator
 
-from s2a_bench.act import ROBOTS
+from s2a_bench.act import ROBOTS, ActionKind, kind
 from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import LiveRequests
 from s2a_bench.inference import STAND_IN
 from s2a_bench.options import Names, Options, group, one_of, option
-from s2a_bench.plugins.chunks.latencies import split
-from s2a_bench.plugins.chunks.modes import COMPARED, MODES, ControlSetting, Rounding, modes
-from s2a_bench.policy.conformal import GUARANTEE, Guarantee
-
-if TYPE_CHECKING:
-    from s2a_bench.act import ActionKind
-    from s2a_bench.plugins.chunks.latencies import Source
-    from s2a_bench.plugins.chunks.modes import Mode
+from s2a_bench.plugins.chunks.latencies import Source, sources, split
+from s2a_bench.plugins.chunks.modes import COMPARED, MODES, ControlSetting, Mode, Rounding, modes
+from s2a_bench.policy.conformal import GUARANTEE, Guarantee, fewest
 
 SHOWN: Final = (
     *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
@@ -141,16 +136,12 @@ class ChunksConfig(Options):
 
     @cached_property
     def sources(self) -> tuple[Source, ...]:
-        from s2a_bench.plugins.chunks.latencies import sources
-
         return tuple(
             each for written in self.latency for each in sources(written, self.horizon * self.tokens_per_action)
         )
 
     @cached_property
     def plant(self) -> ActionKind | None:
-        from s2a_bench.act import ActionKind, kind
-
         if not self.robot:
             return None
         found = kind(self.robot, ActionKind)
@@ -169,8 +160,6 @@ class ChunksConfig(Options):
     @cached_property
     def too_few(self) -> str:
         """The source with too few latencies for a rule that keeps to `epsilon`, as text; else empty."""
-        from s2a_bench.policy.conformal import fewest
-
         needed = fewest(self.epsilon)
         return next(
             (
@@ -221,8 +210,6 @@ class ChunksConfig(Options):
             raise UsageError(f"`rules`: {self.too_few}; raise `epsilon`, or take `rules` {others}")
 
     def _check_live(self) -> None:
-        from s2a_bench.act import ActionKind, kind
-
         if self.robot:
             kind(self.robot, ActionKind)
         given = self.model_fields_set
@@ -252,8 +239,6 @@ class ChunksConfig(Options):
             )
 
     def _check_learning(self) -> None:
-        from s2a_bench.policy.conformal import fewest
-
         if "oracle" in self.rules_tried:
             raise UsageError("`rules`: a live run has no oracle; take calibrated, tracked, maximum or mean")
         if {*PROMISING} & {*self.rules_tried} and self.with_rules:
@@ -278,8 +263,6 @@ class ChunksConfig(Options):
             raise UsageError(f"`export_delays`: {file} should be a .csv file in a folder that there is")
 
     def risks(self) -> Iterator[tuple[str, str, str]]:
-        from s2a_bench.act import ActionKind, kind
-
         yield from super().risks()
         if self.robot and (risk := kind(self.robot, ActionKind).risk):
             yield "robot", risk, self.robot

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.act import open_robot
+from s2a_bench.act import ActionRobot, open_robot
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
@@ -24,19 +24,15 @@ from s2a_bench.harness.session import Session
 from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.plugins.chunks.chunks.build_rows import stall_metrics, stalls_of, write_cell
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes
-from s2a_bench.plugins.chunks.chunks.config import PROMISING
+from s2a_bench.plugins.chunks.chunks.config import PROMISING, ChunksConfig
 from s2a_bench.plugins.chunks.chunks.smooth import MOST_TICKS, smoothness
-from s2a_bench.plugins.chunks.control import ControlLoop, RobotTicks, Send
+from s2a_bench.plugins.chunks.control import Acted, ControlLoop, RobotTicks, Send
 from s2a_bench.plugins.chunks.latencies import Source, delay_rows, measured, write_delays
-from s2a_bench.plugins.chunks.modes import ONE_BY_ONE, ControlSetting, mode
+from s2a_bench.plugins.chunks.modes import ONE_BY_ONE, ControlSetting, Cycles, Ints, Mode, Ticks, mode
 from s2a_bench.plugins.chunks.modes.cycles import gather, lay
 from s2a_bench.plugins.chunks.requester import ChunkRequester, Job
 
 if TYPE_CHECKING:
-    from s2a_bench.act import ActionRobot
-    from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
-    from s2a_bench.plugins.chunks.control import Acted
-    from s2a_bench.plugins.chunks.modes import Cycles, Ints, Mode, Ticks
     from s2a_bench.progress import Progress
     from s2a_bench.store.run import RunWriter
 CLIENTS: Final = 4

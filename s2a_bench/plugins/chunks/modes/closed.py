@@ -8,16 +8,13 @@ time, on a robot whose ticks are shifted by a stall, d Delta t is L.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from s2a_bench.plugins.chunks.modes import Ints
+from s2a_bench.plugins.chunks.modes import ControlSetting, Ints, Mode
 from s2a_bench.policy import Floats
-
-if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.modes import ControlSetting, Mode
 
 
 @dataclass(frozen=True, slots=True)
