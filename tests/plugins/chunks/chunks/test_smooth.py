@@ -208,7 +208,7 @@ class TestRuns:
         [
             ("ros", "`robot`: ros: virtual time has no actions to send; name a plant, or nothing"),
             ("plant?frequency_hz=0", "`robot`: plant: frequency_hz = '0': input should be greater than 0"),
-            ("timed", "`robot`: timed takes no actions; plant, ros, call do"),
+            ("timed", "`robot`: timed takes no actions; ros, call, plant do"),
         ],
     )
     def test_a_robot_that_cannot_be_is_refused(self, robot: str, message: str) -> None:
