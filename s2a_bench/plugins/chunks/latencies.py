@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.boards.gaps import Gaps
 from s2a_bench.boards.latency import draw_ns, read_latency, whole_ns
+from s2a_bench.boards.profile import load_profile, profile_files
+from s2a_bench.boards.tokens import AS_PROFILE, board_of_profile
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.provenance import Provenance
 from s2a_bench.store.run import StoredRun, fits, read_run
@@ -49,9 +51,6 @@ class Source:
     def draw(self, rng: np.random.Generator, count: int) -> Ints:
         """Draw latencies of shape (count,), in ns; raises TypeError for a recording."""
         if self.profile:
-            from s2a_bench.boards.profile import load_profile
-            from s2a_bench.boards.tokens import AS_PROFILE, board_of_profile
-
             board = board_of_profile(load_profile(self.profile), AS_PROFILE, None)
             return whole_ns(board.tokens(self.tokens, rng, count)[-1])
         if self.gaps is None:
@@ -69,8 +68,6 @@ def sources(written: str, tokens: int) -> Iterator[Source]:
     elif Path(folder := written.partition("#")[0]).is_dir():
         yield from measured(Path(folder), written.partition("#")[2])
     else:
-        from s2a_bench.boards.profile import load_profile, profile_files
-
         if written not in profile_files() and not (written.endswith(".toml") and Path(written).is_file()):
             kinds = "a number of ms, a family, a .csv file, a run folder, or a profile of 'profile list'"
             raise UsageError(f"`latency`: '{written}' should be {kinds}")

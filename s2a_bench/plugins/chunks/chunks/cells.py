@@ -8,6 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.harness.warnings import change_warnings
+from s2a_bench.plugins.chunks.chunks.config import CYCLES, ChunksConfig
 from s2a_bench.plugins.chunks.modes.trigger import (
     Learning,
     Maximum,
@@ -22,7 +23,6 @@ from s2a_bench.policy.parameters import canonical
 from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
     from s2a_bench.plugins.chunks.latencies import Source
     from s2a_bench.plugins.chunks.modes import Ints, Mode
     from s2a_bench.policy.conformal import Calibration
@@ -79,8 +79,6 @@ def draw(config: ChunksConfig, source: Source) -> LatencyDraw:
     if source.recorded_ns is not None:
         judged = source.recorded_ns[count:]
         return LatencyDraw(source, judged[: config.cycles], source.recorded_ns[:count])
-    from s2a_bench.plugins.chunks.chunks.config import CYCLES
-
     judged = source.draw(generator(config.seed, "chunks", source.name), config.cycles or CYCLES)
     return LatencyDraw(source, judged, source.draw(generator(config.seed, "chunks rules", source.name), count))
 

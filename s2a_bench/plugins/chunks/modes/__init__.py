@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Literal, Protocol, TypeAlias
 
 from s2a_bench.errors import UsageError
+from s2a_bench.policy.parameters import build, canonical
 from s2a_bench.registry import Registry
 
 if TYPE_CHECKING:
@@ -289,15 +290,11 @@ ONE_BY_ONE: Final = "sync?execute=1"
 
 def mode(written: str) -> Mode:
     """Build the mode ``name[?parameter=value&...]``; raises UsageError for an unknown name, parameter or value."""
-    from s2a_bench.policy.parameters import build
-
     return build(MODES[written.partition("?")[0]], written, MODES.field)
 
 
 def modes(written: Iterable[str], setting: ControlSetting) -> dict[str, Mode]:
     """Build each mode once, by its canonical name; raises UsageError, also for one that needs longer chunks."""
-    from s2a_bench.policy.parameters import canonical
-
     found = {canonical(each.name, each): each for each in map(mode, written)}
     for name, each in found.items():
         try:
