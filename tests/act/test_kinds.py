@@ -71,7 +71,7 @@ def test_one_of_another_package_is_found_by_its_name(offer: ModuleType) -> None:
     assert open_robot("arm?stiff=true", 1, 1).describe()["frequency_hz"] == "20"
     with pytest.raises(UsageError, match="`robot`: arm: 'soft' is no parameter; its parameters are stiff"):
         kind("arm?soft=true", ActionKind)
-    with pytest.raises(UsageError, match="`robot`: timed takes no actions; ros, call, arm, plant do"):
+    with pytest.raises(UsageError, match="`robot`: timed takes no actions; ros, call, arm do"):
         kind("timed", ActionKind)
 
 

@@ -10,7 +10,7 @@ import jsonschema
 from s2a_bench.store.run import read_run
 from tests.cli.program import called
 
-ROOT = Path(__file__).parent.parent.parent
+ROOT = Path(__file__).parents[4]
 
 
 def test_json_keeps_its_schema_and_has_the_keys_of_a_cell(tmp_path: Path) -> None:
