@@ -17,10 +17,10 @@ from typing import Final
 import numpy as np
 from scipy import stats
 
-from s2a_bench.experiments.capacity.config import CapacityConfig
-from s2a_bench.experiments.capacity.metrics import RobotTrace, measures
-from s2a_bench.experiments.capacity.search import Judge, Tried, knee, search
-from s2a_bench.experiments.capacity.simulate import UNKNOWN, ServiceTime, VirtualFleet, simulate
+from s2a_bench.plugins.chunks.capacity.config import CapacityConfig
+from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace, measures
+from s2a_bench.plugins.chunks.capacity.search import Judge, Tried, knee, search
+from s2a_bench.plugins.chunks.capacity.simulate import UNKNOWN, ServiceTime, VirtualFleet, simulate
 
 CONFIG: Final = CapacityConfig(predict="20")
 """The defaults of the command: 10 s a look, 4 looks, at most 1 % stalled."""

@@ -15,8 +15,8 @@ import numpy as np
 
 from benchmarks.timing import turns_s
 from s2a_bench.boards.gaps import Lognormal
-from s2a_bench.policy.chunks import ControlSetting, Mode, mode
-from s2a_bench.policy.chunks.cycles import step
+from s2a_bench.plugins.chunks.modes import ControlSetting, Mode, mode
+from s2a_bench.plugins.chunks.modes.cycles import step
 
 MODES = (
     "sync",

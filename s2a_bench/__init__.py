@@ -1,40 +1,34 @@
 """s2a-bench measures the transport between a robot and a vision-language model, and when the robot may act.
 
-Every experiment is a function (`latency`, `throughput`, `timeline`, `chunks`, `capacity`, `boundary`, `ccrb`), `load`
-opens a run folder, `compare` compares two. See docs/library.md; the types are in __init__.pyi.
+Every experiment is a function (`latency`, `throughput`, `timeline`, those of plug-ins), `load` opens a run folder,
+`compare` compares two. See docs/library.md; the types are in __init__.pyi.
 """
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Any
 
 __version__ = "0.1.0"
 
-__all__ = [
-    "Comparison",
-    "Run",
-    "boundary",
-    "capacity",
-    "ccrb",
-    "chunks",
-    "compare",
-    "latency",
-    "load",
-    "throughput",
-    "timeline",
-]
+_LIBRARY = ("Comparison", "Run", "compare", "load")
 
 
 def __getattr__(name: str) -> Any:
     """Import the library at the first use of a name, so that importing the package stays fast."""
-    if name not in __all__:
+    if find_spec(f"s2a_bench.{name}"):
+        raise AttributeError(f"the module 's2a_bench.{name}' is not imported")
+    from s2a_bench.experiments import EXPERIMENTS
+
+    if name == "__all__":
+        return sorted((*_LIBRARY, *(each for each, _ in EXPERIMENTS.loaded() if each.isidentifier())))
+    if name not in _LIBRARY and name not in EXPERIMENTS:
         raise AttributeError(f"module 's2a_bench' has no attribute '{name}'")
     from s2a_bench import library
 
-    found = getattr(library, name, None) or library.command(name)
-    globals()[name] = found
+    found = globals()[name] = getattr(library, name) if name in _LIBRARY else library.command(name)
     return found
 
 
 def __dir__() -> list[str]:
-    return [*__all__, "__version__"]
+    return [*__getattr__("__all__"), "__version__"]

@@ -23,11 +23,7 @@ _CORE: Final = {
     "llama-server": "llama.cpp's own server, without a compiler",
     "ccrb": "the embedded simulator",
     "nvidia": "load, memory and power of NVIDIA GPUs",
-    "act": "the openvla dialect, /act",
     "ray": "sweeps, and fleets of robots, on a Ray cluster",
-    "grpc": "policies over gRPC, as lerobot serves them",
-    "websocket": "policies over WebSocket, as openpi serves them",
-    "zmq": "policies over ZeroMQ, as GR00T serves them",
 }
 _OFFERED: Final[Registry[str]] = Registry("extras", "extra", {})
 _NOTED: ContextVar[dict[str, None] | None] = ContextVar("extras that are missing", default=None)

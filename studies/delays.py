@@ -18,9 +18,9 @@ import numpy as np
 from s2a_bench.boards.gaps import Markov
 from s2a_bench.machine import environment
 from s2a_bench.options import Options, option
-from s2a_bench.policy.chunks import ControlSetting, Ints, mode
-from s2a_bench.policy.chunks.metrics import measure
-from s2a_bench.policy.chunks.trigger import Maximum, TrackedLatency, calibrate, follow, trigger
+from s2a_bench.plugins.chunks.modes import ControlSetting, Ints, mode
+from s2a_bench.plugins.chunks.modes.metrics import measure
+from s2a_bench.plugins.chunks.modes.trigger import Maximum, TrackedLatency, calibrate, follow, trigger
 from s2a_bench.policy.conformal import GUARANTEE, Guarantee
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.stats.change import change_of_ranks

@@ -19,23 +19,28 @@ import pytest
 
 import s2a_bench
 from s2a_bench.act import ROBOTS
+from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.frames import SOURCES
 from s2a_bench.inference import ENGINES
+from s2a_bench.plugins.chunks.modes import MODES
 from s2a_bench.policy import POLICIES
-from s2a_bench.policy.chunks import MODES
 from s2a_bench.ros import MIDDLEWARES
 from s2a_bench.transport import TRANSPORTS
 
 ROOT = Path(__file__).parent.parent
 ALLOWED = Path(__file__).parent / "data" / "names.txt"
-EXPERIMENTS = {path.parent.name for path in (ROOT / "s2a_bench" / "experiments").glob("*/__init__.py")}
+HOMES = {
+    *(f"s2a_bench.experiments.{path.parent.name}" for path in ROOT.glob("s2a_bench/experiments/*/__init__.py")),
+    *(each.run.partition(":")[0].rpartition(".")[0] for _, each in EXPERIMENTS.loaded()),
+}
+"""The packages of experiments."""
 COMMON = {"queue", "replace"}
 """Modes whose names are words of other things too (a stage, an error handler): seen where they are imported only."""
-OTHERS = {"s2a_bench/act/": ROBOTS, "s2a_bench/frames/": SOURCES}
-"""Where a name is a robot's or a camera's, whatever else is called so."""
+OTHERS = {"s2a_bench/act/": ROBOTS, "s2a_bench/frames/": SOURCES, "s2a_bench/plugins/chunks/modes/": POLICIES}
+"""Where a name is a robot's, a camera's or a parameter's value, whatever else is called so."""
 KINDS = {
     "policy": (POLICIES, "s2a_bench/policy/"),
-    "mode": (MODES, "s2a_bench/policy/"),
+    "mode": (MODES, "s2a_bench/plugins/chunks/"),
     "engine": (ENGINES, "s2a_bench/inference/"),
     "transport": (TRANSPORTS, "s2a_bench/transport/{}/"),
     "middleware": (MIDDLEWARES, "s2a_bench/ros/"),
@@ -87,12 +92,10 @@ def named(path: Path) -> Iterator[str]:
                 name in texts and name not in COMMON and not elsewhere
             ):
                 yield f"{kind} {name}"
-    parts = path.relative_to(ROOT).parts
-    if parts[1] == "experiments" and parts[2] in EXPERIMENTS:
-        for each in modules:
-            other = each.removeprefix("s2a_bench.experiments.").partition(".")[0]
-            if each.startswith("s2a_bench.experiments.") and other in EXPERIMENTS - {parts[2]}:
-                yield f"experiment {other}"
+    for mine in HOMES:
+        if where.startswith(f"{mine.replace('.', '/')}/"):
+            others = {home for home in HOMES - {mine} if any(within(each, home) for each in modules)}
+            yield from (f"experiment {home.rpartition('.')[2]}" for home in others)
 
 
 def test_nobody_in_the_core_names_one_of_a_kind_but_where_it_is_allowed() -> None:

@@ -295,7 +295,10 @@ def test_its_experiment_is_a_command_and_a_function(
     one, other = sorted((tmp_path / "results").iterdir())
     assert json.loads(command("compare", str(one), str(other), "--json").stdout)["comparisons"]
     command("report", str(one), "--output", str(tmp_path / "report.html"))
-    assert "cost of a reading" in (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report.html").read_text()
+    assert "cost of a reading" in page
+    assert "Bars are readings, end to end." in page
+    assert page.count('<rect class="skill"') == 20
     code = "from s2a_bench import library; print(len(library.run('toy-clock', readings=7).table('readings')))"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=installed, cwd=tmp_path

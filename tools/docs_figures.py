@@ -20,11 +20,11 @@ from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
 from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.run import run_ccrb
-from s2a_bench.experiments.chunks.config import ChunksConfig
-from s2a_bench.experiments.chunks.run import run_chunks
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.figures import policy_colours
 from s2a_bench.harness.timelines.config import TimelineConfig
+from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
+from s2a_bench.plugins.chunks.chunks.run import run_chunks
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
 from s2a_bench.scenario import SIMULATORS, DriveCommand

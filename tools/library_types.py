@@ -96,7 +96,7 @@ def _field(options: type[Options], path: Sequence[str]) -> FieldInfo:
 
 def stub() -> str:
     """Return the text of the file."""
-    commands = sorted(EXPERIMENTS.built_in())
+    commands = sorted(name for name, each in EXPERIMENTS.loaded() if each.config.startswith("s2a_bench."))
     taken = {name: dict(keywords(resolve_name(EXPERIMENTS[name].config))).items() for name in commands}
     sets: dict[tuple[str, ...], list[tuple[str, str]]] = defaultdict(list)
     for keyword in dict.fromkeys(chain(*taken.values())):

@@ -51,8 +51,8 @@ TESTS = {
     "plugins/policy_servers": ["tests/plugins/policy_servers"],
     "plugins/paper/claims": ["tests/plugins/paper"],
     "report/compare/gates.py": ["tests/report/test_compare.py"],
-    "experiments/capacity": ["tests/experiments/capacity"],
     "plugins/two_hosts": ["tests/plugins/two_hosts"],
+    "plugins/chunks": ["tests/plugins/chunks"],
 }
 """Package -> the tests that belong to it."""
 WITH_ARGUMENTS = ("VariableReplacer", "VariableInserter")

@@ -107,7 +107,8 @@ def compare_schema() -> dict[str, Any]:
 
 def frame_schema() -> dict[str, Any]:
     """Return the schema of what the measuring commands print, with what is declared in the place of what was there."""
-    cells = [resolve_name(where) for name in EXPERIMENTS.built_in() if (where := EXPERIMENTS[name].cell)]
+    declared = [EXPERIMENTS[name].cell for name in sorted(EXPERIMENTS)]
+    cells = [resolve_name(cell) for cell in declared if cell.startswith("s2a_bench.")]
     named: dict[str, Any] = {"ratio": RatioJson, "warning": RunWarning, "origins": Origins}
     named |= {_name(each): each for each in (*cells, Reference, CcrbStudy)}
     named["sweep_cell"] = PlannedCell | SweptCell

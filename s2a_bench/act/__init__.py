@@ -1,11 +1,12 @@
-"""Acting: an `Executor` carries out a policy's decisions, a `ControlLoop` the actions of chunks; robots execute both.
+"""Acting: an `Executor` carries out a policy's decisions; robots execute its skills, or actions at a control rate.
 
-docs/executor.md and docs/chunks-live.md define the timing, and show how a robot is plugged in.
+docs/executor.md defines the timing, and shows how a robot is plugged in.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Protocol, TypeAlias, TypeGuard, TypeVar
 
 from s2a_bench.errors import UsageError
@@ -15,7 +16,6 @@ from s2a_bench.registry import Registry
 from s2a_bench.types import Vector
 
 if TYPE_CHECKING:
-    from s2a_bench.act.plant import PlantMotion
     from s2a_bench.policy import Floats
 
 Report: TypeAlias = Callable[[str], None]
@@ -51,6 +51,20 @@ class SkillRobot(Protocol):
         """Let go of the robot; may be called twice."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Motion:
+    """Motion of a robot in K ticks with n steps each: arrays of shape (K, n, D), the first step when a tick begins.
+
+    The units are those of the actions, and s. A tick's action is in effect from its first step on.
+    """
+
+    position: Floats
+    velocity: Floats
+    acceleration: Floats
+    jerk: Floats
+    """(acceleration - acceleration one control period before) / control period; at rest before the first tick."""
+
+
 class ActionRobot(Protocol):
     """A robot that executes actions. Called on the control loop's thread: every call returns at once."""
 
@@ -63,7 +77,7 @@ class ActionRobot(Protocol):
     def state(self) -> tuple[float, ...]:
         """Return the state that a request sends to the policy, in the robot's units; empty: none."""
 
-    def moved(self, most: int) -> tuple[PlantMotion, Floats] | None:  # noqa: ARG002 - for subclasses
+    def moved(self, most: int) -> tuple[Motion, Floats] | None:  # noqa: ARG002 - for subclasses
         """Return the motion from the first action on, and the actions, of ``most`` ticks; None: unknown."""
         return None
 
@@ -107,7 +121,7 @@ class ActionKind(RobotKind):
         """Open a robot for actions of ``dims`` numbers, one every ``period_ns``; raises S2AError."""
         raise NotImplementedError
 
-    def respond(self, actions: Floats, period_s: float) -> PlantMotion:
+    def respond(self, actions: Floats, period_s: float) -> Motion:
         """Return the motion under actions of shape (K, D), K >= 1, one every ``period_s``; NaN: the last one is held.
 
         Raises ValueError for a first action that is NaN.
@@ -120,7 +134,6 @@ ROBOTS: Final[Registry[type[RobotKind]]] = Registry(
     "robot",
     {
         "timed": "s2a_bench.act.timed:Timed",
-        "plant": "s2a_bench.act.plant:Plant",
         "ros": "s2a_bench.act.ros:RosRobot",
         "call": "s2a_bench.act.call:PythonCall",
     },

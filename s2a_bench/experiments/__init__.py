@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
     from s2a_bench.store.schema import Table
     from s2a_bench.writers.csv_text import CsvTable
+    from s2a_bench.writers.lanes import Lanes
     from s2a_bench.writers.tables import TextTable
 
 TIME, COUNT, FLAG, SHARE, NUMBER = "time", "count", "flag", "share", "number"
@@ -136,7 +137,7 @@ class Shown:
     csvs: Mapping[str, CsvTable] = field(default_factory=dict)
     figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     json: Callable[[], dict[str, Any]] = dict
-    lanes: Sequence[Any] = ()
+    lanes: Lanes | None = None
     failures: list[str] = field(default_factory=list)
     """What could not be built, each with its error; a figure that cannot be drawn adds its own."""
 
@@ -236,9 +237,7 @@ EXPERIMENTS: Final[Registry[Experiment]] = Registry(
     "command",
     {
         "boundary": "s2a_bench.experiments.boundary:EXPERIMENT",
-        "capacity": "s2a_bench.experiments.capacity:EXPERIMENT",
         "ccrb": "s2a_bench.experiments.ccrb:EXPERIMENT",
-        "chunks": "s2a_bench.experiments.chunks:EXPERIMENT",
         "latency": "s2a_bench.experiments.latency:EXPERIMENT",
         "throughput": "s2a_bench.experiments.throughput:EXPERIMENT",
         "timeline": "s2a_bench.experiments.timeline:EXPERIMENT",

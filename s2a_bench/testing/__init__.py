@@ -17,11 +17,10 @@ fixtures that the suite's docstring names:
 | engine | `engine.EngineSuite` | ``engine``, and ``fresh_engine``, which is closed |
 | frame source | `frame_source.FrameSourceSuite` | ``make_source``: opens it with a width and a height |
 | policy | `policy.PolicySuite` | ``policy`` |
-| mode of acting on chunks | `mode.ModeSuite` | ``mode`` |
 | simulator | `simulator.SimulatorSuite` | none: the simulator's ``name`` as an attribute, or `open_world` |
 
-`VirtualClock` jumps instead of sleeping; `NullProgress` records a run's messages. The suites need pytest, those of
-policies and modes hypothesis too.
+`VirtualClock` jumps instead of sleeping; `NullProgress` records a run's messages. The suites need pytest, that of
+policies hypothesis too.
 """
 
 from __future__ import annotations

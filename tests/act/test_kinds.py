@@ -12,9 +12,9 @@ import pytest
 
 from s2a_bench.act import ROBOTS, ActionKind, ActionRobot, SkillKind, SkillRobot, kind, open_robot
 from s2a_bench.act.call import CallableRobot
-from s2a_bench.act.plant import Plant
 from s2a_bench.errors import UsageError
 from s2a_bench.plan import SkillSet, load_skills
+from s2a_bench.plugins.chunks.plant import Plant
 
 
 @pytest.fixture
@@ -36,7 +36,7 @@ def test_each_of_ours_can_do_one_or_both() -> None:
     ("written", "able", "message"),
     [
         ("plant?damping=2", SkillKind, "`robot`: plant carries out no skills; timed, ros, call do"),
-        ("timed", ActionKind, "`robot`: timed takes no actions; plant, ros, call do"),
+        ("timed", ActionKind, "`robot`: timed takes no actions; ros, call, plant do"),
     ],
 )
 def test_one_that_cannot_is_refused_with_those_that_can(written: str, able: Any, message: str) -> None:
@@ -71,7 +71,7 @@ def test_one_of_another_package_is_found_by_its_name(offer: ModuleType) -> None:
     assert open_robot("arm?stiff=true", 1, 1).describe()["frequency_hz"] == "20"
     with pytest.raises(UsageError, match="`robot`: arm: 'soft' is no parameter; its parameters are stiff"):
         kind("arm?soft=true", ActionKind)
-    with pytest.raises(UsageError, match="`robot`: timed takes no actions; plant, ros, call, arm do"):
+    with pytest.raises(UsageError, match="`robot`: timed takes no actions; ros, call, arm do"):
         kind("timed", ActionKind)
 
 

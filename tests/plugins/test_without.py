@@ -52,12 +52,6 @@ PLUGINS = {
             ("latency", "--help-all"),
             "--template",
         ),
-        Named(
-            ("chunks", "--live", "--transport", "grpc"),
-            "--transport: 'grpc' is none of ",
-            ("chunks", "--help-all"),
-            "[default: websocket",
-        ),
     ],
     "paper": [
         Named(
@@ -66,6 +60,12 @@ PLUGINS = {
             ("report", "--help"),
             "paper: add",
         )
+    ],
+    "chunks": [
+        Named(("chunks",), "No such command 'chunks'", ("--help",), "chunks "),
+        Named(
+            ("timeline", "--live", "--robot", "plant"), "'plant' is none of timed, ros, call", ("--help",), "capacity "
+        ),
     ],
     "rclpy": [
         Named(

@@ -23,17 +23,18 @@ from hypothesis import strategies as st
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
+from s2a_bench.experiments.timeline.view.lanes import page_lanes
 from s2a_bench.experiments.timeline.view.tables import execution_table, timeline_csv
 from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import MOST_CHAPTERS, read_chapters
 from s2a_bench.report.page.files import inline, make_report, write_report
-from s2a_bench.report.page.lanes import panels_of, ticks_of
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.store.sweep import CELLS, CellRow
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import caption_of
+from s2a_bench.writers.lanes import LanePanel
 from s2a_bench.writers.latex import PREAMBLE, document, escape, to_siunitx
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import ABSENT, TextTable
@@ -183,7 +184,7 @@ def test_the_command_can_be_pasted_into_a_shell(make_run: MakeRun) -> None:
 
 
 def test_timelines_stand_in_the_page_where_they_were(computed: Path) -> None:
-    six, _ = panels_of(timelines_of(read_run(computed)))
+    six, _ = page_lanes(timelines_of(read_run(computed))).panels
     assert six.title == "Jetson AGX Orin, 4.8 tokens/s: L = 6, N = 8, T_nom = 1 s"
     naive, wait, ours = six.lanes
     assert [bar.kind for bar in naive.bars] == ["skill", *["stall", "skill"] * 7]
@@ -206,7 +207,7 @@ def test_timelines_stand_in_the_page_where_they_were(computed: Path) -> None:
 
 @given(st.floats(1e-4, 1e6))
 def test_ticks_are_round_few_and_from_zero(end_s: float) -> None:
-    ticks = ticks_of(end_s)
+    ticks = LanePanel("a plan", end_s, ()).ticks
     assert ticks[0] == 0
     assert 2 <= len(ticks) <= 8
     assert ticks[-1] <= end_s * (1 + 1e-9)
@@ -228,7 +229,7 @@ def test_a_sweep_of_timelines_is_shown_as_the_one_run_that_it_amounts_to(tmp_pat
     assert pooled.content.tables["timelines"] == replace(execution_table(whole), provenance=whole.origins.line)
     assert pooled.content.csvs == timeline_csv(whole)
     assert pooled.run.origins == whole.origins
-    assert panels_of(pooled.content.lanes) == panels_of(timelines_of(whole))
+    assert pooled.content.lanes == page_lanes(timelines_of(whole))
     assert len(overview.content.tables["cells"].rows) == 12
     assert overview.content.sentences[0] == "12 of 12 cells of s2a-bench timeline are finished."
     page = Page(page_of(folder))
@@ -241,7 +242,7 @@ def test_cells_of_one_name_are_not_made_one(tmp_path: Path) -> None:
     folder = sweep_of(tmp_path / "sweeps", [({"n": n}, timeline(tmp_path, **same)) for n in (1, 2)])
     _, first, second = read_chapters([folder])
     assert first.content.tables == second.content.tables
-    assert [len(chapter.content.lanes) for chapter in (first, second)] == [3, 3]
+    assert [len(chapter.content.lanes.panels[0].lanes) for chapter in (first, second)] == [3, 3]
     assert first.name != second.name
 
 

@@ -37,7 +37,7 @@ def test_the_committed_types_are_what_the_options_declare() -> None:
     assert tool.stub() == tool.STUB.read_text(encoding="utf-8"), "run tools/library_types.py"
 
 
-@pytest.mark.parametrize("name", EXPERIMENTS.built_in())
+@pytest.mark.parametrize("name", sorted(EXPERIMENTS))
 def test_every_keyword_is_taken(name: str) -> None:
     config = resolve_name(EXPERIMENTS[name].config)
     assert dict(tool.keywords(config)).keys() <= places(config).keys()

@@ -167,7 +167,7 @@ def _launches(run: StoredRun, subjects: Iterable[Subject]) -> list[tuple[str, di
 def _comparable(command: str) -> Comparable:
     if (experiment := experiment_of(command)) and (by := experiment.compared_by()):
         return by
-    known = ", ".join(name for name, found in EXPERIMENTS.loaded() if found.compared)
+    known = ", ".join(sorted(name for name, found in EXPERIMENTS.loaded() if found.compared))
     raise UsageError(f"runs of {command} cannot be compared, only those of {known}")
 
 

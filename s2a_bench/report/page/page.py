@@ -7,10 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench import __version__
-from s2a_bench.experiments.chunks.view.figures import CellTicks as ChunkLane
 from s2a_bench.report.page import GENERATOR
 from s2a_bench.report.page.chapters import when
-from s2a_bench.report.page.lanes import MOST_PANELS, panels_of, panels_of_chunks
 from s2a_bench.store.manifest import utc_now
 from s2a_bench.store.sweep import is_sweep
 from s2a_bench.text import visible
@@ -42,7 +40,6 @@ def render(
     )
     world.filters["parts"] = re.compile(r" (?=[(\[])").split  # a number, and its spread or interval
     world.filters["short"] = lambda value: f"{value:.6g}"
-    world.globals.update(most_panels=MOST_PANELS)
     shown = [_view(chapter, figures.get(chapter.name, {})) for chapter in chapters]
     return world.get_template("page.html").render(
         generator=GENERATOR,
@@ -82,7 +79,7 @@ def _view(chapter: Chapter, figures: dict[str, DrawnFigure]) -> dict[str, Any]:
         "warnings": manifest.get("warnings", []),
         "tables": main,
         "more": [table for name, table in content.tables.items() if name not in content.main],
-        **_panels(content.lanes),
+        "lanes": content.lanes,
         "figures": figures,
         "command": chapter.command,
         "attached": chapter.attached,
@@ -92,15 +89,6 @@ def _view(chapter: Chapter, figures: dict[str, DrawnFigure]) -> dict[str, Any]:
         "facts": [(name, fact["about"]) for name, fact in chapter.run.facts.items()],
         "seeds": list(_facts(manifest.get("seeds", {}))),
     }
-
-
-def _panels(shown: Sequence[Any]) -> dict[str, Any]:
-    if any(isinstance(each, ChunkLane) for each in shown):
-        bars = "Bars are actions, a colour a chunk; dashed boxes are stalls. Time counts from the first request."
-        return {"panels": panels_of_chunks(shown), "bars": bars, "left_out": 0}
-    bars = "Bars are skills, dashed boxes stalls, the dashed line is S0, long ticks are complete skills."
-    left_out = max(0, len({cell.setting for cell in shown}) - MOST_PANELS)
-    return {"panels": panels_of(shown), "bars": bars, "left_out": left_out}
 
 
 def _facts(facts: Any, prefix: str = "") -> list[tuple[str, str]]:

@@ -10,10 +10,10 @@ from matplotlib.text import Text
 
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.boundary.config import BoundaryConfig
-from s2a_bench.experiments.capacity.config import CapacityConfig
 from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.chunks.config import ChunksConfig
 from s2a_bench.harness.timelines.config import TimelineConfig
+from s2a_bench.plugins.chunks.capacity.config import CapacityConfig
+from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress

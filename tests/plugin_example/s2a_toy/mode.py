@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from s2a_bench.policy.chunks import ChunkAction, ChunkStepper, Mode, ControlSetting
+from s2a_bench.plugins.chunks.modes import ChunkAction, ChunkStepper, Mode, ControlSetting
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,11 +16,11 @@ from s2a_toy.world import SERVER
 
 from s2a_bench.frames import FrameSource
 from s2a_bench.inference import Engine, EngineConfig
+from s2a_bench.plugins.chunks.modes import Mode
+from s2a_bench.plugins.chunks.testing.mode import ModeSuite
 from s2a_bench.policy import Policy
-from s2a_bench.policy.chunks import Mode
 from s2a_bench.testing.engine import EngineSuite
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
-from s2a_bench.testing.mode import ModeSuite
 from s2a_bench.testing.policy import PolicySuite
 from s2a_bench.testing.simulator import SimulatorSuite
 from s2a_bench.testing.transport import Connect, TransportSuite

@@ -90,6 +90,11 @@ def panels(cells: Sequence[Timelines]) -> Iterator[tuple[tuple[str, int, int, fl
     yield from groups.items()
 
 
+def seconds(value: float) -> str:
+    """Return a time in s as text: two decimals below 100, one above."""
+    return f"{value:.2f}" if abs(value) < 99.995 else f"{value:.1f}"  # noqa: PLR2004 - five characters at most
+
+
 def origin_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
     boards = run.manifest.get("boards", [])
     notes = []

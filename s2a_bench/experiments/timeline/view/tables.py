@@ -13,10 +13,12 @@ from s2a_bench.experiments.timeline.view.cells import (
     jitter_notes,
     origin_notes,
     panels,
+    seconds,
     timelines_json,
     timelines_of,
 )
 from s2a_bench.experiments.timeline.view.figures import timeline_figures
+from s2a_bench.experiments.timeline.view.lanes import page_lanes
 from s2a_bench.policy import ONLINE
 from s2a_bench.policy.conformal import promise
 from s2a_bench.stats import summary_of
@@ -35,7 +37,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
         csvs=lambda: timeline_csv(run),
         figures=lambda: timeline_figures(run),
         json=lambda: timelines_json(run),
-        lanes=lambda: [cell for cell in timelines_of(run) if len(cell.skills)],
+        lanes=lambda: page_lanes(timelines_of(run)),
     )
 
 
@@ -145,11 +147,6 @@ def timeline_csv(run: StoredRun) -> dict[str, CsvTable]:
                 values = (getattr(found, each) if each in statistics else None for each in SUMMARY)
                 summaries.append((cell.about("cell"), name, *values))
     return {"timelines.csv": CsvTable.of(("cell", "metric", *SUMMARY), summaries)}
-
-
-def seconds(value: float) -> str:
-    """Return a time in s as text: two decimals below 100, one above."""
-    return f"{value:.2f}" if abs(value) < 99.995 else f"{value:.1f}"  # noqa: PLR2004 - five characters at most
 
 
 def _table(cells: Sequence[Timelines], title: str, metrics: Sequence[str], notes: Iterable[str]) -> TextTable:

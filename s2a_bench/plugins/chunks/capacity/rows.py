@@ -1,0 +1,92 @@
+"""The tables of a capacity run: fleets, the robots of each, their requests, and the knee of each cell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Final, Literal
+
+from s2a_bench.experiments import columns
+from s2a_bench.plugins.chunks.capacity.metrics import METRICS
+from s2a_bench.store.schema import Count, Many, NonNegative, Table, about, with_fields
+
+TWIN: Final = ", instant"
+"""After the name of a pipeline: its instant server."""
+Source = Literal["measured", "predicted", "twin"]
+Verdict = Literal["below", "above", "undecided", "none"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AboutFleet:
+    """The columns of a row of `FLEETS` besides the metrics."""
+
+    cell: Annotated[str, about("The pipeline, and the mode of chunks.")]
+    source: Annotated[Source, about("twin: the same robots against an instant server, which checks the generator.")]
+    robots: Annotated[Many, about("N.")]
+    seconds: Annotated[NonNegative, about("How long it acted, without settling.")]
+    looks: Annotated[Count, about("After how many looks it was decided, or given up.")]
+    verdict: Annotated[Verdict, about("Where the interval lies against the limit; none: no limit.")]
+    within: Annotated[bool, about("Whether the value itself keeps to the limit.")]
+    clean: Annotated[
+        bool,
+        about(
+            "Whether its own ticks at p99 were within 5 % of one, true of twins; in JSON and CSV also its twin within "
+            "the limit."
+        ),
+    ]
+
+
+FleetRow: Final[Any] = with_fields(
+    "FleetRow", "N robots on one server, with a column a metric.", AboutFleet, columns(METRICS.values())
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AboutRobot:
+    """The columns of a row of `ROBOTS` besides the metrics."""
+
+    cell: str
+    source: str
+    robots: int
+    robot: int
+
+
+RobotRow: Final[Any] = with_fields(
+    "RobotRow", "One robot of a fleet in an episode, with a column a metric.", AboutRobot, columns(METRICS.values())
+)
+
+
+@dataclass(frozen=True, slots=True)
+class RequestRow:
+    """One request of a robot: its intended time after its first tick, and its latency, null without an answer."""
+
+    cell: str
+    source: str
+    robots: int
+    robot: int
+    intended_ns: int
+    latency_ns: int | None
+    settling: bool
+    """Whether it is left out, as the fleet settles."""
+
+
+@dataclass(frozen=True, slots=True)
+class KneeRow:
+    """How many robots a server carries, and from where to where that is sure; ``high`` null: no fleet was too large.
+
+    Predicted, it has no interval: ``low`` is ``robots``, ``high`` is less than the next fleet that was tried.
+    ``driven`` is the largest fleet that the generator drives; null in virtual time.
+    """
+
+    cell: str
+    source: str
+    limit: str
+    robots: int
+    low: int
+    high: int | None
+    driven: int | None
+
+
+FLEETS: Final[Table[AboutFleet]] = Table("capacity", FleetRow)
+ROBOTS: Final[Table[AboutRobot]] = Table("capacity_robots", RobotRow)
+REQUESTS: Final[Table[RequestRow]] = Table("capacity_requests", RequestRow)
+KNEES: Final[Table[KneeRow]] = Table("capacity_knees", KneeRow)

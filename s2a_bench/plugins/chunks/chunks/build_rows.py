@@ -1,0 +1,202 @@
+"""The rows of a cell: its metrics, its first ticks, its first requests."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, fields
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from s2a_bench.experiments import COUNT
+from s2a_bench.plugins.chunks.chunks.rows import (
+    CHUNKS,
+    METRICS,
+    REACTIONS,
+    REQUESTS,
+    TICKS,
+    ChunkRow,
+    ReactionRow,
+    RequestRow,
+    TickRow,
+)
+from s2a_bench.plugins.chunks.modes.closed import beta, closed
+from s2a_bench.plugins.chunks.modes.metrics import margin_ticks, measure, reaction_ticks
+from s2a_bench.policy.conformal import upper_bound
+from s2a_bench.stats.seeds import generator
+
+if TYPE_CHECKING:
+    from s2a_bench.plugins.chunks.chunks.cells import ChunkCell
+    from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
+    from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ints, Ticks
+    from s2a_bench.policy import Floats
+    from s2a_bench.store.run import RunWriter
+
+EVENTS: Final = 100_000
+"""Random events whose reaction times are measured."""
+SHARES: Final = np.linspace(0, 1, 401)
+"""Quantiles of reaction times that are stored: denser than a figure can show."""
+NO_NAMES: Final[Mapping[int, str]] = {}
+_SIDE: Final = 0.975
+"""Confidence of each end of a two-sided 95 % interval."""
+
+
+def write_cell(
+    config: ChunksConfig,
+    writer: RunWriter,
+    cell: ChunkCell,
+    cycles: Cycles,
+    ticks: Ticks,
+    most: int,
+    *,
+    more: Mapping[str, Any],
+    late_ns: Ints | None = None,
+    names: Mapping[int, str] = NO_NAMES,
+) -> None:
+    """Write the rows of a cell, its ticks and requests within the first ``most`` ticks.
+
+    ``more`` adds metrics or overrides computed ones; ``late_ns`` is each action's delay after its due time, ``names``
+    are the ids of the requests' samples.
+    """
+    setting, latency_ns = config.setting.slowed(cell.slower), cell.drawn.judged
+    reaction_s = reactions_s(cycles, ticks, setting, generator(config.seed, "chunks events"))
+    values = metrics_of(cell, setting, cycles, ticks, reaction_s)
+    values |= {"slow_down": beta(cell.mode, latency_ns, setting, config.epsilon), "slower": cell.slower, **more}
+    row = ChunkRow(
+        cell=cell.cell,
+        mode=cell.name,
+        rule=cell.rule,
+        latency=cell.drawn.source.name,
+        latency_s=float((latency_ns / 1e9).mean()),
+        latency_s_p99=float(np.quantile(latency_ns / 1e9, 0.99)),
+        rounding=setting.rounding,
+        delta_t_s=setting.period_ns / 1e9,
+        horizon=setting.horizon,
+        execution_horizon=cell.mode.execution_horizon(setting),
+        requests=int(latency_ns.size),
+        trigger=_mean(cell.triggers, cell.mode.trigger),
+        **{name: _plain(values.get(name), whole=metric.kind == COUNT) for name, metric in METRICS.items()},
+    )
+    writer.append(CHUNKS, [row])
+    writer.append(REACTIONS, _reaction_rows(cell, latency_ns, setting, reaction_s))
+    writer.append(TICKS, _tick_rows(cell.cell, ticks, most, late_ns))
+    writer.append(REQUESTS, _request_rows(cell.cell, latency_ns, cycles, most, names))
+
+
+def metrics_of(
+    cell: ChunkCell, setting: ControlSetting, cycles: Cycles, ticks: Ticks, reaction_s: Floats
+) -> dict[str, float | None]:
+    """Return the value of every computed metric; NaN or None if it has none."""
+    period_s, latency_ns = setting.period_ns / 1e9, cell.drawn.judged
+    found: dict[str, Any] = asdict(measure(cell.mode, cycles, ticks))
+    expected = closed(cell.acting, latency_ns, setting)
+    mean_reaction = expected.mean_reaction_ticks
+    delay = cycles.delay_ticks[: latency_ns.size]  # a live run may end before an answer
+    later = setting.rounding == "floor"  # an action leaves at the end of its tick
+    assumed = np.array(cell.triggers[1:] or cell.triggers) if cell.triggers else cell.mode.assumed_ticks
+    length = found["ticks"] or math.nan
+    return found | {
+        **stalls_of(cycles),
+        "stall_ticks_per_s": found["stall_ticks"] / length / period_s,
+        "p_stall_closed": expected.p_stall,
+        "age_ticks_blended": _blended(cell, cycles),
+        "reaction_s_mean": float(reaction_s.mean()) if reaction_s.size else None,
+        "reaction_s_p99": float(np.quantile(reaction_s, 0.99)) if reaction_s.size else None,
+        "reaction_s_closed": None if mean_reaction is None else mean_reaction * period_s,
+        "first_action_s": (found["first_action_tick"] + later) * period_s if found["age_ticks_mean"] >= 0 else None,
+        "control_rate_hz": (found["ticks"] - found["stall_ticks"]) / length / period_s,
+        "delay_ticks_mean": float(delay.mean()),
+        "delay_ticks_p99": float(np.quantile(delay, 0.99)),
+        "delay_ticks_max": float(delay.max()),
+        "delay_assumed_ticks": _mean(cell.triggers, cell.mode.assumed_ticks),
+        "p_delay_above": None if assumed is None else float(np.mean(delay[1:] > assumed)),
+        "margin_ticks": margin_ticks(cell.acting, latency_ns, setting) if len(cell.triggers) < 2 else None,  # noqa: PLR2004 - the rule would answer
+    }
+
+
+def stalls_of(cycles: Cycles) -> dict[str, Any]:
+    return stall_metrics(int((cycles.stall_ticks[cycles.settled] > 0).sum()), int(cycles.settled.sum()))
+
+
+def stall_metrics(stalled: int, boundaries: int) -> dict[str, Any]:
+    """Return counts, and with boundaries the share and its two-sided 95 % interval (Clopper and Pearson)."""
+    found: dict[str, Any] = {"boundaries": boundaries, "stalled_cycles": stalled}
+    if boundaries:
+        found["p_stall_cycle"] = stalled / boundaries
+        found["p_stall_low"] = 1 - upper_bound(boundaries - stalled, boundaries, _SIDE)
+        found["p_stall_high"] = upper_bound(stalled, boundaries, _SIDE)
+    return found
+
+
+def reactions_s(cycles: Cycles, ticks: Ticks, setting: ControlSetting, rng: np.random.Generator) -> Floats:
+    """Return the reaction times in s to uniform random events from the first action to the last request."""
+    acted = ticks.chunk >= 0
+    if not acted.any():
+        return np.empty(0)
+    moments = rng.uniform(int(acted.argmax()), max(int(cycles.request_tick[-1]), int(acted.argmax())), EVENTS)
+    found = reaction_ticks(cycles, moments) * (setting.period_ns / 1e9)
+    return found[~np.isnan(found)]
+
+
+def _reaction_rows(
+    cell: ChunkCell, latency_ns: Ints, setting: ControlSetting, reaction_s: Floats
+) -> Iterator[ReactionRow]:
+    if not reaction_s.size:
+        return
+    period_s = setting.period_ns / 1e9
+    form = closed(cell.acting, latency_ns, setting).reaction_ticks(SHARES)
+    found = np.quantile(reaction_s, SHARES).tolist()
+    closed_s = [None] * SHARES.size if form is None else (form * period_s).tolist()
+    for share, simulated_s, expected_s in zip(SHARES.tolist(), found, closed_s, strict=True):
+        yield ReactionRow(cell.cell, share, simulated_s, expected_s)
+
+
+def _tick_rows(cell: str, ticks: Ticks, most: int, late_ns: Ints | None) -> Iterator[TickRow]:
+    late = [None] * most if late_ns is None else late_ns.tolist()
+    columns = (ticks.chunk, ticks.index, ticks.age, ticks.stalled)
+    for tick, (chunk, index, age, stalled) in enumerate(zip(*(each[:most].tolist() for each in columns), strict=True)):
+        none = chunk < 0
+        yield TickRow(
+            cell=cell,
+            tick=tick,
+            chunk=None if none else chunk,
+            index=None if none else index,
+            age_ticks=None if none else age,
+            stalled=bool(stalled),
+            late_ns=late[tick],
+        )
+
+
+def _request_rows(
+    cell: str, latency_ns: Ints, cycles: Cycles, most: int, names: Mapping[int, str]
+) -> Iterator[RequestRow]:
+    count = min(latency_ns.size, int(np.searchsorted(cycles.request_tick, most)))
+    kept = [each.name for each in fields(RequestRow)]
+    columns = {name: getattr(cycles, name)[:count].tolist() for name in kept if hasattr(cycles, name)}
+    for request in range(count):
+        row = {name: values[request] for name, values in columns.items()}
+        if not row["executed"]:
+            row |= dict.fromkeys(("start_tick", "first_index", "jump"))
+        yield RequestRow(
+            cell=cell,
+            request=request,
+            latency_ns=int(latency_ns[request]),
+            request_id=names.get(request),
+            **row,
+        )
+
+
+def _mean(triggers: tuple[int, ...], given: int | None) -> float | None:
+    return float(np.mean(triggers)) if triggers else None if given is None else float(given)
+
+
+def _blended(cell: ChunkCell, cycles: Cycles) -> float | None:
+    age = cell.mode.blended_age(cycles)
+    return None if age is None or not np.isfinite(age).any() else float(np.nanmean(age))
+
+
+def _plain(value: float | None, *, whole: bool) -> float | int | None:
+    if value is None or math.isnan(value):
+        return None
+    return int(value) if whole else float(value)

@@ -1,0 +1,223 @@
+"""A measured run's fleets, one by one, without a server: looks, rows, processes, phases, and what is no measurement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import nullcontext
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from s2a_bench.harness.plan import resolve
+from s2a_bench.plugins.chunks.capacity import run as run_module
+from s2a_bench.plugins.chunks.capacity.config import CapacityConfig
+from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
+from s2a_bench.plugins.chunks.capacity.rows import FLEETS, REQUESTS, ROBOTS
+from s2a_bench.plugins.chunks.capacity.run import _Robots, run_capacity
+from s2a_bench.plugins.chunks.capacity.search import Judge, Tried
+from s2a_bench.plugins.chunks.modes import Ticks
+from s2a_bench.testing import NullProgress
+
+MS = 1_000_000
+CONFIG = CapacityConfig(predict="20", modes="sync", settle_s=0, control_hz=50, looks=4)
+
+
+def trace(late_ms: float = 0, *, stalled: int = 0, ticks: bool = True) -> RobotTrace:
+    """Make 2 s of a robot: 100 ticks of 20 ms, some stall; a request of 40 ms each 100 ms, the last unanswered."""
+    chunk = np.where(np.diff(np.arange(101) * stalled // 100), -1, 0)
+    latency_ns = np.where(np.arange(20) == 19, -1, 40 * MS)
+    late_ns = np.full(100 if ticks else 20, round(late_ms * MS))
+    acted = Ticks(chunk, chunk, chunk, chunk < -1) if ticks else None
+    return RobotTrace(0, 0, 2000 * MS, np.arange(20) * 100 * MS, latency_ns, acted, latency_ns, late_ns)
+
+
+class Looks:
+    """Robots that did the same in every look."""
+
+    def __init__(self, one: RobotTrace) -> None:
+        """Have looked at nothing."""
+        self.name, self.trace, self.looked, self.stopped = "c", one, 0, False
+        self.session: Any = SimpleNamespace(cell=SimpleNamespace(name="c"), origin=SimpleNamespace(to_dict=dict))
+
+    def looks(self, _number: int) -> Iterator[Any]:
+        """Yield four times."""
+        for self.looked in (1, 2, 3, 4):
+            yield [self.trace], {}
+
+    def stop(self) -> None:
+        """Note that."""
+        self.stopped = True
+
+
+def fleet(robots: Looks, source: Any = "measured", number: int = 2, mode: str = "sync", **judge: Any) -> Any:
+    """Return what is made of a fleet, and its rows by table."""
+    rows: dict[str, list[Any]] = {table.name: [] for table in (FLEETS, ROBOTS, REQUESTS)}
+    writer = SimpleNamespace(
+        manifest={"provenance": {"cells": {"c": {}}}}, append=lambda table, found: rows[table.name].extend(found)
+    )
+    launch: Any = SimpleNamespace(writer=writer, progress=NullProgress())
+    judges = Judge(CONFIG.limited, beyond=judge.get("beyond", False), settle_ns=0, confidence=0.95)
+    cell = run_module._Cell(CONFIG, None, launch, robots.session, None, mode, judges, service=object())  # type: ignore[arg-type]
+    found = cell._fleet(robots, number, source)  # type: ignore[arg-type]
+    assert robots.stopped
+    return found, rows
+
+
+@pytest.mark.parametrize(
+    ("source", "late_ms", "mode", "clean"),
+    [
+        ("measured", 0.9, "sync", True),  # of a tick of 20 ms
+        ("measured", 1.1, "sync", False),
+        ("measured", 1.9, "", True),  # of a latency of 40 ms
+        ("measured", 2.1, "", False),
+        ("twin", 1.1, "sync", True),
+    ],
+)
+def test_a_fleet_is_no_measurement_if_its_own_ticks_are_late_by_over_a_twentieth(
+    source: str, late_ms: float, mode: str, clean: bool
+) -> None:
+    found, rows = fleet(Looks(trace(late_ms, ticks=bool(mode))), source, mode=mode)
+    (row,) = rows[FLEETS.name]
+    assert (found.clean, row.clean, row.late_p99_ns) == (clean, clean, round(late_ms * MS))
+
+
+@pytest.mark.parametrize(
+    ("source", "number", "stalled", "beyond", "looks"),
+    [
+        ("measured", 2, 50, False, 1),  # decided
+        ("measured", 2, 1, False, 4),  # never
+        ("measured", 1, 50, False, 1),
+        ("measured", 1, 50, True, 4),  # the others are judged by it
+        ("measured", 2, 50, True, 1),
+        ("twin", 2, 1, False, 1),
+    ],
+)
+def test_a_fleet_is_looked_at_until_it_is_decided(
+    source: str, number: int, stalled: int, beyond: bool, looks: int
+) -> None:
+    robots = Looks(trace(stalled=stalled))
+    _, rows = fleet(robots, source, number, beyond=beyond)
+    assert robots.looked == rows[FLEETS.name][0].looks == looks
+
+
+def test_every_request_and_every_robot_has_a_row() -> None:
+    _, rows = fleet(Looks(trace(stalled=50)), number=2)
+    (robot,), requests = rows[ROBOTS.name], rows[REQUESTS.name]
+    assert (robot.stalled, robot.robot, robot.robots) == (0.5, 0, 2)
+    assert [each.latency_ns for each in requests] == [40 * MS] * 19 + [None]
+    assert [each.intended_ns for each in requests] == [place * 100 * MS for place in range(20)]
+
+
+@pytest.mark.parametrize("within", [True, False])
+def test_a_fleet_is_withdrawn_for_a_twin_that_exceeds_the_limit_and_not_for_one_whose_ticks_are_late(
+    monkeypatch: pytest.MonkeyPatch, within: bool
+) -> None:
+    def found(_cell: Any, _robots: Any, number: int, source: str) -> Tried:
+        twin = source == "twin"
+        return Tried(number, "below", within=number < 4 or (twin and within), clean=not twin)
+
+    monkeypatch.setattr(run_module, "_Robots", lambda *_, **__: nullcontext())
+    monkeypatch.setattr(run_module._Cell, "_fleet", found)
+    monkeypatch.setattr(run_module._Cell, "_conclude", lambda _: None)
+    config = CONFIG.but(robots="1..4")
+    nothing: Any = SimpleNamespace()
+    judge = Judge(config.limited, beyond=False, settle_ns=0, confidence=0.95)
+    cell = run_module._Cell(config, None, nothing, nothing, nothing, "sync", judge)
+    cell.run()
+    assert {number: each.clean for number, each in cell.tried.items()} == {1: True, 2: True, 3: True, 4: within}
+
+
+def robots_of(monkeypatch: pytest.MonkeyPatch, *, twin: bool = False, mode: str = "sync", **options: Any) -> _Robots:
+    """Return robots whose fleets are `(kind, plan)`."""
+    for kind in ("Fleet", "FleetProcess"):
+        monkeypatch.setattr(
+            run_module, kind, lambda plan, kind=kind: SimpleNamespace(kind=kind, plan=plan, close=lambda: None)
+        )
+    config = CapacityConfig(**options)
+    plan = resolve(config.live_requests)
+    launch: Any = SimpleNamespace(plan=plan, wiring=lambda _: SimpleNamespace(to_json=dict))
+    return _Robots(config, None, launch, SimpleNamespace(cell=plan.cells[0], origin=None), mode, twin=twin)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("transport", "processes", "twin", "kinds", "own"),
+    [
+        ("loopback", 1, False, ["Fleet"], False),
+        ("loopback", 2, False, ["Fleet"], False),  # the engine is in this process
+        ("loopback", 2, True, ["FleetProcess"] * 2, True),  # an instant one in each
+        ("http/binary", 1, True, ["Fleet"], False),
+        ("http/binary", 2, False, ["FleetProcess"] * 2, False),
+        ("http/binary", 2, True, ["FleetProcess"] * 2, False),  # all at the server of the run
+    ],
+)
+def test_robots_are_in_as_many_processes_as_their_server_lets_them(
+    monkeypatch: pytest.MonkeyPatch, transport: str, processes: int, twin: bool, kinds: list[str], own: bool
+) -> None:
+    options = {"requests": {"transports": transport}, "processes": processes, "modes": "sync"}
+    fleets = robots_of(monkeypatch, twin=twin, **options)._fleets
+    assert [each.kind for each in fleets] == kinds
+    assert [each.plan.own is not None for each in fleets] == [own] * len(kinds)
+
+
+@pytest.mark.parametrize(
+    ("mode", "options", "cycle_ms"),
+    [
+        ("sync", {}, 16 * 20),
+        ("queue?trigger=8", {"control_hz": 100}, 16 * 10),
+        ("", {"plan_every_s": 2, "limit": "stalled=50%"}, 2000),
+        ("", {"closed_loop": True, "think_s": 0.5}, 500),
+    ],
+)
+def test_robots_start_at_random_moments_of_a_cycle(
+    monkeypatch: pytest.MonkeyPatch, mode: str, options: Any, cycle_ms: float
+) -> None:
+    more = {"modes": mode} if mode else {}
+    robots = robots_of(monkeypatch, mode=mode, requests={"transports": "loopback"}, **options, **more)
+    cycle_ns = cycle_ms * MS
+    if mode:
+        made = robots._config.made[mode]
+        assert made.execution_horizon(robots._config.setting) * robots._config.setting.period_ns <= cycle_ns
+        cycle_ns = made.execution_horizon(robots._config.setting) * robots._config.setting.period_ns
+    phases_ns = np.array([*robots._phases(2000).values()])
+    assert 0 <= phases_ns.min() < 0.01 * cycle_ns
+    assert 0.99 * cycle_ns < phases_ns.max() <= cycle_ns
+    assert phases_ns.mean() == pytest.approx(cycle_ns / 2, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("options", "cadence", "fleets"),
+    [
+        ({}, "control loops at 50 Hz", 5),  # 1, 2, 4, and two by bisection at most
+        ({"modes": "sync,queue", "robots": "1,2"}, "control loops at 50 Hz", 4),
+        ({"plan_every_s": 2.5}, "a plan every 2.5 s", 5),
+        (
+            {"closed_loop": True, "think_s": 0.5, "robots": "1,2,3"},
+            "closed loop, 0.5 s from an answer to the next request",
+            3,
+        ),
+    ],
+)
+def test_the_manifest_says_when_requests_are_made_and_as_many_fleets_are_expected(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Any, options: Any, cadence: str, fleets: int
+) -> None:
+    progress, cadences = NullProgress(), []
+
+    def run(task: Any, plan: Any, *_: Any) -> Any:
+        cadences.append(plan.manifest["cadence"])
+        count = len(plan.cells) // (1 if config.load == "closed" else 2)
+        sessions = [SimpleNamespace(cell=cell, measure=lambda _: None, origin=None) for cell in plan.cells]
+        keep = lambda *_: None  # noqa: E731
+        launch = SimpleNamespace(sessions=sessions, progress=progress, plan=plan, keep=keep)
+        monkeypatch.setattr(run_module._Cell, "run", lambda cell: cells.append((cell.mode, cell.instant is None)))
+        task.drive(launch)
+        assert len(cells) == count * max(1, len(config.made) * (config.load == "chunks"))
+        return tmp_path
+
+    cells: list[tuple[str, bool]] = []
+    monkeypatch.setattr(run_module, "run_requests", run)
+    config = CapacityConfig(requests={"transports": "loopback"}, **{"robots": "1..4", "seconds": 10, **options})
+    run_capacity(config, tmp_path, progress)
+    assert (cadences, progress.expected) == ([cadence], fleets)
+    assert cells[0] == ("" if config.load != "chunks" else next(iter(config.made)), config.load == "closed")

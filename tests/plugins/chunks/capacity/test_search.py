@@ -1,0 +1,150 @@
+"""The search for the largest fleet within a limit: fleets tried, decisions, and the knee with its interval."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from s2a_bench.plugins.chunks.capacity.config import CapacityConfig, Limit
+from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace, measures
+from s2a_bench.plugins.chunks.capacity.search import Judge, Knee, Tried, above_limit, knee, search
+from s2a_bench.plugins.chunks.modes import ControlSetting, Ticks
+
+MS = 1_000_000
+SETTING = ControlSetting(20 * MS, 16)
+
+
+@pytest.mark.parametrize("robots", ["1..64", "3..50", "1..1"])
+def test_the_search_finds_every_knee_in_as_many_fleets_as_it_says(robots: str) -> None:
+    config = CapacityConfig(robots=robots)
+    for largest in range(70):
+        attempts: list[int] = []
+
+        def attempt(number: int, attempts: list[int] = attempts, largest: int = largest) -> Tried:
+            attempts.append(number)
+            return Tried(number, "below" if number <= largest else "above", number <= largest)
+
+        tried: dict[int, Tried] = {}
+        search(config.numbers, attempt, tried, bisects=True)
+        first, last = config.numbers[0], config.numbers[-1]
+        found = min(1, largest) if largest < first else min(largest, last)
+        high = None if largest >= last else first - 1 if found == 1 < first else found
+        assert knee(tried.values()) == Knee(found, found, high)
+        assert attempts == [*tried]
+        assert len(attempts) <= config.most_fleets
+
+
+def test_a_list_is_tried_to_its_end_after_one_robot_alone() -> None:
+    tried: dict[int, Tried] = {}
+    search([2, 4], lambda number: Tried(number, "above", within=False), tried, bisects=False)
+    assert [*tried] == [1, 2, 4]
+
+
+B, U, A = "below", "undecided", "above"
+
+
+@pytest.mark.parametrize(
+    ("tried", "found"),
+    [
+        ([(1, B, True), (2, B, True), (4, A, False), (3, U, True)], Knee(3, 2, 3)),
+        ([(1, B, True), (2, U, False), (4, A, False)], Knee(1, 1, 3)),
+        ([(1, U, True), (2, U, True)], Knee(2, 0, None)),
+        ([(1, A, False)], Knee(0, 0, 0)),
+    ],
+)
+def test_undecided_fleets_are_inside_the_interval(tried: Any, found: Knee) -> None:
+    assert knee(Tried(*each) for each in tried) == found
+
+
+def test_a_fleet_that_the_generator_does_not_drive_is_no_measurement() -> None:
+    driven = [Tried(1, "below", within=True), Tried(2, "below", within=True)]
+    assert knee([*driven, Tried(4, "above", within=False, clean=False)]) == Knee(2, 2, None)
+    assert knee([Tried(1, "below", within=True, clean=False)]) is None
+
+
+def trace(robot: int, stalled: Any, latency_ms: Any) -> RobotTrace:
+    """Make a trace of 1,000 ticks, 20 s, with a request each 200 ms."""
+    chunk = np.where(stalled, -1, 0)
+    age = np.where(stalled, -1, np.arange(chunk.size) % 16)
+    ticks = Ticks(chunk, chunk, age, np.asarray(stalled))
+    arrival_ns = np.where(np.array(latency_ms) < 0, -1, np.array(latency_ms) * MS)
+    request_ns = np.arange(arrival_ns.size) * 200 * MS
+    return RobotTrace(robot, 0, chunk.size * 20 * MS, request_ns, arrival_ns, ticks, arrival_ns)
+
+
+def fleet(share: float, latency_ms: Any = (50,) * 100) -> list[RobotTrace]:
+    rng = np.random.default_rng(0)
+    return [trace(robot, rng.random(1000) < share, latency_ms) for robot in range(8)]
+
+
+@pytest.mark.parametrize(
+    ("share", "alone", "verdict"),
+    [
+        (0, 0, "below"),
+        (0.002, 0, "below"),
+        (0.01, 0, "undecided"),
+        (0.05, 0, "above"),
+        (0.05, 0.05, "undecided"),
+        (0.05, 0.06, "below"),
+    ],
+)
+def test_stalls_are_judged_by_their_interval_less_what_one_robot_has_alone(
+    share: float, alone: float, verdict: str
+) -> None:
+    traces = fleet(share)
+    row = measures(traces, SETTING)
+    assert Judge(Limit.read("stalled=1%"), True, 0, 0.95, alone)(row, traces)[0] == verdict
+
+
+@pytest.mark.parametrize(
+    ("limit", "verdict"),
+    [
+        ("latency_p50=60ms", "below"),
+        ("latency_p50=40ms", "above"),
+        ("age_p99=400ms", "below"),
+        ("age_p50=40ms", "above"),
+    ],
+)
+def test_a_percentile_is_judged_by_the_share_of_values_above_it(limit: str, verdict: str) -> None:
+    traces = fleet(0)
+    assert Judge(Limit.read(limit), False, 0, 0.95)(measures(traces, SETTING), traces)[0] == verdict
+
+
+def test_stalls_that_come_back_every_cycle_are_decided() -> None:
+    cycle = np.arange(1000) % 19 < 3  # sync: 3 of 19 ticks
+    traces = [trace(robot, np.roll(cycle, robot * 5), [50] * 100) for robot in range(8)]
+    row = measures(traces, SETTING)
+    assert Judge(Limit.read("stalled=2%"), True, 0, 0.99, 3 / 19)(row, traces)[0] == "below"
+    assert Judge(Limit.read("stalled=2%"), True, 0, 0.99, 2 / 18)(row, traces)[0] == "above"
+
+
+def test_one_long_stall_is_one_event() -> None:
+    traces = [
+        trace(robot, np.arange(1000) // 40 == 12 if robot == 3 else [False] * 1000, [50] * 100) for robot in range(8)
+    ]
+    row = measures(traces, SETTING)
+    assert row["stalled"] == 0.005
+    assert Judge(Limit.read("stalled=1%"), False, 0, 0.95)(row, traces)[0] == "undecided"
+
+
+def test_a_request_without_an_answer_is_above_the_limit_once_it_waits_for_longer() -> None:
+    latency_ms = [50] * 98 + [-1, -1]  # 400 and 200 ms before the end
+    _, robots, above = above_limit(Limit.read("latency_p99=300ms"), [trace(3, [False] * 1000, latency_ms)], 5000 * MS)
+    assert above.tolist() == [False] * 73 + [True]
+    assert set(robots.tolist()) == {3}
+
+
+@pytest.mark.parametrize(("stalled", "found"), [(0.2, ("below", True)), (0.8, ("above", False))])
+def test_one_robot_alone_has_no_stalls_beyond_its_own_but_may_leave_no_room(stalled: float, found: Any) -> None:
+    judge, traces = Judge(Limit.read("stalled=25%"), True, 0, 0.95), fleet(stalled)[:1]
+    assert judge(measures(traces, SETTING), traces, first=True) == found
+    assert judge.alone == pytest.approx(stalled, abs=0.05)
+
+
+def test_without_values_nothing_is_decided() -> None:
+    row = {"stalled": None, "stalled_low": None, "stalled_high": None}
+    assert Judge(Limit.read("stalled=1%"), False, 0, 0.95)(row, []) == ("undecided", False)
+    assert Judge(Limit.read("ttft_p99=1s"), False, 0, 0.95)(row, []) == ("undecided", False)
+    assert Judge(None, False, 0, 0.95)(row, []) == ("none", True)

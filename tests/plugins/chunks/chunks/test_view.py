@@ -1,0 +1,158 @@
+"""Runs of chunks as they are shown: tables, sentences, CSV, figures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from s2a_bench.plugins.chunks.chunks import EXPERIMENT
+from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
+from s2a_bench.plugins.chunks.chunks.run import run_chunks
+from s2a_bench.plugins.chunks.chunks.view import chunk_sentences, show
+from s2a_bench.plugins.chunks.chunks.view.figures import (
+    build_lanes,
+    build_reactions,
+    build_triggers,
+    chunk_figures,
+    lanes_of,
+    short,
+)
+from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.testing import NullProgress
+from s2a_bench.writers.style import paper_column
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
+    config = ChunksConfig(latency="60,lognormal:mean_ms=80,cv=.5", cycles=1500)
+    return read_run(run_chunks(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
+
+
+def drawn(run: StoredRun, build: object) -> Figure:
+    with paper_column():
+        figure: Figure = build(run)  # type: ignore[operator]
+        return figure
+
+
+def test_tables_number_the_sources_and_name_the_convention(run: StoredRun) -> None:
+    tables = show(run).tables
+    stalls, actions, delays = tables["chunks"], tables["actions"], tables["delays"]
+    assert stalls.header[:3] == ("L", "mode", "rule")
+    assert [row[0] for row in stalls.rows] == ["1"] * 9 + ["2"] * 9
+    assert stalls.rules == {9}
+    assert [row[:2] for row in delays.rows] == [("1", "60"), ("2", "lognormal:mean_ms=80,cv=.5")]
+    for table in (stalls, actions, delays):
+        assert "floor" in table.title
+        assert any(note.startswith("d = floor(L / Delta t)") for note in table.notes)
+    sync = dict(zip(stalls.header, stalls.rows[0], strict=True))
+    assert (sync["s"], sync["m"], sync["longest"], sync["form"], sync["margin"]) == (
+        "16",
+        "\N{EN DASH}",
+        "3",
+        "100",
+        "-1",
+    )
+
+
+def test_sentences_say_what_each_rule_costs(run: StoredRun) -> None:
+    constant, random = chunk_sentences(run)
+    assert constant.startswith("Stalled cycles of queue @ 60, epsilon 0.01: calibrated 0.00% at age 10.5")
+    assert "mean 3" in random
+
+
+def test_csv_has_every_row_with_its_provenance(run: StoredRun) -> None:
+    lines = EXPERIMENT.show(run).csvs["chunks.csv"].text(run.origins).splitlines()
+    assert len(lines) == 1 + 18
+    assert all(line.endswith("none/none/emulated/clock-virtual") for line in lines[1:])
+
+
+def test_lanes_show_the_modes_and_the_calibrated_trigger(run: StoredRun) -> None:
+    assert [(lane.name, lane.rule) for lane in lanes_of(run)[:5]] == [
+        ("sync", "given"),
+        ("queue?trigger=6", "given"),
+        ("replace", "given"),
+        ("aggregate?trigger=6", "given"),
+        ("queue", "calibrated"),
+    ]
+    axes = drawn(run, build_lanes).axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()][:2] == ["sync\n60", "queue?trigger=6\n60"]
+    stalls = [found for found in axes.collections if getattr(found, "get_hatch", lambda: None)()]
+    assert len(stalls) >= 6
+    assert any(text.get_text() == "\N{MINUS SIGN}8" for text in axes.texts)
+    (ages,) = axes.child_axes
+    assert [label.get_text() for label in ages.get_yticklabels()][::2] == ["0"] * 10
+    curve, at = next(line for line in axes.lines if len(line.get_xdata()) > 2), ages.get_yticks()
+    assert at[0] <= np.nanmin(curve.get_ydata()) <= np.nanmax(curve.get_ydata()) <= at[1]
+
+
+def test_stalls_are_a_line_a_mode_over_mean_latency(run: StoredRun) -> None:
+    (axes,) = drawn(run, lambda run: chunk_figures(run)["stability"]()).axes
+    assert [line.get_label() for line in axes.lines] == ["sync", "queue?trigger=6", "replace", "aggregate?trigger=6"]
+    share = {line.get_label(): np.asarray(line.get_ydata()) for line in axes.lines}
+    ms = np.asarray(axes.lines[0].get_xdata())
+    assert (ms[0], ms[-1], ms.size) == (0, 320, 33)
+    assert share["sync"][12] == pytest.approx(6 / 22, rel=0.01)  # of d + H ticks at 120 ms, d
+    assert (share["queue?trigger=6"] > 0).tolist() == (ms >= 140).tolist()  # d above the trigger
+
+
+def test_triggers_are_a_line_a_source_with_a_mark_a_rule(run: StoredRun) -> None:
+    axes = drawn(run, build_triggers).axes[0]
+    assert axes.get_yscale() == "log"
+    labels = {str(line.get_label()) for line in axes.lines}
+    assert {"60", "lognormal:mean_ms=80,cv=.5", "calibrated", "oracle"} <= labels
+    assert [text.get_text() for text in axes.texts] == ["epsilon = 0.01"]
+
+
+def test_reactions_have_the_closed_form_drawn_over_them(run: StoredRun) -> None:
+    upper, lower = drawn(run, build_reactions).axes
+    dotted = [line for line in upper.lines if line.get_linestyle() == ":"]
+    assert len(dotted) == 5
+    simulated = [line for line in lower.lines if line.get_drawstyle() == "steps-post"]
+    assert {len(line.get_xdata()) for line in simulated} == {401}
+    ms = np.asarray(dotted[0].get_xdata())
+    assert (ms[0], ms[-1]) == (pytest.approx(60), pytest.approx(2 * 60 + 320))
+    assert lower.get_title(loc="left") == "lognormal:mean_ms=80,cv=.5"
+
+
+def test_smoothness_stands_beside_the_ideal(run: StoredRun) -> None:
+    table = show(run).tables["smoothness"]
+    assert table.header[3:] == ("tracking", "ideal", "jerk", "ideal", "jump", "p99", "step")
+    tracking, ideal = (float(text) for text in table.rows[0][3:5])
+    assert tracking > ideal > 0
+    assert any("of plant, in the target's standard deviation" in note for note in table.notes)
+    assert not any("P(stall)" in note for note in table.notes)
+    assert any(note.startswith("EMULATED") for note in table.notes)
+
+
+def test_smoothness_is_a_line_a_mode_and_the_ideal_dashed(run: StoredRun) -> None:
+    panels = drawn(run, lambda run: chunk_figures(run)["smoothness"]()).axes
+    for axes in panels:
+        *modes, ideal = axes.lines
+        assert [line.get_label() for line in modes] == ["sync", "queue?trigger=6", "replace", "aggregate?trigger=6"]
+        assert ideal.get_linestyle() == "--"
+        assert all(len(np.asarray(line.get_xdata())) == 33 for line in axes.lines)
+    *tracking, ideal = (np.asarray(line.get_ydata()) for line in panels[0].lines)
+    assert (ideal < np.min(tracking, axis=0)).all()
+
+
+def test_a_long_name_is_cut_and_a_short_one_is_not() -> None:
+    assert short("bimodal:mean_ms=80", 30) == "bimodal:mean_ms=80"
+    assert short("bimodal:mean_ms=80", 10) == "bimodal..."
+
+
+def test_what_a_run_has_no_rows_for_is_not_drawn(run: StoredRun, tmp_path: Path) -> None:
+    assert list(EXPERIMENT.show(run).figures) == ["lanes", "stability", "triggers", "reactions", "smoothness"]
+    config = ChunksConfig(modes="sync", cycles=20, shown_ticks=0, robot="")
+    run = read_run(run_chunks(config, tmp_path, NullProgress()))
+    assert list(EXPERIMENT.show(run).figures) == ["stability", "reactions"]
+    assert "smoothness" not in EXPERIMENT.show(run).tables
+
+
+@pytest.mark.parametrize("modes", ["sync", "sync,replace"])
+def test_few_lanes_have_room_for_their_labels(tmp_path: Path, modes: str) -> None:
+    few = read_run(run_chunks(ChunksConfig(latency="60", modes=modes, rules="", cycles=100), tmp_path, NullProgress()))
+    assert len(lanes_of(few)) == modes.count(",") + 1
+    drawn(few, build_lanes).savefig(tmp_path / "lanes.png")  # a warning where they have none

@@ -1,0 +1,410 @@
+"""Every closed form against robots in continuous time: exact where nothing is random, and where it stops to hold."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from s2a_bench.plugins.chunks.modes import ControlSetting, Mode, Rounding, mode
+from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
+from s2a_bench.plugins.chunks.modes.append import Queue, Streamed, Sync
+from s2a_bench.plugins.chunks.modes.closed import (
+    Closed,
+    appended,
+    mean_reaction_s,
+    replace_stall_share,
+    slack_ticks,
+    slow_down,
+    stall_share,
+)
+from s2a_bench.plugins.chunks.modes.replace import Replace
+from tests.plugins.chunks.modes.drawn import plainly
+from tests.plugins.chunks.modes.forms import (
+    jump_actions,
+    queue_age_ticks,
+    queue_stall_s,
+    queue_stall_ticks,
+    reaction_s,
+    replace_age_ticks,
+    replace_stall_ticks,
+    steady_stall_ticks,
+    sync_motion_share,
+)
+from tests.plugins.chunks.modes.plain import Log
+from tests.plugins.chunks.modes.plans import earliest_arrivals, safe_start_ticks
+
+PERIOD = 20
+ROUNDINGS = st.sampled_from(["floor", "ceil"])
+steady = settings(max_examples=150)
+
+
+def constant(latency: int, requests: int = 8) -> Any:
+    return np.full(requests, latency, np.int64)
+
+
+def boundaries(log: Log) -> list[int]:
+    """Return the stalled ticks before each chunk but the first, of those that are executed."""
+    found, idle, last = [], 0, -1
+    for act in log.acts:
+        if act is None:
+            idle += 1
+            continue
+        if act[0] != last:
+            found.append(idle)
+        last, idle = act[0], 0
+    return found[1:]
+
+
+def ages(log: Log, skip: int) -> list[int]:
+    """Return the ages of the executed actions of whole cycles after the first ``skip`` chunks."""
+    left_at = [at // PERIOD for at in log.asked_ns]
+    last = len(left_at) - 1
+    acted = [(act[0], tick) for tick, act in enumerate(log.acts) if act is not None]
+    return [tick - left_at[chunk] for chunk, tick in acted if skip <= chunk < last]
+
+
+def spread(values: list[int]) -> tuple[float, float, float]:
+    return min(values), float(np.mean(values)), max(values)
+
+
+# (a) queue and sync
+
+
+@steady
+@given(
+    latency=st.integers(0, 400),
+    trigger=st.integers(0, 8),
+    extra=st.integers(1, 6),
+    rounding=ROUNDINGS,
+    rest=st.integers(0, 3),
+)
+def test_a_queue_stalls_for_what_the_delay_exceeds_the_trigger_by(
+    latency: int, trigger: int, extra: int, rounding: Rounding, rest: int
+) -> None:
+    s = trigger + extra
+    setting = ControlSetting(PERIOD, s + rest, rounding)
+    log = plainly(Queue(trigger, s), constant(latency), setting)
+    delay = int(setting.delay_ticks(np.array(latency)))
+    assert boundaries(log) == [int(queue_stall_ticks(np.array(delay), trigger))] * 7
+    age = queue_age_ticks(delay, trigger, s)
+    assert spread(ages(log, 1)) == (age.least, age.mean, age.most)
+    none_from = math.ceil(latency / PERIOD) if rounding == "ceil" else latency // PERIOD
+    assert (boundaries(log)[0] == 0) == (trigger >= none_from)
+
+
+@steady
+@given(
+    latency=st.integers(0, 300),
+    trigger=st.integers(0, 12),
+    s=st.integers(1, 9),
+    gap=st.integers(0, 50),
+    rounding=ROUNDINGS,
+)
+def test_with_any_trigger_it_stalls_for_what_answers_take_longer_than_they_last_too(
+    latency: int, trigger: int, s: int, gap: int, rounding: Rounding
+) -> None:
+    setting = ControlSetting(PERIOD, 9, rounding)
+    made = Streamed(trigger, s, gap * 1e-9)
+    log = plainly(made, constant(latency, 60), setting)
+    ready = setting.delay_ticks(np.array(latency)) + made.hold_ticks(setting)
+    known = setting.known_ticks(np.array(latency + (s - 1) * gap))
+    assert boundaries(log)[40] == int(steady_stall_ticks(ready, known, trigger, s))
+
+
+@given(latency=st.integers(0, 400), trigger=st.integers(0, 8), s=st.integers(1, 9))
+def test_without_a_tick_the_stall_is_the_latency_less_what_is_left(latency: int, trigger: int, s: int) -> None:
+    assume(trigger <= s)
+    end = latency + s * PERIOD
+    for _ in range(5):
+        arrival = end - trigger * PERIOD + latency
+        stall = max(end, arrival) - end
+        assert stall == queue_stall_s(latency, trigger, PERIOD)
+        end += stall + s * PERIOD
+
+
+def test_a_queue_that_asks_before_it_has_what_it_asked_for_stalls_otherwise() -> None:
+    # m = s = 2 and 2.5 ticks: no request can follow from the answer before one of its two actions has left.
+    setting = ControlSetting(PERIOD, 2)
+    assert int(queue_stall_ticks(np.array(2), 2)) == 0
+    assert int(steady_stall_ticks(np.array(2), np.array(3), 2, 2)) == 1
+    assert boundaries(plainly(Queue(2), constant(50), setting)) == [1] * 7
+    assert not any(boundaries(plainly(Queue(2), constant(50), ControlSetting(PERIOD, 3))))
+    # m = 9 > s = 2 and d = 3 > s: an answer takes longer than it lasts, whatever the trigger.
+    assert boundaries(plainly(Queue(9), constant(60), setting))[2:] == [1] * 4
+
+
+@given(latency=st.integers(0, 400), s=st.integers(1, 9), rounding=ROUNDINGS)
+def test_sync_moves_for_the_share_of_its_actions(latency: int, s: int, rounding: Rounding) -> None:
+    setting = ControlSetting(PERIOD, 9, rounding)
+    log = plainly(Sync(s), constant(latency), setting)
+    share = sum(act is not None for act in log.acts) / len(log.acts)
+    delay = int(setting.delay_ticks(np.array(latency)))
+    assert share == pytest.approx(float(sync_motion_share(delay * PERIOD, s, PERIOD)))
+
+
+# (b) replace
+
+
+@steady
+@given(
+    latency=st.integers(0, 300),
+    s=st.integers(1, 9),
+    rest=st.integers(0, 6),
+    rounding=ROUNDINGS,
+    under_way=st.sampled_from(["one", "many"]),
+)
+def test_replace_stalls_for_what_a_cycle_and_a_delay_exceed_the_chunk_by(
+    latency: int, s: int, rest: int, rounding: Rounding, under_way: str
+) -> None:
+    setting = ControlSetting(PERIOD, s + rest, rounding)
+    log = plainly(Replace(s, under_way), constant(latency, 24), setting)  # type: ignore[arg-type]
+    delay, known = (int(each(np.array(latency))) for each in (setting.delay_ticks, setting.known_ticks))
+    cycle = max(s, known) if under_way == "one" else s
+    assume(under_way == "one" or known <= 8 * s)  # else none of a few requests arrives before the last one leaves
+    stall = int(replace_stall_ticks(np.array(delay), cycle, setting.horizon))
+    acted = [act is not None for act in log.acts]
+    from_tick = log.asked_ns[10] // PERIOD
+    window = acted[from_tick : from_tick + cycle]
+    assert cycle - sum(window) == stall
+    if under_way == "many" or known <= s:
+        assert (stall == 0) == (s + delay <= setting.horizon)
+    if delay < setting.horizon:
+        age = replace_age_ticks(delay, cycle, setting.horizon)
+        left_at = [at // PERIOD for at in log.asked_ns]
+        found = [
+            tick - left_at[act[0]] for tick, act in enumerate(log.acts) if act and from_tick <= tick < from_tick + cycle
+        ]
+        assert spread(found) == (age.least, age.mean, age.most)
+
+
+def test_with_one_request_under_way_a_delay_above_s_stalls_though_s_plus_d_fits() -> None:
+    # H = 8, s = 2, d = 5: s + d - H < 0, but a cycle lasts 5 ticks, and 5 + 5 - 8 = 2.
+    setting = ControlSetting(PERIOD, 8)
+    assert boundaries(plainly(Replace(2), constant(100), setting))[1:] == [2] * 5
+    assert int(replace_stall_ticks(np.array(5), 5, 8)) == 2
+    assert not any(boundaries(plainly(Replace(2, "many"), constant(100), setting))[1:])
+
+
+def test_a_delay_of_a_whole_chunk_executes_nothing() -> None:
+    log = plainly(Replace(4), constant(160), ControlSetting(PERIOD, 8))
+    assert {act[0] for act in log.acts if act} == {0}  # only the first, which is due when it arrives
+    with pytest.raises(ValueError, match="no action of 8"):
+        replace_age_ticks(8, 8, 8)
+
+
+# (c) reaction
+
+
+@steady
+@given(latency=st.integers(0, 300), s=st.integers(1, 9), trigger=st.integers(0, 5), name=st.sampled_from("qrsa"))
+def test_a_reaction_takes_the_wait_and_up_to_a_cycle(latency: int, s: int, trigger: int, name: str) -> None:
+    setting = ControlSetting(PERIOD, 18, "ceil")
+    made: Mode = {"q": Queue(trigger, s + trigger), "r": Replace(s, "many"), "s": Sync(s), "a": Aggregate(trigger)}[
+        name
+    ]
+    assume(name != "r" or latency <= 8 * PERIOD)
+    log = plainly(made, constant(latency, 24), setting)
+    delay = -(-latency // PERIOD)
+    wait = max(delay, trigger) if name == "q" else delay
+    late = max(0, delay - trigger)
+    cycle = {"q": s + trigger + late, "r": s, "s": s + delay, "a": 18 - trigger + late}[name]
+    first = {}
+    for act, at in zip(log.acts, log.acted_ns, strict=True):
+        if act is not None:
+            first.setdefault(act[0], at)
+    moments = range(log.asked_ns[4] + 1, log.asked_ns[5] + 1)
+    left_at = log.asked_ns[5]
+    reactions = [first[5] - moment for moment in moments]
+    assert left_at == max(moments)
+    expected = reaction_s(wait * PERIOD, cycle * PERIOD)
+    assert (min(reactions), max(reactions) + 1) == (expected.least, expected.most)
+    assert np.mean(reactions) + 0.5 == expected.mean  # moments are whole ns
+
+
+def test_of_a_blocking_robot_the_mean_reaction_is_one_and_a_half_latencies_and_half_a_chunk() -> None:
+    assert reaction_s(0.3, 8 * 0.02 + 0.3).mean == pytest.approx(1.5 * 0.3 + 8 * 0.02 / 2)
+
+
+def test_random_latencies_cost_a_blocking_robot_more_than_their_mean() -> None:
+    rng = np.random.default_rng(3)
+    latency = lognormal(rng, 3 * PERIOD * 1_000_000, 0.8, 100_000)
+    period = PERIOD * 1_000_000
+    cycles = Sync(4).cycles(latency, ControlSetting(period, 4, "ceil"))
+    moments = rng.uniform(0, cycles.request_tick[-1], 400_000)
+    answered = np.searchsorted(cycles.request_tick, moments)
+    reactions = cycles.start_tick[answered] - moments
+    delay = cycles.delay_ticks.astype(float)
+    error = reactions.std() / 400_000**0.5 * 3  # moments share cycles
+    assert reactions.mean() == pytest.approx(mean_reaction_s(delay, delay + 4), abs=4 * error)
+    assert reactions.mean() > 1.5 * delay.mean() + 2 + 4 * error  # the form for a constant latency
+
+
+# (e) random latencies
+
+
+def lognormal(rng: np.random.Generator, mean: float, cv: float, count: int) -> Any:
+    variance = np.log1p(cv**2)
+    return rng.lognormal(np.log(mean) - variance / 2, variance**0.5, count).astype(np.int64)
+
+
+def within(stalls: int, count: int, probability: float) -> bool:
+    return bool(stats.binomtest(stalls, count, probability).pvalue > 0.001)
+
+
+MS = 1_000_000
+RANDOM = [
+    (Queue(4, 8), 4),
+    (Queue(5, 16), 5),
+    (Aggregate(3), 3),
+    (Aggregate(7), 7),
+    (Replace(12, "one"), 4),
+]
+
+
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+@pytest.mark.parametrize(("made", "slack"), RANDOM)
+def test_a_cycle_stalls_as_often_as_its_latency_exceeds_the_slack(made: Mode, slack: int, rounding: Rounding) -> None:
+    setting, count = ControlSetting(20 * MS, 16, rounding), 200_000
+    latency = np.minimum(lognormal(np.random.default_rng(5), 60 * MS, 0.35, count), 12 * 20 * MS)  # no overlap
+    cycles = made.cycles(latency, setting)
+    stalls = int(np.count_nonzero(cycles.stall_ticks[1:]))
+    assert stalls == int((setting.delay_ticks(latency[1:]) > slack).sum())  # the very cycles
+    variance = np.log1p(0.35**2)
+    law = stats.lognorm(variance**0.5, scale=60 * MS * np.exp(-variance / 2))
+    at = slack * 20 * MS if rounding == "ceil" else (slack + 1) * 20 * MS
+    assert within(stalls, count - 1, float(law.sf(at)))
+
+
+@pytest.mark.parametrize(("made", "slack"), [(Queue(2, 4), 2), (Replace(3, "one"), 1), (Aggregate(1), 1)])
+def test_so_it_does_for_a_robot_in_continuous_time(made: Mode, slack: int) -> None:
+    setting, count = ControlSetting(20 * MS, 4, "ceil"), 100_001
+    latency = np.minimum(lognormal(np.random.default_rng(6), 18 * MS, 0.5, count), 60 * MS)
+    stalls = np.count_nonzero(boundaries(plainly(made, latency, setting)))
+    variance = np.log1p(0.5**2)
+    law = stats.lognorm(variance**0.5, scale=18 * MS * np.exp(-variance / 2))
+    assert within(int(stalls), count - 1, float(law.sf(slack * 20 * MS)))
+
+
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+def test_where_latencies_exceed_s_one_late_answer_makes_the_next_one_late_too(rounding: Rounding) -> None:
+    setting, s, count = ControlSetting(20 * MS, 8, rounding), 3, 200_000
+    latency = lognormal(np.random.default_rng(7), 60 * MS, 0.5, count)
+    cycles = Replace(s).cycles(latency, setting)
+    settled = cycles.settled
+    # A chunk that is all past when it arrives has no boundary; the tick before a cycle's end says what it left.
+    gap = cycles.usable_tick[1:] - cycles.request_tick[:-1] - 8
+    share = float(np.mean(gap[1:] > 0))
+    delay, known = setting.delay_ticks(latency), setting.known_ticks(latency)
+    expected = replace_stall_share(delay, known, s, 8)
+    assert share == pytest.approx(expected, abs=4 * (expected / count * 2) ** 0.5)
+    assert share > 2 * stall_share(delay, 8 - s)  # P(L > (H - s) Delta t) alone
+    few = Replace(s).ticks(latency[:2000], setting)
+    assert few.stalled.sum() > 0
+    assert settled.sum() > 0.9 * count
+
+
+def test_the_share_over_pairs_is_the_share_over_all_pairs() -> None:
+    rng = np.random.default_rng(8)
+    delay = rng.integers(0, 9, 60)
+    known = delay + rng.integers(0, 2, 60)
+    pairs = [max(3, before) + after > 8 for before in known for after in delay]
+    assert replace_stall_share(delay, known, 3, 8) == pytest.approx(np.mean(pairs))
+
+
+# (f) where nothing but slowing down helps
+
+
+@steady
+@given(
+    latency=st.integers(1, 900),
+    s=st.integers(1, 9),
+    rest=st.integers(1, 8),
+    rounding=ROUNDINGS,
+    under_way=st.sampled_from(["one", "many"]),
+)
+def test_slowed_down_by_beta_no_cycle_stalls_and_by_less_each_does(
+    latency: int, s: int, rest: int, rounding: Rounding, under_way: Any
+) -> None:
+    horizon = s + rest
+    slack = slack_ticks(horizon, s, under_way)
+    beta = slow_down(latency / 1e9, slack, 1e-6)
+    # Ticks of 1000 ns, so that rounding to whole ns is little.
+    latency_ns = constant(latency * 1000, 30)
+    beta = slow_down(latency * 1e-6, slack, 1e-6)
+    slowed = ControlSetting(1000, horizon, rounding).slowed(beta)
+    assert not any(Replace(s, under_way).cycles(latency_ns, slowed).stall_ticks[12:])
+    if beta > 1.01 and rounding == "ceil":
+        hasty = ControlSetting(1000, horizon, rounding).slowed(beta * 0.995)
+        assert Replace(s, under_way).ticks(latency_ns, hasty).stalled[-4 * horizon :].any()
+
+
+def test_the_slack_h_less_s_is_not_enough_with_one_request_under_way() -> None:
+    # H = 8, s = 1: slowed until d = 7 = H - s the next request waits for 7 ticks, and 7 + 7 > 8.
+    slowed = ControlSetting(1000, 8, "ceil").slowed(slow_down(20e-6, 8 - 1, 1e-6))
+    assert (Replace(1).cycles(constant(20_000), slowed).stall_ticks[2:-1] == 6).all()
+    assert not Replace(1, "many").cycles(constant(20_000), slowed).stall_ticks[8:].any()
+    with pytest.raises(ValueError, match="any speed"):
+        slow_down(1.0, 0, 0.02)
+
+
+def test_no_start_delay_helps_where_progress_asks_but_playing_back_late_does() -> None:
+    # H = 8, s = 6, d = 4. A robot that begins late asks late.
+    setting = ControlSetting(PERIOD, 8)
+    for first in (80, 800, 8000):
+        latency_ns = np.concatenate(([first], constant(80)))
+        assert (Replace(6).cycles(latency_ns, setting).stall_ticks[1:] == 2).all()
+        assert (Aggregate(2).cycles(latency_ns, setting).stall_ticks[1:] == 2).all()
+    # One that asks by the clock and executes what was due S0 = d ticks ago never stalls, for older actions.
+    left_at = 6 * np.arange(20)
+    assert safe_start_ticks(earliest_arrivals(left_at, np.full(20, 4), 8)) == 4
+
+
+# (g) a wrong estimate
+
+
+@given(latency=st.integers(0, 140), assumed=st.integers(0, 7), s=st.integers(1, 8), rounding=ROUNDINGS)
+def test_a_fixed_estimate_makes_the_robot_jump_by_its_error(
+    latency: int, assumed: int, s: int, rounding: Rounding
+) -> None:
+    setting = ControlSetting(PERIOD, 16, rounding)
+    delay = int(setting.delay_ticks(np.array(latency)))
+    made = Replace(s, "one", assumed)
+    assume(max(s, -(-latency // PERIOD)) + assumed <= 16)
+    log = plainly(made, constant(latency), setting)
+    takeovers = [
+        tick for tick in range(1, len(log.acts)) if (log.acts[tick] or (0, 0))[0] > (log.acts[tick - 1] or (0, 0))[0]
+    ]
+    assert takeovers
+    for tick in takeovers:
+        chunk, index = log.acts[tick] or (0, 0)
+        left_at = log.asked_ns[chunk] // PERIOD
+        done = sum(act is not None for act in log.acts[left_at:tick])
+        assert abs(index - done) == jump_actions(np.array(assumed), np.array(delay))
+    assert set(
+        np.abs(mode(f"replace?execute={s}&assumed={assumed}").cycles(constant(latency), setting).jump[1:-1])
+    ) == {abs(assumed - delay)}
+
+
+@pytest.mark.parametrize(
+    ("name", "latency"),
+    [
+        ("aggregate?trigger=8", 2),
+        ("streamed?start=naive&gap_s=1", 2),
+        ("replace?execute=2&under_way=many", 3),
+        ("replace?assumed=2", 2),
+    ],
+)
+def test_where_no_closed_form_holds_none_is_told(name: str, latency: int) -> None:
+    assert mode(name).closed_form(constant(latency * PERIOD), ControlSetting(PERIOD, 16)) == Closed()
+
+
+def test_appended_chunks_have_a_closed_form_while_answers_come_within_a_cycle() -> None:
+    ready = np.array([2, 3])
+    assert appended(ready, ready + 4, 0, 4) != Closed()
+    assert appended(ready, ready + 5, 0, 4) == Closed()

@@ -1,0 +1,180 @@
+"""Every mode does in ticks what a robot in continuous time does, step by step and over arrays."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from s2a_bench.errors import UsageError
+from s2a_bench.plugins.chunks.modes import MODES, ControlSetting, Mode, mode
+from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
+from s2a_bench.plugins.chunks.modes.append import Queue, Streamed, Sync
+from s2a_bench.plugins.chunks.modes.cycles import follow, step
+from s2a_bench.plugins.chunks.modes.replace import Replace
+from tests.plugins.chunks.modes.drawn import cases, latencies, modes, plainly, settings_of_chunks
+
+named = pytest.mark.parametrize("name", MODES)
+many = settings(max_examples=300)
+
+
+@named
+@many
+@given(data=st.data())
+def test_ticks_are_those_of_a_robot_in_continuous_time(name: str, data: st.DataObject) -> None:
+    made, latency_ns, setting = data.draw(cases(name))
+    log, ticks, cycles = plainly(made, latency_ns, setting), *simulate(made, latency_ns, setting)
+    expected = [act or (-1, -1) for act in log.acts[: cycles.ticks]]
+    assert list(zip(ticks.chunk.tolist(), ticks.index.tolist(), strict=True)) == expected
+    assert (cycles.request_tick * setting.period_ns).tolist() == log.asked_ns
+    begun = next((tick for tick, act in enumerate(expected) if act != (-1, -1)), cycles.ticks)
+    assert ticks.stalled.tolist() == [tick > begun and act == (-1, -1) for tick, act in enumerate(expected)]
+    left_at = [at // setting.period_ns for at in log.asked_ns]
+    ages = [tick - left_at[chunk] if chunk >= 0 else -1 for tick, (chunk, _) in enumerate(expected)]
+    assert ticks.age.tolist() == ages
+
+
+@named
+@many
+@given(data=st.data())
+def test_the_stepper_and_the_arrays_agree(name: str, data: st.DataObject) -> None:
+    made, latency_ns, setting = data.draw(cases(name))
+    for arrays, stepped in zip(simulate(made, latency_ns, setting)[::-1], step(made, latency_ns, setting), strict=True):
+        for field in fields(arrays):
+            np.testing.assert_array_equal(getattr(arrays, field.name), getattr(stepped, field.name), field.name)
+
+
+@many
+@given(data=st.data(), setting=settings_of_chunks())
+def test_arrays_of_streamed_actions_are_the_stepper_s_at_any_gaps(data: st.DataObject, setting: ControlSetting) -> None:
+    made, latency_ns = data.draw(modes(setting, "streamed")), data.draw(latencies(setting))
+    most = data.draw(st.sampled_from([0, 1, setting.period_ns, 2 * setting.period_ns]))
+    gap_ns = np.random.default_rng(data.draw(st.integers(0, 99))).integers(
+        0, most + 1, (latency_ns.size, setting.horizon)
+    )
+    arrival_ns = latency_ns[:, np.newaxis] + np.cumsum(gap_ns, axis=1) - gap_ns[:, :1]
+    arrays, stepped = made.arrays(arrival_ns, setting), follow(made, arrival_ns, setting)[0]
+    length = made.execution_horizon(setting)
+    waits = (np.diff(setting.delay_ticks(arrival_ns[:, :length])) > 1).any()
+    assert arrays is not None or waits or made.trigger >= length
+    for field in fields(stepped) if arrays is not None else ():
+        np.testing.assert_array_equal(getattr(arrays, field.name), getattr(stepped, field.name), field.name)
+
+
+@named
+@given(data=st.data())
+def test_cycles_are_what_ticks_add_up_to(name: str, data: st.DataObject) -> None:
+    made, latency_ns, setting = data.draw(cases(name))
+    ticks, cycles = simulate(made, latency_ns, setting)
+    assert len(ticks.chunk) == cycles.ticks
+    np.testing.assert_array_equal(cycles.delay_ticks, setting.delay_ticks(latency_ns))
+    for request in range(latency_ns.size):
+        acted = np.flatnonzero(ticks.chunk == request)
+        assert cycles.executed[request] == acted.size
+        assert cycles.thrown_away[request] == setting.horizon - acted.size
+        if not acted.size:
+            assert cycles.start_tick[request] == cycles.ticks
+            continue
+        first = acted[0]
+        assert (cycles.start_tick[request], cycles.first_index[request]) == (first, ticks.index[first])
+        done = np.count_nonzero(ticks.chunk[cycles.request_tick[request] : first] >= 0)
+        assert cycles.jump[request] == ticks.index[first] - done
+    tail = np.argmax((ticks.chunk >= 0)[::-1]) if cycles.executed.any() else 0
+    assert cycles.stall_ticks.sum() == ticks.stalled.sum() - tail
+    assert cycles.settled.sum() == max(np.count_nonzero(cycles.executed) - 1, 0)
+
+
+@many
+@given(data=st.data())
+def test_blended_ages_are_those_of_the_weights(data: st.DataObject) -> None:
+    made, latency_ns, setting = data.draw(cases("aggregate"))
+    assert isinstance(made, Aggregate)
+    cycles = made.cycles(latency_ns, setting)
+    log = plainly(made, latency_ns, setting)
+    ages = [
+        sum(share * (tick - log.asked_ns[chunk] // setting.period_ns) for chunk, share in blend.items())
+        if blend
+        else np.nan
+        for tick, blend in enumerate(log.blends[: cycles.ticks])
+    ]
+    np.testing.assert_allclose(made.blended_age(cycles), ages, atol=1e-9)
+
+
+@given(data=st.data(), setting=settings_of_chunks())
+def test_sync_is_a_queue_that_is_empty_when_it_asks(data: st.DataObject, setting: ControlSetting) -> None:
+    latency_ns = data.draw(latencies(setting))
+    for each, same in zip(simulate(Sync(), latency_ns, setting), simulate(Queue(), latency_ns, setting), strict=True):
+        for field in fields(each):
+            np.testing.assert_array_equal(getattr(each, field.name), getattr(same, field.name))
+
+
+def test_a_mode_by_hand() -> None:
+    setting = ControlSetting(10, 4)
+    queue = mode("queue?trigger=1").ticks(np.array([5, 25, 9]), setting)
+    # Asked at 0 and usable at once; at 3 with one left, late by one tick; at 8.
+    assert queue.chunk.tolist() == [0, 0, 0, 0, -1, 1, 1, 1, 1, 2, 2, 2]
+    assert queue.index.tolist() == [0, 1, 2, 3, -1, 0, 1, 2, 3, 0, 1, 2]
+    assert queue.age.tolist() == [0, 1, 2, 3, -1, 2, 3, 4, 5, 1, 2, 3]
+    assert np.flatnonzero(queue.stalled).tolist() == [4]
+    replace = mode("replace?execute=2")
+    cycles = replace.cycles(np.array([15, 15, 35, 5]), setting)
+    # Asked at 0, 3 (two ticks after it began), 5, and when the late third answer is known: 9; then nothing is left.
+    assert cycles.request_tick.tolist() == [0, 3, 5, 9]
+    assert replace.ticks(np.array([15, 15, 35, 5]), setting).chunk.tolist() == [-1, 0, 0, 0, 1, 1, 1, -1, 2, 3, 3]
+    assert cycles.first_index.tolist() == [0, 1, 3, 0]
+    assert cycles.jump.tolist() == [0, 0, 1, -0]
+    assert cycles.stall_ticks.tolist() == [0, 0, 1, 0]
+    assert cycles.executed.tolist() == [3, 3, 1, 2]
+
+
+def test_a_latency_of_whole_ticks_is_one_delay_by_both_conventions() -> None:
+    latency_ns = np.array([0, 1, 19, 20, 21, 40])
+    assert ControlSetting(20, 4).delay_ticks(latency_ns).tolist() == [0, 0, 0, 1, 1, 2]
+    assert ControlSetting(20, 4, "ceil").delay_ticks(latency_ns).tolist() == [0, 1, 1, 1, 2, 2]
+    assert ControlSetting(20, 4).known_ticks(latency_ns).tolist() == [0, 1, 1, 1, 2, 2]
+
+
+def test_time_scaling_takes_longer_ticks_and_never_shorter_ones_than_asked() -> None:
+    assert ControlSetting(20, 4).slowed(1.26) == ControlSetting(26, 4)
+    assert ControlSetting(20, 4).slowed(1.0) == ControlSetting(20, 4)
+
+
+@pytest.mark.parametrize(
+    ("written", "message"),
+    [
+        ("wait", "`modes`: 'wait' is none of sync, queue, streamed, replace, aggregate"),
+        ("queue?trigger=-1", "`modes`: queue: trigger = '-1': input should be greater than or equal to 0"),
+        ("replace?execute=0", "`modes`: replace: execute = '0'"),
+        ("replace?s=2", "`modes`: replace: 's' is no parameter; its parameters are execute, under_way, assumed"),
+        ("aggregate?kind=best", "`modes`: aggregate: kind = 'best'"),
+    ],
+)
+def test_a_mode_that_is_none_is_refused(written: str, message: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        mode(written)
+    assert message in str(caught.value)
+
+
+def test_a_mode_has_its_name_and_its_parameters() -> None:
+    assert [mode(name).name for name in MODES] == list(MODES)
+    assert mode("streamed?gap_s=0.01&start=naive&trigger=3") == Streamed(3, 0, 0.01, "naive")
+    assert mode("replace?execute=3&under_way=many") == Replace(3, "many")
+
+
+def test_what_is_no_setting_is_refused() -> None:
+    with pytest.raises(ValueError, match="period 0 ns"):
+        ControlSetting(0, 4)
+    with pytest.raises(ValueError, match="horizon 0"):
+        ControlSetting(20, 0)
+    with pytest.raises(ValueError, match="a latency of -1 ns"):
+        ControlSetting(20, 4).delay_ticks(np.array([3, -1]))
+    with pytest.raises(ValueError, match="execute = 5 of a chunk of 4"):
+        Queue(0, 5).cycles(np.array([3]), ControlSetting(20, 4))
+
+
+def simulate(made: Mode, latency_ns: Any, setting: ControlSetting) -> tuple[Any, Any]:
+    return made.ticks(latency_ns, setting), made.cycles(latency_ns, setting)

@@ -1,0 +1,278 @@
+"""Calibrated triggers keep their promise on latencies of any family, and follow a machine that drifts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from s2a_bench.boards.gaps import Gaps, Lognormal, Markov
+from s2a_bench.errors import UsageError
+from s2a_bench.plugins.chunks.modes import ControlSetting, Rounding
+from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
+from s2a_bench.plugins.chunks.modes.append import Queue
+from s2a_bench.plugins.chunks.modes.replace import Replace
+from s2a_bench.plugins.chunks.modes.trigger import (
+    Maximum,
+    Mean,
+    TrackedLatency,
+    Trigger,
+    TriggerRule,
+    calibrate,
+    follow,
+    trigger,
+)
+from s2a_bench.policy.conformal import EPSILON, upper_bound
+
+MS = 1_000_000
+CALIBRATION, FRESH = 8_000, 100_000
+
+
+@dataclass(slots=True)
+class Fixed:
+    """One latency for ever: what a calibration or the oracle found."""
+
+    latency_ns: float
+
+    def learn(self, latency_ns: int, *, stalled: bool) -> None:
+        """Learn nothing."""
+
+
+def oracle_ticks(survival: Callable[[float], float], setting: ControlSetting, epsilon: float = EPSILON) -> int:
+    """Return the smallest safe trigger, the least m with P(d > m) <= ``epsilon``, from P(L > x) with x in s.
+
+    It is ceil(F^-1(1 - epsilon) / Delta t) where actions leave at the start of their tick, and the floor of that where
+    they leave at its end. Of a distribution without atoms.
+    """
+    later = 1 if setting.rounding == "floor" else 0
+
+    def safe(ticks: int) -> bool:
+        return survival((ticks + later) * setting.period_ns / 1e9) <= epsilon
+
+    high = 1
+    while not safe(high):
+        high *= 2
+    low = 0
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (low, middle) if safe(middle) else (middle + 1, high)
+    return low
+
+
+def draw(latencies: Gaps, rng: np.random.Generator, count: int) -> Any:
+    return np.rint(latencies.sample(rng, count, 1)[:, 0] * 1e9).astype(np.int64)
+
+
+def law(latencies: Lognormal | Markov) -> Callable[[float], float]:
+    """Return P(L > x), x in s."""
+
+    def lognormal(mean_s: float) -> Any:
+        variance = math.log1p(latencies.cv**2)
+        return stats.lognorm(variance**0.5, scale=mean_s * math.exp(-variance / 2))
+
+    if isinstance(latencies, Lognormal):
+        one = lognormal(latencies.mean_s)
+        return lambda x: float(one.sf(x))
+    normal, pause = lognormal(latencies.normal_s), lognormal(latencies.normal_s * latencies.pause_ratio)
+    share = latencies.pause_share
+    return lambda x: float((1 - share) * normal.sf(x) + share * pause.sf(x))
+
+
+def world(seed: int, family: str) -> tuple[Lognormal | Markov, ControlSetting]:
+    """Draw latencies of 20 to 200 ms in the mean, at a control rate of 30 to 200 Hz."""
+    rng = np.random.default_rng([seed, 1])
+    mean_s = float(rng.uniform(0.02, 0.2))
+    setting = ControlSetting(int(rng.choice([5, 10, 20, 33])) * MS, 4096, "floor" if rng.random() < 0.5 else "ceil")
+    if family == "lognormal":
+        return Lognormal(mean_s, float(rng.uniform(0.05, 0.8))), setting
+    share = float(rng.uniform(0.005, 0.3))
+    lasts = 1 / (1 - share) if family == "bimodal" else float(rng.uniform(5, 20))
+    return Markov(mean_s, float(rng.uniform(0.05, 0.3)), share, float(rng.uniform(1.5, 6)), lasts), setting
+
+
+@dataclass
+class Found:
+    """What a rule came to, in each setting."""
+
+    stalls: list[float] = field(default_factory=list)
+    age: list[float] = field(default_factory=list)
+    """Of the first action of a chunk, over the oracle's: the part of an age that the trigger decides."""
+
+
+def study(settings: int, *families: str, period_ns: int = 0) -> dict[str, Found]:
+    found: dict[str, Found] = {}
+    for family, seed in product(families, range(settings)):
+        latencies, setting = world(seed, family)
+        if period_ns:
+            setting = ControlSetting(period_ns, 10**6)
+        known = draw(latencies, np.random.default_rng([seed, 2]), CALIBRATION)
+        fresh = draw(latencies, np.random.default_rng([seed, 3]), FRESH)
+        chosen = {
+            "oracle": oracle_ticks(law(latencies), setting),
+            "high-confidence": ticks_of(calibrate(known).caution, setting),
+            "expected": ticks_of(calibrate(known, guarantee="expected").caution, setting),
+            "maximum": ticks_of(known.max(), setting),
+            "mean": ticks_of(known.mean(), setting),
+        }
+        ages = {}
+        for rule, ticks in chosen.items():
+            cycles = Queue(ticks, ticks + 8).cycles(fresh, setting)
+            settled = cycles.settled
+            ages[rule] = float((cycles.start_tick - cycles.request_tick)[settled].mean())
+            each = found.setdefault(rule, Found())
+            each.stalls.append(float(np.mean(cycles.stall_ticks[settled] > 0)))
+            each.age.append(ages[rule] / ages["oracle"])
+    return found
+
+
+def ticks_of(latency_ns: float, setting: ControlSetting) -> int:
+    return trigger(float(latency_ns), setting, setting.horizon).ticks
+
+
+def judge(found: dict[str, Found]) -> None:
+    for rule in ("high-confidence", "expected"):
+        assert max(found[rule].stalls) <= 0.015
+        assert np.median(found[rule].age) == pytest.approx(1, abs=0.1)
+    assert max(found["oracle"].stalls) <= 0.01 + 4 * (0.01 / FRESH) ** 0.5
+    assert np.median(found["maximum"].age) > 1.3  # lerobot's rule: safe, and acts on older observations
+    assert np.mean(found["maximum"].stalls) < 0.0005
+    assert np.mean(np.array(found["mean"].stalls) > 0.015) > 0.9  # the mean rule: fresh, and stalls
+    assert np.median(found["mean"].age) < 0.7
+
+
+def test_a_calibrated_trigger_stalls_as_rarely_as_asked() -> None:
+    judge(study(8, "lognormal", "bimodal"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("period_ns", [0, MS // 10], ids=["control rates", "as good as no grid"])
+def test_so_it_does_in_each_of_200_settings(period_ns: int) -> None:
+    found = study(100, "lognormal", "bimodal", period_ns=period_ns)
+    assert len(found["oracle"].stalls) == 200
+    judge(found)
+
+
+def test_bursty_latencies_stall_as_rarely_as_asked_when_pooled() -> None:
+    found = study(60, "bursty")
+    assert np.mean(found["high-confidence"].stalls) <= 0.015
+    assert np.mean(found["expected"].stalls) <= 0.015
+    assert np.median(found["high-confidence"].age) == pytest.approx(1, abs=0.1)
+
+
+def stalled(triggers: Any, latency_ns: Any, setting: ControlSetting) -> Any:
+    """Tell in which cycles a queue with these triggers stalls."""
+    return setting.delay_ticks(latency_ns) > triggers
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.3, 1.6])
+@pytest.mark.parametrize("latencies", [Lognormal(0.1, 0.3), Markov(0.1, 0.15, 0.05, 3.0, 12.0)], ids=["calm", "bursty"])
+def test_tracking_brings_a_machine_that_drifts_back_to_epsilon(latencies: Gaps, scale: float) -> None:
+    setting = ControlSetting(20 * MS, 64)
+    known = draw(latencies, np.random.default_rng(1), CALIBRATION)
+    fresh = np.rint(draw(latencies, np.random.default_rng(2), 40_000) * scale).astype(np.int64)
+    rules: dict[str, TriggerRule] = {
+        "fixed": Fixed(calibrate(known).caution),
+        "tracked": TrackedLatency.begin(known),
+        "maximum": Maximum(float(known.max())),
+        "mean": Mean(int(known.sum()), known.size),
+    }
+    stalls, waits = {}, {}
+    for name, rule in rules.items():
+        found = follow(rule, fresh, setting, 60)
+        stalls[name], waits[name] = float(np.mean(stalled(found, fresh, setting))), float(found.mean())
+    assert 0.006 < stalls["tracked"] < 0.0115
+    assert stalls["fixed"] > 0.025 or scale == 1.0
+    assert stalls["maximum"] < 0.001
+    assert waits["maximum"] > 1.4 * waits["tracked"]
+    assert stalls["mean"] > 0.05
+
+
+def test_the_maximum_never_forgets_one_outlier_and_tracking_does() -> None:
+    setting, latency_ns = ControlSetting(20 * MS, 64), np.full(2000, 50 * MS)
+    latency_ns[500] = 900 * MS
+    found = follow(Maximum(), latency_ns, setting, 60)
+    assert set(found[501:].tolist()) == {45}
+    assert np.flatnonzero(stalled(found, latency_ns, setting)).tolist() == [0, 500]
+    found = follow(TrackedLatency.begin(latency_ns[:500], 0.01), latency_ns[500:], setting, 60)
+    assert set(found.tolist()) == {2}
+    assert np.flatnonzero(stalled(found, latency_ns[500:], setting)).tolist() == [0]
+
+
+@given(
+    latency=st.integers(0, 400),
+    most=st.integers(1, 12),
+    rounding=st.sampled_from(["floor", "ceil"]),
+    s=st.integers(0, 5),
+)
+def test_a_trigger_is_safe_at_its_latency_slowed_down_or_not(
+    latency: int, most: int, rounding: Rounding, s: int
+) -> None:
+    latency *= 1000
+    setting = ControlSetting(20_000, 13 + s, rounding)
+    found = trigger(latency, setting, most)
+    slowed = setting.slowed(found.beta)
+    assert found.ticks <= most
+    assert (found.beta == 1) == (setting.delay_ticks(np.array(latency)) <= most or latency <= most * 20_000)
+    latencies = np.full(6, latency)
+    assert not Queue(found.ticks, 13).cycles(latencies, slowed).stall_ticks.any()
+    if found.ticks and found.beta == 1:
+        assert Queue(found.ticks - 1, 13).cycles(latencies, setting).stall_ticks[1:].all()
+
+
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+def test_where_no_trigger_helps_slowing_down_keeps_epsilon(rounding: Rounding) -> None:
+    # H = 16, s = 12: four actions are left, 80 ms, for latencies of 120 ms in the mean.
+    setting, latencies = ControlSetting(20 * MS, 16, rounding), Lognormal(0.12, 0.2)
+    known = draw(latencies, np.random.default_rng(1), CALIBRATION)
+    fresh = draw(latencies, np.random.default_rng(2), FRESH)
+    found = trigger(calibrate(known).caution, setting, 4)
+    assert found.ticks == 4
+    assert found.beta == pytest.approx(0.189 / 0.08, rel=0.05)
+    slowed = setting.slowed(found.beta)
+    for mode in (Replace(12), Aggregate(4)):
+        assert np.mean(mode.cycles(fresh, setting).stall_ticks[1:] > 0) > 0.5
+        stalls = int(np.count_nonzero(mode.cycles(fresh, slowed).stall_ticks[1:]))
+        assert upper_bound(stalls, FRESH - 1, 0.975) < 0.015
+
+
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+def test_the_oracle_s_trigger_is_the_smallest_safe_one(rounding: Rounding) -> None:
+    setting = ControlSetting(20 * MS, 64, rounding)
+    for seed in range(40):
+        survival = law(world(seed, "bimodal")[0])
+        for epsilon in (0.001, 0.01, 0.2):
+            ticks = oracle_ticks(survival, setting, epsilon)
+            at = [(m + (rounding == "floor")) * 0.02 for m in range(ticks + 1)]
+            assert survival(at[-1]) <= epsilon
+            assert all(survival(x) > epsilon for x in at[:-1])
+
+
+def test_a_rule_that_needs_the_greatest_trigger_gets_it() -> None:
+    assert trigger(math.inf, ControlSetting(20, 8), 5) == Trigger(5, 1.0)
+    assert TrackedLatency.begin([1.0] * 50, 0.01).latency_ns == math.inf  # too few to promise 1 %
+    found = follow(TrackedLatency.begin([1.0] * 50, 0.01), np.array([90, 110, 130]), ControlSetting(20, 8), 5)
+    assert found.tolist() == [5, 5, 5]
+
+
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+def test_a_tracked_robot_stalls_while_its_latencies_exceed_the_slack(rounding: Rounding) -> None:
+    setting, latencies = ControlSetting(20 * MS, 16, rounding), Lognormal(0.05, 0.2)
+    known = draw(latencies, np.random.default_rng(1), 2000)
+    fresh = draw(latencies, np.random.default_rng(2), 30_000)
+    fresh[10_000:20_000] *= 2  # above the slack of 80 ms for a while
+    stalls = stalled(follow(TrackedLatency.begin(known), fresh, setting, 4), fresh, setting)
+    assert np.mean(stalls[10_000:20_000]) > 0.1
+    assert np.mean(stalls[:10_000]) < 0.0115
+    assert np.mean(stalls[24_000:]) < 0.0115
+    with pytest.raises(UsageError, match="calibrating on 98 promises"):
+        calibrate(np.arange(98))
+    with pytest.raises(ValueError, match="any speed"):
+        trigger(50, ControlSetting(20, 8), 0)
