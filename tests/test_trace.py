@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.clock import clock_id, now_ns
-from s2a_bench.trace import GROUPS, RESIDUAL, RESIDUAL_LIMIT, STAGES, Remote, Trace, budget, mark_cost_ns, path_of
+from s2a_bench.trace import RESIDUAL, RESIDUAL_LIMIT, STAGES, Remote, Trace, budget, mark_cost_ns, path_of
 
 names = st.sampled_from([RESIDUAL, *STAGES])
 chains = st.lists(st.tuples(names, st.integers(0, 10**9)), max_size=40).map(
@@ -75,22 +75,6 @@ def test_own_stages_come_last_on_the_way_out_and_first_on_the_way_in() -> None:
         *("preprocess", "inference", "server", "return"),
     ]
     assert path_of([]) == STAGES
-
-
-def test_the_groups_are_the_cards_seven_and_those_the_design_adds() -> None:
-    assert GROUPS == (
-        "capture",
-        "encode",
-        "pack",
-        "network",
-        "ingest",
-        "parse",
-        "decode",
-        "queue",
-        "inference",
-        "server",
-        "return",
-    )
 
 
 def test_both_sides_join_in_order_of_time() -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.evaluate import evaluate
-from s2a_bench.policy import Plans, policy
+from s2a_bench.policy import policy
 from s2a_bench.policy.metrics import measure
 from s2a_bench.policy.schedule import BLOCK
 from s2a_bench.testing.policy import draw
@@ -66,11 +66,3 @@ def test_plans_of_hundreds_of_skills_count_every_stall() -> None:
 def test_a_stall_as_long_as_the_tolerance_does_not_count() -> None:
     arrival_s = np.array([[0.0], [1.25], [2.75]])
     assert evaluate(arrival_s, np.ones((3, 1)), 0.25).naive_stalls == [1]
-
-
-def test_plans_may_be_strided_views() -> None:
-    whole = draw(4, 6, 2, 1.5, 10)
-    assert whole.token_s is not None
-    strided = Plans(whole.token_s[1::2, ::2], whole.nominal_s[:, ::2], whole.least_s[:, ::2], whole.most_s[:, ::2])
-    dense = evaluate(whole.arrival_s[:, ::2].copy(), whole.nominal_s[:, ::2].copy())
-    assert evaluate(strided.arrival_s, strided.nominal_s).end_s.tolist() == dense.end_s.tolist()

@@ -80,10 +80,6 @@ def run(*arguments: str, options: type[Options] = Asked) -> Any:
     return got[0]
 
 
-def test_what_is_not_given_keeps_its_default() -> None:
-    assert run() == Asked()
-
-
 def test_flags_reach_their_fields_and_groups() -> None:
     config = run("--runs", "7", "--t-nom", "2", "--names", "x, y,x", "--lengths", "4,2", "--quick", "--threads", "3")
     assert config == Asked(runs=7, t_nom_s=2, names=["x", "y"], lengths=(4, 2), quick=True, engine=Engine(threads=3))
@@ -97,12 +93,6 @@ def test_an_argument_is_given_by_its_place() -> None:
         run("GO", options=Named)
     with pytest.raises(UsageError, match=r"^`name` is needed$"):
         Named()
-
-
-def test_a_size_is_width_and_height() -> None:
-    assert run("go", "--size", "64x48", options=Named).size == (64, 48)
-    with pytest.raises(UsageError, match=r"^--size: 'big' should look like 640x480$"):
-        run("go", "--size", "big", options=Named)
 
 
 def test_of_a_group_only_some_fields_may_be_flags() -> None:

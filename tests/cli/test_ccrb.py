@@ -9,9 +9,7 @@ import jsonschema
 import pytest
 
 from tests.cli.program import called, program
-
-ROOT = Path(__file__).parents[2]
-SCHEMA = json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text())
+from tests.made_runs import SCHEMA
 
 
 def test_json_is_one_object_that_the_schema_describes(tmp_path: Path) -> None:

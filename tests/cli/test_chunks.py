@@ -7,17 +7,15 @@ from pathlib import Path
 
 import jsonschema
 
-from s2a_bench.store.run import read_run
-from tests.cli.program import called
-
-ROOT = Path(__file__).parent.parent.parent
+from tests.cli.program import called, only_run
+from tests.made_runs import SCHEMA
 
 
 def test_json_keeps_its_schema_and_has_the_keys_of_a_cell(tmp_path: Path) -> None:
     latencies = "40,bimodal:mean_ms=80,cv=.2,pause_share=.1,pause_ratio=3"
     done = called("chunks", "--json", "--cycles", "200", "--latency", latencies, "--output", tmp_path)
     found = json.loads(done.stdout)
-    jsonschema.validate(found, json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text()))
+    jsonschema.validate(found, SCHEMA)
     assert found["command"] == "chunks"
     wanted = (
         "mode latency_s delta_t_s horizon execution_horizon ticks stall_ticks p_stall_cycle age_ticks_mean rounding"
@@ -38,11 +36,11 @@ def test_the_tables_say_the_convention_and_that_nothing_was_measured(tmp_path: P
     assert "EMULATED" in text
     assert "virtual time" in text
     assert "more tables (actions, delays, smoothness): " in text
-    (folder,) = tmp_path.iterdir()
+    run = only_run(tmp_path)
     for name in ("chunks", "actions", "delays"):
         for suffix in ("md", "tex"):
-            written = (folder / "tables" / f"{name}.{suffix}").read_text()
+            written = (run.path / "tables" / f"{name}.{suffix}").read_text()
             assert "ceil" in written
             assert "rovenance: " in written
-    assert len((folder / "tables" / "chunks.csv").read_text().splitlines()) == 1 + 9
-    assert read_run(folder).manifest["configuration"]["rounding"] == "ceil"
+    assert len((run.path / "tables" / "chunks.csv").read_text().splitlines()) == 1 + 9
+    assert run.manifest["configuration"]["rounding"] == "ceil"

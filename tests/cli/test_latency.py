@@ -6,21 +6,17 @@ import json
 import os
 import re
 import signal
-import socket
 import subprocess
-import sys
 from collections import Counter
 from contextlib import ExitStack, closing
 from importlib.util import find_spec
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
 
 import jsonschema
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.experiments.requests import cells_of
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
@@ -28,15 +24,12 @@ from s2a_bench.ros.router import Router, free_endpoint
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.trace import budget
 from s2a_bench.types import Frame
-from tests.cli.program import program, refused
+from tests.cli.program import command, program
+from tests.cli.program import only_run as only
+from tests.made_runs import SCHEMA
 
-ROOT = Path(__file__).parent.parent.parent
 DRAWN = ["--engine", "echo", "--quick", "--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3"]
 SMALL = [*DRAWN, "--data-only"]
-
-
-def command(*arguments: str, output: Path) -> list[str]:
-    return [sys.executable, "-m", "s2a_bench", "latency", *arguments, "--output", str(output)]
 
 
 def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
@@ -45,8 +38,7 @@ def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedPro
 
 def only_run(output: Path) -> StoredRun:
     """Return the run, all of whose facts are declared."""
-    (folder,) = output.iterdir()
-    kept = read_run(folder)
+    kept = only(output)
     assert {name for facts in kept.samples["facts"] for name in json.loads(facts)} <= kept.manifest["facts"].keys()
     return kept
 
@@ -91,7 +83,11 @@ def test_a_server_whose_latencies_are_known_answers_after_them_and_is_emulated_i
     assert (kept.samples["inference_ns"] >= 20_000_000).all()
     assert {json.loads(facts)["latency_drawn_ms"] for facts in kept.samples["facts"]} == {20}
     assert set(kept.samples["provenance"]) == {"echo/none/emulated"}
-    cells = json.loads(done.stdout)["cells"]
+    whole = json.loads(done.stdout)
+    jsonschema.validate(whole, SCHEMA)
+    compared = {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]}
+    assert {("http/binary", "ros/topic"), ("ros/topic", "loopback")} <= compared
+    cells = whole["cells"]
     assert {(cell["emulated"], cell["profile"]) for cell in cells} == {(True, "latencies 20 ms")}
     for path in (kept.path / "tables").glob("*.md"):
         assert "Echo engine, EMULATED: latencies 20 ms" in path.read_text(), path
@@ -134,18 +130,6 @@ def test_every_token_has_its_two_times(whole: tuple[StoredRun, str]) -> None:
 
 
 @pytest.mark.slow
-def test_json_is_the_only_thing_on_standard_output(tmp_path: Path) -> None:
-    done = run(*SMALL, "--transport", "http,ros,loopback", "--json", output=tmp_path)
-    whole: dict[str, Any] = json.loads(done.stdout)
-    jsonschema.validate(whole, json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text()))
-    assert whole["command"] == "latency"
-    assert [cell["n"] for cell in whole["cells"]] == [4] * 5
-    compared = {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]}
-    assert ("http/as-deployed", "ros/topic") in compared
-    assert ("ros/topic", "loopback") in compared
-
-
-@pytest.mark.slow
 def test_stream_mode_knows_the_age_of_the_frame(tmp_path: Path) -> None:
     done = run(*SMALL, "--transport", "http,ros", "--mode", "stream", "--fps", "60", "--verbose", output=tmp_path)
     assert "Frame path" in done.stdout
@@ -154,12 +138,8 @@ def test_stream_mode_knows_the_age_of_the_frame(tmp_path: Path) -> None:
     assert (kept.samples["frame_age_ns"] > 0).all()
     used = kept.frames[(kept.frames["used_by"] != "") & (kept.frames["cell"] == "ros/topic")]
     assert len(used) == 5
-    assert (
-        used[["capture_ns", "convert_ns", "cdr_pack_ns", "network_ns", "cdr_parse_ns", "channel_swap_ns"]]
-        .notna()
-        .all()
-        .all()
-    )
+    stages = [f"{name}_ns" for name in ("capture", "convert", "cdr_pack", "network", "cdr_parse", "channel_swap")]
+    assert used[stages].notna().all(axis=None)
     ros = kept.samples[kept.samples["cell"] == "ros/topic"]
     assert ros["convert_ns"].isna().all()
 
@@ -224,7 +204,7 @@ def test_the_manifest_tells_the_machine(whole: tuple[StoredRun, str]) -> None:
 def start_long(output: Path, *arguments: str) -> tuple[subprocess.Popen[str], Path]:
     """Start a run that would take very long and wait until it has some samples."""
     process = subprocess.Popen(
-        command(*SMALL, "--requests", "1000000", *arguments, output=output),
+        command("latency", *SMALL, "--requests", "1000000", *arguments, "--output", output),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -313,47 +293,6 @@ def test_a_run_beside_another_has_a_namespace_of_its_own_unless_it_is_told_that_
     assert "ROS_DOMAIN_ID or another --namespace" in last
 
 
-def test_a_port_in_use_is_one_clear_line(tmp_path: Path) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        output = run(*SMALL, "--transport", "http", "--port", str(port), output=tmp_path, code=1).stderr
-    assert f"error: --port: {port} is in use" in output
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        (["--source", "v4l2:/dev/video99"], 1, "/dev/video99"),
-        (["--source", "video:/no/such.mp4"], 1, "/no/such.mp4"),
-        (["--source", "images:/no/such"], 1, "/no/such"),
-        (["--url", "http://127.0.0.1:9", "--transport", "http"], 1, "nothing answers at http://127.0.0.1:9"),
-        (["--engine", "llama", "--model", "/no/such.gguf"], 1, "/no/such.gguf"),
-        (["--engine", "llama", "--llama-server", "/no/such"], 2, "--llama-server: /no/such is no program"),
-        (["--output", __file__], 1, f"--output {__file__}"),
-    ],
-)
-def test_what_is_missing_is_one_clear_line(tmp_path: Path, arguments: list[str], code: int, message: str) -> None:
-    assert message in refused("latency", *SMALL, "--output", tmp_path / "results", *arguments, code=code)
-    assert "--source" not in arguments or not (tmp_path / "results").exists()
-
-
-def test_a_video_is_a_source(tmp_path: Path) -> None:
-    import cv2
-    import numpy as np
-
-    path = tmp_path / "clip.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48))
-    for shade in range(12):
-        writer.write(np.full((48, 64, 3), 20 * shade, np.uint8))
-    writer.release()
-    run(*SMALL, "--source", f"video:{path}", "--transport", "http,ros", output=tmp_path / "results")
-    kept = only_run(tmp_path / "results")
-    assert (kept.samples["error"] == "").all()
-    assert kept.samples["convert_ns"].isna().all()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["request", "stream"])
 def test_a_run_is_recorded_and_its_frames_are_a_source(tmp_path: Path, mode: str) -> None:
@@ -416,20 +355,5 @@ def test_a_single_picture_is_another_one_in_every_sample_and_the_same_in_every_c
     source = ["--source", f"images:{tmp_path / 'pictures'}"]
     output = run(*SMALL, *source, "--transport", "http", output=tmp_path / "results").stderr
     assert "duplicate-frames" not in output
-    (folder,) = (tmp_path / "results").iterdir()
-    samples = read_run(folder).samples
+    samples = only_run(tmp_path / "results").samples
     assert samples["rgb_source"].nunique() == samples["block"].nunique() > 1
-
-
-@pytest.mark.slow
-def test_a_real_model_answers_over_both_pipelines(tmp_path: Path) -> None:
-    grammar = tmp_path / "yes.gbnf"
-    grammar.write_text('root ::= "yes" | "no"\n')
-    few = ["--quick", "--requests", "2", "--warmup", "1", "--max-tokens", "5", "--threads", "1"]
-    run(*few, "--grammar", str(grammar), "--transport", "http/as-deployed,ros", output=tmp_path / "r")
-    kept = only_run(tmp_path / "r")
-    assert kept.manifest["model"]["dummy"] is True
-    answers = kept.tokens.groupby("request_id")["text"].apply("".join)
-    assert set(answers) <= {"yes", "no"}
-    assert len(answers) == 6
-    assert {cell.about["engine"] for cell in cells_of(kept)} == {"llama"}

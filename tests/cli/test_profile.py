@@ -11,7 +11,6 @@ import jsonschema
 import pytest
 
 from s2a_bench.boards.profile import read_profile, to_toml
-from s2a_bench.store.run import read_run
 from tests.cli.program import called, program, refused
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-profile-1.json").read_text())
@@ -98,24 +97,3 @@ def test_where_nothing_can_be_written_nothing_is_measured(home: Path) -> None:
     (home / "file").write_text("")
     error = refused("profile", "capture", "here", "--output", "file/profiles", code=1)
     assert error == "error: --output: cannot write file/profiles/here.toml: Not a directory"
-
-
-def test_a_replayed_run_is_labelled_emulated_wherever_it_shows(home: Path) -> None:
-    done = program(
-        *("latency", "--engine", "replay", "--profile", "fast", "--transport", "loopback", "--size", "64x48"),
-        *("--requests", "4", "--warmup", "1", "--max-tokens", "20", "--json"),
-    )
-    whole = json.loads(done.stdout)
-    (cell,) = whole["cells"]
-    assert (cell["engine"], cell["profile"], cell["emulated"]) == ("replay", "fast", True)
-    # a sleeping machine is late, never early; the profile draws 10 ms before the first token, and no less than 3
-    assert cell["groups_ms"]["inference"]["mean"] > 3
-    assert cell["itl_ms"]["n"] == 4 * 19
-    found = read_run(Path(home / whole["run"]))
-    assert found.manifest["model"]["emulated"] is True
-    assert set(found.samples["engine"]) == {"replay"}
-    note = "EMULATED: replayed profile fast (parametric gaps, recorded with dummy weights)"
-    tables = list((found.path / "tables").glob("*.md")) + list((found.path / "tables").glob("*.tex"))
-    assert tables
-    for table in tables:
-        assert note in table.read_text(), table

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 import s2a_bench
-from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.store.run import StoredRun
 from s2a_bench.testing.transport import RecordingHandler
-from tests.cli.program import called, program, refused
+from tests.cli.program import called, command, only_run, program
 from tests.servers.sockets import serving as serving_socket
 from tests.servers.speakers import Cloud, answering
 
@@ -25,8 +23,9 @@ SMALL = ("--size", "64x48", "--requests", "5", "--warmup", "1", "--max-tokens", 
 @contextmanager
 def serving(*arguments: str) -> Iterator[str]:
     """Serve and yield the first line."""
-    command = [sys.executable, "-m", "s2a_bench", "serve", *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    process = subprocess.Popen(
+        command("serve", *arguments), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
     try:
         assert process.stdout is not None
         yield process.stdout.readline()
@@ -38,8 +37,7 @@ def serving(*arguments: str) -> Iterator[str]:
 def measured(output: Path, *arguments: str) -> tuple[StoredRun, str]:
     """Measure and return the run with what was printed."""
     done = program("latency", *SMALL, *arguments, "--output", output)
-    (folder,) = output.iterdir()
-    return read_run(folder), done.stdout
+    return only_run(output), done.stdout
 
 
 @pytest.fixture(scope="module")
@@ -71,24 +69,12 @@ def test_a_replay_behind_a_url_is_emulated_in_every_place(replayed: tuple[Stored
     assert shown["provenance"]["cells"]["http/as-deployed"]["tokens"] == "emulated"
 
 
-def test_it_is_not_compared_with_a_measured_run(replayed: tuple[StoredRun, str], tmp_path: Path) -> None:
-    own, _ = measured(tmp_path, "--transport", "http/as-deployed", "--engine", "echo", "--data-only")
-    output = refused("compare", own.path, replayed[0].path, code=1)
-    assert "provenance tokens: measured against emulated" in output
-
-
 def test_a_replay_behind_an_action_is_emulated_too(tmp_path: Path) -> None:
     namespace = f"/replayed_{os.getpid()}"
     with serving("ros", "--engine", "replay", "--profile", "rtx-4080", "--namespace", namespace) as line:
         assert line
-        action: tuple[Any, ...] = (
-            "--transport",
-            "ros/action",
-            "--action",
-            f"{namespace}/generate_response",
-            "--data-only",
-        )
-        run, output = measured(tmp_path, *action)
+        action = ("--transport", "ros/action", "--action", f"{namespace}/generate_response")
+        run, output = measured(tmp_path, *action, "--data-only")
     assert run.origins.of("ros/action").code == "replay/none/emulated/link-unknown"
     assert set(run.samples["engine"]) == {"replay"}
     assert "EMULATED" in output

@@ -15,6 +15,7 @@ from s2a_bench.inference.models import tiny_dummy
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.store.schema import PROVENANCE
 from tests.cli.program import called, program
+from tests.cli.program import only_run as only
 
 FEW = ("--size", "64x48", "--payload", "raw", "--max-tokens", "4", "--requests", "2", "--warmup", "1", "--threads", "1")
 UNSEEN, UNSENT = "picture not seen", "picture not seen or sent"
@@ -27,11 +28,6 @@ def texts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model = tmp_path_factory.mktemp("model") / "texts.gguf"
     model.symlink_to(tiny_dummy()[0])
     return model
-
-
-def only(folder: Path) -> StoredRun:
-    (found,) = folder.iterdir()
-    return read_run(found)
 
 
 @pytest.fixture(scope="module")
@@ -95,18 +91,8 @@ def test_llama_server_refuses_pictures_then_so_it_gets_none_and_is_compared_by_i
     server = next(each for each in run.manifest["servers"].values() if "version" in each)
     assert server["engine"]["pictures"] == printed["provenance"]["cells"]["http/llama-server"]["pictures"]
     assert not {"mmproj", "mmproj_sha256"} & server["engine"].keys()
-    program(
-        "throughput",
-        "--engine",
-        "llama-server",
-        "--model",
-        texts,
-        *FEW,
-        "--payload",
-        "jpeg",
-        "--output",
-        tmp_path / "throughput",
-    )
+    flags = ("--engine", "llama-server", "--model", texts, *FEW, "--payload", "jpeg")
+    program("throughput", *flags, "--output", tmp_path / "throughput")
     table = s2a.load(only(tmp_path / "throughput").path).table("ratios")
     assert {*table["metric"]} >= {"tokens_per_s"}
 

@@ -12,11 +12,10 @@ import jsonschema
 import pytest
 
 from s2a_bench.experiments.throughput.metrics import REFERENCE
-from s2a_bench.store.run import StoredRun, read_run
-from tests.cli.program import program
+from tests.cli.program import only_run, program
 from tests.llama_bench_stand_in import install
+from tests.made_runs import SCHEMA
 
-ROOT = Path(__file__).parent.parent.parent
 SMALL = ["--size", "64x48", "--requests", "2", "--warmup", "1", "--max-tokens", "40", "--threads", "1"]
 REAL = "S2A_BENCH_LLAMA_BENCH"
 """Names the real llama-bench, for the test that needs it."""
@@ -26,14 +25,9 @@ def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedPro
     return program("throughput", *arguments, "--output", output, code=code)
 
 
-def only_run(output: Path) -> StoredRun:
-    (folder,) = output.iterdir()
-    return read_run(folder)
-
-
 def valid(text: str) -> dict[str, Any]:
     whole: dict[str, Any] = json.loads(text)
-    jsonschema.validate(whole, json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text()))
+    jsonschema.validate(whole, SCHEMA)
     return whole
 
 

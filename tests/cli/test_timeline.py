@@ -12,25 +12,14 @@ import pytest
 
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.store.requests import SKILLS
-from s2a_bench.store.run import StoredRun, read_run
-from tests.cli.program import called
+from s2a_bench.store.run import read_run
+from tests.cli.program import called, only_run
+from tests.made_runs import SCHEMA
 from tests.policy.test_tables import CASES, shown
-
-ROOT = Path(__file__).parent.parent.parent
 
 BOARDS = {"34.2": "rtx-4080", "4.8": "jetson-agx-orin", ".58": "jetson-orin-nano"}
 POLICIES = {"s2a-clairvoyant": "stream-to-act"}
 """With even tokens it starts at S0 as well."""
-
-
-def schema() -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text())
-    return found
-
-
-def only_run(output: Path) -> StoredRun:
-    (folder,) = output.iterdir()
-    return read_run(folder)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +45,7 @@ def test_the_command_prints_the_expected_timelines(
 
 
 def test_the_json_keeps_its_schema(whole: dict[str, Any]) -> None:
-    jsonschema.validate(whole, schema())
+    jsonschema.validate(whole, SCHEMA)
     assert whole["command"] == "timeline"
     assert len(whole["cells"]) == 3 * 4 * 3
     assert all(cell["emulated"] for cell in whole["cells"])
@@ -91,7 +80,7 @@ def test_a_given_rate_takes_the_place_of_the_profiles(tmp_path: Path) -> None:
         *("--jitter", "lognormal:cv=0.2", "--plans", "20", "--json", "--output", tmp_path),
     )
     found = json.loads(done.stdout)
-    jsonschema.validate(found, schema())
+    jsonschema.validate(found, SCHEMA)
     assert {(cell["rate_tokens_per_s"], cell["n_skills"]) for cell in found["cells"]} == {
         (rate, count) for rate in (4.8, 2) for count in (4, 8)
     }
@@ -103,7 +92,7 @@ def test_a_given_rate_takes_the_place_of_the_profiles(tmp_path: Path) -> None:
 def test_boundary_prints_json_that_keeps_its_schema_and_leaves_the_plane_as_csv(tmp_path: Path) -> None:
     done = called("boundary", "--json", "--output", tmp_path)
     found = json.loads(done.stdout)
-    jsonschema.validate(found, schema())
+    jsonschema.validate(found, SCHEMA)
     kept = only_run(tmp_path)
     lines = (kept.path / "tables" / "boundary.csv").read_text().splitlines()
     assert len(lines) - 1 == len(found["cells"]) == 2 * (8 * 25 + 3 * 4)

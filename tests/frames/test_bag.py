@@ -233,28 +233,6 @@ def test_an_encoding_that_is_no_colour_is_named(tmp_path: Path, encoding: str, w
         opened(path)
 
 
-@pytest.mark.parametrize(
-    ("encoding", "shape", "code"),
-    [
-        ("bgra8", (48, 64, 4), cv2.COLOR_BGRA2BGR),
-        ("rgba8", (48, 64, 4), cv2.COLOR_RGBA2BGR),
-        ("bayer_rggb8", (48, 64), cv2.COLOR_BayerRGGB2BGR),
-        ("nv12", (72, 64), cv2.COLOR_YUV2BGR_NV12),
-        ("yuv422", (48, 64, 2), cv2.COLOR_YUV2BGR_UYVY),
-    ],
-)
-@pytest.mark.parametrize("size", [(64, 48), (32, 24)])
-def test_every_other_encoding_comes_as_bgr(
-    tmp_path: Path, encoding: str, shape: tuple[int, ...], code: int, size: tuple[int, int], opened: Open
-) -> None:
-    pixels = np.random.default_rng(1).integers(0, 256, shape, np.uint8)
-    path = record(tmp_path / "bag", [("/c", IMAGE, image(pixels, encoding, height=48))])
-    frame = opened(path, *size).read()
-    assert frame.encoding == "bgr8"
-    expected = cv2.resize(cv2.cvtColor(pixels, code), size, interpolation=cv2.INTER_AREA)
-    np.testing.assert_array_equal(frame.data, expected)
-
-
 def test_a_change_of_format_is_refused(tmp_path: Path, opened: Open) -> None:
     source = opened(record(tmp_path / "bag", [*camera("bgr8"), *camera("mono8")]))
     for _ in range(3):

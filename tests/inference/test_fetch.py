@@ -257,21 +257,6 @@ def test_the_files_of_the_commit_that_was_fetched_last_are_the_model(hub: Hub) -
     assert len(hub.gets(MMPROJ)) == 1
 
 
-def test_a_file_that_the_library_fetched_is_used_as_it_is(hub: Hub) -> None:
-    for name in (MODEL, MMPROJ):
-        huggingface_hub.hf_hub_download(REPOSITORY, name)
-    before = len(hub.gets(MODEL))
-    fetch()
-    assert len(hub.gets(MODEL)) == before == 1
-
-
-def test_an_unknown_quantisation_names_those_there_are(hub: Hub) -> None:
-    assert refusal(quant="Q9") == (
-        f"{REPOSITORY}: no model is Q9, or several; it has {MODEL}, {MMPROJ}; name one as OWNER/REPO:FILE"
-    )
-    assert hub.gets(MODEL) == hub.gets(MMPROJ) == []
-
-
 @pytest.mark.parametrize(
     ("status", "headers", "message"),
     [
@@ -376,12 +361,6 @@ def test_a_cache_that_cannot_be_written_is_named(hub: Hub, tmp_path: Path) -> No
 def test_what_is_neither_name_nor_file_is_wrong_usage(what: str) -> None:
     with pytest.raises(UsageError, match=r"neither minicpm-v-2.6, .* nor OWNER/REPO\[:FILE\]"):
         fetch(what)
-
-
-def test_a_quantisation_goes_with_a_repository_not_with_a_file(hub: Hub) -> None:
-    with pytest.raises(UsageError, match="`quant` Q8_0"):
-        fetch("a/b:c.gguf", quant="Q8_0")
-    assert hub.requests == []
 
 
 def test_a_file_is_found_in_upper_and_lower_case_the_exact_name_first(hub: Hub) -> None:
@@ -510,15 +489,6 @@ def test_another_mmproj_of_the_repository_is_fetched_by_its_name(hub: Hub) -> No
     hold(hub, "qwen2.5-vl-3b", LISTINGS["qwen2.5-vl-3b"])
     done = fetch("qwen2.5-vl-3b", quant="Q8_0", mmproj="mmproj-Qwen2.5-VL-3B-Instruct-Q8_0.gguf")
     assert [file.path.name for file in done.files] == LISTINGS["qwen2.5-vl-3b"][1::2]
-
-
-def test_a_name_stands_for_its_files_once_they_are_fetched(hub: Hub) -> None:
-    with pytest.raises(ModelError, match=f"^`model` {NAME}: not fetched yet; run: s2a-bench model fetch {NAME}$"):
-        load_headers(EngineConfig(model=Path(NAME)))
-    done = fetch()
-    files = load_headers(EngineConfig(model=Path(NAME)))
-    assert (files.model.path, files.mmproj and files.mmproj.path) == tuple(file.path for file in done.files)
-    assert hub.gets(MODEL) == [None]
 
 
 @pytest.mark.parametrize("name", ["hub:", "hub:a", "hub:a/b/c", "hub:a/b:", "hub:a b/c"])

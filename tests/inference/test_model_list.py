@@ -86,12 +86,6 @@ def test_a_dummy_has_its_sizes_and_the_tokens_that_its_engine_evaluates(tiny: En
     assert model.name in shown()
 
 
-def test_a_larger_picture_costs_more_and_a_smaller_one_less() -> None:
-    files = tiny_dummy()
-    small, usual, wide = (picture_tokens(*files, width, width * 3 // 4) for width in (320, 640, 1280))
-    assert small < usual < wide
-
-
 def test_fetched_models_are_listed_by_the_names_that_the_flag_takes(tmp_path: Path) -> None:
     model, mmproj = (path.read_bytes() for path in tiny_dummy())
     fetched(tmp_path, HUB_MODELS["gemma3-270m"], text=model)

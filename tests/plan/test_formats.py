@@ -34,10 +34,6 @@ t_nom_s = 1
     return parse_skills(text, "many.toml")
 
 
-def test_the_granularities_are_the_papers() -> None:
-    assert GRANULARITIES == (6, 4, 2, 1)
-
-
 @pytest.mark.parametrize("tokens", GRANULARITIES)
 @pytest.mark.parametrize("n_skills", [4, 32])
 def test_every_call_and_every_plan_costs_exactly_what_was_asked_for(

@@ -25,7 +25,6 @@ from s2a_bench.report.compare.comparison import (
     compare,
     metrics_of,
     open_comparison,
-    read_side,
     warnings_of,
 )
 from s2a_bench.report.compare.gates import Judgement, concerned, judge, read_gate
@@ -198,13 +197,6 @@ def test_another_machine_or_model_is_refused_unless_told(
         warning for warning in warnings_of(compared(first, second, "e2e", unlike=True)) if warning.code == "unlike"
     )
     assert warning.message == f"the runs are unlike: {message}"
-
-
-def test_other_latencies_of_an_echo_are_refused_unless_told(launch: Launch) -> None:
-    echo = {"engine": "echo", "emulated": True}
-    sides = [launch(1, n=2, manifest=with_(MANIFEST, "model", **echo, latency=each)) for each in ("40", "80")]
-    with pytest.raises(UnlikeRuns, match="model latency: 40 against 80"):
-        opened(*sides)
 
 
 def test_another_gpu_is_refused_and_another_driver_is_told(launch: Launch) -> None:
@@ -495,13 +487,6 @@ def test_a_gate_that_too_few_values_feed_is_undecided_not_passed(launch: Launch)
     assert outcomes(found, "e2e.p99>10%", strict=True) == {"tripped"}
 
 
-def test_a_gate_on_a_cell_that_there_is_not_is_answered_by_those_there_are(launch: Launch) -> None:
-    with pytest.raises(
-        UsageError, match="no cell with e2e is called 'zmq'; there are http/as-deployed, http/binary, ros"
-    ):
-        outcomes(opened(launch(1, n=6), launch(2, n=6)), "zmq:e2e>5%")
-
-
 def test_the_json_object_is_what_its_schema_says(launch: Launch) -> None:
     found = compared(launch(1), launch(2, factor=1.2), "e2e", "e2e.p99")
     whole = compare_json(found, judge(found, [read_gate("e2e>5%")], one_launch=True), warnings_of(found))
@@ -541,12 +526,3 @@ def test_the_figure_has_a_panel_a_metric_and_a_row_a_cell(launch: Launch) -> Non
 )
 def test_a_change_is_written_in_per_cent(share: float, text: str) -> None:
     assert percent(share) == text
-
-
-def test_a_side_is_one_folder_or_several_each_once(launch: Launch) -> None:
-    paths = [str(launch(seed, n=2).path) for seed in (1, 2)]
-    assert [str(run.path) for run in read_side(" , ".join(paths), "A")] == paths
-    with pytest.raises(UsageError, match="A: a folder is named twice"):
-        read_side(f"{paths[0]},{paths[0]}", "A")
-    with pytest.raises(UsageError, match="B: name a run folder"):
-        read_side(" , ", "B")

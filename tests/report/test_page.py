@@ -20,7 +20,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.tables import execution_table, timeline_csv
@@ -341,19 +340,6 @@ def test_every_verdict_has_its_evidence_on_the_page(computed: Path) -> None:
     assert "Run: s2a-bench latency" in page.text
     for verdict in ("supported", "contradicted", "undecided"):
         assert f'class="claim {verdict}"' in text
-
-
-def test_what_a_report_wrote_may_be_replaced_and_nothing_else(tmp_path: Path, computed: Path) -> None:
-    page, other = tmp_path / "page.html", tmp_path / "mine.html"
-    report = make_report(read_chapters([computed], against_paper=False), against_paper=False)
-    for _ in range(2):
-        write_report(report, ReportConfig(runs=[computed], output=page, markdown=tmp_path / "page.md"))
-    other.write_text("<html>mine</html>")
-    wrong = {"output": other, "markdown": other, "latex": other, "csv": other}
-    for field, path in (*wrong.items(), ("output", tmp_path)):
-        with pytest.raises(UsageError, match=f"`{field}`"):
-            ReportConfig(runs=[computed], **{field: path})
-    assert other.read_text() == "<html>mine</html>"
 
 
 def test_files_lie_in_a_folder_a_run(tmp_path: Path, computed: Path, make_run: MakeRun) -> None:

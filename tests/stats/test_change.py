@@ -69,15 +69,6 @@ def test_a_slowdown_of_ten_per_cent_is_found(n: int, correlation: float, least: 
     assert found(n, correlation, 0.0, 1.1) >= least
 
 
-def test_a_test_that_takes_samples_for_independent_would_find_what_is_not_there() -> None:
-    rng = np.random.default_rng(20)
-    naive = 0
-    for _ in range(REPEATS):
-        first, second = launch(rng, 200, 0.8), launch(rng, 200, 0.8)
-        naive += stats.mannwhitneyu(first, second).pvalue < LEVEL
-    assert naive > 30
-
-
 def test_launches_that_differ_by_themselves_are_judged_by_launches() -> None:
     rng = np.random.default_rng(3)
     by_launch = by_request = 0

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 
-from s2a_bench.plan import Parser, SkillParsed, choose_format, parse_skills
 from s2a_bench.store.run import read_run
 from studies.validity import VALIDITY
 
@@ -77,19 +76,6 @@ def test_a_row_an_answer_is_kept_with_its_text_and_counts(folder: Path) -> None:
     free = rows[~rows["grammar"]]
     assert (free["skills"] < free["lines"]).any()  # random weights
     assert (free["tokens"] <= 2 * 5 * free["format"].astype(int)).all()
-
-
-def test_the_counts_are_those_of_the_text(folder: Path) -> None:
-    from s2a_bench.inference.tokenizer import Tokenizer
-
-    kept = read_run(folder)
-    format_ = choose_format(parse_skills(FEW, "few.toml"), 4, Tokenizer(Path(kept.manifest["model"]["model"])), 5)
-    for row in kept.table(VALIDITY).to_dict("records"):
-        if row["format"] == "4":
-            parser = Parser(format_)
-            events = [*parser.feed(row["text"]), *parser.close()][:5]
-            assert row["lines"] == len(events)
-            assert row["skills"] == sum(isinstance(event, SkillParsed) for event in events)
 
 
 def test_the_table_says_that_the_weights_are_dummies(folder: Path) -> None:
