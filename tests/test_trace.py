@@ -93,7 +93,6 @@ def test_marks_of_another_clock_are_not_mixed_in_unless_shifted() -> None:
     assert trace.chain() == [("", 10), ("server", 90)]
     trace.receive(Remote("another host", [("network", 1040)], [1060], frame_marks=[("network", 1005)]).shifted(1000))
     assert trace.chain() == [("", 10), ("network", 40), ("return", 90)]
-    assert trace.remote is not None
     assert (trace.remote.token_ns, trace.remote.frame_marks) == ([60], [("network", 5)])
 
 

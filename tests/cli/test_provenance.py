@@ -27,7 +27,6 @@ def serving(*arguments: str) -> Iterator[str]:
         command("serve", *arguments), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
     try:
-        assert process.stdout is not None
         yield process.stdout.readline()
     finally:
         process.kill()

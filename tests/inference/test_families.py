@@ -73,7 +73,6 @@ def logits_of(engine: LlamaCppEngine, frame: Frame) -> NDArray[np.float32]:
     """The logits of the first token of an answer about a picture."""
     ask(engine, images=(frame,), max_tokens=1)
     llama = engine._llama
-    assert llama is not None
     return np.ctypeslib.as_array(llama_cpp.llama_get_logits_ith(llama.ctx, -1), (llama.n_vocab(),)).copy()
 
 

@@ -241,8 +241,6 @@ def damaged(path: Path, target: Path, old: bytes, new: bytes) -> Path:
 def test_what_only_llama_cpp_can_tell_is_a_model_error(
     tiny: EngineConfig, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert tiny.model is not None
-    assert tiny.mmproj is not None
     strange = damaged(tiny.model, tmp_path / "model.gguf", b"blk.3.ffn_up.weight", b"blk.3.ffn_xx.weight")
     with pytest.raises(ModelError, match=r"`model` .*model.gguf: llama.cpp: .*blk.3.ffn_up.weight"):
         LlamaCppEngine(tiny.but(model=strange))

@@ -44,7 +44,6 @@ class TestTextModel(EngineSuite):
 
 
 def vocab_of(engine: LlamaCppEngine) -> Any:
-    assert engine._llama is not None
     return engine._llama._model.vocab
 
 
@@ -79,7 +78,6 @@ def test_what_the_tokenizer_adds_is_not_there_twice(base: LlamaCppEngine) -> Non
     assert ChatTemplate(PARTS, vocab_of(base)).prompt("go", 0) == "<user>go<model>"
     for prompt in ("go", "<bos>go"):
         ask(base, prompt, max_tokens=1)
-        assert base._llama is not None
         assert base._llama.prompt[0] == 2
         assert base._llama.prompt[1] != 2
 

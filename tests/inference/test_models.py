@@ -20,7 +20,6 @@ def refusal(model: Path | None, mmproj: Path | None = None) -> str:
 
 
 def paths(config: EngineConfig) -> tuple[Path, Path]:
-    assert config.model is not None
     assert config.mmproj is not None
     return config.model, config.mmproj
 

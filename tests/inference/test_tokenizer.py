@@ -19,7 +19,6 @@ def tokenizer(tiny: EngineConfig) -> Tokenizer:
 def test_the_ids_are_those_of_the_model(tiny: EngineConfig, tokenizer: Tokenizer) -> None:
     engine = LlamaCppEngine(tiny)
     llama = engine._llama
-    assert llama is not None
     for text in ("1. go_to(kitchen)\n", " the tea", "\n\n", "küche 鍋", ""):
         assert tokenizer(text) == llama.tokenize(text.encode(), add_bos=False, special=False)
     engine.close()

@@ -53,7 +53,6 @@ def wait_for(condition: Callable[[], bool], timeout_s: float = 60) -> bool:
 @pytest.mark.parametrize("stopped", [False, True])
 def test_a_killed_parent_takes_along_children_that_ignore_signals_or_are_stopped(where: str, stopped: bool) -> None:
     with subprocess.Popen([sys.executable, "-c", PARENT, STUBBORN, where], stdout=subprocess.PIPE) as parent:
-        assert parent.stdout
         child = int(parent.stdout.readline())
         if stopped:
             os.kill(child, signal.SIGSTOP)
@@ -71,7 +70,6 @@ def test_a_child_lives_on_when_the_thread_that_started_it_ends() -> None:
     thread.start()
     thread.join()
     with children[0] as child:
-        assert child.stdout
         assert child.stdout.readline() == b"ready\n"
         assert not wait_for(lambda: child.poll() is not None, 0.3)
         child.kill()

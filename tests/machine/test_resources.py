@@ -233,7 +233,6 @@ def test_the_cpu_clock_of_another_process_counts_its_threads() -> None:
         "import sys,time,threading\nsum(range(3_000_000))\nprint(time.process_time_ns(), flush=True)\nsys.stdin.read()"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
         own_ns = int(process.stdout.readline())
         read_ns = CpuTimes([process.pid]).read()["server_cpu_ns"]
         process.communicate(b"")

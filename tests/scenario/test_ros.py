@@ -93,8 +93,6 @@ def direct(policy: Policy) -> Driven:
 
 def farthest(one: Driven, other: Driven) -> tuple[float, float]:
     """Return how far two drives are apart: in m over all three cars, and in m/s."""
-    assert one.trajectory is not None
-    assert other.trajectory is not None
     steps = min(len(one.trajectory.time_s), len(other.trajectory.time_s))
     pairs = ((getattr(each.trajectory, name)[:steps] for each in (one, other)) for name in ("position_m", "speed_mps"))
     position, speed = (float(np.abs(first - second).max()) for first, second in pairs)

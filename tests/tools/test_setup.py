@@ -74,8 +74,6 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     for name in ("S2A_BENCH_CUDA", "CMAKE_ARGS", "CUDACXX", "CC", "CXX", "CFLAGS", "CXXFLAGS"):
         monkeypatch.delenv(name, raising=False)
     spec = importlib.util.spec_from_file_location("setup_script", ROOT / "tools" / "setup.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     monkeypatch.setattr(module, "CPUINFO", tmp_path / "cpuinfo")
