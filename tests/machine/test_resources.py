@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import threading
-import types
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from s2a_bench.machine.resources.host import CpuTimes, HostMemory, Rapl
 from s2a_bench.machine.resources.nvidia import Nvml, Tegrastats, parse_tegrastats
 from s2a_bench.machine.resources.sampler import ResourceSampler
 from s2a_bench.store.run import RunWriter, read_run
+from tests.machine.nvml import FakeNvml
 
 S = 1_000_000_000
 
@@ -166,36 +166,6 @@ def test_rapl_without_zones_or_with_damaged_ones_is_unreadable(tmp_path: Path) -
     (tmp_path / "intel-rapl:0" / "energy_uj").unlink()
     with pytest.raises(Unreadable, match=r"energy_uj: No such file.*sudo chmod"):
         Rapl(root=tmp_path)
-
-
-class FakeNvml(types.ModuleType):
-    """Stands in for pynvml with two GPUs; ``refused`` names the functions that these boards do not have."""
-
-    class NVMLError(Exception): ...
-
-    NVML_TEMPERATURE_GPU, NVML_CLOCK_SM = 0, 1
-
-    def __init__(self, *refused: str, gpus: int = 2) -> None:
-        super().__init__("pynvml")
-        answers = {
-            "nvmlInit": lambda: None,
-            "nvmlShutdown": lambda: None,
-            "nvmlSystemGetDriverVersion": lambda: "550.54",
-            "nvmlDeviceGetCount": lambda: gpus,
-            "nvmlDeviceGetHandleByIndex": lambda place: place,
-            "nvmlDeviceGetName": lambda gpu: f"RTX {gpu}",
-            "nvmlDeviceGetUtilizationRates": lambda gpu: types.SimpleNamespace(gpu=(10, 90)[gpu]),
-            "nvmlDeviceGetMemoryInfo": lambda gpu: types.SimpleNamespace(used=(1 << 30, 2 << 30)[gpu]),
-            "nvmlDeviceGetPowerUsage": lambda gpu: (20_500, 200_000)[gpu],
-            "nvmlDeviceGetTotalEnergyConsumption": lambda gpu: (5_000, 7_000)[gpu],
-            "nvmlDeviceGetTemperature": lambda gpu, _sensor: (40, 71)[gpu],
-            "nvmlDeviceGetClockInfo": lambda gpu, _clock: (300, 2_505)[gpu],
-        }
-        for name, answer in answers.items():
-            setattr(self, name, self._refuse if name in refused else answer)
-
-    def _refuse(self, *_: object) -> None:
-        raise self.NVMLError("Not Supported")
 
 
 def test_nvml_adds_up_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
