@@ -11,18 +11,13 @@ from tests.cli.program import called, only_run
 from tests.made_runs import SCHEMA
 
 
-def test_json_keeps_its_schema_and_has_the_keys_of_a_cell(tmp_path: Path) -> None:
+def test_json_keeps_its_schema(tmp_path: Path) -> None:
     latencies = "40,bimodal:mean_ms=80,cv=.2,pause_share=.1,pause_ratio=3"
     done = called("chunks", "--json", "--cycles", "200", "--latency", latencies, "--output", tmp_path)
     found = json.loads(done.stdout)
     jsonschema.validate(found, SCHEMA)
     assert found["command"] == "chunks"
-    wanted = (
-        "mode latency_s delta_t_s horizon execution_horizon ticks stall_ticks p_stall_cycle age_ticks_mean rounding"
-    )
-    for cell in found["cells"]:
-        assert {*wanted.split()} <= cell.keys()
-        assert cell["emulated"] is True
+    assert all(cell["emulated"] is True for cell in found["cells"])
     assert len(found["cells"]) == 18
     assert any("trigger" in cell for cell in found["cells"])
     for cell in found["provenance"]["cells"].values():

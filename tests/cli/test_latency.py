@@ -144,22 +144,6 @@ def test_stream_mode_knows_the_age_of_the_frame(tmp_path: Path) -> None:
     assert ros["convert_ns"].isna().all()
 
 
-def test_other_payloads_have_their_stages(tmp_path: Path) -> None:
-    stages = {
-        "ros/topic?payload=yuyv": "yuv_decode",
-        "ros/topic?payload=jpeg": "image_decode",
-        "ros/topic?payload=jpeg-preencoded": "image_decode",
-        "http/as-deployed?payload=jpeg-preencoded": "base64_encode",
-    }
-    run(*SMALL, "--transport", ",".join(stages), output=tmp_path)
-    samples = only_run(tmp_path).samples
-    assert (samples["error"] == "").all()
-    for cell, stage in stages.items():
-        assert samples[samples["cell"] == cell][f"{stage}_ns"].notna().all()
-    http = samples[samples["pipeline"] == "http"]
-    assert http[["convert_ns", "image_encode_ns"]].isna().all().all()  # Base64 alone is left
-
-
 def test_one_run_compares_payloads_and_options_on_servers_of_their_own(tmp_path: Path) -> None:
     cells = ["http/binary", "http/binary?payload=png", "http/binary?host=127.0.0.2", "ros/topic?payload=yuyv"]
     cells += ["ros/topic?qos=sensor_data", "loopback"]

@@ -56,16 +56,6 @@ def measured(output: Path, *arguments: str) -> StoredRun:
     return only_run(output)
 
 
-def test_http_speaks_the_openai_dialect(start: Start) -> None:
-    process, line = start("http", "--engine", "echo", "--port", "0")
-    url = line.split()[2]
-    body = {"messages": [{"role": "user", "content": "hello robot"}], "max_tokens": 2}
-    answer = httpx.post(url.rstrip(";"), json=body).json()
-    assert answer["choices"][0]["message"]["content"] == "hello robot"
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(30) in {0, -signal.SIGTERM}
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_ros_answers_goals_and_publishes_tokens(start: Start, dds_domain: int, number: signal.Signals) -> None:
     process, line = start("ros", "--engine", "echo", "--namespace", "/robot_llama", "--max-tokens", "5", *ONE_BY_ONE)

@@ -65,13 +65,6 @@ def test_every_table_and_figure_and_the_page_say_it(blind: StoredRun, tmp_path: 
     assert all(UNSEEN.upper() in file.read_text() for file in tex.glob("*.tex"))
 
 
-def test_it_is_not_compared_with_a_model_that_sees_its_picture(blind: StoredRun, tmp_path: Path) -> None:
-    program("latency", "--transport", "http/binary", *FEW, "--data-only", "--output", tmp_path)
-    done = called("compare", only(tmp_path).path, blind.path, code=1)
-    assert "provenance pictures: seen against not seen" in done.stderr
-    assert f"Dummy weights, {UNSEEN}." in called("compare", only(tmp_path).path, blind.path, "--unlike").stdout
-
-
 @LLAMA_SERVER
 def test_llama_server_refuses_pictures_then_so_it_gets_none_and_is_compared_by_its_tokens(
     texts: Path, tmp_path: Path

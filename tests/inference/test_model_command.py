@@ -23,12 +23,6 @@ def test_it_prints_the_two_paths_and_writes_once_unless_forced(tmp_path: Path) -
     assert model.stat().st_size > 1e6
 
 
-def test_the_default_folder_is_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path))
-    out = CliRunner().invoke(app, ["dummy", "--quant", "q4_0"]).stdout
-    assert Path(out.splitlines()[0]).parent == tmp_path / "models" / "dummy-tiny"
-
-
 def test_a_dummy_of_another_model_has_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder with two mmproj files would be one of which none is found."""
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path))

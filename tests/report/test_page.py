@@ -244,12 +244,6 @@ def test_cells_of_one_name_are_not_made_one(tmp_path: Path) -> None:
     assert first.name != second.name
 
 
-def test_timelines_of_other_settings_are_kept_apart(tmp_path: Path) -> None:
-    same: dict[str, Any] = {"profiles": ("rtx-4080",), "tokens_per_skill": (6,), "policies": ("naive",)}
-    runs = [({"t-max": most}, timeline(tmp_path, t_max=most, **same)) for most in (1.0, 2.0)]
-    assert len(read_chapters([sweep_of(tmp_path / "sweeps", runs)], against_paper=False)) == 3
-
-
 @pytest.mark.slow
 def test_measured_cells_stand_side_by_side_and_are_not_pooled(tmp_path: Path, make_run: MakeRun) -> None:
     runs = [({"runs": n}, make_run(n=n).path) for n in range(2, MOST_CHAPTERS + 4)]

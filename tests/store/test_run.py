@@ -6,7 +6,6 @@ import re
 import socket
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from datetime import datetime, timezone
 from io import FileIO
 from pathlib import Path
@@ -23,7 +22,7 @@ from s2a_bench.store import manifest as manifests
 from s2a_bench.store.files import RESERVE, RESERVE_BYTES, read_csv, read_parquet, why
 from s2a_bench.store.requests import TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
 from s2a_bench.store.run import RunWriter, StoredRun, fits, read_run
-from tests.made_runs import STAGES
+from tests.made_runs import STAGES, row_of
 
 CHAIN = [
     ("", 1_000),
@@ -37,28 +36,15 @@ CHAIN = [
 
 
 def sample(request_id: str = "r1", **facts: object) -> SampleRow:
-    row = SampleRow(
-        cell="ros/topic",
-        pipeline="ros",
-        variant="topic",
-        payload="bgr",
-        connection="keep-alive",
-        engine="echo",
-        mode="request",
-        size="640x480",
-        block=0,
-        position=1,
-        warmup=False,
-        request_id=request_id,
-        frame_index=7,
-        marks=CHAIN,
-        payload_bytes=921_600,
-        n_tokens=3,
-        last_token_ns=13_000,
-        server_prompt_ms=0.1,
-        facts={"load": 0.30000000000000004},
-    )
-    return replace(row, **facts)
+    measured = {
+        "marks": CHAIN,
+        "payload_bytes": 921_600,
+        "n_tokens": 3,
+        "last_token_ns": 13_000,
+        "server_prompt_ms": 0.1,
+    }
+    whole = {"request_id": request_id, "facts": {"load": 0.30000000000000004}, **measured, **facts}
+    return row_of("ros/topic", {}, 0, **whole)
 
 
 def token(index: int, text: str, engine_ns: int | None = 5) -> TokenRow:
