@@ -8,7 +8,6 @@ import io
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
@@ -16,7 +15,7 @@ import pytest
 from PIL import Image
 
 from s2a_bench.inference import Like, Quant
-from s2a_bench.inference.dummy import DummyFiles, write_dummy, write_mmproj
+from s2a_bench.inference.dummy import DummyFiles, write_dummy
 from s2a_bench.inference.dummy.families import FAMILIES, mmproj_tensors, model_tensors
 from s2a_bench.inference.dummy.tensors import Tensor
 from s2a_bench.inference.dummy.vocab import TEXT, make_vocab
@@ -180,14 +179,3 @@ def test_the_full_vocabulary_has_the_real_ones_size(like: Like) -> None:
     vocab = make_vocab(full=True, size=family.vocab, special=family.special)
     assert len(vocab.tokens) == len(vocab.types) == len(set(vocab.tokens)) == family.vocab
     assert vocab.tokens[vocab.pad : vocab.eos + 1] == [*family.special[:3]]
-
-
-def test_a_tower_can_be_of_any_width(tmp_path: Path, tiny: Callable[[Like], DummyFiles]) -> None:
-    path = tmp_path / "mmproj.gguf"
-    write_mmproj(path, 640, "tiny", like="gemma3-4b")
-    header = gguf.GGUFReader(path)
-    (projection,) = (tensor for tensor in header.tensors if tensor.name == "mm.input_projection.weight")
-    assert projection.data.shape == (64, 640)
-    assert [*tmp_path.iterdir()] == [path]
-    with pytest.raises(ValueError, match="Failed to load mtmd"), loaded(DummyFiles(tiny("gemma3-4b").model, path)):
-        pass

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks.models import PROMPT, TOKENS, Engine, picture, server
-from s2a_bench.errors import BadRequest, ModelError
+from s2a_bench.errors import ModelError
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.dummy import write_dummy, write_mmproj
 from s2a_bench.inference.dummy.families import FAMILIES
@@ -89,13 +89,6 @@ def test_the_picture_is_seen_and_every_part_of_the_prompt_is_timed(engine: Llama
 def test_a_grammar_is_obeyed_after_a_picture(engine: LlamaCppEngine) -> None:
     tokens = ask(engine, images=(rgb_frame(1, 64, 48),), grammar=ACTIONS, max_tokens=40)
     assert "".join(token.text for token in tokens)[-3:].strip("(0123456789") == ")"
-
-
-def test_a_picture_that_does_not_fit_is_refused_before_it_is_evaluated(family: EngineConfig) -> None:
-    with closing(LlamaCppEngine(family.but(context=512))) as engine:
-        with pytest.raises(BadRequest, match=r"does not fit the context of 512 tokens \(prompt of \d+ tokens"):
-            ask(engine, images=(rgb_frame(1, 640, 480),) * 4)
-        assert ask(engine)
 
 
 @pytest.mark.parametrize("batch", [32, 100])

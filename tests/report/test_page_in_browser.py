@@ -214,24 +214,6 @@ def test_keys_go_from_bar_to_bar(opened: Callable[..., Chrome]) -> None:
     assert span_of(view) == (pytest.approx((0.375 + 0.25 / 4) * end), pytest.approx(end / 4))
 
 
-def test_links_lead_to_what_they_name_and_what_is_folded_opens(opened: Callable[..., Chrome]) -> None:
-    browser = opened()
-    links = found(browser, "nav a")
-    assert len(links) == 7
-    for link in links:
-        link.click()
-        section = found(browser, link.get_dom_attribute("href"))[0]
-        assert found(section, "h2")[0].text.startswith(link.text)
-        top = browser.execute_script("return arguments[0].getBoundingClientRect().top", section)
-        assert abs(top) < 1
-    for folded in found(browser, "details"):
-        summary, parts = found(folded, "summary")[0], found(folded, ".table, .claim")
-        summary.click()
-        assert all(part.is_displayed() for part in parts)
-        if "(" in summary.text:
-            assert summary.text.endswith(f"({len(parts)})")
-
-
 @pytest.mark.parametrize("width", WIDTHS)
 def test_nothing_is_wider_than_the_window(opened: Callable[..., Chrome], width: int) -> None:
     browser = opened(width, unfold=True)

@@ -126,14 +126,6 @@ def test_a_drive_over_ros_is_the_direct_one_but_for_single_precision_and_the_hel
     assert speed < 0.1
 
 
-def test_a_world_that_is_one_step_late_drives_a_little_later(meeting: Meeting) -> None:
-    """One step is 5 ms, in which no car changes its speed by more than 0.04 m/s."""
-    found, wanted = driven(meeting.ego(meeting.world(late=True)), Clairvoyant()), direct(Clairvoyant())
-    assert found.outcomes.name(0) == wanted.outcomes.name(0) == "none"
-    position, _ = farthest(found, wanted)
-    assert 0 < position < 0.15
-
-
 @pytest.mark.parametrize("more", SPOKEN)
 def test_each_preset_speaks_and_looks_under_the_names_of_its_own(meeting: Meeting, more: str) -> None:
     type_name, commands, pictures = SPOKEN[more]

@@ -11,6 +11,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from benchmarks.sweep_scaling import measure
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.sweep import Sweep, read_sweep
@@ -121,3 +122,9 @@ def test_an_address_where_nobody_answers_is_one_line(tmp_path: Path) -> None:
     _, err = end(begin(VIRTUAL, tmp_path, "--ray", "127.0.0.1:1"), code=2)
     assert "--ray: no Ray cluster answers at 127.0.0.1:1" in err
     assert len(err.splitlines()) == 1
+
+
+def test_a_hundred_thousand_timelines_are_the_same_in_this_process_in_two_and_on_ray() -> None:
+    lines = list(measure(100_000, 7, [2], ray=True))
+    assert [line.how for line in lines] == ["this process", "processes", "Ray, local"]
+    assert len({(line.checksum, line.p_any_stall, line.mean_stall_s) for line in lines}) == 1
