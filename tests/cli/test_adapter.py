@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import pytest
 import typer
@@ -55,21 +55,6 @@ class Both(Options):
     there: There = group(There, about="there: ")
 
 
-class Panelled(Options):
-    PANEL: ClassVar[str] = "Loop"
-
-    rate: float = option(1.0, "ticks a second", first=True)
-    kind: Literal["", "slow"] = option("", "how", panel="Way")
-    engine: Engine = group(Engine, first=("model",))
-
-
-class Derived(Panelled):
-    PANEL: ClassVar[str] = "More"
-
-    rate: float = option(2.0, "ticks a second")
-    many: int = option(1, "how many", first=True)
-
-
 def run(*arguments: str, options: type[Options] = Asked) -> Any:
     got: list[Options] = []
     app = typer.Typer()
@@ -113,17 +98,6 @@ def test_groups_beside_each_other_share_a_flag() -> None:
     assert about == {
         "port": "here, there: port of the server [default: here 0, there 8]",
         "own": "here: what nobody else has",
-    }
-
-
-def test_headings_and_what_comes_first_are_declared_with_the_option_or_its_class() -> None:
-    found = {flag.name: (flag.panel, flag.first) for flag in flags_of(Derived)}
-    assert found == {
-        "rate": ("Loop", True),
-        "kind": ("Way", False),
-        "threads": ("", False),
-        "model": ("", True),
-        "many": ("More", True),
     }
 
 

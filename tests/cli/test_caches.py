@@ -9,8 +9,6 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 
 from s2a_bench.testing.transport import RecordingHandler
@@ -77,28 +75,11 @@ def codes(result: dict[str, Any]) -> set[str]:
     return {warning["code"] for warning in result["warnings"]}
 
 
-@pytest.fixture(params=["synthetic", "images", "video"])
-def source(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """Sources that start over, one of them a single picture."""
-    picture = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
-    if request.param == "images":
-        (tmp_path / "pictures").mkdir()
-        cv2.imwrite(str(tmp_path / "pictures" / "only.png"), picture)
-        return f"images:{tmp_path / 'pictures'}"
-    if request.param == "video":
-        path = tmp_path / "v.avi"
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
-        writer.write(picture)
-        writer.release()
-        return f"video:{path}"
-    return "synthetic"
-
-
 @pytest.mark.slow
-def test_identical_runs_against_a_server_that_keeps_pictures_never_hit(source: str, tmp_path: Path) -> None:
+def test_identical_runs_against_a_server_that_keeps_pictures_never_hit(tmp_path: Path) -> None:
     server = Caching()
     with caching(server) as url:
-        results = [run(url, "--source", source, output=tmp_path / "results") for _ in range(2)]
+        results = [run(url, output=tmp_path) for _ in range(2)]
     assert server.hits == 0
     assert len(server.seen) == 2 * 2 * 5  # runs, variants, samples with warm-ups
     for result in results:

@@ -50,7 +50,6 @@ class Hub:
     refuse_files: tuple[int, dict[str, str]] | None = None
     commit: str = COMMIT
     lfs: bool = True
-    ranges: bool = True
     listing: bytes | None = None
     port: int = 0
     requests: list[tuple[str, str, str | None, str | None]] = field(default_factory=list)
@@ -105,7 +104,7 @@ class Handler(BaseHTTPRequestHandler):
 
     def content(self, digest: str) -> None:
         ((name, data),) = [item for item in self.hub.files.items() if hashlib.sha256(item[1]).hexdigest() == digest]
-        first = int((self.headers["Range"] or "bytes=0-")[6:-1]) if self.hub.ranges else 0
+        first = int((self.headers["Range"] or "bytes=0-")[6:-1])
         rest, cuts = data[first:], self.hub.cuts.get(name, [])
         self.send_response(206 if first else 200)
         if first:
