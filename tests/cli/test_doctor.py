@@ -13,7 +13,6 @@ import pytest
 from typer.testing import CliRunner
 
 from s2a_bench.cli import app
-from s2a_bench.cli.doctor import all_checks
 from s2a_bench.machine.doctor import Finding, Level
 from s2a_bench.machine.resources import RESOURCES
 from tests.cli.program import only_run, program
@@ -25,16 +24,6 @@ ECHO = ["latency", "--engine", "echo", "--transport", "http,loopback", *SMALL]
 
 def s2a_bench(*arguments: str | Path, code: int = 0, **environ: str) -> subprocess.CompletedProcess[str]:
     return program(*arguments, code=code, env={**os.environ, **environ})
-
-
-@pytest.mark.slow
-def test_every_line_is_one_check_with_its_level() -> None:
-    *lines, counts = s2a_bench("doctor", ROS_DOMAIN_ID="7").stdout.splitlines()
-    seen = [line.split()[1] for line in lines]
-    assert seen == [code for code in all_checks() if code in seen]
-    assert {line.split()[0] for line in lines} <= {"state", "advice", "warning"}
-    assert sum(int(part.split()[0]) for part in counts.split(",")) == len(lines)
-    assert any("domain 7, loopback only" in line for line in lines)
 
 
 def test_json_is_one_object_that_the_schema_describes() -> None:

@@ -20,7 +20,7 @@ from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.warnings import before_run
 from s2a_bench.inference.smoke import Smoke
 from s2a_bench.machine import doctor, environment
-from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, LEVELS, Finding, Machine, examine, worst
+from s2a_bench.machine.doctor import BEFORE_RUN, CHECKS, Finding, Machine, examine, worst
 from s2a_bench.machine.doctor.gpu import current_power_mode
 from tests.machine.nvml import FakeNvml
 
@@ -429,12 +429,6 @@ def test_a_run_gets_the_doctors_warnings_that_concern_it(
     warnings = before_run(resolve(config).checks, make(tree))
     assert [warning.code for warning in warnings] == expected
     assert all(warning.advice for warning in warnings)
-
-
-def test_the_worst_level_wins() -> None:
-    assert [worst([Finding("x", level, "m")]) for level in LEVELS] == list(LEVELS)
-    assert worst([]) == "state"
-    assert worst([Finding("x", "warning", "m"), Finding("y", "advice", "m")]) == "warning"
 
 
 def test_a_command_that_is_missing_or_fails_says_nothing() -> None:
