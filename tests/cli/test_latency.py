@@ -27,6 +27,7 @@ from s2a_bench.types import Frame
 from tests.cli.program import command, program
 from tests.cli.program import only_run as only
 from tests.made_runs import SCHEMA
+from tests.waiting import ended, until
 
 DRAWN = ["--engine", "echo", "--quick", "--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3"]
 SMALL = [*DRAWN, "--data-only"]
@@ -252,10 +253,7 @@ def test_a_killed_harness_takes_its_servers_along_and_leaves_a_readable_run(tmp_
     process.kill()
     process.communicate(timeout=60)
     assert len(read_run(folder).samples) >= 29
-    deadline = now_ns() + 60_000_000_000
-    while any(Path(f"/proc/{pid}/cmdline").exists() for pid in servers):
-        assert now_ns() < deadline, "the servers outlived the harness"
-        Event().wait(0.02)
+    until(lambda: all(map(ended, servers)), 60)  # they do not outlive the harness
 
 
 @pytest.mark.slow

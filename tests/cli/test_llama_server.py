@@ -6,15 +6,14 @@ import json
 import os
 import signal
 import subprocess
-import time
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from s2a_bench.inference.models import tiny_dummy
-from s2a_bench.store.run import read_run
 from tests.cli.program import command, only_run, program, refused
+from tests.waiting import until
 
 pytestmark = pytest.mark.skipif(find_spec("xllamacpp") is None, reason="the wheel xllamacpp is not installed")
 
@@ -78,18 +77,14 @@ def test_connections_that_are_closed_after_each_answer(tmp_path: Path, connectio
 def test_killed_in_the_middle_is_one_line_and_keeps_the_samples(tmp_path: Path) -> None:
     long = command("latency", *SMALL, "--requests", "100000", "--transport", "http/llama-server", "--output", tmp_path)
     process = subprocess.Popen(long, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    deadline = time.monotonic() + 120
-    while not (kept := [*tmp_path.glob("*/manifest.json")]) or len(read_run(kept[0].parent).samples) < 3:
-        assert time.monotonic() < deadline
-        assert process.poll() is None, process.communicate()[1]
-        time.sleep(0.1)
-    (server,) = read_run(kept[0].parent).manifest["servers"].values()
+    until(lambda: [*tmp_path.glob("*/manifest.json")] and len(only_run(tmp_path).samples) >= 3, 120)
+    (server,) = only_run(tmp_path).manifest["servers"].values()
     os.kill(server["pid"], signal.SIGKILL)
     _, output = process.communicate(timeout=120)
     assert process.returncode == 1
     assert "killed by signal 9" in output
     assert "Traceback" not in output
-    assert read_run(kept[0].parent).manifest["state"] == "failed"
+    assert only_run(tmp_path).manifest["state"] == "failed"
 
 
 def test_a_projector_that_is_none_is_one_line(tmp_path: Path) -> None:

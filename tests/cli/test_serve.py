@@ -24,7 +24,7 @@ from s2a_bench.testing.transport import ask, wiring_of, yuyv_frame
 from s2a_bench.transport import open_client
 from s2a_bench.types import Action, Request
 from tests.cli.program import command, only_run, program, refused
-from tests.waiting import until
+from tests.waiting import ended, until
 
 ONE_BY_ONE = ("--ros-args", "-p", "feedback_interval:=0.0", "--")
 """The echo engine is faster than any model: without this its tokens share feedbacks."""
@@ -92,13 +92,6 @@ def test_limits_are_flags_and_keys_of_the_file(start: Start, tmp_path: Path) -> 
 def child_of(process: subprocess.Popen[str]) -> int:
     """The process that serves."""
     return int(Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()[0])
-
-
-def ended(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().split()[2] == "Z"
-    except OSError:
-        return True
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
