@@ -123,16 +123,6 @@ def test_yuyv_of_another_size_comes_as_bgr(tmp_path: Path, opened: Open) -> None
     np.testing.assert_array_equal(frame.data, expected)
 
 
-def test_padded_rows_are_cut(tmp_path: Path, opened: Open) -> None:
-    picture = pictures("rgb8")[0]
-    padded = np.zeros((48, 200), np.uint8)
-    padded[:, :192] = picture.reshape(48, -1)
-    message = image(picture, "rgb8", step=200)
-    message.data = padded.reshape(-1)
-    path = record(tmp_path / "bag", [("/c", IMAGE, message)])
-    np.testing.assert_array_equal(opened(path).read().data, picture)
-
-
 def test_the_first_image_topic_is_read_unless_another_is_named(tmp_path: Path, opened: Open) -> None:
     string = TYPES.types["std_msgs/msg/String"](data="x")
     path = record(

@@ -48,22 +48,6 @@ def test_the_scene_moves() -> None:
     assert np.mean(first != later) > 0.5
 
 
-def test_motion_is_smooth() -> None:
-    camera = SyntheticCamera("", 640, 480)
-    corners = np.array([camera._corner(index / 30) for index in range(400)])
-    assert np.abs(np.diff(corners, axis=0)).max() <= 4
-    assert (corners[:, 0] % 2 == 0).all()
-    assert corners.min() >= 0
-    assert np.ptp(corners, axis=0).tolist() == [160, 120]
-
-
-def test_a_higher_rate_moves_less_from_frame_to_frame() -> None:
-    slow, fast = (SyntheticCamera("", 64, 48, fps=fps) for fps in (10, 30))
-    at_slow = [slow.read() for _ in range(5)]
-    at_fast = [fast.read() for _ in range(13)]
-    np.testing.assert_array_equal(at_slow[4].data, at_fast[12].data)
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_a_vga_jpeg_weighs_what_a_photograph_does(seed: int) -> None:
     for frame in frames(4, 640, 480, step=40, seed=seed):

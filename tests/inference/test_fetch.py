@@ -318,16 +318,6 @@ def test_an_endpoint_that_is_none_is_one_line(hub: Hub, monkeypatch: pytest.Monk
     assert "HF_ENDPOINT" in refusal()
 
 
-def test_offline_by_choice_says_so(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
-    huggingface_hub.close_session()  # the library looks once for each session
-    try:
-        assert "please unset the `HF_HUB_OFFLINE` environment variable" in refusal()
-    finally:
-        huggingface_hub.close_session()
-    assert hub.requests == []
-
-
 @pytest.mark.filterwarnings("default")
 def test_a_disk_without_room_is_refused_before_the_first_byte(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1_000_000))

@@ -88,13 +88,6 @@ def test_codes_of_one_token_need_nothing_between_them(tokenize: Tokenize, skills
             assert tokenize(first + second) == tokenize(first) + tokenize(second)
 
 
-def test_codes_that_would_merge_are_not_taken() -> None:
-    def capitals_merge(text: str) -> list[int]:
-        return [hash(piece) for piece in re.findall("[A-Y]+|.", text)]
-
-    assert choose_format(many(3), 1, capitals_merge).texts == ("Z", "a", "b")
-
-
 def test_codes_that_would_merge_with_another_are_not_taken_nor_are_two_of_one_token() -> None:
     def a_and_b_merge(text: str) -> list[int]:
         return [hash(piece) for piece in re.findall("AB|.", text)]

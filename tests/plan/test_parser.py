@@ -294,15 +294,6 @@ def test_what_the_end_leaves_open_is_not_guessed(
     assert (calls(events), problems(events)) == (found, wrong)
 
 
-def test_a_word_that_may_go_on_is_not_guessed() -> None:
-    words = FORMATS["words"]
-    shorter = next(
-        text for text in words.texts if any(other != text and other.startswith(text) for other in words.texts)
-    )
-    assert problems(parse(words, [f"1. {shorter}"])) == ["incomplete"]
-    assert problems(parse(words, [f"1. {shorter}\n"])) == []
-
-
 def test_a_bad_run_of_codes_ends_at_a_blank() -> None:
     events = parse(FORMATS["1 household"], ["AB?CD E\n.F\nG"])
     assert calls(events) == ["go_to(kitchen)", "go_to(table)", "open(cup)", "open(bottle)"]

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import UnlikeRuns, UsageError
-from s2a_bench.experiments import EXPERIMENTS, Metric
+from s2a_bench.experiments import Metric
 from s2a_bench.experiments.latency import metrics as latency
 from s2a_bench.experiments.throughput import metrics as throughput
 from s2a_bench.experiments.timeline.view import cells as timeline
@@ -143,14 +143,6 @@ def test_metrics_that_only_one_run_has_can_be_named(launch: Launch, monkeypatch:
     monkeypatch.setattr(latency, "COMPARED", own)
     both = opened(*(launch(seed, n=6, manifest={**MANIFEST, "more": seed}) for seed in (1, 2)))
     assert list(both.metrics)[-2:] == ["squash1", "squash2"]
-
-
-def test_a_declared_experiment_is_compared_by_what_it_declares(launch: Launch, monkeypatch: pytest.MonkeyPatch) -> None:
-    runs = launch(1, n=6), launch(2, n=6)
-    assert opened(*runs).by is latency.COMPARED
-    monkeypatch.setattr("s2a_bench.experiments.latency.EXPERIMENT", replace(EXPERIMENTS["latency"], compared=""))
-    with pytest.raises(UsageError, match=r"runs of latency cannot be compared, only those of"):
-        opened(*runs)
 
 
 def test_cells_without_a_partner_are_listed_and_not_compared(launch: Launch) -> None:

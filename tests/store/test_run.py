@@ -357,15 +357,6 @@ def test_a_failure_before_the_first_row_keeps_a_folder_that_holds_runs(tmp_path:
     assert read_run(run.path).manifest["state"] == "failed"
 
 
-def test_intervals_are_drawn_from_the_seed_that_the_manifest_tells(tmp_path: Path) -> None:
-    with RunWriter.create(tmp_path, "latency", {"seeds": {"order": 3, "bootstrap": 7}}) as seeded:
-        pass
-    with RunWriter.create(tmp_path, "latency", {"seeds": {"order": 3}}) as unseeded:
-        pass
-    assert read_run(seeded.path).bootstrap_seed == 7
-    assert read_run(unseeded.path).bootstrap_seed == 0
-
-
 def test_rows_are_counted_in_files_of_either_kind_and_empty_tables_left_out(tmp_path: Path) -> None:
     with RunWriter.create(tmp_path, "latency", {"stages": STAGES}) as run:
         run.sample(sample("r1"))
