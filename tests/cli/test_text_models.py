@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,7 +12,6 @@ import s2a_bench as s2a
 from s2a_bench.boards.profile import load_profile
 from s2a_bench.inference.models import tiny_dummy
 from s2a_bench.store.run import StoredRun, read_run
-from s2a_bench.store.schema import PROVENANCE
 from tests.cli.program import called, program
 from tests.cli.program import only_run as only
 
@@ -48,21 +46,6 @@ def test_the_picture_travels_and_is_decoded_and_the_manifest_says_that_it_is_not
     model = blind.manifest["model"]
     assert model["pictures"] == "not seen"
     assert not {"mmproj", "mmproj_sha256", "projector"} & model.keys()
-
-
-def test_every_table_and_figure_and_the_page_say_it(blind: StoredRun, tmp_path: Path) -> None:
-    files = [*(blind.path / "tables").iterdir(), *(blind.path / "figures").glob("*.md")]
-    assert {file.suffix for file in files} == {".csv", ".md", ".tex"}
-    for file in files:
-        if file.suffix == ".csv":
-            codes = {row[PROVENANCE] for row in csv.DictReader(file.read_text().splitlines())}
-            assert codes <= {"llama/dummy/measured/pictures-not-seen"}, file
-        else:
-            assert UNSEEN.upper() in file.read_text(), file
-    page, tex = tmp_path / "page.html", tmp_path / "tex"
-    called("report", blind.path, "--output", page, "--latex", tex)
-    assert f'<span class="label">{UNSEEN}</span></h2>' in page.read_text()
-    assert all(UNSEEN.upper() in file.read_text() for file in tex.glob("*.tex"))
 
 
 @LLAMA_SERVER

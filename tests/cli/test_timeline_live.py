@@ -28,13 +28,3 @@ def test_a_live_run_prints_one_json_object_and_leaves_a_whole_folder(fast_board:
     for name in ("figures/timeline.png", "tables/timelines.md", "skills.parquet", "samples.parquet"):
         assert (folder / name).stat().st_size > 0
     assert read_run(folder).manifest["state"] == "finished"
-
-
-@pytest.mark.slow
-def test_a_real_time_run_says_what_is_emulated_and_how_late_it_was(fast_board: str, tmp_path: Path) -> None:
-    flags = ["--real-time", "--profile", fast_board, "--tokens-per-skill", "6", "--t-nom", "0.03"]
-    done = program("timeline", *flags, "--output", tmp_path / "runs")
-    text = " ".join(done.stdout.split())
-    assert "EMULATED, executed in real time: no model answered" in text
-    assert "Start jitter on the system clock: median" in text
-    assert "over 24 starts." in text

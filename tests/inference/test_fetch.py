@@ -4,7 +4,6 @@ import errno
 import hashlib
 import json
 import os
-import shutil
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -316,15 +315,6 @@ def test_an_endpoint_that_is_none_is_one_line(hub: Hub, monkeypatch: pytest.Monk
     assert hub.requests == []
     point_at(monkeypatch, endpoint)
     assert "HF_ENDPOINT" in refusal()
-
-
-@pytest.mark.filterwarnings("default")
-def test_a_disk_without_room_is_refused_before_the_first_byte(hub: Hub, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=1_000_000))
-    message = refusal()
-    assert "cannot be written (Not enough free disk space to download the file" in message
-    assert "make room, or set HF_HOME" in message
-    assert hub.gets(MODEL) == hub.gets(MMPROJ) == []
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])

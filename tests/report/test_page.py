@@ -278,19 +278,6 @@ def test_a_run_without_rows_is_told(make_run: MakeRun) -> None:
     assert chapter.content.sentences == ("The run has no rows: it ended before anything was measured.",)
 
 
-def test_a_timeline_that_was_cut_off_does_not_hide_the_others(computed: Path, tmp_path: Path) -> None:
-    cut = shutil.copytree(computed, tmp_path / "cut")
-    manifest = json.loads((cut / "manifest.json").read_text())
-    del manifest["configuration"]
-    (cut / "manifest.json").write_text(json.dumps({**manifest, "state": "running"}))
-    (cut / "skills.parquet").unlink()
-    (cut / "skills.csv").unlink()
-    chapters = read_chapters([cut, computed], against_paper=False)
-    assert len(chapters) == 2
-    assert chapters[0].caveats
-    assert not chapters[1].caveats
-
-
 def test_rows_that_their_manifest_does_not_fit_fail_alone(computed: Path, tmp_path: Path) -> None:
     odd = shutil.copytree(computed, tmp_path / "odd")
     (odd / "manifest.json").write_text(json.dumps({**read_run(odd).manifest, "boards": [{"name": "x"}]}))
