@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import jsonschema
@@ -78,18 +77,3 @@ def test_sampling_can_be_left_out(tmp_path: Path) -> None:
     assert run.manifest["resources"] == {}
     assert not list(run.path.glob("resources*"))
     assert not any("cpu" in facts for facts in run.samples["facts"])
-
-
-def test_without_cyclonedds_one_line_names_rclpy() -> None:
-    """As on aarch64, where it has no wheel."""
-    code = (
-        "import sys\nsys.modules['cyclonedds'] = None\nfrom s2a_bench.ros import open_middleware\n"
-        "from s2a_bench.errors import TransportError\n"
-        "try:\n    open_middleware('cyclonedds')\nexcept TransportError as error:\n    print(error)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    (line,) = done.stdout.splitlines()
-    assert line.startswith("middleware cyclonedds is not installed")
-    assert "rclpy" in line
-    assert "source /opt/ros/<distribution>/setup.bash" in line
-    assert "--transport" in line

@@ -112,15 +112,6 @@ def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: P
     assert "failed-samples" not in output
 
 
-def test_throughput_of_a_server_that_does_not_tell_says_only_that(tmp_path: Path) -> None:
-    reply = answering(Cloud(), RecordingHandler(["go", "_to", "x"]))
-    with serving(reply) as url:
-        done = program("throughput", *SMALL, "--url", url, "--output", tmp_path)
-    output = " ".join(done.stdout.split())
-    assert "http/as-deployed: the server does not report T_eval; decode stands in for N / T_eval." in output
-    assert "the engine's own figure" not in output
-
-
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [

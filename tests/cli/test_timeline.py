@@ -63,17 +63,6 @@ def test_the_run_folder_holds_skills_tokens_tables_figure_and_trace(whole: dict[
     assert {"tables/timelines.csv", "figures/timeline.png", "figures/timeline.pdf"} <= files
 
 
-def test_one_setting_shows_every_skill_and_says_what_is_emulated_and_assumed(tmp_path: Path) -> None:
-    done = called(
-        *("timeline", "--profile", "jetson-agx-orin", "--tokens-per-skill", "6", "--policy", "naive", "--verbose"),
-        *("--output", tmp_path),
-    )
-    assert "stall before" in done.stdout
-    assert "EMULATED in virtual time" in done.stdout
-    assert "our assumption" in done.stdout
-    assert "11.50" in done.stdout
-
-
 def test_a_given_rate_takes_the_place_of_the_profiles(tmp_path: Path) -> None:
     done = called(
         *("timeline", "--rate", "4.8,2", "--prompt-time", "0.5", "--tokens-per-skill", "6", "--n-skills", "4,8"),
