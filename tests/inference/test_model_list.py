@@ -12,9 +12,8 @@ from gguf import GGUFReader
 from typer.testing import CliRunner
 
 from s2a_bench.cli.model import app
-from s2a_bench.errors import ModelError
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.inference.model_list import ListedModel, listed, picture_tokens
+from s2a_bench.inference.model_list import ListedModel, listed
 from s2a_bench.inference.models import HUB_MODELS, load_headers, tiny_dummy
 from s2a_bench.testing.engine import ask, rgb_frame
 
@@ -132,9 +131,3 @@ def test_without_llama_cpp_the_rest_is_listed_and_the_way_out(monkeypatch: pytes
     assert row.picture_tokens is None
     assert row.error
     assert row.error.endswith("pip install '.[llama]' in the clone of s2a-bench")
-
-
-def test_an_mmproj_that_llama_cpp_cannot_load_is_one_line() -> None:
-    model, _ = tiny_dummy()
-    with pytest.raises(ModelError, match=rf"^file {model}: llama.cpp: "):
-        picture_tokens(model, model)
