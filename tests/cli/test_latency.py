@@ -4,26 +4,20 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import subprocess
 from collections import Counter
-from contextlib import ExitStack, closing
 from importlib.util import find_spec
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event
 
 import jsonschema
 import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.harness.session import INTERRUPTED
-from s2a_bench.ros import QoS, open_middleware
-from s2a_bench.ros import messages as ros
-from s2a_bench.ros.router import Router, free_endpoint
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.trace import budget
-from s2a_bench.types import Frame
 from tests.cli.program import command, program
 from tests.cli.program import only_run as only
 from tests.made_runs import SCHEMA
@@ -105,15 +99,6 @@ def test_blocks_hold_every_cell_once_in_changing_order(whole: tuple[StoredRun, s
         orders.append(tuple(ordered["cell"]))
     assert len(set(orders)) > 1
     assert len(samples) == 9 * 5
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_order_and_frames(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        run(*SMALL, "--transport", "http", "--seed", "5", output=tmp_path / name)
-    first, second = only_run(tmp_path / "a").samples, only_run(tmp_path / "b").samples
-    assert list(first["cell"]) == list(second["cell"])
-    assert list(first["frame_index"]) == list(second["frame_index"])
 
 
 def test_every_sample_closes_its_budget(whole: tuple[StoredRun, str]) -> None:
@@ -298,34 +283,6 @@ def test_a_run_is_recorded_and_its_frames_are_a_source(tmp_path: Path, mode: str
     assert [token.text for token in tokens] == list(seen["text"])
     run(*SMALL, "--source", f"bag:{bag}", "--transport", "http", output=tmp_path / "again")
     assert (only_run(tmp_path / "again").samples["error"] == "").all()
-
-
-def test_a_ros_topic_is_a_source(tmp_path: Path, from_pypi: str, stack: ExitStack) -> None:
-    import numpy as np
-
-    router = Router(free_endpoint(), host=True)
-    node = stack.enter_context(closing(open_middleware(from_pypi, node_name="/camera", router=router)))
-    publisher = node.publisher("/camera/image_raw", ros.IMAGE, QoS(1, reliable=False))
-    picture = Frame(0, 0, 64, 48, "rgb8", np.full((48, 64, 3), 99, np.uint8))
-    packed = publisher.pack(ros.image_message(picture, 1, "camera"))
-    ended = Event()
-
-    def work() -> None:
-        while not ended.wait(0.01):
-            publisher.send(packed)
-
-    thread = Thread(target=work)
-    thread.start()
-    stack.callback(thread.join)
-    stack.callback(ended.set)
-    source = f"ros:/camera/image_raw?middleware={from_pypi}&router={router.endpoint}"
-    run(*SMALL, "--source", source, "--transport", "http/binary,loopback", output=tmp_path / "results")
-    kept = only_run(tmp_path / "results")
-    assert (kept.samples["error"] == "").all()
-    assert kept.samples["rgb_source"].nunique() > 1
-    ended.set()
-    silent = run(*SMALL, "--source", source + "&wait_s=1", "--transport", "loopback", output=tmp_path / "none", code=1)
-    assert re.search(r"error: --source: ros:/camera/image_raw.*: no picture for 1 s of 1 publisher; ", silent.stderr)
 
 
 def test_a_single_picture_is_another_one_in_every_sample_and_the_same_in_every_cell(tmp_path: Path) -> None:

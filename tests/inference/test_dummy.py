@@ -8,7 +8,6 @@ from s2a_bench.errors import UsageError
 from s2a_bench.inference import dummy
 from s2a_bench.inference.dummy import write_dummy
 from s2a_bench.inference.dummy.families import FAMILIES, mmproj_tensors, model_tensors
-from s2a_bench.inference.dummy.tensors import KINDS, Kind, Tensor
 from s2a_bench.inference.dummy.vocab import FULL_UNKNOWN, make_vocab
 
 gguf = pytest.importorskip("gguf")
@@ -78,14 +77,6 @@ def test_every_merge_joins_two_tokens_into_one_that_exists(full: bool) -> None:
     for merge in vocab.merges:
         left, right = merge.split(" ")
         assert {left, right, left + right} <= known
-
-
-@pytest.mark.parametrize("kind", list(KINDS))
-def test_a_tensor_has_as_many_bytes_as_it_says_however_it_is_cut(kind: Kind, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.inference.dummy.tensors.PART_BYTES", 1000)
-    tensor = Tensor("t", (6, 512), kind)
-    assert sum(chunk.nbytes for chunk in tensor.parts(0)) == tensor.nbytes
-    assert tensor.nbytes == 6 * 512 // KINDS[kind][0] * KINDS[kind][1]
 
 
 def test_a_crash_leaves_no_half_file(tmp_path: Path) -> None:
