@@ -101,6 +101,15 @@ def test_blocks_hold_every_cell_once_in_changing_order(whole: tuple[StoredRun, s
     assert len(samples) == 9 * 5
 
 
+@pytest.mark.slow
+def test_the_same_seed_gives_the_same_order_and_frames(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        run(*SMALL, "--transport", "http", "--seed", "5", output=tmp_path / name)
+    first, second = only_run(tmp_path / "a").samples, only_run(tmp_path / "b").samples
+    assert list(first["cell"]) == list(second["cell"])
+    assert list(first["frame_index"]) == list(second["frame_index"])
+
+
 def test_every_sample_closes_its_budget(whole: tuple[StoredRun, str]) -> None:
     samples = whole[0].samples
     assert (samples["error"] == "").all()
