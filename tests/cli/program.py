@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import signal
 import subprocess
 import sys
@@ -10,11 +11,13 @@ from contextlib import nullcontext, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 
 from s2a_bench.cli import main
 from s2a_bench.machine import tuning
 from s2a_bench.store.run import StoredRun, read_run
+from tests.made_runs import SCHEMA
 
 
 def command(*arguments: str | Path) -> list[str]:
@@ -55,3 +58,10 @@ def only_run(output: Path) -> StoredRun:
     """Return the run that a command left in an output folder of its own."""
     (folder,) = output.iterdir()
     return read_run(folder)
+
+
+def printed(done: subprocess.CompletedProcess[str], schema: Any = SCHEMA) -> Any:
+    """Return the JSON object that a command printed, which keeps its schema."""
+    whole = json.loads(done.stdout)
+    jsonschema.validate(whole, schema)
+    return whole

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import jsonschema
-
-from tests.cli.program import called
-from tests.made_runs import SCHEMA
+from tests.cli.program import called, printed
 
 
 def test_json_keeps_its_schema(tmp_path: Path) -> None:
     latencies = "40,bimodal:mean_ms=80,cv=.2,pause_share=.1,pause_ratio=3"
     done = called("chunks", "--json", "--cycles", "200", "--latency", latencies, "--output", tmp_path)
-    found = json.loads(done.stdout)
-    jsonschema.validate(found, SCHEMA)
+    found = printed(done)
     assert found["command"] == "chunks"
     assert all(cell["emulated"] is True for cell in found["cells"])
     assert len(found["cells"]) == 18

@@ -9,7 +9,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from tests.cli.program import called, refused
+from tests.cli.program import called, printed, refused
 
 ROOT = Path(__file__).parent.parent.parent
 SCHEMA = json.loads((ROOT / "docs/schema/s2a-bench-compare-1.json").read_text())
@@ -42,8 +42,7 @@ def test_a_run_against_itself_has_no_change_and_says_what_cannot_be_known() -> N
     done = run(
         ECHO, ECHO, "--json", "--fail-if", "e2e.median>5%", "--fail-if", "e2e.median>60%", "--one-launch", code=4
     )
-    whole = json.loads(done.stdout)
-    jsonschema.validate(whole, SCHEMA)
+    whole = printed(done, SCHEMA)
     assert {one["change"]["value"] for one in whole["comparisons"]} == {0.0}
     assert {one["verdict"] for one in whole["comparisons"]} <= {"same", "unclear"}
     assert {one["outcome"] for one in whole["gates"] if one["gate"] == "e2e.median>60%"} == {"passed"}
@@ -89,16 +88,14 @@ def test_computed_timelines_are_the_same_to_the_last_digit_and_gated_without_lau
 ) -> None:
     gate = "--fail-if", "start_s>0%"
     done = run(timelines["even"], timelines["even"], "--metric", "all", *gate, "--json", "--output", tmp_path)
-    whole = json.loads(done.stdout)
     assert not list(tmp_path.glob("*.png"))  # nothing to draw
-    jsonschema.validate(whole, SCHEMA)
+    whole = printed(done, SCHEMA)
     assert {one["verdict"] for one in whole["comparisons"]} == {"same"}
     assert {one["p"] for one in whole["comparisons"]} == {1.0}
 
 
 def test_drawn_timelines_of_two_seeds_do_not_differ(timelines: dict[str, str]) -> None:
-    whole = json.loads(run(timelines["drawn"], timelines["drawn-too"], "--json").stdout)
-    jsonschema.validate(whole, SCHEMA)
+    whole = printed(run(timelines["drawn"], timelines["drawn-too"], "--json"), SCHEMA)
     assert not {"better", "worse"} & {one["verdict"] for one in whole["comparisons"]}
     assert "one-launch" not in {one["code"] for one in whole["warnings"]}
 

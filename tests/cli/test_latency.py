@@ -11,16 +11,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from threading import Event
 
-import jsonschema
 import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.trace import budget
-from tests.cli.program import command, program
+from tests.cli.program import command, printed, program
 from tests.cli.program import only_run as only
-from tests.made_runs import SCHEMA
 from tests.waiting import ended, until
 
 DRAWN = ["--engine", "echo", "--quick", "--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3"]
@@ -78,8 +76,7 @@ def test_a_server_whose_latencies_are_known_answers_after_them_and_is_emulated_i
     assert (kept.samples["inference_ns"] >= 20_000_000).all()
     assert {json.loads(facts)["latency_drawn_ms"] for facts in kept.samples["facts"]} == {20}
     assert set(kept.samples["provenance"]) == {"echo/none/emulated"}
-    whole = json.loads(done.stdout)
-    jsonschema.validate(whole, SCHEMA)
+    whole = printed(done)
     compared = {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]}
     assert {("http/binary", "ros/topic"), ("ros/topic", "loopback")} <= compared
     cells = whole["cells"]

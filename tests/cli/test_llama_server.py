@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -12,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from s2a_bench.inference.models import tiny_dummy
-from tests.cli.program import command, only_run, program, refused
+from tests.cli.program import command, only_run, printed, program, refused
 from tests.waiting import until
 
 pytestmark = pytest.mark.skipif(find_spec("xllamacpp") is None, reason="the wheel xllamacpp is not installed")
@@ -44,7 +43,7 @@ def test_it_is_measured_beside_our_own_cells(tmp_path: Path) -> None:
 def test_throughput_lets_it_answer_in_turn_with_our_engine(tmp_path: Path) -> None:
     few = (*SMALL, "--threads", "1", "--requests", "2", "--json", "--output", tmp_path)
     done = program("throughput", "--engine", "llama-server", *few)
-    whole = json.loads(done.stdout)
+    whole = printed(done)
     theirs, native = sorted(whole["cells"], key=lambda cell: str(cell["engine"]), reverse=True)
     assert [(cell["cell"], cell["engine"], cell["t_eval"], cell["errors"]) for cell in (native, theirs)] == [
         ("in-process", "llama", "engine", 0),

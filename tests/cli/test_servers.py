@@ -15,7 +15,7 @@ import pytest
 
 from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.types import Token
-from tests.cli.program import command, only_run, program, refused
+from tests.cli.program import command, only_run, printed, program, refused
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, LlamaServer, Ollama, answering
 
@@ -39,7 +39,7 @@ def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path) -> None:
     with serving(keyed) as url:  # type: ignore[arg-type]
         done = run("--url", url, "--dialect", "ollama", "--api-key-env", "MY_KEY", "--json", output=tmp_path)
     assert set(keys) == {f"Bearer {KEY}"}
-    result = json.loads(done.stdout)
+    result = printed(done)
     assert [(cell["variant"], cell["n"], cell["errors"]) for cell in result["cells"]] == [
         ("as-deployed", 2, 0),
         ("best-effort", 2, 0),
@@ -66,7 +66,7 @@ def test_an_unknown_server_is_asked_what_it_is(tmp_path: Path) -> None:
 
     with serving(reply) as url:  # type: ignore[arg-type]
         done = run("--url", url, "--transport", "http/as-deployed", "--json", output=tmp_path)
-    (cell,) = json.loads(done.stdout)["cells"]
+    (cell,) = printed(done)["cells"]
     assert {"ingest", "inference"} <= set(cell["stages_ms"])
 
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
 import time
 from pathlib import Path
 
-import jsonschema
 import pandas as pd
 import pytest
 
@@ -21,9 +19,8 @@ from s2a_bench.options import extra_of
 from s2a_bench.store.run import read_run
 from s2a_bench.store.sweep import Sweep, read_sweep
 from s2a_bench.transport import TRANSPORTS
-from tests.cli.program import called, program, refused
+from tests.cli.program import called, printed, program, refused
 from tests.cli.program import command as command_line
-from tests.made_runs import SCHEMA
 
 ROOT = Path(__file__).parent.parent.parent
 WAIT_S = 120
@@ -170,8 +167,7 @@ def test_a_measured_cell_runs_in_a_process_of_its_own_and_says_why_it_failed(tmp
         '[grid]\nsource = ["synthetic", "video:/no/such/file.mp4"]\n'
     )
     done = sweep(file, "--output", tmp_path / "results", "--json", code=1)
-    found = json.loads(done.stdout)
-    jsonschema.validate(found, SCHEMA)
+    found = printed(done)
     good, bad = found["cells"]
     assert (good["state"], good["error"], good["virtual"]) == ("finished", None, False)
     assert len(read_run(Path(good["run"])).samples) == 3
@@ -198,8 +194,7 @@ def test_dry_run_prints_cells_and_leaves_nothing(many: Path) -> None:
     assert [line.split("-r")[1][0] for line in lines[:CELLS]] == ["1"] * (CELLS // 2) + ["2"] * (CELLS // 2)
     assert lines[-1] == f"{CELLS} of {CELLS} cells to run, {CELLS} virtual and 0 measured"
     assert not output.exists()
-    found = json.loads(called("sweep", many, "--dry-run", "--json", "--output", output).stdout)
-    jsonschema.validate(found, SCHEMA)
+    found = printed(called("sweep", many, "--dry-run", "--json", "--output", output))
     assert {cell["state"] for cell in found["cells"]} == {"planned"}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import s2a_bench as s2a
 from s2a_bench.boards.profile import load_profile
 from s2a_bench.inference.models import tiny_dummy
 from s2a_bench.store.run import StoredRun, read_run
-from tests.cli.program import called, program
+from tests.cli.program import called, printed, program
 from tests.cli.program import only_run as only
 
 FEW = ("--size", "64x48", "--payload", "raw", "--max-tokens", "4", "--requests", "2", "--warmup", "1", "--threads", "1")
@@ -54,7 +53,7 @@ def test_llama_server_refuses_pictures_then_so_it_gets_none_and_is_compared_by_i
 ) -> None:
     cells = ("--transport", "http/as-deployed,http/llama-server", "--payload", "jpeg")
     done = program("latency", "--model", texts, *FEW, *cells, "--json", "--output", tmp_path / "latency")
-    run, printed = only(tmp_path / "latency"), json.loads(done.stdout)
+    run, shown = only(tmp_path / "latency"), printed(done)
     assert (run.samples["error"] == "").all()
     assert {cell: each.unseen for cell, each in run.origins.cells.items()} == {
         "http/as-deployed": UNSEEN,
@@ -63,9 +62,9 @@ def test_llama_server_refuses_pictures_then_so_it_gets_none_and_is_compared_by_i
     theirs = run.samples[run.samples["cell"] == "http/llama-server"]
     assert theirs["image_encode_ns"].isna().all()
     assert run.samples["prompt_n"].nunique() == 1  # both evaluate the same
-    assert not printed["ratios"]
+    assert not shown["ratios"]
     server = next(each for each in run.manifest["servers"].values() if "version" in each)
-    assert server["engine"]["pictures"] == printed["provenance"]["cells"]["http/llama-server"]["pictures"]
+    assert server["engine"]["pictures"] == shown["provenance"]["cells"]["http/llama-server"]["pictures"]
     assert not {"mmproj", "mmproj_sha256"} & server["engine"].keys()
     flags = ("--engine", "llama-server", "--model", texts, *FEW, "--payload", "jpeg")
     program("throughput", *flags, "--output", tmp_path / "throughput")
