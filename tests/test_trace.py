@@ -96,11 +96,6 @@ def test_marks_of_another_clock_are_not_mixed_in_unless_shifted() -> None:
     assert (trace.remote.token_ns, trace.remote.frame_marks) == ([60], [("network", 5)])
 
 
-def test_a_trace_that_knows_nothing_tells_that_there_is_no_frame() -> None:
-    assert Trace().to_remote() == Remote(clock_id(), [], [], -1, [], {}, {})
-    assert Remote("any").frame_stamp_ns == -1
-
-
 def test_what_a_server_says_of_itself_is_a_number_that_floats_count_exactly_or_odd() -> None:
     trace = Trace()
     trace.learn({"most": 2**53, "least": -(2**53), "half": 0.5, "n" * 63: 1})

@@ -83,14 +83,6 @@ class TestContract(FrameSourceSuite):
         return lambda width, height: Recording(where, width, height)
 
 
-class TestCompressedContract(FrameSourceSuite):
-    @pytest.fixture
-    def make_source(self, tmp_path: Path) -> MakeSource:
-        messages = [("/c", COMPRESSED_IMAGE, compressed(cv2.imencode(".png", p)[1])) for p in pictures("bgr8")]
-        where = str(record(tmp_path / "bag", messages))
-        return lambda width, height: Recording(where, width, height)
-
-
 @pytest.mark.parametrize("encoding", list(SHAPES))
 @pytest.mark.parametrize("plugin", list(StoragePlugin))
 @pytest.mark.parametrize("single", [False, True])
