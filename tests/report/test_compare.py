@@ -113,16 +113,6 @@ def test_a_comparison_of_the_same_thing_finds_nothing_in_at_least_95_of_100_repe
     assert clean >= 95
 
 
-@pytest.mark.slow
-def test_a_slowdown_of_ten_per_cent_is_found_in_every_cell(launch: Launch) -> None:
-    found = [compared(launch(repeat, n=200), launch(100 + repeat, n=200, factor=1.1)) for repeat in range(10)]
-    words = [word for each in found for word in verdicts(each)]
-    assert words.count("worse") >= 76
-    assert "better" not in words
-    sizes = [one.change.relative for each in found for one in each.comparisons]
-    assert np.mean([size for size in sizes if size is not None]) == pytest.approx(0.1, abs=0.01)
-
-
 def test_a_change_below_the_smallest_effect_is_none_however_sure_it_is(launch: Launch) -> None:
     first, second = (launch(seed, n=1000, correlation=0, factor=by) for seed, by in ((1, 1), (2, 1.025)))
     assert set(verdicts(compared(first, second, "e2e.mean"))) == {"same"}
