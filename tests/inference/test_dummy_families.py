@@ -68,39 +68,24 @@ def picture_tokens(context: Any) -> tuple[int, bool]:
     return tokens, answer
 
 
-def minicpm_v() -> int:
-    """64 queries for the picture in small, and for each slice: as many as 448x448 squares have its area."""
-    return 64 * (1 + math.ceil(WIDTH * HEIGHT / 448**2))
-
-
-def qwen2_5_vl() -> int:
-    """One token for 28x28 pixels, of sides rounded to that."""
-    return round(WIDTH / 28) * round(HEIGHT / 28)
-
-
-def smolvlm2() -> int:
-    """64 tokens for the picture in small, and for each tile of 512x512 of the picture with a longer side of 2048."""
-    return 64 * (1 + math.ceil(2048 / 512) * math.ceil(2048 * HEIGHT / WIDTH / 512))
-
-
-def gemma3() -> int:
-    """256 tokens for each picture (``mm_tokens_per_image``)."""
-    return 256
-
-
-RULES: dict[Like, Callable[[], int]] = {
-    "minicpm-v-2.6": minicpm_v,
-    "qwen2.5-vl-3b": qwen2_5_vl,
-    "smolvlm2-500m": smolvlm2,
-    "gemma3-4b": gemma3,
+RULES: dict[Like, int] = {
+    # 64 queries for the picture in small, and for each slice: as many as 448x448 squares have its area
+    "minicpm-v-2.6": 64 * (1 + math.ceil(WIDTH * HEIGHT / 448**2)),
+    # one token for 28x28 pixels, of sides rounded to that
+    "qwen2.5-vl-3b": round(WIDTH / 28) * round(HEIGHT / 28),
+    # 64 tokens for the picture in small, and for each tile of 512x512 of the picture with a longer side of 2048
+    "smolvlm2-500m": 64 * (1 + math.ceil(2048 / 512) * math.ceil(2048 * HEIGHT / WIDTH / 512)),
+    # 256 tokens for each picture (``mm_tokens_per_image``)
+    "gemma3-4b": 256,
 }
+"""Tokens of a picture in the real models."""
 
 
 @pytest.mark.parametrize("like", LIKES)
 def test_a_picture_costs_what_it_costs_in_the_real_model(like: Like, tiny: Callable[[Like], DummyFiles]) -> None:
     with loaded(tiny(like)) as (_, context):
         tokens, non_causal = picture_tokens(context)
-        assert tokens == RULES[like]()
+        assert tokens == RULES[like]
         assert non_causal == (like == "gemma3-4b")
         assert mtmd_cpp.mtmd_decode_use_mrope(context) == (like == "qwen2.5-vl-3b")
 
