@@ -256,34 +256,22 @@ def test_the_files_of_the_commit_that_was_fetched_last_are_the_model(hub: Hub) -
 
 
 @pytest.mark.parametrize(
-    ("status", "headers", "message"),
+    ("what", "status", "headers", "message"),
     [
-        (404, {"X-Error-Code": "RepoNotFound"}, "no such repository at http://127.0.0.1"),
-        (401, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
-        (403, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
-        (401, {}, "answered 401; check the name and HF_TOKEN, try later, or download"),
-        (401, {"X-Error-Message": "Invalid credentials in Authorization header"}, "answered 401 Invalid credentials"),
-        (500, {}, "answered 500; check the name and HF_TOKEN, try later"),
+        ("refuse", 404, {"X-Error-Code": "RepoNotFound"}, f"{REPOSITORY}: no such repository at http://127.0.0.1"),
+        ("refuse", 401, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
+        ("refuse", 403, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
+        ("refuse", 401, {}, "answered 401; check the name and HF_TOKEN, try later, or download"),
+        ("refuse", 401, {"X-Error-Message": "Invalid credentials in"}, "answered 401 Invalid credentials"),
+        ("refuse", 500, {}, "answered 500; check the name and HF_TOKEN, try later"),
+        ("refuse_files", 403, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
+        ("refuse_files", 403, {"X-Error-Message": "Not today."}, "answered 403 Not today; check the name and HF_TOKEN"),
     ],
 )
-def test_a_refusal_by_the_hub_is_one_line(hub: Hub, status: int, headers: dict[str, str], message: str) -> None:
-    hub.refuse = (status, headers)
-    shown = refusal()
-    assert shown.startswith(f"{REPOSITORY}: ")
-    assert message in shown
-
-
-@pytest.mark.parametrize(
-    ("headers", "message"),
-    [
-        ({"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
-        ({"X-Error-Message": "Not today."}, "answered 403 Not today; check the name and HF_TOKEN"),
-    ],
-)
-def test_files_can_be_refused_where_the_listing_is_not(
-    hub: Hub, tmp_path: Path, headers: dict[str, str], message: str
+def test_a_refusal_by_the_hub_of_all_or_of_its_files_is_one_line(
+    hub: Hub, tmp_path: Path, what: str, status: int, headers: dict[str, str], message: str
 ) -> None:
-    hub.refuse_files = (403, headers)
+    setattr(hub, what, (status, headers))
     assert message in refusal()
     assert blobs(tmp_path) == []
 
