@@ -265,56 +265,33 @@ HUMBLE = {"ROS_DISTRO": "humble", "AMENT_PREFIX_PATH": "/opt/ros/humble", "RMW_I
 OURS = f"python{sys.version_info.major}.{sys.version_info.minor}"
 
 
+NONE, ALL = {"finds": lambda _package: False}, {"finds": lambda _package: True}
+SOURCED = {"environ": HUMBLE}
+LISTENING = "  sl  local st\n  0: 0100007F:1D17 00000000:0000 0A 0\n"
+CONNECTED = "  0: 0100007F:9999 0100007F:1D17 01 0\n  1: 0100007F:1D17 0:0 01 0\nx\n"
+
+
 @pytest.mark.parametrize(
-    ("tree", "environ", "level", "says", "fix"),
+    ("code", "tree", "fields", "level", "says", "fix"),
     [
-        (
-            {"opt/ros/jazzy/setup.bash": ""},
-            {},
-            "advice",
-            "jazzy is installed and not sourced",
-            "source /opt/ros/jazzy/",
-        ),
-        ({"opt/ros/humble/lib/python3.7/site-packages/rclpy/x": ""}, HUMBLE, "warning", "for Python 3.7", "python3.7"),
-        ({}, HUMBLE, "warning", "humble is sourced without rclpy", "apt install ros-humble-rclpy"),
-        ({f"opt/ros/humble/lib/{OURS}/site-packages/rclpy/x": ""}, HUMBLE, "state", "humble, rmw_cyclonedds_cpp", ""),
-        ({f"opt/ros/humble/local/lib/{OURS}/dist-packages/rclpy/x": ""}, HUMBLE, "state", "humble, rmw", ""),
+        ("ros", {"opt/ros/jazzy/setup.bash": ""}, {}, "advice", "jazzy is installed and not sourced", "source /opt/"),
+        ("ros", {"opt/ros/humble/lib/python3.7/site-packages/rclpy/x": ""}, SOURCED, "warning", "3.7", "python3.7"),
+        ("ros", {}, SOURCED, "warning", "humble is sourced without rclpy", "apt install ros-humble-rclpy"),
+        ("ros", {f"opt/ros/humble/lib/{OURS}/site-packages/rclpy/x": ""}, SOURCED, "state", "humble, rmw_cyclone", ""),
+        ("ros", {f"opt/ros/humble/local/lib/{OURS}/dist-packages/rclpy/x": ""}, SOURCED, "state", "humble, rmw", ""),
+        ("middleware", JETSON, NONE, "error", "not installed", "or the rclpy of a ROS 2 (source /opt/ros/"),
+        ("zenoh", JETSON, NONE, "state", "not installed", "pip install '.[zenoh]' in the clone of s2a-bench"),
+        ("zenoh", {}, ALL, "state", "no router listens at tcp/127.0.0.1:7447", ""),
+        ("zenoh", {"proc/net/tcp": LISTENING}, ALL, "state", "a router listens at tcp/", ""),
+        ("zenoh", {"proc/net/tcp6": "  sl  local st\n  0: 0:1D17 0:0 0A 0\n"}, ALL, "state", "a router listens", ""),
+        ("zenoh", {"proc/net/tcp": CONNECTED}, ALL, "state", "no router", ""),
     ],
 )
-def test_ros_is_looked_up(
-    make: Make, tree: dict[str, str], environ: dict[str, str], level: str, says: str, fix: str
+def test_ros_its_middleware_and_zenohs_router_are_looked_for(
+    make: Make, code: str, tree: dict[str, str], fields: dict[str, Any], level: str, says: str, fix: str
 ) -> None:
-    finding = see(make(tree, environ=environ), "ros")
-    assert finding.level == level
-    assert says in finding.message
-    assert fix in finding.fix
-
-
-@pytest.mark.parametrize(
-    ("code", "level", "fix"),
-    [
-        ("middleware", "error", "or the rclpy of a ROS 2 (source /opt/ros/"),
-        ("zenoh", "state", "pip install '.[zenoh]' in the clone of s2a-bench"),
-    ],
-)
-def test_a_missing_package_is_told_with_the_way_to_it(make: Make, code: str, level: str, fix: str) -> None:
-    finding = see(make(JETSON, finds=lambda _package: False), code)
-    assert (finding.level, "not installed" in finding.message, fix in finding.fix) == (level, True, True)
-
-
-@pytest.mark.parametrize(
-    ("tree", "says"),
-    [
-        ({}, "no router listens at tcp/127.0.0.1:7447"),
-        ({"proc/net/tcp": "  sl  local st\n  0: 0100007F:1D17 00000000:0000 0A 0\n"}, "a router listens at tcp/"),
-        ({"proc/net/tcp6": "  sl  local st\n  0: 0:1D17 0:0000 0A 0\n"}, "a router listens at tcp/"),
-        ({"proc/net/tcp": "  0: 0100007F:9999 0100007F:1D17 01 0\n  1: 0100007F:1D17 0:0 01 0\nx\n"}, "no router"),
-    ],
-)
-def test_zenohs_router_is_looked_for(make: Make, tree: dict[str, str], says: str) -> None:
-    finding = see(make(tree, finds=lambda _package: True), "zenoh")
-    assert finding.level == "state"
-    assert finding.message.startswith(says)
+    finding = see(make(tree, **fields), code)
+    assert (finding.level, says in finding.message, fix in finding.fix) == (level, True, True), finding
 
 
 def test_cameras_are_listed_and_closed_ones_warned_of(make: Make) -> None:
