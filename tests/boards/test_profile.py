@@ -155,12 +155,6 @@ def test_a_path_is_a_path_wherever_it_is(elsewhere: Path) -> None:
         load_profile("deep/mine")
 
 
-@pytest.mark.usefixtures("elsewhere")
-def test_an_unknown_name_lists_the_known_ones() -> None:
-    with pytest.raises(UsageError, match="`profile`: 'orin' is none of jetson-agx-orin, jetson-orin-nano, rtx-4080"):
-        load_profile("orin")
-
-
 SCALARS = st.one_of(
     st.text(st.characters(exclude_categories=("Cs",))),
     st.booleans(),

@@ -24,13 +24,6 @@ def paths(config: EngineConfig) -> tuple[Path, Path]:
     return config.model, config.mmproj
 
 
-def test_no_model_means_the_tiny_dummy_made_once(tiny: EngineConfig) -> None:
-    model, mmproj = resolve(EngineConfig())
-    assert (model, mmproj) == paths(tiny)
-    before = model.stat().st_mtime_ns
-    assert resolve(EngineConfig())[0].stat().st_mtime_ns == before
-
-
 def _race(folder: str, barrier: "multiprocessing.synchronize.Barrier") -> None:
     os.environ["S2A_BENCH_CACHE"] = folder
     barrier.wait(30)

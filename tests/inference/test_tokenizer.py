@@ -41,10 +41,6 @@ def test_a_mark_in_the_text_is_not_special(tokenizer: Tokenizer) -> None:
     assert len(tokenizer("<image>")) == 7
 
 
-def test_no_model_means_the_tiny_dummy(tokenizer: Tokenizer) -> None:
-    assert Tokenizer()("place(cup, table)") == tokenizer("place(cup, table)")
-
-
 def test_what_is_no_language_model_is_told(tiny: EngineConfig, tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"`model` /no/such.gguf: "):
         Tokenizer(Path("/no/such.gguf"))
