@@ -20,7 +20,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.lanes import page_lanes
@@ -246,12 +245,6 @@ def test_cells_of_one_name_are_not_made_one(tmp_path: Path) -> None:
     assert first.name != second.name
 
 
-def test_timelines_of_other_settings_are_kept_apart(tmp_path: Path) -> None:
-    same: dict[str, Any] = {"profiles": ("rtx-4080",), "tokens_per_skill": (6,), "policies": ("naive",)}
-    runs = [({"t-max": most}, timeline(tmp_path, t_max=most, **same)) for most in (1.0, 2.0)]
-    assert len(read_chapters([sweep_of(tmp_path / "sweeps", runs)])) == 3
-
-
 @pytest.mark.slow
 def test_measured_cells_stand_side_by_side_and_are_not_pooled(tmp_path: Path, make_run: MakeRun) -> None:
     runs = [({"runs": n}, make_run(n=n).path) for n in range(2, MOST_CHAPTERS + 4)]
@@ -284,19 +277,6 @@ def test_an_unfinished_run_is_shown_and_told(make_run: MakeRun, state: str, erro
 def test_a_run_without_rows_is_told(make_run: MakeRun) -> None:
     (chapter,) = read_chapters([make_run({}).path])
     assert chapter.content.sentences == ("The run has no rows: it ended before anything was measured.",)
-
-
-def test_a_timeline_that_was_cut_off_does_not_hide_the_others(computed: Path, tmp_path: Path) -> None:
-    cut = shutil.copytree(computed, tmp_path / "cut")
-    manifest = json.loads((cut / "manifest.json").read_text())
-    del manifest["configuration"]
-    (cut / "manifest.json").write_text(json.dumps({**manifest, "state": "running"}))
-    (cut / "skills.parquet").unlink()
-    (cut / "skills.csv").unlink()
-    chapters = read_chapters([cut, computed])
-    assert len(chapters) == 2
-    assert chapters[0].caveats
-    assert not chapters[1].caveats
 
 
 def test_rows_that_their_manifest_does_not_fit_fail_alone(computed: Path, tmp_path: Path) -> None:
@@ -342,19 +322,6 @@ def test_every_verdict_has_its_evidence_on_the_page(computed: Path) -> None:
     assert "Run: s2a-bench latency" in page.text
     for verdict in ("supported", "contradicted", "undecided"):
         assert f'class="claim {verdict}"' in text
-
-
-def test_what_a_report_wrote_may_be_replaced_and_nothing_else(tmp_path: Path, computed: Path) -> None:
-    page, other = tmp_path / "page.html", tmp_path / "mine.html"
-    report = make_report(read_chapters([computed]))
-    for _ in range(2):
-        write_report(report, ReportConfig(runs=[computed], output=page, markdown=tmp_path / "page.md"))
-    other.write_text("<html>mine</html>")
-    wrong = {"output": other, "markdown": other, "latex": other, "csv": other}
-    for field, path in (*wrong.items(), ("output", tmp_path)):
-        with pytest.raises(UsageError, match=f"`{field}`"):
-            ReportConfig(runs=[computed], **{field: path})
-    assert other.read_text() == "<html>mine</html>"
 
 
 def test_files_lie_in_a_folder_a_run(tmp_path: Path, computed: Path, make_run: MakeRun) -> None:

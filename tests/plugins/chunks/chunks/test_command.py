@@ -2,47 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import jsonschema
-
-from s2a_bench.store.run import read_run
-from tests.cli.program import called
-
-ROOT = Path(__file__).parents[4]
+from tests.cli.program import called, printed
 
 
-def test_json_keeps_its_schema_and_has_the_keys_of_a_cell(tmp_path: Path) -> None:
+def test_json_keeps_its_schema(tmp_path: Path) -> None:
     latencies = "40,bimodal:mean_ms=80,cv=.2,pause_share=.1,pause_ratio=3"
     done = called("chunks", "--json", "--cycles", "200", "--latency", latencies, "--output", tmp_path)
-    found = json.loads(done.stdout)
-    jsonschema.validate(found, json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text()))
+    found = printed(done)
     assert found["command"] == "chunks"
-    wanted = (
-        "mode latency_s delta_t_s horizon execution_horizon ticks stall_ticks p_stall_cycle age_ticks_mean rounding"
-    )
-    for cell in found["cells"]:
-        assert {*wanted.split()} <= cell.keys()
-        assert cell["emulated"] is True
+    assert all(cell["emulated"] is True for cell in found["cells"])
     assert len(found["cells"]) == 18
     assert any("trigger" in cell for cell in found["cells"])
     for cell in found["provenance"]["cells"].values():
         assert (cell["tokens"], cell["clock"]) == ("emulated", "virtual")
-
-
-def test_the_tables_say_the_convention_and_that_nothing_was_measured(tmp_path: Path) -> None:
-    text = called("chunks", "--cycles", "200", "--rounding", "ceil", "--output", tmp_path).stdout
-    assert text.count("d by ceil") == 1
-    assert "d = ceil(L / Delta t)" in text
-    assert "EMULATED" in text
-    assert "virtual time" in text
-    assert "more tables (actions, delays, smoothness): " in text
-    (folder,) = tmp_path.iterdir()
-    for name in ("chunks", "actions", "delays"):
-        for suffix in ("md", "tex"):
-            written = (folder / "tables" / f"{name}.{suffix}").read_text()
-            assert "ceil" in written
-            assert "rovenance: " in written
-    assert len((folder / "tables" / "chunks.csv").read_text().splitlines()) == 1 + 9
-    assert read_run(folder).manifest["configuration"]["rounding"] == "ceil"
