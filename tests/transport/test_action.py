@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, ServerDied, TransportError
+from s2a_bench.errors import MessagesLost, RequestFailed, ServerDied, TransportError
 from s2a_bench.ros import ActionClient, ActionServer, Rejected, Result, ServerGoal, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import ServedAction, Status
@@ -152,6 +152,14 @@ def test_a_refusal_fails_the_request(
     node(answer=answer)
     with closing(open_client(foreign)) as client, pytest.raises(RequestFailed, match=message):
         ask(client, Request("a", "plan"))
+
+
+def test_feedback_that_does_not_arrive_is_a_message_lost(dds_domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ServedAction, "publish_feedback", lambda *_: None)
+    with closing(connector(wiring_of("ros/action", "/test_lost", domain_id=dds_domain))) as connecting:
+        client = next(connecting)(RecordingHandler(["go", "on"]))
+        with pytest.raises(MessagesLost, match="of the answer's 4 letters 0 came as feedback"):
+            ask(client, Request("a", "plan"))
 
 
 def test_a_node_that_leaves_is_noticed(foreign: Wiring[Any], dds_domain: int) -> None:
