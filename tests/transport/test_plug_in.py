@@ -10,18 +10,15 @@ from typing import Any, ClassVar
 import pytest
 
 from s2a_bench import registry
-from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
-from s2a_bench.experiments.latency.metrics import latency_json
 from s2a_bench.experiments.latency.run import run_latency
-from s2a_bench.experiments.latency.view import stage_table, summary_table
+from s2a_bench.experiments.latency.view import stage_table
 from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.requests import cells_of
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import option
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
-from s2a_bench.testing.transport import TransportSuite
 from s2a_bench.trace import Trace
 from s2a_bench.transport import (
     SERVER,
@@ -88,32 +85,12 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     forget()
 
 
-@pytest.mark.usefixtures("toy")
-class TestToy(TransportSuite):
-    name = "toy?greeting=servus"
-
-
 @pytest.fixture
 def run(toy: None, tmp_path: Path) -> StoredRun:  # noqa: ARG001 - what is measured
     names = ("loopback", "toy", "toy?greeting=servus", "toy?number=2")
     few: dict[str, Any] = {"requests": 3, "warmup": 1, "max_tokens": 3, "sample_resources_hz": 0}
     config = LatencyConfig(transports=names, payload=("raw",), engine=EngineConfig(name="echo"), size=(64, 48), **few)
     return read_run(run_latency(config, tmp_path, NullProgress()))
-
-
-def test_a_run_measures_it_and_everything_shows_it(run: StoredRun) -> None:
-    names = ["toy", "toy?greeting=servus", "toy?number=2", "loopback"]
-    assert (run.samples["error"] == "").all()
-    assert run.samples["greet_ns"].notna().sum() == 12
-    assert run.stages["greet"] == "pack"
-    assert "pytest" in run.manifest["environment"]["packages"]
-    assert [cell.name for cell in cells_of(run)] == names
-    assert ("pack", "greet") in {row[:2] for row in stage_table(run).rows}
-    assert summary_table(run).header[-1] == "ratio to loopback"
-    whole = latency_json(run)
-    assert "greet" in whole["cells"][0]["stages_ms"]
-    assert {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]} == {(name, "loopback") for name in names[:3]}
-    assert [draw() for draw in latency_figures(run).values()]
 
 
 def test_its_folder_reads_where_the_package_is_not(run: StoredRun, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,9 +114,3 @@ def test_a_stage_that_nobody_declares_makes_the_sample_an_error(
     )
     with pytest.raises(Exception, match="toy does not declare the stage greet"):
         run_latency(config, tmp_path, NullProgress())
-
-
-@pytest.mark.usefixtures("toy")
-def test_its_options_are_checked_like_any_other() -> None:
-    with pytest.raises(UsageError, match="toy has no option 'colour'; it has payload, number, greeting"):
-        LatencyConfig(transports="toy?colour=red")

@@ -6,7 +6,6 @@ import os
 import socket
 import stat
 import struct
-import tracemalloc
 from collections.abc import Generator, Iterator
 from contextlib import closing, suppress
 from dataclasses import replace
@@ -32,7 +31,7 @@ from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.shm import shared_memory, unix_socket
 from s2a_bench.transport.shm.memory import ANSWER_BYTES, HELLO, MAGIC, PLACE, STEP_BYTES, SharedMemory, accept, offer
 from s2a_bench.transport.shm.pieces import packed, unpacked
-from s2a_bench.transport.shm.server import HEADER_BYTES, Writer, request_at, size_of
+from s2a_bench.transport.shm.server import Writer
 from s2a_bench.types import Action, Frame, Request, Token
 from tests.hostile.asking import usage
 from tests.waiting import until
@@ -169,13 +168,6 @@ def test_a_client_that_is_killed_in_mid_answer_leaves_nothing() -> None:
             peer.close()
 
 
-def test_nothing_of_the_memory_has_a_name_while_it_is_used(connect: Connect) -> None:
-    client = connect(RecordingHandler(["x"]))
-    ask(client, Request("a", "plan", (yuyv_frame(),)))
-    assert sum("memfd:s2a_bench" in name for name in memory_of(os.getpid())) >= 4  # two, seen from both sides
-    assert named_memory(os.getpid()) == []
-
-
 def test_servers_that_start_at_once_do_not_take_each_other_for_dead() -> None:
     number = 12
     barrier = Barrier(number)
@@ -235,15 +227,6 @@ def test_a_socket_of_ones_own_is_used_once_and_never_takes_the_place_of_a_file(t
     assert path.read_text() == "mine"
     with pytest.raises(PortInUse, match="nowhere"):
         open_server(wiring_of("shm", str(tmp_path / "nowhere" / "a.sock")), RecordingHandler([]))
-
-
-def test_the_name_of_a_socket_may_be_nearly_as_long_as_the_kernel_takes(tmp_path: Path) -> None:
-    folder = tmp_path / ("d" * (95 - len(str(tmp_path))))
-    folder.mkdir()
-    path = folder / "robot.sock"
-    assert len(str(path)) == 107
-    listener, _ = unix_socket.listen(str(path))
-    listener.close()
 
 
 def test_another_version_of_us_is_told_as_such() -> None:
@@ -325,24 +308,6 @@ def _as_nobody(path: str) -> int:
         return 1
     data, files, _, _ = socket.recv_fds(link, 256, 4)
     return 2 if data.startswith(b"refused:") and not files and not link.recv(1) else 0
-
-
-@pytest.mark.parametrize("unit", [b"{}", b"[[]]", b'{"":[]}', b'"a"'])
-def test_a_header_of_many_values_is_refused_before_it_takes_memory(unit: bytes) -> None:
-    text = b"[" + b",".join([unit] * (HEADER_BYTES // (len(unit) + 1) - 1)) + b"]"
-    file = os.memfd_create("header")
-    os.ftruncate(file, len(text))
-    memory = SharedMemory(file, len(text), writes=True)
-    os.close(file)
-    memory.map[:] = text
-    tracemalloc.start()
-    try:
-        assert size_of(memory, 0, len(text)) == len(text)
-        with pytest.raises(RequestFailed, match="more than 20000 values"):
-            request_at(memory, 0, len(text), Limits(), Trace())
-        assert len(text) < tracemalloc.get_traced_memory()[1] < 8 * len(text)
-    finally:
-        tracemalloc.stop()
 
 
 def test_memory_above_the_limit_is_refused() -> None:

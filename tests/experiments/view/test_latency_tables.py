@@ -254,24 +254,6 @@ def test_a_cell_in_which_everything_failed_is_in_the_summary(
     assert summary_table(run).rows == [("ros/topic", "0", "1", NONE, NONE, NONE, NONE)]
 
 
-def test_the_files_are_written_below_the_run(make_run: MakeRun) -> None:
-    run = make_run(n=3)
-    write_shown(run, replace(EXPERIMENT.show(run), figures={}))
-    paths = [*(run.path / "tables").iterdir()]
-    assert sorted(path.name for path in paths) == [
-        "ratios.csv",
-        "stages.csv",
-        "stages.md",
-        "stages.tex",
-        "summary-e2e.md",
-        "summary-e2e.tex",
-        "summary.csv",
-        "summary.md",
-        "summary.tex",
-    ]
-    assert all(path.parent == run.path / "tables" and path.stat().st_size > 50 for path in paths)
-
-
 @pytest.mark.parametrize("folder", ["tables", "figures"])
 def test_a_folder_that_cannot_be_written_is_named(make_run: MakeRun, folder: str) -> None:
     run = make_run(n=1)
