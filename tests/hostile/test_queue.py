@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from threading import Event
 from typing import Any
@@ -14,10 +14,10 @@ import httpx
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import Busy, EngineError
-from s2a_bench.testing.transport import served, wiring_of
+from s2a_bench.errors import BadRequest, Busy, EngineError, RequestFailed
+from s2a_bench.testing.transport import ask, served, wiring_of
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler
+from s2a_bench.transport import Handler, open_client
 from s2a_bench.transport.http.native import PATHS
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.serving import Queued, Turn, Turns
@@ -156,3 +156,27 @@ def test_health_says_when_the_engine_is_stuck(path: str, monkeypatch: pytest.Mon
         gate.go.set()
         connection.close()
         until(lambda: httpx.get(url + "/health").status_code == 200)
+
+
+@paths
+def test_an_answer_that_is_not_streamed_is_504_at_its_deadline(path: str) -> None:
+    gate = Gate()
+    gate.go.set()
+    with serving(gate, SERVERS[path], Limits(answer_s=1.0)) as url:
+        answer = httpx.post(url + path, json=body("for ever", stream=False, max_tokens=60_000), timeout=30)
+    assert answer.status_code == 504
+    assert "1 s after its arrival the request is still being answered" in answer.json()["error"]["message"]
+
+
+@pytest.mark.parametrize("name", [*(f"http/{variant}" for variant in PATHS), "ros/topic", "ros/action"])
+def test_a_grammar_that_is_none_is_the_client_s_mistake(name: str) -> None:
+    def answer(request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        if request.grammar:
+            raise BadRequest("the grammar is not valid GBNF")
+        yield Token(0, "a")
+
+    says = "answered 400: .*not valid GBNF" if name.startswith("http") else "not valid GBNF"
+    with serving(answer, name) as address, closing(open_client(wiring_of(name, address))) as client:
+        with pytest.raises(RequestFailed, match=says):
+            ask(client, Request("a", "a", grammar="x"))
+        assert len(ask(client, Request("b", "a", max_tokens=2))[0]) == 1

@@ -8,10 +8,8 @@ from contextlib import ExitStack
 from threading import Event, active_count
 from typing import Any
 
-import numpy as np
 import pytest
 
-from s2a_bench.errors import S2AError
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Result, open_middleware
@@ -19,17 +17,15 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.ros.service import READER_QOS
-from s2a_bench.testing.transport import RecordingHandler, ask, wiring_of, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, wiring_of
 from s2a_bench.trace import Trace
 from s2a_bench.transport import open_client
-from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.transport.ros.camera import picture_of
+from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.ros.joining import join
 from s2a_bench.transport.ros.wire import TOKEN_QOS, request_message, token_message
 from s2a_bench.transport.serving import Queued
 from s2a_bench.types import Request, Token
 from tests.hostile.test_queue import Gate, serving
-from tests.hostile.wires.http import png_of_zeros
 from tests.waiting import until
 
 NAMESPACE = "/s2a_bench"
@@ -119,35 +115,6 @@ def test_the_name_of_a_request_on_the_topic_cannot_be_guessed(stranger: Middlewa
     assert names[0] != names[1]
     assert all(len(name) == len("cell-1#") + 32 for name in names)
     assert [request.id for request in handler.requests] == ["cell-1", "cell-1"]
-
-
-def image(width: int, height: int, step: int, size: int, encoding: str = "bgr8") -> Any:
-    made = ros.image_message(yuyv_frame(), 0, "c")
-    made.width, made.height, made.step, made.encoding, made.data = width, height, step, encoding, np.zeros(size, "u1")
-    return made
-
-
-IMPOSSIBLE = [
-    image(0, 0, 0, 0),
-    image(64, 0, 192, 0),
-    image(2**32 - 1, 2**32 - 1, 2**32 - 1, 100),
-    image(50_000_001, 1, 150_000_003, 100),
-    image(64, 48, 192, 64 * 48 * 3 - 1),
-    image(64, 48, 191, 64 * 48 * 3),
-    image(64, 48, 2**32 - 1, 64 * 48 * 3),
-    image(64, 48, 0, 64 * 48 * 3),
-    image(64, 48, 192, 64 * 48 * 3, "16UC1"),
-    image(63, 48, 126, 63 * 48 * 2, "yuv422_yuy2"),
-    ros.compressed_image_message(np.frombuffer(png_of_zeros(30_000, 2000), np.uint8), 0, "c", "png"),
-    ros.compressed_image_message(np.frombuffer(b"\xff\xd8" + bytes(100), np.uint8), 0, "c"),
-    ros.compressed_image_message(np.zeros(0, np.uint8), 0, "c"),
-]
-
-
-@pytest.mark.parametrize("message", IMPOSSIBLE)
-def test_a_picture_that_cannot_be_is_refused_before_it_is_converted(message: Any) -> None:
-    with pytest.raises(S2AError):
-        picture_of(message, Trace(), LIMITS)
 
 
 def test_a_goal_has_no_more_tokens_than_the_limit(goals: Callable[[], Any]) -> None:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +31,6 @@ from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import TextTable
 
-MakeRun: TypeAlias = Callable[..., StoredRun]
 BOARD = {"name": "orin", "title": "Orin", "origin": "paper", "prompt_s": 0.5, "prompt_origin": "assumed"}
 STARTS = {"naive": lambda t, _d: t[0], "wait-then-act": lambda t, _d: t[-1], "stream-to-act": safe_start}
 

@@ -90,25 +90,16 @@ def _clients(path: str) -> Iterator[Case[Attack]]:
     yield Case("64 MiB of spaces", sends_made(lambda: [post(b" " * 64 * MIB, path=path)]), REFUSED)
     lines = [b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)]
     yield Case("1 MiB of headers", sends(head(path=path)[:-2], *lines))
-    yield Case("one header of 1 MiB", sends(head(path=path)[:-2] + b"x: " + b"a" * MIB + b"\r\n\r\n"))
     yield Case("16,000 empty headers", sends(head(path=path)[:-2] + b"a:\r\n" * 16_000 + b"\r\n"), "^HTTP/1.1 431 ")
-    yield Case("length of 5,000 digits", sends(head(f"Content-Length: {'9' * 5000}", path=path)), REFUSED)
-    yield Case("two lengths", sends(head("Content-Length: 3", "Content-Length: 5", path=path) + b"{}{}{}"), REFUSED)
     both = head("Content-Length: 3", CHUNKS, path=path)
     yield Case("length and chunks", sends(both + b"0\r\n\r\nGET / HTTP/1.1\r\n\r\n"))
-    yield Case("HTTP/9.9", sends(b"POST / HTTP/9.9\r\n\r\n"), REFUSED)
     yield Case("TLS", sends(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + NOISE[:500]))
-    yield Case("upgrade to a WebSocket", sends(head("Upgrade: websocket", "Connection: upgrade", path="/", length=0)))
     many = chat(path=path).replace(b"Connection: close\r\n", b"") * 200
     yield Case("200 requests in one piece", sends(many, chat(path=path)))
-    yield Case("no JSON", sends(post(b"{]", path=path)), REFUSED)
-    yield Case("no UTF-8", sends(post(b'{"messages": [{"role": "user", "content": "\xff\xfe"}]}', path=path)), REFUSED)
     yield Case("deep JSON", sends(post(b"[" * MIB, path=path)), REFUSED)
     for size in (4, 57):
         lists = sends_made(partial(_lists, size, path), seconds=10)
         yield Case(f"{size} MiB of lists", lists, REFUSED + "20000 values", mib=512)
-    for text in ("5", "[5]", "[[]]", '[{"role": 5}]', '{"a": 1}', "null", '[{"role": "user", "content": [[]]}]'):
-        yield Case(f"messages {text[:20]}", sends(post(f'{{"messages": {text}}}'.encode(), path=path)), REFUSED)
     yield Case("picture of 900 million pixels", sends_made(lambda: bomb_uri(path)), REFUSED + "30000x30000")
     yield Case("bad grammar", sends(chat(fields=f'"grammar": {parentheses(20_000)}', path=path)))
     goes_on = chat(fields=GOES_ON, path=path)
