@@ -75,18 +75,8 @@ def test_a_run_keeps_a_row_for_each_and_ends_with_the_reason(name: str, tmp_path
     case = CASES[name]
     small = ["--transport", "http/as-deployed", "--size", "64x48", "--requests", "2", "--warmup", "0"]
     with serving(lambda _: case.pieces()) as url:
-        options = [
-            *small,
-            "--max-tokens",
-            "8",
-            "--url",
-            url,
-            "--dialect",
-            DIALECT,
-            "--deadline",
-            str(case.deadline_s or 60),
-        ]
-        command = [sys.executable, "-m", "s2a_bench", "latency", *options, "--output", str(tmp_path)]
+        options = ["--max-tokens", "8", "--url", url, "--dialect", DIALECT, "--deadline", str(case.deadline_s or 60)]
+        command = [sys.executable, "-m", "s2a_bench", "latency", *small, *options, "--output", str(tmp_path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr
