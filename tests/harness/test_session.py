@@ -90,6 +90,19 @@ def test_the_link_to_a_server_of_another_machine_is_unknown(
         assert servers.origin(cell).link == link
 
 
+def test_a_stage_that_its_transport_does_not_declare_makes_the_sample_an_error() -> None:
+    class Greeting:
+        def request(self, _: Request, trace: Trace) -> Iterator[Token]:
+            trace.mark("greet")
+            yield Token(0, "x")
+
+    source = open_source("synthetic", 64, 48, fps=30.0, seed=0)
+    feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request
+    measured = Session(one_pipeline("loopback"), Greeting(), feed, plan).measure(Place(0, 0, warmup=False))
+    source.close()
+    assert measured.sample.error == "TransportError: loopback does not declare the stage greet"
+
+
 STAGES = {**COMMON, "json_pack": "pack"}
 HERE, ELSEWHERE = clock_id(), "another machine"
 

@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import BadRequest, Busy, EngineError, RequestFailed
+from s2a_bench.errors import BadRequest, EngineError, RequestFailed
 from s2a_bench.testing.transport import ask, served, wiring_of
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, open_client
@@ -60,21 +60,6 @@ class Gate:
 
 
 class TestTurns:
-    def test_they_come_in_the_order_of_arrival(self) -> None:
-        turns = Turns()
-        queue = [turns.join() for _ in range(5)]
-        for index, turn in enumerate(queue):
-            assert [other.has_started for other in queue[index:]] == [True] + [False] * (4 - index)
-            turn.leave()
-
-    def test_whoever_is_one_too_many_is_refused_at_once(self) -> None:
-        turns = Turns(Limits(waiting=2))
-        held = [turns.join() for _ in range(3)]
-        with pytest.raises(Busy, match="2 requests are waiting"):
-            turns.join()
-        held[1].leave()
-        turns.join()
-
     def test_leaving_twice_lets_one_run_not_two(self) -> None:
         turns = Turns()
         first, second, third = (turns.join() for _ in range(3))
@@ -82,14 +67,6 @@ class TestTurns:
         first.leave()
         assert second.has_started
         assert not third.has_started
-
-    def test_whoever_waits_and_goes_is_passed_over(self) -> None:
-        turns = Turns()
-        first, second, third = (turns.join() for _ in range(3))
-        assert not second.wait(lambda: True)
-        second.leave()
-        first.leave()
-        assert third.has_started
 
     def test_silence_is_that_of_the_running_answer(self) -> None:
         turns = Turns()
