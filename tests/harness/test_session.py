@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -32,6 +33,13 @@ from tests.servers.sockets import head, serving
 from tests.servers.speakers import Cloud
 
 
+def session_of(client: Any, cell: Any = "http/as-deployed", **more: Any) -> Session:
+    """Return a session of a client whose pictures are made up."""
+    cell = one_pipeline(cell) if isinstance(cell, str) else cell
+    feed = RequestFeed(open_source("synthetic", 64, 48, fps=30.0, seed=0), preencoded=False)
+    return Session(cell, client, feed, **{"request": resolve(RequestsConfig()).request, **more})
+
+
 @pytest.mark.parametrize(("retry_after_s", "waited_s"), [(0.0, 0), (1.5, 1.5), (60.0, 60), (3600.0, 60)])
 def test_the_wait_is_what_was_asked_up_to_a_minute(retry_after_s: float, waited_s: float) -> None:
     clock, lines = VirtualClock(5), []
@@ -53,11 +61,8 @@ def test_a_refused_sample_is_one_row_with_its_error_and_is_not_sent_again(
     with serving(busy) as url:
         cell = one_pipeline("http/as-deployed", url=url, dialect="openai", served_model="m")
         client = open_client(cell.wiring(url))
-        source = open_source("synthetic", 64, 48, fps=30.0, seed=0)
-        session = Session(cell, client, RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request)
-        measured = session.measure(Place(0, 0, warmup=False))
+        measured = session_of(client, cell).measure(Place(0, 0, warmup=False))
         client.close()
-        source.close()
     assert measured.retry_after_s == retry_after_s
     assert "answered 429: slow down" in measured.sample.error
     assert (measured.fatal, measured.tokens, len(requests)) == (None, [], 1)
@@ -96,10 +101,7 @@ def test_a_stage_that_its_transport_does_not_declare_makes_the_sample_an_error()
             trace.mark("greet")
             yield Token(0, "x")
 
-    source = open_source("synthetic", 64, 48, fps=30.0, seed=0)
-    feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request
-    measured = Session(one_pipeline("loopback"), Greeting(), feed, plan).measure(Place(0, 0, warmup=False))
-    source.close()
+    measured = session_of(Greeting(), "loopback").measure(Place(0, 0, warmup=False))
     assert measured.sample.error == "TransportError: loopback does not declare the stage greet"
 
 
@@ -124,11 +126,8 @@ def test_the_clock_of_an_answer_tells_whether_the_link_leaves_this_machine(befor
             yield Token(0, "x")
             trace.receive(Remote(clock, provenance=Provenance("echo", link="real").to_dict()))
 
-    source = open_source("synthetic", 64, 48, fps=30.0, seed=0)
-    feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request
-    session = Session(one_pipeline("loopback"), Answering(), feed, plan, origin=Provenance(link=before))
+    session = session_of(Answering(), "loopback", origin=Provenance(link=before))
     session.measure(Place(0, 0, warmup=False))
-    source.close()
     assert (session.origin.engine, session.origin.link) == ("echo", after)
 
 
@@ -155,11 +154,9 @@ class ElsewhereClient:
 
 
 @pytest.fixture
-def elsewhere() -> Iterator[tuple[ElsewhereClient, Session]]:
-    source, client = open_source("synthetic", 64, 48, fps=30.0, seed=0), ElsewhereClient()
-    feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request
-    yield client, Session(one_pipeline("http/as-deployed"), client, feed, plan, offsets={})
-    source.close()
+def elsewhere() -> tuple[ElsewhereClient, Session]:
+    client = ElsewhereClient()
+    return client, session_of(client, offsets={})
 
 
 def test_one_way_times_to_another_host_are_intervals_that_hold_the_truth(
@@ -206,13 +203,8 @@ def test_a_clock_that_is_set_ends_the_run_with_one_line(elsewhere: tuple[Elsewhe
 
 
 def test_a_server_elsewhere_without_marks_cannot_be_joined(monkeypatch: pytest.MonkeyPatch) -> None:
-    source, client = open_source("synthetic", 64, 48, fps=30.0, seed=0), ElsewhereClient()
     monkeypatch.setattr(Trace, "receive", lambda trace, remote: setattr(trace, "remote", replace(remote, marks=[])))
-    feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request
-    measured = Session(one_pipeline("http/as-deployed"), client, feed, plan, offsets={}).measure(
-        Place(0, 0, warmup=False)
-    )
-    source.close()
+    measured = session_of(ElsewhereClient(), offsets={}).measure(Place(0, 0, warmup=False))
     assert "the server reported no marks" in measured.sample.error
 
 
@@ -224,12 +216,8 @@ def with_wall_clocks(
     monkeypatch.setattr("s2a_bench.harness.clocks.wall_clock", lambda _: ours)
     theirs_ms = (ours.offset_ns - client.ahead_ns) / 1e6 + off_ms
     client.facts = {REALTIME_MS: theirs_ms, REALTIME_ERROR_MS: ours.error_ns / 1e6} if tells else {}
-    source, plan = open_source("synthetic", 64, 48, fps=30.0, seed=0), resolve(RequestsConfig()).request
-    feed = RequestFeed(source, preencoded=False)
-    session = Session(one_pipeline("http/as-deployed"), client, feed, replace(plan, clock="chrony"), offsets={})
-    measured = session.measure(Place(0, 0, warmup=False))
-    source.close()
-    return measured
+    request = replace(resolve(RequestsConfig()).request, clock="chrony")
+    return session_of(client, request=request, offsets={}).measure(Place(0, 0, warmup=False))
 
 
 def test_bounds_of_the_wall_clocks_narrow_the_interval(monkeypatch: pytest.MonkeyPatch) -> None:

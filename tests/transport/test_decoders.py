@@ -144,6 +144,11 @@ def test_a_message_without_end_is_bounded(framing: type[ServerSentEvents]) -> No
         list(cutter.feed(b"x"))
 
 
+def test_a_line_without_end_is_an_error_of_the_server() -> None:
+    (last,) = events("openai", [b"data: " + b"x" * LIMIT])
+    assert last.error.startswith("the server sent a line of more than")
+
+
 def test_data_without_an_end_of_the_event_is_bounded() -> None:
     cutter = ServerSentEvents()
     for _ in range(LIMIT // 2**16 - 1):

@@ -122,6 +122,14 @@ def test_a_live_run_is_shown_and_its_latencies_are_a_source(tmp_path: Path, monk
     assert again.sources[0].recorded_ns is not None
 
 
+def test_delays_of_a_live_run_are_exported(tmp_path: Path) -> None:
+    act(tmp_path, modes="queue", export_delays=tmp_path / "delays.csv")
+    delays = pd.read_csv(tmp_path / "delays.csv")
+    assert len(delays) >= 2
+    assert (delays["received_ns"] > delays["observation_ns"]).all()
+    assert (delays["rounding"] == "floor").all()
+
+
 def test_rules_choose_triggers_as_they_go(tmp_path: Path) -> None:
     requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
     options = {"rules": "calibrated,tracked,maximum,mean", "epsilon": 0.05, "latency": "lognormal:mean_ms=50,cv=.5"}
@@ -179,6 +187,14 @@ def test_a_slow_server_slows_actions_down(tmp_path: Path) -> None:
     assert rows.loc["calibrated", "stall_share"] < rows.loc["given", "stall_share"]
 
 
+moved: list[float] = []
+
+
+def move(action: Vector) -> None:
+    """Stand in for somebody's robot."""
+    moved.append(float(action[0]))
+
+
 def drop(action: Vector) -> None:
     """Stand in for a robot that breaks."""
     raise ValueError(f"no grip on {action.size}")
@@ -203,6 +219,14 @@ def test_a_plant_moves_and_the_policy_is_told_where_it_is(tmp_path: Path, monkey
     assert not any("EMULATED" in note for note in table.notes)
     assert {len(state) for state in states[2:]} == {7}
     assert len(set(states[2:])) > 1
+
+
+def test_a_function_is_called_with_every_action(tmp_path: Path) -> None:
+    moved.clear()
+    rows = act(tmp_path, modes="queue?trigger=4", robot=f"call?function={__name__}:move")
+    assert len(moved) >= rows["ticks"].item() - rows["stall_ticks"].item()
+    assert rows["jerk_rms"].isna().item()
+    assert read_run(folder_of(tmp_path)).manifest["robot"]["function"].endswith(":move")
 
 
 def test_a_robot_that_breaks_ends_the_run_with_one_line(tmp_path: Path) -> None:
