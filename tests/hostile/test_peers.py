@@ -56,7 +56,6 @@ class TestRosTopicOverZenoh(HostileSuite):
 class TestShm(HostileSuite):
     name = "shm"
     clients = shm.CLIENTS
-    servers = shm.SERVERS
 
 
 class TestWebsocket(HostileSuite):

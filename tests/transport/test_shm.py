@@ -213,6 +213,31 @@ def test_another_version_of_us_is_told_as_such() -> None:
             accept(other, 4096)
 
 
+@pytest.mark.parametrize(
+    "packet", [b"abc", *(PLACE.pack(*at) for at in ((0, 0), (0, 1 << 63), ((1 << 64) - 8, 8), (ANSWER_BYTES - 1, 2)))]
+)
+def test_a_place_that_cannot_be_is_no_answer(packet: bytes) -> None:
+    listener, path = unix_socket.listen("")
+
+    def serve() -> None:
+        link, _ = listener.accept()
+        with link:
+            kept = accept(link, 1 << 30), offer(link, ANSWER_BYTES)
+            link.recv(PLACE.size)
+            link.send(packet)
+            del kept
+
+    server = Thread(target=serve)
+    server.start()
+    with (
+        listener,
+        closing(open_client(wiring_of("shm", path))) as client,
+        pytest.raises(RequestFailed, match=r"sent what is no answer: .*(none of an answer|cannot be)"),
+    ):
+        ask(client, Request("a", "plan"))
+    server.join()
+
+
 def test_a_limit_that_is_no_whole_step_is_kept_all_the_same() -> None:
     for connect in connector(replace(wiring_of("shm"), limits=Limits(body_mib=0.5))):
         client = connect(RecordingHandler(["x"]))

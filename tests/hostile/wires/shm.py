@@ -7,10 +7,9 @@ import json
 import os
 import socket
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
-from threading import Event, Thread
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from threading import Event
 from typing import Any, TypeAlias
 
 from s2a_bench.transport import Wiring
@@ -18,7 +17,7 @@ from s2a_bench.transport.shm.memory import ANSWER_BYTES, HELLO, MAGIC, PLACE
 from s2a_bench.transport.shm.pieces import unpacked
 from s2a_bench.transport.shm.server import HEADER_BYTES
 from s2a_bench.types import Action, Token
-from tests.hostile.suite import FAILED, Attack, Case, Trap
+from tests.hostile.suite import Attack, Case
 from tests.hostile.wires.http import png_of_zeros
 
 ODD: tuple[Any, ...] = (-1, 1.5, [], 1 << 40)
@@ -217,60 +216,3 @@ CLIENTS: tuple[Case[Attack], ...] = (
     *(Case(f"state {value}", asks(fields(state=value)), "the state") for value in (7, ["x"], [[1]], {"a": 1}, [1e39])),
     Case("reads nothing", attack(does_not_read)),
 )
-
-
-def serves(does: Does, *, asked: bool = True) -> Trap:
-    """Return a server that does something with each link, when it has been ``asked``, and then waits."""
-
-    @contextmanager
-    def trap(_: Wiring[Any]) -> Iterator[str]:
-        over = Event()
-
-        def answer(link: socket.socket) -> None:
-            with link, suppress(OSError):
-                while asked:
-                    data, files, _, _ = socket.recv_fds(link, 1 << 16, 8)
-                    for file in files:
-                        os.close(file)
-                    if not data or (len(data) == PLACE.size and not files):
-                        break
-                does(link)
-                over.wait(30)
-
-        def serve() -> None:
-            with suppress(OSError):
-                while True:
-                    link, _ = listener.accept()
-                    Thread(target=answer, args=(link,), daemon=True).start()
-
-        with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as listener:
-            path = str(Path(folder) / "hostile.sock")
-            listener.bind(path)
-            listener.listen()
-            Thread(target=serve, daemon=True).start()
-            try:
-                yield path
-            finally:
-                over.set()
-                with suppress(OSError):
-                    listener.shutdown(socket.SHUT_RDWR)
-
-    return trap
-
-
-SERVERS: tuple[Case[Trap], ...] = (
-    Case("silence", serves(sends()), FAILED),
-    Case("silence after a greeting", serves(lambda link: hello(link, file_of(MIB), MIB)), FAILED),
-    Case("gone at once", serves(goes, asked=False), FAILED),
-    Case("gone when asked", serves(goes), FAILED),
-    Case("packet of 3 bytes", serves(sends(b"abc")), FAILED),
-    Case("piece without memory", serves(sends(PLACE.pack(0, 10))), FAILED),
-    Case("memory without a file", serves(lambda link: hello(link, -1, 4096)), FAILED),
-    Case("1 TiB of memory", serves(lambda link: hello(link, file_of(4096), 1 << 40)), FAILED),
-    Case("memory that may shrink", serves(lambda link: hello(link, file_of(MIB, sealed=False), MIB)), FAILED),
-    Case("piece of 2^63 bytes", serves(greets(PLACE.pack(0, 1 << 63))), FAILED),
-    Case("piece at 2^64 - 8", serves(greets(PLACE.pack((1 << 64) - 8, 8))), FAILED),
-    Case("piece across the end", serves(greets(PLACE.pack(ANSWER_BYTES - 1, 2))), FAILED),
-    Case("empty piece", serves(greets(PLACE.pack(0, 0))), FAILED),
-)
-"""What pieces say is tried in `tests/transport/test_shm.py`."""
