@@ -73,21 +73,10 @@ def test_who_asks_what_a_server_is_does_not_wait_for_ever(name: str) -> None:
 @pytest.mark.parametrize("name", ["tokens", "103, slowly"])
 def test_a_run_keeps_a_row_for_each_and_ends_with_the_reason(name: str, tmp_path: Path) -> None:
     case = CASES[name]
-    small = [
-        "--transport",
-        "http/as-deployed",
-        "--size",
-        "64x48",
-        "--requests",
-        "2",
-        "--warmup",
-        "0",
-        "--max-tokens",
-        "8",
-    ]
+    small = ["--transport", "http/as-deployed", "--size", "64x48", "--requests", "2", "--warmup", "0"]
     with serving(lambda _: case.pieces()) as url:
-        options = [*small, "--url", url, "--dialect", DIALECT, "--deadline", str(case.deadline_s or 60)]
-        command = [sys.executable, "-m", "s2a_bench", "latency", *options, "--output", str(tmp_path)]
+        options = ["--max-tokens", "8", "--url", url, "--dialect", DIALECT, "--deadline", str(case.deadline_s or 60)]
+        command = [sys.executable, "-m", "s2a_bench", "latency", *small, *options, "--output", str(tmp_path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr

@@ -20,38 +20,10 @@ from tests.servers.speakers import SPEAKERS, Speaker
 NAMES = sorted(DIALECTS)
 SHAPED = st.sampled_from(
     [
-        "choices",
-        "delta",
-        "content",
-        "error",
-        "message",
-        "done",
-        "token",
-        "text",
-        "id",
-        "details",
-        "generated_text",
-        "candidates",
-        "parts",
-        "usage",
-        "usageMetadata",
-        "timings",
-        "prompt_ms",
-        "s2a",
-        "__numpy__",
-        "dtype",
-        "shape",
-        "finish_reason",
-        "finishReason",
-        "thinking",
-        "total_duration",
-        "eval_duration",
-        "metrics",
-        "object",
-        "detail",
-        "special",
-        "done_reason",
-        "promptFeedback",
+        *("choices", "delta", "content", "error", "message", "done", "token", "text", "id", "details"),
+        *("generated_text", "candidates", "parts", "usage", "usageMetadata", "timings", "prompt_ms", "s2a"),
+        *("__numpy__", "dtype", "shape", "finish_reason", "finishReason", "thinking", "total_duration"),
+        *("eval_duration", "metrics", "object", "detail", "special", "done_reason", "promptFeedback"),
     ]
 )
 JSON = st.recursive(
@@ -170,6 +142,11 @@ def test_a_message_without_end_is_bounded(framing: type[ServerSentEvents]) -> No
         assert list(cutter.feed(b"x" * 2**16)) == []
     with pytest.raises(ValueError, match="more than"):
         list(cutter.feed(b"x"))
+
+
+def test_a_line_without_end_is_an_error_of_the_server() -> None:
+    (last,) = events("openai", [b"data: " + b"x" * LIMIT])
+    assert last.error.startswith("the server sent a line of more than")
 
 
 def test_data_without_an_end_of_the_event_is_bounded() -> None:

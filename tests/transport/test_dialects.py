@@ -299,19 +299,6 @@ def test_a_silent_server_is_given_up(speaker: Speaker) -> None:
         over.set()
 
 
-def test_a_line_without_end_is_given_up(speaker: Speaker) -> None:
-    def endless(_: Received) -> Iterator[bytes]:
-        yield head(kind=speaker.kind)
-        while True:
-            yield b"data: " * 100_000
-
-    with (
-        pytest.raises(RequestFailed, match="the server sent a line of more than"),
-        client_of(speaker, endless) as client,
-    ):
-        ask(client, Request("a", "plan"))
-
-
 def test_a_kept_connection_that_the_server_closed_is_opened_again(speaker: Speaker) -> None:
     """It promises to keep it and closes after each answer; the race with its closing is ours to mend."""
     whole = b"".join(answer(speaker)[1:])

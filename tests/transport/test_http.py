@@ -237,19 +237,6 @@ def test_health_and_models_answer(urls: dict[str, str]) -> None:
         assert httpx.get(url + "/v1/models").json()["data"][0]["id"] == "s2a"
 
 
-@pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
-@pytest.mark.parametrize(
-    ("headers", "status"), [({"host": "example.com"}, 403), ({"origin": "http://localhost"}, 403), ({"host": ""}, 200)]
-)
-def test_a_page_in_a_browser_is_not_answered(
-    urls: dict[str, str], variant: str, headers: dict[str, str], status: int
-) -> None:
-    body = {"messages": [{"role": "user", "content": "plan"}]}
-    answer = httpx.post(urls[variant] + "/v1/chat/completions", json=body, headers=headers)
-    assert answer.status_code == status
-    assert ("message" in answer.json().get("error", {})) == (status == 403)
-
-
 @pytest.mark.parametrize(("options", "status"), [({}, 404), ({"api_docs": True}, 200)])
 def test_the_pages_of_fastapi_are_served_on_request_only(
     handler: RecordingHandler, options: dict[str, bool], status: int

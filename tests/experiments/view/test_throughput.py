@@ -15,7 +15,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from matplotlib.patches import Rectangle
-from rich.console import Console
 
 from s2a_bench.experiments.requests import RequestCell
 from s2a_bench.experiments.throughput.metrics import (
@@ -43,7 +42,6 @@ from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
-from s2a_bench.writers.tables import lay_out
 from tests.made_runs import SCHEMA, known
 
 MakeRow = Callable[..., SampleRow]
@@ -224,22 +222,6 @@ def test_the_json_is_strict_and_valid(make: Make) -> None:
     del cell["positions"]
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(whole, SCHEMA, cls=jsonschema.Draft202012Validator)
-
-
-def test_the_tables_fit_a_terminal(make: Make) -> None:
-    gaps = {name: [10.0] * 69 for name in ("in-process", "http/as-deployed", "http/best-effort", "ros/topic")}
-    run = make(gaps, reference=[900.0, 1000.0, 1000.0, 1000.0], model={"dummy": True})
-    console = Console(width=100, record=True, file=io.StringIO())
-    tables = show(run).tables
-    assert list(tables) == ["throughput", "prompt", "gaps", "positions"]
-    for table in tables.values():
-        console.print(lay_out(table, 100))
-    text = console.export_text()
-    assert "…" not in text
-    assert "1000 ± 0" in text
-    notes = " ".join(tables["throughput"].notes)
-    assert "Dummy weights." in notes
-    assert "llama-bench decodes after 42 tokens" in notes
 
 
 def test_the_csv_keeps_every_digit(make: Make) -> None:

@@ -110,40 +110,6 @@ def _goal(prompt: str = "go on", **more: Any) -> Any:
     return generate_goal(prompt, **more)
 
 
-def _garbage_goal(client: Any) -> Iterator[Any]:
-    packed = bytearray(client.pack(_goal("marker")))
-    at = packed.index(b"marker")
-    packed[at - 4 : at] = struct.pack("<I", 1 << 30)
-    client.send(packed)
-    yield type(_event(client, Rejected, Result)).__name__
-
-
-def _cancelled(client: Any) -> Iterator[Any]:
-    goals = [client.send(client.pack(_goal("go on " * 100))) for _ in range(8)]
-    for goal in goals:
-        client.cancel(goal)
-    yield from (_event(client, Rejected, Result) is not None for _ in goals)
-
-
-def _same_id(client: Any) -> Iterator[Any]:
-    goal = client.send(client.pack(_goal()))
-    for _ in range(9):
-        client.send(client.pack(_goal()), goal)
-    yield from (type(_event(client, Rejected, Result)).__name__ for _ in range(10))
-
-
-def _unknown(client: Any) -> Iterator[Any]:
-    for index in range(1, 21):  # 0 means all goals
-        client.cancel(index.to_bytes(16, "big"))
-        client.get_result(index.to_bytes(16, "little"))
-    yield _event(client, Result)
-
-
-def _gone(client: Any) -> Iterator[Any]:
-    client.send(client.pack(_goal()))
-    yield "gone"
-
-
 def _with(image_of_goal: Any) -> Callable[[Any], Iterator[Any]]:
     def act(client: Any) -> Iterator[Any]:
         client.send(client.pack(_goal(images=[image_of_goal])))
@@ -192,11 +158,6 @@ CLIENTS: tuple[Case[Attack], ...] = (
     Case("300 requests at once", publishes(lambda: [*_asks(id="flood", max_tokens=50)()] * 300, answers=300)),
     Case("gone in the middle of an answer", publishes(_asks(max_tokens=5000), answers=0)),
     Case("noise as a camera", publishes(lambda: [CDR + NOISE] * 50, CAMERA, ros.IMAGE, qos=QoS(1), answers=0)),
-    Case("noise as a goal", sends_goals(_garbage_goal), "Rejected"),
-    Case("8 goals that are cancelled", sends_goals(_cancelled), "^(True\n?)+$"),
-    Case("one id for ten goals", sends_goals(_same_id), "Rejected"),
-    Case("unknown goals are cancelled and asked about", sends_goals(_unknown)),
-    Case("gone in the middle of a goal", sends_goals(_gone)),
     Case("a goal with fewer pixels than said", sends_goals(_with(image(640, 480, 10))), "."),
     Case(
         "a goal of 2^31 x 2^31 pixels", sends_goals(_with(image((1 << 31) - 1, (1 << 31) - 1, 12, step=12))), "at most"

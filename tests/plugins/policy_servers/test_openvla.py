@@ -110,11 +110,6 @@ def test_what_is_no_action_is_a_failure(body: str, message: str) -> None:
         act(says(body))
 
 
-def test_a_body_of_another_type_is_a_failure() -> None:
-    with pytest.raises(RequestFailed, match="answered 500: Internal Server Error"):
-        act(lambda _: [head("500 Internal Server Error", "text/plain") + b"Internal Server Error"])
-
-
 OFT = [np.array([0.5, -0.25, float(tick)]) for tick in range(4)]
 CHUNK = [[0.5, -0.25, 0.0], [0.5, -0.25, 1.0]]
 PICTURES = (yuyv_frame(seed=1), yuyv_frame(seed=2), yuyv_frame(seed=3))

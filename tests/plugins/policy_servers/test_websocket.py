@@ -8,7 +8,7 @@ import sys
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Generator, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from socket import SHUT_RDWR, create_connection
@@ -120,17 +120,6 @@ def test_openpi_client_gets_actions_from_our_server() -> None:
     assert handler.requests[0].images[0].data.shape == (8, 9, 3)
 
 
-@pytest.mark.parametrize("dtype", ["bool", "int8", "uint16", ">i4", "int64", "float16", "float32", ">f8", "S3", "U3"])
-def test_openpi_client_sends_arrays_of_every_type(dtype: str) -> None:
-    handler = RecordingHandler(list(CHUNK))
-    sent = np.ones((2, 3)).astype(dtype)
-    with serving(handler) as server:
-        policy = openpi(server.address)
-        policy.infer({"x": sent, "y": np.float32(2.5), "prompt": "go"})
-        policy._ws.close()
-    assert handler.requests[0].state == ((1.0,) * 6 if sent.dtype.kind == "f" else ()) + (2.5,)
-
-
 def test_openpi_client_gets_an_error_as_text_and_the_connection_closes_with_1011() -> None:
     handler = RecordingHandler(list(CHUNK))
     handler.fail_at = 0
@@ -190,16 +179,6 @@ def test_health_and_pings_are_answered_while_a_request_runs() -> None:
         assert unpackb(socket.recv())["actions"].shape == (4, 3)
 
 
-def test_a_request_that_comes_early_waits_for_the_one_before() -> None:
-    handler = Slow()
-    with serving(handler) as server, robot(server.address) as (socket, _):
-        for _ in "ab":
-            socket.send(packb({"prompt": "go"}))
-        assert handler.began.wait(20)
-        handler.go.set()
-        assert [unpackb(socket.recv())["actions"].shape for _ in "ab"] == [(4, 3)] * 2
-
-
 def test_messages_in_fragments_are_joined() -> None:
     handler = RecordingHandler(list(CHUNK))
     with serving(handler) as server, robot(server.address) as (socket, _):
@@ -233,36 +212,6 @@ def test_what_is_no_observation_is_refused_in_a_line(message: Any, says: str, co
         said, got = closed_with(socket)
     assert says in said
     assert got == code
-
-
-def test_a_message_that_is_too_large_is_refused_before_it_comes() -> None:
-    with (
-        serving(RecordingHandler(list(CHUNK)), limits=Limits(body_mib=0.1)) as server,
-        robot(server.address) as (socket, _),
-    ):
-        socket.socket.sendall(b"\x82\xff" + (1 << 30).to_bytes(8, "big"))
-        with pytest.raises(ConnectionClosed) as closed:
-            socket.recv(timeout=20)
-        assert closed.value.rcvd
-        assert closed.value.rcvd.code == 1009
-
-
-def test_small_requests_that_are_too_much_together_are_refused() -> None:
-    handler = Slow()
-    body = packb({"prompt": "go" * 2000})
-    with serving(handler, limits=Limits(in_flight_mib=0.009)) as server, ExitStack() as stack:
-        first, other, third = (stack.enter_context(robot(server.address))[0] for _ in "abc")
-        first.send(body)
-        assert handler.began.wait(20)
-        other.send(body)
-        assert other.ping().wait(20)
-        third.send(body)
-        said, code = closed_with(third)
-        handler.go.set()
-        for socket in (first, other):
-            assert unpackb(socket.recv(timeout=20))["actions"].shape == (4, 3)
-    assert "come again later" in said
-    assert code == 1013
 
 
 def test_what_half_a_message_held_is_given_back() -> None:
@@ -307,27 +256,6 @@ def test_a_message_that_does_not_end_is_given_up() -> None:
     assert code == 1008
 
 
-def test_one_that_goes_with_bytes_unread_behind_its_request_does_not_keep_the_engine() -> None:
-    ended = Event()
-
-    def endless(_: Request, trace: Trace) -> Generator[Piece, None, None]:
-        try:
-            for index in range(10**9):
-                trace.token_ns[:] = [now_ns()]
-                yield Action(index, CHUNK[0])
-        finally:
-            ended.set()
-
-    with serving(endless) as server:
-        with robot(server.address, "/stream") as (socket, _):
-            socket.send(packb({"prompt": "go"}))
-            assert unpackb(socket.recv())["type"] == "partial"
-            for _ in range(3):  # one runs, one waits, and what is behind them is not read
-                socket.send(packb({"image": np.zeros((256, 256, 3), np.uint8)}))
-            socket.socket.shutdown(SHUT_RDWR)
-        assert ended.wait(20)
-
-
 def test_keepalive_pings_and_more_than_a_thousand_of_them_over_time_pass(monkeypatch: pytest.MonkeyPatch) -> None:
     began = now_ns()
     pings = iter(range(10**6))
@@ -348,15 +276,6 @@ def test_a_name_of_somebody_else_is_refused_unless_it_is_allowed() -> None:
         status, said = get(server.address, "/healthz", **headers)
     assert status == 403
     assert "--allow-host" in said
-
-
-def test_no_page_of_a_browser_may_ask() -> None:
-    with (
-        serving(RecordingHandler(list(CHUNK))) as server,
-        pytest.raises(InvalidStatus, match="403"),
-        robot(server.address, origin="https://example.org"),
-    ):
-        pass
 
 
 def test_what_is_no_websocket_is_told_so() -> None:
@@ -404,17 +323,6 @@ def test_the_parts_of_a_picture_are_marked(connect: Connect) -> None:
     assert set(spent) == own | {"convert"}
     assert {"infer_ms", "payload_bytes"} <= set(trace.facts)
     assert "reconnects" not in trace.facts
-
-
-def test_the_first_action_of_a_stream_comes_before_the_last_is_there() -> None:
-    handler = Slow()
-    with serving(handler) as server:
-        client = open_client(replace(wiring_of("websocket/openpi-stream"), address=server.address))
-        actions = client.request(Request("a", "go"), Trace())
-        assert [next(actions).index for _ in range(3)] == [0, 1, 2]
-        handler.go.set()
-        assert [action.index for action in actions] == [3]
-        client.close()
 
 
 def test_a_server_that_came_back_is_connected_to_again() -> None:
@@ -666,28 +574,6 @@ def test_our_client_gets_actions_from_policy_websocket(policy_server: tuple[subp
             ask(client, Request("a", "fail", (yuyv_frame(),), state=(0.5,)))
         assert len(ask(client, Request("a", "go", (yuyv_frame(),), state=(0.5,)))[0]) == 4
         assert client.describe()["robot"] == "none"
-
-
-def test_policy_websocket_killed_in_mid_request_is_one_line(policy_server: tuple[subprocess.Popen[str], str]) -> None:
-    process, address = policy_server
-    with foreign(address) as client:
-        ask(client, Request("a", "go", (yuyv_frame(),), state=(0.5,)))
-
-        def kill() -> None:
-            assert process.stdout
-            process.stdout.readline()
-            process.kill()
-
-        killer = Thread(target=kill)
-        killer.start()
-        with pytest.raises((RequestFailed, ServerDied)) as failed:
-            ask(client, Request("a", "wait", (yuyv_frame(),), state=(0.5,)))
-        killer.join()
-        assert address in str(failed.value)
-        assert str(failed.value).isprintable()
-        process.wait()
-        with pytest.raises(ServerDied, match="nothing answers"):
-            ask(client, Request("a", "go", (yuyv_frame(),), state=(0.5,)))
 
 
 def test_an_answer_that_no_socket_takes_at_once_comes_whole() -> None:

@@ -269,21 +269,6 @@ class TestClientsOfOthers:
         with serving(RecordingHandler(["go"])) as server, plain(server.address) as call:
             assert "choose `answer` actions" in call("get_action", flat())["error"]
 
-    def test_marks_are_computed_when_they_are_requested(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("s2a_bench.plugins.policy_servers.zmq.server.WANTED_S", 20)
-        arrived, recording = Event(), RecordingHandler(list(CHUNK))
-
-        def handler(request: Request, trace: Trace) -> Generator[Piece, None, None]:
-            trace.later["had_arrived"] = lambda: float(arrived.is_set())
-            yield from recording(request, trace)
-
-        with serving(handler) as server, robot(server.address) as client:
-            trace = Trace()
-            for piece in client.request(Request("a", "plan"), trace):
-                if piece.index == len(CHUNK) - 1:
-                    arrived.set()
-        assert trace.facts["had_arrived"] == 1
-
     def test_marks_are_for_who_said_an_id_and_once(self) -> None:
         with serving(RecordingHandler(list(CHUNK))) as server, plain(server.address) as call:
             call("get_action", flat())
@@ -403,27 +388,6 @@ class TestBlackBox:
             with pytest.raises(RequestFailed, match="another kind of policy"):
                 ask(client, Request("a", "go"))
             assert len(ask(client, Request("a", "go"))[0]) == 4
-
-    def test_a_silent_server_is_given_up_and_the_socket_with_it(self) -> None:
-        begun = Event()
-
-        def answers(_: Any) -> Any:
-            if begun.is_set():
-                return [{"robot": CHUNK[np.newaxis]}, {}]
-            begun.set()
-            Event().wait(1.0)
-            return [{"robot": np.zeros((1, 4, 3), np.float32)}, {}]  # nobody waits for it
-
-        with policy(answers) as url:
-            wiring = wiring_of("zmq/gr00t", url=url, layout="n1.6", timeout_s=0.5)
-            client = open_client(wiring)
-            with pytest.raises(RequestFailed, match=r"silent for too long: 0\.5 s"):
-                ask(client, Request("a", "go"))
-            client.close()
-            with robot("", url=url, layout="n1.6") as patient:
-                actions, trace = ask(patient, Request("a", "go"))
-        np.testing.assert_array_equal(actions[1].values, CHUNK[1])  # type: ignore[union-attr]
-        assert trace.facts.get("reconnects") is None
 
     def test_the_same_client_connects_anew_after_a_failure(self) -> None:
         calls: list[int] = []
@@ -729,15 +693,6 @@ class TestEmbodiments:
             pytest.raises(RequestFailed, match=why),
         ):
             ask(client, numbered(state, cameras))
-
-    def test_two_parts_of_unknown_width_are_told(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setitem(EMBODIMENTS, "ours", (("front",), 1, ("tail", "x", "wing"), "task"))
-        with (
-            policy(Embodied("ours", "n1.6")) as url,
-            robot("", url=url) as client,
-            pytest.raises(RequestFailed, match=r"state is tail \(\?\), x \(1\), wing \(\?\), not 5 numbers"),
-        ):
-            ask(client, numbered(5, 1))
 
     def test_a_template_goes_first(self) -> None:
         with policy(Embodied("unitree_g1", "n1.6")) as url, robot("", url=url, template="gr00t-so100") as client:

@@ -188,6 +188,29 @@ def test_no_other_class_becomes_anything() -> None:
     assert unpack(pack(told)) == told
 
 
+def lying(shape: str, descr: str = "'|u1'", version: bytes = b"\x01\x00") -> bytes:
+    """A file of 12 bytes whose header may lie."""
+    text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}".encode()
+    return b"\x93NUMPY" + version + len(text).to_bytes(2, "little") + text + bytes(12)
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        *("text", 5, None, b"", b"\x93NUMPY", b"\x93NUMPY\x01\x00\xff\xff{", b"\x93NUMPY\x02\x00\xff\xff\xff\xff{"),
+        lying("(12,)", version=b"\x09\x00"),
+        lying("(1,)", "[('a', '<i4'), ('b', '|O')]"),
+        *map(lying, ["(3,)", "(-1, 4, 3)", "('a',)", f"({10**30}, {10**30})", f"(0, {2**60}, 3)", f"({'1, ' * 1000})"]),
+    ],
+    ids=lambda file: repr(file)[:60],
+)
+def test_a_file_that_is_none_is_refused_in_a_line(file: Any) -> None:
+    with pytest.raises(RequestFailed) as failed:
+        array_of(file)
+    assert str(failed.value).isprintable()
+    assert len(str(failed.value)) < 200
+
+
 @pytest.mark.parametrize("size", [-1, 1, 100])
 def test_a_file_is_as_long_as_it_says(size: int) -> None:
     data = saved(np.zeros(10, np.float32))

@@ -18,7 +18,6 @@ from s2a_bench.plugins.chunks.chunks.view.figures import (
     build_triggers,
     chunk_figures,
     lanes_of,
-    short,
 )
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
@@ -136,11 +135,6 @@ def test_smoothness_is_a_line_a_mode_and_the_ideal_dashed(run: StoredRun) -> Non
         assert all(len(np.asarray(line.get_xdata())) == 33 for line in axes.lines)
     *tracking, ideal = (np.asarray(line.get_ydata()) for line in panels[0].lines)
     assert (ideal < np.min(tracking, axis=0)).all()
-
-
-def test_a_long_name_is_cut_and_a_short_one_is_not() -> None:
-    assert short("bimodal:mean_ms=80", 30) == "bimodal:mean_ms=80"
-    assert short("bimodal:mean_ms=80", 10) == "bimodal..."
 
 
 def test_what_a_run_has_no_rows_for_is_not_drawn(run: StoredRun, tmp_path: Path) -> None:

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from s2a_bench.errors import UsageError
 from s2a_bench.plugins.chunks.modes import MODES, ControlSetting, Mode, mode
 from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
-from s2a_bench.plugins.chunks.modes.append import Queue, Streamed, Sync
+from s2a_bench.plugins.chunks.modes.append import Queue, Sync
 from s2a_bench.plugins.chunks.modes.cycles import follow, step
-from s2a_bench.plugins.chunks.modes.replace import Replace
 from tests.plugins.chunks.modes.drawn import cases, latencies, modes, plainly, settings_of_chunks
 
 named = pytest.mark.parametrize("name", MODES)
@@ -149,20 +148,12 @@ def test_time_scaling_takes_longer_ticks_and_never_shorter_ones_than_asked() -> 
         ("wait", "`modes`: 'wait' is none of sync, queue, streamed, replace, aggregate"),
         ("queue?trigger=-1", "`modes`: queue: trigger = '-1': input should be greater than or equal to 0"),
         ("replace?execute=0", "`modes`: replace: execute = '0'"),
-        ("replace?s=2", "`modes`: replace: 's' is no parameter; its parameters are execute, under_way, assumed"),
-        ("aggregate?kind=best", "`modes`: aggregate: kind = 'best'"),
     ],
 )
 def test_a_mode_that_is_none_is_refused(written: str, message: str) -> None:
     with pytest.raises(UsageError) as caught:
         mode(written)
     assert message in str(caught.value)
-
-
-def test_a_mode_has_its_name_and_its_parameters() -> None:
-    assert [mode(name).name for name in MODES] == list(MODES)
-    assert mode("streamed?gap_s=0.01&start=naive&trigger=3") == Streamed(3, 0, 0.01, "naive")
-    assert mode("replace?execute=3&under_way=many") == Replace(3, "many")
 
 
 def test_what_is_no_setting_is_refused() -> None:
