@@ -50,10 +50,10 @@ def ros_2() -> Iterator[None]:
                 prefix = f"{package}/{kind}/"
                 vars(sys.modules[name])["__getattr__"] = lambda part, make=make, prefix=prefix: make(prefix + part)
         for part in GLUE:
-            patch.delitem(sys.modules, f"s2a_bench.ros.rclpy_{part}", raising=False)
+            patch.delitem(sys.modules, f"s2a_bench.plugins.rclpy.{part}", raising=False)
         yield
         for part in GLUE:
-            sys.modules.pop(f"s2a_bench.ros.rclpy_{part}", None)
+            sys.modules.pop(f"s2a_bench.plugins.rclpy.{part}", None)
 
 
 @pytest.fixture

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import subprocess
+from importlib.metadata import EntryPoint
 from typing import Any
 
 import pytest
 
-from s2a_bench.errors import RequestFailed
+from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.machine.clocks import WALL_CLOCKS
 from s2a_bench.plugins.two_hosts import wall_clocks as clocks
+from s2a_bench.plugins.two_hosts.surroundings import HostOptions
 
 CHRONY = (
     "01020304,a.b.c,3,1328281229.000000000,-0.000001501,-0.000001632,0.000002360,331.898,0.004,0.154,"
@@ -73,3 +75,11 @@ def test_a_reading_is_used_for_a_second(monkeypatch: pytest.MonkeyPatch) -> None
     assert clocks.PTP() is first
     assert runs == [("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET")]
     assert first.error_ns >= 9452
+
+
+def test_any_packages_wall_clock_may_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    offered = EntryPoint("gps", "somebodys_gps:clock", WALL_CLOCKS.group)
+    monkeypatch.setitem(WALL_CLOCKS._offered, "gps", offered)
+    assert HostOptions(clock="gps").clock == "gps"
+    with pytest.raises(UsageError, match="'sundial' is none of chrony, ptp, gps"):
+        HostOptions(clock="sundial")
