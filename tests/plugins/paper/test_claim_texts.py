@@ -11,8 +11,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
 from s2a_bench.plugins.paper.claims.table import judge_claims
@@ -34,11 +32,6 @@ def claim_lines(*runs: StoredRun) -> list[str]:
     texts = [f"- **{each.where}: {each.claim}**: {each.verdict}. {each.text} *{each.required}*" for each in judged]
     names = sorted({run.path.name for run in runs}, key=len, reverse=True)
     return [re.sub("|".join(map(re.escape, names)), "RUN", text) for text in texts]
-
-
-@pytest.fixture
-def kit(tmp_path: Path, beside: MakeRun, spoken: MakeRun) -> Kit:
-    return Kit(tmp_path, beside, spoken)
 
 
 def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_row: MakeRow, tmp_path: Path) -> None:
@@ -80,11 +73,11 @@ def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_ro
         "Transports, llama-server (longer|6.57)": kit.beside_llama_server,
         "Bodies": lambda: bodies(120_500, 90_000),
         "Small bodies": lambda: bodies(66_666, 49_999),
-        "A rate (RTX|Orin: )": lambda: kit.rates(34.0, REAL, GPU),
-        "Another rate (RTX)": lambda: kit.rates(50.0, REAL, GPU),
-        "A rate of layers on CPU and GPU (RTX)": lambda: kit.rates(34.0, REAL, GPU | {"gpu_layers": 8}),
-        "A rate of no layers on the GPU (RTX)": lambda: kit.rates(34.0, REAL, GPU | {"gpu_layers": 0}),
-        "A rate of a server that does not tell (RTX)": lambda: kit.rates(34.0, None, {}),
+        "A rate (RTX|Orin: )": lambda: kit.rates(rate=34.0),
+        "Another rate (RTX)": lambda: kit.rates(rate=50.0),
+        "A rate of layers on CPU and GPU (RTX)": lambda: kit.rates(rate=34.0, model=GPU | {"gpu_layers": 8}),
+        "A rate of no layers on the GPU (RTX)": lambda: kit.rates(rate=34.0, model=GPU | {"gpu_layers": 0}),
+        "A rate of a server that does not tell (RTX)": lambda: kit.rates(None, 34.0, {}),
         "Boundary": boundary,
         "Boundary, all on one line (Below)": lambda: boundary(t_min=1.0),
         "CCRB": lambda: kit.ccrb(phase=True, phase_points=(3, 3)),
