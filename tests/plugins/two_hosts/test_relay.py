@@ -9,7 +9,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import asdict
-from random import Random
 from statistics import mean
 
 import pytest
@@ -104,18 +103,6 @@ def test_a_trace_carries_the_bytes_of_its_steps_and_asks_for_nothing_in_an_outag
     late = Shaper(Direction(24.0, steps=steps, period_s=0.01, queue_ms=1e6))
     assert late.due_s(0.0025, 3000) == pytest.approx(0.006 + 0.001, abs=1e-6)
     assert late.due_s(1.008, 1500) == pytest.approx(1.0085, abs=1e-6)
-
-
-def test_packets_that_are_lost_or_dropped_are_counted_apart() -> None:
-    shaper = Shaper(Direction(12.0, loss=0.5, seed=3, queue_ms=4))
-    random = Random(3)
-    lost = 0
-    for _ in range(40):
-        chance = random.random() < 0.5
-        due_s = shaper.due_s(0.0, 1500)
-        lost += chance
-        assert due_s is None or not chance
-    assert (shaper.lost, shaper.dropped) == (lost, 40 - lost - 5)
 
 
 class Devices:

@@ -124,15 +124,6 @@ class TestWhatIsExecuted:
             executed_so_far += executed_so_far in queue
         np.testing.assert_allclose(executed(made, cycles, done, target), expected, atol=1e-12)
 
-    def test_the_weights_of_a_tick_add_up_to_one(self) -> None:
-        latency_ns = np.random.default_rng(3).integers(0, 250 * MS, 80)
-        made = Aggregate(9, "conservative")
-        cycles = made.cycles(latency_ns, SETTING)
-        total = np.zeros(cycles.ticks)
-        for tick, _, _, share in made.blend(cycles, made.ticks(latency_ns, SETTING)):
-            total[tick] += share
-        np.testing.assert_allclose(total, made.ticks(latency_ns, SETTING).chunk >= 0)
-
 
 def measured(written: str, latency_ns: np.ndarray, target: TargetPath) -> dict[str, float]:
     made = mode(written)

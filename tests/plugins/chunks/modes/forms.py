@@ -23,15 +23,6 @@ class Span:
     most: float
 
 
-def queue_stall_s(latency_s: ArrayLike, trigger: int, period_s: float) -> Floats:
-    """Return max(0, L - m Delta t), the stall at each boundary in continuous time, for m <= s and any L.
-
-    On a robot with a fixed tick it is rounded to `queue_stall_ticks`: none iff m >= d, that is m >= ceil(L / Delta t)
-    where actions leave at the start of their tick, one less (but for whole L / Delta t) where they leave at its end.
-    """
-    return np.maximum(0.0, np.asarray(latency_s, dtype=np.float64) - trigger * period_s)
-
-
 def queue_stall_ticks(delay_ticks: Ints, trigger: int) -> Ints:
     """Return max(0, d - m): the stall at each boundary under queue, and under aggregate too.
 

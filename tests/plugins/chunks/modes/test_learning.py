@@ -74,23 +74,6 @@ def test_a_mean_of_ticks_is_the_mean(rounding: Rounding) -> None:
     assert stepper.rule.latency_ns == pytest.approx(latency_ns.mean(), rel=0.01)
 
 
-def test_a_rule_that_tracks_comes_back_after_a_slow_time() -> None:
-    calm, slow = drawn(600, 2, 40e6), drawn(600, 3, 160e6)
-    latency_ns = np.concatenate([calm, slow, calm, calm, calm])
-    stepper = Learning(Queue(), lambda: TrackedLatency.begin(calm.tolist(), 0.05)).stepper(SETTING)
-    stepper_of = {"maximum": Learning(Queue(), maximum).stepper(SETTING)}
-    for each in (stepper, stepper_of["maximum"]):
-        tick = 0
-        for request, latency in enumerate(latency_ns.tolist()):
-            while not each.ask(tick):
-                each.act(tick)
-                tick += 1
-            each.arrived(request, 16, tick + latency // SETTING.period_ns)
-    assert stepper.triggers[1100] > stepper.triggers[500]
-    assert stepper.triggers[-1] < stepper.triggers[1100]
-    assert stepper_of["maximum"].triggers[-1] == max(stepper_of["maximum"].triggers)
-
-
 def test_each_robot_has_a_rule_of_its_own() -> None:
     mode = Learning(Queue(), maximum)
     one, other = mode.stepper(SETTING), mode.stepper(SETTING)

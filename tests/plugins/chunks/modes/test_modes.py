@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from s2a_bench.plugins.chunks.modes import MODES, ControlSetting, Mode, mode
 from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
 from s2a_bench.plugins.chunks.modes.append import Queue, Sync
 from s2a_bench.plugins.chunks.modes.cycles import follow, step
-from tests.plugins.chunks.modes.drawn import cases, latencies, modes, plainly, settings_of_chunks
+from tests.plugins.chunks.modes.drawn import agree, cases, latencies, modes, plainly, settings_of_chunks
 
 named = pytest.mark.parametrize("name", MODES)
 many = settings(max_examples=300)
@@ -42,9 +41,7 @@ def test_ticks_are_those_of_a_robot_in_continuous_time(name: str, data: st.DataO
 @given(data=st.data())
 def test_the_stepper_and_the_arrays_agree(name: str, data: st.DataObject) -> None:
     made, latency_ns, setting = data.draw(cases(name))
-    for arrays, stepped in zip(simulate(made, latency_ns, setting)[::-1], step(made, latency_ns, setting), strict=True):
-        for field in fields(arrays):
-            np.testing.assert_array_equal(getattr(arrays, field.name), getattr(stepped, field.name), field.name)
+    agree(simulate(made, latency_ns, setting)[::-1], step(made, latency_ns, setting))
 
 
 @many
@@ -60,8 +57,8 @@ def test_arrays_of_streamed_actions_are_the_stepper_s_at_any_gaps(data: st.DataO
     length = made.execution_horizon(setting)
     waits = (np.diff(setting.delay_ticks(arrival_ns[:, :length])) > 1).any()
     assert arrays is not None or waits or made.trigger >= length
-    for field in fields(stepped) if arrays is not None else ():
-        np.testing.assert_array_equal(getattr(arrays, field.name), getattr(stepped, field.name), field.name)
+    if arrays is not None:
+        agree((arrays,), (stepped,))
 
 
 @named
@@ -106,9 +103,7 @@ def test_blended_ages_are_those_of_the_weights(data: st.DataObject) -> None:
 @given(data=st.data(), setting=settings_of_chunks())
 def test_sync_is_a_queue_that_is_empty_when_it_asks(data: st.DataObject, setting: ControlSetting) -> None:
     latency_ns = data.draw(latencies(setting))
-    for each, same in zip(simulate(Sync(), latency_ns, setting), simulate(Queue(), latency_ns, setting), strict=True):
-        for field in fields(each):
-            np.testing.assert_array_equal(getattr(each, field.name), getattr(same, field.name))
+    agree(simulate(Sync(), latency_ns, setting), simulate(Queue(), latency_ns, setting))
 
 
 def test_a_mode_by_hand() -> None:

@@ -17,9 +17,7 @@ from scipy import stats
 from s2a_bench.boards.gaps import Gaps, Lognormal, Markov
 from s2a_bench.errors import UsageError
 from s2a_bench.plugins.chunks.modes import ControlSetting, Rounding
-from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
 from s2a_bench.plugins.chunks.modes.append import Queue
-from s2a_bench.plugins.chunks.modes.replace import Replace
 from s2a_bench.plugins.chunks.modes.trigger import (
     Maximum,
     Mean,
@@ -30,7 +28,7 @@ from s2a_bench.plugins.chunks.modes.trigger import (
     follow,
     trigger,
 )
-from s2a_bench.policy.conformal import EPSILON, upper_bound
+from s2a_bench.policy.conformal import EPSILON
 
 MS = 1_000_000
 CALIBRATION, FRESH = 8_000, 100_000
@@ -225,34 +223,6 @@ def test_a_trigger_is_safe_at_its_latency_slowed_down_or_not(
     assert not Queue(found.ticks, 13).cycles(latencies, slowed).stall_ticks.any()
     if found.ticks and found.beta == 1:
         assert Queue(found.ticks - 1, 13).cycles(latencies, setting).stall_ticks[1:].all()
-
-
-@pytest.mark.parametrize("rounding", ["floor", "ceil"])
-def test_where_no_trigger_helps_slowing_down_keeps_epsilon(rounding: Rounding) -> None:
-    # H = 16, s = 12: four actions are left, 80 ms, for latencies of 120 ms in the mean.
-    setting, latencies = ControlSetting(20 * MS, 16, rounding), Lognormal(0.12, 0.2)
-    known = draw(latencies, np.random.default_rng(1), CALIBRATION)
-    fresh = draw(latencies, np.random.default_rng(2), FRESH)
-    found = trigger(calibrate(known).caution, setting, 4)
-    assert found.ticks == 4
-    assert found.beta == pytest.approx(0.189 / 0.08, rel=0.05)
-    slowed = setting.slowed(found.beta)
-    for mode in (Replace(12), Aggregate(4)):
-        assert np.mean(mode.cycles(fresh, setting).stall_ticks[1:] > 0) > 0.5
-        stalls = int(np.count_nonzero(mode.cycles(fresh, slowed).stall_ticks[1:]))
-        assert upper_bound(stalls, FRESH - 1, 0.975) < 0.015
-
-
-@pytest.mark.parametrize("rounding", ["floor", "ceil"])
-def test_the_oracle_s_trigger_is_the_smallest_safe_one(rounding: Rounding) -> None:
-    setting = ControlSetting(20 * MS, 64, rounding)
-    for seed in range(40):
-        survival = law(world(seed, "bimodal")[0])
-        for epsilon in (0.001, 0.01, 0.2):
-            ticks = oracle_ticks(survival, setting, epsilon)
-            at = [(m + (rounding == "floor")) * 0.02 for m in range(ticks + 1)]
-            assert survival(at[-1]) <= epsilon
-            assert all(survival(x) > epsilon for x in at[:-1])
 
 
 def test_a_rule_that_needs_the_greatest_trigger_gets_it() -> None:

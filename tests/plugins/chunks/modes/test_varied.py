@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from typing import Any
 
-import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,7 +11,7 @@ from s2a_bench.plugins.chunks.modes import ControlSetting
 from s2a_bench.plugins.chunks.modes.append import Queue, VariedQueue
 from s2a_bench.plugins.chunks.modes.cycles import step
 from s2a_bench.plugins.chunks.modes.trigger import Varied
-from tests.plugins.chunks.modes.drawn import latencies, settings_of_chunks
+from tests.plugins.chunks.modes.drawn import agree, latencies, settings_of_chunks
 
 
 @st.composite
@@ -22,12 +20,6 @@ def varied(draw: st.DrawFn) -> tuple[Varied, Any, ControlSetting]:
     triggers = draw(st.lists(st.integers(0, setting.horizon), min_size=1, max_size=14))
     execute = draw(st.integers(0, setting.horizon))
     return VariedQueue(Queue(0, execute), tuple(triggers)), draw(latencies(setting)), setting
-
-
-def agree(one: tuple[Any, ...], other: tuple[Any, ...]) -> None:
-    for mine, yours in zip(one, other, strict=True):
-        for field in fields(mine):
-            np.testing.assert_array_equal(getattr(mine, field.name), getattr(yours, field.name), field.name)
 
 
 @settings(max_examples=300)
