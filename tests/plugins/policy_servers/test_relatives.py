@@ -17,7 +17,6 @@ import pytest
 import uvicorn
 from fastapi import FastAPI, WebSocket
 from PIL import Image
-from websockets.sync.server import serve
 
 from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.frames.convert import yuyv_to_rgb
@@ -30,6 +29,7 @@ from s2a_bench.transport import TRANSPORTS, Choice, Client, open_client
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.risks import examine
 from s2a_bench.types import Request
+from tests.plugins.policy_servers.test_websocket import handled_by
 from tests.waiting import until
 
 CHUNK = np.arange(12, dtype=np.float32).reshape(4, 3) / 8
@@ -74,22 +74,14 @@ def relative(
 
     def handle(socket: Any) -> None:
         heard.append(socket.request.path)
-        if greets:
-            socket.send(packb(greeting))
         for message in socket:
             heard.append(unpackb(message) if message else b"")
             if message:
                 said = answer(heard[-1])
                 socket.send(said if isinstance(said, str) else packb(said, **packing))
 
-    with serve(handle, "127.0.0.1", 0, compression=None, max_size=None) as server:
-        thread = Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield "ws://{}:{}".format(*server.socket.getsockname()[:2]), heard
-        finally:
-            server.shutdown()
-            thread.join()
+    with handled_by(handle, greeting if greets else None) as address:
+        yield address, heard
 
 
 @contextmanager
@@ -118,27 +110,20 @@ def fastapi(path: str, key: str = "") -> Iterator[str]:
             thread.join()
 
 
-@contextmanager
-def robot(address: str, template: str, name: str = "websocket") -> Iterator[Client]:
-    client = open_client(wiring_of(name, url=address, template=template))
-    try:
-        yield client
-    finally:
-        client.close()
+def robot(address: str, template: str, name: str = "websocket") -> closing[Client]:
+    return closing(open_client(wiring_of(name, url=address, template=template)))
 
 
-def asked(address: str, template: str, name: str = "websocket") -> np.ndarray[Any, Any]:
+def asked(address: str, template: str, name: str = "websocket", request: Request = REQUEST) -> np.ndarray[Any, Any]:
     with robot(address, template, name) as client:
-        actions, trace = ask(client, REQUEST)
+        actions, trace = ask(client, request)
     assert "server" in budget(trace.chain()).stages_ns
     return np.stack([action.values for action in actions])
 
 
 def asked_with(address: str, template: str, cameras: int, state: int) -> np.ndarray[Any, Any]:
     frames = tuple(yuyv_frame(64, 48, index) for index in range(cameras))
-    with robot(address, template) as client:
-        actions, _ = ask(client, Request("a", "go", frames, state=tuple(np.arange(state) / 8)))
-    return np.stack([action.values for action in actions])
+    return asked(address, template, request=Request("a", "go", frames, state=tuple(np.arange(state) / 8)))
 
 
 PICTURE, TWICE = (48, 64, 3), (1, 2, 48, 64, 3)
@@ -353,11 +338,8 @@ def test_of_paths_that_are_refused_the_one_that_wants_a_key_is_told() -> None:
         status = HTTPStatus.UNAUTHORIZED if request.path == "/openpi/policy" else HTTPStatus.NOT_FOUND
         return connection.respond(status, "no\n")
 
-    with serve(lambda _: None, "127.0.0.1", 0, process_request=gate) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        address = f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+    with handled_by(lambda _: None, process_request=gate) as address:
         found = {finding.code: finding.message for finding in examine(address)}
-        server.shutdown()
     assert f"{address}/openpi/policy answered 401" in found["server"]
 
 

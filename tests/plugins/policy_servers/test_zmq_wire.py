@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import EngineError, RequestFailed
-from s2a_bench.plugins.policy_servers.zmq.layouts import actions_in, answer_of, modalities
+from s2a_bench.plugins.policy_servers.zmq.layouts import actions_in, answer_of
 from s2a_bench.plugins.policy_servers.zmq.npy import PictureFile, array_of, file_of
 from s2a_bench.plugins.policy_servers.zmq.wire import pack, read
 from s2a_bench.types import Token
@@ -237,8 +237,3 @@ def test_neither_tokens_nor_nothing_are_an_answer() -> None:
         answer_of({}, "n1.6", [Token(0, "go")])
     with pytest.raises(EngineError, match="no action at all"):
         answer_of({}, "n1.6", [])
-
-
-@pytest.mark.parametrize("layout", ["n1.5", "n1.6"])
-def test_every_modality_has_keys(layout: str) -> None:
-    assert {config["__ModalityConfig_class__"] for config in modalities(layout).values()} == {True}

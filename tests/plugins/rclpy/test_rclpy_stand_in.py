@@ -50,10 +50,10 @@ def ros_2() -> Iterator[None]:
                 prefix = f"{package}/{kind}/"
                 vars(sys.modules[name])["__getattr__"] = lambda part, make=make, prefix=prefix: make(prefix + part)
         for part in GLUE:
-            patch.delitem(sys.modules, f"s2a_bench.ros.rclpy_{part}", raising=False)
+            patch.delitem(sys.modules, f"s2a_bench.plugins.rclpy.{part}", raising=False)
         yield
         for part in GLUE:
-            sys.modules.pop(f"s2a_bench.ros.rclpy_{part}", None)
+            sys.modules.pop(f"s2a_bench.plugins.rclpy.{part}", None)
 
 
 @pytest.fixture
@@ -75,16 +75,6 @@ def test_a_goal_that_has_ended_goes_with_its_pictures_at_once() -> None:
         assert gone() is None
     finally:
         gc.enable()
-
-
-def test_llama_msgs_is_needed_where_its_version_is_an_option(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    without_llama_msgs(monkeypatch)
-    wiring = wiring_of("ros/topic", "/s2a", middleware="rclpy", domain_id=7, llama_msgs="4.4")
-    with pytest.raises(MissingInterface, match="colcon build --packages-select llama_msgs"):
-        open_server(wiring, RecordingHandler([]))
-    assert GRAPH == []
 
 
 @pytest.mark.parametrize(
@@ -195,10 +185,17 @@ def test_topics_are_served_without_llama_msgs_and_the_log_says_what_is_not(
     assert GRAPH == []
 
 
-def test_the_action_needs_llama_msgs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_action_needs_llama_msgs_and_so_do_topics_where_its_version_is_an_option(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     without_llama_msgs(monkeypatch)
-    wiring = wiring_of("ros/action", "/s2a", middleware="rclpy", domain_id=7)
-    for opened in (lambda: open_server(wiring, RecordingHandler([])), lambda: open_client(wiring)):
+    action = wiring_of("ros/action", "/s2a", middleware="rclpy", domain_id=7)
+    topic = wiring_of("ros/topic", "/s2a", middleware="rclpy", domain_id=7, llama_msgs="4.4")
+    for opened in (
+        lambda: open_server(action, RecordingHandler([])),
+        lambda: open_client(action),
+        lambda: open_server(topic, RecordingHandler([])),
+    ):
         with pytest.raises(MissingInterface, match="colcon build --packages-select llama_msgs"):
             opened()
     assert GRAPH == []

@@ -268,17 +268,6 @@ def test_a_port_that_is_taken_is_named(endpoint: str) -> None:
         open_middleware("zenoh", place=endpoint, host=True)
 
 
-def test_noise_at_the_routers_port_does_no_harm(join: Join, endpoint: str) -> None:
-    publisher, subscription = join().publisher("/topic", STRING, QoS()), join().subscription("/topic", STRING, QoS(0))
-    wait_matched(publisher, subscription)
-    at = ("127.0.0.1", endpoint_of(endpoint)[2])
-    for noise in (b"", b"\xff" * 70_000, b"GET / HTTP/1.1\r\n\r\n", b"\x05\x00\x01\x09" + bytes(5)):
-        with socket.create_connection(at) as link, suppress(OSError):
-            link.sendall(noise)
-    publisher.send(publisher.pack(text("whole")))
-    assert subscription.unpack(subscription.take(WAIT_S)).data == "whole"
-
-
 def test_an_inbox_is_bounded_and_says_once_that_it_is_full(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from s2a_bench.errors import UsageError
 from s2a_bench.plugins.chunks.modes import MODES, ControlSetting, Mode, mode
 from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
-from s2a_bench.plugins.chunks.modes.append import Queue, Sync
+from s2a_bench.plugins.chunks.modes.append import Queue, Sync, VariedQueue
 from s2a_bench.plugins.chunks.modes.cycles import follow, step
+from s2a_bench.plugins.chunks.modes.trigger import Varied
+from s2a_bench.plugins.chunks.testing.mode import ModeSuite
 from tests.plugins.chunks.modes.drawn import agree, cases, latencies, modes, plainly, settings_of_chunks
 
 named = pytest.mark.parametrize("name", MODES)
@@ -164,3 +166,62 @@ def test_what_is_no_setting_is_refused() -> None:
 
 def simulate(made: Mode, latency_ns: Any, setting: ControlSetting) -> tuple[Any, Any]:
     return made.ticks(latency_ns, setting), made.cycles(latency_ns, setting)
+
+
+@pytest.mark.parametrize("name", MODES)
+class TestDefaults(ModeSuite):
+    @pytest.fixture
+    def mode(self, name: str) -> Mode:
+        return mode(name)
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "queue?trigger=3",
+        "queue?trigger=9&execute=4",
+        "sync?execute=2",
+        "streamed?trigger=2&gap_s=3e-8&start=naive",
+        "streamed?trigger=2&gap_s=3e-8",
+        "streamed?trigger=2&gap_s=4e-9&execute=5",
+        "replace?execute=3&under_way=many",
+        "replace?execute=2&assumed=3",
+        "aggregate?trigger=3",
+        "aggregate?trigger=7&kind=average",
+    ],
+)
+class TestParameters(ModeSuite):
+    @pytest.fixture
+    def mode(self, written: str) -> Mode:
+        return mode(written)
+
+
+@st.composite
+def varied(draw: st.DrawFn) -> tuple[Varied, Any, ControlSetting]:
+    setting = draw(settings_of_chunks())
+    triggers = draw(st.lists(st.integers(0, setting.horizon), min_size=1, max_size=14))
+    execute = draw(st.integers(0, setting.horizon))
+    return VariedQueue(Queue(0, execute), tuple(triggers)), draw(latencies(setting)), setting
+
+
+@settings(max_examples=300)
+@given(case=varied())
+def test_its_arrays_and_its_stepper_agree(case: tuple[Varied, Any, ControlSetting]) -> None:
+    mode, latency_ns, setting = case
+    agree((mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)), step(mode, latency_ns, setting))
+
+
+@given(case=varied())
+def test_with_one_trigger_it_is_queue(case: tuple[Varied, Any, ControlSetting]) -> None:
+    mode, latency_ns, setting = case
+    queue = mode.mode.varied(mode.triggers[:1])
+    assert isinstance(queue, Queue)
+    same = VariedQueue(mode.mode, mode.triggers[:1])
+    agree((same.cycles(latency_ns, setting),), (queue.cycles(latency_ns, setting),))
+
+
+@given(case=varied())
+def test_a_mode_without_arrays_of_its_own_does_the_same(case: tuple[Varied, Any, ControlSetting]) -> None:
+    mode, latency_ns, setting = case
+    stepped = Varied(mode.mode, mode.triggers)
+    agree((stepped.cycles(latency_ns, setting),), (mode.cycles(latency_ns, setting),))
