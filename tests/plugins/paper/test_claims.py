@@ -1,4 +1,4 @@
-"""The paper's claims, judged by runs of which it is known what they must say."""
+"""The paper's claims, judged by runs of which it is known what they must say, and what verdicts are made of."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from math import inf, nextafter
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -27,22 +29,28 @@ from s2a_bench.plugins.paper.claims import (
     REPRODUCED,
     SUPPORTED,
     UNDECIDED,
+    Check,
+    ClaimFinding,
     Need,
     RunPart,
     Trial,
+    all_of,
+    combine,
     judge,
+    within,
 )
 from s2a_bench.plugins.paper.claims.plans import CHOSEN, PLANE, PLANS
+from s2a_bench.plugins.paper.claims.requests import PAPERS_MODEL, facts_of, on_board
 from s2a_bench.plugins.paper.claims.table import CLAIMS, judge_claims
-from s2a_bench.report.verdicts import ClaimVerdict, Verdicts
+from s2a_bench.provenance import Provenance
+from s2a_bench.report.verdicts import ClaimVerdict, Met, Verdicts
+from s2a_bench.stats import Ratio
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 
 MakeRun = Callable[..., StoredRun]
 MakeRow = Callable[..., SampleRow]
-ORIN = {"board": "NVIDIA Jetson AGX Orin Developer Kit"}
-RTX = {"gpus": [{"name": "NVIDIA GeForce RTX 4080"}]}
 EVEN: dict[str, dict[str, float]] = {
     "http/as-deployed": {"base64_encode": 65.7, "inference": 5, "return": 0},
     "ros/topic": {"convert": 10, "inference": 5, "return": 0},
@@ -277,14 +285,6 @@ def test_what_ends_with_stream_to_act_or_before_it_does_not_end_later(timelines:
     assert claim_of("preferable for fast and smooth control", early).verdict == CONTRADICTED
 
 
-def test_s0_is_minimal_with_fixed_durations_and_not_with_elastic_ones(timelines: StoredRun) -> None:
-    assert claim_of("with fixed durations", timelines).verdict == IDENTITY
-    elastic = claim_of("up to T_max", timelines)
-    assert elastic.verdict == CONTRADICTED
-    # Q_7 = 7 * 1.5 s instead of P_7 = 7 s after S0 = 78.76 s.
-    assert "75.26 s instead of S0 = 78.76 s" in elastic.text
-
-
 def test_where_nothing_can_be_stretched_only_fixed_durations_are_judged(tmp_path: Path) -> None:
     run = read_run(run_timeline(TimelineConfig(t_max=1.0), tmp_path, NullProgress()))
     assert claim_of("with fixed durations", run).verdict == IDENTITY
@@ -310,14 +310,12 @@ def test_at_another_t_min_than_the_chosen_the_papers_line_is_tried_without_a_ver
         assert missing in below.required
 
 
-def test_the_chosen_point_is_the_default_of_the_command() -> None:
-    settings = json.loads(json.dumps(CcrbConfig().to_manifest()))
-    assert {name: settings[name] for name in CHOSEN} == CHOSEN
-
-
-def test_the_chosen_settings_of_plans_and_plane_are_the_defaults_of_the_commands() -> None:
-    plans, plane = (json.loads(json.dumps(kind().to_manifest())) for kind in (TimelineConfig, BoundaryConfig))
+def test_the_chosen_settings_are_the_defaults_of_the_commands() -> None:
+    point, plans, plane = (
+        json.loads(json.dumps(kind().to_manifest())) for kind in (CcrbConfig, TimelineConfig, BoundaryConfig)
+    )
     several = {"n_skills": [PLANS["n_skills"]], "t_nom_s": [PLANS["t_nom_s"]]}
+    assert {name: point[name] for name in CHOSEN} == CHOSEN
     assert {name: plans[name] for name in PLANS} == PLANS | several
     assert {name: plane[name] for name in PLANE} == PLANE
 
@@ -344,3 +342,173 @@ def test_a_diagram_of_other_settings_contradicts_no_outcome(ccrb: StoredRun) -> 
     settings = ccrb.manifest["configuration"] | {"phase_rates": [20.0, 40.0]}
     run = replace(changed(ccrb, rollouts=rows), manifest=ccrb.manifest | {"configuration": settings})
     assert claim_of("hit from behind", run).verdict == UNDECIDED
+
+
+MakeRun = Callable[..., StoredRun]
+ORIN = {"board": "NVIDIA Jetson AGX Orin Developer Kit"}
+RTX = {"gpus": [{"name": "NVIDIA GeForce RTX 4080"}]}
+
+
+def unmeasured(_: RunPart) -> tuple[list[Ratio], str]:
+    return [], ""
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict"),
+    [
+        (1.0, 2.0, SUPPORTED),
+        (0.9, 2.0, UNDECIDED),
+        (1.0, 2.1, UNDECIDED),
+        (0.9, 2.1, UNDECIDED),
+        (0.5, 1.0, UNDECIDED),
+        (2.0, 3.0, UNDECIDED),
+        (0.5, 0.9, CONTRADICTED),
+        (2.1, 3.0, CONTRADICTED),
+    ],
+)
+def test_an_interval_is_wholly_between_the_bounds_or_wholly_outside_or_decides_nothing(
+    low: float, high: float, verdict: str
+) -> None:
+    check = Check("", unmeasured, 1.0, 2.0)
+    assert within(low, high, 1.0, 2.0) == check.verdict([Ratio(1.5, low, high)]) == verdict
+    assert check.verdict([Ratio(1.5, low, None)]) == check.verdict([Ratio(1.5, None, high)]) == UNDECIDED
+    assert Check("", unmeasured).verdict([Ratio(1.5, None, None)]) == SUPPORTED  # only stated
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "verdict"),
+    [
+        ([SUPPORTED, SUPPORTED], SUPPORTED),
+        ([SUPPORTED, UNDECIDED], UNDECIDED),
+        ([SUPPORTED, UNDECIDED, CONTRADICTED], CONTRADICTED),
+        ([], UNDECIDED),
+    ],
+)
+def test_of_what_is_claimed_of_all_one_that_contradicts_is_enough(verdicts: list[str], verdict: str) -> None:
+    assert all_of(verdicts) == verdict
+
+
+@pytest.mark.parametrize(
+    ("values", "each", "alike", "one"),
+    [
+        ((1, 2), SUPPORTED, SUPPORTED, SUPPORTED),
+        ((1, 3), CONTRADICTED, UNDECIDED, SUPPORTED),
+        ((0, 3), CONTRADICTED, UNDECIDED, UNDECIDED),
+        ((3, 4), CONTRADICTED, CONTRADICTED, CONTRADICTED),
+        ((0, -1), CONTRADICTED, CONTRADICTED, CONTRADICTED),
+    ],
+)
+def test_values_lie_inside_each_or_together_or_one_of_them(
+    values: tuple[float, ...], each: str, alike: str, one: str
+) -> None:
+    exact = [Ratio(value, value, value) for value in values]
+    assert Check("", unmeasured, 1, 2).verdict(exact) == each
+    assert Check("", unmeasured, 1, 2, "joint").verdict(exact) == alike
+    assert Check("", unmeasured, 1, 2, "one").verdict(exact) == one
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "verdict"),
+    [
+        (0.56, 0.6, SUPPORTED),
+        (0.54, 0.6, UNDECIDED),
+        (0.51, 0.52, UNDECIDED),
+        (0.4, 0.46, UNDECIDED),
+        (0.4, 0.44, CONTRADICTED),
+    ],
+)
+def test_an_interval_within_the_margin_of_a_bound_decides_nothing(low: float, high: float, verdict: str) -> None:
+    assert Check("", unmeasured, 0.5, margin=0.05).verdict([Ratio(0.5, low, high)]) == verdict
+
+
+def test_more_than_a_half_is_not_a_half() -> None:
+    more = Check("", unmeasured, nextafter(0.5, inf))
+    assert more.verdict([Ratio(0.5, 0.5, 0.5)]) == CONTRADICTED
+    assert more.verdict([Ratio(0.6, 0.5, 0.7)]) == UNDECIDED
+    assert more.verdict([Ratio(0.6, 0.51, 0.7)]) == SUPPORTED
+
+
+@pytest.mark.parametrize(
+    ("testable", "others", "verdict"),
+    [
+        ([], [], UNDECIDED),
+        ([], [UNDECIDED], UNDECIDED),
+        ([SUPPORTED], [], SUPPORTED),
+        ([SUPPORTED, SUPPORTED], [UNDECIDED], SUPPORTED),
+        ([REPRODUCED], [UNDECIDED], REPRODUCED),
+        ([CONTRADICTED], [SUPPORTED], CONTRADICTED),
+        ([UNDECIDED], [], UNDECIDED),
+        ([UNDECIDED], [SUPPORTED], UNDECIDED),
+        ([SUPPORTED, UNDECIDED], [], UNDECIDED),
+        ([CONTRADICTED, UNDECIDED], [], UNDECIDED),
+        ([SUPPORTED, CONTRADICTED], [], UNDECIDED),
+    ],
+)
+def test_runs_that_can_tell_have_to_agree_and_no_other_counts(
+    testable: list[str], others: list[str], verdict: str
+) -> None:
+    findings = [ClaimFinding(verdict, str(place), (Met("board: it", True),)) for place, verdict in enumerate(testable)]
+    findings += [ClaimFinding(verdict, "", (Met("board: another (needs it)", False),)) for verdict in others]
+    for order in (findings, findings[::-1]):
+        judged = combine(CLAIMS[0], dict.fromkeys(order, ("run",)))
+        assert judged.verdict == verdict
+        assert judged.tested == bool(testable)
+        assert any("disagree" in note for note in judged.notes) == (len(set(testable)) > 1)
+        assert any(note.startswith("Run: ") for note in judged.notes) == (not testable)
+
+
+@pytest.mark.parametrize(
+    ("offload", "layers", "found", "met"),
+    [
+        (True, -1, "all layers on the GPU", True),
+        (True, 28, "all layers on the GPU", True),
+        (True, 27, "27 layers on the GPU", False),
+        (True, 0, "CPU", False),
+        (False, 28, "CPU", False),
+        (None, 28, "unknown", False),
+        (True, None, "unknown", False),
+    ],
+)
+def test_a_model_is_on_the_gpu_with_all_its_28_layers(
+    make_run: MakeRun, offload: bool | None, layers: int | None, found: str, met: bool
+) -> None:
+    model = {"gpu_offload_supported": offload, "gpu_layers": layers, "model_sha256": "ab"}
+    run, ours = make_run({}, manifest={"model": model}), Provenance(model_sha256="ab")
+    on_gpu = PAPERS_MODEL[2].of(facts_of(run, [ours]))
+    assert on_gpu.met == met
+    assert on_gpu.text.startswith(f"processor: {found}")
+    assert facts_of(run, [ours, Provenance(model_sha256="cd")])["processor"] == "unknown"
+
+
+@pytest.mark.parametrize(
+    ("environment", "name", "same"),
+    [
+        (ORIN, "Jetson AGX Orin", True),
+        (ORIN, "Jetson Orin Nano", False),
+        ({"board": "NVIDIA Jetson Orin Nano Super Developer Kit"}, "Jetson AGX Orin", False),
+        ({"board": "AGX Orin NX"}, "Jetson AGX Orin", True),
+        ({"board": "AGX"}, "Jetson AGX Orin", False),
+        (RTX, "RTX 4080", True),
+        ({"gpus": [{}, {"name": "My NVIDIA GeForce RTX 4080 16 GB"}]}, "RTX 4080", True),
+        ({"gpus": [{"name": "NVIDIA GeForce RTX 4080 SUPER"}]}, "RTX 4080", False),
+        ({"gpus": [{"name": "NVIDIA GeForce RTX 4080 Laptop GPU"}]}, "RTX 4080", False),
+        ({"gpus": [{"name": "NVIDIA GeForce RTX 40800"}]}, "RTX 4080", False),
+        ({}, "RTX 4080", False),
+    ],
+)
+def test_a_board_is_known_by_its_whole_name(
+    make_run: MakeRun, environment: dict[str, Any], name: str, same: bool
+) -> None:
+    assert on_board(name).of(facts_of(make_run({}, manifest={"environment": environment}), [])).met == same
+
+
+@pytest.mark.parametrize(
+    ("environment", "named"),
+    [
+        (RTX | {"cpu": "AMD Ryzen 9"}, "AMD Ryzen 9, NVIDIA GeForce RTX 4080"),
+        (ORIN | {"gpus": []}, "NVIDIA Jetson AGX Orin Developer Kit"),
+        ({}, "a machine that is not known"),
+    ],
+)
+def test_a_machine_is_named_by_what_is_known_of_it(make_run: MakeRun, environment: dict[str, Any], named: str) -> None:
+    assert facts_of(make_run({}, manifest={"environment": environment}), [])["board"] == named

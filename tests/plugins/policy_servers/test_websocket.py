@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
@@ -12,6 +10,7 @@ from socket import SHUT_RDWR, create_connection
 from threading import Event, Thread
 from typing import Any
 
+import httpx
 import msgpack
 import numpy as np
 import pytest
@@ -56,13 +55,8 @@ def robot(address: str, path: str = "", **more: Any) -> Iterator[Any]:
 
 
 def get(address: str, path: str, **headers: str) -> tuple[int, str]:
-    request = urllib.request.Request(address.replace("ws:", "http:") + path, headers=headers)  # noqa: S310
-    try:
-        with urllib.request.urlopen(request, timeout=10) as response:  # noqa: S310
-            return response.status, response.read().decode()
-    except urllib.error.HTTPError as error:
-        with error:
-            return error.code, error.read().decode()
+    response = httpx.get(address.replace("ws:", "http:") + path, headers=headers, timeout=10)
+    return response.status_code, response.text
 
 
 # anybody's clients at our server

@@ -75,11 +75,14 @@ def test_only_numbers_are_read(array: Any) -> None:
         array_of(saved(array, allow_pickle=True))
 
 
-def test_nothing_is_unpickled() -> None:
-    class Trap:
-        def __reduce__(self) -> Any:
-            return pytest.fail, ("it was unpickled",)
+class Trap:
+    """What fails the test if it is unpickled."""
 
+    def __reduce__(self) -> Any:
+        return pytest.fail, ("it was unpickled",)
+
+
+def test_nothing_is_unpickled() -> None:
     for data in (pickle.dumps(Trap()), saved(np.array([Trap()], object), allow_pickle=True)):
         with pytest.raises(RequestFailed):
             unpack(msgpack.packb({"__ndarray_class__": True, "as_npy": data}))
@@ -158,10 +161,6 @@ def test_a_map_that_lies_is_refused_in_a_line(fields: dict[str, Any], why: str) 
 
 
 def test_a_pickle_in_a_map_is_refused_unread(peer: Any) -> None:
-    class Trap:
-        def __reduce__(self) -> Any:
-            return pytest.fail, ("it was unpickled",)
-
     message = peer.packb(np.array([Trap()], object))
     with pytest.raises(RequestFailed, match=r"kind 'O'.*nothing is unpickled"):
         unpack(message)

@@ -61,10 +61,8 @@ def replace_stall_ticks(delay_ticks: Ints, cycle_ticks: ArrayLike, horizon: int)
 def replace_age_ticks(delay: int, cycle: int, horizon: int) -> Span:
     """Return the age of the observation behind the executed actions: d to c + d - 1 ticks, mean d + (c - 1) / 2.
 
-    Where the chunk runs out before (c + d > H), d to H - 1. Raises ValueError for d >= H, which executes nothing.
+    Where the chunk runs out before (c + d > H), d to H - 1. With d >= H nothing is executed.
     """
-    if delay >= horizon:
-        raise ValueError(f"a delay of {delay} ticks leaves no action of {horizon}")
     last = min(cycle + delay, horizon) - 1
     return Span(delay, (delay + last) / 2, last)
 

@@ -115,17 +115,6 @@ def test_with_any_trigger_it_stalls_for_what_answers_take_longer_than_they_last_
     assert boundaries(log)[40] == int(steady_stall_ticks(ready, known, trigger, s))
 
 
-def test_a_queue_that_asks_before_it_has_what_it_asked_for_stalls_otherwise() -> None:
-    # m = s = 2 and 2.5 ticks: no request can follow from the answer before one of its two actions has left.
-    setting = ControlSetting(PERIOD, 2)
-    assert int(queue_stall_ticks(np.array(2), 2)) == 0
-    assert int(steady_stall_ticks(np.array(2), np.array(3), 2, 2)) == 1
-    assert boundaries(plainly(Queue(2), constant(50), setting)) == [1] * 7
-    assert not any(boundaries(plainly(Queue(2), constant(50), ControlSetting(PERIOD, 3))))
-    # m = 9 > s = 2 and d = 3 > s: an answer takes longer than it lasts, whatever the trigger.
-    assert boundaries(plainly(Queue(9), constant(60), setting))[2:] == [1] * 4
-
-
 @given(latency=st.integers(0, 400), s=st.integers(1, 9), rounding=ROUNDINGS)
 def test_sync_moves_for_the_share_of_its_actions(latency: int, s: int, rounding: Rounding) -> None:
     setting = ControlSetting(PERIOD, 9, rounding)
@@ -168,21 +157,6 @@ def test_replace_stalls_for_what_a_cycle_and_a_delay_exceed_the_chunk_by(
             tick - left_at[act[0]] for tick, act in enumerate(log.acts) if act and from_tick <= tick < from_tick + cycle
         ]
         assert spread(found) == (age.least, age.mean, age.most)
-
-
-def test_with_one_request_under_way_a_delay_above_s_stalls_though_s_plus_d_fits() -> None:
-    # H = 8, s = 2, d = 5: s + d - H < 0, but a cycle lasts 5 ticks, and 5 + 5 - 8 = 2.
-    setting = ControlSetting(PERIOD, 8)
-    assert boundaries(plainly(Replace(2), constant(100), setting))[1:] == [2] * 5
-    assert int(replace_stall_ticks(np.array(5), 5, 8)) == 2
-    assert not any(boundaries(plainly(Replace(2, "many"), constant(100), setting))[1:])
-
-
-def test_a_delay_of_a_whole_chunk_executes_nothing() -> None:
-    log = plainly(Replace(4), constant(160), ControlSetting(PERIOD, 8))
-    assert {act[0] for act in log.acts if act} == {0}  # only the first, which is due when it arrives
-    with pytest.raises(ValueError, match="no action of 8"):
-        replace_age_ticks(8, 8, 8)
 
 
 # (c) reaction
@@ -262,16 +236,6 @@ def test_a_cycle_stalls_as_often_as_its_latency_exceeds_the_slack(made: Mode, sl
     law = stats.lognorm(variance**0.5, scale=60 * MS * np.exp(-variance / 2))
     at = slack * 20 * MS if rounding == "ceil" else (slack + 1) * 20 * MS
     assert within(stalls, count - 1, float(law.sf(at)))
-
-
-@pytest.mark.parametrize(("made", "slack"), [(Queue(2, 4), 2), (Replace(3, "one"), 1), (Aggregate(1), 1)])
-def test_so_it_does_for_a_robot_in_continuous_time(made: Mode, slack: int) -> None:
-    setting, count = ControlSetting(20 * MS, 4, "ceil"), 100_001
-    latency = np.minimum(lognormal(np.random.default_rng(6), 18 * MS, 0.5, count), 60 * MS)
-    stalls = np.count_nonzero(boundaries(plainly(made, latency, setting)))
-    variance = np.log1p(0.5**2)
-    law = stats.lognorm(variance**0.5, scale=18 * MS * np.exp(-variance / 2))
-    assert within(int(stalls), count - 1, float(law.sf(slack * 20 * MS)))
 
 
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])

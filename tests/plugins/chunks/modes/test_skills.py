@@ -7,14 +7,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.plugins.chunks.modes import ControlSetting
+from s2a_bench.plugins.chunks.modes import ControlSetting, Ints
 from s2a_bench.plugins.chunks.modes.append import Streamed
-from s2a_bench.policy import policy
+from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.schedule import safe_start
 from tests.plugins.chunks.modes.forms import start_s
-from tests.plugins.chunks.modes.plans import as_plans, streamed_arrivals
 
 PERIOD = 20_000_000
+NS = 1e9
+
+
+def as_plans(arrival_ns: Ints, period_ns: int, *, slowest: float = 1.0) -> Plans:
+    """Take M chunks for plans: actions' arrivals after the request, shape (H, M), in ns, and Delta t.
+
+    ``slowest`` is by how much time-scaling may stretch an action.
+    """
+    nominal_s = np.full((arrival_ns.shape[0], 1), period_ns / NS)
+    return Plans(arrival_ns / NS, nominal_s, nominal_s, slowest * nominal_s)
+
+
+def streamed_arrivals(latency_ns: Ints, gap_ns: int, horizon: int) -> Ints:
+    """Return when each action arrives, shape (H, M): the first after its latency, then one every ``gap_ns``."""
+    return latency_ns + gap_ns * np.arange(horizon, dtype=np.int64)[:, np.newaxis]
 
 
 @given(first=st.integers(0, 10**9), gap=st.integers(0, 10**8), horizon=st.integers(1, 60), period=st.integers(1, 10**8))
