@@ -146,11 +146,6 @@ def test_a_template_that_makes_no_sense_is_refused_with_the_key(content: Any, sa
         Template(content, "mine")
 
 
-def test_it_is_known_what_a_template_takes() -> None:
-    droid = template_of("droid")
-    assert (droid.pictures, droid.accepts_state, droid.encoded) == (2, True, False)
-
-
 @pytest.mark.parametrize("name", names())
 def test_those_with_names_can_be_filled(name: str) -> None:
     template = template_of(name)

@@ -91,24 +91,30 @@ def test_an_action_in_any_of_its_forms_is_read(encode: Callable[[np.ndarray], st
 
 
 @pytest.mark.parametrize(
-    ("body", "message"),
+    ("template", "body", "message"),
     [
-        ('"error"', "the server answered 'error'; the reason is in the server's output"),
-        ('{"detail": "no such route"}', "broke off: no such route"),
-        ("[]", "no finite numbers"),
-        ("null", "no finite numbers"),
-        ("[[1], [1, 2]]", "not the dialect 'openvla'"),
-        ("[NaN]", "no finite numbers"),
-        ('{"__numpy__": "AAAA", "dtype": "O", "shape": [1]}', "an action of type O"),
-        ('{"__numpy__": "AAAA", "dtype": "<f8", "shape": [7]}', "not the dialect 'openvla'"),
-        ("{}", "not the dialect 'openvla'"),
-        ('"pick"', "not the dialect 'openvla'"),
-        ("", "not the dialect 'openvla'"),
+        ("", '"error"', "the server answered 'error'; the reason is in the server's output"),
+        ("", '{"detail": "no such route"}', "broke off: no such route"),
+        ("", "[]", "no finite numbers"),
+        ("", "null", "no finite numbers"),
+        ("", "[[1], [1, 2]]", "not the dialect 'openvla'"),
+        ("", "[NaN]", "no finite numbers"),
+        ("", '{"__numpy__": "AAAA", "dtype": "O", "shape": [1]}', "an action of type O"),
+        ("", '{"__numpy__": "AAAA", "dtype": "<f8", "shape": [7]}', "not the dialect 'openvla'"),
+        ("", "{}", "not the dialect 'openvla'"),
+        ("", '"pick"', "not the dialect 'openvla'"),
+        ("", "", "not the dialect 'openvla'"),
+        ("x-vla", '{"actions": [[1]]}', "an answer without action: actions"),
+        ("x-vla", '{"action": [[NaN]]}', "actions: not finite numbers"),
+        ("x-vla", '{"action": null}', "not numbers of shape"),
+        ("x-vla", '{"error": "Request failed"}', "broke off: Request failed"),
+        ("openvla-oft", '"error"', "the server answered 'error'; the reason is in the server's output"),
+        ("openvla-oft", "[[1], [1, 2]]", "no array of numbers"),
     ],
 )
-def test_what_is_no_action_is_a_failure(body: str, message: str) -> None:
+def test_what_is_no_action_is_a_failure(template: str, body: str, message: str) -> None:
     with pytest.raises(RequestFailed, match=message):
-        asked(says(body))
+        asked(says(body), yuyv_frame(), state=STATE if template else (), **({"template": template} if template else {}))
 
 
 OFT = [np.array([0.5, -0.25, float(tick)]) for tick in range(4)]
@@ -169,23 +175,6 @@ def test_the_file_of_a_picture_is_an_array_of_its_bytes(tmp_path: Path) -> None:
     picture, prompt = json_numpy.loads(seen[0].body)["images"]
     assert decode_image(picture.tobytes()).shape == (48, 64, 3)
     assert (prompt, seen[0].path) == ("pick up the cup", "/v1/act")
-
-
-@pytest.mark.parametrize(
-    ("template", "body", "message"),
-    [
-        ("x-vla", '{"actions": [[1]]}', "an answer without action: actions"),
-        ("x-vla", '{"action": [[NaN]]}', "actions: not finite numbers"),
-        ("x-vla", '{"action": null}', "not numbers of shape"),
-        ("x-vla", '{"error": "Request failed"}', "broke off: Request failed"),
-        ("openvla-oft", '"error"', "the server answered 'error'; the reason is in the server's output"),
-        ("openvla-oft", '[{"__numpy__": "AAAA", "dtype": "O", "shape": [1]}]', "an action of type O"),
-        ("openvla-oft", "[[1], [1, 2]]", "no array of numbers"),
-    ],
-)
-def test_an_answer_that_is_no_chunk_is_a_failure(template: str, body: str, message: str) -> None:
-    with pytest.raises(RequestFailed, match=message):
-        asked(says(body), PICTURES[0], state=STATE, template=template)
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,6 @@ def test_openpi_client_gets_an_error_as_text_and_the_connection_closes_with_1011
             policy.infer({"prompt": "go"})
         with pytest.raises(ConnectionClosed) as closed:
             policy._ws.recv()
-        assert closed.value.rcvd
         assert closed.value.rcvd.code == 1011
         handler.fail_at = None
         assert len(openpi(server.address).infer({"prompt": "go"})["actions"]) == 4
@@ -161,7 +160,6 @@ def closed_with(socket: Any) -> tuple[str, int]:
     said = socket.recv(timeout=20)
     with pytest.raises(ConnectionClosed) as closed:
         socket.recv(timeout=20)
-    assert closed.value.rcvd
     return said, closed.value.rcvd.code
 
 

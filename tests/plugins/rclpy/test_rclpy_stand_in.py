@@ -123,7 +123,6 @@ def test_an_image_is_published_as_ready_cdr_and_its_pixels_are_views_of_what_arr
     assert type(packed) is bytes
     publisher.send(packed)
     got = subscription.take(5)
-    assert got is not None
     data = subscription.unpack(got).data
     assert data.tobytes() == pixels.tobytes()
     assert not data.flags.owndata
@@ -146,7 +145,6 @@ def test_a_result_is_given_out_after_all_feedback(join: Join) -> None:
     client: Any = join().action_client(NAME, llama.GENERATE_RESPONSE)
     goal_id = client.send(client.pack(llama.generate_goal("p")))
     goal = server.next_goal(5)
-    assert goal is not None
     goal.accept()
     goal.executing()
     with client.lock:  # the client's thread stops after its first take, while all of this arrives

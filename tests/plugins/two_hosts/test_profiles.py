@@ -41,18 +41,10 @@ def test_every_published_profile_has_a_source_and_two_directions() -> None:
     ],
 )
 def test_a_link_is_a_name_a_file_or_pairs(
-    text: str,
-    up: float,
-    down: float,
-    delay_ms: float,
-    loss: float,
-    name: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    text: str, up: float, down: float, delay_ms: float, loss: float, name: str, tmp_path: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("mine.toml").write_text('up_mbps = 5\ndelay_ms = 1\nsource = "mine"\n')
-    profile = load_link(text)
+    (tmp_path / "mine.toml").write_text('up_mbps = 5\ndelay_ms = 1\nsource = "mine"\n')
+    profile = load_link(text.replace("mine.toml", str(tmp_path / "mine.toml")))
     ways = profile.directions()
     assert ([way.mbps for way in ways], profile.name) == ([up, down], name)
     assert {(way.delay_ms, way.loss) for way in ways} == {(delay_ms, loss)}

@@ -37,17 +37,14 @@ class Looks:
     """Robots that did the same in every look."""
 
     def __init__(self, one: RobotTrace) -> None:
-        """Have looked at nothing."""
         self.name, self.trace, self.looked, self.stopped = "c", one, 0, False
         self.session: Any = SimpleNamespace(cell=SimpleNamespace(name="c"), origin=SimpleNamespace(to_dict=dict))
 
     def looks(self, _number: int) -> Iterator[Any]:
-        """Yield four times."""
         for self.looked in (1, 2, 3, 4):
             yield [self.trace], {}
 
     def stop(self) -> None:
-        """Note that."""
         self.stopped = True
 
 

@@ -273,24 +273,28 @@ def test_the_last_answer_of_a_mode_is_waited_for_and_is_none_of_the_next(tmp_pat
     assert sorted(rows["latency_s_p99"] > 1.9) == [False, True]
 
 
-def test_where_no_warm_up_succeeds_it_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object) -> None:
-        raise EngineError("out of batteries")
-
-    monkeypatch.setattr("s2a_bench.inference.echo.chunk", fails)
-    with pytest.raises(S2AError, match="out of batteries"):
-        act(tmp_path, modes="sync")
+def fails(*_: object) -> None:
+    raise EngineError("out of batteries")
 
 
-def test_a_chunk_of_another_length_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.inference.echo.chunk", lambda *args: islice(chunk(*args), 5))
-    with pytest.raises(UsageError, match=r"`horizon`: loopback answers with chunks of 5 actions, not 16"):
-        act(tmp_path, modes="sync")
-
-
-def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.inference.echo.chunk", lambda *_: [Token(0, "go")])
-    with pytest.raises(RequestFailed, match="chunks of actions"):
+@pytest.mark.parametrize(
+    ("answers", "error", "says"),
+    [
+        (fails, S2AError, "out of batteries"),
+        (
+            lambda *args: islice(chunk(*args), 5),
+            UsageError,
+            "`horizon`: loopback answers with chunks of 5 actions",
+        ),
+        (lambda *_: [Token(0, "go")], RequestFailed, "chunks of actions"),
+    ],
+    ids=["no warm-up succeeds", "another length", "no actions"],
+)
+def test_answers_that_no_robot_can_act_on_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answers: object, error: type[S2AError], says: str
+) -> None:
+    monkeypatch.setattr("s2a_bench.inference.echo.chunk", answers)
+    with pytest.raises(error, match=says):
         act(tmp_path, modes="sync")
 
 

@@ -42,12 +42,6 @@ def steady_stall_ticks(ready_ticks: Ints, known_ticks: Ints, trigger: int, execu
     return np.maximum(np.maximum(0, ready_ticks - trigger), known_ticks - execute)
 
 
-def sync_motion_share(latency_s: ArrayLike, execute: int, period_s: float) -> Floats:
-    """Return s Delta t / (s Delta t + L), the share of time in motion under sync; random L counts with its mean."""
-    busy_s = execute * period_s
-    return busy_s / (busy_s + np.asarray(latency_s, dtype=np.float64))
-
-
 def replace_stall_ticks(delay_ticks: Ints, cycle_ticks: ArrayLike, horizon: int) -> Ints:
     """Return min(c, max(0, c + d - H)), the stall between a chunk's takeover and the next one's, at constant d.
 

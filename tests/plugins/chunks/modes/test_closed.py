@@ -33,7 +33,6 @@ from tests.plugins.chunks.modes.forms import (
     replace_age_ticks,
     replace_stall_ticks,
     steady_stall_ticks,
-    sync_motion_share,
 )
 from tests.plugins.chunks.modes.plain import Log
 
@@ -113,15 +112,6 @@ def test_with_any_trigger_it_stalls_for_what_answers_take_longer_than_they_last_
     ready = setting.delay_ticks(np.array(latency)) + made.hold_ticks(setting)
     known = setting.known_ticks(np.array(latency + (s - 1) * gap))
     assert boundaries(log)[40] == int(steady_stall_ticks(ready, known, trigger, s))
-
-
-@given(latency=st.integers(0, 400), s=st.integers(1, 9), rounding=ROUNDINGS)
-def test_sync_moves_for_the_share_of_its_actions(latency: int, s: int, rounding: Rounding) -> None:
-    setting = ControlSetting(PERIOD, 9, rounding)
-    log = plainly(Sync(s), constant(latency), setting)
-    share = sum(act is not None for act in log.acts) / len(log.acts)
-    delay = int(setting.delay_ticks(np.array(latency)))
-    assert share == pytest.approx(float(sync_motion_share(delay * PERIOD, s, PERIOD)))
 
 
 # (b) replace

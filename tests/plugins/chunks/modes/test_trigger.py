@@ -261,19 +261,11 @@ def drawn(count: int, seed: int, scale: float = 80e6) -> NDArray[np.int64]:
     return ticks.astype(np.int64) * SETTING.period_ns + SETTING.period_ns // 2
 
 
-def maximum() -> TriggerRule:
-    return Maximum()
-
-
-def mean() -> TriggerRule:
-    return Mean()
-
-
 def tracked() -> TriggerRule:
     return TrackedLatency.begin(drawn(500, 1).tolist(), 0.05)
 
 
-@pytest.mark.parametrize("begin", [maximum, mean, tracked])
+@pytest.mark.parametrize("begin", [Maximum, Mean, tracked])
 @pytest.mark.parametrize("seed", range(3))
 def test_the_robot_chooses_what_is_computed_of_its_latencies(begin: Callable[[], TriggerRule], seed: int) -> None:
     latency_ns = drawn(300, 100 + seed)
@@ -297,7 +289,7 @@ def test_the_robot_chooses_what_is_computed_of_its_latencies(begin: Callable[[],
 def test_a_mean_of_ticks_is_the_mean(rounding: Rounding) -> None:
     setting = ControlSetting(SETTING.period_ns, 16, rounding)
     latency_ns = np.random.default_rng(7).lognormal(np.log(70e6), 0.5, 4000).astype(np.int64)
-    stepper = Learning(Queue(), mean).stepper(setting)
+    stepper = Learning(Queue(), Mean).stepper(setting)
     tick = 0
     for request, delay in enumerate(setting.delay_ticks(latency_ns).tolist()):
         while not stepper.ask(tick):
@@ -308,7 +300,7 @@ def test_a_mean_of_ticks_is_the_mean(rounding: Rounding) -> None:
 
 
 def test_each_robot_has_a_rule_of_its_own() -> None:
-    mode = Learning(Queue(), maximum)
+    mode = Learning(Queue(), Maximum)
     one, other = mode.stepper(SETTING), mode.stepper(SETTING)
     assert one.ask(0)
     one.arrived(0, 16, 9)
