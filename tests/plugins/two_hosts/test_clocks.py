@@ -1,13 +1,16 @@
-"""Offsets between clocks: simulated exchanges, whose true offset is known."""
+"""Offsets between clocks: simulated exchanges, whose true offset is known, and what chrony and PTP say of an error."""
 
 from __future__ import annotations
 
 import re
+import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint
 from itertools import pairwise
 from random import Random
 from statistics import mean
+from typing import Any
 
 import pytest
 from hypothesis import example, given, settings
@@ -15,8 +18,9 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from s2a_bench.clock import VirtualClock, clock_id
-from s2a_bench.errors import ClockMoved, RequestFailed
-from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WallClock
+from s2a_bench.errors import ClockMoved, RequestFailed, UsageError
+from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WALL_CLOCKS, WallClock
+from s2a_bench.plugins.two_hosts import wall_clocks as clocks
 from s2a_bench.plugins.two_hosts.clocks import (
     KEPT,
     RATE,
@@ -27,6 +31,7 @@ from s2a_bench.plugins.two_hosts.clocks import (
     RemoteClock,
     interval_at,
 )
+from s2a_bench.plugins.two_hosts.surroundings import HostOptions
 from s2a_bench.trace import Remote, Trace
 
 SECOND_NS, MS_NS = 10**9, 10**6
@@ -136,23 +141,6 @@ def test_a_step_more_than_a_window_ago_no_longer_counts() -> None:
     assert found.lo_ns <= simulated.offset(at_ns) <= found.hi_ns
 
 
-def test_one_exchange_bounds_its_own_one_way_times() -> None:
-    only = Exchange(sent_ns=100, received_ns=5_000_150, answered_ns=5_000_250, seen_ns=300)
-    offset = Offset()
-    offset.add(only)
-    found = offset.over(only.sent_ns, only.seen_ns)
-    assert found.lo_ns <= 5_000_000 <= found.hi_ns
-    assert found.half_ns >= found.middle_ns - found.lo_ns
-
-
-def test_far_from_its_exchange_an_offset_may_have_drifted_at_the_limit_of_the_rate_both_ways() -> None:
-    only, far_ns = Exchange(sent_ns=0, received_ns=500, answered_ns=500, seen_ns=2000), 10**9
-    drift_ns = round(RATE * far_ns)
-    after, before = interval_at(2000 + far_ns, [only]), interval_at(-far_ns, [only])
-    assert (after.lo_ns, after.hi_ns) == pytest.approx((-1500 - drift_ns, 500 + drift_ns + 200), abs=2)
-    assert (before.lo_ns, before.hi_ns) == pytest.approx((-1500 - drift_ns - 200, 500 + drift_ns), abs=2)
-
-
 def best(at_ns: int, exchanges: Sequence[Exchange], slack_ns: float) -> tuple[float, float] | None:
     """Return the least and the greatest a + b t over all lines between the bounds, by linear programming."""
     rows = [((1, (time - at_ns) / 1e6), bound + slack_ns) for time, bound in (each.upper for each in exchanges)]
@@ -190,7 +178,6 @@ def test_an_interval_is_that_of_every_line_between_the_bounds(exchanges: list[Ex
     except ClockMoved:
         assert not inner
         return
-    assert outer
     assert outer[0] - 2.1 <= found.lo_ns
     assert found.hi_ns <= outer[1] + 2.1
     if inner:
@@ -202,7 +189,6 @@ def test_with_more_bounds_than_count_an_interval_still_holds_the_offset() -> Non
     """Upper bounds on a parabola are all vertices; some 100 of 600 count, and so do the last 2000 exchanges."""
     exchanges = [Exchange(at, at + (at // 1000) ** 2, at, at + 10) for at in range(-300_000, 300_000, 1000)]
     found, tight = interval_at(0, exchanges), best(0, exchanges, 0)
-    assert tight
     assert found.lo_ns <= tight[0] <= tight[1] <= found.hi_ns <= tight[1] + 40
     offset = Offset()
     for at in (-10, *range(KEPT)):
@@ -287,7 +273,6 @@ def test_a_report_on_this_hosts_clock_is_off_by_no_more_than_it_says(
         last_ns = virtual.now_ns()
         joined = remote.join(trace, last_ns)
         report = trace.remote
-        assert report is not None
         assert report.clock == clock_id()
         for (_, stamp), true_ns in zip(report.marks, (sent_ns + 8 * MS_NS, sent_ns + 10 * MS_NS), strict=True):
             assert abs(stamp - true_ns) <= joined.error_ns
@@ -374,3 +359,75 @@ def test_a_server_that_tells_less_than_its_wall_clock_or_no_marks_is_refused(
     for silent in (Trace(), Trace([("", 1), ("", 2)], remote=Remote("elsewhere"))):
         with pytest.raises(RequestFailed, match="no marks"):
             remote.join(silent, virtual.now_ns())
+
+
+CHRONY = (
+    "01020304,a.b.c,3,1328281229.000000000,-0.000001501,-0.000001632,0.000002360,331.898,0.004,0.154,"
+    "0.373169000,0.024780000,64.2,Normal\n"
+)
+PTP = """sending: GET CURRENT_DATA_SET
+\t90e2ba.fffe.20c7f8-0 seq 0 RESPONSE MANAGEMENT CURRENT_DATA_SET
+\t\tstepsRemoved        1
+\t\toffsetFromMaster  -142.0
+\t\tmeanPathDelay     9310.0
+"""
+
+
+@pytest.fixture(autouse=True)
+def nothing_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    for each in (clocks.CHRONY, clocks.PTP):
+        monkeypatch.setattr(each, "known", None)
+
+
+def test_chronys_bound_is_the_root_distance_and_the_offset() -> None:
+    assert clocks.chrony_error_s(CHRONY) == pytest.approx(1.501e-6 + 0.024780 + 0.373169 / 2)
+
+
+def test_ptps_bound_is_the_offset_and_the_path() -> None:
+    assert clocks.ptp_error_s(PTP) == pytest.approx(9452e-9)
+
+
+@pytest.mark.parametrize(
+    ("system", "output", "message"),
+    [
+        ("chrony", CHRONY.replace("Normal", "Not synchronised"), "chronyd is not synchronised (Not synchronised)"),
+        ("chrony", "506 Cannot talk to daemon\n", "'chronyc -c tracking'"),
+        ("ptp", "sending: GET CURRENT_DATA_SET\n", "'pmc -u -b 0 GET CURRENT_DATA_SET'"),
+        ("ptp", FileNotFoundError("No such file"), "tells no bound on the host "),
+    ],
+)
+def test_a_system_without_a_bound_is_one_line(
+    system: str, output: Any, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(command: tuple[str, ...], **_: Any) -> subprocess.CompletedProcess[str]:
+        if isinstance(output, Exception):
+            raise output
+        return subprocess.CompletedProcess(command, 0, output, "")
+
+    monkeypatch.setattr(clocks.subprocess, "run", run)
+    with pytest.raises(RequestFailed, match="`clock` ") as error:
+        WALL_CLOCKS[system]()
+    assert message in str(error.value)
+
+
+def test_a_reading_is_used_for_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = []
+
+    def run(command: tuple[str, ...], **_: Any) -> subprocess.CompletedProcess[str]:
+        runs.append(command)
+        return subprocess.CompletedProcess(command, 0, PTP, "")
+
+    monkeypatch.setattr(clocks.subprocess, "run", run)
+    monkeypatch.setattr(clocks, "FRESH_NS", 10**15)
+    first = clocks.PTP()
+    assert clocks.PTP() is first
+    assert runs == [("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET")]
+    assert first.error_ns >= 9452
+
+
+def test_any_packages_wall_clock_may_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    offered = EntryPoint("gps", "somebodys_gps:clock", WALL_CLOCKS.group)
+    monkeypatch.setitem(WALL_CLOCKS._offered, "gps", offered)
+    assert HostOptions(clock="gps").clock == "gps"
+    with pytest.raises(UsageError, match="'sundial' is none of chrony, ptp, gps"):
+        HostOptions(clock="sundial")

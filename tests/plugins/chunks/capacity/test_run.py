@@ -37,17 +37,14 @@ class Looks:
     """Robots that did the same in every look."""
 
     def __init__(self, one: RobotTrace) -> None:
-        """Have looked at nothing."""
         self.name, self.trace, self.looked, self.stopped = "c", one, 0, False
         self.session: Any = SimpleNamespace(cell=SimpleNamespace(name="c"), origin=SimpleNamespace(to_dict=dict))
 
     def looks(self, _number: int) -> Iterator[Any]:
-        """Yield four times."""
         for self.looked in (1, 2, 3, 4):
             yield [self.trace], {}
 
     def stop(self) -> None:
-        """Note that."""
         self.stopped = True
 
 
@@ -164,8 +161,8 @@ def test_robots_are_in_as_many_processes_as_their_server_lets_them(
 @pytest.mark.parametrize(
     ("mode", "options", "cycle_ms"),
     [
-        ("sync", {}, 16 * 20),
-        ("queue?trigger=8", {"control_hz": 100}, 16 * 10),
+        ("sync", {"modes": "sync"}, 16 * 20),
+        ("queue?trigger=8", {"modes": "queue?trigger=8", "control_hz": 100}, 16 * 10),
         ("", {"plan_every_s": 2, "limit": "stalled=50%"}, 2000),
         ("", {"closed_loop": True, "think_s": 0.5}, 500),
     ],
@@ -173,13 +170,7 @@ def test_robots_are_in_as_many_processes_as_their_server_lets_them(
 def test_robots_start_at_random_moments_of_a_cycle(
     monkeypatch: pytest.MonkeyPatch, mode: str, options: Any, cycle_ms: float
 ) -> None:
-    more = {"modes": mode} if mode else {}
-    robots = robots_of(monkeypatch, mode=mode, requests={"transports": "loopback"}, **options, **more)
-    cycle_ns = cycle_ms * MS
-    if mode:
-        made = robots._config.made[mode]
-        assert made.execution_horizon(robots._config.setting) * robots._config.setting.period_ns <= cycle_ns
-        cycle_ns = made.execution_horizon(robots._config.setting) * robots._config.setting.period_ns
+    robots, cycle_ns = robots_of(monkeypatch, mode=mode, requests={"transports": "loopback"}, **options), cycle_ms * MS
     phases_ns = np.array([*robots._phases(2000).values()])
     assert 0 <= phases_ns.min() < 0.01 * cycle_ns
     assert 0.99 * cycle_ns < phases_ns.max() <= cycle_ns
