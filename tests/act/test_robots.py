@@ -123,13 +123,6 @@ class TestFunctions:
         assert motion.wait()
         assert motion.remaining_s == 0
 
-    def test_what_remains_is_in_seconds_and_never_less_than_none(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        motion = SkillMotion(CUP, 3_500_000_000)
-        monkeypatch.setattr("s2a_bench.act.call.now_ns", lambda: 1_000_000_000)
-        assert motion.remaining_s == 2.5
-        motion.retime(999_999_999)
-        assert motion.remaining_s == 0
-
     def test_a_skill_without_a_function_is_refused(self) -> None:
         actions: dict[str, SkillFunction] = {"go_to": lambda _: None, "pick": lambda _: None}
         with pytest.raises(UsageError, match="`robot`: no function for the skills open, close, place of 'household'"):

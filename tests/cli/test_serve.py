@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import signal
@@ -209,20 +208,6 @@ def test_ros_args_name_the_node_its_topics_and_its_parameters(start: Start, dds_
         middleware.close()
     process.send_signal(signal.SIGINT)
     assert process.wait(30) == 0
-
-
-def test_a_server_whose_latencies_are_known_says_so_and_is_recognised_from_afar(start: Start, tmp_path: Path) -> None:
-    process, line = start(
-        "http", "--engine", "echo", "--port", "0", "--latency", "bursty:mean_ms=5,cv=0,burst_tokens=2,within=.2"
-    )
-    assert "engine echo, latencies bursty:mean_ms=5,cv=0,burst_tokens=2,within=.2 (EMULATED); " in line
-    url = line.split()[2].partition("/v1")[0]
-    found = measured(tmp_path, "--transport", "http/as-deployed", "--url", url)
-    assert {round(json.loads(facts)["latency_drawn_ms"], 6) for facts in found.samples["facts"]} == {1, 9}
-    assert "latency_drawn_ms" in found.manifest["facts"]
-    assert found.origins.every[0].profile.startswith("latencies bursty")
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(30) in {0, -signal.SIGTERM}
 
 
 def test_shm_says_where_memory_is_handed_over_and_leaves_no_socket(start: Start, tmp_path: Path) -> None:

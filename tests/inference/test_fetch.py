@@ -422,12 +422,6 @@ def test_the_listing_gives_one_language_model_or_names_all(
     assert all(file in str(error.value) for file in files if file.endswith("gguf"))
 
 
-def test_another_mmproj_of_the_repository_is_fetched_by_its_name(hub: Hub) -> None:
-    hold(hub, "qwen2.5-vl-3b", LISTINGS["qwen2.5-vl-3b"])
-    done = fetch("qwen2.5-vl-3b", quant="Q8_0", mmproj="mmproj-Qwen2.5-VL-3B-Instruct-Q8_0.gguf")
-    assert [file.path.name for file in done.files] == LISTINGS["qwen2.5-vl-3b"][1::2]
-
-
 @pytest.mark.parametrize("name", ["hub:", "hub:a", "hub:a/b/c", "hub:a/b:", "hub:a b/c"])
 def test_what_is_no_address_on_the_hub_is_wrong_usage(name: str) -> None:
     with pytest.raises(UsageError, match=rf"^`model` '{name}' is neither .* nor OWNER/REPO\[:FILE\]$"):

@@ -198,21 +198,6 @@ class ActionSuite:
         with pytest.raises(TransportError, match="is SUCCEEDED and cannot become ABORTED"):
             goal.abort(llama.text_result(""))
 
-    def test_goals_queue_while_one_executes(self, action: Action) -> None:
-        client = action.client
-        sent = [send(client, str(number)) for number in range(3)]
-        goals = [receive(action.server) for _ in sent]
-        for goal in goals:
-            goal.accept()
-        assert [event(client, Accepted).goal_id for _ in sent] == sent
-        for goal in goals:
-            assert goal.executing()
-            goal.succeed(llama.text_result("answer to " + goal.unpack().prompt))
-        results = [event(client, Result) for _ in sent]
-        assert [result.goal_id for result in results] == sent
-        texts = [client.unpack_result(result.packed).response.text for result in results]
-        assert texts == ["answer to 0", "answer to 1", "answer to 2"]
-
     def test_two_clients_get_only_their_own(self, action: Action, join: Join) -> None:
         other = join().action_client(NAME, llama.GENERATE_RESPONSE)
         assert other.wait_for_server(WAIT_S)

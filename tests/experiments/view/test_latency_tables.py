@@ -1,7 +1,5 @@
 import csv
 import io
-import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import replace
@@ -299,15 +297,6 @@ def test_the_terminal_shows_the_stages_what_they_say_and_where_the_rest_is(
 
 def test_an_empty_run_prints_a_line(make_run: MakeRun) -> None:
     assert "No samples." in printed(make_run({}))
-
-
-def test_importing_the_tables_imports_no_heavy_library() -> None:
-    code = (
-        "import sys; from s2a_bench.experiments.latency.view import figures;"
-        "print([n for n in ('pandas', 'pyarrow', 'matplotlib', 'scipy', 'numpy', 'rich') if n in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 def test_over_launches_the_table_says_by_how_much_they_differ(
