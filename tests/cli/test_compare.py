@@ -24,18 +24,11 @@ def run(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess[st
 
 
 @pytest.fixture(scope="module")
-def timelines(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return run folders of timelines: computed ones, and drawn ones of two seeds."""
-    folders = {}
-    for name, flags in {
-        "even": ["--profile", "jetson-agx-orin"],
-        "drawn": ["--profile", "jetson-agx-orin", "--jitter", "lognormal:cv=0.3", "--plans", "60", "--seed", "1"],
-        "drawn-too": ["--profile", "jetson-agx-orin", "--jitter", "lognormal:cv=0.3", "--plans", "60", "--seed", "2"],
-    }.items():
-        root = tmp_path_factory.mktemp(name)
-        called("timeline", "--tokens-per-skill", "6", "--output", root, *flags)
-        folders[name] = str(next(root.iterdir()))
-    return folders
+def timelines(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a run folder of computed timelines."""
+    root = tmp_path_factory.mktemp("even")
+    called("timeline", "--tokens-per-skill", "6", "--output", root, "--profile", "jetson-agx-orin")
+    return str(next(root.iterdir()))
 
 
 def test_a_run_against_itself_has_no_change_and_says_what_cannot_be_known() -> None:
@@ -67,10 +60,10 @@ def test_a_gate_that_trips_is_exit_code_three_and_files_are_written_all_the_same
 
 
 def test_computed_timelines_are_the_same_to_the_last_digit_and_gated_without_launches(
-    timelines: dict[str, str], tmp_path: Path
+    timelines: str, tmp_path: Path
 ) -> None:
     gate = "--fail-if", "start_s>0%"
-    done = run(timelines["even"], timelines["even"], "--metric", "all", *gate, "--json", "--output", tmp_path)
+    done = run(timelines, timelines, "--metric", "all", *gate, "--json", "--output", tmp_path)
     assert not list(tmp_path.glob("*.png"))  # nothing to draw
     whole = printed(done, SCHEMA)
     assert {one["verdict"] for one in whole["comparisons"]} == {"same"}

@@ -151,15 +151,6 @@ def test_ctrl_c_leaves_a_folder_that_goes_on(many: Path) -> None:
     assert found.manifest["state"] == "finished"
 
 
-def test_repeats_have_draws_of_their_own_and_policies_share_them(whole: Sweep) -> None:
-    found = numbers(whole)
-    orin = found[(found["board"] == "jetson-agx-orin") & (found["tokens_per_skill"] == 6)]
-    first = orin[orin["seed"] == 3].groupby("policy")["last_arrival_ns"].apply(list)
-    assert set(orin["seed"]) == {3, 4}
-    assert first["naive"] == first["stream-to-act"] == first["wait-then-act"]
-    assert first["naive"] != orin[orin["seed"] == 4].groupby("policy")["last_arrival_ns"].apply(list)["naive"]
-
-
 def test_a_measured_cell_runs_in_a_process_of_its_own_and_says_why_it_failed(tmp_path: Path) -> None:
     file = tmp_path / "m.toml"
     file.write_text(
@@ -200,11 +191,6 @@ def test_dry_run_prints_cells_and_leaves_nothing(many: Path) -> None:
 
 def test_the_papers_sweep_is_36_timelines() -> None:
     assert called("sweep", "paper", "--dry-run").stdout.splitlines()[-1].startswith("36 of 36 cells to run, 36 virtual")
-
-
-def test_dry_run_of_a_killed_sweep_says_what_is_left(whole: Sweep) -> None:
-    done = called("sweep", "--resume", whole.path, "--dry-run")
-    assert f"0 of {CELLS} cells to run" in done.stdout
 
 
 @pytest.mark.parametrize(
