@@ -294,11 +294,3 @@ class TestRosActions:
         name = parameter.partition("=")[0]
         with pytest.raises(UsageError, match=f"^`robot`: ros: {name} is about actions, not skills$"):
             kind(f"ros?{parameter}", SkillKind).open_skills(QUICK)
-
-    def test_a_robot_that_is_not_there_is_missed(self, dds_domain: int, stack: ExitStack) -> None:
-        middleware = open_middleware("cyclonedds", domain_id=dds_domain)
-        stack.callback(middleware.close)
-        with pytest.raises(
-            TransportError, match=r"`robot`: ros: no server of the action /nowhere/execute_skill .* in 0\.2 s"
-        ):
-            RosSkills(middleware, "/nowhere", 0.2)

@@ -72,19 +72,6 @@ def test_a_server_whose_latencies_are_known_answers_after_them_and_is_emulated_i
         assert "Echo engine, EMULATED: latencies 20 ms" in path.read_text(), path
 
 
-def test_blocks_hold_every_cell_once_in_changing_order(whole: tuple[StoredRun, str]) -> None:
-    samples = whole[0].samples
-    orders = []
-    for block, rows in samples.groupby("block"):
-        ordered = rows.sort_values("position")
-        assert list(ordered["position"]) == [0, 1, 2, 3, 4]
-        assert len(set(ordered["cell"])) == 5
-        assert set(ordered["warmup"]) == {block < 1}
-        orders.append(tuple(ordered["cell"]))
-    assert len(set(orders)) > 1
-    assert len(samples) == 9 * 5
-
-
 def test_every_sample_closes_its_budget(whole: tuple[StoredRun, str]) -> None:
     samples = whole[0].samples
     assert (samples["error"] == "").all()

@@ -168,15 +168,6 @@ def test_a_measured_cell_runs_in_a_process_of_its_own_and_says_why_it_failed(tmp
     assert found["state"] == "failed"
 
 
-def test_latencies_are_an_axis_as_numbers_and_as_families(tmp_path: Path) -> None:
-    file = tmp_path / "f.toml"
-    axis = 'latency = [20, "lognormal:mean_ms=20,cv=.5"]'
-    file.write_text(f'command = "latency"\n[settings]\nengine = "echo"\n[grid]\n{axis}\n')
-    lines = called("sweep", file, "--dry-run", "--output", tmp_path / "results").stdout.splitlines()
-    latencies = {line.partition("--latency=")[2].split()[0] for line in lines if "--latency" in line}
-    assert latencies == {"20", "lognormal:mean_ms=20,cv=.5"}
-
-
 def test_dry_run_prints_cells_and_leaves_nothing(many: Path) -> None:
     output = many.parent / "results"
     done = called("sweep", many, "--dry-run", "--output", output)

@@ -340,13 +340,6 @@ def test_a_file_is_found_in_upper_and_lower_case_the_exact_name_first(hub: Hub) 
 # as the repositories list them, by what public programs download from there
 LISTINGS = {
     "minicpm-v-2.6": ["ggml-model-Q4_K_M.gguf", "ggml-model-Q2_K.gguf", "ggml-model-f16.gguf", "mmproj-model-f16.gguf"],
-    "qwen2.5-vl-3b": [
-        "Qwen2.5-VL-3B-Instruct-Q4_K_M.gguf",
-        "Qwen2.5-VL-3B-Instruct-Q8_0.gguf",
-        "Qwen2.5-VL-3B-Instruct-f16.gguf",
-        "mmproj-Qwen2.5-VL-3B-Instruct-Q8_0.gguf",
-        "mmproj-Qwen2.5-VL-3B-Instruct-f16.gguf",
-    ],
     "qwen3-vl-2b": ["Qwen3VL-2B-Instruct-Q4_K_M.gguf", "mmproj-Qwen3VL-2B-Instruct-F16.gguf"],
     "gemma3-270m": ["gemma-3-270m-it-Q8_0.gguf"],
 }
