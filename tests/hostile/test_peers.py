@@ -55,7 +55,7 @@ class TestWebsocket(HostileSuite):
 
     @classmethod
     def wiring(cls) -> Wiring[Any]:
-        return replace(super().wiring(), limits=Limits(head_s=2, body_s=3))  # three cases wait for them
+        return replace(super().wiring(), limits=Limits(head_s=2, body_s=3))  # two cases wait for them
 
 
 class TestWebsocketStreamed(HostileSuite):

@@ -13,7 +13,7 @@ from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.boundary.run import rows, run_boundary
-from s2a_bench.experiments.boundary.view import board_table, boundary_csv, build_boundary, disagreements, line_table
+from s2a_bench.experiments.boundary.view import board_table, build_boundary, disagreements, line_table
 from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.conformal import ANY_STALL_S
 from s2a_bench.policy.metrics import measure
@@ -150,9 +150,3 @@ def test_tables_give_the_formula_and_the_first_rate_that_passed(even: StoredRun)
     verdicts = {row[1:3]: row[4:] for row in board_table(even).rows}
     assert verdicts["4", "0.833"] == ("stall-free", "stalls")
     assert any("agree at 424 of 424 points" in note for note in board_table(even).notes)
-
-
-def test_the_csv_holds_every_point(even: StoredRun) -> None:
-    lines = boundary_csv(even)["boundary.csv"].text(even.origins).splitlines()
-    assert lines[0] == "duration,duration_s,tokens_per_skill,tokens_per_s,board,stall_free,plans,p_stall,provenance"
-    assert len(lines) == 1 + 424
