@@ -100,13 +100,3 @@ def test_the_nonce_of_a_run_repeats_its_pictures_and_the_guard_sees_the_hits(tmp
         w["message"] for w in again["warnings"] if w["code"] == "server-cache"
     )
     assert json.loads((Path(again["run"]) / "manifest.json").read_text())["seeds"] == manifest["seeds"]
-
-
-def test_a_server_that_is_not_ours_is_asked_for_its_first_model_and_nothing_of_ours_is_spoken_of(
-    tmp_path: Path,
-) -> None:
-    with caching(Caching()) as url:
-        result = run(url, "--transport", "http/as-deployed", output=tmp_path)
-    options = json.loads((Path(result["run"]) / "manifest.json").read_text())["asked"]["http/as-deployed"]
-    assert options["model"] == "first"
-    assert not [word for word in ("dummy", "starting", "model's headers") if word in result["stderr"]]

@@ -72,28 +72,6 @@ def test_a_server_whose_latencies_are_known_answers_after_them_and_is_emulated_i
         assert "Echo engine, EMULATED: latencies 20 ms" in path.read_text(), path
 
 
-def test_blocks_hold_every_cell_once_in_changing_order(whole: tuple[StoredRun, str]) -> None:
-    samples = whole[0].samples
-    orders = []
-    for block, rows in samples.groupby("block"):
-        ordered = rows.sort_values("position")
-        assert list(ordered["position"]) == [0, 1, 2, 3, 4]
-        assert len(set(ordered["cell"])) == 5
-        assert set(ordered["warmup"]) == {block < 1}
-        orders.append(tuple(ordered["cell"]))
-    assert len(set(orders)) > 1
-    assert len(samples) == 9 * 5
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_order_and_frames(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        run(*SMALL, "--transport", "http", "--seed", "5", output=tmp_path / name)
-    first, second = only_run(tmp_path / "a").samples, only_run(tmp_path / "b").samples
-    assert list(first["cell"]) == list(second["cell"])
-    assert list(first["frame_index"]) == list(second["frame_index"])
-
-
 def test_every_sample_closes_its_budget(whole: tuple[StoredRun, str]) -> None:
     samples = whole[0].samples
     assert (samples["error"] == "").all()
@@ -276,16 +254,3 @@ def test_a_run_is_recorded_and_its_frames_are_a_source(tmp_path: Path, mode: str
     assert [token.text for token in tokens] == list(seen["text"])
     run(*SMALL, "--source", f"bag:{bag}", "--transport", "http", output=tmp_path / "again")
     assert (only_run(tmp_path / "again").samples["error"] == "").all()
-
-
-def test_a_single_picture_is_another_one_in_every_sample_and_the_same_in_every_cell(tmp_path: Path) -> None:
-    import cv2
-    import numpy as np
-
-    (tmp_path / "pictures").mkdir()
-    cv2.imwrite(str(tmp_path / "pictures" / "one.png"), np.zeros((48, 64, 3), np.uint8))
-    source = ["--source", f"images:{tmp_path / 'pictures'}"]
-    output = run(*SMALL, *source, "--transport", "http", output=tmp_path / "results").stderr
-    assert "duplicate-frames" not in output
-    samples = only_run(tmp_path / "results").samples
-    assert samples["rgb_source"].nunique() == samples["block"].nunique() > 1

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 from importlib.util import find_spec
 from pathlib import Path
@@ -11,8 +9,7 @@ from pathlib import Path
 import pytest
 
 from s2a_bench.inference.models import tiny_dummy
-from tests.cli.program import command, only_run, printed, program, refused
-from tests.waiting import until
+from tests.cli.program import only_run, printed, program, refused
 
 pytestmark = pytest.mark.skipif(find_spec("xllamacpp") is None, reason="the wheel xllamacpp is not installed")
 
@@ -71,19 +68,6 @@ def test_a_grammar_is_obeyed(tmp_path: Path) -> None:
 def test_connections_that_are_closed_after_each_answer(tmp_path: Path, connection: str) -> None:
     latency(tmp_path, "--transport", "http/llama-server", "--connection", connection)
     assert (only_run(tmp_path).samples["error"] == "").all()
-
-
-def test_killed_in_the_middle_is_one_line_and_keeps_the_samples(tmp_path: Path) -> None:
-    long = command("latency", *SMALL, "--requests", "100000", "--transport", "http/llama-server", "--output", tmp_path)
-    process = subprocess.Popen(long, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-    until(lambda: [*tmp_path.glob("*/manifest.json")] and len(only_run(tmp_path).samples) >= 3, 120)
-    (server,) = only_run(tmp_path).manifest["servers"].values()
-    os.kill(server["pid"], signal.SIGKILL)
-    _, output = process.communicate(timeout=120)
-    assert process.returncode == 1
-    assert "killed by signal 9" in output
-    assert "Traceback" not in output
-    assert only_run(tmp_path).manifest["state"] == "failed"
 
 
 def test_a_projector_that_is_none_is_one_line(tmp_path: Path) -> None:

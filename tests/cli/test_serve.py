@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import signal
@@ -17,11 +16,10 @@ import pytest
 
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.store.run import StoredRun
 from s2a_bench.testing.transport import ask, wiring_of, yuyv_frame
 from s2a_bench.transport import open_client
 from s2a_bench.types import Action, Request
-from tests.cli.program import command, only_run, program, refused
+from tests.cli.program import command, refused
 from tests.waiting import ended, until
 
 ONE_BY_ONE = ("--ros-args", "-p", "feedback_interval:=0.0", "--")
@@ -45,13 +43,6 @@ def start() -> Iterator[Start]:
             return process, line
 
         yield run
-
-
-def measured(output: Path, *arguments: str) -> StoredRun:
-    """Measure a server that runs already."""
-    few = ("--requests", "3", "--warmup", "1", "--max-tokens", "4", "--size", "64x48", "--data-only")
-    program("latency", *few, *arguments, "--output", output)
-    return only_run(output)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -139,15 +130,6 @@ def test_a_signal_while_it_starts_leaves_nothing() -> None:
     until(lambda: ended(child))
 
 
-def test_off_loopback_it_wants_a_key_or_to_be_told_that_there_is_none(start: Start) -> None:
-    strangers = ("http", "--engine", "echo", "--port", "0", "--host", "0.0.0.0")  # noqa: S104 - what is tested
-    error = refused("serve", *strangers)
-    assert "--host: others reach 0.0.0.0" in error
-    assert "--api-key-env, or serve every client with --no-auth" in error
-    _, line = start(*strangers, "--no-auth")
-    assert "for every client" in line
-
-
 def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -> None:
     (tmp_path / "node.toml").write_text('engine = "echo"\nnamespace = "/from_file"\nresult-timeout = 5\n')
     _, line = start("ros", "--config", str(tmp_path / "node.toml"), "--namespace", "/from_flag")
@@ -169,16 +151,6 @@ def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -
 def test_a_wrong_file_is_one_line(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "node.toml").write_text(text)
     assert message in refused("serve", "ros", "--config", tmp_path / "node.toml")
-
-
-def test_latency_drives_a_node_that_runs_already(start: Start, tmp_path: Path) -> None:
-    start("ros", "--engine", "echo", "--namespace", "/llama", "--max-tokens", "50", *ONE_BY_ONE)
-    samples = measured(tmp_path, "--transport", "ros", "--action", "/llama/generate_response").samples
-    assert set(samples["cell"]) == {"ros/action"}
-    assert (samples["error"] == "").all()
-    assert (samples["n_tokens"] == 4).all()
-    assert samples["server_ns"].notna().all()
-    assert samples["e2e_without_inference_ns"].isna().all()
 
 
 def test_ros_args_name_the_node_its_topics_and_its_parameters(start: Start, dds_domain: int, tmp_path: Path) -> None:
@@ -209,20 +181,6 @@ def test_ros_args_name_the_node_its_topics_and_its_parameters(start: Start, dds_
         middleware.close()
     process.send_signal(signal.SIGINT)
     assert process.wait(30) == 0
-
-
-def test_a_server_whose_latencies_are_known_says_so_and_is_recognised_from_afar(start: Start, tmp_path: Path) -> None:
-    process, line = start(
-        "http", "--engine", "echo", "--port", "0", "--latency", "bursty:mean_ms=5,cv=0,burst_tokens=2,within=.2"
-    )
-    assert "engine echo, latencies bursty:mean_ms=5,cv=0,burst_tokens=2,within=.2 (EMULATED); " in line
-    url = line.split()[2].partition("/v1")[0]
-    found = measured(tmp_path, "--transport", "http/as-deployed", "--url", url)
-    assert {round(json.loads(facts)["latency_drawn_ms"], 6) for facts in found.samples["facts"]} == {1, 9}
-    assert "latency_drawn_ms" in found.manifest["facts"]
-    assert found.origins.every[0].profile.startswith("latencies bursty")
-    process.send_signal(signal.SIGTERM)
-    assert process.wait(30) in {0, -signal.SIGTERM}
 
 
 def test_shm_says_where_memory_is_handed_over_and_leaves_no_socket(start: Start, tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.types import Token
 from tests.cli.program import command, only_run, printed, program, refused
 from tests.servers.sockets import Received, head, serving
-from tests.servers.speakers import Cloud, LlamaServer, Ollama, answering
+from tests.servers.speakers import Cloud, Ollama, answering
 
 SMALL = ["--transport", "http", "--size", "64x48", "--requests", "2", "--warmup", "1", "--max-tokens", "3"]
 KEY = "sekret-0123456789"
@@ -54,20 +54,6 @@ def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path) -> None:
     assert all(json.loads(row["facts"])["outside_model_ms"] == pytest.approx(10.0) for row in rows)
     assert not [path for path in folder.rglob("*") if path.is_file() and KEY.encode() in path.read_bytes()]
     assert KEY not in done.stdout + done.stderr
-
-
-def test_an_unknown_server_is_asked_what_it_is(tmp_path: Path) -> None:
-    chat = answering(LlamaServer(), RecordingHandler(["go"]))
-
-    def reply(received: Received) -> object:
-        if received.path == "/v1/models":
-            return [head(kind="application/json") + b'{"data":[{"id":"m","owned_by":"llamacpp"}]}']
-        return chat(received)
-
-    with serving(reply) as url:  # type: ignore[arg-type]
-        done = run("--url", url, "--transport", "http/as-deployed", "--json", output=tmp_path)
-    (cell,) = printed(done)["cells"]
-    assert {"ingest", "inference"} <= set(cell["stages_ms"])
 
 
 def test_a_run_that_is_refused_waits_as_asked_and_ends_with_the_reason(tmp_path: Path) -> None:

@@ -72,15 +72,6 @@ def test_llama_server_refuses_pictures_then_so_it_gets_none_and_is_compared_by_i
     assert {*table["metric"]} >= {"tokens_per_s"}
 
 
-@LLAMA_SERVER
-def test_robots_of_a_fleet_send_no_picture_to_it_either(texts: Path, tmp_path: Path) -> None:
-    fleet = ("--closed-loop", "--robots", "1", "--seconds", "0.5", "--settle", "0", "--size", "64x48", "--threads", "1")
-    program("capacity", "--transport", "http/llama-server", "--model", texts, *fleet, "--output", tmp_path)
-    run = only(tmp_path)
-    assert (run.samples["error"] == "").all()
-    assert run.origins.labels == ("dummy weights", UNSENT)
-
-
 def test_a_profile_of_it_says_so_and_so_do_what_it_computes_and_its_replay(
     texts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

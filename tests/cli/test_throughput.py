@@ -57,23 +57,6 @@ def test_in_process_http_and_ros_stand_beside_llama_bench(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_the_engines_settings_reach_it_and_the_terminal_shows_all(tmp_path: Path) -> None:
-    settings = ["--batch", "64", "--context", "1024", "--kv-type", "q8_0", "--flash-attention", "on"]
-    done = run(*SMALL, *settings, "--against", "paper", "--verbose", output=tmp_path)
-    kept = only_run(tmp_path)
-    model = kept.manifest["model"]
-    expected = {"batch": 64, "context": 1024, "kv_type": "q8_0", "flash_attention": "on", "sampling": "model"}
-    assert {key: model[key] for key in expected} == expected
-    text = " ".join(done.stdout.split())
-    assert all(title in text for title in ("Dummy weights.", "Tokens a second", "The prompt", "by position"))
-    assert str(kept.path) in done.stdout
-    names = {path.name for path in (kept.path / "figures").iterdir()}
-    assert {"throughput_bars.png", "gaps.pdf", "positions.png"} <= names
-    assert (kept.path / "tables" / "throughput.tex").stat().st_size > 0
-    assert not (kept.path / "reference.csv").exists()
-
-
-@pytest.mark.slow
 def test_both_ways_of_flash_attention_are_cells_of_one_run(tmp_path: Path) -> None:
     ways = ["--transport", "in-process,http", "--flash-attention", "off,on"]
     whole = printed(run(*SMALL, *ways, "--json", output=tmp_path))

@@ -58,20 +58,6 @@ def test_the_run_folder_holds_skills_tokens_tables_figure_and_trace(whole: dict[
     assert {"tables/timelines.csv", "figures/timeline.png", "figures/timeline.pdf"} <= files
 
 
-def test_a_given_rate_takes_the_place_of_the_profiles(tmp_path: Path) -> None:
-    done = called(
-        *("timeline", "--rate", "4.8,2", "--prompt-time", "0.5", "--tokens-per-skill", "6", "--n-skills", "4,8"),
-        *("--jitter", "lognormal:cv=0.2", "--plans", "20", "--json", "--output", tmp_path),
-    )
-    found = printed(done)
-    assert {(cell["rate_tokens_per_s"], cell["n_skills"]) for cell in found["cells"]} == {
-        (rate, count) for rate in (4.8, 2) for count in (4, 8)
-    }
-    assert {cell["profile"] for cell in found["cells"]} == {None}
-    assert {cell["plans"] for cell in found["cells"]} == {20}
-    assert len(list((only_run(tmp_path).path / "figures").glob("timeline_N*_T1.png"))) == 2
-
-
 def test_boundary_prints_json_that_keeps_its_schema_and_leaves_the_plane_as_csv(tmp_path: Path) -> None:
     done = called("boundary", "--json", "--output", tmp_path)
     found = printed(done)

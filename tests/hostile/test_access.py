@@ -45,14 +45,8 @@ def documented(request: pytest.FixtureRequest, key_in_the_environment: None) -> 
     "headers",
     [
         [],
-        [("authorization", "")],
-        [("authorization", KEY)],
-        [("authorization", f"Basic {KEY}")],
         [("authorization", f"Bearer {KEY[:-1]}")],
-        [("authorization", f"Bearer {KEY}x")],
-        [("authorization", "Bearer é")],
         [("authorization", f"Bearer {KEY}"), ("authorization", f"Bearer {KEY}")],
-        [("x-api-key", KEY)],
     ],
 )
 @pytest.mark.parametrize("path", [*PATHS.values(), "/v1/models", "/openapi.json", "/nowhere"])

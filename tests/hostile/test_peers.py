@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib.util import find_spec
 from typing import Any
-
-import pytest
 
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Limits
@@ -46,13 +43,6 @@ class TestZmq(HostileSuite):
     servers = zmq.SERVERS
 
 
-@pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh is not installed")
-class TestRosTopicOverZenoh(HostileSuite):
-    name = "ros/topic?middleware=zenoh"
-    clients = ros.CLIENTS
-    targets = 1
-
-
 class TestShm(HostileSuite):
     name = "shm"
     clients = shm.CLIENTS
@@ -61,13 +51,13 @@ class TestShm(HostileSuite):
 class TestWebsocket(HostileSuite):
     name = "websocket/openpi"
     clients = websocket.CLIENTS
-    servers = websocket.SERVERS
+    servers = websocket.SERVERS[:-1]
 
     @classmethod
     def wiring(cls) -> Wiring[Any]:
-        return replace(super().wiring(), limits=Limits(head_s=2, body_s=3))  # three cases wait for them
+        return replace(super().wiring(), limits=Limits(head_s=2, body_s=3))  # two cases wait for them
 
 
 class TestWebsocketStreamed(HostileSuite):
     name = "websocket/openpi-stream"
-    servers = websocket.SERVERS
+    servers = websocket.SERVERS[-1:]

@@ -13,7 +13,6 @@ from typing import Any
 import httpx
 import pytest
 
-from s2a_bench.clock import now_ns
 from s2a_bench.errors import BadRequest, EngineError, RequestFailed
 from s2a_bench.testing.transport import ask, served, wiring_of
 from s2a_bench.trace import Trace
@@ -67,15 +66,6 @@ class TestTurns:
         first.leave()
         assert second.has_started
         assert not third.has_started
-
-    def test_silence_is_that_of_the_running_answer(self) -> None:
-        turns = Turns()
-        assert turns.silent_s() == 0
-        turn = turns.join()
-        turn.alive_ns = now_ns() - 5_000_000_000
-        assert 5 <= turns.silent_s() < 60
-        turn.leave()
-        assert turns.silent_s() == 0
 
     @pytest.mark.parametrize(
         "fails", [EngineError("no"), ValueError("no"), UnicodeEncodeError("utf-8", "", 0, 1, "no")]

@@ -340,13 +340,6 @@ def test_a_file_is_found_in_upper_and_lower_case_the_exact_name_first(hub: Hub) 
 # as the repositories list them, by what public programs download from there
 LISTINGS = {
     "minicpm-v-2.6": ["ggml-model-Q4_K_M.gguf", "ggml-model-Q2_K.gguf", "ggml-model-f16.gguf", "mmproj-model-f16.gguf"],
-    "qwen2.5-vl-3b": [
-        "Qwen2.5-VL-3B-Instruct-Q4_K_M.gguf",
-        "Qwen2.5-VL-3B-Instruct-Q8_0.gguf",
-        "Qwen2.5-VL-3B-Instruct-f16.gguf",
-        "mmproj-Qwen2.5-VL-3B-Instruct-Q8_0.gguf",
-        "mmproj-Qwen2.5-VL-3B-Instruct-f16.gguf",
-    ],
     "qwen3-vl-2b": ["Qwen3VL-2B-Instruct-Q4_K_M.gguf", "mmproj-Qwen3VL-2B-Instruct-F16.gguf"],
     "gemma3-270m": ["gemma-3-270m-it-Q8_0.gguf"],
 }
@@ -420,12 +413,6 @@ def test_the_listing_gives_one_language_model_or_names_all(
     ) as error:
         chosen("a/b", "", config, files)
     assert all(file in str(error.value) for file in files if file.endswith("gguf"))
-
-
-def test_another_mmproj_of_the_repository_is_fetched_by_its_name(hub: Hub) -> None:
-    hold(hub, "qwen2.5-vl-3b", LISTINGS["qwen2.5-vl-3b"])
-    done = fetch("qwen2.5-vl-3b", quant="Q8_0", mmproj="mmproj-Qwen2.5-VL-3B-Instruct-Q8_0.gguf")
-    assert [file.path.name for file in done.files] == LISTINGS["qwen2.5-vl-3b"][1::2]
 
 
 @pytest.mark.parametrize("name", ["hub:", "hub:a", "hub:a/b/c", "hub:a/b:", "hub:a b/c"])

@@ -12,7 +12,6 @@ from s2a_bench.errors import BadRequest, EngineError, ModelError, UsageError
 from s2a_bench.facts import LLAMA
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.llama_cpp import LlamaCppEngine, llama_cpp
-from s2a_bench.inference.llama_decode import GrammarSampler
 from s2a_bench.inference.llama_prompt import Steps, mtmd_cpp
 from s2a_bench.testing.engine import EngineSuite, ask, rgb_frame
 from s2a_bench.transport.ros.action_source import BOUNDS
@@ -76,18 +75,6 @@ def test_the_grammar_is_obeyed_and_ends_the_answer(shared: LlamaCppEngine) -> No
     answers = {text(shared, seed=seed, max_tokens=200, grammar=PLAN) for seed in range(4)}
     assert all(re.fullmatch(rf"\[{skill}(,{skill}){{2}}\]", answer) for answer in answers)
     assert len(answers) > 1
-
-
-def test_a_grammar_that_allows_what_the_model_says_costs_no_second_look(
-    shared: LlamaCppEngine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seed, one = next((seed, one) for seed in range(99) if (one := text(shared, seed=seed, max_tokens=1)).isalnum())
-    looks: list[int] = []
-    monkeypatch.setattr(GrammarSampler, "_among_allowed", lambda *_: looks.append(1) or 0)
-    assert text(shared, seed=seed, max_tokens=1, grammar=f'root ::= "{one}"') == one
-    assert looks == []
-    ask(shared, seed=seed, max_tokens=1, grammar='root ::= "!" | "?"')
-    assert looks == [1]
 
 
 @pytest.mark.parametrize(

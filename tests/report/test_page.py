@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
@@ -34,7 +34,7 @@ from s2a_bench.store.sweep import CELLS, CellRow
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.lanes import LanePanel
-from s2a_bench.writers.latex import PREAMBLE, document, escape, to_siunitx
+from s2a_bench.writers.latex import escape, to_siunitx
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import ABSENT, TextTable
 from tests.report.conftest import REAL
@@ -415,34 +415,6 @@ def test_no_text_is_a_command_to_latex(text: str) -> None:
     assert escaped.isprintable()
     left = re.sub(r"\\(text[a-z]+\{\}|[{}_%&#$])|\$\\?[a-z^0-9-]+\$", "", escaped)
     assert not set(left) & set("\\{}_%&#$^~<>|")
-
-
-def tables_of(make_run: MakeRun) -> Iterator[TextTable]:
-    rows: list[tuple[str, ...]] = [(HOSTILE, "1.5 ± 0.2"), ("[x]", ABSENT)]
-    yield TextTable(HOSTILE, (HOSTILE, "n"), rows, 1, notes=(HOSTILE, "λ ≥ 2 → ☃"), provenance=HOSTILE)
-    (chapter,) = read_chapters([make_run(n=3).path], against="paper")
-    yield from chapter.content.tables.values()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not shutil.which("pdflatex"), reason="there is no pdflatex on this machine")
-def test_the_latex_compiles(tmp_path: Path, computed: Path, make_run: MakeRun) -> None:
-    for package in ("siunitx.sty", "booktabs.sty"):
-        if subprocess.run(["kpsewhich", package], capture_output=True, check=False).returncode:
-            pytest.skip(f"TeX has no {package}")
-    odd = shutil.copytree(computed, tmp_path / "50 % of_a #run {x}")
-    report = make_report(read_chapters([odd, make_run(n=3).path], against="paper"), against="paper")
-    write_report(report, ReportConfig(runs=[odd], latex=tmp_path / "tex"))
-    texts = [to_siunitx(table, long=long) for table in tables_of(make_run) for long in (False, True)]
-    (tmp_path / "tex" / "hard.tex").write_text(document(HOSTILE, texts))
-    for name in ("report", "hard"):
-        command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", f"{name}.tex"]
-        done = subprocess.run(
-            command, cwd=tmp_path / "tex", capture_output=True, text=True, errors="replace", check=False, timeout=120
-        )
-        assert done.returncode == 0, done.stdout[-2000:].decode(errors="replace")
-        assert (tmp_path / "tex" / f"{name}.pdf").stat().st_size > 10_000
-    assert "siunitx" in PREAMBLE
 
 
 def test_a_chapter_of_another_command_is_named_and_not_guessed_at(make_run: MakeRun) -> None:

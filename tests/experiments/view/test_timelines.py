@@ -107,14 +107,6 @@ def test_a_panel_shows_each_skill_and_each_stall_where_it_was(computed: StoredRu
     assert [first[lane].get_x() for lane in (1, 2, 3)] == pytest.approx([1.75, 10.5, 3.5])
 
 
-def test_the_safe_start_and_every_token_are_marked(computed: StoredRun) -> None:
-    axes = drawn(computed).axes[0]
-    lines = [segments for found in axes.collections for segments in [found.get_segments()]]
-    dashed = [segments for found, segments in zip(axes.collections, lines, strict=True) if found.get_linestyle()[0][1]]
-    assert {segments[0][0][0] for segments in dashed} == {3.5}
-    assert sorted(len(segments) for segments in lines) == [1] * 6 + [8, 48]
-
-
 def test_the_figure_says_what_is_emulated_and_assumed(computed: StoredRun, live: StoredRun) -> None:
     caption = " ".join(caption_of(drawn(computed)))
     assert "EMULATED in virtual time" in caption

@@ -134,12 +134,9 @@ def datagrams(wiring: Wiring[Any]) -> str:
 CLIENTS: tuple[Case[Attack], ...] = (
     Case("noise as datagrams", datagrams),
     Case("noise as requests", publishes(lambda: [CDR + NOISE[: 4 * n] for n in range(1, 200)], answers=0)),
-    Case("nothing as a request", publishes(lambda: [CDR] * 9, answers=0)),
     Case("a text of 1 GiB announced", publishes(lambda: [CDR + struct.pack("<I", 1 << 30) + NOISE[:400]], answers=0)),
     Case("2^32-1 pictures announced", publishes(lambda: [CDR + b"\x01\0\0\0\0\0\0\0" * 4 + b"\xff" * 400], answers=0)),
     Case("no UTF-8", publishes(_altered(b"marker", b"\xff\xfe\xc0\xed\xa0\x80"), answers=0)),
-    Case("a NUL in a text", publishes(_altered(b"marker", b"m\0rker"))),
-    Case("max_tokens 0", publishes(_asks(max_tokens=0)), "max_tokens should be"),
     Case("max_tokens 2^32-1", publishes(_asks(max_tokens=(1 << 32) - 1)), "max_tokens should be"),
     Case("a prompt of 16 MiB", publishes(_asks(prompt="go" + " " * (16 << 20)))),
     Case(
@@ -147,18 +144,12 @@ CLIENTS: tuple[Case[Attack], ...] = (
         publishes(lambda: [*_asks(id="flood", prompt="go" + " " * (16 << 20))()] * 8, answers=8),
     ),
     Case("fewer pixels than said", publishes(_asks([image(640, 480, 10)])), "."),
-    Case("more pixels than said", publishes(_asks([image(2, 2, 5000)]))),
     Case("2^31 x 2^31 pixels", publishes(_asks([image((1 << 31) - 1, (1 << 31) - 1, 12, step=12)])), "at most"),
-    Case("a step of 0", publishes(_asks([image(2, 2, 12, step=0)])), "."),
     Case("an unknown encoding", publishes(_asks([image(2, 2, 12, "bayer_rggb16")])), "bayer_rggb16"),
-    Case("an empty picture", publishes(_asks([image(0, 0, 0)])), "empty"),
-    Case("100 pictures", publishes(_asks([image(64, 48, 64 * 48 * 3)] * 100))),
     Case("a picture of 900 million pixels", publishes(_bomb), "30000x30000"),
-    Case("noise as a picture", publishes(_asks(compressed=[compressed(NOISE)])), "neither"),
     Case("300 requests at once", publishes(lambda: [*_asks(id="flood", max_tokens=50)()] * 300, answers=300)),
     Case("gone in the middle of an answer", publishes(_asks(max_tokens=5000), answers=0)),
     Case("noise as a camera", publishes(lambda: [CDR + NOISE] * 50, CAMERA, ros.IMAGE, qos=QoS(1), answers=0)),
-    Case("a goal with fewer pixels than said", sends_goals(_with(image(640, 480, 10))), "."),
     Case(
         "a goal of 2^31 x 2^31 pixels", sends_goals(_with(image((1 << 31) - 1, (1 << 31) - 1, 12, step=12))), "at most"
     ),

@@ -13,7 +13,7 @@ from threading import Event
 from typing import Any, TypeAlias
 
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.shm.memory import ANSWER_BYTES, HELLO, MAGIC, PLACE
+from s2a_bench.transport.shm.memory import HELLO, MAGIC, PLACE
 from s2a_bench.transport.shm.pieces import unpacked
 from s2a_bench.transport.shm.server import HEADER_BYTES
 from s2a_bench.types import Action, Token
@@ -105,12 +105,6 @@ def encoded(*files: bytes) -> tuple[bytes, bytes]:
     return fields(images=[{"encoding": "image/png", "bytes": len(file)} for file in files]), b"".join(files)
 
 
-def jpeg_header(width: int, height: int) -> bytes:
-    """Return the beginning of a JPEG of such a size."""
-    sides = height.to_bytes(2, "big") + width.to_bytes(2, "big")
-    return b"\xff\xd8\xff\xc0\x00\x11\x08" + sides + bytes(64)
-
-
 def goes(link: socket.socket) -> None:
     """Leave at once."""
     link.shutdown(socket.SHUT_RDWR)
@@ -143,28 +137,12 @@ def on_a_disk(link: socket.socket) -> None:
         hello(link, os.dup(file.fileno()), 4096)
 
 
-def greets(packet: bytes, size: int = ANSWER_BYTES) -> Does:
-    """Return what greets properly, and then sends a packet."""
-
-    def does(link: socket.socket) -> None:
-        hello(link, file_of(size), size)
-        link.send(packet)
-
-    return does
-
-
-def many_files(number: int, *, later: bool = False) -> Does:
-    """Return what sends more files than belong to a packet: with the first one, or ``later``, where none belongs."""
-
-    def does(link: socket.socket) -> None:
-        if later:
-            hello(link, file_of(4096), 4096)
-        files = [file_of(4096) for _ in range(number)]
-        socket.send_fds(link, [PLACE.pack(0, 0) if later else HELLO.pack(MAGIC, 4096)], files)
-        for file in files:
-            os.close(file)
-
-    return does
+def three_files(link: socket.socket) -> None:
+    """Send more files than belong to an offer."""
+    files = [file_of(4096) for _ in range(3)]
+    socket.send_fds(link, [HELLO.pack(MAGIC, 4096)], files)
+    for file in files:
+        os.close(file)
 
 
 def does_not_read(link: socket.socket) -> None:
@@ -180,36 +158,26 @@ CLIENTS: tuple[Case[Attack], ...] = (
     Case("silence", attack(sends(), seconds=1)),
     Case("gone at once", attack(goes)),
     Case("packet of 3 bytes", attack(sends(b"abc")), "no offer"),
-    Case("packet of 64 KiB", attack(sends(bytes(1 << 16))), "no offer"),
     Case("request without memory", attack(sends(PLACE.pack(64, 10))), "no offer"),
     Case("memory of another version", attack(sends(HELLO.pack(b"S2A-SHM9", 4096))), "another version"),
     Case("memory without a file", attack(lambda link: hello(link, -1, 4096)), "should be one file"),
-    Case("memory of three files", attack(many_files(3)), "should be one file"),
-    Case("memory of 200 files", attack(many_files(200)), "should be one file"),
+    Case("memory of three files", attack(three_files), "should be one file"),
     Case("1 TiB of memory", attack(lambda link: hello(link, file_of(4096), 1 << 40)), "at most"),
     Case("more memory than the file has", attack(lambda link: hello(link, file_of(4096), MIB)), "its size may change"),
-    Case("no memory", attack(lambda link: hello(link, file_of(4096), 0)), "of 0 bytes"),
     Case("a pipe as memory", attack(lambda link: hello(link, os.pipe()[0], 4096)), "is no memory"),
     Case("a file on a disk as memory", attack(on_a_disk), "is no memory"),
     Case("memory that may shrink", attack(lambda link: hello(link, file_of(MIB, fields(), sealed=False), MIB)), "may"),
     Case("memory that shrinks", attack(truncates)),
-    Case("files with a request", attack(many_files(4, later=True))),
-    Case("packet of 64 KiB as a request", attack(greets(bytes(1 << 16), 4096))),
     Case("header beyond the memory", asks(fields(), at=1 << 40), "cannot be"),
-    Case("header of 2^63 bytes", asks(fields(), length=1 << 63), "cannot be"),
     Case("header across the end", asks(fields(), at=1), "cannot be"),
     Case("header of 5 MiB", asks(b"[" + b"{}," * (5 * MIB // 3) + b"{}]"), "cannot be"),
     Case("200,000 pictures", asks(fields(images=[{}] * (HEADER_BYTES // 5))), "more than 20000 values"),
     Case("no JSON", asks(b"{]" * 50), "no JSON"),
-    Case("100,000 brackets", asks(b"[" * 100_000), "more than 20000 values"),
     Case("a list", asks(b"[1, 2]"), "should be an object"),
-    Case("images that are no list", asks(fields(images=7)), "should be an object"),
     Case("image that is no object", asks(fields(images=[7])), "should lie before the header"),
     Case("picture after the header", asks(picture(bytes=1 << 30), bytes(24)), "should lie before the header"),
     Case("picture of other sides", asks(picture(width=5), bytes(24)), "are no bgr8 picture of 5x2"),
-    Case("picture of 2^62 pixels", asks(picture(width=1 << 31, height=1 << 31), bytes(24)), "should be a whole number"),
     Case("unknown encoding", asks(picture(encoding="tiff"), bytes(24)), "neither a JPEG nor a PNG"),
-    Case("JPEG of 4 gigapixels", asks(*encoded(jpeg_header(65_000, 65_000))), "pixels are taken"),
     Case("ten pictures of 36 megapixels", asks(*encoded(*[png_of_zeros(6000, 6000)] * 10)), "at most .* pixels"),
     Case("half a surrogate", asks(fields().replace(b'"go"', b'"\\ud800"')), "no JSON|surrogate"),
     *(Case(f"max_tokens {value}", asks(fields(max_tokens=value)), "max_tokens") for value in ODD),

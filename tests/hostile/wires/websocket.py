@@ -69,16 +69,12 @@ GO = says({"prompt": "go on"})
 FLOOD = "more than 1000 pings, pongs or small fragments"
 FLOODS = {
     "pings": floods(frame(b"", Opcode.PING)),
-    "pongs": floods(frame(b"", Opcode.PONG)),
-    "fragments of nothing": floods(frame(b"", Opcode.CONT, fin=False), frame(b"", fin=False)),
     "fragments of a byte": floods(frame(b"a", Opcode.CONT, fin=False), frame(b"", fin=False)),
-    "pings behind a request": floods(frame(b"", Opcode.PING), GO),
 }
 NO_MESSAGE = "that are no message"
 
 CLIENTS: tuple[Case[Attack], ...] = (
     *ANY_CLIENT,
-    Case("half the handshake, then gone", sends(upgrade()[:40], then="goes")),
     Case(
         "a handshake a byte at a time",
         sends(*(bytes([byte]) for byte in upgrade()[:-2] + b"x: " + b"a" * 300), every_s=0.05),
@@ -86,16 +82,12 @@ CLIENTS: tuple[Case[Attack], ...] = (
     ),
     Case("1 MiB of headers", sends(upgrade()[:-2], *[b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)])),
     Case("no handshake but HTTP", sends(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"), "^HTTP/1.1 426 "),
-    Case("a body", sends(b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3\r\n\r\nabc"), "^HTTP/1.1 400 "),
     Case("a page of a browser", sends(upgrade("Origin: https://example.org")), "^HTTP/1.1 403 "),
     Case("a name of somebody else", sends(upgrade().replace(b"localhost", b"example.org")), "^HTTP/1.1 403 "),
     Case("a compression that nobody wants", sends(upgrade("Sec-WebSocket-Extensions: permessage-deflate"), GO), "101"),
     Case("a frame without a mask", asked(frame(b"abc", mask=False)), "incorrect masking"),
     Case("1 GiB announced in a frame", asked(announced(1 << 30), NOISE), "too big|over size limit|exceeds limit|bytes"),
-    Case("2^63 announced in a frame", asked(announced(1 << 63), NOISE), "too big|over size limit|exceeds limit|bytes"),
-    Case("half a frame, then gone", asked(announced(1 << 20), NOISE, then="goes")),
     Case("half a frame, then silence", asked(announced(1 << 20), NOISE, seconds=8), "took more than 3 s"),
-    Case("a frame a byte at a time", asked(announced(1 << 20), *[b" "] * 60, every_s=0.1), "took more than 3 s"),
     *(Case(f"{name} without end", flood, FLOOD) for name, flood in FLOODS.items()),
     Case(
         "fragments of 1 MiB without end",
@@ -105,15 +97,12 @@ CLIENTS: tuple[Case[Attack], ...] = (
         "pings whose pongs nobody reads", sends_made(lambda: [upgrade(), *[frame(bytes(99), Opcode.PING) * 999] * 999])
     ),
     Case("60 MiB of empty maps", sends_made(lambda: large(b"\x80")), NO_MESSAGE),
-    Case("60 MiB of empty lists", sends_made(lambda: large(b"\x90")), NO_MESSAGE),
     Case("60 MiB of zeros", sends_made(lambda: [upgrade(), frame(bytes(60 * MIB))]), NO_MESSAGE),
     Case("a picture of 900 million pixels", sends_made(lambda: [upgrade(), says({"image": bomb()})]), "30000x30000"),
     Case("200 requests in one piece", asked(GO * 200), "actions|more than two requests at once|HTTP/1.1 101 "),
     Case("gone in the middle of an answer", asked(GO, then="goes")),
     Case("reset in the middle of an answer", asked(GO, then="resets")),
-    Case("reset in the middle of a stream", sends(upgrade(path="/stream"), GO, then="resets")),
     Case("100 clients at once", crowd(100, asked(GO)), "actions"),
-    Case("100 clients that go", crowd(100, asked(GO, then="resets"))),
 )
 
 
@@ -161,18 +150,12 @@ SERVERS: tuple[Case[Trap], ...] = (
     Case("half a frame, then silence", _greets(tells(CHUNK)[:30]), "^RequestFailed: .*silent"),
     Case("a frame with a mask", _greets(frame(msgpack.packb(CHUNK))), "^RequestFailed: .*masking"),
     Case("1 GiB announced in a frame", _greets(announced(1 << 30, mask=False), NOISE), FAILED),
-    Case("2^63 announced in a frame", _greets(announced(1 << 63, mask=False), NOISE), FAILED),
     Case("an error that forges lines", _greets(frame(CONTROL.encode(), Opcode.TEXT, mask=False)), "all is well"),
     Case(
         "an error without end",
         _greets(
             frame(b"", Opcode.TEXT, fin=False, mask=False), again=[frame(NOISE, Opcode.CONT, fin=False, mask=False)]
         ),
-        FAILED,
-    ),
-    Case(
-        "fragments of nothing without end",
-        _greets(frame(b"", fin=False, mask=False), again=[frame(b"", Opcode.CONT, fin=False, mask=False) * 1000]),
         FAILED,
     ),
     Case("pings without end", _greets(again=[frame(b"", Opcode.PING, mask=False) * 1000]), FAILED),
