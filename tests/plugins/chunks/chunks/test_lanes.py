@@ -8,8 +8,8 @@ import pytest
 
 from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
 from s2a_bench.plugins.chunks.chunks.run import run_chunks
+from s2a_bench.plugins.chunks.chunks.view import page_lanes
 from s2a_bench.plugins.chunks.chunks.view.figures import COLOURS, lanes_of
-from s2a_bench.plugins.chunks.chunks.view.lanes import page_lanes
 from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import read_chapters
 from s2a_bench.report.page.files import make_report, write_report
