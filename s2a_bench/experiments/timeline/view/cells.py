@@ -102,9 +102,11 @@ def origin_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
         rates = {"paper": "the paper's rates (table II)", "measured": "measured rates", "given": "rates as given"}
         origins = [rates[origin] for origin in dict.fromkeys(board["origin"] for board in boards)]
         virtual = all(cell.about("mode") == "virtual" for cell in cells)
+        jitter = run.manifest.get("configuration", {}).get("jitter", "none")
+        how = {"none": "evenly", "profile": "with the profiles' jitter"}.get(jitter, f"with jitter {jitter}")
         emulated = (
             f"EMULATED{' in virtual time' if virtual else ', executed in real time'}: no model answered; tokens arrive "
-            f"at {' and '.join(origins) or 'given rates'}, {_jitter(run)}."
+            f"at {' and '.join(origins) or 'given rates'}, {how}."
         )
         papers = [PAPERS] if any(board["origin"] == "paper" for board in boards) else []
         notes.append(Note(emulated, EMULATED, *papers))
@@ -114,11 +116,6 @@ def origin_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
         shift = f"c = {listed} s before decoding is our assumption: it shifts all policies of a board by as much."
         notes.append(Note(shift, ASSUMED))
     return tuple(notes)
-
-
-def _jitter(run: StoredRun) -> str:
-    jitter = run.manifest.get("configuration", {}).get("jitter", "none")
-    return {"none": "evenly", "profile": "with the profiles' jitter"}.get(jitter, f"with jitter {jitter}")
 
 
 def _live_notes(run: StoredRun) -> list[Note]:
