@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
 
 DURATIONS = ("t_nom", "t_min")
-_IN_CSV = ("duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall")
 _FREE, _BETWEEN, _STALLS = "#009E73", "#F0E442", "#D55E00"
 _SHADE: Final = 0.3
 _INK: Final = "#222222"
@@ -40,7 +39,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
         sentences=partial(_boundary_sentences, run),
         tables={"boundary": partial(line_table, run), "boards": partial(board_table, run)},
         main=["boards"],
-        csvs=lambda: {"boundary.csv": CsvTable.of_frame(run.table(BOUNDARY)[[*_IN_CSV, PROVENANCE]])},
+        csvs=partial(boundary_csv, run),
         figures=lambda: {"boundary": partial(build_boundary, run)},
         json=lambda: frame(run, list(_cells(run)), []),
     )
@@ -108,6 +107,11 @@ def line_table(run: StoredRun) -> TextTable:
         rows.append(tuple(row))
     header = ("L", "T_nom: formula", "trial", "T_min: formula", "trial")
     return TextTable("Slowest rate without stalls under naive, in tokens/s", header, rows, 1)
+
+
+def boundary_csv(run: StoredRun) -> dict[str, CsvTable]:
+    names = ["duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall"]
+    return {"boundary.csv": CsvTable.of_frame(run.table(BOUNDARY)[[*names, PROVENANCE]])}
 
 
 def _boundary_sentences(run: StoredRun) -> list[str]:

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from threading import Thread
 from typing import Final, TypeAlias
 
+import numpy as np
+
 from s2a_bench.clock import Clock, SystemClock, quick_switching
 from s2a_bench.plugins.chunks.modes import ControlSetting, Ints, Mode
 from s2a_bench.types import Vector
@@ -117,8 +119,6 @@ class RobotTicks:
 
     def acted(self) -> Acted:
         """Return the record so far; while the loop runs, that of the ticks that have ended."""
-        import numpy as np
-
         acts, horizon = np.array(self._acts[:], np.int64).reshape(-1, 3), self._setting.horizon
         request_tick = np.array(self._request_ticks[:], np.int64)
         arrival_ns = np.full((request_tick.size, horizon), -1)

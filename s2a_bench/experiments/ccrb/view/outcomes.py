@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+import pandas as pd
+
 from s2a_bench.experiments import TIME
 from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
@@ -15,8 +17,6 @@ from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
     from collections.abc import Collection
-
-    import pandas as pd
 
     from s2a_bench.store.run import StoredRun
 
@@ -63,8 +63,6 @@ def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
     than stream-to-act's (none counts as 0); ``naive_rear_worse``, ``naive_rear_better``: the same for rear impacts.
     ``survives``: the car behind avoids an ego with immediate tokens.
     """
-    import pandas as pd
-
     rows = rollouts_of(run, study)
     rows = rows[rows["gap_behaviour"] == gap]
     policies = {name: group.set_index("draw").sort_index() for name, group in rows.groupby("policy")}
@@ -134,8 +132,6 @@ def token_times_s(run: StoredRun, cell: str) -> list[float]:
 
 
 def _cell(row: dict[Any, Any]) -> dict[str, Any]:
-    import pandas as pd
-
     plain = {str(name): value for name, value in row.items() if not pd.isna(value)}
     for name in ("draw", "title", PROVENANCE):
         plain.pop(name, None)

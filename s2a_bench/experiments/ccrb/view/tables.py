@@ -67,18 +67,15 @@ def _ccrb_sentences(run: StoredRun) -> list[str]:
         f"{cell['stalls']} stalls of {cell['stall_s']:.2f} s."
         for cell in cells_of(run)
     ]
-    sentences += [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
+    if has(run, "phase"):
+        sentences += [f"Phase diagram, gap behaviour {finding(run, gap)}" for gap in GAPS]
     if studies := run.manifest.get("studies"):
         speed = studies["rollouts_per_cpu_s"]
         sentences.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time.")
     return sentences
 
 
-def findings(run: StoredRun) -> list[str]:
-    return [_finding(run, gap) for gap in GAPS] if has(run, "phase") else []
-
-
-def _finding(run: StoredRun, gap: str) -> str:
+def finding(run: StoredRun, gap: str) -> str:
     share = share_of(scenes_of(run, "phase", gap), "paper")
     sentence = f"{gap}: the paper's ordering holds at {share.value:.1%} of the diagram"
     span, at_point = rate_span(run, gap), rate_span_at_point(run, gap)

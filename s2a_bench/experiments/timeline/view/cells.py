@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
+import pandas as pd
+
 from s2a_bench.experiments import TIME, Comparable, Subject
 from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES
 from s2a_bench.store.manifest import present
@@ -15,8 +17,6 @@ from s2a_bench.writers.json import frame
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from s2a_bench.policy import Floats
     from s2a_bench.store.run import StoredRun
 
@@ -31,8 +31,6 @@ class Timelines:
 
     def about(self, column: str) -> Any:
         """Return a value that all rows of the cell share; None if missing."""
-        import pandas as pd
-
         value = self.rows[column].iloc[0]
         return None if pd.isna(value) else value.item() if hasattr(value, "item") else value
 

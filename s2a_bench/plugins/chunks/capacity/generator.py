@@ -6,7 +6,7 @@ Latencies count from the intended time of a request, whatever delays it here, an
 
 from __future__ import annotations
 
-import time
+import signal
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
@@ -17,7 +17,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from tempfile import TemporaryDirectory
 from threading import Event, Lock, Thread
-from time import monotonic
+from time import monotonic, process_time
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -290,7 +290,7 @@ class Fleet:
         self._robots, self._threads, self._loop = {}, [], None
 
     def cpu_s(self) -> float:
-        return time.process_time()
+        return process_time()
 
     def close(self) -> None:
         """Close the connections; that of a request under way ends with the process."""
@@ -367,8 +367,6 @@ class FleetProcess(RemoteFleet):
 
 def _serve(plan: FleetPlan, pipe: Connection) -> None:
     """Answer calls of a fleet's methods until it is closed or the other end has gone."""
-    import signal
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run handles Ctrl-C
     end_with_parent()
     fleet, name = Fleet(plan), ""
