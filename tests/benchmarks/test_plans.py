@@ -14,6 +14,7 @@ from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.models import resolve
 from s2a_bench.inference.tokenizer import Tokenizer
 from s2a_bench.plan import load_skills, paper_format
+from studies.validity import cost_of
 
 
 def shares(row: str) -> list[float]:
@@ -42,7 +43,7 @@ def test_every_prompt_is_printed_with_its_plans_and_gaps(
 def test_a_real_model_plans_with_the_grammar_and_its_tokens_are_counted(gemma: Path) -> None:
     config = EngineConfig(model=gemma, chat_template="none", threads=1)
     found = plans.ask_all(config, 1)
-    cost = paper_format(load_skills("household")).cost(Tokenizer(gemma), plans.N_SKILLS)
+    cost = cost_of(paper_format(load_skills("household")), Tokenizer(gemma), plans.N_SKILLS)
     assert len(found) == 3 * 2
     for (_, ruled), (answer,) in found.items():
         assert len(answer.gaps_s) >= plans.N_SKILLS * cost.least - 1 or not ruled

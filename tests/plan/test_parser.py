@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.plan_text import text_of
 from s2a_bench.plan import (
     BadLine,
     Event,
@@ -191,7 +192,7 @@ def test_work_grows_with_the_length_only(name: str, piece: bytes) -> None:
 def test_every_call_comes_back(format_: Format) -> None:
     for index, call in enumerate(format_.skills.calls):
         parser = Parser(format_)
-        assert parser.feed(format_.write([call])) == [SkillParsed(0, call, 0, 0)], index
+        assert parser.feed(text_of(format_, [call])) == [SkillParsed(0, call, 0, 0)], index
         assert parser.close() == []
 
 
