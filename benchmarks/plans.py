@@ -24,6 +24,7 @@ from typing import Final
 import numpy as np
 from scipy.stats import ks_2samp, wasserstein_distance
 
+from benchmarks.plan_text import text_of
 from s2a_bench.boards.fit import FITS, SKILL_TOKENS, Rows, fit_gaps, lag1
 from s2a_bench.boards.gaps import Constant, Floats, Gaps, Recorded, from_table, to_table
 from s2a_bench.boards.profile import load_profile
