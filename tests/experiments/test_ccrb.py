@@ -19,7 +19,6 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     Share,
     cells_of,
     rate_span,
-    rate_span_at_point,
     scenes_of,
     share_of,
 )
@@ -55,7 +54,7 @@ def test_with_full_braking_in_gaps_the_ordering_holds_for_a_band_of_rates_and_wa
     made: Callable[..., StoredRun],
 ) -> None:
     run = made(**GRID)
-    low, high = rate_span_at_point(run, "stop") or (0.0, 0.0)
+    low, high = rate_span(run, "stop", at_point=True) or (0.0, 0.0)
     assert 4.0 <= low <= 4.8 <= high <= 6.5
     scenes = scenes_of(run, "phase", "stop")
     assert share_of(scenes, "paper").value < 0.15
@@ -71,7 +70,7 @@ def test_acting_at_once_is_better_more_often_and_the_ordering_next_to_nowhere_un
     scenes = scenes_of(run, "phase", gap)
     assert share_of(scenes, "naive_better").k > share_of(scenes, "naive_worse").k
     if gap != "stop":
-        assert rate_span_at_point(run, gap) is None
+        assert rate_span(run, gap, at_point=True) is None
         assert share_of(scenes, "paper").value < 0.02
 
 
@@ -80,7 +79,7 @@ def test_with_the_hybrid_follower_the_operating_point_turns_round(made: Callable
     point = run.table(ROLLOUTS)[run.table(ROLLOUTS)["study"] == "point"].set_index("policy")
     assert point["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "rear"}
     assert point["rear_impact_mps"]["stream-to-act"] > point["rear_impact_mps"]["naive"] + 1
-    assert rate_span_at_point(run, "stop") is None
+    assert rate_span(run, "stop", at_point=True) is None
     assert share_of(scenes_of(run, "phase", "stop"), "paper").value < 0.02
 
 

@@ -27,6 +27,8 @@ Send: TypeAlias = "Callable[[Vector | None, int], None]"
 RequestChunk: TypeAlias = "Callable[[int, int], None]"
 """Called on the loop's thread with a request's number, from 0, and the tick in which it leaves; must not block."""
 
+ENDLESS: Final = 2**62
+"""Ticks of a loop that is stopped."""
 HEAD_START_NS: Final = 20_000_000
 """From `ControlLoop.start` to the first tick."""
 

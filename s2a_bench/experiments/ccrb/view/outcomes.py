@@ -84,25 +84,15 @@ def share_of(scenes: pd.DataFrame, ordering: str) -> Share:
     return Share(int(scenes[ordering].sum()), len(scenes))
 
 
-def survives_of(rows: pd.DataFrame) -> bool:
-    """Return whether the car behind avoids an ego with immediate tokens."""
-    return bool(rows["follower_survives"].all())
+def rate_span(run: StoredRun, gap: str, *, at_point: bool = False) -> tuple[float, float] | None:
+    """Return the least and greatest R of the phase diagram with the paper's ordering; None without any.
 
-
-def rate_span(run: StoredRun, gap: str) -> tuple[float, float] | None:
-    """Return the least and greatest R of the phase diagram with the paper's ordering; None without any."""
-    return _span_of(scenes_of(run, "phase", gap))
-
-
-def rate_span_at_point(run: StoredRun, gap: str) -> tuple[float, float] | None:
-    """Return the same at the grid's rear gap nearest to the operating point's."""
+    ``at_point``: only at the grid's rear gap nearest to the operating point's.
+    """
     scenes = scenes_of(run, "phase", gap)
-    wanted = configuration(run)["rear_gap_m"]
-    nearest = min(scenes["rear_gap_m"].unique(), key=lambda gap_m: abs(gap_m - wanted))
-    return _span_of(scenes[scenes["rear_gap_m"] == nearest])
-
-
-def _span_of(scenes: pd.DataFrame) -> tuple[float, float] | None:
+    if at_point:
+        away = (scenes["rear_gap_m"] - configuration(run)["rear_gap_m"]).abs()
+        scenes = scenes[away == away.min()]
     rates = scenes[scenes["paper"]]["tokens_per_s"]
     return (float(rates.min()), float(rates.max())) if len(rates) else None
 
@@ -154,7 +144,7 @@ def origin_notes(run: StoredRun) -> tuple[str, ...]:
     if ego := settings.get("ego"):
         notes.append(f"Ego: commanded and seen over ROS 2 ({ego}).")
     notes.append(f"Rear: {law(settings)}.")
-    notes.append(follower_check(settings, survives_of(rollouts_of(run, "point"))))
+    notes.append(follower_check(settings, bool(rollouts_of(run, "point")["follower_survives"].all())))
     reflex = "on" if settings["reflex"] else "off"
     notes.append(f"Front: while no skill is valid the ego does '{settings['gap']}'; the reflex layer is {reflex}.")
     return tuple(notes)

@@ -17,8 +17,7 @@ from s2a_bench.experiments.timeline.view.cells import (
     timelines_json,
     timelines_of,
 )
-from s2a_bench.experiments.timeline.view.figures import timeline_figures
-from s2a_bench.experiments.timeline.view.lanes import page_lanes
+from s2a_bench.experiments.timeline.view.figures import page_lanes, timeline_figures
 from s2a_bench.policy import ONLINE
 from s2a_bench.policy.conformal import promise, upper_bound
 from s2a_bench.stats import summary_of

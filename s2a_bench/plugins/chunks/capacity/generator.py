@@ -31,7 +31,7 @@ from s2a_bench.harness.session import UNKNOWN_ORIGIN, Measured, Place, RequestCo
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import allowed, end_with_parent, keep_large_blocks, limit_threads
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
-from s2a_bench.plugins.chunks.control import ControlLoop, RobotTicks
+from s2a_bench.plugins.chunks.control import ENDLESS, ControlLoop, RobotTicks
 from s2a_bench.plugins.chunks.modes import ControlSetting, mode
 from s2a_bench.plugins.chunks.modes.cycles import gather
 from s2a_bench.plugins.chunks.requester import SEEDS, ChunkRequester, Job, wait_s
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 
 STRIDE: Final = 1 << 20
 """Between the numbers of two requests of a robot, so that those of different robots differ."""
-ENDLESS: Final = 2**62
 PATIENCE_S: Final = 2.0
 """For answers under way when a fleet is stopped by an error."""
 FREE_CORE_S: Final = 60.0
