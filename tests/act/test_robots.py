@@ -289,7 +289,7 @@ class TestRosActions:
         def interrupted(*_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("s2a_bench.ros.open_middleware", lambda *_, **__: middleware)
+        monkeypatch.setattr("s2a_bench.ros.join.open_middleware", lambda *_, **__: middleware)
         monkeypatch.setattr(ros, "RosSkills", interrupted)
         with pytest.raises(KeyboardInterrupt):
             kind("ros", SkillKind).open_skills(QUICK)
