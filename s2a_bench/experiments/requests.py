@@ -273,7 +273,7 @@ def _fact(name: Fact) -> Of:
     return lambda cell: cell.fact(name)
 
 
-def _ms(name: str, title: str, about: str, of: Of | None = None, **more: Any) -> RequestMetric:
+def in_ms(name: str, title: str = "", about: str = "", of: Of | None = None, **more: Any) -> RequestMetric:
     return RequestMetric(name, "ms", title=title, about=about, of=of, **more)
 
 
@@ -292,25 +292,25 @@ ANSWER_METRICS: Final = (
         "(n - 1) / (t_last - t_first), as the client saw the tokens.",
         decode_rate,
     ),
-    _ms("ttft_ms", "TTFT", "From the prompt: e2e without capture."),
-    _ms("prompt_ms", "all", "Picture and prompt in the engine, up to the first token's logits.", _fact(PROMPT_MS)),
-    _ms(
+    in_ms("ttft_ms", "TTFT", "From the prompt: e2e without capture."),
+    in_ms("prompt_ms", "all", "Picture and prompt in the engine, up to the first token's logits.", _fact(PROMPT_MS)),
+    in_ms(
         *("preprocess_ms", "preprocess"),
         "The part of prompt_ms before the model: template, slicing, resizing, tokenising.",
         _fact(PREPROCESS_MS),
     ),
-    _ms(
+    in_ms(
         *("vision_encode_ms", "vision encode"),
         "The vision tower's part of prompt_ms, over all slices.",
         _fact(VISION_ENCODE_MS),
     ),
-    _ms(
+    in_ms(
         *("image_ms", ""),
         "The part of prompt_ms outside the language model: slicing, vision tower, tokenising.",
         lambda cell: cell.fact(PROMPT_MS) - cell.fact(PROMPT_EVAL_MS),
     ),
-    _ms("prompt_eval_ms", "prefill", "The language model's part of prompt_ms.", _fact(PROMPT_EVAL_MS)),
-    _ms(
+    in_ms("prompt_eval_ms", "prefill", "The language model's part of prompt_ms.", _fact(PROMPT_EVAL_MS)),
+    in_ms(
         *("first_decode_ms", "1st decode"),
         "The first token to the second in the engine: the first step after the prompt.",
         _fact(FIRST_DECODE_MS),
@@ -333,13 +333,13 @@ ANSWER_METRICS: Final = (
 )
 
 TOKEN_METRICS: Final = (
-    _ms(
+    in_ms(
         *("itl", "gap"),
         "Every gap between a token and the next, as the client saw them.",
         lambda cell: cell.answers["gap_ns"] / _NS_PER_MS,
         shown=("median", "p99"),
     ),
-    _ms(
+    in_ms(
         *("token_delay", "delay"),
         "From a token's leaving the engine to the client's seeing it.",
         lambda cell: (cell.answers["client_ns"] - cell.answers["engine_ns"]) / _NS_PER_MS,

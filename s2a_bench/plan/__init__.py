@@ -3,20 +3,18 @@
 docs/plans.md has an example; `s2a_bench.inference.tokenizer.Tokenizer` is the tokenizer of a GGUF file.
 """
 
-from s2a_bench.plan.choose import GRANULARITIES, choose_format
-from s2a_bench.plan.formats import Cost, Format, Tokenize, paper_format, prompt
+from s2a_bench.plan.choose import choose_format
+from s2a_bench.plan.formats import Format, Tokenize, paper_format, prompt
 from s2a_bench.plan.grammar import grammar
 from s2a_bench.plan.parser import BadLine, Event, Parser, Problem, SkillParsed
 from s2a_bench.plan.skill_file import SKILL_SETS, load_skills, parse_skills
 from s2a_bench.plan.skillset import Argument, Call, Gap, Skill, SkillSet, Value
 
 __all__ = [
-    "GRANULARITIES",
     "SKILL_SETS",
     "Argument",
     "BadLine",
     "Call",
-    "Cost",
     "Event",
     "Format",
     "Gap",

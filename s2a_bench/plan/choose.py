@@ -13,9 +13,6 @@ from s2a_bench.plan.formats import Format, Tokenize, spelled
 from s2a_bench.plan.labels import CallLabels, Codes, Letters, Words
 from s2a_bench.plan.skillset import SkillSet
 
-GRANULARITIES = (6, 4, 2, 1)
-"""Tokens a skill in the paper (section IV-E)."""
-
 _FILLERS = ("-", "~", "_", ".")
 """Texts without meaning that make a call longer; the tokenizer decides which of them cost a token."""
 

@@ -2,25 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
 
 from s2a_bench.plan.labels import CallLabels, normalise
-from s2a_bench.plan.skillset import Call, SkillSet
+from s2a_bench.plan.skillset import SkillSet
 
 Tokenize: TypeAlias = Callable[[str], list[int]]
 """A model's tokenizer: text to token ids, without special tokens (`s2a_bench.inference.tokenizer` has llama.cpp's)."""
-
-
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """Tokens per skill, number and delimiter included, over all calls and all numbers of a plan."""
-
-    least: int
-    mean: float
-    most: int
 
 
 @dataclass(frozen=True)
@@ -46,10 +37,6 @@ class Format:
         """Return the index in ``skills.calls`` of each normalised text."""
         return {normalise(text): index for index, text in enumerate(self.texts)}
 
-    @cached_property
-    def _index(self) -> dict[Call, int]:
-        return {call: index for index, call in enumerate(self.skills.calls)}
-
     def line(self, number: int, text: str) -> str:
         prefix = f"{number}.{self.labels.glue}" if self.numbered else ""
         return f"{prefix}{text}{self.delimiter}"
@@ -57,15 +44,6 @@ class Format:
     def lines(self, number: int) -> list[str]:
         """Return every possible line of that number, in the order of ``skills.calls``."""
         return [self.line(number, text) for text in self.texts]
-
-    def write(self, plan: Iterable[Call]) -> str:
-        """Return the text of a plan; raises KeyError for a call that is not of these skills."""
-        return "".join(self.line(number, self.texts[self._index[call]]) for number, call in enumerate(plan, 1))
-
-    def cost(self, tokenize: Tokenize, n_skills: int) -> Cost:
-        """Count the tokens of every line of plans of up to ``n_skills``; with N > 9 a number may take two."""
-        counts = self.counts(tokenize, range(1, n_skills + 1) if self.numbered else (1,))
-        return Cost(min(counts), sum(counts) / len(counts), max(counts))
 
     def counts(self, tokenize: Tokenize, numbers: Sequence[int]) -> list[int]:
         return [len(tokenize(line)) for number in numbers for line in self.lines(number)]

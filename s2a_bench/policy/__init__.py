@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Final, Protocol, TypeAlias
 
+from s2a_bench.policy.parameters import build, canonical
 from s2a_bench.registry import Registry
 from s2a_bench.stats.seeds import Verbatim
 from s2a_bench.types import Timing as Timing
@@ -187,14 +188,10 @@ CAUTION: Final = 2.33
 
 def policy(written: str) -> Policy:
     """Build the policy ``name[?parameter=value&...]``; raises UsageError for an unknown name, parameter or value."""
-    from s2a_bench.policy.parameters import build
-
     return build(POLICIES[written.partition("?")[0]], written)
 
 
 def policies(written: Iterable[str]) -> dict[str, Policy]:
     """Build each policy once, by its canonical name: parameters in their order, those at their default left out."""
-    from s2a_bench.policy.parameters import canonical
-
     built = ((each.partition("?")[0], policy(each)) for each in written)
     return {canonical(name, each): each for name, each in built}

@@ -241,23 +241,6 @@ class Tracker:
         insort(self._sorted, score)
         del self._sorted[bisect_left(self._sorted, self._scores.popleft())]
 
-    def state(self) -> dict[str, Any]:
-        """Return level and scores as plain data; an infinite score is null."""
-        scores = [None if math.isinf(score) else score for score in self._scores]
-        return {"epsilon": self.epsilon, "step": self.step, "level": self.level, "scores": scores}
-
-    @staticmethod
-    def resume(state: Mapping[str, Any]) -> Tracker:
-        """Continue from `state`; raises KeyError, TypeError or ValueError for an invalid one."""
-        scores = [math.inf if score is None else float(score) for score in state["scores"]]
-        tracker = Tracker(scores, float(state["epsilon"]), step=float(state["step"]))
-        tracker.level = float(state["level"])
-        if not (0 < tracker.epsilon < 1 and 0 < tracker.step < 1 and math.isfinite(tracker.level)):
-            raise ValueError(f"epsilon {tracker.epsilon:g}, step {tracker.step:g}, level {tracker.level:g}")
-        if any(math.isnan(score) or score < 0 for score in scores):
-            raise ValueError("a score below 0")
-        return tracker
-
 
 def upper_bound(stalled: float, plans: float, confidence: float) -> float:
     """Return the share x with P(Bin(plans, x) <= stalled) = 1 - confidence (Clopper and Pearson, Biometrika 1934).

@@ -19,7 +19,8 @@ T = TypeVar("T")
 def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
     """Build ``name?parameter=value&...``; raises UsageError naming ``field``, the parameter, and the known ones."""
     name, _, given = written.partition("?")
-    types = _types(made_by) if given else {}
+    hints = get_type_hints(made_by, include_extras=True) if given and is_dataclass(made_by) else {}
+    types = {field.name: hints[field.name] for field in _parameters(made_by)} if given else {}
     known = f"its parameters are {', '.join(types)}" if types else "it has no parameters"
     values: dict[str, Any] = {}
     for pair in given.split("&") if given else ():
@@ -53,12 +54,6 @@ def _value(type_: Any, text: str, what: str, known: str) -> Any:
     except ValidationError as error:
         wrong = error.errors()[0]["msg"]
         raise UsageError(f"{what}: {wrong[0].lower()}{wrong[1:]}; {known}") from error
-
-
-def _types(made_by: Callable[..., object]) -> dict[str, Any]:
-    parameters = _parameters(made_by)
-    hints = get_type_hints(made_by, include_extras=True) if parameters else {}
-    return {field.name: hints[field.name] for field in parameters}
 
 
 def _parameters(made_by: Any) -> list[Field[Any]]:

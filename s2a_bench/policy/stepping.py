@@ -13,6 +13,7 @@ from itertools import groupby
 import numpy as np
 
 from s2a_bench.policy import Plans, Policy, Schedule, Start, Stepper, Timing
+from s2a_bench.policy.schedule import align, safe_start
 
 ROUNDING_S = 1e-9
 
@@ -104,8 +105,6 @@ def step(policy: Policy, plans: Plans, column: int = 0, *, missing: int = 0) -> 
 
     The policy gets S0, which a robot could not know. Raises ValueError for plans without ``shape``.
     """
-    from s2a_bench.policy.schedule import align, safe_start
-
     if plans.shape is None:
         raise ValueError(f"{policy.name} decides step by step: plans need shape")
     arrays = align(plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s)

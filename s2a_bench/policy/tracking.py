@@ -7,17 +7,14 @@ plan stalled. `TrackedPolicy.follow` does the same for arrays of plans. `conform
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from s2a_bench.errors import UsageError
 from s2a_bench.policy import Floats, Plans, Policy, Schedule
 from s2a_bench.policy.conformal import ANY_STALL_S, EPSILON, GRID, Tracker, scores, take
-from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import stalls as stalls_of
 
 CAUTIONS: Final = (*GRID, float("inf"))
@@ -63,18 +60,6 @@ class TrackedPolicy:
             starts.append(every.start_s[:, ranks, columns])
             durations.append(every.duration_s[:, ranks, columns])
         return np.array(chosen), Schedule(np.concatenate(starts, axis=1), np.concatenate(durations, axis=1))
-
-    def state(self) -> dict[str, Any]:
-        return {"prior": asdict(self.made.prior), **self.tracker.state()}
-
-    @staticmethod
-    def resume(policy: Policy, state: Mapping[str, Any]) -> TrackedPolicy:
-        """Continue from `state`; raises UsageError for an invalid one."""
-        try:
-            prior = GapPrior(**{name: float(value) for name, value in state["prior"].items()})
-            return TrackedPolicy(policy.informed(prior), Tracker.resume(state))
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise UsageError(f"holds no state of tracking ({type(error).__name__}: {error})") from error
 
 
 def _least(stalls: NDArray[np.bool_]) -> list[float]:

@@ -50,15 +50,6 @@ class Noise:
             return shift
         return -math.expm1(-shift) if falls else math.expm1(min(shift, _MOST))
 
-    def power(self, change: float, level: float) -> float:
-        from scipy import stats
-
-        shift = math.log1p(change) if self.logarithmic else change
-        if not self.error:
-            return float(shift != 0)
-        critical = float(stats.t.isf(level / 2, self.freedom))
-        return float(stats.nct.sf(critical, self.freedom, abs(shift) / self.error))
-
 
 @dataclass(frozen=True, slots=True)
 class Change:

@@ -404,9 +404,7 @@ def test_lambda_is_followed_live_by_each_policy(
     assert [each.made.detect for each in taught] == [False, True] * 2
     assert taught[:2] == taught[2:]
     for each in taught[:2]:
-        state = each.state()
-        assert len(state["scores"]) == 400
-        assert state["level"] != state["epsilon"] == 0.01
+        assert each.tracker.level != each.tracker.epsilon == 0.01
 
 
 def test_lambda_is_followed_in_real_time(fast_board: str, taught: list[TrackedPolicy], tmp_path: Path) -> None:
@@ -425,6 +423,4 @@ def test_lambda_is_followed_in_real_time(fast_board: str, taught: list[TrackedPo
     assert len(run.table(TIMELINES)) == 2
     first, again = taught
     assert first is again
-    state = first.state()
-    assert len(state["scores"]) == 400
-    assert state["level"] != state["epsilon"]
+    assert first.tracker.level != first.tracker.epsilon

@@ -7,8 +7,11 @@ from gguf import GGUFWriter
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.dummy.vocab import make_vocab
 from s2a_bench.inference.tokenizer import Tokenizer
-from s2a_bench.plan import GRANULARITIES, Format, SkillSet, Tokenize, choose_format, load_skills, paper_format
+from s2a_bench.plan import Format, SkillSet, Tokenize, choose_format, load_skills, paper_format
 from tests.inference.conftest import cached, tiny  # noqa: F401 - fixtures
+
+GRANULARITIES = (6, 4, 2, 1)
+"""Tokens a skill in the paper (section IV-E)."""
 
 
 @pytest.fixture(scope="session")

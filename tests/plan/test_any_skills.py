@@ -7,10 +7,10 @@ from collections.abc import Callable
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.plan_text import text_of
 from s2a_bench.errors import UsageError
 from s2a_bench.plan import (
     Argument,
-    Cost,
     Parser,
     Skill,
     SkillParsed,
@@ -21,6 +21,7 @@ from s2a_bench.plan import (
     paper_format,
 )
 from s2a_bench.types import Timing
+from studies.validity import Cost, cost_of
 from tests.plan.gbnf import Gbnf
 
 NAME = st.text("abcgop_ü鍋0", min_size=1, max_size=6).filter(str.isidentifier)
@@ -71,18 +72,18 @@ def test_a_format_is_exact_and_can_be_read_or_is_refused(
     except UsageError as error:
         assert str(error).startswith(f"`tokens_per_skill` {tokens}: ")  # noqa: PT017 both are right
     else:
-        assert chosen.cost(tokenize, n_skills) == Cost(tokens, float(tokens), tokens)
+        assert cost_of(chosen, tokenize, n_skills) == Cost(tokens, float(tokens), tokens)
         formats.append(chosen)
     for format_ in formats:
         for call in skills.calls:
-            assert Parser(format_).feed(format_.write([call])) == [SkillParsed(0, call, 0, 0)]
+            assert Parser(format_).feed(text_of(format_, [call])) == [SkillParsed(0, call, 0, 0)]
         allowed = Gbnf(grammar(format_, 1)).words("root")
         assert sorted("".join(map(str, word)) for word in allowed) == sorted(
-            format_.write([call]) for call in skills.calls
+            text_of(format_, [call]) for call in skills.calls
         )
         plan = rng.choices(skills.calls, k=n_skills)
         parser = Parser(format_)
-        found = [event for char in format_.write(plan) for event in parser.feed(char)] + parser.close()
+        found = [event for char in text_of(format_, plan) for event in parser.feed(char)] + parser.close()
         assert [event.call for event in found if isinstance(event, SkillParsed)] == plan
         pinned = Gbnf(grammar(format_, n_skills, tokenize)).sample(rng)
         if format_ is not formats[0]:

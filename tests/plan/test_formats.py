@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import pytest
 
+from benchmarks.plan_text import text_of
 from s2a_bench.errors import UsageError
 from s2a_bench.inference.tokenizer import Tokenizer
 from s2a_bench.plan import (
-    GRANULARITIES,
-    Cost,
     Format,
     SkillSet,
     Tokenize,
@@ -18,6 +17,10 @@ from s2a_bench.plan import (
     parse_skills,
     prompt,
 )
+from studies.validity import Cost, cost_of
+
+GRANULARITIES = (6, 4, 2, 1)
+"""Tokens a skill in the paper (section IV-E)."""
 
 
 def many(count: int) -> SkillSet:
@@ -40,13 +43,13 @@ def test_every_call_and_every_plan_costs_exactly_what_was_asked_for(
     skills: SkillSet, tokenize: Tokenize, tokens: int, n_skills: int
 ) -> None:
     chosen = choose_format(skills, tokens, tokenize, n_skills)
-    assert chosen.cost(tokenize, n_skills) == Cost(tokens, float(tokens), tokens)
+    assert cost_of(chosen, tokenize, n_skills) == Cost(tokens, float(tokens), tokens)
     for call in skills.calls:
-        assert len(tokenize(chosen.write([call]))) == tokens
+        assert len(tokenize(text_of(chosen, [call]))) == tokens
     rng = random.Random(tokens)
     for _ in range(20):
         plan = rng.choices(skills.calls, k=n_skills)
-        assert len(tokenize(chosen.write(plan))) == tokens * n_skills
+        assert len(tokenize(text_of(chosen, plan))) == tokens * n_skills
 
 
 @pytest.mark.parametrize("tokens", GRANULARITIES)
@@ -67,14 +70,14 @@ def test_a_number_of_two_digits_counts(of_bytes: Tokenizer) -> None:
     one_digit = choose_format(skills, 6, of_bytes, n_skills=9)
     two_digits = choose_format(skills, 6, of_bytes, n_skills=10)
     assert (one_digit.numbered, two_digits.numbered) == (True, False)
-    assert one_digit.cost(of_bytes, 9) == Cost(6, 6.0, 6)
-    assert one_digit.cost(of_bytes, 10) == Cost(6, 6.1, 7)
+    assert cost_of(one_digit, of_bytes, 9) == Cost(6, 6.0, 6)
+    assert cost_of(one_digit, of_bytes, 10) == Cost(6, 6.1, 7)
 
 
 def test_the_papers_format_costs_what_it_costs(of_bytes: Tokenizer) -> None:
     paper = paper_format(load_skills("household"))
     costs = [len(f"1. {call}\n".replace(" t", "t")) for call in paper.skills.calls]  # " t" is the only merge
-    assert paper.cost(of_bytes, 8) == Cost(min(costs), sum(costs) / 32, max(costs))
+    assert cost_of(paper, of_bytes, 8) == Cost(min(costs), sum(costs) / 32, max(costs))
 
 
 def test_codes_of_one_token_need_nothing_between_them(tokenize: Tokenize, skills: SkillSet) -> None:
@@ -111,13 +114,13 @@ def test_lines_that_cost_something_else_in_a_row_are_not_taken() -> None:
 
     chosen = choose_format(many(3), 5, line_ends_merge)
     assert chosen.name == "numbered letters"
-    assert len(line_ends_merge(chosen.write(chosen.skills.calls))) == 15
+    assert len(line_ends_merge(text_of(chosen, chosen.skills.calls))) == 15
     with pytest.raises(UsageError, match="`tokens_per_skill` 2: no way found"):
         choose_format(many(3), 2, line_ends_merge)
 
 
 def test_what_the_vocabulary_cannot_say_is_refused_with_the_limit(of_bytes: Tokenizer, of_words: Tokenizer) -> None:
-    assert choose_format(many(94), 1, of_bytes).cost(of_bytes, 8) == Cost(1, 1.0, 1)
+    assert cost_of(choose_format(many(94), 1, of_bytes), of_bytes, 8) == Cost(1, 1.0, 1)
     with pytest.raises(UsageError, match="`tokens_per_skill` 1: 'many' has 95 calls, but only 94 codes of one token"):
         choose_format(many(95), 1, of_bytes)
     with pytest.raises(UsageError, match=r"`tokens_per_skill` 2: no way .* 95 calls of 'many'.* cost up to 7"):
@@ -126,7 +129,7 @@ def test_what_the_vocabulary_cannot_say_is_refused_with_the_limit(of_bytes: Toke
         choose_format(many(2), 0, of_bytes)
     with pytest.raises(UsageError, match="a plan has at least one skill, not 0"):
         choose_format(many(2), 2, of_bytes, n_skills=0)
-    assert choose_format(many(300), 2, of_words).cost(of_words, 8) == Cost(2, 2.0, 2)  # codes of two letters
+    assert cost_of(choose_format(many(300), 2, of_words), of_words, 8) == Cost(2, 2.0, 2)  # codes of two letters
 
 
 def test_two_calls_that_read_alike_are_no_format() -> None:

@@ -2,6 +2,7 @@ import random
 
 import pytest
 
+from benchmarks.plan_text import text_of
 from s2a_bench.errors import UsageError
 from s2a_bench.inference.llama_decode import grammar_error
 from s2a_bench.inference.tokenizer import Tokenizer
@@ -11,7 +12,7 @@ from tests.plan.gbnf import Gbnf
 
 def test_the_pinned_grammar_allows_the_counted_tokens_and_nothing_else(format_: Format, tokenize: Tokenize) -> None:
     allowed = Gbnf(grammar(format_, 1, tokenize)).words("root")
-    assert sorted(allowed) == sorted(tuple(tokenize(format_.write([call]))) for call in format_.skills.calls)
+    assert sorted(allowed) == sorted(tuple(tokenize(text_of(format_, [call]))) for call in format_.skills.calls)
 
 
 def test_what_the_grammar_allows_is_exactly_n_skills(format_: Format) -> None:
@@ -24,7 +25,7 @@ def test_what_the_grammar_allows_is_exactly_n_skills(format_: Format) -> None:
             events = parser.feed(answer)
             assert parser.close() == []
             assert [type(event) for event in events] == [SkillParsed] * n_skills
-            assert format_.write(event.call for event in events if isinstance(event, SkillParsed)) == answer
+            assert text_of(format_, (event.call for event in events if isinstance(event, SkillParsed))) == answer
 
 
 def test_what_the_pinned_grammar_allows_is_the_tokens_of_a_plan(format_: Format, tokenize: Tokenize) -> None:

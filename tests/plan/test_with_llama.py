@@ -6,7 +6,6 @@ from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.tokenizer import Tokenizer
 from s2a_bench.plan import (
-    GRANULARITIES,
     Parser,
     SkillParsed,
     SkillSet,
@@ -15,6 +14,9 @@ from s2a_bench.plan import (
     prompt,
 )
 from s2a_bench.types import Request, Token
+
+GRANULARITIES = (6, 4, 2, 1)
+"""Tokens a skill in the paper (section IV-E)."""
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
-from s2a_bench.experiments.timeline.view.lanes import page_lanes
+from s2a_bench.experiments.timeline.view.figures import page_lanes
 from s2a_bench.experiments.timeline.view.tables import execution_table, timeline_csv
 from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.report.page import ReportConfig

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from s2a_bench.boards.profile import Profile, load_profile
 from s2a_bench.boards.tokens import NO_JITTER, gaps_of
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, Numbers, Options, WholeNumbers, option
-
-if TYPE_CHECKING:
-    from s2a_bench.boards.profile import Profile
 
 PLANS: Final = 2000
 """Plans a point with jitter; without jitter all plans are equal."""
@@ -47,8 +45,6 @@ class BoundaryConfig(Options):
 
     @cached_property
     def boards(self) -> list[Profile]:
-        from s2a_bench.boards.profile import load_profile
-
         return [load_profile(name) for name in self.profiles]
 
     @property

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Final
+from typing import Any, ClassVar, Final
 
 from pydantic import Field
 
@@ -13,15 +13,13 @@ from s2a_bench.boards.profile import profile_files
 from s2a_bench.boards.tokens import PROMPT_TIME
 from s2a_bench.errors import UsageError
 from s2a_bench.harness import RECORD
+from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Names, Numbers, Options, group, option
 from s2a_bench.policy import COMPARED, POLICIES
 from s2a_bench.scenario import SIMULATORS, simulator_class
 from s2a_bench.scenario.ccrb.options import SKILL_SET, CcrbOptions
 from s2a_bench.transport import paths
-
-if TYPE_CHECKING:
-    from s2a_bench.harness.timelines.config import TimelineConfig
 
 
 class PlanRequest(Options):
@@ -93,8 +91,6 @@ class CcrbConfig(Options):
     @cached_property
     def timeline(self) -> TimelineConfig:
         """The timeline run with the same plans: one setting, even tokens."""
-        from s2a_bench.harness.timelines.config import TimelineConfig
-
         durations, rate = (
             self.scenario.durations,
             self.plan_request.engine.pace if self.plan_request.live else self.rate,
@@ -115,8 +111,6 @@ class CcrbConfig(Options):
     @cached_property
     def request(self) -> TimelineConfig:
         """The live timeline whose one plan is driven; raises UsageError naming the field."""
-        from s2a_bench.harness.timelines.config import TimelineConfig
-
         plan_request = self.plan_request
         played = plan_request.engine.kind.plays
         skills, tokens = played or (SKILL_SET, self.tokens_per_skill)

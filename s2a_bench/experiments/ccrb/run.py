@@ -30,7 +30,6 @@ from s2a_bench.scenario.ccrb.ttc import ttc_aware
 from s2a_bench.scenario.ros import with_ego
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import RunWriter
-from s2a_bench.types import Timing
 
 if TYPE_CHECKING:
     from s2a_bench.progress import Progress
@@ -63,20 +62,16 @@ def complete(
     """Schedule a plan, drawn or received, under every policy."""
     scenario = config.scenario
     if scenario.lane_change:
-        plans = _with_lane_change(plans, scenario.lane_durations)
+        changed: dict[str, Any] = {name: np.array(getattr(plans, name)) for name in ("nominal_s", "least_s", "most_s")}
+        for name, value in changed.items():
+            value[-1] = getattr(scenario.lane_durations, name)
+        plans = replace(plans, **changed)
     schedules = {name: policy.schedule(plans) for name, policy in policies.items()}
     late = None
     if config.ttc:
         timed = ttc_aware(plans, scenario.deadline_s)
         schedules[TTC], late = timed.schedule, bool(timed.late[0])
     return Prepared(setting, request_id, plans, policies, schedules, late)
-
-
-def _with_lane_change(plans: Plans, lane: Timing) -> Plans:
-    changed: dict[str, Any] = {name: np.array(getattr(plans, name)) for name in ("nominal_s", "least_s", "most_s")}
-    for name, value in changed.items():
-        value[-1] = getattr(lane, name)
-    return replace(plans, **changed)
 
 
 def drive_point(config: CcrbConfig, ready: Prepared, world: Simulator, writer: RunWriter) -> None:

@@ -46,7 +46,7 @@ def rollout_rows(
     each = {name: value for name, value in about.items() if isinstance(value, np.ndarray)}
     found = {metric.name: getattr(outcomes, metric.name) for metric in (*IMPACTS, *MARGINS)}
     for place in range(len(outcomes.code)):
-        metrics: dict[str, Any] = {name: _finite(values[place]) for name, values in found.items()}
+        metrics: dict[str, Any] = {name: float(values[place]) for name, values in found.items()}
         yield RolloutRow(
             **shared,
             **{name: value[place].item() for name, value in each.items()},
@@ -55,7 +55,7 @@ def rollout_rows(
             stalls=int((stall_s[:, place] > TOLERANCE_S).sum()),
             stall_ns=to_ns(stall_s[:, place].sum()),
             outcome=outcomes.name(place),
-            **metrics,
+            **{name: value if math.isfinite(value) else None for name, value in metrics.items()},
             **(motion or {}),
         )
 
@@ -84,10 +84,6 @@ def trajectory_rows(cell: str, path: Trajectory) -> Iterator[TrajectoryRow]:
             ego_lateral_m=float(path.lateral_m[step, EGO, 0]),
             **{name: values[step] for name, values in cars.items()},
         )
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 FORMS: Final = {name: policy(name).foreseeing for name in COMPARED}

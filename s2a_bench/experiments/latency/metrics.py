@@ -16,6 +16,7 @@ from s2a_bench.experiments.requests import (
     cells_of,
     compared_by,
     groups_present,
+    in_ms,
     ratio_table,
     ratios,
     stages_present,
@@ -35,41 +36,30 @@ if TYPE_CHECKING:
 AROUND: Final[tuple[RequestMetric, ...]] = tuple(chain.from_iterable(shown("metrics")))
 """What is known of a request by what surrounds its run, beside e2e without inference."""
 METRICS: Final = (
-    RequestMetric(
-        "e2e_without_inference",
-        "ms",
-        title="e2e w/o infer.",
-        about="Absent if the server does not report its inference time.",
-    ),
-    RequestMetric(
-        "e2e_without_model",
-        "ms",
-        title="e2e w/o model",
-        about="e2e less the model's time up to the first token; preprocessing is included. Of a llama-server: "
+    in_ms("e2e_without_inference", "e2e w/o infer.", "Absent if the server does not report its inference time."),
+    in_ms(
+        *("e2e_without_model", "e2e w/o model"),
+        "e2e less the model's time up to the first token; preprocessing is included. Of a llama-server: "
         "e2e less the prompt_ms it reports.",
     ),
-    RequestMetric("e2e", "ms", title="e2e"),
-    RequestMetric("ttft", "ms", about="From the prompt: e2e without capture."),
-    RequestMetric(
-        "round_trip",
-        "ms",
-        title="round trip",
-        about="network and return together: exact, where a server on another host has them as intervals.",
+    in_ms("e2e", "e2e"),
+    in_ms("ttft", about="From the prompt: e2e without capture."),
+    in_ms(
+        *("round_trip", "round trip"),
+        "network and return together: exact, where a server on another host has them as intervals.",
     ),
-    RequestMetric(
-        "frame_age", "ms", about="Age of the frame when inference starts.", ends=lambda cell: cell.ends("frame_age")
-    ),
+    in_ms("frame_age", about="Age of the frame when inference starts.", ends=lambda cell: cell.ends("frame_age")),
     *AROUND,
     *TOKEN_METRICS,
-    RequestMetric("residual", "ms", title="residual", about="The time between the stages."),
+    in_ms("residual", "residual", "The time between the stages."),
     RequestMetric("residual_share", about="The residual as a share of e2e without inference."),
 )
 
 
 COMPARED: Final = compared_by(
-    (*METRICS, *(RequestMetric(f"group.{name}", "ms", of=partial(RequestCell.sums_ms, group=name)) for name in GROUPS)),
+    (*METRICS, *(in_ms(f"group.{name}", of=partial(RequestCell.sums_ms, group=name)) for name in GROUPS)),
     ("e2e_without_inference", "e2e", "itl"),
-    run_metrics=lambda run: [RequestMetric(stage, "ms") for stage in run.stages],
+    run_metrics=lambda run: map(in_ms, run.stages),
 )
 """What latency runs are compared by: metrics, groups of stages, and each run's stages."""
 LatencyCell: Final = cell_class(

@@ -11,6 +11,8 @@ from itertools import count, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from s2a_bench.boards.fit import fit_gaps
 from s2a_bench.boards.gaps import to_table
 from s2a_bench.boards.profile import Profile, parse_profile, to_toml
@@ -110,8 +112,6 @@ def document(
     config: CaptureConfig, recorded: list[TimedAnswer], model: dict[str, Any], warnings: list[str]
 ) -> dict[str, Any]:
     """Turn timed answers, warm-ups first, into the tables of a profile's file."""
-    import numpy as np
-
     counted = recorded[config.warmup :]
     rows = [[gap / 1e9 for gap in answer.gaps_ns] for answer in counted]
     total = sum(map(len, rows))
@@ -164,8 +164,6 @@ def document(
 
 def rate_cv(rows: list[list[float]]) -> float:
     """Return the spread of requests' mean gaps beyond that of independent gaps, as a share of the mean."""
-    import numpy as np
-
     long = [row for row in rows if len(row) > 1]
     if len(long) < 2:  # noqa: PLR2004 - one request has no spread
         return 0.0

@@ -81,7 +81,9 @@ def _execute(
     progress.stage(f"{link.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
     side_by_side = SideBySide(policies, ask.shape, ask.skills.gap, robots, link.config.timeout_s)
     feed = PlanFeed(Parser(ask.format), side_by_side.send)
-    title = f"live {link.cell.name}, L = {ask.tokens_per_skill}{_remarks(link)}"
+    paced = [f"paced to {link.pace:g} tokens/s"] if link.pace else []
+    remarks = [*paced, *(label for label in link.origin.labels if label != "paced")]
+    title = ", ".join((f"live {link.cell.name}", f"L = {ask.tokens_per_skill}", *remarks))
     request_id = ""
     try:
         with side_by_side, watching(progress, Scene(title, side_by_side.records, ask.n_skills, span_s)):
@@ -98,8 +100,3 @@ def _execute(
         link.learn_rate(max((record.token_ns for record in executed), key=len))
         link.launch.warnings.extend(keep(link.writer, link.setting(ask), plan, request_id, policies, executed))
     following.learn(side_by_side.records)
-
-
-def _remarks(link: ModelLink) -> str:
-    paced = [f"paced to {link.pace:g} tokens/s"] if link.pace else []
-    return "".join(f", {each}" for each in (*paced, *(label for label in link.origin.labels if label != "paced")))

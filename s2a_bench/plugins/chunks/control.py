@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from threading import Thread
 from typing import Final, TypeAlias
 
+import numpy as np
+
 from s2a_bench.clock import Clock, SystemClock, quick_switching
 from s2a_bench.plugins.chunks.modes import ControlSetting, Ints, Mode
 from s2a_bench.types import Vector
@@ -25,6 +27,8 @@ Send: TypeAlias = "Callable[[Vector | None, int], None]"
 RequestChunk: TypeAlias = "Callable[[int, int], None]"
 """Called on the loop's thread with a request's number, from 0, and the tick in which it leaves; must not block."""
 
+ENDLESS: Final = 2**62
+"""Ticks of a loop that is stopped."""
 HEAD_START_NS: Final = 20_000_000
 """From `ControlLoop.start` to the first tick."""
 
@@ -117,8 +121,6 @@ class RobotTicks:
 
     def acted(self) -> Acted:
         """Return the record so far; while the loop runs, that of the ticks that have ended."""
-        import numpy as np
-
         acts, horizon = np.array(self._acts[:], np.int64).reshape(-1, 3), self._setting.horizon
         request_tick = np.array(self._request_ticks[:], np.int64)
         arrival_ns = np.full((request_tick.size, horizon), -1)

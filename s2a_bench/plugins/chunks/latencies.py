@@ -11,6 +11,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+
 from s2a_bench.boards.gaps import Gaps
 from s2a_bench.boards.latency import draw_ns, read_latency, whole_ns
 from s2a_bench.boards.profile import load_profile, profile_files
@@ -20,7 +22,6 @@ from s2a_bench.provenance import Provenance
 from s2a_bench.store.run import StoredRun, fits, read_run
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
 
     from s2a_bench.plugins.chunks.modes import ControlSetting, Ints, Mode
@@ -90,8 +91,6 @@ def measured(folder: Path, only: str = "") -> Iterator[Source]:
 
     Failed requests and warm-ups are left out. Raises StoreError without a run, UsageError without answers or cell.
     """
-    import numpy as np
-
     run = read_run(folder)
     with fits(run):
         samples = run.samples
@@ -202,8 +201,6 @@ All times are whole ns of one clock. `boards.latency` reads the file back.
 
 def delay_rows(source: Source, drawn_ns: Ints, mode: Mode, setting: ControlSetting) -> Iterator[dict[str, object]]:
     """Yield a row a request: all measured requests at their times, or those of ``mode`` with drawn latencies."""
-    import numpy as np
-
     requests = source.requests or list(_simulated(drawn_ns, mode, setting))
     delays = setting.delay_ticks(np.array([request["latency_ns"] for request in requests], np.int64))
     for number, (request, delay) in enumerate(zip(requests, delays.tolist(), strict=True)):

@@ -45,7 +45,8 @@ class Plant(ActionKind):
 
         if np.isnan(actions[0]).any():
             raise ValueError("nothing to hold: the first action is NaN")
-        held = _hold(np.asarray(actions, np.float64))
+        rows = np.where(np.isnan(actions), 0, np.arange(len(actions))[:, np.newaxis])
+        held = np.take_along_axis(np.asarray(actions, np.float64), np.maximum.accumulate(rows, axis=0), axis=0)
         rest = held[0]
         moved = held - rest
         steps, drives = zip(
@@ -113,9 +114,3 @@ class PlantRobot(ActionRobot):
         return {"robot": "plant", "frequency_hz": f"{plant.frequency_hz:g}", "damping": f"{plant.damping:g}"}
 
     def close(self) -> None: ...
-
-
-def _hold(actions: Floats) -> Floats:
-    rows = np.where(np.isnan(actions), 0, np.arange(len(actions))[:, np.newaxis])
-    held: Floats = np.take_along_axis(actions, np.maximum.accumulate(rows, axis=0), axis=0)
-    return held

@@ -130,7 +130,11 @@ def open_comparison(
     commands = list(dict.fromkeys(str(run.manifest["command"]) for run in runs))
     if len(commands) > 1:
         raise UsageError(f"these are runs of {' and '.join(commands)}: name runs of one command")
-    by = _comparable(commands[0])
+    experiment = experiment_of(commands[0])
+    by = experiment.compared_by() if experiment else None
+    if by is None:
+        known = ", ".join(sorted(name for name, found in EXPERIMENTS.loaded() if found.compared))
+        raise UsageError(f"runs of {commands[0]} cannot be compared, only those of {known}")
     with fits(*runs):
         dated = [[each for run in side for each in _launches(run, by.subjects(run))] for side in (baseline, other)]
         sides = [[launch for _, launch in side] for side in dated]
@@ -162,13 +166,6 @@ def _launches(run: StoredRun, subjects: Iterable[Subject]) -> list[tuple[str, di
     if not found:
         raise UnlikeRuns(f"{run.path} has no complete cell, its state is {run.manifest['state']}: measure it again")
     return [(str(run.manifest.get("started") or ""), launch) for launch in found.values()]
-
-
-def _comparable(command: str) -> Comparable:
-    if (experiment := experiment_of(command)) and (by := experiment.compared_by()):
-        return by
-    known = ", ".join(sorted(name for name, found in EXPERIMENTS.loaded() if found.compared))
-    raise UsageError(f"runs of {command} cannot be compared, only those of {known}")
 
 
 def _match(

@@ -33,13 +33,8 @@ def ahead(options: Mapping[str, Any]) -> str:
 
 
 def outcome_label(outcome: str, survives: bool) -> str:
-    """Describe an outcome, marked if the car behind would hit any ego."""
-    return OUTCOME_LABELS[outcome] + marked(outcome, survives)
-
-
-def marked(outcome: str, survives: bool) -> str:
-    """Return the mark of a rear outcome that does not depend on the policy, else nothing."""
-    return f" {MARK}" if outcome in {"rear", "both"} and not survives else ""
+    """Describe an outcome; a rear one is marked if the car behind would hit any ego, as it says nothing of a policy."""
+    return OUTCOME_LABELS[outcome] + f" {MARK}" * (outcome in {"rear", "both"} and not survives)
 
 
 def follower_check(options: Mapping[str, Any], survives: bool) -> str:

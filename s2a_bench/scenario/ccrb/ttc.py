@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from s2a_bench.policy import Floats, Plans, Schedule
+from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.schedule import align, safe_start, work_conserving
 
 NAME: Final = "s2a-ttc"
@@ -40,10 +40,6 @@ def ttc_aware(plans: Plans, deadline_s: ArrayLike) -> TimedStart:
     # Stretch early skills instead of stalling later: backwards, but not in late plans.
     for i in reversed(range(1, len(start) - 1)):
         np.maximum(start[i], start[i + 1] - most_s[i], out=start[i], where=~late)
-    return TimedStart(Schedule(start, _durations(start, nominal_s, most_s)), late)
-
-
-def _durations(start_s: Floats, nominal_s: Floats, most_s: Floats) -> Floats:
-    duration: Floats = nominal_s.copy()
-    np.minimum(np.diff(start_s, axis=0), most_s[:-1], out=duration[:-1])
-    return duration
+    duration = nominal_s.copy()
+    np.minimum(np.diff(start, axis=0), most_s[:-1], out=duration[:-1])
+    return TimedStart(Schedule(start, duration), late)

@@ -13,11 +13,10 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     configuration,
     has,
     origin_notes,
-    rate_span_at_point,
+    rate_span,
     rollouts_of,
     scenes_of,
     share_of,
-    survives_of,
     token_times_s,
 )
 from s2a_bench.plan.skillset import GAPS
@@ -70,7 +69,7 @@ _POINT: Final[dict[str, Any]] = {
 def build_scenario(run: StoredRun) -> Figure:
     """Draw positions, speeds and gaps over time at the operating point, a column a policy, and name its roll-out."""
     found = rollouts_of(run, "point")
-    survives, rows = survives_of(found), found.to_dict("records")
+    survives, rows = bool(found["follower_survives"].all()), found.to_dict("records")
     paths = {row["policy"]: _path(run, row) for row in rows}
     skills = dict(list(run.table(SKILLS).groupby("cell", sort=False)))
     settings, beside = configuration(run), rollouts_of(run, "rollout").set_index("cell")
@@ -214,7 +213,7 @@ def build_phase(run: StoredRun) -> Figure:
     for axes, gap in zip(grid.flat, GAPS, strict=True):
         scenes = scenes_of(run, "phase", gap)
         seen |= _draw_panel(axes, scenes, settings, run)
-        share, span = share_of(scenes, "paper").value, rate_span_at_point(run, gap)
+        share, span = share_of(scenes, "paper").value, rate_span(run, gap, at_point=True)
         where = f"R {span[0]:.1f}\N{EN DASH}{span[1]:.1f}" if span else "no R"
         at = f"at {settings['rear_gap_m']:g} m: {where}"
         axes.set_title(f"{gap}: the paper's ordering {share:.1%}, {at}", loc="left")

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
+import pandas as pd
+
 from s2a_bench.experiments import TIME
 from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
@@ -15,8 +17,6 @@ from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
     from collections.abc import Collection
-
-    import pandas as pd
 
     from s2a_bench.store.run import StoredRun
 
@@ -63,8 +63,6 @@ def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
     than stream-to-act's (none counts as 0); ``naive_rear_worse``, ``naive_rear_better``: the same for rear impacts.
     ``survives``: the car behind avoids an ego with immediate tokens.
     """
-    import pandas as pd
-
     rows = rollouts_of(run, study)
     rows = rows[rows["gap_behaviour"] == gap]
     policies = {name: group.set_index("draw").sort_index() for name, group in rows.groupby("policy")}
@@ -86,25 +84,15 @@ def share_of(scenes: pd.DataFrame, ordering: str) -> Share:
     return Share(int(scenes[ordering].sum()), len(scenes))
 
 
-def survives_of(rows: pd.DataFrame) -> bool:
-    """Return whether the car behind avoids an ego with immediate tokens."""
-    return bool(rows["follower_survives"].all())
+def rate_span(run: StoredRun, gap: str, *, at_point: bool = False) -> tuple[float, float] | None:
+    """Return the least and greatest R of the phase diagram with the paper's ordering; None without any.
 
-
-def rate_span(run: StoredRun, gap: str) -> tuple[float, float] | None:
-    """Return the least and greatest R of the phase diagram with the paper's ordering; None without any."""
-    return _span_of(scenes_of(run, "phase", gap))
-
-
-def rate_span_at_point(run: StoredRun, gap: str) -> tuple[float, float] | None:
-    """Return the same at the grid's rear gap nearest to the operating point's."""
+    ``at_point``: only at the grid's rear gap nearest to the operating point's.
+    """
     scenes = scenes_of(run, "phase", gap)
-    wanted = configuration(run)["rear_gap_m"]
-    nearest = min(scenes["rear_gap_m"].unique(), key=lambda gap_m: abs(gap_m - wanted))
-    return _span_of(scenes[scenes["rear_gap_m"] == nearest])
-
-
-def _span_of(scenes: pd.DataFrame) -> tuple[float, float] | None:
+    if at_point:
+        away = (scenes["rear_gap_m"] - configuration(run)["rear_gap_m"]).abs()
+        scenes = scenes[away == away.min()]
     rates = scenes[scenes["paper"]]["tokens_per_s"]
     return (float(rates.min()), float(rates.max())) if len(rates) else None
 
@@ -134,8 +122,6 @@ def token_times_s(run: StoredRun, cell: str) -> list[float]:
 
 
 def _cell(row: dict[Any, Any]) -> dict[str, Any]:
-    import pandas as pd
-
     plain = {str(name): value for name, value in row.items() if not pd.isna(value)}
     for name in ("draw", "title", PROVENANCE):
         plain.pop(name, None)
@@ -158,7 +144,7 @@ def origin_notes(run: StoredRun) -> tuple[str, ...]:
     if ego := settings.get("ego"):
         notes.append(f"Ego: commanded and seen over ROS 2 ({ego}).")
     notes.append(f"Rear: {law(settings)}.")
-    notes.append(follower_check(settings, survives_of(rollouts_of(run, "point"))))
+    notes.append(follower_check(settings, bool(rollouts_of(run, "point")["follower_survives"].all())))
     reflex = "on" if settings["reflex"] else "off"
     notes.append(f"Front: while no skill is valid the ego does '{settings['gap']}'; the reflex layer is {reflex}.")
     return tuple(notes)

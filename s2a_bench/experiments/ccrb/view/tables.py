@@ -23,7 +23,6 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     has,
     origin_notes,
     rate_span,
-    rate_span_at_point,
     request_of,
     rollouts_of,
     scenes_of,
@@ -67,21 +66,18 @@ def _ccrb_sentences(run: StoredRun) -> list[str]:
         f"{cell['stalls']} stalls of {cell['stall_s']:.2f} s."
         for cell in cells_of(run)
     ]
-    sentences += [f"Phase diagram, gap behaviour {line}" for line in findings(run)]
+    if has(run, "phase"):
+        sentences += [f"Phase diagram, gap behaviour {finding(run, gap)}" for gap in GAPS]
     if studies := run.manifest.get("studies"):
         speed = studies["rollouts_per_cpu_s"]
         sentences.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time.")
     return sentences
 
 
-def findings(run: StoredRun) -> list[str]:
-    return [_finding(run, gap) for gap in GAPS] if has(run, "phase") else []
-
-
-def _finding(run: StoredRun, gap: str) -> str:
+def finding(run: StoredRun, gap: str) -> str:
     share = share_of(scenes_of(run, "phase", gap), "paper")
     sentence = f"{gap}: the paper's ordering holds at {share.value:.1%} of the diagram"
-    span, at_point = rate_span(run, gap), rate_span_at_point(run, gap)
+    span, at_point = rate_span(run, gap), rate_span(run, gap, at_point=True)
     if span is None:
         return f"{gap}: the paper's ordering holds nowhere in the diagram."
     at = f"at a rear gap of {configuration(run)['rear_gap_m']:g} m"
@@ -191,7 +187,7 @@ def _phase_table(run: StoredRun) -> TextTable:
     rows = _share_rows(run, "phase", lambda share: f"{share.value:.1%}")
     settings = configuration(run)
     rows.append(("R of the paper's ordering", *(_span(rate_span(run, gap)) for gap in GAPS)))
-    at_point = (_span(rate_span_at_point(run, gap)) for gap in GAPS)
+    at_point = (_span(rate_span(run, gap, at_point=True)) for gap in GAPS)
     rows.append((f"  at a rear gap of {settings['rear_gap_m']:g} m", *at_point))
     (low, high), (near, far) = settings["phase_rates"], settings["phase_gaps_m"]
     spans = f"R {low:g} to {high:g} tokens/s, rear gap {near:g} to {far:g} m"

@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from s2a_bench.stats import Ratio
     from s2a_bench.store.run import StoredRun
 
-BESIDE = {"e2e_without_inference": tuple(each.name for each in AROUND)}
 _STAGE_CELLS = 5
 """With more cells than this a narrow table has the cells as rows."""
 _MOST = 6
@@ -179,11 +178,8 @@ def summary_table(run: StoredRun, metric: str = "e2e_without_inference") -> Text
         if base.values_ms(metric).size and any(cell.is_compared_with(base) for cell in cells):
             bases.setdefault(base.name if base.mixed else base.label, []).append(base)
     figures = (MEAN_SD, "median", "p90", "p99")
-    bounds = [
-        each
-        for each in METRICS
-        if each.name in BESIDE.get(metric, ()) and any(cell.values(each).size for cell in cells)
-    ]
+    around = AROUND if metric == "e2e_without_inference" else ()
+    bounds = [each for each in around if any(cell.values(each).size for cell in cells)]
     rows = []
     found: list[Ratio] = []
     for cell in cells:

@@ -6,6 +6,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
+import pandas as pd
+
 from s2a_bench.experiments import TIME, Comparable, Subject
 from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES
 from s2a_bench.store.manifest import present
@@ -15,8 +17,6 @@ from s2a_bench.writers.json import frame
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from s2a_bench.policy import Floats
     from s2a_bench.store.run import StoredRun
 
@@ -31,8 +31,6 @@ class Timelines:
 
     def about(self, column: str) -> Any:
         """Return a value that all rows of the cell share; None if missing."""
-        import pandas as pd
-
         value = self.rows[column].iloc[0]
         return None if pd.isna(value) else value.item() if hasattr(value, "item") else value
 
@@ -102,9 +100,11 @@ def origin_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
         rates = {"paper": "the paper's rates (table II)", "measured": "measured rates", "given": "rates as given"}
         origins = [rates[origin] for origin in dict.fromkeys(board["origin"] for board in boards)]
         virtual = all(cell.about("mode") == "virtual" for cell in cells)
+        jitter = run.manifest.get("configuration", {}).get("jitter", "none")
+        how = {"none": "evenly", "profile": "with the profiles' jitter"}.get(jitter, f"with jitter {jitter}")
         emulated = (
             f"EMULATED{' in virtual time' if virtual else ', executed in real time'}: no model answered; tokens arrive "
-            f"at {' and '.join(origins) or 'given rates'}, {_jitter(run)}."
+            f"at {' and '.join(origins) or 'given rates'}, {how}."
         )
         papers = [PAPERS] if any(board["origin"] == "paper" for board in boards) else []
         notes.append(Note(emulated, EMULATED, *papers))
@@ -114,11 +114,6 @@ def origin_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
         shift = f"c = {listed} s before decoding is our assumption: it shifts all policies of a board by as much."
         notes.append(Note(shift, ASSUMED))
     return tuple(notes)
-
-
-def _jitter(run: StoredRun) -> str:
-    jitter = run.manifest.get("configuration", {}).get("jitter", "none")
-    return {"none": "evenly", "profile": "with the profiles' jitter"}.get(jitter, f"with jitter {jitter}")
 
 
 def _live_notes(run: StoredRun) -> list[Note]:

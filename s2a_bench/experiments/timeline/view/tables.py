@@ -17,10 +17,9 @@ from s2a_bench.experiments.timeline.view.cells import (
     timelines_json,
     timelines_of,
 )
-from s2a_bench.experiments.timeline.view.figures import timeline_figures
-from s2a_bench.experiments.timeline.view.lanes import page_lanes
+from s2a_bench.experiments.timeline.view.figures import page_lanes, timeline_figures
 from s2a_bench.policy import ONLINE
-from s2a_bench.policy.conformal import promise
+from s2a_bench.policy.conformal import promise, upper_bound
 from s2a_bench.stats import summary_of
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable
 from s2a_bench.writers.tables import ABSENT, TextTable, number
@@ -64,8 +63,6 @@ def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
     stall_s, (title, tokens, *_) = worst.mean("stall_s") or 0.0, worst.setting
     share = ""
     if worst.n > 1:
-        from s2a_bench.policy.conformal import upper_bound
-
         stalled = int(worst.rows["any_stall"].sum())
         high = upper_bound(stalled, worst.n, 0.975)
         share = f" there {worst.p_any_stall:.1%} of {worst.n} plans stall (95 % interval up to {high:.1%});"

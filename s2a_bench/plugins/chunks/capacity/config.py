@@ -37,9 +37,9 @@ _LIMIT: Final = re.compile(r"(stalled)=(\d+\.?\d*)%?|((?:latency|ttft|age)_p(50|
 
 @dataclass(frozen=True, slots=True)
 class Limit:
-    """What a fleet may not exceed: at most ``share`` of the values of a metric are above ``above_ns``.
+    """What a fleet may not exceed: at most ``share`` of the values of a metric are above ``value``.
 
-    The values of ``stalled`` are ticks, or plans, that stall or not.
+    The values of ``stalled`` are 1 for a tick, or a plan, that stalls, else 0; all others are in ns.
     """
 
     column: str
@@ -47,7 +47,6 @@ class Limit:
     value: float
     """The greatest allowed value of the column."""
     share: float
-    above_ns: float = 0.0
 
     @staticmethod
     def read(written: str) -> Limit:
@@ -61,28 +60,13 @@ class Limit:
                 raise ValueError(f"'{written}' allows every tick to stall; write 1% or 0.01")
             return Limit("stalled", share, share)
         value_ns = float(found[5]) * (1e9 if found[6] == "s" else 1e6)
-        return Limit(f"{found[3]}_ns", value_ns, 1 - int(found[4]) / 100, value_ns)
+        return Limit(f"{found[3]}_ns", value_ns, 1 - int(found[4]) / 100)
 
     @property
     def text(self) -> str:
         if self.column == "stalled":
             return f"at most {self.share * 100:g} % stalled"
         return f"{self.column.removesuffix('_ns').replace('_', ' ')} of at most {self.value / 1e6:g} ms"
-
-
-def _read_robots(written: str) -> tuple[int, ...]:
-    """Return the numbers of robots: FROM..TO as powers of two times FROM, then TO; or those of a list."""
-    low, _, high = written.partition("..")
-    try:
-        found = sorted({int(each) for each in (*low.split(","), *high.split(",")) if each.strip()})
-    except ValueError:
-        found = []
-    if not found or found[0] < 1:
-        raise UsageError(f"`robots`: '{written}' should be 1 or more: a number, a list, or FROM..TO")
-    if not high:
-        return tuple(found)
-    first, last = found[0], found[-1]
-    return (*(first << step for step in range((last // first).bit_length()) if first << step < last), last)
 
 
 class CapacityRequests(LiveRequests):
@@ -154,8 +138,18 @@ class CapacityConfig(Options):
 
     @cached_property
     def numbers(self) -> Sequence[int]:
-        """The numbers of robots to try, ascending; of a search, those before the bisection."""
-        return _read_robots(self.robots)
+        """The numbers of robots to try, ascending; of FROM..TO the powers of two times FROM, then TO."""
+        low, _, high = self.robots.partition("..")
+        try:
+            found = sorted({int(each) for each in (*low.split(","), *high.split(",")) if each.strip()})
+        except ValueError:
+            found = []
+        if not found or found[0] < 1:
+            raise UsageError(f"`robots`: '{self.robots}' should be 1 or more: a number, a list, or FROM..TO")
+        if not high:
+            return tuple(found)
+        first, last = found[0], found[-1]
+        return (*(first << step for step in range((last // first).bit_length()) if first << step < last), last)
 
     @property
     def searches(self) -> bool:

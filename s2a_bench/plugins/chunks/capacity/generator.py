@@ -6,7 +6,7 @@ Latencies count from the intended time of a request, whatever delays it here, an
 
 from __future__ import annotations
 
-import time
+import signal
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
@@ -17,7 +17,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from tempfile import TemporaryDirectory
 from threading import Event, Lock, Thread
-from time import monotonic
+from time import monotonic, process_time
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -31,7 +31,7 @@ from s2a_bench.harness.session import UNKNOWN_ORIGIN, Measured, Place, RequestCo
 from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import allowed, end_with_parent, keep_large_blocks, limit_threads
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
-from s2a_bench.plugins.chunks.control import ControlLoop, RobotTicks
+from s2a_bench.plugins.chunks.control import ENDLESS, ControlLoop, RobotTicks
 from s2a_bench.plugins.chunks.modes import ControlSetting, mode
 from s2a_bench.plugins.chunks.modes.cycles import gather
 from s2a_bench.plugins.chunks.requester import SEEDS, ChunkRequester, Job, wait_s
@@ -48,7 +48,6 @@ if TYPE_CHECKING:
 
 STRIDE: Final = 1 << 20
 """Between the numbers of two requests of a robot, so that those of different robots differ."""
-ENDLESS: Final = 2**62
 PATIENCE_S: Final = 2.0
 """For answers under way when a fleet is stopped by an error."""
 FREE_CORE_S: Final = 60.0
@@ -290,7 +289,7 @@ class Fleet:
         self._robots, self._threads, self._loop = {}, [], None
 
     def cpu_s(self) -> float:
-        return time.process_time()
+        return process_time()
 
     def close(self) -> None:
         """Close the connections; that of a request under way ends with the process."""
@@ -367,8 +366,6 @@ class FleetProcess(RemoteFleet):
 
 def _serve(plan: FleetPlan, pipe: Connection) -> None:
     """Answer calls of a fleet's methods until it is closed or the other end has gone."""
-    import signal
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run handles Ctrl-C
     end_with_parent()
     fleet, name = Fleet(plan), ""

@@ -136,13 +136,13 @@ def above_limit(limit: Limit, traces: Sequence[RobotTrace], settle_ns: int) -> t
             age = trace.ticks.age
             period_ns = (trace.end_ns - trace.start_ns) / max(1, age.size)
             since_ns = (np.arange(age.size) * period_ns).astype(np.int64)
-            known, exceeds = age >= 0, age * period_ns > limit.above_ns
+            known, exceeds = age >= 0, age * period_ns > limit.value
         else:
             taken_ns = trace.first_ns if limit.column.startswith("ttft") else trace.arrival_ns
             if taken_ns is None:
                 continue
             since_ns, waits_ns = trace.request_ns - trace.start_ns, trace.end_ns - trace.request_ns
-            exceeds = np.where(taken_ns < 0, waits_ns, taken_ns) > limit.above_ns
+            exceeds = np.where(taken_ns < 0, waits_ns, taken_ns) > limit.value
             known = (taken_ns >= 0) | exceeds
         kept = known & (since_ns >= settle_ns)
         robots = np.full(int(kept.sum()), trace.robot)

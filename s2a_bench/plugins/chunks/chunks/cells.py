@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from s2a_bench.harness.warnings import change_warnings
 from s2a_bench.plugins.chunks.chunks.config import CYCLES, ChunksConfig
 from s2a_bench.plugins.chunks.modes.trigger import (
@@ -126,8 +128,6 @@ def _learner(config: ChunksConfig, rule: str, drawn: LatencyDraw) -> TriggerRule
 
 def _oracle_ns(config: ChunksConfig, drawn: LatencyDraw) -> int:
     """Return the latency that at most a share epsilon exceeds of a million other draws, or of the whole recording."""
-    import numpy as np
-
     source = drawn.source
     latency_ns = source.recorded_ns
     if latency_ns is None:

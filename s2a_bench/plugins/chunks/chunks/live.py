@@ -26,7 +26,7 @@ from s2a_bench.plugins.chunks.chunks.build_rows import stall_metrics, stalls_of,
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes
 from s2a_bench.plugins.chunks.chunks.config import PROMISING, ChunksConfig
 from s2a_bench.plugins.chunks.chunks.smooth import MOST_TICKS, smoothness
-from s2a_bench.plugins.chunks.control import Acted, ControlLoop, RobotTicks, Send
+from s2a_bench.plugins.chunks.control import ENDLESS, Acted, ControlLoop, RobotTicks, Send
 from s2a_bench.plugins.chunks.latencies import Source, delay_rows, measured, write_delays
 from s2a_bench.plugins.chunks.modes import ONE_BY_ONE, ControlSetting, Cycles, Ints, Mode, Ticks, mode
 from s2a_bench.plugins.chunks.modes.cycles import gather, lay
@@ -41,8 +41,6 @@ KEEP_S: Final = 0.05
 """Period in which measurements are written while the loop runs."""
 WARM_UP_TICK_NS: Final = 20_000_000
 """The longest tick of the loop that warms up."""
-ENDLESS: Final = 2**62
-"""Ticks of a loop that is stopped."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

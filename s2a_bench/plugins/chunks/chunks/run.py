@@ -15,7 +15,6 @@ from s2a_bench.machine import environment
 from s2a_bench.plugins.chunks.chunks.build_rows import stalls_of, write_cell
 from s2a_bench.plugins.chunks.chunks.cells import (
     FOLLOW,
-    ChunkCell,
     LatencyDraw,
     cells,
     changes,
@@ -134,7 +133,10 @@ def run_chunks(config: ChunksConfig, output: Path, progress: Progress) -> Path:
         progress.expect(len(tried))
         follows = follower(config)
         for cell in tried:
-            _simulate(config, cell, follows, writer)
+            setting, latency_ns = config.setting.slowed(cell.slower), cell.drawn.judged
+            cycles, ticks = cell.acting.cycles(latency_ns, setting), cell.acting.ticks(latency_ns, setting)
+            smooth = follows.measure(cell.mode, cycles, ticks) if follows and cell.slower == 1 else {}
+            write_cell(config, writer, cell, cycles, ticks, config.shown_ticks, more=smooth)
             progress.advance()
         for each in drawn:
             writer.append(TRIGGERS, trigger_rows(config, each))
@@ -151,13 +153,6 @@ def _warnings(config: ChunksConfig) -> Iterator[RunWarning]:
         yield RunWarning(
             "few-latencies", f"without the rules {missing}: {config.too_few}", "record more, or raise --eps"
         )
-
-
-def _simulate(config: ChunksConfig, cell: ChunkCell, follows: TrackingPlant | None, writer: RunWriter) -> None:
-    setting, latency_ns = config.setting.slowed(cell.slower), cell.drawn.judged
-    cycles, ticks = cell.acting.cycles(latency_ns, setting), cell.acting.ticks(latency_ns, setting)
-    smooth = follows.measure(cell.mode, cycles, ticks) if follows and cell.slower == 1 else {}
-    write_cell(config, writer, cell, cycles, ticks, config.shown_ticks, more=smooth)
 
 
 def _check(config: ChunksConfig, drawn: LatencyDraw) -> None:

@@ -68,7 +68,8 @@ def gather(request_tick: Ints, usable_tick: Ints, chunk: Ints, index: Ints, hori
         request_tick, usable_tick, start_tick, first_index, executed, stall_ticks, jump, ticks=ticks, horizon=horizon
     )
     age = np.where(chunk >= 0, np.arange(ticks) - request_tick[chunk], -1) if count else chunk
-    return cycles, Ticks(chunk, index, age, _stalled(chunk))
+    begun = np.maximum.accumulate(chunk >= 0) if chunk.size else chunk >= 0
+    return cycles, Ticks(chunk, index, age, np.asarray(begun & (chunk < 0)))
 
 
 def lay(cycles: Cycles) -> Ticks:
@@ -99,11 +100,6 @@ def _executed_before(tick: Ints, start: Ints, length: Ints, done_before: Ints) -
     run = np.searchsorted(start, tick, "right") - 1
     inside = np.minimum(tick - start[run], length[run])
     return np.where(run < 0, 0, done_before[run] + inside)
-
-
-def _stalled(chunk: Ints) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    begun = np.maximum.accumulate(chunk >= 0) if chunk.size else chunk >= 0
-    return np.asarray(begun & (chunk < 0))
 
 
 def arrivals(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> Ints:

@@ -49,13 +49,13 @@ def measure(mode: Mode, cycles: Cycles, ticks: Ticks) -> ChunkMetrics:
     first = int(np.argmax(ticks.chunk >= 0)) if age.size else cycles.ticks
     stall_ticks, length = int(ticks.stalled.sum()), cycles.ticks - first
     last = int(np.flatnonzero(cycles.executed)[-1]) if age.size else 0
-    jump = np.abs(cycles.jump[settled])
+    jump, edges = np.abs(cycles.jump[settled]), np.diff(ticks.stalled.astype(np.int8), prepend=0, append=0)
     return ChunkMetrics(
         first_action_tick=first,
         ticks=length,
         stall_ticks=stall_ticks,
         stall_share=stall_ticks / length if length else np.nan,
-        longest_stall_ticks=_longest(ticks),
+        longest_stall_ticks=int((np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)).max(initial=0)),
         p_stall_cycle=mean(cycles.stall_ticks[settled] > 0),
         age_ticks_mean=mean(age),
         age_ticks_p99=float(np.quantile(age, 0.99)) if age.size else np.nan,
@@ -89,12 +89,6 @@ def margin_ticks(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> int:
         if mode.ticks(latency_ns + added * setting.period_ns, setting).stalled.any():
             return added - 1
     return 2 * setting.horizon
-
-
-def _longest(ticks: Ticks) -> int:
-    edges = np.diff(ticks.stalled.astype(np.int8), prepend=0, append=0)
-    lengths = np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)
-    return int(lengths.max(initial=0))
 
 
 def mean(values: NDArray[Any]) -> float:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from s2a_bench.plugins.chunks.chunks import EXPERIMENT
 from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
 from s2a_bench.plugins.chunks.chunks.run import run_chunks
-from s2a_bench.plugins.chunks.chunks.view import chunk_sentences, show
+from s2a_bench.plugins.chunks.chunks.view import chunk_sentences, page_lanes, show
 from s2a_bench.plugins.chunks.chunks.view.figures import (
     COLOURS,
     build_lanes,
@@ -19,7 +19,6 @@ from s2a_bench.plugins.chunks.chunks.view.figures import (
     chunk_figures,
     lanes_of,
 )
-from s2a_bench.plugins.chunks.chunks.view.lanes import page_lanes
 from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import read_chapters
 from s2a_bench.report.page.files import make_report, write_report

@@ -1,13 +1,14 @@
-"""The sentences, tables, figures and JSON of a run of chunks."""
+"""The sentences, tables, figures and JSON of a run of chunks, and the lanes of its first ticks on the page."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
 
 from s2a_bench.experiments import Shown
-from s2a_bench.plugins.chunks.chunks.view.figures import chunk_figures, lanes_of
-from s2a_bench.plugins.chunks.chunks.view.lanes import page_lanes
+from s2a_bench.plugins.chunks.chunks.view.figures import COLOURS, CellTicks, chunk_figures, lanes_of, runs_of
 from s2a_bench.plugins.chunks.chunks.view.tables import (
     Row,
     chunk_csv,
@@ -18,10 +19,13 @@ from s2a_bench.plugins.chunks.chunks.view.tables import (
     rows_of,
     sources_of,
 )
+from s2a_bench.writers.lanes import Lane, LaneBar, LanePanel, Lanes
 from s2a_bench.writers.tables import number
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
+
+BARS: Final = "Bars are actions, a colour a chunk; dashed boxes are stalls. Time counts from the first request."
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
@@ -71,3 +75,42 @@ def _loop(rows: list[Row]) -> Iterator[str]:
     if unchecked := dict.fromkeys(row["mode"] for row in rows if row["agreement"] is None):
         yield f"not checked, as arrays do not cover its arrivals: {', '.join(unchecked)}"
     yield f"p99 of the jitter at most {number(max(row['jitter_s_p99'] for row in rows) * 1e3)} ms"
+
+
+def page_lanes(cells: Sequence[CellTicks]) -> Lanes:
+    """Return a panel a source of latencies, a lane a mode, in seconds from the first request."""
+    panels = []
+    for source in dict.fromkeys(cell.source for cell in cells):
+        group = [cell for cell in cells if cell.source == source]
+        end_s = max(len(cell.ticks) * cell.period_s for cell in group)
+        panels.append(LanePanel(f"Latency {source}", end_s, [_lane(cell) for cell in group]))
+    return Lanes(panels, BARS)
+
+
+def _lane(cell: CellTicks) -> Lane:
+    bars = tuple(_bars(cell))
+    stalled = int(cell.ticks["stalled"].sum())
+    begin = next((bar.start_s for bar in bars), 0.0)
+    summary = f"{stalled} of the first {len(cell.ticks)} ticks stall" if stalled else "no stall"
+    return Lane(cell.title, COLOURS[0], bars, begin, summary)
+
+
+def _bars(cell: CellTicks) -> Iterator[LaneBar]:
+    """Yield a bar for every stretch of actions of one chunk, and for every stall."""
+    chunk = cell.ticks["chunk"].fillna(-1).to_numpy(dtype="int64")
+    index = cell.ticks["index"].fillna(-1).to_numpy(dtype="int64")
+    age = cell.ticks["age_ticks"].fillna(-1).to_numpy(dtype="int64")
+    stalled = cell.ticks["stalled"].to_numpy(dtype="bool")
+    unused = dict(zip(cell.requests["request"], cell.requests["thrown_away"], strict=True))
+    for first, last in runs_of(np.where(stalled, -2, chunk)):
+        span = f"ticks {first} to {last - 1}"
+        start_s, width_s = first * cell.period_s, (last - first) * cell.period_s
+        if stalled[first]:
+            yield LaneBar("stall", start_s, width_s, f"{cell.title}: stall of {last - first} ticks, {span}")
+        elif chunk[first] >= 0:
+            text = (
+                f"{cell.title}: chunk {chunk[first]}, actions {index[first]} to {index[last - 1]}, {span}, "
+                f"observation {age[first]} to {age[last - 1]} ticks old"
+            )
+            away = f", {unused[chunk[first]]} actions thrown away" if unused.get(chunk[first]) else ""
+            yield LaneBar("skill", start_s, width_s, text + away, COLOURS[chunk[first] % len(COLOURS)])
