@@ -33,7 +33,7 @@ def test_rooms_are_folders_and_each_transport_experiment_and_report_is_one() -> 
         "s2a_bench/ros/dds.py": "ros",
         "s2a_bench/machine/doctor/gpu.py": "machine",
         "s2a_bench/transport/serving.py": "transport",
-        "s2a_bench/transport/http/dialects/tgi.py": "transport/http",
+        "s2a_bench/transport/http/dialects/ollama.py": "transport/http",
         "s2a_bench/experiments/ccrb/view/tables.py": "experiments/ccrb",
         "s2a_bench/plugins/carla/world.py": "plugins/carla",
         "tools/size.py": "tools",
