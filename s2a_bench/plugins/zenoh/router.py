@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import re
 import socket
 from contextlib import closing
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.extras import how_to_install
+from s2a_bench.transport.listening import is_loopback
 
 if TYPE_CHECKING:
     from s2a_bench.machine.doctor import Finding, Machine
@@ -46,10 +46,7 @@ def listens(endpoint: str) -> bool:
 def may_host(endpoint: str) -> bool:
     """Return whether a server of ours may be the router there without authentication: on loopback only."""
     protocol, host, _ = endpoint_of(endpoint)
-    try:
-        return protocol == "tcp" and (host == "localhost" or ipaddress.ip_address(host).is_loopback)
-    except ValueError:
-        return False
+    return protocol == "tcp" and is_loopback(host)
 
 
 def to_host(endpoint: str) -> str:
