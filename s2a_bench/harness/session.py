@@ -31,8 +31,9 @@ from s2a_bench.facts import (
     PROMPT_N,
 )
 from s2a_bench.frames import open_source
+from s2a_bench.frames.convert import to_rgb
 from s2a_bench.harness.feed import Feed, RequestFeed, StreamedFrame, StreamFeed
-from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint, together
+from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, together
 from s2a_bench.harness.plan import RequestPlan
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.inference import swing
@@ -258,12 +259,12 @@ class Session:
             index, captured_ns, picture = streamed.index, streamed.captured_ns, streamed.index
         elif frames:
             index, captured_ns = frames[0].index, frames[0].stamp_ns
-            picture = together(fingerprint(frame) for frame in frames)
+            picture = together(fingerprint(frame.data) for frame in frames)
         else:
             index, captured_ns, picture = -1, -1, place.block
         if isinstance(self.feed, StreamFeed) and streamed is None:
             error = error or "RequestFailed: the server knew no frame of this camera"
-        rgb_source = together(rgb_fingerprint(frame) for frame in frames) if frames else None
+        rgb_source = together(fingerprint(to_rgb(frame)) for frame in frames) if frames else None
         rgb_engine = _whole(facts.pop(RGB_ENGINE, None))
         error = error or self._doubt(trace, rgb_source, rgb_engine)
         started_ns = inference_start_ns(trace)
