@@ -5,14 +5,12 @@ from __future__ import annotations
 import re
 import socket
 from contextlib import closing
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.extras import how_to_install
+from s2a_bench.machine.doctor import Finding, Machine
 from s2a_bench.transport.listening import is_loopback
-
-if TYPE_CHECKING:
-    from s2a_bench.machine.doctor import Finding, Machine
 
 ROUTER: Final = "tcp/127.0.0.1:7447"
 """Where rmw_zenoh's nodes look for their router."""
@@ -64,8 +62,6 @@ def free_endpoint() -> str:
 
 def check(machine: Machine) -> Finding:
     """Return whether Zenoh can be spoken, and whether a router listens where rmw_zenoh's nodes look for one."""
-    from s2a_bench.machine.doctor import Finding
-
     if not machine.finds("zenoh"):
         return Finding("zenoh", "state", "not installed", how_to_install("zenoh"))
     port = f":{endpoint_of(ROUTER)[2]:04X}"
