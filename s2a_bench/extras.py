@@ -34,6 +34,10 @@ def purposes() -> dict[str, str]:
     return {**_CORE, **dict(_OFFERED.loaded())}
 
 
+def _purpose(extra: str) -> str:
+    return purposes().get(extra, extra)  # a package need not have said what its extra is for
+
+
 def installed(module: str) -> bool:
     """Whether a top-level module could be imported, without importing it."""
     return sys.modules[module] is not None if module in sys.modules else find_spec(module) is not None
@@ -45,7 +49,7 @@ def need(extra: str, *modules: str) -> None:
         if (noted := _NOTED.get()) is not None:
             noted[extra] = None
             return
-        raise MissingExtra(f"{purposes()[extra]}: the package {missing[0]} is not installed; {how_to_install(extra)}")
+        raise MissingExtra(f"{_purpose(extra)}: the package {missing[0]} is not installed; {how_to_install(extra)}")
 
 
 @contextmanager
@@ -65,7 +69,7 @@ def require(module: str, extra: str) -> Any:
     try:
         return import_module(module)
     except (ImportError, OSError, RuntimeError) as error:
-        raise MissingExtra(f"{purposes()[extra]}: {module} does not load ({error}); {how_to_install(extra)}") from error
+        raise MissingExtra(f"{_purpose(extra)}: {module} does not load ({error}); {how_to_install(extra)}") from error
 
 
 def how_to_install(*extras: str) -> str:

@@ -14,12 +14,13 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Generic, TypeVar
+from typing import Final, Generic, TypeVar
 
 from s2a_bench.errors import UsageError
 from s2a_bench.text import none_of
 
 T = TypeVar("T")
+OURS: Final = "s2a_bench."
 
 
 class Registry(Mapping[str, T], Generic[T]):
@@ -33,8 +34,12 @@ class Registry(Mapping[str, T], Generic[T]):
 
     @cached_property
     def _offered(self) -> dict[str, EntryPoint]:
-        """Return the entry points of installed packages, except those with a built-in's name."""
-        found = {point.name: point for point in entry_points(group=self.group)}
+        """Return the entry points of installed packages, except those with a built-in's name.
+
+        Of two with one name it is that of s2a-bench, else the first by module, wherever they are installed.
+        """
+        points = sorted(entry_points(group=self.group), key=lambda each: (not each.value.startswith(OURS), each.value))
+        found = {point.name: point for point in reversed(points)}
         return {name: point for name, point in sorted(found.items()) if name not in self._builtins}
 
     def __getitem__(self, name: str) -> T:
@@ -79,14 +84,17 @@ class Registry(Mapping[str, T], Generic[T]):
 
 
 def missing_entry_points(checkout: Path = Path(__file__).parent.parent) -> list[str]:
-    """Return the plug-ins of a checkout that its installed metadata does not name, as it is older; [] elsewhere."""
+    """Return the plug-ins of a checkout that its installed metadata lacks or has elsewhere, as it is older; else []."""
     if not (project := checkout / "pyproject.toml").is_file():
         return []
     tomllib = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
-    declared = tomllib.loads(project.read_text(encoding="utf-8"))["project"]["entry-points"]
+    about = tomllib.loads(project.read_text(encoding="utf-8")).get("project", {})
+    declared = about["entry-points"] if about.get("name") == "s2a-bench" else {}  # or we lie in another's folder
     try:
-        installed = {(point.group, point.name) for point in distribution("s2a-bench").entry_points}
+        installed = {(point.group, point.name, point.value) for point in distribution("s2a-bench").entry_points}
     except PackageNotFoundError:
         installed = set()
-    missing = (name for group, points in declared.items() for name in points if (group, name) not in installed)
+    missing = (
+        name for group, points in declared.items() for name, at in points.items() if (group, name, at) not in installed
+    )
     return [*dict.fromkeys(missing)]

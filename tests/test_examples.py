@@ -197,7 +197,6 @@ def serving(command: str, folder: Path) -> Iterator[None]:
         ["bash", "-c", f"exec {command}"], cwd=folder, env=environ(), stdout=subprocess.PIPE, text=True
     ) as server:
         try:
-            assert server.stdout is not None
             assert "serving" in server.stdout.readline()
             yield
         finally:

@@ -159,6 +159,8 @@ def test_a_library_that_does_not_load_is_one_line_with_its_reason(
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(MissingExtra, match=r"broken_library does not load \(libcuda.so.1: .*\[llama\]"):
         extras.require("broken_library", "llama")
+    with pytest.raises(MissingExtra, match=r"^theirs: broken_library does not load"):  # a package's, which says no more
+        extras.require("broken_library", "theirs")
 
 
 def test_without_nvml_a_gpu_is_not_watched_and_the_reason_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:

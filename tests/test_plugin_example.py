@@ -351,6 +351,7 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
     kinds += ("surroundings", "commands", "references")
     (broken / "entry_points.txt").write_text(
         "".join(f"[s2a_bench.{kind}]\nbroken = s2a_broken:THING\n" for kind in kinds)
+        + "[s2a_bench.commands]\nlost = s2a_broken:THING\ndoctor = s2a_bench.transport.defaults:BESIDE\n"
     )
     environment = installed | {"PYTHONPATH": f"{broken.parent}{os.pathsep}{installed['PYTHONPATH']}"}
 
@@ -360,12 +361,12 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
             line, capture_output=True, text=True, check=False, env=environment, cwd=tmp_path, timeout=120
         )
 
-    assert run("--help").returncode == 0
+    assert "Check this machine" in run("--help").stdout  # the name of a command that there is counts for nothing
     assert run("boundary", "--points", "3").returncode == 0
     middleware = ("latency", "--transport", "ros?middleware=broken", *SMALL)
     transport = ("latency", "--transport", "broken", *SMALL)
     reference = ("latency", "--against", "broken", *SMALL)
-    for args in (("broken",), transport, middleware, reference, ("timeline", "--policy", "broken")):
+    for args in (("broken",), ("lost",), transport, middleware, reference, ("timeline", "--policy", "broken")):
         done = run(*args)
         assert done.returncode == 2
         assert "the package s2a-broken does not load: ModuleNotFoundError" in done.stderr

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from threading import Event
 
 from s2a_bench.clock import now_ns
@@ -14,3 +15,11 @@ def until(met: Callable[[], object], seconds: float = 20) -> None:
     while not met():
         assert now_ns() < deadline, "it did not come about"
         Event().wait(0.005)
+
+
+def ended(pid: int) -> bool:
+    """Return whether a process has ended, reaped or not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+    except OSError:
+        return True

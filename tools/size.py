@@ -19,8 +19,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 PRODUCT = "s2a_bench"
 BESIDE = ("studies", "tools", "benchmarks", "tests")
-BUDGETS = {"s2a_bench": 56_450, "core": 55_200}
-"""Lines: of the product, and of its core."""
+BUDGETS = {"s2a_bench": 56_450, "core": 42_800, "tests": 49_500}
+"""Lines: of the product, of its core, and of the tests."""
 NO_CODE = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
 
 
@@ -101,7 +101,7 @@ def table(found: dict[str, Size]) -> str:
 
 def excess(found: dict[str, Size]) -> list[str]:
     """Return a line for each budget that is exceeded."""
-    counted = sums({name: size for name, size in found.items() if name not in BESIDE})
+    counted = found | sums({name: size for name, size in found.items() if name not in BESIDE})
     over = {name: counted[name].lines - most for name, most in BUDGETS.items() if counted[name].lines > most}
     return [f"{name} has {lines} lines more than its budget of {BUDGETS[name]}" for name, lines in over.items()]
 

@@ -15,11 +15,15 @@ from pydantic import Field, ValidationInfo, field_validator
 from s2a_bench.boards.gaps import Gaps, from_table
 from s2a_bench.errors import UsageError
 from s2a_bench.provenance import Provenance
+from s2a_bench.registry import Registry
 from s2a_bench.text import none_of
 from s2a_bench.toml_file import Line, TomlTable, parse, read
 
 SHIPPED: Final = Path(__file__).parent.parent / "profiles"
 """A link to profiles/ at the top of the repository; files in an installed package."""
+
+OFFERED: Final[Registry[Path]] = Registry("sweeps", "sweep", {})
+"""Folders of packages, laid out as profiles/: boards, and sweeps in a folder of that name."""
 
 FACTS: Final = ("board", "model", "capture", "fit", "environment", "source")
 """Tables for people and for `profile match`; their content is free."""
@@ -167,9 +171,14 @@ def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
     return {key: _without_none(value) if isinstance(value, Mapping) else value for key, value in given.items()}
 
 
+def shipped() -> list[Path]:
+    """Return the folders of the package and its plug-ins."""
+    return [SHIPPED, *(folder for _, folder in OFFERED.loaded())]
+
+
 def search_path() -> list[Path]:
     config = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-    return [Path("profiles"), config / "s2a-bench" / "profiles", SHIPPED]
+    return [Path("profiles"), config / "s2a-bench" / "profiles", *shipped()]
 
 
 def profile_files() -> dict[str, Path]:

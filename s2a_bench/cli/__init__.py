@@ -35,10 +35,12 @@ COMMANDS: Final[Registry[tuple[str, str]]] = Registry("commands", "command", {})
 
 
 class TopCommands(Commands):
-    """All commands: those listed below, those of other packages, and the experiments."""
+    """All commands: those listed below, the experiments, and those of other packages with a name of their own."""
 
     experiments = EXPERIMENTS
     lazy: ClassVar[Mapping[str, tuple[str, str]]] = {
+        name: offered for name, offered in COMMANDS.loaded() if name not in EXPERIMENTS
+    } | {
         name: (f"s2a_bench.cli.{where}", about)
         for name, where, about in (
             (
@@ -61,7 +63,13 @@ class TopCommands(Commands):
             ),
             ("sweep", "sweep:sweep", "Run a command for every cell of a grid; an interrupted sweep can be resumed."),
         )
-    } | dict(COMMANDS.loaded())
+    }
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Find a command; raises UsageError for that of a package that does not load."""
+        if args[0] in COMMANDS and args[0] not in self.list_commands(ctx):
+            _ = COMMANDS[args[0]]
+        return super().resolve_command(ctx, args)
 
 
 app = typer.Typer(

@@ -404,7 +404,7 @@ class ServedAction(Generic[Caller]):
             self._once.warning(
                 other,
                 "%s: a client on %s waits in vain, as its services have another form on the wire: start it with "
-                "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or serve in a sourced ROS 2 of its RMW (--middleware rclpy)",
+                "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or serve in a sourced ROS 2 of its RMW",
                 self._name,
                 other,
             )

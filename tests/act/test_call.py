@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import sys
-from threading import Event, current_thread, main_thread
 from types import ModuleType
 
 import numpy as np
 import pytest
 
 from s2a_bench.act import SkillKind, kind, open_robot
-from s2a_bench.act.call import CallableRobot, SkillMotion
-from s2a_bench.clock import now_ns
 from s2a_bench.errors import RobotError, UsageError
 from s2a_bench.plan import load_skills
 
@@ -67,24 +64,3 @@ def test_what_is_no_function_is_refused(arm: ModuleType, written: str, message: 
     with pytest.raises(UsageError) as again:
         kind(written, SkillKind).open_skills(load_skills("household"))
     assert str(again.value) == str(error.value)
-
-
-def test_the_function_gets_each_skill_on_a_thread_of_its_own(arm: ModuleType) -> None:
-    seen: list[tuple[str, bool]] = []
-    over = Event()
-
-    def act(motion: SkillMotion) -> None:
-        seen.append((str(motion.call), current_thread() is main_thread()))
-
-    arm.act = act  # type: ignore[attr-defined]
-    household = load_skills("household")
-    robot = kind("call?function=somebodys_arm:act", SkillKind).open_skills(household)
-    assert isinstance(robot, CallableRobot)
-    for call in household.calls[:2]:
-        over.clear()
-        running = robot.start(call, now_ns() + 10**9, lambda error: over.set() if not error else None)
-        assert over.wait(10)
-        assert running.ended()
-    assert seen == [(str(call), False) for call in household.calls[:2]]
-    robot.hold("coast")
-    robot.close()

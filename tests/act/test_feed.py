@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -36,15 +34,6 @@ def execute(chunks: list[str], n_skills: int, gap_s: float = 0.5, name: str = "n
     return record
 
 
-@given(cuts=st.lists(st.integers(0, len(PLAN)), max_size=12))
-def test_any_chunking_is_carried_out_alike(cuts: list[int]) -> None:
-    places = sorted({0, len(PLAN), *cuts})
-    chunks = [PLAN[start:end] for start, end in pairwise(places)]
-    record = execute(chunks, 3, gap_s=1e-6)
-    assert [str(skill.call) for skill in record.ran] == ["go_to(kitchen)", "pick(cup)", "place(cup, table)"]
-    assert record.outcome == "completed"
-
-
 def test_a_skill_arrives_with_the_token_that_completes_it() -> None:
     record = execute(["1. go_to(", "kitchen", ")\n2. pick(cup)\n", "3. place(cup, table)"], 3)
     assert [(at_ns - ns(0)) / 1e9 for at_ns, _ in record.arrivals] == [1.5, 1.5, 2.5]
@@ -56,13 +45,6 @@ def test_skills_before_a_malformed_line_are_begun_and_those_after_it_are_not() -
     assert record.outcome == "invalid-line"
     assert record.why == "line 2 (unknown-skill): 'fly' is none of the skills"
     assert [str(skill.call) for skill in record.skills] == ["go_to(kitchen)"]
-
-
-@given(text=st.text(max_size=60), n_skills=st.integers(1, 4))
-def test_prose_moves_nothing(text: str, n_skills: int) -> None:
-    record = execute(list("~" + text), n_skills)
-    assert record.outcome in {"invalid-line", "short"}
-    assert record.skills == []
 
 
 @given(length=st.integers(0, len(PLAN)), name=st.sampled_from(["naive", "wait-then-act", "stream-to-act"]))

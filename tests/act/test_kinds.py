@@ -45,15 +45,6 @@ def test_one_that_cannot_is_refused_with_those_that_can(written: str, able: Any,
     assert str(error.value) == message
 
 
-def test_only_the_one_that_moves_nothing_may_be_had_several_times() -> None:
-    skilled = [made_by for _, made_by in ROBOTS.loaded() if issubclass(made_by, SkillKind)]
-    assert [made_by.several for made_by in skilled] == [True, False, False]
-
-
-def test_only_the_one_that_runs_code_of_its_users_is_a_risk() -> None:
-    assert {name: made_by.risk for name, made_by in ROBOTS.loaded() if made_by.risk} == {"call": "program"}
-
-
 def test_one_of_another_package_is_found_by_its_name(offer: ModuleType) -> None:
     @dataclass(frozen=True)
     class Arm(SkillKind, ActionKind):

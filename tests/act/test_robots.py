@@ -123,23 +123,6 @@ class TestFunctions:
         assert motion.wait()
         assert motion.remaining_s == 0
 
-    def test_waiting_for_longer_than_the_end_ends_with_it(self) -> None:
-        end_ns = now_ns() + 20 * NS
-        assert SkillMotion(CUP, end_ns).wait(3600)
-        assert now_ns() >= end_ns
-
-    def test_what_remains_is_in_seconds_and_never_less_than_none(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        motion = SkillMotion(CUP, 3_500_000_000)
-        monkeypatch.setattr("s2a_bench.act.call.now_ns", lambda: 1_000_000_000)
-        assert motion.remaining_s == 2.5
-        motion.retime(999_999_999)
-        assert motion.remaining_s == 0
-
-    def test_waiting_a_while_does_not_wait_for_the_end(self) -> None:
-        motion = SkillMotion(CUP, now_ns() + 3600 * 10**9)
-        assert motion.wait(0.001)
-        assert not motion.aborted
-
     def test_a_skill_without_a_function_is_refused(self) -> None:
         actions: dict[str, SkillFunction] = {"go_to": lambda _: None, "pick": lambda _: None}
         with pytest.raises(UsageError, match="`robot`: no function for the skills open, close, place of 'household'"):
@@ -289,7 +272,7 @@ class TestRosActions:
         def interrupted(*_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr("s2a_bench.ros.open_middleware", lambda *_, **__: middleware)
+        monkeypatch.setattr("s2a_bench.ros.join.open_middleware", lambda *_, **__: middleware)
         monkeypatch.setattr(ros, "RosSkills", interrupted)
         with pytest.raises(KeyboardInterrupt):
             kind("ros", SkillKind).open_skills(QUICK)
@@ -311,11 +294,3 @@ class TestRosActions:
         name = parameter.partition("=")[0]
         with pytest.raises(UsageError, match=f"^`robot`: ros: {name} is about actions, not skills$"):
             kind(f"ros?{parameter}", SkillKind).open_skills(QUICK)
-
-    def test_a_robot_that_is_not_there_is_missed(self, dds_domain: int, stack: ExitStack) -> None:
-        middleware = open_middleware("cyclonedds", domain_id=dds_domain)
-        stack.callback(middleware.close)
-        with pytest.raises(
-            TransportError, match=r"`robot`: ros: no server of the action /nowhere/execute_skill .* in 0\.2 s"
-        ):
-            RosSkills(middleware, "/nowhere", 0.2)

@@ -14,12 +14,6 @@ def test_a_server_of_20_ms_carries_16_robots_that_ask_every_16_ticks_of_20_ms() 
     assert capacity_coverage.predicted("constant", 0) == (16, 16, 16)
 
 
-def test_a_search_is_wrong_if_it_decides_against_the_truth() -> None:
-    shares = {robots: float(robots > 16) for robots in range(1, 18)}
-    assert not capacity_coverage.wrong("constant", shares, 0)
-    assert capacity_coverage.wrong("constant", shares | {16: 0.02}, 0)
-
-
 def test_every_setting_is_printed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.argv", ["capacity_coverage", "--trials", "2", "--searches", "1", "--sets", "1"])
     monkeypatch.setattr(capacity_coverage, "LONG_S", 10)

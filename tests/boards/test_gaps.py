@@ -77,12 +77,6 @@ def test_a_family_survives_the_way_through_a_table(gaps: Gaps) -> None:
     assert from_table(to_table(gaps), gaps.mean_s) == gaps
 
 
-@pytest.mark.parametrize("gaps", EXAMPLES, ids=lambda gaps: type(gaps).__name__)
-def test_the_same_seed_gives_the_same_gaps(gaps: Gaps) -> None:
-    np.testing.assert_array_equal(gaps.sample(rng(5), 9, 7), gaps.sample(rng(5), 9, 7))
-    assert gaps.sample(rng(5), 0, 7).shape == (0, 7)
-
-
 def test_lognormal_gaps_have_their_coefficient_of_variation() -> None:
     drawn = Lognormal(0.3, 0.5).sample(rng(), 100, 5000)
     assert drawn.std() / drawn.mean() == pytest.approx(0.5, rel=0.02)
@@ -145,18 +139,13 @@ def test_a_recording_in_order_is_exactly_what_was_recorded(trace: list[float], t
         ({"family": "normal"}, "family: 'normal' is none of"),
         ({"family": "lognormal"}, "cv: is missing"),
         ({"family": "lognormal", "cv": 0.2, "sd": 1}, "sd: lognormal gaps have no such key; they have cv"),
-        ({"family": "lognormal", "cv": 0.2, "mean_s": 1}, "mean_s: lognormal gaps have no such key"),
         ({"family": "constant", "cv": 0}, "cv: constant gaps have no such key; they have none"),
         ({"family": "lognormal", "cv": "0.2"}, "cv: '0.2' should be a number"),
         ({"family": "lognormal", "cv": True}, "cv: True should be a number"),
         ({"family": "lognormal", "cv": -0.1}, "cv: -0.1 should be greater than or equal to 0"),
-        ({"family": "lognormal", "cv": math.nan}, "cv: nan should be"),
         ({"family": "lognormal", "cv": math.inf}, "cv: inf should be"),
         ({"family": "bursty", "cv": 0, "burst_tokens": 2.5, "within": 0}, "burst_tokens: 2.5 should be a whole number"),
-        (
-            {"family": "bursty", "cv": 0, "burst_tokens": 0, "within": 0},
-            "burst_tokens: 0 should be greater than",
-        ),
+        ({"family": "bursty", "cv": 0, "burst_tokens": 0, "within": 0}, "burst_tokens: 0 should be greater"),
         ({"family": "bursty", "cv": 0, "burst_tokens": 2, "within": 2}, "within: 2 should be less than or equal to 1"),
         (
             {"family": "markov", "cv": 0, "pause_share": 0.5, "pause_ratio": 2, "pause_tokens": 1},
@@ -167,7 +156,6 @@ def test_a_recording_in_order_is_exactly_what_was_recorded(trace: list[float], t
         ({"family": "quantiles", "levels": [0, 0.5, 0.5, 1], "values": [1, 2, 3, 4]}, "levels: should increase"),
         ({"family": "quantiles", "levels": [0, 1], "values": [1]}, "values: 1 of them for 2 levels"),
         ({"family": "quantiles", "levels": [0, 1], "values": [2, 1]}, "values: should not decrease"),
-        ({"family": "quantiles", "levels": [0, 1], "values": [0, 0]}, "values: should be finite, none negative"),
         ({"family": "quantiles", "levels": [0, 1], "values": [-1, 1]}, "values: should be finite, none negative"),
         ({"family": "recorded", "trace": []}, "trace: should hold finite gaps"),
         ({"family": "recorded", "trace": [0.1, -0.1]}, "trace: should hold finite gaps"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import signal
 import subprocess
 import sys
@@ -10,16 +11,23 @@ from contextlib import nullcontext, redirect_stderr, redirect_stdout
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 import pytest
 
 from s2a_bench.cli import main
 from s2a_bench.machine import tuning
+from s2a_bench.store.run import StoredRun, read_run
+from tests.made_runs import SCHEMA
+
+
+def command(*arguments: str | Path) -> list[str]:
+    """Return the command line that starts s2a-bench in a process of its own."""
+    return [sys.executable, "-m", "s2a_bench", *map(str, arguments)]
 
 
 def program(*arguments: str | Path, code: int = 0, **settings: Any) -> subprocess.CompletedProcess[str]:
     """Run s2a-bench in a process of its own; ``settings`` are those of `subprocess.run`."""
-    command = [sys.executable, "-m", "s2a_bench", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300, **settings)
+    done = subprocess.run(command(*arguments), capture_output=True, text=True, check=False, timeout=300, **settings)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
     return done
@@ -44,3 +52,16 @@ def refused(*arguments: str | Path, code: int = 2) -> str:
     assert done.stdout == ""
     (line,) = (line for line in done.stderr.splitlines() if line.startswith("error: "))
     return line
+
+
+def only_run(output: Path) -> StoredRun:
+    """Return the run that a command left in an output folder of its own."""
+    (folder,) = output.iterdir()
+    return read_run(folder)
+
+
+def printed(done: subprocess.CompletedProcess[str], schema: Any = SCHEMA) -> Any:
+    """Return the JSON object that a command printed, which keeps its schema."""
+    whole = json.loads(done.stdout)
+    jsonschema.validate(whole, schema)
+    return whole

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import pytest
 import typer
@@ -55,21 +55,6 @@ class Both(Options):
     there: There = group(There, about="there: ")
 
 
-class Panelled(Options):
-    PANEL: ClassVar[str] = "Loop"
-
-    rate: float = option(1.0, "ticks a second", first=True)
-    kind: Literal["", "slow"] = option("", "how", panel="Way")
-    engine: Engine = group(Engine, first=("model",))
-
-
-class Derived(Panelled):
-    PANEL: ClassVar[str] = "More"
-
-    rate: float = option(2.0, "ticks a second")
-    many: int = option(1, "how many", first=True)
-
-
 def run(*arguments: str, options: type[Options] = Asked) -> Any:
     got: list[Options] = []
     app = typer.Typer()
@@ -78,10 +63,6 @@ def run(*arguments: str, options: type[Options] = Asked) -> Any:
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return got[0]
-
-
-def test_what_is_not_given_keeps_its_default() -> None:
-    assert run() == Asked()
 
 
 def test_flags_reach_their_fields_and_groups() -> None:
@@ -97,12 +78,6 @@ def test_an_argument_is_given_by_its_place() -> None:
         run("GO", options=Named)
     with pytest.raises(UsageError, match=r"^`name` is needed$"):
         Named()
-
-
-def test_a_size_is_width_and_height() -> None:
-    assert run("go", "--size", "64x48", options=Named).size == (64, 48)
-    with pytest.raises(UsageError, match=r"^--size: 'big' should look like 640x480$"):
-        run("go", "--size", "big", options=Named)
 
 
 def test_of_a_group_only_some_fields_may_be_flags() -> None:
@@ -123,17 +98,6 @@ def test_groups_beside_each_other_share_a_flag() -> None:
     assert about == {
         "port": "here, there: port of the server [default: here 0, there 8]",
         "own": "here: what nobody else has",
-    }
-
-
-def test_headings_and_what_comes_first_are_declared_with_the_option_or_its_class() -> None:
-    found = {flag.name: (flag.panel, flag.first) for flag in flags_of(Derived)}
-    assert found == {
-        "rate": ("Loop", True),
-        "kind": ("Way", False),
-        "threads": ("", False),
-        "model": ("", True),
-        "many": ("More", True),
     }
 
 

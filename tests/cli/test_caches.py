@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
-from statistics import median
 from threading import Event
 from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 
 from s2a_bench.testing.transport import RecordingHandler
@@ -23,7 +17,6 @@ from tests.cli.program import program
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, answering
 
-ROOT = Path(__file__).parent.parent.parent
 SMALL = ["--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3", "--data-only", "--json"]
 ENCODER_S = 0.1
 """What the server below needs for a picture that it has not seen."""
@@ -82,32 +75,11 @@ def codes(result: dict[str, Any]) -> set[str]:
     return {warning["code"] for warning in result["warnings"]}
 
 
-def typical(result: dict[str, Any]) -> float:
-    return float(median(cell["e2e_ms"]["median"] for cell in result["cells"]))
-
-
-@pytest.fixture(params=["synthetic", "images", "video"])
-def source(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """Sources that start over, one of them a single picture."""
-    picture = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
-    if request.param == "images":
-        (tmp_path / "pictures").mkdir()
-        cv2.imwrite(str(tmp_path / "pictures" / "only.png"), picture)
-        return f"images:{tmp_path / 'pictures'}"
-    if request.param == "video":
-        path = tmp_path / "v.avi"
-        writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10, (64, 48))
-        writer.write(picture)
-        writer.release()
-        return f"video:{path}"
-    return "synthetic"
-
-
 @pytest.mark.slow
-def test_identical_runs_against_a_server_that_keeps_pictures_never_hit(source: str, tmp_path: Path) -> None:
+def test_identical_runs_against_a_server_that_keeps_pictures_never_hit(tmp_path: Path) -> None:
     server = Caching()
     with caching(server) as url:
-        results = [run(url, "--source", source, output=tmp_path / "results") for _ in range(2)]
+        results = [run(url, output=tmp_path) for _ in range(2)]
     assert server.hits == 0
     assert len(server.seen) == 2 * 2 * 5  # runs, variants, samples with warm-ups
     for result in results:
@@ -128,38 +100,3 @@ def test_the_nonce_of_a_run_repeats_its_pictures_and_the_guard_sees_the_hits(tmp
         w["message"] for w in again["warnings"] if w["code"] == "server-cache"
     )
     assert json.loads((Path(again["run"]) / "manifest.json").read_text())["seeds"] == manifest["seeds"]
-
-
-def test_a_server_that_is_not_ours_is_asked_for_its_first_model_and_nothing_of_ours_is_spoken_of(
-    tmp_path: Path,
-) -> None:
-    with caching(Caching()) as url:
-        result = run(url, "--transport", "http/as-deployed", output=tmp_path)
-    options = json.loads((Path(result["run"]) / "manifest.json").read_text())["asked"]["http/as-deployed"]
-    assert options["model"] == "first"
-    assert not [word for word in ("dummy", "starting", "model's headers") if word in result["stderr"]]
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(find_spec("xllamacpp") is None, reason="xllamacpp, llama.cpp's server as a wheel, is not installed")
-def test_identical_runs_against_one_llama_server_never_hit(tmp_path: Path) -> None:
-    from s2a_bench.inference import EngineConfig
-    from s2a_bench.inference.models import resolve
-
-    program = [sys.executable, "-m", "tests.servers.wheel", *map(str, resolve(EngineConfig()))]
-    with subprocess.Popen(
-        program, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as server:
-        try:
-            assert server.stdout is not None
-            url = server.stdout.readline().strip()
-            arguments = ["--transport", "http/as-deployed", "--size", "320x240", "--extra-body", '{"ignore_eos": true}']
-            first, second = (run(url, *arguments, output=tmp_path) for _ in range(2))
-            hit = run(url, *arguments, "--dialect", "openai", "--nonce", "n", output=tmp_path)
-            hit = run(url, *arguments, "--dialect", "openai", "--nonce", "n", output=tmp_path)
-        finally:
-            server.kill()
-    for result in (first, second):
-        assert not {"prompt-cache", "server-cache"} & codes(result)
-        assert typical(result) > typical(hit)  # some twenty times, on a machine that does nothing else
-    assert {"prompt-cache", "server-cache"} <= codes(hit)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import jsonschema
 import pytest
 
-from tests.cli.program import called, program, refused
+from tests.cli.program import called, printed, refused
 
 ROOT = Path(__file__).parent.parent.parent
 SCHEMA = json.loads((ROOT / "docs/schema/s2a-bench-compare-1.json").read_text())
@@ -26,26 +24,18 @@ def run(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess[st
 
 
 @pytest.fixture(scope="module")
-def timelines(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """Return run folders of timelines: computed ones, and drawn ones of two seeds."""
-    folders = {}
-    for name, flags in {
-        "even": ["--profile", "jetson-agx-orin"],
-        "drawn": ["--profile", "jetson-agx-orin", "--jitter", "lognormal:cv=0.3", "--plans", "60", "--seed", "1"],
-        "drawn-too": ["--profile", "jetson-agx-orin", "--jitter", "lognormal:cv=0.3", "--plans", "60", "--seed", "2"],
-    }.items():
-        root = tmp_path_factory.mktemp(name)
-        called("timeline", "--tokens-per-skill", "6", "--output", root, *flags)
-        folders[name] = str(next(root.iterdir()))
-    return folders
+def timelines(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return a run folder of computed timelines."""
+    root = tmp_path_factory.mktemp("even")
+    called("timeline", "--tokens-per-skill", "6", "--output", root, "--profile", "jetson-agx-orin")
+    return str(next(root.iterdir()))
 
 
 def test_a_run_against_itself_has_no_change_and_says_what_cannot_be_known() -> None:
     done = run(
         ECHO, ECHO, "--json", "--fail-if", "e2e.median>5%", "--fail-if", "e2e.median>60%", "--one-launch", code=4
     )
-    whole = json.loads(done.stdout)
-    jsonschema.validate(whole, SCHEMA)
+    whole = printed(done, SCHEMA)
     assert {one["change"]["value"] for one in whole["comparisons"]} == {0.0}
     assert {one["verdict"] for one in whole["comparisons"]} <= {"same", "unclear"}
     assert {one["outcome"] for one in whole["gates"] if one["gate"] == "e2e.median>60%"} == {"passed"}
@@ -69,54 +59,15 @@ def test_a_gate_that_trips_is_exit_code_three_and_files_are_written_all_the_same
     jsonschema.validate(json.loads((out / "compare.json").read_text()), SCHEMA)
 
 
-def test_a_gate_that_cannot_be_judged_is_an_error_unless_it_is_strict() -> None:
-    gate = "--fail-if", "loopback:e2e.p99>5%"
-    done = run(ECHO, ECHO, *gate, "--one-launch", code=4)
-    assert "undecided in loopback: 0.0 %; too few values for a test: measure more" in done.stderr
-    run(ECHO, ECHO, *gate, "--strict")
-
-
-def test_a_gate_on_one_launch_a_side_is_undecided_and_names_the_way_out() -> None:
-    done = run(ECHO, RAW, "--unlike", "--fail-if", "http/as-*:e2e.median>5%", "--json", code=4)
-    in_turn = "measure A and B in turn, a launch each, three times or more, and name the folders with commas"
-    way_out = f"1 of the 3 launches that a side needs: {in_turn}, or --one-launch"
-    (gate,) = json.loads(done.stdout)["gates"]
-    assert (gate["outcome"], gate["reason"]) == ("undecided", way_out)
-    assert "undecided in http/as-deployed: +126 % [" in done.stderr
-    assert f"; {way_out}\n" in done.stderr
-
-
-def test_computed_timelines_are_gated_without_launches(timelines: dict[str, str]) -> None:
-    run(timelines["even"], timelines["even"], "--fail-if", "start_s>0%")
-
-
-def test_computed_timelines_are_the_same_to_the_last_digit(timelines: dict[str, str], tmp_path: Path) -> None:
-    done = run(timelines["even"], timelines["even"], "--metric", "all", "--json", "--output", str(tmp_path))
-    whole = json.loads(done.stdout)
+def test_computed_timelines_are_the_same_to_the_last_digit_and_gated_without_launches(
+    timelines: str, tmp_path: Path
+) -> None:
+    gate = "--fail-if", "start_s>0%"
+    done = run(timelines, timelines, "--metric", "all", *gate, "--json", "--output", tmp_path)
     assert not list(tmp_path.glob("*.png"))  # nothing to draw
-    jsonschema.validate(whole, SCHEMA)
+    whole = printed(done, SCHEMA)
     assert {one["verdict"] for one in whole["comparisons"]} == {"same"}
     assert {one["p"] for one in whole["comparisons"]} == {1.0}
-
-
-def test_drawn_timelines_of_two_seeds_do_not_differ(timelines: dict[str, str]) -> None:
-    whole = json.loads(run(timelines["drawn"], timelines["drawn-too"], "--json").stdout)
-    jsonschema.validate(whole, SCHEMA)
-    assert not {"better", "worse"} & {one["verdict"] for one in whole["comparisons"]}
-    assert "one-launch" not in {one["code"] for one in whole["warnings"]}
-
-
-@pytest.mark.slow
-def test_throughput_is_compared_with_higher_as_better(tmp_path: Path) -> None:
-    replay = ("--engine", "replay", "--profile", "rtx-4080", "--transport", "in-process")
-    few = ("--requests", "6", "--warmup", "1", "--max-tokens", "8", "--sample-resources", "0")
-    program("throughput", *replay, *few, "--output", tmp_path)
-    folder = str(next(tmp_path.iterdir()))
-    whole: dict[str, Any] = json.loads(run(folder, folder, "--json").stdout)
-    jsonschema.validate(whole, SCHEMA)
-    better = {one["metric"]: one["better"] for one in whole["comparisons"]}
-    assert better["decode_tokens_per_s"] == "higher"
-    assert better["ttft_ms"] == better["itl"] == "lower"
 
 
 @pytest.mark.parametrize(
@@ -125,33 +76,18 @@ def test_throughput_is_compared_with_higher_as_better(tmp_path: Path) -> None:
         ([ECHO], 2, "Missing argument 'B'"),
         ([ECHO, "/no/such"], 1, "/no/such is no run folder"),
         ([ECHO, RAW], 1, "cells of one name differ: http/as-deployed payload: jpeg against raw"),
-        (
-            [ECHO, LLAMA],
-            1,
-            "the runs are unlike: model engine: echo against llama; provenance engine: echo against llama; ",
-        ),
+        ([ECHO, LLAMA], 1, "the runs are unlike: model engine: echo against llama; provenance engine: echo "),
         ([ECHO, ECHO, "--metric", "speed"], 2, "--metric: 'speed' is no metric of these latency runs; there are e2e"),
         ([ECHO, ECHO, "--fail-if", "e2e"], 2, "--fail-if: 'e2e' should look like e2e.median>5%"),
-        (
-            [ECHO, ECHO, "--fail-if", "zmq:e2e>5%"],
-            2,
-            "--fail-if: no cell with e2e is called 'zmq'; there are ros/topic, http/as-",
-        ),
+        ([ECHO, ECHO, "--fail-if", "zmq:e2e>5%"], 2, "no cell with e2e is called 'zmq'; there are ros/topic, http/as-"),
         ([ECHO, ECHO, "--strict"], 2, "--strict: there is no gate; add --fail-if"),
         ([ECHO, ECHO, "--one-launch"], 2, "--one-launch: there is no gate; add --fail-if"),
         ([ECHO, ECHO, "--min-effect", "-1"], 2, "--min-effect"),
         ([f"{ECHO},{ECHO}", ECHO], 2, "A: a folder is named twice"),
+        ([ECHO, " , "], 2, "B: name a run folder"),
         ([f"{ECHO},{RAW}", ECHO], 2, "name several launches on both sides, or one on each"),
         ([ECHO, ECHO, "--output", __file__], 1, f"--output {__file__}: "),
     ],
 )
 def test_wrong_use_is_one_line(arguments: list[str], code: int, message: str) -> None:
     assert message in refused("compare", *arguments, code=code)
-
-
-def test_an_interrupted_run_is_compared_and_told(tmp_path: Path) -> None:
-    folder = tmp_path / "killed"
-    shutil.copytree(ECHO, folder)
-    manifest = json.loads((folder / "manifest.json").read_text())
-    (folder / "manifest.json").write_text(json.dumps(manifest | {"state": "running"}))
-    assert f"note [state]: {folder} is running, not finished" in run(ECHO, str(folder)).stderr

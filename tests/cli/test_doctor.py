@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import jsonschema
@@ -13,30 +12,17 @@ import pytest
 from typer.testing import CliRunner
 
 from s2a_bench.cli import app
-from s2a_bench.cli.doctor import all_checks
 from s2a_bench.machine.doctor import Finding, Level
 from s2a_bench.machine.resources import RESOURCES
-from s2a_bench.store.run import StoredRun, read_run
-from tests.cli.program import program
+from tests.cli.program import only_run, program
+from tests.made_runs import SCHEMA
 
-ROOT = Path(__file__).parent.parent.parent
-SCHEMA = json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text())
 SMALL = ["--size", "64x48", "--requests", "4", "--warmup", "1", "--data-only"]
 ECHO = ["latency", "--engine", "echo", "--transport", "http,loopback", *SMALL]
 
 
 def s2a_bench(*arguments: str | Path, code: int = 0, **environ: str) -> subprocess.CompletedProcess[str]:
     return program(*arguments, code=code, env={**os.environ, **environ})
-
-
-@pytest.mark.slow
-def test_every_line_is_one_check_with_its_level() -> None:
-    *lines, counts = s2a_bench("doctor", ROS_DOMAIN_ID="7").stdout.splitlines()
-    seen = [line.split()[1] for line in lines]
-    assert seen == [code for code in all_checks() if code in seen]
-    assert {line.split()[0] for line in lines} <= {"state", "advice", "warning"}
-    assert sum(int(part.split()[0]) for part in counts.split(",")) == len(lines)
-    assert any("domain 7, loopback only" in line for line in lines)
 
 
 def test_json_is_one_object_that_the_schema_describes() -> None:
@@ -52,14 +38,6 @@ def test_json_is_one_object_that_the_schema_describes() -> None:
     }
 
 
-@pytest.mark.slow
-def test_an_error_is_exit_code_one_with_the_way_out() -> None:
-    done = s2a_bench("doctor", code=1, ROS_DOMAIN_ID="300")
-    (line,) = [line for line in done.stdout.splitlines() if line.startswith("error")]
-    assert "ROS_DOMAIN_ID: '300'" in line
-    assert "-> unset ROS_DOMAIN_ID" in line
-
-
 @pytest.mark.parametrize(
     ("level", "plain", "strict"), [("state", 0, 0), ("advice", 0, 0), ("warning", 0, 1), ("error", 1, 1)]
 )
@@ -72,15 +50,10 @@ def test_the_exit_code_is_the_severitys(level: Level, plain: int, strict: int, m
     assert f"{level:8}load  busy -> wait" in shown.splitlines()
 
 
-def run_folder(tmp_path: Path) -> StoredRun:
-    (folder,) = tmp_path.iterdir()
-    return read_run(folder)
-
-
 def test_a_run_samples_resources_and_says_what_that_cost(tmp_path: Path) -> None:
     done = s2a_bench(*ECHO, "--verbose", "--sample-resources", "50", "--output", str(tmp_path))
     assert "sampling takes" in done.stdout
-    run = run_folder(tmp_path)
+    run = only_run(tmp_path)
     resources = run.manifest["resources"]
     assert resources["hz"] == 50
     assert {"cpu", "memory"} <= resources["readers"].keys()
@@ -100,22 +73,7 @@ def test_a_run_samples_resources_and_says_what_that_cost(tmp_path: Path) -> None
 
 def test_sampling_can_be_left_out(tmp_path: Path) -> None:
     s2a_bench(*ECHO, "--sample-resources", "0", "--output", str(tmp_path))
-    run = run_folder(tmp_path)
+    run = only_run(tmp_path)
     assert run.manifest["resources"] == {}
     assert not list(run.path.glob("resources*"))
     assert not any("cpu" in facts for facts in run.samples["facts"])
-
-
-def test_without_cyclonedds_one_line_names_rclpy() -> None:
-    """As on aarch64, where it has no wheel."""
-    code = (
-        "import sys\nsys.modules['cyclonedds'] = None\nfrom s2a_bench.ros import open_middleware\n"
-        "from s2a_bench.errors import TransportError\n"
-        "try:\n    open_middleware('cyclonedds')\nexcept TransportError as error:\n    print(error)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    (line,) = done.stdout.splitlines()
-    assert line.startswith("middleware cyclonedds is not installed")
-    assert "rclpy" in line
-    assert "source /opt/ros/<distribution>/setup.bash" in line
-    assert "--transport" in line

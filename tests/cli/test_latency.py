@@ -4,37 +4,24 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
-import socket
 import subprocess
-import sys
 from collections import Counter
-from contextlib import ExitStack, closing
 from pathlib import Path
-from threading import Event, Thread
-from typing import Any
+from threading import Event
 
-import jsonschema
 import pytest
 
 from s2a_bench.clock import now_ns
-from s2a_bench.experiments.requests import cells_of
 from s2a_bench.harness.session import INTERRUPTED
-from s2a_bench.ros import QoS, open_middleware
-from s2a_bench.ros import messages as ros
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.trace import budget
-from s2a_bench.types import Frame
-from tests.cli.program import program, refused
+from tests.cli.program import command, printed, program
+from tests.cli.program import only_run as only
+from tests.waiting import ended, until
 
-ROOT = Path(__file__).parent.parent.parent
 DRAWN = ["--engine", "echo", "--quick", "--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3"]
 SMALL = [*DRAWN, "--data-only"]
-
-
-def command(*arguments: str, output: Path) -> list[str]:
-    return [sys.executable, "-m", "s2a_bench", "latency", *arguments, "--output", str(output)]
 
 
 def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
@@ -43,8 +30,7 @@ def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedPro
 
 def only_run(output: Path) -> StoredRun:
     """Return the run, all of whose facts are declared."""
-    (folder,) = output.iterdir()
-    kept = read_run(folder)
+    kept = only(output)
     assert {name for facts in kept.samples["facts"] for name in json.loads(facts)} <= kept.manifest["facts"].keys()
     return kept
 
@@ -77,32 +63,13 @@ def test_a_server_whose_latencies_are_known_answers_after_them_and_is_emulated_i
     assert (kept.samples["inference_ns"] >= 20_000_000).all()
     assert {json.loads(facts)["latency_drawn_ms"] for facts in kept.samples["facts"]} == {20}
     assert set(kept.samples["provenance"]) == {"echo/none/emulated"}
-    cells = json.loads(done.stdout)["cells"]
+    whole = printed(done)
+    compared = {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]}
+    assert {("http/binary", "ros/topic"), ("ros/topic", "loopback")} <= compared
+    cells = whole["cells"]
     assert {(cell["emulated"], cell["profile"]) for cell in cells} == {(True, "latencies 20 ms")}
     for path in (kept.path / "tables").glob("*.md"):
         assert "Echo engine, EMULATED: latencies 20 ms" in path.read_text(), path
-
-
-def test_blocks_hold_every_cell_once_in_changing_order(whole: tuple[StoredRun, str]) -> None:
-    samples = whole[0].samples
-    orders = []
-    for block, rows in samples.groupby("block"):
-        ordered = rows.sort_values("position")
-        assert list(ordered["position"]) == [0, 1, 2, 3, 4]
-        assert len(set(ordered["cell"])) == 5
-        assert set(ordered["warmup"]) == {block < 1}
-        orders.append(tuple(ordered["cell"]))
-    assert len(set(orders)) > 1
-    assert len(samples) == 9 * 5
-
-
-@pytest.mark.slow
-def test_the_same_seed_gives_the_same_order_and_frames(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        run(*SMALL, "--transport", "http", "--seed", "5", output=tmp_path / name)
-    first, second = only_run(tmp_path / "a").samples, only_run(tmp_path / "b").samples
-    assert list(first["cell"]) == list(second["cell"])
-    assert list(first["frame_index"]) == list(second["frame_index"])
 
 
 def test_every_sample_closes_its_budget(whole: tuple[StoredRun, str]) -> None:
@@ -120,18 +87,6 @@ def test_every_token_has_its_two_times(whole: tuple[StoredRun, str]) -> None:
 
 
 @pytest.mark.slow
-def test_json_is_the_only_thing_on_standard_output(tmp_path: Path) -> None:
-    done = run(*SMALL, "--transport", "http,ros,loopback", "--json", output=tmp_path)
-    whole: dict[str, Any] = json.loads(done.stdout)
-    jsonschema.validate(whole, json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text()))
-    assert whole["command"] == "latency"
-    assert [cell["n"] for cell in whole["cells"]] == [4] * 5
-    compared = {(ratio["of"], ratio["to"]) for ratio in whole["ratios"]}
-    assert ("http/as-deployed", "ros/topic") in compared
-    assert ("ros/topic", "loopback") in compared
-
-
-@pytest.mark.slow
 def test_stream_mode_knows_the_age_of_the_frame(tmp_path: Path) -> None:
     done = run(*SMALL, "--transport", "http,ros", "--mode", "stream", "--fps", "60", "--verbose", output=tmp_path)
     assert "Frame path" in done.stdout
@@ -140,30 +95,10 @@ def test_stream_mode_knows_the_age_of_the_frame(tmp_path: Path) -> None:
     assert (kept.samples["frame_age_ns"] > 0).all()
     used = kept.frames[(kept.frames["used_by"] != "") & (kept.frames["cell"] == "ros/topic")]
     assert len(used) == 5
-    assert (
-        used[["capture_ns", "convert_ns", "cdr_pack_ns", "network_ns", "cdr_parse_ns", "channel_swap_ns"]]
-        .notna()
-        .all()
-        .all()
-    )
+    stages = [f"{name}_ns" for name in ("capture", "convert", "cdr_pack", "network", "cdr_parse", "channel_swap")]
+    assert used[stages].notna().all(axis=None)
     ros = kept.samples[kept.samples["cell"] == "ros/topic"]
     assert ros["convert_ns"].isna().all()
-
-
-def test_other_payloads_have_their_stages(tmp_path: Path) -> None:
-    stages = {
-        "ros/topic?payload=yuyv": "yuv_decode",
-        "ros/topic?payload=jpeg": "image_decode",
-        "ros/topic?payload=jpeg-preencoded": "image_decode",
-        "http/as-deployed?payload=jpeg-preencoded": "base64_encode",
-    }
-    run(*SMALL, "--transport", ",".join(stages), output=tmp_path)
-    samples = only_run(tmp_path).samples
-    assert (samples["error"] == "").all()
-    for cell, stage in stages.items():
-        assert samples[samples["cell"] == cell][f"{stage}_ns"].notna().all()
-    http = samples[samples["pipeline"] == "http"]
-    assert http[["convert_ns", "image_encode_ns"]].isna().all().all()  # Base64 alone is left
 
 
 def test_one_run_compares_payloads_and_options_on_servers_of_their_own(tmp_path: Path) -> None:
@@ -210,7 +145,7 @@ def test_the_manifest_tells_the_machine(whole: tuple[StoredRun, str]) -> None:
 def start_long(output: Path, *arguments: str) -> tuple[subprocess.Popen[str], Path]:
     """Start a run that would take very long and wait until it has some samples."""
     process = subprocess.Popen(
-        command(*SMALL, "--requests", "1000000", *arguments, output=output),
+        command("latency", *SMALL, "--requests", "1000000", *arguments, "--output", output),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -274,10 +209,7 @@ def test_a_killed_harness_takes_its_servers_along_and_leaves_a_readable_run(tmp_
     process.kill()
     process.communicate(timeout=60)
     assert len(read_run(folder).samples) >= 29
-    deadline = now_ns() + 60_000_000_000
-    while any(Path(f"/proc/{pid}/cmdline").exists() for pid in servers):
-        assert now_ns() < deadline, "the servers outlived the harness"
-        Event().wait(0.02)
+    until(lambda: all(map(ended, servers)), 60)  # they do not outlive the harness
 
 
 @pytest.mark.slow
@@ -297,47 +229,6 @@ def test_a_run_beside_another_has_a_namespace_of_its_own_unless_it_is_told_that_
     last = output.strip().splitlines()[-1]
     assert last.startswith(f"error: another server answers under {taken} in DDS domain")
     assert "ROS_DOMAIN_ID or another --namespace" in last
-
-
-def test_a_port_in_use_is_one_clear_line(tmp_path: Path) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        output = run(*SMALL, "--transport", "http", "--port", str(port), output=tmp_path, code=1).stderr
-    assert f"error: --port: {port} is in use" in output
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        (["--source", "v4l2:/dev/video99"], 1, "/dev/video99"),
-        (["--source", "video:/no/such.mp4"], 1, "/no/such.mp4"),
-        (["--source", "images:/no/such"], 1, "/no/such"),
-        (["--url", "http://127.0.0.1:9", "--transport", "http"], 1, "nothing answers at http://127.0.0.1:9"),
-        (["--engine", "llama", "--model", "/no/such.gguf"], 1, "/no/such.gguf"),
-        (["--engine", "llama", "--llama-server", "/no/such"], 2, "--llama-server: /no/such is no program"),
-        (["--output", __file__], 1, f"--output {__file__}"),
-    ],
-)
-def test_what_is_missing_is_one_clear_line(tmp_path: Path, arguments: list[str], code: int, message: str) -> None:
-    assert message in refused("latency", *SMALL, "--output", tmp_path / "results", *arguments, code=code)
-    assert "--source" not in arguments or not (tmp_path / "results").exists()
-
-
-def test_a_video_is_a_source(tmp_path: Path) -> None:
-    import cv2
-    import numpy as np
-
-    path = tmp_path / "clip.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, (64, 48))
-    for shade in range(12):
-        writer.write(np.full((48, 64, 3), 20 * shade, np.uint8))
-    writer.release()
-    run(*SMALL, "--source", f"video:{path}", "--transport", "http,ros", output=tmp_path / "results")
-    kept = only_run(tmp_path / "results")
-    assert (kept.samples["error"] == "").all()
-    assert kept.samples["convert_ns"].isna().all()
 
 
 @pytest.mark.slow
@@ -363,58 +254,3 @@ def test_a_run_is_recorded_and_its_frames_are_a_source(tmp_path: Path, mode: str
     assert [token.text for token in tokens] == list(seen["text"])
     run(*SMALL, "--source", f"bag:{bag}", "--transport", "http", output=tmp_path / "again")
     assert (only_run(tmp_path / "again").samples["error"] == "").all()
-
-
-def test_a_ros_topic_is_a_source(tmp_path: Path, from_pypi: str, place: str, stack: ExitStack) -> None:
-    import numpy as np
-
-    node = stack.enter_context(closing(open_middleware(from_pypi, node_name="/camera", place=place, host=True)))
-    publisher = node.publisher("/camera/image_raw", ros.IMAGE, QoS(1, reliable=False))
-    picture = Frame(0, 0, 64, 48, "rgb8", np.full((48, 64, 3), 99, np.uint8))
-    packed = publisher.pack(ros.image_message(picture, 1, "camera"))
-    ended = Event()
-
-    def work() -> None:
-        while not ended.wait(0.01):
-            publisher.send(packed)
-
-    thread = Thread(target=work)
-    thread.start()
-    stack.callback(thread.join)
-    stack.callback(ended.set)
-    source = f"ros:/camera/image_raw?middleware={from_pypi}" + f"&router={place}" * bool(place)
-    run(*SMALL, "--source", source, "--transport", "http/binary,loopback", output=tmp_path / "results")
-    kept = only_run(tmp_path / "results")
-    assert (kept.samples["error"] == "").all()
-    assert kept.samples["rgb_source"].nunique() > 1
-    ended.set()
-    silent = run(*SMALL, "--source", source + "&wait_s=1", "--transport", "loopback", output=tmp_path / "none", code=1)
-    assert re.search(r"error: --source: ros:/camera/image_raw.*: no picture for 1 s of 1 publisher; ", silent.stderr)
-
-
-def test_a_single_picture_is_another_one_in_every_sample_and_the_same_in_every_cell(tmp_path: Path) -> None:
-    import cv2
-    import numpy as np
-
-    (tmp_path / "pictures").mkdir()
-    cv2.imwrite(str(tmp_path / "pictures" / "one.png"), np.zeros((48, 64, 3), np.uint8))
-    source = ["--source", f"images:{tmp_path / 'pictures'}"]
-    output = run(*SMALL, *source, "--transport", "http", output=tmp_path / "results").stderr
-    assert "duplicate-frames" not in output
-    (folder,) = (tmp_path / "results").iterdir()
-    samples = read_run(folder).samples
-    assert samples["rgb_source"].nunique() == samples["block"].nunique() > 1
-
-
-@pytest.mark.slow
-def test_a_real_model_answers_over_both_pipelines(tmp_path: Path) -> None:
-    grammar = tmp_path / "yes.gbnf"
-    grammar.write_text('root ::= "yes" | "no"\n')
-    few = ["--quick", "--requests", "2", "--warmup", "1", "--max-tokens", "5", "--threads", "1"]
-    run(*few, "--grammar", str(grammar), "--transport", "http/as-deployed,ros", output=tmp_path / "r")
-    kept = only_run(tmp_path / "r")
-    assert kept.manifest["model"]["dummy"] is True
-    answers = kept.tokens.groupby("request_id")["text"].apply("".join)
-    assert set(answers) <= {"yes", "no"}
-    assert len(answers) == 6
-    assert {cell.about["engine"] for cell in cells_of(kept)} == {"llama"}

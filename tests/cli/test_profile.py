@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
 from pathlib import Path
-from typing import Any
 
-import jsonschema
 import pytest
 
 from s2a_bench.boards.profile import read_profile, to_toml
-from s2a_bench.store.run import read_run
-from tests.cli.program import called, program, refused
+from tests.cli.program import called, printed, program, refused
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-profile-1.json").read_text())
 FAST = {
@@ -37,13 +33,6 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def json_of(done: subprocess.CompletedProcess[str]) -> Any:
-    """Read what --json printed, and hold it against its schema."""
-    whole = json.loads(done.stdout)
-    jsonschema.validate(whole, SCHEMA)
-    return whole
-
-
 def test_list_names_the_profiles_of_this_folder_and_those_that_ship() -> None:
     done = called("profile", "list")
     lines = {line.split()[0]: line for line in done.stdout.splitlines() if "assumed" in line or "measured" in line}
@@ -51,7 +40,7 @@ def test_list_names_the_profiles_of_this_folder_and_those_that_ship() -> None:
     assert "measured, dummy" in lines["fast"]
     assert "0.0105" in lines["fast"]  # .01 s and a gap of .5 ms
     assert "0.708 (assumed)" in lines["jetson-agx-orin"]
-    found = json_of(called("profile", "list", "--json"))
+    found = printed(called("profile", "list", "--json"), SCHEMA)
     assert found["command"] == "profile list"
     assert [profile["name"] for profile in found["profiles"]] == list(lines)
     assert [profile["dummy"] for profile in found["profiles"]] == [True, False, False, False]
@@ -71,7 +60,7 @@ def test_show_says_where_numbers_are_from() -> None:
     assert "RTX 4080, 34.2 tokens/s, first token after 0.0792 s (paper)" in text
     assert "assumed, not from paper data: prompt_s, prompt_cv, rate_cv, gaps" in text
     assert "  gpu: GeForce RTX 4080" in text
-    (shown,) = json_of(called("profile", "show", "profiles/fast.toml", "--json"))["profiles"]
+    (shown,) = printed(called("profile", "show", "profiles/fast.toml", "--json"), SCHEMA)["profiles"]
     assert (shown["tokens_per_s"], shown["gaps"]) == (2000, {"family": "lognormal", "cv": 0.1})
     assert shown["file"] == "profiles/fast.toml"
 
@@ -81,13 +70,13 @@ def test_capture_measures_this_machine_which_match_then_finds(home: Path) -> Non
     assert "no profile is of this board" in none.stdout
     flags = ["--threads", "1", "--requests", "5", "--warmup", "1", "--tokens", "12", "--size", "64x48"]
     done = program("profile", "capture", "here", *flags, "--title", "My board", "--json")
-    (made,) = json_of(done)["profiles"]
+    (made,) = printed(done, SCHEMA)["profiles"]
     assert made["file"] == "profiles/here.toml"
     assert (made["recorded"], made["dummy"], made["title"]) == (55, True, "My board")
     profile = read_profile(home / "profiles" / "here.toml")
     assert profile.facts["model"]["threads"] == 1
     assert len(profile.facts["model"]["model_sha256"]) == 64
-    found = json_of(called("profile", "match", "--json"))
+    found = printed(called("profile", "match", "--json"), SCHEMA)
     assert [profile["name"] for profile in found["profiles"]] == ["here"]
     assert found["profiles"][0]["differences"] == []
     error = refused("profile", "capture", "here", *flags)
@@ -98,24 +87,3 @@ def test_where_nothing_can_be_written_nothing_is_measured(home: Path) -> None:
     (home / "file").write_text("")
     error = refused("profile", "capture", "here", "--output", "file/profiles", code=1)
     assert error == "error: --output: cannot write file/profiles/here.toml: Not a directory"
-
-
-def test_a_replayed_run_is_labelled_emulated_wherever_it_shows(home: Path) -> None:
-    done = program(
-        *("latency", "--engine", "replay", "--profile", "fast", "--transport", "loopback", "--size", "64x48"),
-        *("--requests", "4", "--warmup", "1", "--max-tokens", "20", "--json"),
-    )
-    whole = json.loads(done.stdout)
-    (cell,) = whole["cells"]
-    assert (cell["engine"], cell["profile"], cell["emulated"]) == ("replay", "fast", True)
-    # a sleeping machine is late, never early; the profile draws 10 ms before the first token, and no less than 3
-    assert cell["groups_ms"]["inference"]["mean"] > 3
-    assert cell["itl_ms"]["n"] == 4 * 19
-    found = read_run(Path(home / whole["run"]))
-    assert found.manifest["model"]["emulated"] is True
-    assert set(found.samples["engine"]) == {"replay"}
-    note = "EMULATED: replayed profile fast (parametric gaps, recorded with dummy weights)"
-    tables = list((found.path / "tables").glob("*.md")) + list((found.path / "tables").glob("*.tex"))
-    assert tables
-    for table in tables:
-        assert note in table.read_text(), table

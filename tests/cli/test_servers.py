@@ -7,19 +7,17 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from threading import Event
 
 import pytest
 
-from s2a_bench.store.run import read_run
 from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.types import Token
-from tests.cli.program import program, refused
+from tests.cli.program import command, only_run, printed, program, refused
 from tests.servers.sockets import Received, head, serving
-from tests.servers.speakers import Cloud, LlamaServer, Ollama, answering
+from tests.servers.speakers import Cloud, Ollama, answering
 
 SMALL = ["--transport", "http", "--size", "64x48", "--requests", "2", "--warmup", "1", "--max-tokens", "3"]
 KEY = "sekret-0123456789"
@@ -41,7 +39,7 @@ def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path) -> None:
     with serving(keyed) as url:  # type: ignore[arg-type]
         done = run("--url", url, "--dialect", "ollama", "--api-key-env", "MY_KEY", "--json", output=tmp_path)
     assert set(keys) == {f"Bearer {KEY}"}
-    result = json.loads(done.stdout)
+    result = printed(done)
     assert [(cell["variant"], cell["n"], cell["errors"]) for cell in result["cells"]] == [
         ("as-deployed", 2, 0),
         ("best-effort", 2, 0),
@@ -58,35 +56,11 @@ def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path) -> None:
     assert KEY not in done.stdout + done.stderr
 
 
-def test_an_unknown_server_is_asked_what_it_is(tmp_path: Path) -> None:
-    chat = answering(LlamaServer(), RecordingHandler(["go"]))
-
-    def reply(received: Received) -> object:
-        if received.path == "/v1/models":
-            return [head(kind="application/json") + b'{"data":[{"id":"m","owned_by":"llamacpp"}]}']
-        return chat(received)
-
-    with serving(reply) as url:  # type: ignore[arg-type]
-        done = run("--url", url, "--transport", "http/as-deployed", "--json", output=tmp_path)
-    (cell,) = json.loads(done.stdout)["cells"]
-    assert {"ingest", "inference"} <= set(cell["stages_ms"])
-
-
 def test_a_run_that_is_refused_waits_as_asked_and_ends_with_the_reason(tmp_path: Path) -> None:
     reply = [head("429 Too Many Requests", "application/json", "Retry-After: 0.01"), Cloud().refusal(429, "slow down")]
     with serving(lambda _: reply) as url:
-        done = run(
-            "--url",
-            url,
-            "--dialect",
-            "openai",
-            "--transport",
-            "http/best-effort",
-            "--requests",
-            "9",
-            output=tmp_path,
-            code=1,
-        )
+        flags = ("--url", url, "--dialect", "openai", "--transport", "http/best-effort", "--requests", "9")
+        done = run(*flags, output=tmp_path, code=1)
     assert "waiting 0.01 s for the server of http/best-effort" in done.stderr
     last = done.stderr.strip().splitlines()[-2:]
     assert any("failed 5 times in a row" in line and "answered 429: slow down" in line for line in last)
@@ -108,40 +82,20 @@ def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: P
             over.wait(60)
         yield speaker.closing([Token(0, "go")])
 
-    command = [
-        sys.executable,
-        "-m",
-        "s2a_bench",
-        "latency",
-        *SMALL,
-        "--transport",
-        "http/as-deployed",
-        "--output",
-        str(tmp_path),
-    ]
+    flags = (*SMALL, "--transport", "http/as-deployed", "--output", tmp_path)
     with serving(reply) as url:
-        process = subprocess.Popen([*command, "--url", url], stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen(command("latency", *flags, "--url", url), stderr=subprocess.PIPE, text=True)
         assert under_way.wait(60)
         process.send_signal(signal.SIGINT)
         _, output = process.communicate(timeout=60)
         over.set()
     assert process.returncode == 130, output
-    (folder,) = tmp_path.iterdir()
-    run = read_run(folder)
+    run = only_run(tmp_path)
     assert run.manifest["state"] == "interrupted"
     *before, last = run.samples["error"]
     assert before == ["", ""]
     assert last.startswith("Interrupted: the run was ended during this request")
     assert "failed-samples" not in output
-
-
-def test_throughput_of_a_server_that_does_not_tell_says_only_that(tmp_path: Path) -> None:
-    reply = answering(Cloud(), RecordingHandler(["go", "_to", "x"]))
-    with serving(reply) as url:
-        done = program("throughput", *SMALL, "--url", url, "--output", tmp_path)
-    output = " ".join(done.stdout.split())
-    assert "http/as-deployed: the server does not report T_eval; decode stands in for N / T_eval." in output
-    assert "the engine's own figure" not in output
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import errno
 import os
 import resource
 import subprocess
-import sys
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -14,8 +13,7 @@ import pytest
 
 from s2a_bench import cli
 from s2a_bench.cli import shortage
-from s2a_bench.store.run import read_run
-from tests.cli.program import refused
+from tests.cli.program import command, only_run, refused
 
 LATENCY = ["latency", "--engine", "echo", "--transport", "http,loopback", "--size", "64x48", "--data-only"]
 
@@ -23,7 +21,7 @@ LATENCY = ["latency", "--engine", "echo", "--transport", "http,loopback", "--siz
 def run(kind: int, limit: int, output: Path, *more: str) -> list[str]:
     """Run latency below a limit; return its lines on stderr, the last of which is the error."""
     done = subprocess.run(
-        [sys.executable, "-m", "s2a_bench", *LATENCY, *more, "--output", str(output)],
+        command(*LATENCY, *more, "--output", output),
         capture_output=True,
         text=True,
         check=False,
@@ -53,8 +51,7 @@ def test_too_little_address_space_is_told_before_anything_begins(tmp_path: Path)
 def test_a_file_that_may_not_grow_ends_the_run_with_its_samples(tmp_path: Path) -> None:
     lines = run(resource.RLIMIT_FSIZE, 600_000, tmp_path, "--requests", "1000000")
     assert "csv: File too large; samples so far are kept" in lines[-1]
-    (folder,) = tmp_path.iterdir()
-    kept = read_run(folder)
+    kept = only_run(tmp_path)
     assert kept.manifest["state"] == "failed"
     assert "File too large" in kept.manifest["error"]
     assert len(kept.samples) > 100
@@ -83,8 +80,7 @@ def test_a_broken_pipe_is_quiet_only_where_the_reader_of_the_output_has_ended(mo
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "w") as unread:
-        command = [sys.executable, "-m", "s2a_bench", "profile", "list"]
-        done = subprocess.run(command, stdout=unread, stderr=subprocess.PIPE, text=True, check=False)
+        done = subprocess.run(command("profile", "list"), stdout=unread, stderr=subprocess.PIPE, text=True, check=False)
     assert (done.returncode, done.stderr) == (1, "")
 
     broken = Mock(info=cli.app.info, side_effect=BrokenPipeError(errno.EPIPE, "Broken pipe"))

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
-from typing import Any
 
-import jsonschema
 import pandas as pd
 import pytest
 
@@ -23,8 +19,8 @@ from s2a_bench.options import extra_of
 from s2a_bench.store.run import read_run
 from s2a_bench.store.sweep import Sweep, read_sweep
 from s2a_bench.transport import TRANSPORTS
-from tests.cli.program import called, program, refused
-from tests.experiments.test_timeline import recorded_run
+from tests.cli.program import called, printed, program, refused
+from tests.cli.program import command as command_line
 
 ROOT = Path(__file__).parent.parent.parent
 WAIT_S = 120
@@ -53,11 +49,6 @@ def sweep(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess[
     return program("sweep", *arguments, code=code)
 
 
-def schema() -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text())
-    return found
-
-
 @pytest.fixture
 def many(tmp_path: Path) -> Path:
     path = tmp_path / "many.toml"
@@ -82,7 +73,7 @@ def only(output: Path) -> Path:
 def begin(file: Path, output: Path, finished: int) -> tuple[subprocess.Popen[str], Path]:
     """Start a sweep and return when so many cells are finished."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "s2a_bench", "sweep", str(file), "--output", str(output), "--jobs", "2"],
+        command_line("sweep", file, "--output", output, "--jobs", "2"),
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
@@ -160,38 +151,6 @@ def test_ctrl_c_leaves_a_folder_that_goes_on(many: Path) -> None:
     assert found.manifest["state"] == "finished"
 
 
-def test_repeats_have_draws_of_their_own_and_policies_share_them(whole: Sweep) -> None:
-    found = numbers(whole)
-    orin = found[(found["board"] == "jetson-agx-orin") & (found["tokens_per_skill"] == 6)]
-    first = orin[orin["seed"] == 3].groupby("policy")["last_arrival_ns"].apply(list)
-    assert set(orin["seed"]) == {3, 4}
-    assert first["naive"] == first["stream-to-act"] == first["wait-then-act"]
-    assert first["naive"] != orin[orin["seed"] == 4].groupby("policy")["last_arrival_ns"].apply(list)["naive"]
-
-
-@pytest.mark.slow
-def test_a_failed_cell_keeps_its_error_and_is_retried_when_told(tmp_path: Path) -> None:
-    file, output = tmp_path / "f.toml", tmp_path / "results"
-    folder = recorded_run(tmp_path, 120, 12)
-    file.write_text(
-        f'command = "timeline"\n[settings]\nrate = 5\ntokens-per-skill = 3\ncalibrate = "{folder}"\n'
-        "[grid]\nn-skills = [4, 5]\n"  # no answer is as long as five skills
-    )
-    done = sweep(file, "--output", output, code=1)
-    assert "1 of 2 cells failed" in done.stderr
-    assert "Cells that failed" in done.stdout
-    folder = only(output)
-    (failed,) = read_sweep(folder).cells.query("state == 'failed'").to_dict("records")
-    assert failed["error"].startswith("--calibrate: 0 of 120 answers have the 15 tokens")
-    assert failed["folder"] == ""
-    sweep("--resume", folder, code=1)
-    assert len(read_sweep(folder).attempts) == 2
-    sweep("--resume", folder, "--retry-failed", code=1)
-    attempts = read_sweep(folder).attempts
-    assert list(attempts[attempts["state"] == "failed"]["attempt"]) == [1, 2]
-    assert len(attempts) == 3
-
-
 def test_a_measured_cell_runs_in_a_process_of_its_own_and_says_why_it_failed(tmp_path: Path) -> None:
     file = tmp_path / "m.toml"
     file.write_text(
@@ -199,8 +158,7 @@ def test_a_measured_cell_runs_in_a_process_of_its_own_and_says_why_it_failed(tmp
         '[grid]\nsource = ["synthetic", "video:/no/such/file.mp4"]\n'
     )
     done = sweep(file, "--output", tmp_path / "results", "--json", code=1)
-    found = json.loads(done.stdout)
-    jsonschema.validate(found, schema())
+    found = printed(done)
     good, bad = found["cells"]
     assert (good["state"], good["error"], good["virtual"]) == ("finished", None, False)
     assert len(read_run(Path(good["run"])).samples) == 3
@@ -208,23 +166,6 @@ def test_a_measured_cell_runs_in_a_process_of_its_own_and_says_why_it_failed(tmp
     assert bad["state"] == "failed"
     assert "/no/such/file.mp4" in bad["error"]
     assert found["state"] == "failed"
-
-
-def test_a_setting_that_makes_no_sense_is_told_before_anything_runs(tmp_path: Path) -> None:
-    file = tmp_path / "f.toml"
-    file.write_text('command = "timeline"\n[grid]\nplans = [1, 5]\n')
-    line = refused("sweep", file, "--output", tmp_path / "results")
-    assert "plans=5: --plans: without --jitter or --t-nom-cv all plans are the same" in line
-    assert not (tmp_path / "results").exists()
-
-
-def test_latencies_are_an_axis_as_numbers_and_as_families(tmp_path: Path) -> None:
-    file = tmp_path / "f.toml"
-    axis = 'latency = [20, "lognormal:mean_ms=20,cv=.5"]'
-    file.write_text(f'command = "latency"\n[settings]\nengine = "echo"\n[grid]\n{axis}\n')
-    lines = called("sweep", file, "--dry-run", "--output", tmp_path / "results").stdout.splitlines()
-    latencies = {line.partition("--latency=")[2].split()[0] for line in lines if "--latency" in line}
-    assert latencies == {"20", "lognormal:mean_ms=20,cv=.5"}
 
 
 def test_dry_run_prints_cells_and_leaves_nothing(many: Path) -> None:
@@ -235,27 +176,12 @@ def test_dry_run_prints_cells_and_leaves_nothing(many: Path) -> None:
     assert [line.split("-r")[1][0] for line in lines[:CELLS]] == ["1"] * (CELLS // 2) + ["2"] * (CELLS // 2)
     assert lines[-1] == f"{CELLS} of {CELLS} cells to run, {CELLS} virtual and 0 measured"
     assert not output.exists()
-    found = json.loads(called("sweep", many, "--dry-run", "--json", "--output", output).stdout)
-    jsonschema.validate(found, schema())
+    found = printed(called("sweep", many, "--dry-run", "--json", "--output", output))
     assert {cell["state"] for cell in found["cells"]} == {"planned"}
 
 
-def test_dry_run_of_a_killed_sweep_says_what_is_left(whole: Sweep) -> None:
-    done = called("sweep", "--resume", whole.path, "--dry-run")
-    assert f"0 of {CELLS} cells to run" in done.stdout
-
-
-@pytest.mark.slow
-def test_the_papers_sweep_is_36_timelines(tmp_path: Path) -> None:
-    found = json.loads(sweep("paper", "--json", "--output", tmp_path).stdout)
-    jsonschema.validate(found, schema())
-    assert len(found["cells"]) == 36
-    table = numbers(read_sweep(Path(found["run"])))
-    naive = table[
-        (table["policy"] == "naive") & (table["board"] == "jetson-agx-orin") & (table["tokens_per_skill"] == 6)
-    ]
-    assert list(naive["stalls"]) == [7]
-    assert list(naive["stall_ns"]) == [1_750_000_000]
+def test_the_papers_sweep_is_36_timelines() -> None:
+    assert called("sweep", "paper", "--dry-run").stdout.splitlines()[-1].startswith("36 of 36 cells to run, 36 virtual")
 
 
 @pytest.mark.parametrize(
@@ -264,8 +190,9 @@ def test_the_papers_sweep_is_36_timelines(tmp_path: Path) -> None:
         ('command = "fly"', "command: 'fly' is none of boundary, capacity, ccrb, chunks, latency"),
         (
             'command = "timeline"\n[settings]\npolicies = "naive"',
-            "'policies' is no flag of s2a-bench timeline; did you mean policy?",
+            "'policies' is no flag of s2a-bench timeline; did you",
         ),
+        ('command = "timeline"\n[grid]\nplans = [1, 5]', "plans=5: --plans: without --jitter or --t-nom-cv all plans"),
         ('command = "timeline"\n[settings]\nt-min = "soon"', "t-min=soon: Invalid value for '--t-min'"),
         ('command = "latency"\n[settings]\nboard = "orin"', "--board: "),
     ],
@@ -279,6 +206,7 @@ def test_a_wrong_file_is_one_line_and_leaves_no_folder(text: str, message: str, 
     assert not output.exists()
 
 
+REPLAY = 'engine = "replay"\nprofile = "rtx-4080"\npolicy = "naive"'
 AWAY = "--url sends requests off this machine"
 RISKY = [
     ("throughput", 'reference = "{file}"', "--reference runs a program"),
@@ -286,17 +214,9 @@ RISKY = [
     ("latency", 'transport = "http/llama-server?llama_server={file}"', "--llama-server runs a program"),
     ("latency", 'transport = "http/llama-server?llama-server={file}"', "--llama-server runs a program"),
     ("chunks", 'live = true\nengine = "echo"\nrobot = "call?function=os:abort"', "--robot runs a program"),
-    (
-        "timeline",
-        'live = true\nengine = "replay"\nprofile = "rtx-4080"\npolicy = "naive"\nrobot = "call?function=os:abort"',
-        "--robot runs a program",
-    ),
+    ("timeline", f'live = true\n{REPLAY}\nrobot = "call?function=os:abort"', "--robot runs a program"),
     ("latency", 'url = "http://127.0.0.1:9"\napi-key-env = "SECRET"', "--api-key-env sends a key"),
-    (
-        "latency",
-        'transport = "http/as-deployed?url=http://127.0.0.1:9&api_key_env=SECRET"',
-        "--api-key-env sends a key",
-    ),
+    ("latency", 'transport = "http?url=http://127.0.0.1:9&api_key_env=SECRET"', "--api-key-env sends a key"),
     ("latency", 'transport = "http?url=http://127.0.0.1:9"\napi-key-env = "SECRET"', "--api-key-env sends a key"),
     ("chunks", 'live = true\nurl = "ws://127.0.0.1:9"\napi-key-env = "SECRET"', "--api-key-env sends a key"),
     ("latency", 'url = "http://192.0.2.1:9"\nprompt = "@/sys/devices/pci0000:00/../../../../etc/hostname"', AWAY),
@@ -353,18 +273,3 @@ def test_no_other_file_can_name_a_program_or_a_server(tmp_path: Path) -> None:
     profile.write_text('reference = "/bin/true"\n' + (ROOT / "profiles" / "rtx-4080.toml").read_text())
     with pytest.raises(UsageError, match="reference: there is no such key"):
         read_profile(profile)
-
-
-def test_without_ray_the_flag_says_how_to_install_it(tmp_path: Path) -> None:
-    (tmp_path / "sitecustomize.py").write_text("import sys\nsys.modules['ray'] = None\n")
-    done = subprocess.run(
-        [sys.executable, "-m", "s2a_bench", "sweep", "paper", "--ray", "local", "--output", str(tmp_path / "results")],
-        env=os.environ | {"PYTHONPATH": f"{tmp_path}:{ROOT}"},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=WAIT_S,
-    )
-    assert done.returncode == 1
-    assert done.stderr.count("\n") == 1
-    assert "pip install '.[ray]' in the clone of s2a-bench" in done.stderr

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -13,8 +11,8 @@ import s2a_bench as s2a
 from s2a_bench.boards.profile import load_profile
 from s2a_bench.inference.models import tiny_dummy
 from s2a_bench.store.run import StoredRun, read_run
-from s2a_bench.store.schema import PROVENANCE
-from tests.cli.program import called, program
+from tests.cli.program import called, printed, program
+from tests.cli.program import only_run as only
 
 FEW = ("--size", "64x48", "--payload", "raw", "--max-tokens", "4", "--requests", "2", "--warmup", "1", "--threads", "1")
 UNSEEN, UNSENT = "picture not seen", "picture not seen or sent"
@@ -27,11 +25,6 @@ def texts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     model = tmp_path_factory.mktemp("model") / "texts.gguf"
     model.symlink_to(tiny_dummy()[0])
     return model
-
-
-def only(folder: Path) -> StoredRun:
-    (found,) = folder.iterdir()
-    return read_run(found)
 
 
 @pytest.fixture(scope="module")
@@ -54,35 +47,13 @@ def test_the_picture_travels_and_is_decoded_and_the_manifest_says_that_it_is_not
     assert not {"mmproj", "mmproj_sha256", "projector"} & model.keys()
 
 
-def test_every_table_and_figure_and_the_page_say_it(blind: StoredRun, tmp_path: Path) -> None:
-    files = [*(blind.path / "tables").iterdir(), *(blind.path / "figures").glob("*.md")]
-    assert {file.suffix for file in files} == {".csv", ".md", ".tex"}
-    for file in files:
-        if file.suffix == ".csv":
-            codes = {row[PROVENANCE] for row in csv.DictReader(file.read_text().splitlines())}
-            assert codes <= {"llama/dummy/measured/pictures-not-seen"}, file
-        else:
-            assert UNSEEN.upper() in file.read_text(), file
-    page, tex = tmp_path / "page.html", tmp_path / "tex"
-    called("report", blind.path, "--output", page, "--latex", tex)
-    assert f'<span class="label">{UNSEEN}</span></h2>' in page.read_text()
-    assert all(UNSEEN.upper() in file.read_text() for file in tex.glob("*.tex"))
-
-
-def test_it_is_not_compared_with_a_model_that_sees_its_picture(blind: StoredRun, tmp_path: Path) -> None:
-    program("latency", "--transport", "http/binary", *FEW, "--data-only", "--output", tmp_path)
-    done = called("compare", only(tmp_path).path, blind.path, code=1)
-    assert "provenance pictures: seen against not seen" in done.stderr
-    assert f"Dummy weights, {UNSEEN}." in called("compare", only(tmp_path).path, blind.path, "--unlike").stdout
-
-
 @LLAMA_SERVER
 def test_llama_server_refuses_pictures_then_so_it_gets_none_and_is_compared_by_its_tokens(
     texts: Path, tmp_path: Path
 ) -> None:
     cells = ("--transport", "http/as-deployed,http/llama-server", "--payload", "jpeg")
     done = program("latency", "--model", texts, *FEW, *cells, "--json", "--output", tmp_path / "latency")
-    run, printed = only(tmp_path / "latency"), json.loads(done.stdout)
+    run, shown = only(tmp_path / "latency"), printed(done)
     assert (run.samples["error"] == "").all()
     assert {cell: each.unseen for cell, each in run.origins.cells.items()} == {
         "http/as-deployed": UNSEEN,
@@ -91,33 +62,14 @@ def test_llama_server_refuses_pictures_then_so_it_gets_none_and_is_compared_by_i
     theirs = run.samples[run.samples["cell"] == "http/llama-server"]
     assert theirs["image_encode_ns"].isna().all()
     assert run.samples["prompt_n"].nunique() == 1  # both evaluate the same
-    assert not printed["ratios"]
+    assert not shown["ratios"]
     server = next(each for each in run.manifest["servers"].values() if "version" in each)
-    assert server["engine"]["pictures"] == printed["provenance"]["cells"]["http/llama-server"]["pictures"]
+    assert server["engine"]["pictures"] == shown["provenance"]["cells"]["http/llama-server"]["pictures"]
     assert not {"mmproj", "mmproj_sha256"} & server["engine"].keys()
-    program(
-        "throughput",
-        "--engine",
-        "llama-server",
-        "--model",
-        texts,
-        *FEW,
-        "--payload",
-        "jpeg",
-        "--output",
-        tmp_path / "throughput",
-    )
+    flags = ("--engine", "llama-server", "--model", texts, *FEW, "--payload", "jpeg")
+    program("throughput", *flags, "--output", tmp_path / "throughput")
     table = s2a.load(only(tmp_path / "throughput").path).table("ratios")
     assert {*table["metric"]} >= {"tokens_per_s"}
-
-
-@LLAMA_SERVER
-def test_robots_of_a_fleet_send_no_picture_to_it_either(texts: Path, tmp_path: Path) -> None:
-    fleet = ("--closed-loop", "--robots", "1", "--seconds", "0.5", "--settle", "0", "--size", "64x48", "--threads", "1")
-    program("capacity", "--transport", "http/llama-server", "--model", texts, *fleet, "--output", tmp_path)
-    run = only(tmp_path)
-    assert (run.samples["error"] == "").all()
-    assert run.origins.labels == ("dummy weights", UNSENT)
 
 
 def test_a_profile_of_it_says_so_and_so_do_what_it_computes_and_its_replay(

@@ -6,17 +6,13 @@ import json
 import os
 import subprocess
 from pathlib import Path
-from typing import Any
 
-import jsonschema
 import pytest
 
 from s2a_bench.experiments.throughput.metrics import REFERENCE
-from s2a_bench.store.run import StoredRun, read_run
-from tests.cli.program import program
+from tests.cli.program import only_run, printed, program
 from tests.llama_bench_stand_in import install
 
-ROOT = Path(__file__).parent.parent.parent
 SMALL = ["--size", "64x48", "--requests", "2", "--warmup", "1", "--max-tokens", "40", "--threads", "1"]
 REAL = "S2A_BENCH_LLAMA_BENCH"
 """Names the real llama-bench, for the test that needs it."""
@@ -26,23 +22,12 @@ def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedPro
     return program("throughput", *arguments, "--output", output, code=code)
 
 
-def only_run(output: Path) -> StoredRun:
-    (folder,) = output.iterdir()
-    return read_run(folder)
-
-
-def valid(text: str) -> dict[str, Any]:
-    whole: dict[str, Any] = json.loads(text)
-    jsonschema.validate(whole, json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text()))
-    return whole
-
-
 @pytest.mark.slow
 def test_in_process_http_and_ros_stand_beside_llama_bench(tmp_path: Path) -> None:
     program = install(tmp_path)
     everywhere = ["--transport", "in-process,http,ros", "--payload", "raw"]
     done = run(*SMALL, *everywhere, "--reference", str(program), "--json", output=tmp_path / "r")
-    whole = valid(done.stdout)
+    whole = printed(done)
     assert whole["command"] == "throughput"
     assert [cell["cell"] for cell in whole["cells"]] == ["in-process", "http/as-deployed", "ros/topic"]
     for cell in whole["cells"]:
@@ -72,26 +57,9 @@ def test_in_process_http_and_ros_stand_beside_llama_bench(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_the_engines_settings_reach_it_and_the_terminal_shows_all(tmp_path: Path) -> None:
-    settings = ["--batch", "64", "--context", "1024", "--kv-type", "q8_0", "--flash-attention", "on"]
-    done = run(*SMALL, *settings, "--against", "paper", "--verbose", output=tmp_path)
-    kept = only_run(tmp_path)
-    model = kept.manifest["model"]
-    expected = {"batch": 64, "context": 1024, "kv_type": "q8_0", "flash_attention": "on", "sampling": "model"}
-    assert {key: model[key] for key in expected} == expected
-    text = " ".join(done.stdout.split())
-    assert all(title in text for title in ("Dummy weights.", "Tokens a second", "The prompt", "by position"))
-    assert str(kept.path) in done.stdout
-    names = {path.name for path in (kept.path / "figures").iterdir()}
-    assert {"throughput_bars.png", "gaps.pdf", "positions.png"} <= names
-    assert (kept.path / "tables" / "throughput.tex").stat().st_size > 0
-    assert not (kept.path / "reference.csv").exists()
-
-
-@pytest.mark.slow
 def test_both_ways_of_flash_attention_are_cells_of_one_run(tmp_path: Path) -> None:
     ways = ["--transport", "in-process,http", "--flash-attention", "off,on"]
-    whole = valid(run(*SMALL, *ways, "--json", output=tmp_path).stdout)
+    whole = printed(run(*SMALL, *ways, "--json", output=tmp_path))
     names = [f"{path}?flash_attention={way}" for path in ("in-process", "http/as-deployed") for way in ("off", "on")]
     assert [(cell["cell"], cell["n"], cell["errors"]) for cell in whole["cells"]] == [(name, 2, 0) for name in names]
     compared = [(ratio["of"], ratio["to"]) for ratio in whole["ratios"]]
@@ -118,7 +86,7 @@ def test_a_reference_that_fails_ends_the_run_with_one_line_and_keeps_the_samples
 @pytest.mark.skipif(REAL not in os.environ, reason=f"{REAL} does not name llama.cpp's llama-bench")
 def test_the_real_llama_bench_understands_what_it_is_asked(tmp_path: Path) -> None:
     settings = ["--kv-type", "q8_0", "--batch", "64", "--reference", os.environ[REAL]]
-    reference = valid(run(*SMALL, *settings, "--json", output=tmp_path).stdout)["reference"]
+    reference = printed(run(*SMALL, *settings, "--json", output=tmp_path))["reference"]
     assert reference["decode_tokens_per_s"]["n"] == 2
     facts = json.loads(only_run(tmp_path).table(REFERENCE)["facts"].iloc[0])
     assert (facts["n_batch"], facts["type_k"], facts["n_threads"], facts["n_gpu_layers"]) == (64, "q8_0", 1, 0)

@@ -2,42 +2,27 @@
 
 from __future__ import annotations
 
-import json
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
 
-import jsonschema
 import pytest
 
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.store.requests import SKILLS
-from s2a_bench.store.run import StoredRun, read_run
-from tests.cli.program import called
+from s2a_bench.store.run import read_run
+from tests.cli.program import called, only_run, printed
 from tests.policy.test_tables import CASES, shown
-
-ROOT = Path(__file__).parent.parent.parent
 
 BOARDS = {"34.2": "rtx-4080", "4.8": "jetson-agx-orin", ".58": "jetson-orin-nano"}
 POLICIES = {"s2a-clairvoyant": "stream-to-act"}
 """With even tokens it starts at S0 as well."""
 
 
-def schema() -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((ROOT / "docs" / "schema" / "s2a-bench-1.json").read_text())
-    return found
-
-
-def only_run(output: Path) -> StoredRun:
-    (folder,) = output.iterdir()
-    return read_run(folder)
-
-
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Return what the command prints when it is given nothing."""
-    done = called("timeline", "--json", "--output", tmp_path_factory.mktemp("timeline"))
-    found: dict[str, Any] = json.loads(done.stdout)
+    found: dict[str, Any] = printed(called("timeline", "--json", "--output", tmp_path_factory.mktemp("timeline")))
     return found
 
 
@@ -55,8 +40,7 @@ def test_the_command_prints_the_expected_timelines(
         assert shown(found[name], text) == Decimal(text)
 
 
-def test_the_json_keeps_its_schema(whole: dict[str, Any]) -> None:
-    jsonschema.validate(whole, schema())
+def test_the_json_has_a_cell_a_setting(whole: dict[str, Any]) -> None:
     assert whole["command"] == "timeline"
     assert len(whole["cells"]) == 3 * 4 * 3
     assert all(cell["emulated"] for cell in whole["cells"])
@@ -74,36 +58,9 @@ def test_the_run_folder_holds_skills_tokens_tables_figure_and_trace(whole: dict[
     assert {"tables/timelines.csv", "figures/timeline.png", "figures/timeline.pdf"} <= files
 
 
-def test_one_setting_shows_every_skill_and_says_what_is_emulated_and_assumed(tmp_path: Path) -> None:
-    done = called(
-        *("timeline", "--profile", "jetson-agx-orin", "--tokens-per-skill", "6", "--policy", "naive", "--verbose"),
-        *("--output", tmp_path),
-    )
-    assert "stall before" in done.stdout
-    assert "EMULATED in virtual time" in done.stdout
-    assert "our assumption" in done.stdout
-    assert "11.50" in done.stdout
-
-
-def test_a_given_rate_takes_the_place_of_the_profiles(tmp_path: Path) -> None:
-    done = called(
-        *("timeline", "--rate", "4.8,2", "--prompt-time", "0.5", "--tokens-per-skill", "6", "--n-skills", "4,8"),
-        *("--jitter", "lognormal:cv=0.2", "--plans", "20", "--json", "--output", tmp_path),
-    )
-    found = json.loads(done.stdout)
-    jsonschema.validate(found, schema())
-    assert {(cell["rate_tokens_per_s"], cell["n_skills"]) for cell in found["cells"]} == {
-        (rate, count) for rate in (4.8, 2) for count in (4, 8)
-    }
-    assert {cell["profile"] for cell in found["cells"]} == {None}
-    assert {cell["plans"] for cell in found["cells"]} == {20}
-    assert len(list((only_run(tmp_path).path / "figures").glob("timeline_N*_T1.png"))) == 2
-
-
 def test_boundary_prints_json_that_keeps_its_schema_and_leaves_the_plane_as_csv(tmp_path: Path) -> None:
     done = called("boundary", "--json", "--output", tmp_path)
-    found = json.loads(done.stdout)
-    jsonschema.validate(found, schema())
+    found = printed(done)
     kept = only_run(tmp_path)
     lines = (kept.path / "tables" / "boundary.csv").read_text().splitlines()
     assert len(lines) - 1 == len(found["cells"]) == 2 * (8 * 25 + 3 * 4)

@@ -2,39 +2,25 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import jsonschema
 import pytest
 
 from s2a_bench.store.run import read_run
-from tests.cli.program import program
-from tests.made_runs import SCHEMA
+from tests.cli.program import printed, program
 
 
 @pytest.mark.slow
 def test_a_live_run_prints_one_json_object_and_leaves_a_whole_folder(fast_board: str, tmp_path: Path) -> None:
     flags = ["--live", "--engine", "replay", "--profile", fast_board, "--transport", "loopback", "--size", "64x48"]
     done = program("timeline", *flags, "--t-nom", "0.03", "--json", "--output", tmp_path / "runs")
-    printed = json.loads(done.stdout)
-    jsonschema.validate(printed, SCHEMA)
-    assert [cell["policy"] for cell in printed["cells"]] == ["naive", "wait-then-act", "stream-to-act"]
-    assert {(cell["mode"], cell["emulated"], cell["profile"]) for cell in printed["cells"]} == {("live", True, None)}
-    assert printed["live"]["transport"] == "loopback"
-    assert printed["start_jitter"]["starts"] == 24
+    whole = printed(done)
+    assert [cell["policy"] for cell in whole["cells"]] == ["naive", "wait-then-act", "stream-to-act"]
+    assert {(cell["mode"], cell["emulated"], cell["profile"]) for cell in whole["cells"]} == {("live", True, None)}
+    assert whole["live"]["transport"] == "loopback"
+    assert whole["start_jitter"]["starts"] == 24
     assert "  wait-then-act: started at " in done.stderr
-    folder = Path(printed["run"])
+    folder = Path(whole["run"])
     for name in ("figures/timeline.png", "tables/timelines.md", "skills.parquet", "samples.parquet"):
         assert (folder / name).stat().st_size > 0
     assert read_run(folder).manifest["state"] == "finished"
-
-
-@pytest.mark.slow
-def test_a_real_time_run_says_what_is_emulated_and_how_late_it_was(fast_board: str, tmp_path: Path) -> None:
-    flags = ["--real-time", "--profile", fast_board, "--tokens-per-skill", "6", "--t-nom", "0.03"]
-    done = program("timeline", *flags, "--output", tmp_path / "runs")
-    text = " ".join(done.stdout.split())
-    assert "EMULATED, executed in real time: no model answered" in text
-    assert "Start jitter on the system clock: median" in text
-    assert "over 24 starts." in text

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from s2a_bench.experiments.profile_capture.run import (
     TimedAnswer,
     answers,
     document,
-    open_model,
     rate_cv,
     write_profile,
 )
@@ -179,14 +177,3 @@ def test_a_capture_of_a_replayed_recording_is_the_recording(tmp_path: Path, monk
     assert [answer.gaps_ns for answer in captured] == [answer.gaps_ns for answer in recorded[2:]]
     ttft_s = np.array([answer.ttft_ns for answer in captured]) / 1e9
     assert ttft_s.mean() == pytest.approx(0.5, rel=0.1)
-
-
-@pytest.mark.slow
-def test_a_replay_of_a_real_capture_is_the_capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
-    config = CaptureConfig(name="x", size=(64, 48), requests=10, warmup=2, tokens=16, prompt="go")
-    with closing(open_model(EngineConfig(threads=1))) as engine:
-        recorded = list(islice(answers(engine, config), 12))
-        write_profile(document(config, recorded, engine.describe(), []), tmp_path / "board.toml", force=False)
-    replayed = replayed_ns(tmp_path / "board.toml", "trace", 10, 16)
-    assert replayed == [answer.gaps_ns for answer in recorded[2:]]

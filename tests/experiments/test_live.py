@@ -149,17 +149,6 @@ def test_a_function_is_called_with_every_skill(config: TimelineConfig, tmp_path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ros", ["topic", "action"])
-def test_a_replay_over_dds_is_executed_by_three_policies_at_once(
-    config: TimelineConfig, tmp_path: Path, dds_domain: int, ros: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(dds_domain))
-    run, _ = live(config.but(transport=f"ros/{ros}"), tmp_path)
-    check(run, f"ros/{ros}")
-
-
-@pytest.mark.slow
 def test_a_real_model_is_held_to_its_grammar_and_its_pace(
     config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -80,16 +80,6 @@ def test_while_it_runs_the_present_is_marked_and_s0_is_so_far() -> None:
     assert "(S0)" in lines[-1]
 
 
-def test_a_stall_under_way_grows() -> None:
-    lines = text(scene(under_way(finished("naive"), 3.9)), 3.9, 100)
-    assert 3 * STALL in lane(lines, "naive")
-
-
-def test_before_the_request_there_is_nothing_to_see() -> None:
-    lines = text(scene([Record("naive")]), 0.0, 80)
-    assert lane(lines, "naive").endswith("0/4 0.0s")
-
-
 @given(width=st.integers(30, 250), at_s=st.floats(0, 30), span_s=st.floats(0.001, 1000))
 def test_no_line_is_wider_than_the_terminal(width: int, at_s: float, span_s: float) -> None:
     for records in (finished("naive"), under_way(finished("naive"), at_s), [Record("naive")]):

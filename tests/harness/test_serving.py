@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from threading import Event, Thread
+from threading import Event
 
 import pytest
 
@@ -63,41 +63,6 @@ def test_preprocessing_that_an_engine_tells_is_a_stage_before_inference(told_ms:
     assert [stage for stage, _ in trace.marks] == ["", "preprocess", "inference"]
     (_, handed_ns), (_, prepared_ns), (_, first_ns) = trace.marks
     assert handed_ns < prepared_ns <= min(handed_ns + longest_ns, first_ns)
-
-
-def test_a_second_request_waits_and_says_so() -> None:
-    engine = Engine()
-    handle = engine_handler(engine)
-    first, second = Trace(), Trace()
-    running = handle(Request("a", "1"), first)
-    next(running)
-    waiting = Thread(target=lambda: list(handle(Request("b", "2"), second)))
-    waiting.start()
-    engine.go.set()
-    assert [token.text for token in running] == ["!"]
-    waiting.join(20)
-    assert "queue" not in dict(first.marks)
-    assert [stage for stage, _ in second.marks] in (["", "queue", "", "inference"], ["", "inference"])
-
-
-def test_a_request_left_early_frees_the_engine() -> None:
-    engine = Engine()
-    handle = engine_handler(engine)
-    tokens = handle(Request("a", "1"), Trace())
-    next(tokens)
-    tokens.close()
-    assert engine.closed == 1
-    assert next(handle(Request("b", "2"), Trace())).text == "2"
-
-
-def test_a_failure_frees_the_engine() -> None:
-    engine = Engine()
-    handle = engine_handler(engine)
-    engine.fail = True
-    with pytest.raises(EngineError):
-        list(handle(Request("a", "1"), Trace()))
-    engine.fail = False
-    assert next(handle(Request("b", "2"), Trace())).text == "2"
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,6 +25,13 @@ from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.types import Request, Token
 from tests.servers.sockets import head, serving
 from tests.servers.speakers import Cloud
+
+
+def session_of(client: Any, cell: Any = "http/as-deployed", **more: Any) -> Session:
+    """Return a session of a client whose pictures are made up."""
+    cell = one_pipeline(cell) if isinstance(cell, str) else cell
+    feed = RequestFeed(open_source("synthetic", 64, 48, fps=30.0, seed=0), preencoded=False)
+    return Session(cell, client, feed, **{"request": resolve(RequestsConfig()).request, **more})
 
 
 @pytest.mark.parametrize(("retry_after_s", "waited_s"), [(0.0, 0), (1.5, 1.5), (60.0, 60), (3600.0, 60)])
@@ -47,11 +55,8 @@ def test_a_refused_sample_is_one_row_with_its_error_and_is_not_sent_again(
     with serving(busy) as url:
         cell = one_pipeline("http/as-deployed", url=url, dialect="openai", served_model="m")
         client = open_client(cell.wiring(url))
-        source = open_source("synthetic", 64, 48, fps=30.0, seed=0)
-        session = Session(cell, client, RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request)
-        measured = session.measure(Place(0, 0, warmup=False))
+        measured = session_of(client, cell).measure(Place(0, 0, warmup=False))
         client.close()
-        source.close()
     assert measured.retry_after_s == retry_after_s
     assert "answered 429: slow down" in measured.sample.error
     assert (measured.fatal, measured.tokens, len(requests)) == (None, [], 1)
@@ -84,6 +89,16 @@ def test_the_link_to_a_server_of_another_machine_is_unknown(
         assert servers.origin(cell).link == link
 
 
+def test_a_stage_that_its_transport_does_not_declare_makes_the_sample_an_error() -> None:
+    class Greeting:
+        def request(self, _: Request, trace: Trace) -> Iterator[Token]:
+            trace.mark("greet")
+            yield Token(0, "x")
+
+    measured = session_of(Greeting(), "loopback").measure(Place(0, 0, warmup=False))
+    assert measured.sample.error == "TransportError: loopback does not declare the stage greet"
+
+
 HERE, ELSEWHERE = clock_id(), "another machine"
 
 
@@ -104,9 +119,6 @@ def test_the_clock_of_an_answer_tells_whether_the_link_leaves_this_machine(befor
             yield Token(0, "x")
             trace.receive(Remote(clock, provenance=Provenance("echo", link="real").to_dict()))
 
-    source = open_source("synthetic", 64, 48, fps=30.0, seed=0)
-    feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request
-    session = Session(one_pipeline("loopback"), Answering(), feed, plan, origin=Provenance(link=before))
+    session = session_of(Answering(), "loopback", origin=Provenance(link=before))
     session.measure(Place(0, 0, warmup=False))
-    source.close()
     assert (session.origin.engine, session.origin.link) == ("echo", after)

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from http import HTTPStatus
 from pathlib import Path
-from socket import create_server, socket
-from threading import Event, Thread
+from socket import socket
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ import pytest
 from websockets.sync.server import serve
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, ServerDied, TransportError, UsageError
+from s2a_bench.errors import ServerDied, TransportError, UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.harness import rounds
@@ -25,7 +24,6 @@ from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.types import Token
-from tests.servers.lerobot import PolicyServer, chunk, grpc_server
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, LlamaServer, answering
 
@@ -130,43 +128,6 @@ def test_a_policy_server_that_refuses_handshakes_is_waited_for(tmp_path: Path) -
         thread.join()
     assert (run.samples["error"] == "").tolist() == [True] * 4
     assert len(progress.waits) == 3
-
-
-def test_a_tunnel_that_accepts_and_closes_until_its_server_starts_is_waited_for(tmp_path: Path) -> None:
-    progress = Waiting()
-    with create_server(("127.0.0.1", 0)) as tunnel, ThreadPoolExecutor(1) as pool:
-        ended = Event()
-
-        def close_all() -> None:
-            tunnel.settimeout(0.1)
-            while not ended.is_set():
-                with suppress(TimeoutError):
-                    tunnel.accept()[0].close()
-
-        closing_all = pool.submit(close_all)
-        with pytest.raises(RequestFailed, match=r"broke the connection.*; waited [0-9.]+ s for it"):
-            measured(tmp_path, progress, f"ws://127.0.0.1:{tunnel.getsockname()[1]}", wait_s=1.2)
-        ended.set()
-        closing_all.result(20)
-    assert len(progress.waits) > 1
-
-
-def test_a_late_server_of_lerobots_is_waited_for(tmp_path: Path) -> None:
-    port, rows = free_port(), np.zeros((4, 6), np.float32)
-    server = PolicyServer(lambda observation: chunk(observation.timestamp, rows))
-    with ExitStack() as later:
-        progress = Waiting(at_1=lambda: later.enter_context(grpc_server([server.handlers()], port)))
-        options = {"grpc": {"policy_type": "act", "pretrained": "x", "actions_per_chunk": 4}}
-        run = measured(tmp_path, progress, f"grpc://127.0.0.1:{port}", state=6, options=options)
-    assert (run.samples["error"] == "").tolist() == [True] * 4
-    assert "no gRPC server answers" in progress.waits[0]
-
-
-def test_a_zmq_server_that_never_comes_is_told_with_the_time(tmp_path: Path) -> None:
-    progress = Waiting()
-    with pytest.raises(ServerDied, match=r"nothing answers at tcp.*; waited [0-9.]+ s for it"):
-        measured(tmp_path, progress, f"tcp://127.0.0.1:{free_port()}", wait_s=0.2, state=6)
-    assert len(progress.waits) > 1
 
 
 def test_the_last_error_says_how_long_was_waited(tmp_path: Path) -> None:

@@ -124,17 +124,12 @@ def _answer(connection: socket.socket, pieces: Iterator[Block], then: Then, over
                     return
 
 
-LITTLE, BIG = struct.pack("<I", GIB), struct.pack(">I", GIB)
-
 CLIENTS: tuple[Case[Attack], ...] = (
     Case("silence", sends(seconds=1)),
     Case("gone at once", sends(then="goes")),
     Case("garbage", sends(NOISE)),
-    Case("garbage and gone", sends(NOISE, then="goes")),
     Case("garbage and reset", sends(NOISE[:100], then="resets")),
-    Case("zeros", sends(bytes(1 << 20))),
-    Case("1 GiB announced", sends(LITTLE, NOISE)),
-    Case("1 GiB announced, big-endian", sends(BIG, NOISE)),
+    Case("1 GiB announced", sends(struct.pack("<I", GIB), NOISE)),
     Case("truncated message", sends(struct.pack("<I", 1000), b"{", then="goes")),
     Case("endless request", sends_made(lambda: ENDLESS[: 1 << 12])),
     Case("100 silent connections", crowd(100, sends(seconds=1))),
@@ -148,11 +143,7 @@ def servers(scheme: str = "") -> tuple[Case[Trap], ...]:
         Case("silence", answers(scheme=scheme), FAILED),
         Case("gone at once", answers(then="goes", scheme=scheme), FAILED),
         Case("garbage", answers(NOISE, scheme=scheme), FAILED),
-        Case("garbage and reset", answers(NOISE[:100], then="resets", scheme=scheme), FAILED),
-        Case("zeros", answers(bytes(1 << 20), scheme=scheme), FAILED),
-        Case("1 GiB announced", answers(LITTLE, NOISE, scheme=scheme), FAILED),
-        Case("1 GiB announced, big-endian", answers(BIG, NOISE, scheme=scheme), FAILED),
+        Case("1 GiB announced", answers(struct.pack("<I", GIB), NOISE, scheme=scheme), FAILED),
         Case("truncated message", answers(struct.pack("<I", 1000), b"{", then="goes", scheme=scheme), FAILED),
         Case("endless zeros", answers(again=[bytes(1 << 16)], scheme=scheme), FAILED),
-        Case("endless noise", answers(again=[NOISE], scheme=scheme), FAILED),
     )

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import subprocess
-import sys
 import time
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -15,7 +12,6 @@ from threading import Event
 import pytest
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.store.run import read_run
 from s2a_bench.testing.transport import connector, wiring_of
 from s2a_bench.trace import Trace
 from s2a_bench.transport import open_client
@@ -70,37 +66,6 @@ def test_who_asks_what_a_server_is_does_not_wait_for_ever(name: str) -> None:
         client.close()
 
 
-@pytest.mark.parametrize("name", ["tokens", "103, slowly"])
-def test_a_run_keeps_a_row_for_each_and_ends_with_the_reason(name: str, tmp_path: Path) -> None:
-    case = CASES[name]
-    small = [
-        "--transport",
-        "http/as-deployed",
-        "--size",
-        "64x48",
-        "--requests",
-        "2",
-        "--warmup",
-        "0",
-        "--max-tokens",
-        "8",
-    ]
-    with serving(lambda _: case.pieces()) as url:
-        options = [*small, "--url", url, "--dialect", DIALECT, "--deadline", str(case.deadline_s or 60)]
-        command = [sys.executable, "-m", "s2a_bench", "latency", *options, "--output", str(tmp_path)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    (folder,) = tmp_path.iterdir()
-    with (folder / "samples.csv").open() as file:
-        errors = [row["error"] for row in csv.DictReader(file)]
-    assert len(errors) == 2
-    assert all(error.startswith("RequestFailed: ") for error in errors)
-    run = read_run(folder)
-    assert run.manifest["state"] == "failed"
-    assert len(run.samples) == 2
-
-
 @pytest.mark.parametrize("name", ["ros/topic", "ros/action"])
 @pytest.mark.parametrize(
     ("every_s", "says"), [(0.0, r"does not stop: \d+ pieces came for 1 tokens"), (0.2, "within 1 s; see `deadline`")]
@@ -132,11 +97,3 @@ def test_a_server_that_counts_otherwise_is_not_cut() -> None:
         client = open_client(wiring_of("http/as-deployed", url=url, dialect=DIALECT))
         assert len(list(client.request(Request("a", "plan", max_tokens=MAX_TOKENS), Trace()))) == 40
         client.close()
-
-
-@pytest.mark.parametrize("name", ["103, slowly", "103", "headers, a byte at a time", "a compressed gigabyte"])
-def test_counters_of_caches_are_not_waited_for(name: str) -> None:
-    with serving(lambda _: CASES[name].pieces()) as url:
-        started = time.monotonic()
-        assert detect.cache_hits(wiring_of("http/as-deployed", url=url)) == {}
-        assert time.monotonic() - started < detect.PATIENCE_S + 10

@@ -1,8 +1,11 @@
-"""A thousand clients at once are answered or refused, and none hangs."""
+"""A thousand clients at once are answered or refused, and none hangs; nor do they without descriptors."""
 
 from __future__ import annotations
 
+import resource
+import time
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,8 +17,8 @@ from s2a_bench.transport import open_client
 from s2a_bench.transport.http.native import PATHS
 from s2a_bench.types import Request
 from tests.hostile.asking import usage
-from tests.hostile.suite import own_server
-from tests.hostile.tcp import crowd, sends
+from tests.hostile.suite import honest_answer, own_server
+from tests.hostile.tcp import connect, crowd, sends
 from tests.hostile.wires.http import chat
 
 CLIENTS = 1000
@@ -47,3 +50,21 @@ def test_1000_clients_at_once(
             assert len(ask(client, Request("afterwards", "go on", max_tokens=3))[0]) == 3
         finally:
             client.close()
+
+
+@pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
+def test_out_of_descriptors_those_that_are_connected_are_answered(variant: str, tmp_path: Path) -> None:
+    wiring = wiring_of(f"http/{variant}")
+    with own_server(wiring, tmp_path / "log") as server, ExitStack() as stack:
+        here = replace(wiring, address=server.address)
+        client = stack.enter_context(closing(open_client(here)))
+        expected = honest_answer(client)
+        limits = resource.prlimit(server.pid, resource.RLIMIT_NOFILE)
+        resource.prlimit(server.pid, resource.RLIMIT_NOFILE, (usage(server.pid).descriptors + 3, limits[1]))
+        for _ in range(20):
+            stack.enter_context(connect(here, 60))
+        time.sleep(0.5)
+        assert honest_answer(client) == expected
+        resource.prlimit(server.pid, resource.RLIMIT_NOFILE, limits)
+        assert sends(chat(path=PATHS[variant]), seconds=10)(here).startswith("HTTP/1.1 200 ")
+    assert "Traceback" not in (tmp_path / "log").read_text()

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib.util import find_spec
 from typing import Any
-
-import pytest
 
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Limits
 from tests.hostile.suite import HostileSuite
-from tests.hostile.wires import http, ros, ros_servers, shm, websocket, zmq
+from tests.hostile.wires import http, ros, shm, websocket, zmq
 
 
 class TestHttp(HostileSuite):
@@ -34,21 +31,10 @@ class TestHttpBestEffort(HostileSuite):
         return replace(super().wiring(), limits=Limits(head_s=2))  # as above
 
 
-class TestHttpBinary(HostileSuite):
-    name = "http/binary"
-    servers = http.SERVERS
-
-
 class TestRosTopic(HostileSuite):
     name = "ros/topic"
     clients = ros.CLIENTS
     targets = 1  # a case is for the first participants of the domain
-    servers = ros_servers.TOKENS
-
-
-class TestRosAction(HostileSuite):
-    name = "ros/action"
-    servers = ros_servers.GOALS
 
 
 class TestZmq(HostileSuite):
@@ -57,39 +43,21 @@ class TestZmq(HostileSuite):
     servers = zmq.SERVERS
 
 
-needs_zenoh = pytest.mark.skipif(not find_spec("zenoh"), reason="the extra zenoh is not installed")
-
-
-@needs_zenoh
-class TestRosTopicOverZenoh(HostileSuite):
-    name = "ros/topic?middleware=zenoh"
-    clients = ros.CLIENTS
-    targets = 1
-    servers = ros_servers.TOKENS
-
-
-@needs_zenoh
-class TestRosActionOverZenoh(HostileSuite):
-    name = "ros/action?middleware=zenoh"
-    servers = ros_servers.GOALS
-
-
 class TestShm(HostileSuite):
     name = "shm"
     clients = shm.CLIENTS
-    servers = shm.SERVERS
 
 
 class TestWebsocket(HostileSuite):
     name = "websocket/openpi"
     clients = websocket.CLIENTS
-    servers = websocket.SERVERS
+    servers = websocket.SERVERS[:-1]
 
     @classmethod
     def wiring(cls) -> Wiring[Any]:
-        return replace(super().wiring(), limits=Limits(head_s=2, body_s=3))  # three cases wait for them
+        return replace(super().wiring(), limits=Limits(head_s=2, body_s=3))  # two cases wait for them
 
 
 class TestWebsocketStreamed(HostileSuite):
     name = "websocket/openpi-stream"
-    servers = websocket.SERVERS
+    servers = websocket.SERVERS[-1:]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import time
 from collections.abc import Generator, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from threading import Event
 from typing import Any
@@ -13,11 +13,10 @@ from typing import Any
 import httpx
 import pytest
 
-from s2a_bench.clock import now_ns
-from s2a_bench.errors import Busy, EngineError
-from s2a_bench.testing.transport import served, wiring_of
+from s2a_bench.errors import BadRequest, EngineError, RequestFailed
+from s2a_bench.testing.transport import ask, served, wiring_of
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler
+from s2a_bench.transport import Handler, open_client
 from s2a_bench.transport.http.native import PATHS
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.serving import Queued, Turn, Turns
@@ -60,21 +59,6 @@ class Gate:
 
 
 class TestTurns:
-    def test_they_come_in_the_order_of_arrival(self) -> None:
-        turns = Turns()
-        queue = [turns.join() for _ in range(5)]
-        for index, turn in enumerate(queue):
-            assert [other.has_started for other in queue[index:]] == [True] + [False] * (4 - index)
-            turn.leave()
-
-    def test_whoever_is_one_too_many_is_refused_at_once(self) -> None:
-        turns = Turns(Limits(waiting=2))
-        held = [turns.join() for _ in range(3)]
-        with pytest.raises(Busy, match="2 requests are waiting"):
-            turns.join()
-        held[1].leave()
-        turns.join()
-
     def test_leaving_twice_lets_one_run_not_two(self) -> None:
         turns = Turns()
         first, second, third = (turns.join() for _ in range(3))
@@ -82,23 +66,6 @@ class TestTurns:
         first.leave()
         assert second.has_started
         assert not third.has_started
-
-    def test_whoever_waits_and_goes_is_passed_over(self) -> None:
-        turns = Turns()
-        first, second, third = (turns.join() for _ in range(3))
-        assert not second.wait(lambda: True)
-        second.leave()
-        first.leave()
-        assert third.has_started
-
-    def test_silence_is_that_of_the_running_answer(self) -> None:
-        turns = Turns()
-        assert turns.silent_s() == 0
-        turn = turns.join()
-        turn.alive_ns = now_ns() - 5_000_000_000
-        assert 5 <= turns.silent_s() < 60
-        turn.leave()
-        assert turns.silent_s() == 0
 
     @pytest.mark.parametrize(
         "fails", [EngineError("no"), ValueError("no"), UnicodeEncodeError("utf-8", "", 0, 1, "no")]
@@ -156,3 +123,27 @@ def test_health_says_when_the_engine_is_stuck(path: str, monkeypatch: pytest.Mon
         gate.go.set()
         connection.close()
         until(lambda: httpx.get(url + "/health").status_code == 200)
+
+
+@paths
+def test_an_answer_that_is_not_streamed_is_504_at_its_deadline(path: str) -> None:
+    gate = Gate()
+    gate.go.set()
+    with serving(gate, SERVERS[path], Limits(answer_s=1.0)) as url:
+        answer = httpx.post(url + path, json=body("for ever", stream=False, max_tokens=60_000), timeout=30)
+    assert answer.status_code == 504
+    assert "1 s after its arrival the request is still being answered" in answer.json()["error"]["message"]
+
+
+@pytest.mark.parametrize("name", [*(f"http/{variant}" for variant in PATHS), "ros/topic", "ros/action"])
+def test_a_grammar_that_is_none_is_the_client_s_mistake(name: str) -> None:
+    def answer(request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        if request.grammar:
+            raise BadRequest("the grammar is not valid GBNF")
+        yield Token(0, "a")
+
+    says = "answered 400: .*not valid GBNF" if name.startswith("http") else "not valid GBNF"
+    with serving(answer, name) as address, closing(open_client(wiring_of(name, address))) as client:
+        with pytest.raises(RequestFailed, match=says):
+            ask(client, Request("a", "a", grammar="x"))
+        assert len(ask(client, Request("b", "a", max_tokens=2))[0]) == 1

@@ -2,37 +2,30 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack
-from random import Random
-from threading import Event, Thread, active_count
+from threading import Event, active_count
 from typing import Any
 
-import numpy as np
 import pytest
 
-from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Result, Subscription, open_middleware
+from s2a_bench.ros import Accepted, Feedback, Middleware, QoS, Result, open_middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.action import STATUS_ARRAY, Status
-from s2a_bench.ros.config import domain_id
+from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.ros.service import READER_QOS
-from s2a_bench.testing.transport import RecordingHandler, ask, wiring_of, yuyv_frame
+from s2a_bench.testing.transport import RecordingHandler, ask, wiring_of
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Client, open_client
-from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.transport.ros.camera import picture_of
+from s2a_bench.transport import open_client
+from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.ros.joining import join
-from s2a_bench.transport.ros.wire import REQUEST_QOS, TOKEN_QOS, request_message, token_message
+from s2a_bench.transport.ros.wire import TOKEN_QOS, request_message, token_message
 from s2a_bench.transport.serving import Queued
 from s2a_bench.types import Request, Token
 from tests.hostile.test_queue import Gate, serving
-from tests.hostile.wires.http import bomb, png_of_zeros
 from tests.waiting import until
 
 NAMESPACE = "/s2a_bench"
@@ -65,54 +58,6 @@ def goals(stranger: Middleware) -> Callable[[], Any]:
         return client
 
     return connect
-
-
-def test_goals_of_five_clients_wait_as_accepted_and_end_in_the_order_of_their_acceptance(stranger: Middleware) -> None:
-    go = Event()
-
-    def answer(request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        assert go.wait(60)
-        for index in range(int(request.prompt)):
-            yield Token(index, "a")
-
-    queued = Queued.around(answer)
-    with serving(queued, "ros/action") as address, ExitStack() as stack:
-        name = f"{address}/generate_response"
-        statuses = stranger.subscription(name + "/_action/status", STATUS_ARRAY, QoS(depth=0, latched=True))
-
-        clients = []  # kept: their endpoints go with them
-
-        def ten_goals(number: int) -> None:
-            lengths = Random(number)
-            middleware = open_middleware(domain_id=domain_id(os.environ), node_name=f"/client_{number}")
-            stack.callback(middleware.close)
-            client = middleware.action_client(name, GENERATE_RESPONSE)
-            clients.append(client)
-            assert client.wait_for_server(20)
-            for _ in range(10):
-                client.send(client.pack(generate_goal(str(lengths.randint(0, 20)), [])))
-
-        threads = [Thread(target=ten_goals, args=(number,)) for number in range(5)]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join(60)
-        until(lambda: queued.turns.waiting == 49)
-        seen: list[list[int]] = []
-        while [Status.EXECUTING] + [Status.ACCEPTED] * 49 not in seen:
-            seen.append(statuses_of(statuses))
-        go.set()
-        while [Status.SUCCEEDED] * 50 not in seen:
-            seen.append(statuses_of(statuses))
-    for listed in seen:
-        assert listed == sorted(listed, reverse=True), "a goal ended or started before one that was accepted earlier"
-
-
-def statuses_of(subscription: Subscription) -> list[int]:
-    """Return the next list of statuses, which is in the order of acceptance."""
-    packed = subscription.take(20)
-    assert packed is not None, "no status came"
-    return [entry.status for entry in subscription.unpack(packed).status_list]
 
 
 def test_a_goal_cancelled_while_it_waits_leaves_the_queue(goals: Callable[[], Any]) -> None:
@@ -172,55 +117,6 @@ def test_the_name_of_a_request_on_the_topic_cannot_be_guessed(stranger: Middlewa
     assert [request.id for request in handler.requests] == ["cell-1", "cell-1"]
 
 
-def image(width: int, height: int, step: int, size: int, encoding: str = "bgr8") -> Any:
-    made = ros.image_message(yuyv_frame(), 0, "c")
-    made.width, made.height, made.step, made.encoding, made.data = width, height, step, encoding, np.zeros(size, "u1")
-    return made
-
-
-IMPOSSIBLE = [
-    image(0, 0, 0, 0),
-    image(64, 0, 192, 0),
-    image(2**32 - 1, 2**32 - 1, 2**32 - 1, 100),
-    image(50_000_001, 1, 150_000_003, 100),
-    image(64, 48, 192, 64 * 48 * 3 - 1),
-    image(64, 48, 191, 64 * 48 * 3),
-    image(64, 48, 2**32 - 1, 64 * 48 * 3),
-    image(64, 48, 0, 64 * 48 * 3),
-    image(64, 48, 192, 64 * 48 * 3, "16UC1"),
-    image(63, 48, 126, 63 * 48 * 2, "yuv422_yuy2"),
-    ros.compressed_image_message(np.frombuffer(png_of_zeros(30_000, 2000), np.uint8), 0, "c", "png"),
-    ros.compressed_image_message(np.frombuffer(b"\xff\xd8" + bytes(100), np.uint8), 0, "c"),
-    ros.compressed_image_message(np.zeros(0, np.uint8), 0, "c"),
-]
-
-
-@pytest.mark.parametrize("message", IMPOSSIBLE)
-def test_a_picture_that_cannot_be_is_refused_before_it_is_converted(message: Any) -> None:
-    with pytest.raises(S2AError):
-        picture_of(message, Trace(), LIMITS)
-
-
-def test_a_smaller_limit_is_the_server_s_own(stranger: Middleware) -> None:
-    small = Limits(pixels=1000, answer_tokens=3)
-    with serving(engine_handler(open_engine(EngineConfig(name="echo"))), "ros/topic", small) as address:
-        client = open_client(wiring_of("ros/topic", address))
-        try:
-            with pytest.raises(RequestFailed, match="64x48; at most 1000 pixels"):
-                ask(client, Request("a", "a", (yuyv_frame(),), max_tokens=1))
-            with pytest.raises(RequestFailed, match="max_tokens should be a whole number of 1 to 3"):
-                ask(client, Request("a", "a", max_tokens=4))
-        finally:
-            client.close()
-        picture = ros.compressed_image_message(np.frombuffer(bomb(), np.uint8), 0, "c", "png")
-        requests = stranger.publisher(NAMESPACE + "/request", ros.REQUEST, REQUEST_QOS)
-        answers = stranger.subscription(NAMESPACE + "/token", ros.TOKEN, READER_QOS)
-        until(lambda: bool(requests.matched() and answers.matched()))
-        requests.send(requests.pack(request_message(Request("b", "a", max_tokens=1), (), [picture])))
-        packed = answers.take(20)
-        assert "30000x30000" in answers.unpack(packed).error
-
-
 def test_a_goal_has_no_more_tokens_than_the_limit(goals: Callable[[], Any]) -> None:
     small = Limits(answer_tokens=3)
     with serving(engine_handler(open_engine(EngineConfig(name="echo")), limits=small), "ros/action", small):
@@ -249,37 +145,3 @@ def test_the_threads_of_ros_requests_that_waited_end() -> None:
         go.set()
         until(lambda: active_count() <= most - 28)
         middleware.close()
-
-
-def is_answered(client: Client, prompt: str) -> bool:
-    try:
-        return len(ask(client, Request("afterwards", prompt))[0]) == 1
-    except RequestFailed:
-        return False
-
-
-def test_the_bytes_of_ros_requests_are_bounded_and_given_back() -> None:
-    go = Event()
-
-    def answer(request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        yield Token(0, "a")
-        assert go.wait(30) or request.id == "first"
-
-    limits, long = Limits(body_mib=1, in_flight_mib=1.5), "a" * 1_000_000
-    with ExitStack() as stack:
-        address = stack.enter_context(serving(Queued.around(answer), "ros/topic", limits))
-        first, second, goals = (open_client(wiring_of(f"ros/{way}", address)) for way in ("topic", "topic", "action"))
-        for client in (first, second, goals):
-            stack.callback(client.close)
-        with pytest.raises(RequestFailed, match="larger than 1048576 bytes"):
-            ask(second, Request("too long", 2 * long))
-        tokens = first.request(Request("first", long), Trace())
-        next(iter(tokens))
-        with pytest.raises(RequestFailed, match="1572864 bytes are under way already"):
-            ask(second, Request("second", long))
-        with pytest.raises(RequestFailed, match="rejected"):
-            ask(goals, Request("goal", long))
-        go.set()
-        assert len([*tokens]) == 0
-        for client in (second, goals, second):
-            until(lambda client=client: is_answered(client, long))  # type: ignore[misc]  # bound at once

@@ -31,7 +31,6 @@ def tiny(cached: Path) -> EngineConfig:
 @pytest.fixture(scope="session")
 def texts(tiny: EngineConfig, tmp_path_factory: pytest.TempPathFactory) -> EngineConfig:
     """The tiny dummy's language model alone, without a vision tower beside it."""
-    assert tiny.model is not None
     model = tmp_path_factory.mktemp("texts") / "texts.gguf"
     model.symlink_to(tiny.model)
     return EngineConfig(model=model, threads=1)

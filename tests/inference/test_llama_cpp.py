@@ -11,9 +11,7 @@ import pytest
 from s2a_bench.errors import BadRequest, EngineError, ModelError, UsageError
 from s2a_bench.facts import LLAMA
 from s2a_bench.inference import Engine, EngineConfig, open_engine
-from s2a_bench.inference.dummy import write_dummy
 from s2a_bench.inference.llama_cpp import LlamaCppEngine, llama_cpp
-from s2a_bench.inference.llama_decode import GrammarSampler
 from s2a_bench.inference.llama_prompt import Steps, mtmd_cpp
 from s2a_bench.testing.engine import EngineSuite, ask, rgb_frame
 from s2a_bench.transport.ros.action_source import BOUNDS
@@ -79,22 +77,6 @@ def test_the_grammar_is_obeyed_and_ends_the_answer(shared: LlamaCppEngine) -> No
     assert len(answers) > 1
 
 
-def test_a_grammar_that_allows_what_the_model_says_costs_no_second_look(
-    shared: LlamaCppEngine, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seed, one = next((seed, one) for seed in range(99) if (one := text(shared, seed=seed, max_tokens=1)).isalnum())
-    looks: list[int] = []
-    monkeypatch.setattr(GrammarSampler, "_among_allowed", lambda *_: looks.append(1) or 0)
-    assert text(shared, seed=seed, max_tokens=1, grammar=f'root ::= "{one}"') == one
-    assert looks == []
-    ask(shared, seed=seed, max_tokens=1, grammar='root ::= "!" | "?"')
-    assert looks == [1]
-
-
-def test_a_grammar_works_with_a_picture(shared: LlamaCppEngine) -> None:
-    assert text(shared, images=(rgb_frame(),), max_tokens=200, grammar=PLAN).endswith("}]")
-
-
 @pytest.mark.parametrize(
     ("grammar", "reason"),
     [
@@ -132,15 +114,6 @@ def test_facts_tell_what_the_last_request_cost(shared: LlamaCppEngine) -> None:
     assert facts["predicted_n"] == 5
     assert facts["prompt_n"] > 10
     assert min(facts["prompt_ms"], facts["predicted_ms"]) > 0
-
-
-def test_preprocessing_vision_tower_and_language_model_are_parts_of_the_prompt(shared: LlamaCppEngine) -> None:
-    ask(shared, images=(rgb_frame(5, 640, 480),), max_tokens=1)
-    facts = dict(shared.facts)
-    parts = [facts[name] for name in ("preprocess_ms", "vision_encode_ms", "prompt_eval_ms")]
-    assert min(parts) > 0
-    assert sum(parts) <= facts["prompt_ms"] * 1.001 + 1  # llama.cpp's own clock has whole microseconds
-    assert "first_decode_ms" not in facts  # one token: nothing was decoded
 
 
 def test_the_vision_tower_of_a_request_before_is_not_counted_again(shared: LlamaCppEngine) -> None:
@@ -245,14 +218,6 @@ def test_a_quantisation_of_several_words_is_whole(shared: LlamaCppEngine, monkey
     assert shared.describe()["quantisation"] == "Q4_K - Medium"
 
 
-@pytest.mark.parametrize("quant", ["q8_0", "q4_0"])
-def test_quantised_dummies_load_and_answer(tmp_path: Path, quant: str) -> None:
-    model, mmproj = write_dummy(tmp_path, "tiny", quant)  # type: ignore[arg-type]
-    engine = LlamaCppEngine(EngineConfig(model=model, mmproj=mmproj, threads=1))
-    assert len(ask(engine, images=(rgb_frame(),))) == 6
-    engine.close()
-
-
 def damaged(path: Path, target: Path, old: bytes, new: bytes) -> Path:
     data = path.read_bytes()
     assert old in data
@@ -263,8 +228,6 @@ def damaged(path: Path, target: Path, old: bytes, new: bytes) -> Path:
 def test_what_only_llama_cpp_can_tell_is_a_model_error(
     tiny: EngineConfig, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    assert tiny.model is not None
-    assert tiny.mmproj is not None
     strange = damaged(tiny.model, tmp_path / "model.gguf", b"blk.3.ffn_up.weight", b"blk.3.ffn_xx.weight")
     with pytest.raises(ModelError, match=r"`model` .*model.gguf: llama.cpp: .*blk.3.ffn_up.weight"):
         LlamaCppEngine(tiny.but(model=strange))

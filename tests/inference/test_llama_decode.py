@@ -26,7 +26,6 @@ def engine(request: pytest.FixtureRequest, tiny: EngineConfig) -> Iterator[Llama
 def by_the_library(engine: LlamaCppEngine, request: Request) -> list[int]:
     """Answer with ``Llama.generate``."""
     llama = engine._llama
-    assert llama is not None
     engine._evaluate(llama, request)
     llama.set_seed(request.seed)
     return list(islice(llama.generate(llama.prompt, **SAMPLINGS[engine._config.sampling]), request.max_tokens))
@@ -55,7 +54,6 @@ def test_greedy_does_not_depend_on_the_seed(tiny: EngineConfig) -> None:
 
 def test_a_tokens_bytes_are_the_librarys(engine: LlamaCppEngine) -> None:
     llama = engine._llama
-    assert llama is not None
     for token in range(0, llama._n_vocab, 7):
         known = engine._pieces[token]
         assert engine._pieces[token] is known
@@ -70,7 +68,6 @@ def test_kv_types_and_flash_attention_reach_llama_cpp(tiny: EngineConfig, kv_typ
     config = tiny.but(kv_type=kv_type, flash_attention=flash_attention, context=512, batch=64)
     engine = LlamaCppEngine(config)
     llama = engine._llama
-    assert llama is not None
     params = llama.context_params
     assert (params.type_k, params.type_v, params.flash_attn_type) == (
         {"f32": 0, "f16": 1, "q8_0": 8, "q4_0": 2}[kv_type],

@@ -23,12 +23,6 @@ def test_it_prints_the_two_paths_and_writes_once_unless_forced(tmp_path: Path) -
     assert model.stat().st_size > 1e6
 
 
-def test_the_default_folder_is_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path))
-    out = CliRunner().invoke(app, ["dummy", "--quant", "q4_0"]).stdout
-    assert Path(out.splitlines()[0]).parent == tmp_path / "models" / "dummy-tiny"
-
-
 def test_a_dummy_of_another_model_has_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder with two mmproj files would be one of which none is found."""
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path))
@@ -36,11 +30,3 @@ def test_a_dummy_of_another_model_has_a_folder_of_its_own(tmp_path: Path, monkey
     folder = tmp_path / "models" / "dummy-gemma3-4b-tiny"
     assert {*map(Path, paths)} == set(folder.iterdir())
     assert load_headers(EngineConfig(model=Path(paths[0]))).mmproj.path == Path(paths[1])
-
-
-def test_an_unknown_model_is_refused_with_the_known_ones(tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["dummy", "--like", "llava", "--output", str(tmp_path)])
-    assert str(result.exception) == (
-        "--like: 'llava' should be 'minicpm-v-2.6', 'qwen2.5-vl-3b', 'smolvlm2-500m' or 'gemma3-4b'"
-    )
-    assert not list(tmp_path.iterdir())

@@ -12,9 +12,8 @@ from gguf import GGUFReader
 from typer.testing import CliRunner
 
 from s2a_bench.cli.model import app
-from s2a_bench.errors import ModelError
 from s2a_bench.inference import EngineConfig, open_engine
-from s2a_bench.inference.model_list import ListedModel, listed, picture_tokens
+from s2a_bench.inference.model_list import ListedModel, listed
 from s2a_bench.inference.models import HUB_MODELS, load_headers, tiny_dummy
 from s2a_bench.testing.engine import ask, rgb_frame
 
@@ -86,12 +85,6 @@ def test_a_dummy_has_its_sizes_and_the_tokens_that_its_engine_evaluates(tiny: En
     assert model.name in shown()
 
 
-def test_a_larger_picture_costs_more_and_a_smaller_one_less() -> None:
-    files = tiny_dummy()
-    small, usual, wide = (picture_tokens(*files, width, width * 3 // 4) for width in (320, 640, 1280))
-    assert small < usual < wide
-
-
 def test_fetched_models_are_listed_by_the_names_that_the_flag_takes(tmp_path: Path) -> None:
     model, mmproj = (path.read_bytes() for path in tiny_dummy())
     fetched(tmp_path, HUB_MODELS["gemma3-270m"], text=model)
@@ -138,9 +131,3 @@ def test_without_llama_cpp_the_rest_is_listed_and_the_way_out(monkeypatch: pytes
     assert row.picture_tokens is None
     assert row.error
     assert row.error.endswith("pip install '.[llama]' in the clone of s2a-bench")
-
-
-def test_an_mmproj_that_llama_cpp_cannot_load_is_one_line() -> None:
-    model, _ = tiny_dummy()
-    with pytest.raises(ModelError, match=rf"^file {model}: llama.cpp: "):
-        picture_tokens(model, model)

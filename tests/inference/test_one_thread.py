@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-from s2a_bench.errors import EngineError, ModelError
+from s2a_bench.errors import EngineError
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.echo import EchoEngine
 from s2a_bench.inference.one_thread import AHEAD, Llama, OneThreadEngine
@@ -150,12 +149,3 @@ def test_tokens_before_an_error_arrive_before_it() -> None:
     with pytest.raises(EngineError, match="enough"):
         next(tokens)
     engine.close()
-
-
-def test_errors_come_through() -> None:
-    engine = OneThreadEngine(lambda: Spy(fails_at=0))
-    with pytest.raises(EngineError, match="enough"):
-        list(engine.generate(Request("a", "b", max_tokens=9)))
-    engine.close()
-    with pytest.raises(ModelError, match="no such file"):
-        open_engine(EngineConfig(name="llama", model=Path("/no/such.gguf")))

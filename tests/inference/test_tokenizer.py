@@ -19,7 +19,6 @@ def tokenizer(tiny: EngineConfig) -> Tokenizer:
 def test_the_ids_are_those_of_the_model(tiny: EngineConfig, tokenizer: Tokenizer) -> None:
     engine = LlamaCppEngine(tiny)
     llama = engine._llama
-    assert llama is not None
     for text in ("1. go_to(kitchen)\n", " the tea", "\n\n", "küche 鍋", ""):
         assert tokenizer(text) == llama.tokenize(text.encode(), add_bos=False, special=False)
     engine.close()
@@ -40,10 +39,6 @@ def test_the_pieces_make_the_text_again(tokenizer: Tokenizer, text: str) -> None
 
 def test_a_mark_in_the_text_is_not_special(tokenizer: Tokenizer) -> None:
     assert len(tokenizer("<image>")) == 7
-
-
-def test_no_model_means_the_tiny_dummy(tokenizer: Tokenizer) -> None:
-    assert Tokenizer()("place(cup, table)") == tokenizer("place(cup, table)")
 
 
 def test_what_is_no_language_model_is_told(tiny: EngineConfig, tmp_path: Path) -> None:

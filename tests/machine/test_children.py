@@ -6,14 +6,12 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
-from threading import Event, Thread
+from threading import Thread
 
 import pytest
 
-from s2a_bench.clock import now_ns
 from s2a_bench.machine.tuning import start_child
+from tests.waiting import ended, until
 
 STUBBORN = (
     "import signal, time; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); time.sleep(600)"
@@ -34,31 +32,15 @@ time.sleep(600)
 """
 
 
-def gone(pid: int) -> bool:
-    """Return whether a process has ended, reaped or not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
-    except OSError:
-        return True
-
-
-def wait_for(condition: Callable[[], bool], timeout_s: float = 60) -> bool:
-    deadline = now_ns() + int(timeout_s * 1e9)
-    while not condition() and now_ns() < deadline:
-        Event().wait(0.02)
-    return condition()
-
-
 @pytest.mark.parametrize("where", ["main", "thread"])
 @pytest.mark.parametrize("stopped", [False, True])
 def test_a_killed_parent_takes_along_children_that_ignore_signals_or_are_stopped(where: str, stopped: bool) -> None:
     with subprocess.Popen([sys.executable, "-c", PARENT, STUBBORN, where], stdout=subprocess.PIPE) as parent:
-        assert parent.stdout
         child = int(parent.stdout.readline())
         if stopped:
             os.kill(child, signal.SIGSTOP)
         parent.kill()
-    assert wait_for(lambda: gone(child))
+    until(lambda: ended(child), 60)
 
 
 def test_a_child_lives_on_when_the_thread_that_started_it_ends() -> None:
@@ -71,9 +53,9 @@ def test_a_child_lives_on_when_the_thread_that_started_it_ends() -> None:
     thread.start()
     thread.join()
     with children[0] as child:
-        assert child.stdout
         assert child.stdout.readline() == b"ready\n"
-        assert not wait_for(lambda: child.poll() is not None, 0.3)
+        with pytest.raises(subprocess.TimeoutExpired):
+            child.wait(0.3)
         child.kill()
         assert child.wait(60) == -signal.SIGKILL
 

@@ -6,7 +6,6 @@ import os
 import subprocess
 import sys
 import threading
-import types
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from s2a_bench.machine.resources.host import CpuTimes, HostMemory, Rapl
 from s2a_bench.machine.resources.nvidia import Nvml, Tegrastats, parse_tegrastats
 from s2a_bench.machine.resources.sampler import ResourceSampler
 from s2a_bench.store.run import RunWriter, read_run
+from tests.machine.nvml import FakeNvml
 
 S = 1_000_000_000
 
@@ -144,21 +144,6 @@ def test_rapl_adds_packages_and_undoes_the_wrap(tmp_path: Path) -> None:
     reader.close()
 
 
-@given(st.lists(st.integers(0, 999), min_size=1, max_size=30))
-def test_rapl_never_loses_energy_below_one_wrap_a_reading(steps: list[int]) -> None:
-    from s2a_bench.machine.resources.host import Zone
-
-    file = os.memfd_create("energy_uj")
-    try:
-        zone, true_uj = Zone(file, 999), 0
-        for step in steps:
-            true_uj += step
-            os.pwrite(file, f"{true_uj % 1000:<4}".encode(), 0)
-            assert zone.read_uj() == true_uj
-    finally:
-        os.close(file)
-
-
 def test_rapl_without_zones_or_with_damaged_ones_is_unreadable(tmp_path: Path) -> None:
     with pytest.raises(Unreadable, match="no package zone"):
         Rapl(root=tmp_path)
@@ -166,36 +151,6 @@ def test_rapl_without_zones_or_with_damaged_ones_is_unreadable(tmp_path: Path) -
     (tmp_path / "intel-rapl:0" / "energy_uj").unlink()
     with pytest.raises(Unreadable, match=r"energy_uj: No such file.*sudo chmod"):
         Rapl(root=tmp_path)
-
-
-class FakeNvml(types.ModuleType):
-    """Stands in for pynvml with two GPUs; ``refused`` names the functions that these boards do not have."""
-
-    class NVMLError(Exception): ...
-
-    NVML_TEMPERATURE_GPU, NVML_CLOCK_SM = 0, 1
-
-    def __init__(self, *refused: str, gpus: int = 2) -> None:
-        super().__init__("pynvml")
-        answers = {
-            "nvmlInit": lambda: None,
-            "nvmlShutdown": lambda: None,
-            "nvmlSystemGetDriverVersion": lambda: "550.54",
-            "nvmlDeviceGetCount": lambda: gpus,
-            "nvmlDeviceGetHandleByIndex": lambda place: place,
-            "nvmlDeviceGetName": lambda gpu: f"RTX {gpu}",
-            "nvmlDeviceGetUtilizationRates": lambda gpu: types.SimpleNamespace(gpu=(10, 90)[gpu]),
-            "nvmlDeviceGetMemoryInfo": lambda gpu: types.SimpleNamespace(used=(1 << 30, 2 << 30)[gpu]),
-            "nvmlDeviceGetPowerUsage": lambda gpu: (20_500, 200_000)[gpu],
-            "nvmlDeviceGetTotalEnergyConsumption": lambda gpu: (5_000, 7_000)[gpu],
-            "nvmlDeviceGetTemperature": lambda gpu, _sensor: (40, 71)[gpu],
-            "nvmlDeviceGetClockInfo": lambda gpu, _clock: (300, 2_505)[gpu],
-        }
-        for name, answer in answers.items():
-            setattr(self, name, self._refuse if name in refused else answer)
-
-    def _refuse(self, *_: object) -> None:
-        raise self.NVMLError("Not Supported")
 
 
 def test_nvml_adds_up_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -233,7 +188,6 @@ def test_the_cpu_clock_of_another_process_counts_its_threads() -> None:
         "import sys,time,threading\nsum(range(3_000_000))\nprint(time.process_time_ns(), flush=True)\nsys.stdin.read()"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
         own_ns = int(process.stdout.readline())
         read_ns = CpuTimes([process.pid]).read()["server_cpu_ns"]
         process.communicate(b"")
@@ -241,12 +195,6 @@ def test_the_cpu_clock_of_another_process_counts_its_threads() -> None:
     reader = CpuTimes([process.pid])
     assert "server_cpu_ns" not in reader.read()
     assert reader.read()["client_cpu_ns"] > 0
-
-
-def test_memory_is_that_of_the_processes() -> None:
-    values = HostMemory([os.getpid()]).read()
-    assert values["client_rss_bytes"] == pytest.approx(values["server_rss_bytes"], rel=0.05)
-    assert values["memory_available_bytes"] > 0
 
 
 def test_memory_and_load_are_read_from_proc(tmp_path: Path) -> None:

@@ -34,10 +34,6 @@ t_nom_s = 1
     return parse_skills(text, "many.toml")
 
 
-def test_the_granularities_are_the_papers() -> None:
-    assert GRANULARITIES == (6, 4, 2, 1)
-
-
 @pytest.mark.parametrize("tokens", GRANULARITIES)
 @pytest.mark.parametrize("n_skills", [4, 32])
 def test_every_call_and_every_plan_costs_exactly_what_was_asked_for(
@@ -90,13 +86,6 @@ def test_codes_of_one_token_need_nothing_between_them(tokenize: Tokenize, skills
     for first in stream.texts:
         for second in stream.texts:
             assert tokenize(first + second) == tokenize(first) + tokenize(second)
-
-
-def test_codes_that_would_merge_are_not_taken() -> None:
-    def capitals_merge(text: str) -> list[int]:
-        return [hash(piece) for piece in re.findall("[A-Y]+|.", text)]
-
-    assert choose_format(many(3), 1, capitals_merge).texts == ("Z", "a", "b")
 
 
 def test_codes_that_would_merge_with_another_are_not_taken_nor_are_two_of_one_token() -> None:

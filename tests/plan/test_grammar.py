@@ -9,11 +9,6 @@ from s2a_bench.plan import Format, Parser, SkillParsed, Tokenize, grammar, load_
 from tests.plan.gbnf import Gbnf
 
 
-def test_the_grammar_allows_the_calls_and_nothing_else(format_: Format) -> None:
-    allowed = ["".join(map(str, word)) for word in Gbnf(grammar(format_, 1)).words("root")]
-    assert sorted(allowed) == sorted(format_.write([call]) for call in format_.skills.calls)
-
-
 def test_the_pinned_grammar_allows_the_counted_tokens_and_nothing_else(format_: Format, tokenize: Tokenize) -> None:
     allowed = Gbnf(grammar(format_, 1, tokenize)).words("root")
     assert sorted(allowed) == sorted(tuple(tokenize(format_.write([call]))) for call in format_.skills.calls)
@@ -49,13 +44,6 @@ def test_what_the_pinned_grammar_allows_is_the_tokens_of_a_plan(format_: Format,
 def test_llama_cpp_takes_it(format_: Format, tokenize: Tokenizer, n_skills: int, pinned: bool) -> None:
     text = grammar(format_, n_skills, tokenize if pinned else None)
     assert grammar_error(tokenize._vocab, text) == ""
-
-
-def test_it_is_short_enough_to_read() -> None:
-    text = grammar(paper_format(load_skills("driving")), 2)
-    speeds = '("0)\\n" | "5" (")\\n" | [05] ")\\n") | [1234] [05] ")\\n" | "60)\\n")'
-    lanes = '"change_lane(" ("left)\\n" | "right)\\n")'
-    assert text == f'root ::= "1. " skill "2. " skill\nskill ::= ("set_speed(" {speeds} | {lanes})\n'
 
 
 def test_a_number_may_share_a_token_with_what_follows() -> None:

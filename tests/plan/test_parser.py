@@ -152,11 +152,6 @@ def test_no_text_breaks_it_surrogates_included(format_: Format, text: str) -> No
     assert not {"\ufffd"} & set("".join(calls(parse(format_, [text]))))
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_a_lone_surrogate_is_no_skill(name: str) -> None:
-    assert calls(parse(FORMATS[name], ["\ud800\n"])) == []
-
-
 def test_a_lone_surrogate_is_not_the_code_that_python_replaces_it_with() -> None:
     stream = replace(FORMATS["1 household"], texts=("?", *FORMATS["1 household"].texts[1:]))
     assert calls(parse(stream, ["?"])) == ["go_to(kitchen)"]
@@ -186,13 +181,6 @@ def test_work_grows_with_the_length_only(name: str, piece: bytes) -> None:
     for size in (3, 10**9):
         once, fourfold = work(piece * 1000, size), work(piece * 4000, size)
         assert fourfold <= 4 * once + 100
-
-
-def test_every_call_comes_back(format_: Format) -> None:
-    for index, call in enumerate(format_.skills.calls):
-        parser = Parser(format_)
-        assert parser.feed(format_.write([call])) == [SkillParsed(0, call, 0, 0)], index
-        assert parser.close() == []
 
 
 def test_a_skill_comes_with_the_token_that_completes_it(format_: Format, tokenize: Tokenize) -> None:
@@ -304,15 +292,6 @@ def test_what_the_end_leaves_open_is_not_guessed(
 ) -> None:
     events = parse(format_, [answer])
     assert (calls(events), problems(events)) == (found, wrong)
-
-
-def test_a_word_that_may_go_on_is_not_guessed() -> None:
-    words = FORMATS["words"]
-    shorter = next(
-        text for text in words.texts if any(other != text and other.startswith(text) for other in words.texts)
-    )
-    assert problems(parse(words, [f"1. {shorter}"])) == ["incomplete"]
-    assert problems(parse(words, [f"1. {shorter}\n"])) == []
 
 
 def test_a_bad_run_of_codes_ends_at_a_blank() -> None:

@@ -12,8 +12,6 @@ from s2a_bench.plan import (
     SkillSet,
     choose_format,
     grammar,
-    load_skills,
-    paper_format,
     prompt,
 )
 from s2a_bench.types import Request, Token
@@ -47,11 +45,3 @@ def test_a_model_under_the_grammar_writes_n_skills_of_l_tokens(
         assert parser.close() == []
         assert all(isinstance(event, SkillParsed) for event in events)
         assert [event.piece for event in events] == [size * at - 1 for at in range(1, 9)]
-
-
-def test_a_model_under_the_grammar_writes_the_papers_form(engine: LlamaCppEngine) -> None:
-    paper = paper_format(load_skills("household"))
-    answer = "".join(token.text for token in tokens(engine, prompt(paper, 8), grammar(paper, 8), 1))
-    assert [line.partition(".")[0] for line in answer.splitlines()] == list("12345678")
-    parser = Parser(paper)
-    assert len([event for event in parser.feed(answer) if isinstance(event, SkillParsed)]) == 8

@@ -106,12 +106,6 @@ def test_a_regret_over_nothing_is_absent() -> None:
     assert found.fluidity == [1.0]
 
 
-def test_numbers_a_skill_keep_the_shape_of_the_plans() -> None:
-    plans = draw(6, 5, 2, 1.2, 4)
-    schedule = policy("naive").schedule(plans)
-    assert stalls(schedule).shape == (4, 4)
-
-
 @settings(deadline=None, max_examples=100)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.floats(0.3, 4.0))
 def test_fluidity_agrees_with_etalons_algorithm(seed: int, n_skills: int, rho: float) -> None:

@@ -124,13 +124,6 @@ def test_t2_a_linear_program_finds_nothing_less_in_any_component(plans: Plans, r
     assert elastic(plans).start_s[:, 0] == pytest.approx(found.x, abs=1e-7)
 
 
-@quick
-@given(elastic_plans())
-def test_the_papers_start_is_not_minimal_once_skills_may_be_stretched(plans: Plans) -> None:
-    earlier = safe_start(plans.arrival_s, plans.most_s)
-    assert earlier <= safe_start(plans.arrival_s, plans.nominal_s)
-
-
 def test_stretching_can_start_earlier_than_the_papers_start() -> None:
     plans = Plans(*(np.array(column)[:, np.newaxis] for column in ([0.0, 2.0], [1.0, 1.0], [1.0, 1.0], [2.0, 2.0])))
     assert safe_start(plans.arrival_s, plans.nominal_s) == [1.0]

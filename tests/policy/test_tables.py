@@ -7,7 +7,6 @@ from decimal import Decimal
 import numpy as np
 import pytest
 
-from benchmarks.evaluate import evaluate
 from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.metrics import measure
@@ -49,15 +48,3 @@ def test_a_timeline_has_the_numbers_of_the_table(rate: str, length: int, name: s
     assert shown(found.stall_s[0].item(), stall_s) == Decimal(stall_s)
     assert shown(found.first_action_s[0].item(), start_s) == Decimal(start_s)
     assert shown(found.end_s[0].item(), end_s) == Decimal(end_s)
-
-
-@pytest.mark.parametrize(("rate", "length", "name", "cell"), CASES)
-def test_evaluating_without_schedules_gives_the_same_numbers(rate: str, length: int, name: str, cell: str) -> None:
-    found = evaluate(uniform(PROMPT_S[rate], length, float(rate), N_SKILLS), np.full((N_SKILLS, 1), T_NOM_S))
-    numbers = {
-        "naive": (found.naive_stalls, found.naive_stall_s, found.naive_start_s, found.end_s),
-        "wait-then-act": (np.zeros(1), np.zeros(1), found.wait_start_s, found.wait_end_s),
-        "s2a-clairvoyant": (np.zeros(1), np.zeros(1), found.safe_start_s, found.end_s),
-    }[name]
-    for number, text in zip(numbers, cell.split("/"), strict=True):
-        assert shown(number[0].item(), text) == Decimal(text)

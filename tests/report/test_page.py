@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from html import unescape
 from html.parser import HTMLParser
@@ -20,7 +20,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.lanes import page_lanes
@@ -35,7 +34,7 @@ from s2a_bench.store.sweep import CELLS, CellRow
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.lanes import LanePanel
-from s2a_bench.writers.latex import PREAMBLE, document, escape, to_siunitx
+from s2a_bench.writers.latex import escape, to_siunitx
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import ABSENT, TextTable
 from tests.report.conftest import REAL
@@ -246,12 +245,6 @@ def test_cells_of_one_name_are_not_made_one(tmp_path: Path) -> None:
     assert first.name != second.name
 
 
-def test_timelines_of_other_settings_are_kept_apart(tmp_path: Path) -> None:
-    same: dict[str, Any] = {"profiles": ("rtx-4080",), "tokens_per_skill": (6,), "policies": ("naive",)}
-    runs = [({"t-max": most}, timeline(tmp_path, t_max=most, **same)) for most in (1.0, 2.0)]
-    assert len(read_chapters([sweep_of(tmp_path / "sweeps", runs)])) == 3
-
-
 @pytest.mark.slow
 def test_measured_cells_stand_side_by_side_and_are_not_pooled(tmp_path: Path, make_run: MakeRun) -> None:
     runs = [({"runs": n}, make_run(n=n).path) for n in range(2, MOST_CHAPTERS + 4)]
@@ -284,19 +277,6 @@ def test_an_unfinished_run_is_shown_and_told(make_run: MakeRun, state: str, erro
 def test_a_run_without_rows_is_told(make_run: MakeRun) -> None:
     (chapter,) = read_chapters([make_run({}).path])
     assert chapter.content.sentences == ("The run has no rows: it ended before anything was measured.",)
-
-
-def test_a_timeline_that_was_cut_off_does_not_hide_the_others(computed: Path, tmp_path: Path) -> None:
-    cut = shutil.copytree(computed, tmp_path / "cut")
-    manifest = json.loads((cut / "manifest.json").read_text())
-    del manifest["configuration"]
-    (cut / "manifest.json").write_text(json.dumps({**manifest, "state": "running"}))
-    (cut / "skills.parquet").unlink()
-    (cut / "skills.csv").unlink()
-    chapters = read_chapters([cut, computed])
-    assert len(chapters) == 2
-    assert chapters[0].caveats
-    assert not chapters[1].caveats
 
 
 def test_rows_that_their_manifest_does_not_fit_fail_alone(computed: Path, tmp_path: Path) -> None:
@@ -342,19 +322,6 @@ def test_every_verdict_has_its_evidence_on_the_page(computed: Path) -> None:
     assert "Run: s2a-bench latency" in page.text
     for verdict in ("supported", "contradicted", "undecided"):
         assert f'class="claim {verdict}"' in text
-
-
-def test_what_a_report_wrote_may_be_replaced_and_nothing_else(tmp_path: Path, computed: Path) -> None:
-    page, other = tmp_path / "page.html", tmp_path / "mine.html"
-    report = make_report(read_chapters([computed]))
-    for _ in range(2):
-        write_report(report, ReportConfig(runs=[computed], output=page, markdown=tmp_path / "page.md"))
-    other.write_text("<html>mine</html>")
-    wrong = {"output": other, "markdown": other, "latex": other, "csv": other}
-    for field, path in (*wrong.items(), ("output", tmp_path)):
-        with pytest.raises(UsageError, match=f"`{field}`"):
-            ReportConfig(runs=[computed], **{field: path})
-    assert other.read_text() == "<html>mine</html>"
 
 
 def test_files_lie_in_a_folder_a_run(tmp_path: Path, computed: Path, make_run: MakeRun) -> None:
@@ -448,34 +415,6 @@ def test_no_text_is_a_command_to_latex(text: str) -> None:
     assert escaped.isprintable()
     left = re.sub(r"\\(text[a-z]+\{\}|[{}_%&#$])|\$\\?[a-z^0-9-]+\$", "", escaped)
     assert not set(left) & set("\\{}_%&#$^~<>|")
-
-
-def tables_of(make_run: MakeRun) -> Iterator[TextTable]:
-    rows: list[tuple[str, ...]] = [(HOSTILE, "1.5 ± 0.2"), ("[x]", ABSENT)]
-    yield TextTable(HOSTILE, (HOSTILE, "n"), rows, 1, notes=(HOSTILE, "λ ≥ 2 → ☃"), provenance=HOSTILE)
-    (chapter,) = read_chapters([make_run(n=3).path], against="paper")
-    yield from chapter.content.tables.values()
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not shutil.which("pdflatex"), reason="there is no pdflatex on this machine")
-def test_the_latex_compiles(tmp_path: Path, computed: Path, make_run: MakeRun) -> None:
-    for package in ("siunitx.sty", "booktabs.sty"):
-        if subprocess.run(["kpsewhich", package], capture_output=True, check=False).returncode:
-            pytest.skip(f"TeX has no {package}")
-    odd = shutil.copytree(computed, tmp_path / "50 % of_a #run {x}")
-    report = make_report(read_chapters([odd, make_run(n=3).path], against="paper"), against="paper")
-    write_report(report, ReportConfig(runs=[odd], latex=tmp_path / "tex"))
-    texts = [to_siunitx(table, long=long) for table in tables_of(make_run) for long in (False, True)]
-    (tmp_path / "tex" / "hard.tex").write_text(document(HOSTILE, texts))
-    for name in ("report", "hard"):
-        command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", f"{name}.tex"]
-        done = subprocess.run(
-            command, cwd=tmp_path / "tex", capture_output=True, text=True, errors="replace", check=False, timeout=120
-        )
-        assert done.returncode == 0, done.stdout[-2000:].decode(errors="replace")
-        assert (tmp_path / "tex" / f"{name}.pdf").stat().st_size > 10_000
-    assert "siunitx" in PREAMBLE
 
 
 def test_a_chapter_of_another_command_is_named_and_not_guessed_at(make_run: MakeRun) -> None:

@@ -185,34 +185,6 @@ class ActionSuite:
         assert cancel(join(), ALL_GOALS) == (CancelCode.NONE, {goal.id for goal in goals})
         assert all(goal.cancel_requested for goal in goals)
 
-    def test_no_step_is_taken_that_the_state_does_not_allow(self, action: Action) -> None:
-        send(action.client)
-        goal = receive(action.server)
-        goal.accept()
-        with pytest.raises(TransportError, match="is ACCEPTED and cannot become SUCCEEDED"):
-            goal.succeed(llama.text_result(""))
-        goal.executing()
-        with pytest.raises(TransportError, match="is EXECUTING and cannot become CANCELED"):
-            goal.canceled(llama.text_result(""))
-        goal.succeed(llama.text_result(""))
-        with pytest.raises(TransportError, match="is SUCCEEDED and cannot become ABORTED"):
-            goal.abort(llama.text_result(""))
-
-    def test_goals_queue_while_one_executes(self, action: Action) -> None:
-        client = action.client
-        sent = [send(client, str(number)) for number in range(3)]
-        goals = [receive(action.server) for _ in sent]
-        for goal in goals:
-            goal.accept()
-        assert [event(client, Accepted).goal_id for _ in sent] == sent
-        for goal in goals:
-            assert goal.executing()
-            goal.succeed(llama.text_result("answer to " + goal.unpack().prompt))
-        results = [event(client, Result) for _ in sent]
-        assert [result.goal_id for result in results] == sent
-        texts = [client.unpack_result(result.packed).response.text for result in results]
-        assert texts == ["answer to 0", "answer to 1", "answer to 2"]
-
     def test_two_clients_get_only_their_own(self, action: Action, join: Join) -> None:
         other = join().action_client(NAME, llama.GENERATE_RESPONSE)
         assert other.wait_for_server(WAIT_S)

@@ -46,26 +46,6 @@ def test_only_the_steps_of_the_state_machine_are_taken(present: Status, wanted: 
             goals.move(goal_id(1), wanted)
 
 
-def test_an_id_is_taken_while_offered_accepted_or_remembered() -> None:
-    goals = Goals(5)
-    assert goals.offer(goal_id(1))
-    assert not goals.offer(goal_id(1))
-    goals.accept(goal_id(1), 0)
-    assert not goals.offer(goal_id(1))
-    ended(goals, 1, now_ns=0)
-    assert not goals.offer(goal_id(1))
-    goals.expire(5)
-    assert goals.offer(goal_id(1))
-
-
-def test_a_rejected_goal_is_forgotten() -> None:
-    goals = Goals(5)
-    goals.offer(goal_id(1))
-    goals.reject(goal_id(1))
-    assert goals.status(goal_id(1)) == Status.UNKNOWN
-    assert goals.offer(goal_id(1))
-
-
 @pytest.mark.parametrize(
     ("asked", "stamp_ns", "code", "chosen"),
     [
@@ -78,17 +58,6 @@ def test_a_rejected_goal_is_forgotten() -> None:
         (goal_id(3), 10, CancelCode.NONE, [1, 3]),
         (goal_id(9), 10, CancelCode.NONE, [1]),
         (ALL_GOALS, 1, CancelCode.NONE, []),
-    ],
-    ids=[
-        "one",
-        "unknown",
-        "ended",
-        "cancelling",
-        "all",
-        "until",
-        "until-and-one",
-        "until-and-unknown",
-        "none-so-early",
     ],
 )
 def test_a_cancel_request_means_these_goals(asked: bytes, stamp_ns: int, code: CancelCode, chosen: list[int]) -> None:

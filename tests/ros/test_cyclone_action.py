@@ -151,23 +151,6 @@ def test_what_is_no_node_name_is_refused(dds_domain: int) -> None:
         open_middleware(domain_id=dds_domain, node_name="my node")
 
 
-def test_a_goal_of_version_4_4_makes_the_round(join: Join) -> None:
-    server = join().action_server(NAME, llama.GENERATE_RESPONSE, version="4.4")
-    for version in ("6.0", "4.4"):
-        client = join().action_client(NAME, llama.GENERATE_RESPONSE, version)
-        assert client.wait_for_server(20)
-        assert client.server_version() == "4.4"
-    client.send(client.pack(llama.generate_goal("p", version="4.4", grammar="root ::= x")))
-    goal = receive(server)
-    goal.accept()
-    assert goal.unpack().sampling_config.grammar == "root ::= x"
-    assert llama.goal_images(goal.unpack()) == []
-    goal.executing()
-    goal.succeed(llama.text_result("x", version="4.4"))
-    event(client, Accepted)
-    assert client.unpack_result(event(client, Result).packed).response.text == "x"
-
-
 def test_replies_to_other_clients_are_ignored(join: Join) -> None:
     from s2a_bench.ros.dds_service import HEADER, HEADER_AT, Caller
 

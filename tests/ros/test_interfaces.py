@@ -13,7 +13,6 @@ import pytest
 from s2a_bench.errors import UsageError
 from s2a_bench.ros import llama
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.messages import read_package
 from s2a_bench.types import Frame
 
 DATA = Path(__file__).parent.parent / "data"
@@ -78,44 +77,3 @@ def test_llama_msgs_4_4_takes_one_image() -> None:
 def test_an_unknown_version_is_named() -> None:
     with pytest.raises(UsageError, match=r"'7.0' is none of 6.0, 4.4"):
         ros.typestore("7.0")
-
-
-def test_interface_files_become_the_types_ros_derives(tmp_path: Path) -> None:
-    for kind, text in {
-        "msg": "Item[] items\nint32 number -3 # a comment\nstring[2] names\n",
-        "srv": "bool on\n---\nstring message\n",
-        "action": "Thing thing\n---\nint8 code 7\n---\nuint8 percent\n",
-    }.items():
-        (tmp_path / kind).mkdir()
-        (tmp_path / kind / f"Thing.{kind}").write_text(text)
-    (tmp_path / "msg" / "README").write_text("not an interface")
-    definitions, defaults = read_package(tmp_path, "pkg")
-    fields = {name: [field for field, _ in of] for name, (_, of) in definitions.items()}
-    of_service = {
-        "": ["request_message", "response_message", "event_message"],
-        "_Event": ["info", "request", "response"],
-    }
-    services = ("pkg/srv/Thing", "pkg/action/Thing_SendGoal", "pkg/action/Thing_GetResult")
-    assert fields == {
-        **{service + part: names for service in services for part, names in of_service.items()},
-        "pkg/msg/Thing": ["items", "number", "names"],
-        "pkg/srv/Thing_Request": ["on"],
-        "pkg/srv/Thing_Response": ["message"],
-        "pkg/srv/Thing_Request__wire": ["guid", "seq", "body"],
-        "pkg/srv/Thing_Response__wire": ["guid", "seq", "body"],
-        "pkg/action/Thing_Goal": ["thing"],
-        "pkg/action/Thing_Result": ["code"],
-        "pkg/action/Thing_Feedback": ["percent"],
-        "pkg/action/Thing_SendGoal_Request": ["goal_id", "goal"],
-        "pkg/action/Thing_SendGoal_Response": ["accepted", "stamp"],
-        "pkg/action/Thing_GetResult_Request": ["goal_id"],
-        "pkg/action/Thing_GetResult_Response": ["status", "result"],
-        "pkg/action/Thing_FeedbackMessage": ["goal_id", "feedback"],
-        "pkg/action/Thing_SendGoal_Request__wire": ["guid", "seq", "body"],
-        "pkg/action/Thing_SendGoal_Response__wire": ["guid", "seq", "body"],
-        "pkg/action/Thing_GetResult_Request__wire": ["guid", "seq", "body"],
-        "pkg/action/Thing_GetResult_Response__wire": ["guid", "seq", "body"],
-    }
-    assert defaults["pkg/msg/Thing"] == {"number": -3}
-    assert defaults["pkg/action/Thing_Result"] == {"code": 7}
-    assert definitions["pkg/action/Thing_Goal"][1][0][1][1] == "pkg/msg/Thing"

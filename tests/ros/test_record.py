@@ -12,7 +12,6 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 
 from s2a_bench.errors import StoreError
-from s2a_bench.frames import open_source
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros import record
 from s2a_bench.ros.record import BagRecorder
@@ -56,18 +55,6 @@ def test_what_was_sent_reads_back_byte_for_byte(tmp_path: Path, name: str, live:
     ]
 
 
-def test_the_name_says_file_or_folder(tmp_path: Path) -> None:
-    for name in ("one.mcap", "two"):
-        with BagRecorder(tmp_path / name) as recorder:
-            recorder.write("/a", STRING, cdr("x"), 1)
-    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == [
-        "one.mcap",
-        "two",
-        "two/metadata.yaml",
-        "two/two.mcap",
-    ]
-
-
 def test_definitions_and_hashes_travel_with_it(tmp_path: Path) -> None:
     with BagRecorder(tmp_path / "run.mcap") as recorder:
         recorder.write("/token", ros.TOKEN, token(3), 1)
@@ -77,16 +64,6 @@ def test_definitions_and_hashes_travel_with_it(tmp_path: Path) -> None:
         (qos,) = connection.ext.offered_qos_profiles
         assert (qos.depth, qos.reliability.name, qos.durability.name) == (10, "RELIABLE", "VOLATILE")
     assert ros.type_hash(ros.TOKEN).encode() in (tmp_path / "run.mcap").read_bytes()
-
-
-def test_a_recorded_camera_is_a_source(tmp_path: Path) -> None:
-    pixels = np.random.default_rng(1).integers(0, 256, (48, 64, 3), np.uint8)
-    with BagRecorder(tmp_path / "run.mcap") as recorder:
-        recorder.write("/token", ros.TOKEN, token(0), 1)
-        recorder.write("/camera", ros.IMAGE, ros.image_message(Frame(0, 0, 64, 48, "rgb8", pixels), 9, "camera"), 2)
-    source = open_source(f"bag:{tmp_path}/run.mcap", 64, 48)
-    np.testing.assert_array_equal(source.read().data, pixels)
-    source.close()
 
 
 def test_writing_waits_for_flush(tmp_path: Path) -> None:

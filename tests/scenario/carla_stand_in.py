@@ -27,20 +27,17 @@ class RosWorld(Embedded):
     """Its ego does what the newest command says, whatever `step` is given; each step shows a picture.
 
     CARLA steps with the command that it has. This world waits for the one of the step, so that drives are the same each
-    time; with ``late`` it applies the one before.
+    time.
     """
 
     over_ros: ClassVar[bool] = True
 
-    def __init__(
-        self, node: Middleware, type_name: str, commands: str, pictures: str, *, late: bool = False, wait_s: float = 20
-    ) -> None:
+    def __init__(self, node: Middleware, type_name: str, commands: str, pictures: str, *, wait_s: float = 20) -> None:
         super().__init__()
         self._node, self._type, self._wait_s = node, type_name, wait_s
         self._commands = node.subscription(commands, type_name, QUEUE)
         self._pictures = node.publisher(pictures, ros.IMAGE, QUEUE)
         self._eye: FrameSource | None = None
-        self._delay = int(late)
         self.received: list[Any] = []
         self.closed = 0
         self.blind = False
@@ -58,9 +55,8 @@ class RosWorld(Embedded):
         packed = self._commands.take(self._wait_s)
         assert packed is not None, "no command came"
         self.received.append(self._commands.unpack(packed))
-        newest = self.received[-1 - self._delay] if len(self.received) > self._delay else self.received[-1]
         acceleration = command.acceleration_mps2.copy()
-        acceleration[EGO] = self._acceleration_of(newest)
+        acceleration[EGO] = self._acceleration_of(self.received[-1])
         self.state = super().step(replace(command, acceleration_mps2=acceleration))
         if self._eye and not self.blind:
             self._publish(self._eye)

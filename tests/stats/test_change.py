@@ -40,7 +40,6 @@ def found(n: int, correlation: float, trend: float, factor: float, statistic: st
     for seed in range(REPEATS):
         first, second = (rows_of(launch(rng, n, correlation, trend=trend) * by) for by in (1.0, factor))
         p = change_between([first], [second], statistic, seed=seed).p
-        assert p is not None
         times += p < LEVEL
     return times
 
@@ -69,15 +68,6 @@ def test_a_slowdown_of_ten_per_cent_is_found(n: int, correlation: float, least: 
     assert found(n, correlation, 0.0, 1.1) >= least
 
 
-def test_a_test_that_takes_samples_for_independent_would_find_what_is_not_there() -> None:
-    rng = np.random.default_rng(20)
-    naive = 0
-    for _ in range(REPEATS):
-        first, second = launch(rng, 200, 0.8), launch(rng, 200, 0.8)
-        naive += stats.mannwhitneyu(first, second).pvalue < LEVEL
-    assert naive > 30
-
-
 def test_launches_that_differ_by_themselves_are_judged_by_launches() -> None:
     rng = np.random.default_rng(3)
     by_launch = by_request = 0
@@ -85,8 +75,6 @@ def test_launches_that_differ_by_themselves_are_judged_by_launches() -> None:
         sides = [[rows_of(launch(rng, 50, 0.2, 0.05) * rng.lognormal(0, 0.08)) for _ in range(5)] for _ in range(2)]
         many = change_between(*sides, "median", seed=seed).p
         one = change_between(sides[0][:1], sides[1][:1], "median", seed=seed).p
-        assert many is not None
-        assert one is not None
         by_launch += many < LEVEL
         by_request += one < LEVEL
     assert by_launch <= 9
@@ -119,7 +107,6 @@ def test_the_means_of_ten_batches_of_one_value_are_compared_as_welchs_t_does() -
         pytest.approx(high, abs=0.2),
     )
     assert change.relative == pytest.approx(2 / 15)
-    assert change.noise is not None
     reach = float(stats.t.ppf(0.975, change.noise.freedom)) * change.noise.error * 15  # a share of the baseline, -15
     assert change.difference.high == pytest.approx(2 + reach)
     assert not change.noise.logarithmic
@@ -131,8 +118,6 @@ def test_interval_and_p_value_agree() -> None:
         change = change_between(
             [rows_of(launch(rng, 60, 0.3))], [rows_of(launch(rng, 60, 0.3) * 1.06)], "median", seed=seed
         )
-        assert change.p is not None
-        assert change.bounds is not None
         assert (change.p < LEVEL) == (not change.bounds[0] <= 0 <= change.bounds[1])
 
 
@@ -140,7 +125,6 @@ def test_sides_changed_over_turn_the_ratio_over() -> None:
     rng = np.random.default_rng(1)
     sides = [[rows_of(launch(rng, 400, 0.2))], [rows_of(launch(rng, 400, 0.2) * 1.2)]]
     there, back = (change_between(*order, "median", seed=1) for order in (sides, sides[::-1]))
-    assert there.ratio.value is not None
     assert back.ratio.value == pytest.approx(1 / there.ratio.value)
     assert back.difference.value == -(there.difference.value or 0)
     assert back.superiority.value == pytest.approx(1 - (there.superiority.value or 0))
@@ -150,8 +134,6 @@ def test_the_probability_of_superiority_by_hand() -> None:
     # Of 6 x 5 pairs: 7 beats 1..5 (5); 3 beats 1, 2 and ties 3 (2.5); four zeros beat nothing: 7.5 of 30.
     change = change_between([rows_of([1, 2, 3, 4, 5])], [rows_of([7, 3, 0, 0, 0, 0])], "median", seed=0)
     assert change.superiority.value == 7.5 / 30
-    assert change.superiority.low is not None
-    assert change.superiority.high is not None
     assert change.superiority.low <= 0.25 <= change.superiority.high
 
 
@@ -229,7 +211,6 @@ def test_something_out_of_nothing_has_no_size() -> None:
     change = change_between([rows_of([0.0] * 20)], [rows_of([0.0, 1.0] * 10)], "mean", seed=0)
     assert (change.relative, change.bounds, change.ratio.value) == (None, None, None)
     assert change.difference.value == 0.5
-    assert change.p is not None
     assert change.p < 0.01
     slow = change_between([rows_of([0.0] * 20)], [rows_of([0.0] * 10 + [1.0] * 10)], "mean", seed=0)
     assert slow.noise is None  # no share of nothing

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from s2a_bench.stats import Ratio
-from s2a_bench.stats.change import change_between, ratio_of_blocks, ratio_of_launches
+from s2a_bench.stats.change import ratio_of_blocks, ratio_of_launches
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -24,9 +24,7 @@ def blocks_of(values: Sequence[float] | Floats) -> Mapping[int, list[float]]:
 
 
 def ratio(above: Sequence[float] | Floats, below: Sequence[float] | Floats, seed: int = 1) -> Ratio:
-    found = ratio_of_blocks(blocks_of(above), blocks_of(below), seed)
-    assert found is not None
-    return found
+    return ratio_of_blocks(blocks_of(above), blocks_of(below), seed)
 
 
 def remembering(rng: np.random.Generator, n: int, correlation: float) -> Floats:
@@ -36,8 +34,6 @@ def remembering(rng: np.random.Generator, n: int, correlation: float) -> Floats:
 
 
 def width(found: Ratio) -> float:
-    assert found.low is not None
-    assert found.high is not None
     return found.high - found.low
 
 
@@ -68,8 +64,6 @@ def test_the_interval_covers_a_known_ratio_about_as_often_as_it_says(
         load = shared * remembering(rng, n, correlation)
         own = [math.sqrt(1 - shared**2) * remembering(rng, n, correlation) for _ in range(2)]
         found = ratio(6 * np.exp(0.15 * (load + own[0])), np.exp(0.15 * (load + own[1])), seed=trial)
-        assert found.low is not None
-        assert found.high is not None
         covered += found.low <= 6 <= found.high
     assert covered >= least
 
@@ -85,21 +79,7 @@ def test_samples_of_one_block_stay_together() -> None:
     levels = [1.0, 3.0, 2.0, 1.5, 2.5, 1.2] * 4
     single = ratio(levels, np.ones(24))
     many = ratio_of_blocks({block: [value] * 10 for block, value in enumerate(levels)}, blocks_of(np.ones(24)), 1)
-    assert many is not None
     assert width(many) == pytest.approx(width(single), rel=0.1)
-
-
-def test_the_same_seed_gives_the_same_interval() -> None:
-    values = np.random.default_rng(1).lognormal(0, 1, 30)
-    assert ratio(values, values[::-1], 5) == ratio(values, values[::-1], 5)
-    assert ratio(values, values[::-1], 5) != ratio(values, values[::-1], 6)
-
-
-def test_a_wider_confidence_gives_a_wider_interval() -> None:
-    rows = np.random.default_rng(1).lognormal(0, 1, (30, 1))
-    sides = [list(np.ones((30, 1)))], [list(rows)]
-    narrow, wide = (change_between(*sides, "median", seed=5, confidence=by, paired=True).ratio for by in (0.5, 0.99))
-    assert width(narrow) < width(wide)
 
 
 @pytest.mark.parametrize(
@@ -146,16 +126,10 @@ def test_over_launches_the_interval_covers_what_one_launch_cannot_know(spread: f
     for seed in range(400):
         above, below = launches(rng, 5, spread)
         found = ratio_of_launches(above, below, seed)
-        assert found is not None
-        assert found.low is not None
-        assert found.high is not None
         covered += found.low <= 6 <= found.high
         if seed < 100:
             above, below = launches(rng, 1, spread, runs=75)  # as many requests, all in one launch
             one = ratio_of_launches(above, below, seed)
-            assert one is not None
-            assert one.low is not None
-            assert one.high is not None
             alone += one.low <= 6 <= one.high
     assert 366 <= covered <= 393  # 99 of 100 of Binomial(400, 0.95)
     assert alone <= {0.04: 94, 0.08: 82, 0.13: 65}[spread]

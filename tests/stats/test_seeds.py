@@ -50,7 +50,6 @@ def test_other_seeded_draws() -> None:
     assert zlib.crc32(render_scene(64, 48, 3).tobytes()) == 629266562
     assert [item for _, item in rounds("abcdef", 1, 7)] == ["c", "d", "f", "b", "e", "a"]
     latencies = read_latency("lognormal:mean_ms=80,cv=0.2")
-    assert latencies is not None
     assert list(islice(sequence_ns(latencies), 3)) == [80_424_284, 76_420_726, 89_054_362]
     assert World(10.0, 0.5, 2, 2, 1.0).draw(generator(0, "a"), 2).arrival_s.tolist() == [
         [0.6739093793962383, 0.6058667073534734],

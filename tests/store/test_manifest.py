@@ -12,12 +12,6 @@ from s2a_bench.store import manifest as manifests
 from s2a_bench.store.run import read_run
 
 
-def test_facts_are_merged_key_by_key_where_both_have_keys() -> None:
-    found: dict[str, object] = {"a": {"b": 1, "c": {"d": 2}}, "e": 3, "f": {"g": 4}}
-    manifests.merge(found, {"a": {"c": {"h": 5}}, "e": {"i": 6}, "f": 7, "j": {"k": 8}})
-    assert found == {"a": {"b": 1, "c": {"d": 2, "h": 5}}, "e": {"i": 6}, "f": 7, "j": {"k": 8}}
-
-
 def test_what_has_no_value_is_absent_where_its_default_is_none_and_null_where_it_is_not() -> None:
     @dataclass
     class Told:

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from s2a_bench.store.files import RESERVE, release, reserve, why
+from s2a_bench.store.files import why
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])
@@ -26,10 +26,3 @@ def test_where_there_is_no_room_the_file_system_and_what_is_free_are_told(
     assert why(full, tmp_path) == text.replace(", 12,345 bytes free", "")
     assert why(OSError(errno.EIO, "broken"), tmp_path) == "broken"
     assert why(OSError("own words"), tmp_path) == "own words"
-
-
-def test_the_reserve_is_given_back_once(tmp_path: Path) -> None:
-    reserve(tmp_path)
-    assert (tmp_path / RESERVE).stat().st_size == 256 * 1024
-    assert release(tmp_path)
-    assert not release(tmp_path)

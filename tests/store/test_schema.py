@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from s2a_bench.provenance import Origins, Provenance
-from s2a_bench.store.requests import SampleRow, samples_table
 from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.store.schema import Table
 
@@ -70,15 +69,6 @@ def test_columns_that_an_older_run_does_not_have_are_null(tmp_path: Path) -> Non
     assert done.equals(running)
     assert done["whole"].tolist() == [1, 2]
     assert done["later"].isna().tolist() == [True, True]
-
-
-def test_a_request_is_of_the_first_launch_and_has_no_token_unless_it_says_so() -> None:
-    names = ("cell", "pipeline", "variant", "payload", "connection", "engine", "mode", "size")
-    row = SampleRow(*names, block=1, position=2, warmup=False, request_id="r", frame_index=3)
-    found = dict(zip((table := samples_table({})).columns, table.values(row), strict=True))
-    names = ("launch", "n_tokens", "error", "marks", "facts")
-    assert [found[name] for name in names] == [0, 0, "", "[]", "{}"]
-    assert found["payload_bytes"] is found["last_token_ns"] is found["e2e_ns"] is None
 
 
 def test_a_row_says_itself_where_it_comes_from_else_its_cell_or_the_run(tmp_path: Path) -> None:

@@ -10,24 +10,11 @@ import pytest
 
 from s2a_bench.store.run import read_run
 from studies.rows import STUDY_CELLS
-
-ROOT = Path(__file__).parent.parent.parent
-
-
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "studies", *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=200,
-        cwd=ROOT,
-    )
+from tests.studies.program import ROOT, run
 
 
 def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
-    done = run("misfit", "--plans", "100", "--calibration-plans", "100", "--output", str(tmp_path))
-    assert done.returncode == 0, done.stderr
+    done = run("misfit", "--plans", "100", "--calibration-plans", "100", output=tmp_path)
     assert "Wrong beliefs" in done.stdout
     assert (
         "warning [few-calibration-plans]: 100 calibration plans are few: one lambda may stall up to 6.7%" in done.stderr
@@ -55,10 +42,7 @@ def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_use_is_one_line_and_leaves_nothing_behind(arguments: list[str], message: str, tmp_path: Path) -> None:
-    done = run(*arguments, "--output", str(tmp_path))
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert "Traceback" not in done.stderr
+    assert message in run(*arguments, output=tmp_path, code=2).stderr
     assert list(tmp_path.iterdir()) == []
 
 

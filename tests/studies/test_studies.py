@@ -67,7 +67,6 @@ def test_the_settings_are_those_of_the_specification() -> None:
 def test_a_world_draws_what_the_specification_says() -> None:
     world = World(4.8, 0.5, 6, 8, 1.0)
     plans = world.draw(generator(0, "world"), 40_000)
-    assert plans.token_s is not None
     first, gaps = plans.token_s[0], np.diff(plans.token_s, axis=0)
     means = gaps.mean(axis=0)
     assert first.mean() == pytest.approx(0.5 + 1 / 4.8, rel=0.005)
@@ -158,7 +157,6 @@ def test_following_with_a_fixed_caution_is_deciding_all_plans_at_once() -> None:
     world = World(0.58, 3.0, 1, 8, 1.0)
     rng = generator(1, "drift test")
     calibration, plans = world.draw(rng, 200), world.draw(rng, 300)
-    assert calibration.token_s is not None
     policy = StreamToAct(GapPrior.fit(calibration.token_s))
     policy = replace(policy, caution=calibrate(policy, calibration).caution)
     schedule = policy.schedule(plans)
@@ -198,11 +196,8 @@ def test_a_frontier_marks_where_calibration_would_put_the_robot() -> None:
     rows = study_frontier.cell(config, world)
     chosen, expected = (row for row in rows if row.condition)
     assert [chosen.condition, expected.condition] == list(study_frontier.CALIBRATED.values())
-    assert expected.caution is not None
-    assert chosen.caution is not None
     assert expected.caution <= chosen.caution
     drawn = world.draw(generator(config.seed, "frontier", world), config.calibration_plans)
-    assert drawn.token_s is not None
     found = calibrate(StreamToAct(GapPrior.fit(drawn.token_s)), drawn, config.epsilon)
     assert chosen.caution == found.caution > 0
     assert replace(chosen, condition="") in rows

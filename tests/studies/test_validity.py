@@ -10,7 +10,7 @@ from scipy.stats import binomtest
 
 from s2a_bench.plan import load_skills, paper_format
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
-from studies.validity import VALIDITY, Score, Share, ValidityRow, arms_of, score, validity_tables
+from studies.validity import VALIDITY, Score, Share, ValidityRow, arms_of, score
 
 PAPER = {
     "name": "paper",
@@ -85,17 +85,3 @@ def test_answers_are_pooled_by_the_way_they_were_asked_for(tmp_path: Path) -> No
     assert (held.grammar, held.valid, held.as_ordered, held.cut) == (True, Share(4, 4), Share(2, 2), 0)
     assert (free.grammar, free.valid, free.as_ordered, free.cut) == (False, Share(1, 3), Share(0, 2), 1)
     assert (held.problems, free.problems) == ({}, {"unknown-skill": 2})
-
-
-def test_the_tables_show_both_and_say_what_is_dummy_and_cut(tmp_path: Path) -> None:
-    tables = validity_tables(run_of(tmp_path, *ROWS, dummy=True))
-    shares = tables["validity"]
-    assert shares.title == "Valid skills: arm, N = 2, 2 answers"
-    assert shares.rows[0] == ("paper", "with", "4 of 4", "100.0 [39.8, 100.0]", "100.0 [15.8, 100.0]")
-    assert shares.rows[1] == ("paper", "without", "1 of 3", "33.3 [0.8, 90.6]", "0.0 [0.0, 84.2]")
-    assert tables["formats"].rows == [("paper", "numbered calls", "1. open(cup)", "5 / 6.88 / 8")]
-    assert tables["problems"].rows == [("paper", "without", "2")]
-    notes = " ".join(shares.notes)
-    assert "DUMMY WEIGHTS" in notes
-    assert "DUMMY" not in " ".join(validity_tables(run_of(tmp_path, *ROWS))["validity"].notes)
-    assert "1 of 2 answers without grammar were cut off" in notes

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
-from s2a_bench.plan import Parser, SkillParsed, choose_format, parse_skills
 from s2a_bench.store.run import read_run
 from studies.validity import VALIDITY
+from tests.studies.program import run
 
-ROOT = Path(__file__).parent.parent.parent
 FEW = """
 name = "few"
 role = "robot task planner"
@@ -34,20 +31,6 @@ t_nom_s = 1.0
 """A short prompt: the tiny dummy reads it byte by byte."""
 
 
-def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    done = subprocess.run(
-        [sys.executable, "-m", "studies", "validity", *arguments, "--output", str(output)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=200,
-        cwd=ROOT,
-    )
-    assert done.returncode == code, done.stderr
-    assert "Traceback" not in done.stderr
-    return done
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Ask for few answers in two formats; what was printed lies beside the run."""
@@ -55,7 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     skills = tmp_path_factory.mktemp("skills") / "few.toml"
     skills.write_text(FEW)
     flags = ("--tokens-per-skill", "4,1", "--n-skills", "5", "--answers", "3", "--threads", "1")
-    done = run("--skills", str(skills), *flags, output=output)
+    done = run("validity", "--skills", str(skills), *flags, output=output)
     (path,) = output.iterdir()
     (path / "printed").write_text(done.stdout)
     return path
@@ -79,19 +62,6 @@ def test_a_row_an_answer_is_kept_with_its_text_and_counts(folder: Path) -> None:
     assert (free["tokens"] <= 2 * 5 * free["format"].astype(int)).all()
 
 
-def test_the_counts_are_those_of_the_text(folder: Path) -> None:
-    from s2a_bench.inference.tokenizer import Tokenizer
-
-    kept = read_run(folder)
-    format_ = choose_format(parse_skills(FEW, "few.toml"), 4, Tokenizer(Path(kept.manifest["model"]["model"])), 5)
-    for row in kept.table(VALIDITY).to_dict("records"):
-        if row["format"] == "4":
-            parser = Parser(format_)
-            events = [*parser.feed(row["text"]), *parser.close()][:5]
-            assert row["lines"] == len(events)
-            assert row["skills"] == sum(isinstance(event, SkillParsed) for event in events)
-
-
 def test_the_table_says_that_the_weights_are_dummies(folder: Path) -> None:
     text = (folder / "tables" / "validity.md").read_text()
     assert (folder / "printed").read_text().startswith(text)
@@ -110,13 +80,13 @@ def test_the_table_says_that_the_weights_are_dummies(folder: Path) -> None:
     ],
 )
 def test_wrong_use_is_one_line_and_leaves_nothing_behind(arguments: list[str], message: str, tmp_path: Path) -> None:
-    done = run(*arguments, output=tmp_path, code=2)
+    done = run("validity", *arguments, output=tmp_path, code=2)
     assert message in done.stderr.splitlines()[-1]
     assert done.stdout == ""
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_model_that_is_not_there_is_named(tmp_path: Path) -> None:
-    done = run("--model", "/no/such.gguf", output=tmp_path, code=1)
+    done = run("validity", "--model", "/no/such.gguf", output=tmp_path, code=1)
     assert "--model /no/such.gguf" in done.stderr
     assert list(tmp_path.iterdir()) == []

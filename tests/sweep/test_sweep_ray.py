@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from benchmarks.sweep_scaling import measure, part, work
+from benchmarks.sweep_scaling import measure
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.sweep import Sweep, read_sweep
@@ -128,10 +128,3 @@ def test_a_hundred_thousand_timelines_are_the_same_in_this_process_in_two_and_on
     lines = list(measure(100_000, 7, [2], ray=True))
     assert [line.how for line in lines] == ["this process", "processes", "Ray, local"]
     assert len({(line.checksum, line.p_any_stall, line.mean_stall_s) for line in lines}) == 1
-
-
-def test_another_seed_gives_other_numbers_and_chunks_add_up() -> None:
-    assert sum(plans for _, plans in work(100_000, 0)) == 100_000
-    digests = {part(*chunk).digest for seed in (0, 1) for chunk in work(40_000, seed)}
-    assert len(digests) == 6
-    assert [plans for _, plans in work(40_000, 0)] == [16384, 16384, 7232]

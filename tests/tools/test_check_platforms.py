@@ -22,36 +22,6 @@ BY_NAME = {(target.python, target.machine): target for target in EVERYWHERE}
 JETPACK, JAZZY = BY_NAME["3.10", "aarch64"], BY_NAME["3.12", "x86_64"]
 
 
-def names(requirements: list[str]) -> set[str]:
-    return {check.canonicalize_name(check.Requirement(text).name) for text in requirements}
-
-
-def test_five_platforms_are_checked() -> None:
-    assert BY_NAME.keys() == {(python, "x86_64") for python in ("3.10", "3.11", "3.12")} | {
-        (python, "aarch64") for python in ("3.10", "3.12")
-    }
-
-
-def test_markers_are_judged_for_the_target_not_for_this_python() -> None:
-    jetpack, jazzy = names(check.requirements(JETPACK)), names(check.requirements(JAZZY))
-    assert "tomli" in jetpack - jazzy
-    assert "cyclonedds" in jazzy - jetpack
-    assert "pytest" in jazzy - jetpack
-
-
-def test_the_compiled_package_is_replaced_by_what_it_needs() -> None:
-    needed = names(check.requirements(JETPACK))
-    assert "llama-cpp-python" not in needed
-    assert {"diskcache", "jinja2"} <= needed
-
-
-def test_extras_that_take_from_others_bring_what_those_have() -> None:
-    for target in EVERYWHERE:
-        needed = names(check.requirements(target))
-        assert {"gguf", "huggingface-hub", "highway-env", "nvidia-ml-py", "json-numpy", "ray"} <= needed
-        assert "s2a-bench" not in needed
-
-
 def test_pins_follow_their_markers() -> None:
     text = (
         "# comment\n\nnumpy==2.4.6; python_version >= '3.11'\nnumpy==2.2.6; python_version < '3.11'\nRuamel_YAML==1\n"
@@ -90,14 +60,6 @@ def test_wheels_of_every_older_system_are_taken() -> None:
     assert "--platform manylinux_2_17_aarch64" in flags
     assert "x86_64" not in flags
     assert "manylinux_2_36" not in flags
-
-
-def test_the_conflict_is_picked_out_of_pips_output() -> None:
-    output = (
-        "Collecting a\nWARNING: x\n\nThe conflict is caused by:\n    a 1 depends on b\n[notice] new pip\nERROR: no\n"
-    )
-    assert check.reasons(output) == ["The conflict is caused by:", "    a 1 depends on b", "ERROR: no"]
-    assert check.reasons("") == ["pip failed and said nothing"]
 
 
 @pytest.mark.parametrize("target", check.TARGETS, ids=str)

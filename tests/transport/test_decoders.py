@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from itertools import pairwise
 
 import httpx
@@ -18,47 +17,6 @@ from s2a_bench.types import Token
 from tests.servers.speakers import SPEAKERS, Speaker
 
 NAMES = sorted(DIALECTS)
-SHAPED = st.sampled_from(
-    [
-        "choices",
-        "delta",
-        "content",
-        "error",
-        "message",
-        "done",
-        "token",
-        "text",
-        "id",
-        "details",
-        "generated_text",
-        "candidates",
-        "parts",
-        "usage",
-        "usageMetadata",
-        "timings",
-        "prompt_ms",
-        "s2a",
-        "__numpy__",
-        "dtype",
-        "shape",
-        "finish_reason",
-        "finishReason",
-        "thinking",
-        "total_duration",
-        "eval_duration",
-        "metrics",
-        "object",
-        "detail",
-        "special",
-        "done_reason",
-        "promptFeedback",
-    ]
-)
-JSON = st.recursive(
-    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.just("error") | st.just("[DONE]"),
-    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(SHAPED | st.text(max_size=3), inner, max_size=4),
-    max_leaves=12,
-)
 
 
 def events(name: str, pieces: list[bytes]) -> list[Event]:
@@ -70,15 +28,6 @@ def events(name: str, pieces: list[bytes]) -> list[Event]:
 def cut(body: bytes, places: list[int]) -> list[bytes]:
     edges = sorted({0, len(body), *(place % (len(body) + 1) for place in places)})
     return [body[a:b] for a, b in pairwise(edges)]
-
-
-def framed(name: str, values: list[object]) -> bytes:
-    """Values as messages, in the framing of a dialect."""
-    texts = [json.dumps(value) for value in values]
-    framing = open_dialect(name).framing
-    if framing is ServerSentEvents:
-        return "".join(f"data: {text}\n\n" for text in texts).encode()
-    return "".join(f"{text}\n" for text in texts if framing is JsonLines or text == texts[0]).encode()
 
 
 CUTS = st.lists(st.integers(0, 10**6), max_size=30)
@@ -106,17 +55,6 @@ def test_garbage_gives_the_same_events_for_any_cut_and_never_an_exception(
     name: str, body: bytes, places: list[int]
 ) -> None:
     assert events(name, cut(body, places)) == events(name, [body])
-
-
-@given(name=st.sampled_from(NAMES), values=st.lists(JSON, min_size=1, max_size=4), places=CUTS)
-def test_json_of_any_shape_is_an_event_or_an_error(name: str, values: list[object], places: list[int]) -> None:
-    body = framed(name, values)
-    found = events(name, cut(body, places))
-    assert repr(found) == repr(events(name, [body]))  # a NaN is no NaN's equal
-    assert all(not event.error for event in found[:-1])
-    for event in found:
-        assert event.text is None or event.text.encode()
-        assert all(isinstance(value, float) for value in event.facts.values())
 
 
 LINES = st.lists(
@@ -170,6 +108,11 @@ def test_a_message_without_end_is_bounded(framing: type[ServerSentEvents]) -> No
         assert list(cutter.feed(b"x" * 2**16)) == []
     with pytest.raises(ValueError, match="more than"):
         list(cutter.feed(b"x"))
+
+
+def test_a_line_without_end_is_an_error_of_the_server() -> None:
+    (last,) = events("openai", [b"data: " + b"x" * LIMIT])
+    assert last.error.startswith("the server sent a line of more than")
 
 
 def test_data_without_an_end_of_the_event_is_bounded() -> None:

@@ -278,7 +278,7 @@ def test_a_server_that_stops_ends_the_answer_under_way(name: str) -> None:
 
 WITH_LIMITS = [
     *((name, {"in_flight_mib": 0.03}, "under way already|rejected the goal") for name in EVERY),
-    *((name, {"body_mib": 0.03}, "bytes") for name in (*HTTP, "websocket/openpi", "websocket/openpi-stream")),
+    *((name, {"body_mib": 0.03}, "bytes") for name in (*HTTP, "ros/topic", *POLICIES[:2])),
     *((name, {"pixels": 1000}, "320x240; at most 1000 pixels") for name in EVERY),
 ]
 

@@ -237,19 +237,6 @@ def test_health_and_models_answer(urls: dict[str, str]) -> None:
         assert httpx.get(url + "/v1/models").json()["data"][0]["id"] == "s2a"
 
 
-@pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
-@pytest.mark.parametrize(
-    ("headers", "status"), [({"host": "example.com"}, 403), ({"origin": "http://localhost"}, 403), ({"host": ""}, 200)]
-)
-def test_a_page_in_a_browser_is_not_answered(
-    urls: dict[str, str], variant: str, headers: dict[str, str], status: int
-) -> None:
-    body = {"messages": [{"role": "user", "content": "plan"}]}
-    answer = httpx.post(urls[variant] + "/v1/chat/completions", json=body, headers=headers)
-    assert answer.status_code == status
-    assert ("message" in answer.json().get("error", {})) == (status == 403)
-
-
 @pytest.mark.parametrize(("options", "status"), [({}, 404), ({"api_docs": True}, 200)])
 def test_the_pages_of_fastapi_are_served_on_request_only(
     handler: RecordingHandler, options: dict[str, bool], status: int
@@ -262,16 +249,3 @@ def test_the_pages_of_fastapi_are_served_on_request_only(
 def test_best_effort_and_binary_share_a_server_and_as_deployed_has_its_own() -> None:
     deployed, best_effort, binary = (one_pipeline(f"http/{name}").server for name in native.PATHS)
     assert deployed != best_effort == binary
-
-
-def test_servers_bind_loopback_unless_told(url: str) -> None:
-    assert url.startswith("http://127.0.0.1:")
-
-
-@pytest.mark.parametrize("codec", [native.STANDARD, native.FAST])
-def test_both_codecs_write_the_same_wire(codec: native.Codec) -> None:
-    data = np.arange(256, dtype=np.uint8)
-    assert codec.to_base64(data) == base64.b64encode(bytes(range(256))).decode()
-    assert codec.from_base64(codec.to_base64(data)) == bytes(range(256))
-    assert codec.loads(codec.dumps({"a": ["ü", 1, None]})) == {"a": ["ü", 1, None]}
-    assert codec.dumps({"a": ["ü", 1]}) == '{"a":["ü",1]}'.encode()

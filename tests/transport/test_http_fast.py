@@ -18,7 +18,7 @@ from s2a_bench.testing.transport import RecordingHandler, served, wiring_of
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, serving
 from s2a_bench.transport.http.native import PATHS
-from s2a_bench.transport.limits import LIMITS, MIB, Limits
+from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.serving import InFlight
 from s2a_bench.types import Request, Token
 from tests.waiting import until
@@ -161,29 +161,6 @@ def test_an_upgrade_is_ignored() -> None:
         assert answered(read(connection)) == "go_to"
 
 
-class Slow:
-    """Answers once it is released."""
-
-    def __init__(self) -> None:
-        self.began, self.go = Event(), Event()
-
-    def __call__(self, _request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        self.began.set()
-        self.go.wait(20)
-        yield Token(0, "go")
-
-
-def test_a_request_that_comes_before_the_answer_is_kept() -> None:
-    slow = Slow()
-    with connected(slow) as connection:
-        connection.sendall(request(body("first")))
-        assert slow.began.wait(20)
-        connection.sendall(request(body("a" * 300_000)))
-        slow.go.set()
-        assert answered(read(connection)) == "go"
-        assert answered(read(connection)) == "go"
-
-
 def test_requests_that_come_together_are_answered_in_order() -> None:
     with connected() as connection:
         connection.sendall(request(body("a" * 100_000)) * 3 + request(body())[:-1])
@@ -217,12 +194,6 @@ def test_who_leaves_bytes_behind_and_goes_does_not_hold_the_engine(stream: bool,
 
 @pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
 class TestLimits:
-    def test_a_body_that_says_that_it_is_too_large_is_refused_unread(self, variant: str) -> None:
-        with connected(limits=Limits(body_mib=1000 / MIB), variant=variant) as connection:
-            connection.sendall(request(b"", "Content-Length: 1001", path=PATHS[variant]))
-            status, answer = read(connection)
-            assert status == json.loads(answer)["error"]["code"] == 413
-
     def test_headers_a_byte_at_a_time_end(self, variant: str) -> None:
         with connected(limits=Limits(head_s=0.3), variant=variant) as connection:
             with contextlib.suppress(ConnectionError):

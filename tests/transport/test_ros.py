@@ -192,6 +192,21 @@ def test_tokens_out_of_order_are_messages_lost(
         next(answer)
 
 
+@pytest.mark.parametrize(("variant", "says"), [("topic", "no token for 1 s"), ("action", "no feedback for 1 s")])
+def test_a_silent_server_is_given_up(stack: ExitStack, dds_domain: int, variant: str, says: str) -> None:
+    over = Event()
+
+    def silent(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        over.wait(20)
+        yield Token(0, "x")
+
+    wiring = wiring_of(f"ros/{variant}", "/test_silent", domain_id=dds_domain, timeout_s=1.0)
+    serve(stack, wiring, silent)
+    stack.callback(over.set)
+    with pytest.raises(RequestFailed, match=says):
+        ask(connect(stack, wiring), Request("a", "plan"))
+
+
 def test_a_second_server_of_a_namespace_is_refused(stack: ExitStack, wiring: Wiring[Any]) -> None:
     serve(stack, wiring, RecordingHandler(["x"]))
     with pytest.raises(TransportError, match="another server answers under /test_ros"):

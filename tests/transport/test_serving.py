@@ -9,7 +9,7 @@ from threading import Event, Thread
 import pytest
 import zmq
 
-from s2a_bench.errors import EngineError, RequestFailed, S2AError
+from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.plugins.policy_servers.zmq.server import Marks
 from s2a_bench.plugins.policy_servers.zmq.watch import ConnectionWatch
 from s2a_bench.trace import Trace
@@ -65,13 +65,6 @@ def core_of(handler: Callable[[Request, Trace], Generator[Piece, None, None]] = 
     return Core(handler, Limits())
 
 
-def test_a_request_is_read_accepted_answered_and_ended() -> None:
-    core = core_of()
-    exchange = Told(core)
-    assert core.answer(exchange)
-    assert exchange.calls == ["request", "accept", "go", "on", "end"]
-
-
 def test_its_bytes_are_given_back_before_the_end_which_may_wait_for_a_slow_client() -> None:
     core = core_of()
     exchange = Told(core)
@@ -86,29 +79,6 @@ def test_where_the_client_cannot_be_told_the_connection_is_to_be_closed(breaks: 
     assert not core.answer(Told(core, breaks=breaks))
     assert core.answer(Told(core))  # the engine is free
     assert core.in_flight.bytes == 0
-
-
-def test_a_client_that_has_gone_is_not_answered_as_if_it_had_all() -> None:
-    core = core_of()
-    exchange = Told(core, has_gone=True)
-    assert not core.answer(exchange)
-    assert exchange.calls == ["request", "accept"]
-
-
-@pytest.mark.parametrize(
-    ("raised", "message"),
-    [(EngineError("tired"), "tired"), (KeyError("a bug"), "internal error; the server's log has it")],
-)
-def test_what_fails_is_told_in_one_line(raised: Exception, message: str) -> None:
-    def failing(request: Request, trace: Trace) -> Generator[Piece, None, None]:
-        yield from words(request, trace)
-        raise raised
-
-    core = core_of(failing)
-    exchange = Told(core)
-    assert core.answer(exchange)
-    assert exchange.calls[-1] == message
-    assert core.answer(Told(core_of()))
 
 
 def test_a_worker_without_another_thread_answers_all_the_same(

@@ -74,7 +74,7 @@ class GenerateClient(RosClient):
             if other := client.other_dds():
                 raise TransportError(
                     f"the action server {self._name} is on {other}, whose services have another form on the wire: "
-                    "start it with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or use `middleware` rclpy with its RMW"
+                    "start it with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or ask in a sourced ROS 2 of its RMW"
                 ) from absent
             raise
 

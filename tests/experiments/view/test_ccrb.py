@@ -23,8 +23,6 @@ from s2a_bench.experiments.ccrb.view.outcomes import token_times_s
 from s2a_bench.experiments.ccrb.view.tables import ccrb_json, show
 from s2a_bench.inference import EngineConfig
 from s2a_bench.scenario.ccrb.options import CcrbOptions
-from s2a_bench.scenario.longitudinal import Longitudinal
-from s2a_bench.scenario.windscreen import Windscreen
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.writers.figures import caption_of
@@ -245,22 +243,6 @@ def test_a_recording_has_the_egos_view_and_the_requests_with_their_pictures(
     assert len(recorded["/s2a_bench/camera/image_raw"]) == 4  # the warm-up's too
     assert len(recorded["/s2a_bench/http/binary/request"]) == 4
     assert len(recorded["/s2a_bench/http/binary/token"]) == 4 * 18
-
-
-def test_only_a_closed_loop_opens_a_camera_for_its_recording(
-    fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    opened, camera = [], Longitudinal.camera
-
-    def noted(self: Longitudinal, width: int, height: int) -> Windscreen:
-        opened.append((width, height))
-        return camera(self, width, height)
-
-    monkeypatch.setattr(Longitudinal, "camera", noted)
-    engine = EngineConfig(name="replay")
-    asked = PlanRequest(live=True, transport="loopback", engine=engine, record=tmp_path / "run")
-    run(tmp_path, plan_request=asked, profile=fast_board)
-    assert opened == [(640, 480)]
 
 
 def test_a_recording_is_not_overwritten_and_is_of_a_model_that_answers(tmp_path: Path) -> None:

@@ -1,11 +1,9 @@
-import copy
 import json
 import re
 from collections.abc import Callable
 from typing import Any
 
 import jsonschema
-import pytest
 
 from s2a_bench.experiments.latency import EXPERIMENT
 from s2a_bench.experiments.latency.metrics import latency_json
@@ -74,20 +72,8 @@ def test_one_cell_by_hand(make_run: MakeRun) -> None:
         "errors": 0,
         "warmups": 5,
         "residual_flagged": 0,
-        "stages_ms": {
-            "capture": exactly(1),
-            "cdr_pack": exactly(2),
-            "network": exactly(3),
-            "inference": exactly(100),
-            "return": exactly(1.75),
-        },
-        "groups_ms": {
-            "capture": exactly(1),
-            "pack": exactly(2),
-            "network": exactly(3),
-            "inference": exactly(100),
-            "return": exactly(1.75),
-        },
+        "stages_ms": {stage: exactly(ms) for stage, ms in stages.items() if stage},
+        "groups_ms": {stage.removeprefix("cdr_"): exactly(ms) for stage, ms in stages.items() if stage},
         "e2e_ms": exactly(108),
         "e2e_without_inference_ms": exactly(8),
         "ttft_ms": exactly(107),
@@ -124,14 +110,3 @@ def test_a_run_without_samples_is_valid_and_has_no_figures(make_run: MakeRun) ->
     validate(whole)
     assert whole["cells"] == whole["ratios"] == []
     assert EXPERIMENT.show(run).figures == {}
-
-
-@pytest.mark.parametrize("path", [("cells", 0, "e2e_ms"), ("ratios", 0, "value"), ("cells", 0, "n"), ("state",)])
-def test_the_schema_refuses_what_is_wrong(make_run: MakeRun, path: tuple[Any, ...]) -> None:
-    whole = copy.deepcopy(latency_json(make_run(n=2)))
-    place: Any = whole
-    for step in path[:-1]:
-        place = place[step]
-    place[path[-1]] = "nonsense"
-    with pytest.raises(jsonschema.ValidationError):
-        validate(whole)

@@ -1,10 +1,9 @@
 import csv
 import io
-import subprocess
-import sys
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,12 +15,12 @@ from s2a_bench.experiments.latency import EXPERIMENT
 from s2a_bench.experiments.latency.metrics import latency_csv
 from s2a_bench.experiments.latency.view import group_table, show, stage_table, summary_table
 from s2a_bench.stats import Ratio, Summary
-from s2a_bench.store.requests import SampleRow
-from s2a_bench.store.run import StoredRun
+from s2a_bench.store.requests import SampleRow, TokenRow
+from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.trace import path_of
 from s2a_bench.writers.latex import to_latex
 from s2a_bench.writers.tables import interval, mean_sd, number, to_markdown
-from tests.made_runs import STAGES
+from tests.made_runs import STAGES, known
 
 MakeRun = Callable[..., StoredRun]
 NONE = "\N{EN DASH}"
@@ -215,28 +214,13 @@ def test_csv_keeps_every_digit_and_leaves_absent_stages_out(make_run: MakeRun) -
     stages = list(csv.DictReader(io.StringIO(texts["stages.csv"])))
     ros = {row["stage"]: row for row in stages if row["cell"] == "ros/topic"}
     assert list(ros) == ["capture", "cdr_pack", "network", "inference", "return", "residual"]
-    assert ros["cdr_pack"] == {
-        "cell": "ros/topic",
-        "provenance": "unknown/unknown/unknown",
-        "group": "pack",
-        "stage": "cdr_pack",
-        "n": "4",
-        "median": "0.0124",
-        "mean": "0.0124",
-        "sd": "0.0",
-        "p90": "0.0124",
-        "p99": "0.0124",
-        "emulated": "False",
-    }
-    summary = list(csv.DictReader(io.StringIO(texts["summary.csv"])))
-    assert {row["metric"] for row in summary} == {
-        "e2e_without_inference_ms",
-        "e2e_ms",
-        "ttft_ms",
-        "itl_ms",
-        "residual_ms",
-        "residual_share",
-    }
+    pack = ros["cdr_pack"]
+    assert [pack[name] for name in ("provenance", "group", "n", "emulated")] == [
+        *("unknown/unknown/unknown", "pack", "4", "False"),
+    ]
+    assert {pack[name] for name in ("median", "mean", "p90", "p99")} == {"0.0124"}
+    metrics = {row["metric"] for row in csv.DictReader(io.StringIO(texts["summary.csv"]))}
+    assert metrics >= {"e2e_without_inference_ms", "e2e_ms", "ttft_ms", "itl_ms", "residual_share"}
     ratio = next(csv.DictReader(io.StringIO(texts["ratios.csv"])))
     assert ratio["emulated"] == "False"
     replayed = make_run(HAND, n=4, engine="replay", manifest={"model": {"engine": "replay", "emulated": True}})
@@ -246,30 +230,27 @@ def test_csv_keeps_every_digit_and_leaves_absent_stages_out(make_run: MakeRun) -
     assert (ratio["of"], ratio["to"], float(ratio["value"])) == ("http/as-deployed", "ros/topic", 26 / 4.5124)
 
 
+def test_the_table_of_tokens_has_their_gaps_and_delays(tmp_path: Path, make_row: Callable[..., SampleRow]) -> None:
+    with RunWriter.create(tmp_path, "latency", known({"stages": STAGES})) as writer:
+        for block in range(2):
+            row = make_row("ros/topic", HAND["ros/topic"], block)
+            left_ns = [10**9 + i * 5_000_000 for i in range(3)]
+            writer.sample(row)
+            writer.tokens(
+                TokenRow(row.request_id, row.cell, i, i, "x", at_ns, at_ns + (block + 1) * 10**6)
+                for i, at_ns in enumerate(left_ns)
+            )
+    table = show(read_run(writer.path)).tables["tokens"]
+    assert table.header == ("cell", "gap median", "gap p99", "delay median", "delay p90", "delay p99")
+    assert table.rows == [("ros/topic", "5.00", "5.00", "1.50", "2.00", "2.00")]
+
+
 def test_a_cell_in_which_everything_failed_is_in_the_summary(
     make_run: MakeRun, make_row: Callable[..., SampleRow]
 ) -> None:
     run = make_run({}, extra=(make_row("ros/topic", {"capture": 1}, 1, error="lost"),))
     assert latency_csv(run)["summary.csv"].rows == [("ros/topic", "", 1, 0, 0, *[None] * 5, False)]
     assert summary_table(run).rows == [("ros/topic", "0", "1", NONE, NONE, NONE, NONE)]
-
-
-def test_the_files_are_written_below_the_run(make_run: MakeRun) -> None:
-    run = make_run(n=3)
-    write_shown(run, replace(EXPERIMENT.show(run), figures={}))
-    paths = [*(run.path / "tables").iterdir()]
-    assert sorted(path.name for path in paths) == [
-        "ratios.csv",
-        "stages.csv",
-        "stages.md",
-        "stages.tex",
-        "summary-e2e.md",
-        "summary-e2e.tex",
-        "summary.csv",
-        "summary.md",
-        "summary.tex",
-    ]
-    assert all(path.parent == run.path / "tables" and path.stat().st_size > 50 for path in paths)
 
 
 @pytest.mark.parametrize("folder", ["tables", "figures"])
@@ -301,15 +282,6 @@ def test_the_terminal_shows_the_stages_what_they_say_and_where_the_rest_is(
 
 def test_an_empty_run_prints_a_line(make_run: MakeRun) -> None:
     assert "No samples." in printed(make_run({}))
-
-
-def test_importing_the_tables_imports_no_heavy_library() -> None:
-    code = (
-        "import sys; from s2a_bench.experiments.latency.view import figures;"
-        "print([n for n in ('pandas', 'pyarrow', 'matplotlib', 'scipy', 'numpy', 'rich') if n in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
 
 
 def test_over_launches_the_table_says_by_how_much_they_differ(

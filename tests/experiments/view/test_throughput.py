@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -12,10 +10,7 @@ from typing import Any
 
 import jsonschema
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from matplotlib.patches import Rectangle
-from rich.console import Console
 
 from s2a_bench.experiments.requests import RequestCell
 from s2a_bench.experiments.throughput.metrics import (
@@ -43,7 +38,6 @@ from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
-from s2a_bench.writers.tables import lay_out
 from tests.made_runs import SCHEMA, known
 
 MakeRow = Callable[..., SampleRow]
@@ -181,18 +175,6 @@ def test_a_slower_part_of_the_answer_shows_at_its_position(make: Make) -> None:
     }
 
 
-@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.lists(st.integers(1, 50), min_size=1, max_size=3 * BIN))
-def test_the_bins_hold_every_gap_once(make: Make, gaps: list[int]) -> None:
-    cell = only(make({"in-process": gaps}, n=1))
-    found = rates_by_position(cell)
-    counts = [min(last, len(gaps)) - max(first, 1) + 1 for first, last in found]
-    spent_s = sum(count / rates[0] for count, rates in zip(counts, found.values(), strict=True))
-    assert sum(counts) == len(gaps)
-    assert spent_s == pytest.approx(sum(gaps) / 1e3)
-    assert list(cell.values("decode_tokens_per_s")) == [pytest.approx(len(gaps) / (sum(gaps) / 1e3))]
-
-
 def test_cells_are_compared_with_in_process_and_with_llama_bench(make: Make) -> None:
     run = make({"http/as-deployed": [20] * 4, "in-process": [10] * 4}, reference=[1.0, 50.0, 80.0, 100.0])
     found = {(of, to): ratio.value for _, of, to, ratio in ratios_of(run, throughput_cells(run))}
@@ -224,31 +206,6 @@ def test_the_json_is_strict_and_valid(make: Make) -> None:
     del cell["positions"]
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(whole, SCHEMA, cls=jsonschema.Draft202012Validator)
-
-
-def test_the_tables_fit_a_terminal(make: Make) -> None:
-    gaps = {name: [10.0] * 69 for name in ("in-process", "http/as-deployed", "http/best-effort", "ros/topic")}
-    run = make(gaps, reference=[900.0, 1000.0, 1000.0, 1000.0], model={"dummy": True})
-    console = Console(width=100, record=True, file=io.StringIO())
-    tables = show(run).tables
-    assert list(tables) == ["throughput", "prompt", "gaps", "positions"]
-    for table in tables.values():
-        console.print(lay_out(table, 100))
-    text = console.export_text()
-    assert "…" not in text
-    assert "1000 ± 0" in text
-    notes = " ".join(tables["throughput"].notes)
-    assert "Dummy weights." in notes
-    assert "llama-bench decodes after 42 tokens" in notes
-
-
-def test_the_csv_keeps_every_digit(make: Make) -> None:
-    run = make({"in-process": [7] * 3}, n=1)
-    rows = list(csv.DictReader(io.StringIO(throughput_csv(run)["throughput.csv"].text(run.origins))))
-    found = {row["metric"]: row["median"] for row in rows}
-    assert float(found["decode_tokens_per_s"]) == 3 / 0.021
-    assert found["itl_ms"] == "7.0"
-    assert "prompt_ms" not in found
 
 
 def test_answers_of_one_bin_have_no_table_of_positions(make: Make) -> None:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +13,7 @@ from matplotlib.patches import Rectangle
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.view.cells import timelines_json, timelines_of
-from s2a_bench.experiments.timeline.view.figures import build_timelines, policy_colours
+from s2a_bench.experiments.timeline.view.figures import build_timelines
 from s2a_bench.experiments.timeline.view.tables import (
     execution_table,
     seconds,
@@ -33,7 +31,6 @@ from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import TextTable
 
-MakeRun: TypeAlias = Callable[..., StoredRun]
 BOARD = {"name": "orin", "title": "Orin", "origin": "paper", "prompt_s": 0.5, "prompt_origin": "assumed"}
 STARTS = {"naive": lambda t, _d: t[0], "wait-then-act": lambda t, _d: t[-1], "stream-to-act": safe_start}
 
@@ -108,34 +105,6 @@ def test_a_panel_shows_each_skill_and_each_stall_where_it_was(computed: StoredRu
     assert not bars(four, hatched=True)
     first = {round(bar.get_y() + bar.get_height() / 2): bar for bar in reversed(bars(six, hatched=False))}
     assert [first[lane].get_x() for lane in (1, 2, 3)] == pytest.approx([1.75, 10.5, 3.5])
-
-
-def test_the_colours_are_the_papers_and_differ_in_grey(computed: StoredRun) -> None:
-    colours = policy_colours(list(STARTS))
-    red = {name: int(colour[1:3], 16) for name, colour in colours.items()}
-    blue = {name: int(colour[5:7], 16) for name, colour in colours.items()}
-    green = {name: int(colour[3:5], 16) for name, colour in colours.items()}
-    assert blue["wait-then-act"] > max(red["wait-then-act"], green["wait-then-act"])
-    assert red["naive"] > green["naive"] > blue["naive"]
-    assert green["stream-to-act"] > max(red["stream-to-act"], blue["stream-to-act"])
-    grey = sorted(0.3 * red[name] + 0.59 * green[name] + 0.11 * blue[name] for name in STARTS)
-    assert min(b - a for a, b in pairwise(grey)) > 15
-    drawn_colours = {bar.get_facecolor() for bar in bars(drawn(computed).axes[0], hatched=False)}
-    assert len(drawn_colours) == 3
-
-
-def test_the_safe_start_and_every_token_are_marked(computed: StoredRun) -> None:
-    axes = drawn(computed).axes[0]
-    lines = [segments for found in axes.collections for segments in [found.get_segments()]]
-    dashed = [segments for found, segments in zip(axes.collections, lines, strict=True) if found.get_linestyle()[0][1]]
-    assert {segments[0][0][0] for segments in dashed} == {3.5}
-    assert sorted(len(segments) for segments in lines) == [1] * 6 + [8, 48]
-
-
-def test_each_panel_has_the_time_axis_it_needs(computed: StoredRun) -> None:
-    six, four = drawn(computed).axes
-    assert six.get_xlim()[1] == pytest.approx(18.5 * 1.02)
-    assert four.get_xlim()[1] == pytest.approx(15.1667 * 1.02, rel=1e-4)
 
 
 def test_the_figure_says_what_is_emulated_and_assumed(computed: StoredRun, live: StoredRun) -> None:

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import base64
-import gzip
 import json
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from functools import cache, partial
-from typing import Any
 
 from s2a_bench.transport.http.native import PARAMETERS_HEADER, PATHS
-from tests.hostile.suite import FAILED, Attack, Case, Trap
+from tests.hostile.suite import Attack, Case
 from tests.hostile.tcp import CLIENTS as ANY_CLIENT
-from tests.hostile.tcp import NOISE, answers, crowd, sends, sends_made, servers
+from tests.hostile.tcp import NOISE, crowd, sends, sends_made, servers
 
 CHAT = PATHS["as-deployed"]
 MIB = 1 << 20
@@ -92,34 +90,21 @@ def _clients(path: str) -> Iterator[Case[Attack]]:
     yield Case("64 MiB of spaces", sends_made(lambda: [post(b" " * 64 * MIB, path=path)]), REFUSED)
     lines = [b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)]
     yield Case("1 MiB of headers", sends(head(path=path)[:-2], *lines))
-    yield Case("one header of 1 MiB", sends(head(path=path)[:-2] + b"x: " + b"a" * MIB + b"\r\n\r\n"))
     yield Case("16,000 empty headers", sends(head(path=path)[:-2] + b"a:\r\n" * 16_000 + b"\r\n"), "^HTTP/1.1 431 ")
-    yield Case("length that is none", sends(head("Content-Length: -5", path=path)), REFUSED)
-    yield Case("length of 20 digits", sends(head("Content-Length: 99999999999999999999", path=path)), REFUSED)
-    yield Case("length of 5,000 digits", sends(head(f"Content-Length: {'9' * 5000}", path=path)), REFUSED)
-    yield Case("two lengths", sends(head("Content-Length: 3", "Content-Length: 5", path=path) + b"{}{}{}"), REFUSED)
     both = head("Content-Length: 3", CHUNKS, path=path)
     yield Case("length and chunks", sends(both + b"0\r\n\r\nGET / HTTP/1.1\r\n\r\n"))
-    yield Case("HTTP/9.9", sends(b"POST / HTTP/9.9\r\n\r\n"), REFUSED)
     yield Case("TLS", sends(b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03" + NOISE[:500]))
-    yield Case("upgrade to a WebSocket", sends(head("Upgrade: websocket", "Connection: upgrade", path="/", length=0)))
     many = chat(path=path).replace(b"Connection: close\r\n", b"") * 200
     yield Case("200 requests in one piece", sends(many, chat(path=path)))
-    yield Case("no JSON", sends(post(b"{]", path=path)), REFUSED)
-    yield Case("no UTF-8", sends(post(b'{"messages": [{"role": "user", "content": "\xff\xfe"}]}', path=path)), REFUSED)
     yield Case("deep JSON", sends(post(b"[" * MIB, path=path)), REFUSED)
     for size in (4, 57):
         lists = sends_made(partial(_lists, size, path), seconds=10)
         yield Case(f"{size} MiB of lists", lists, REFUSED + "20000 values", mib=512)
-    for text in ("5", "[5]", "[[]]", '[{"role": 5}]', '{"a": 1}', "null", '[{"role": "user", "content": [[]]}]'):
-        yield Case(f"messages {text[:20]}", sends(post(f'{{"messages": {text}}}'.encode(), path=path)), REFUSED)
-    yield Case("max_tokens NaN", sends(chat(fields='"max_tokens": NaN', path=path)), REFUSED)
     yield Case("picture of 900 million pixels", sends_made(lambda: bomb_uri(path)), REFUSED + "30000x30000")
     yield Case("bad grammar", sends(chat(fields=f'"grammar": {parentheses(20_000)}', path=path)))
     goes_on = chat(fields=GOES_ON, path=path)
     yield Case("gone in the middle of an answer", sends(goes_on, then="goes"))
     yield Case("reset in the middle of an answer", sends(goes_on, then="resets"))
-    yield Case("gone without waiting for the whole", sends(chat(fields='"max_tokens": 5000', path=path), then="resets"))
     yield Case("200 KB behind the request, then gone", sends(goes_on + bytes(200_000), then="goes"))
     streamed = chat(fields='"stream": true', path=path)
     yield Case("100 clients at once", crowd(100, sends(streamed, seconds=20)), "HTTP/1.1 (200|503) ")
@@ -150,87 +135,12 @@ FAST: tuple[Case[Attack], ...] = (
         "^HTTP/1.1 411 ",
     ),
     Case("64 MiB of zeros as pixels", sends_made(lambda: [binary(bytes(64 * MIB))]), REFUSED),
-    Case("no parameters", sends(binary(b"", "[]")), REFUSED),
     Case("deep parameters", sends(binary(b"", "[" * 50_000)), REFUSED),
     Case("picture of 900 million pixels as the body", sends_made(lambda: [binary(bomb())]), REFUSED + "30000x30000"),
-    Case("noise as a picture", sends(binary(NOISE)), REFUSED),
-    Case(
-        "raw pixels of another size",
-        sends(binary(b"abc", kind="application/x-raw;width=9;height=9;encoding=bgr8")),
-        REFUSED,
-    ),
 )
-
-
-def response(*lines: str, status: str = "200 OK") -> bytes:
-    """Return the head of an answer."""
-    return "\r\n".join([f"HTTP/1.1 {status}", *lines, "", ""]).encode()
-
-
-STREAM = response("Content-Type: text/event-stream", "Connection: close")
-
-
-def event(value: Any) -> bytes:
-    """Return one server-sent event."""
-    return b"data: " + (value if isinstance(value, bytes) else json.dumps(value).encode()) + b"\n\n"
-
-
-def token(text: str = "go") -> dict[str, Any]:
-    """Return one token as our server sends it."""
-    return {"choices": [{"index": 0, "delta": {"content": text}, "finish_reason": None, "token": 1}]}
-
-
-def _answers(*pieces: bytes, **more: Any) -> Trap:
-    return answers(*pieces, scheme="http://", **more)
-
-
-def _streams(*values: Any, **more: Any) -> Trap:
-    return _answers(STREAM, *(event(value) for value in values), then="goes", **more)
 
 
 CONTROL = "\x1b[2J\r\nOK: all is well\x07\x00"
 
-SERVERS: tuple[Case[Trap], ...] = (
-    *servers("http://"),
-    Case("headers, then silence", _answers(STREAM), "^RequestFailed: .*silent"),
-    Case("headers, then gone", _answers(STREAM, then="goes"), "before the answer was complete"),
-    Case("one token, then silence", _answers(STREAM, event(token())), "^RequestFailed: .*silent"),
-    Case("one token, then gone", _streams(token()), "before the answer was complete"),
-    Case("one token, then reset", _answers(STREAM, event(token()), then="resets"), FAILED),
-    Case("an event that ends in the middle", _answers(STREAM, b'data: {"choi', then="goes"), FAILED),
-    Case("events that are no JSON", _streams(b"{]"), FAILED),
-    Case("events that are no objects", _streams([], 5, "a", None), FAILED),
-    Case("choices that are none", _streams({"choices": "go"}, {"choices": [5]}, {"choices": [{"delta": 5}]}), FAILED),
-    Case("deep events", _streams(b"[" * 100_000), FAILED),
-    Case(
-        "another media type",
-        _answers(response("Content-Type: text/html", "Connection: close"), b"<html>", then="goes"),
-        FAILED,
-    ),
-    Case(
-        "a refusal of 4 GiB", _answers(response(status="500 No"), again=[b"no " * (1 << 15)]), "^RequestFailed: .*500"
-    ),
-    Case("a redirect", _answers(response("Location: http://127.0.0.1:1/", status="302 Found"), then="goes"), FAILED),
-    Case(
-        "a chunk of 2^60 bytes",
-        _answers(STREAM[:-2] + b"Transfer-Encoding: chunked\r\n\r\n1000000000000000\r\ngo"),
-        FAILED,
-    ),
-    Case("endless headers", _answers(b"HTTP/1.1 200 OK\r\n", again=[b"x: y\r\n" * 1000]), FAILED),
-    Case("an endless line", _answers(STREAM, b"data: ", again=[b"a" * (1 << 16)]), FAILED),
-    Case("no gzip", _answers(STREAM[:-2] + b"Content-Encoding: gzip\r\n\r\n" + NOISE, then="goes"), FAILED),
-    Case(
-        "a gzip of 1 GiB",
-        _answers(STREAM[:-2] + b"Content-Encoding: gzip\r\n\r\n", gzip.compress(bytes(1 << 20)) * 1024),
-        FAILED,
-    ),
-    Case("endless tokens", _answers(STREAM, again=[event(token()) * 1000]), FAILED),
-    Case("endless events of nothing", _answers(STREAM, again=[event({}) * 1000]), FAILED),
-    Case("endless interim answers", _answers(again=[response(status="103 Early Hints") * 1000]), FAILED),
-    Case("an error that forges lines", _streams({"error": {"message": CONTROL}}), "^RequestFailed: .*all is well"),
-    Case(
-        "a refusal that forges lines",
-        _answers(response(status="400 No"), CONTROL.encode(), then="goes"),
-        "^RequestFailed: .*all is well",
-    ),
-)
+SERVERS = servers("http://")
+"""The client also meets those of `tests/servers/hostile.py`, in `test_client`."""

@@ -69,45 +69,25 @@ GO = says({"prompt": "go on"})
 FLOOD = "more than 1000 pings, pongs or small fragments"
 FLOODS = {
     "pings": floods(frame(b"", Opcode.PING)),
-    "pongs": floods(frame(b"", Opcode.PONG)),
-    "fragments of nothing": floods(frame(b"", Opcode.CONT, fin=False), frame(b"", fin=False)),
     "fragments of a byte": floods(frame(b"a", Opcode.CONT, fin=False), frame(b"", fin=False)),
-    "pings behind a request": floods(frame(b"", Opcode.PING), GO),
 }
 NO_MESSAGE = "that are no message"
-OBJECTS = array(dtype="|O")
-"""One of the arrays that `tests/plugins/policy_servers/test_websocket_codec.py` tries."""
 
 CLIENTS: tuple[Case[Attack], ...] = (
     *ANY_CLIENT,
-    Case("half the handshake, then gone", sends(upgrade()[:40], then="goes")),
     Case(
         "a handshake a byte at a time",
         sends(*(bytes([byte]) for byte in upgrade()[:-2] + b"x: " + b"a" * 300), every_s=0.05),
         "^HTTP/1.1 408 |^$",
     ),
     Case("1 MiB of headers", sends(upgrade()[:-2], *[b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)])),
-    Case("one header of 1 MiB", sends(upgrade()[:-2] + b"x: " + b"a" * MIB + b"\r\n\r\n")),
     Case("no handshake but HTTP", sends(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"), "^HTTP/1.1 426 "),
-    Case("a body", sends(b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 3\r\n\r\nabc"), "^HTTP/1.1 400 "),
-    Case("HTTP/9.9", sends(upgrade(line="GET / HTTP/9.9")), "^HTTP/1.1 (400|505) "),
-    Case("version 99", sends(upgrade(version="99")), "^HTTP/1.1 400 "),
     Case("a page of a browser", sends(upgrade("Origin: https://example.org")), "^HTTP/1.1 403 "),
     Case("a name of somebody else", sends(upgrade().replace(b"localhost", b"example.org")), "^HTTP/1.1 403 "),
     Case("a compression that nobody wants", sends(upgrade("Sec-WebSocket-Extensions: permessage-deflate"), GO), "101"),
-    Case("a text", asked(frame(b"go on", Opcode.TEXT)), "a binary message, not a text"),
     Case("a frame without a mask", asked(frame(b"abc", mask=False)), "incorrect masking"),
-    Case("reserved bits", asked(b"\xf2" + GO[1:]), "reserved bits"),
-    Case("an opcode that is none", asked(b"\x83" + GO[1:]), "invalid opcode"),
-    Case("a continuation of nothing", asked(frame(b"abc", Opcode.CONT)), "unexpected continuation"),
-    Case("a message within a message", asked(frame(b"abc", fin=False), GO), "expected a continuation"),
-    Case("a ping of 200 bytes", asked(b"\x89\xfe\x00\xc8mask" + bytes(200)), "control frame too long"),
-    Case("a close of one byte", asked(b"\x88\x81maska"), "close frame too short"),
     Case("1 GiB announced in a frame", asked(announced(1 << 30), NOISE), "too big|over size limit|exceeds limit|bytes"),
-    Case("2^63 announced in a frame", asked(announced(1 << 63), NOISE), "too big|over size limit|exceeds limit|bytes"),
-    Case("half a frame, then gone", asked(announced(1 << 20), NOISE, then="goes")),
     Case("half a frame, then silence", asked(announced(1 << 20), NOISE, seconds=8), "took more than 3 s"),
-    Case("a frame a byte at a time", asked(announced(1 << 20), *[b" "] * 60, every_s=0.1), "took more than 3 s"),
     *(Case(f"{name} without end", flood, FLOOD) for name, flood in FLOODS.items()),
     Case(
         "fragments of 1 MiB without end",
@@ -117,21 +97,12 @@ CLIENTS: tuple[Case[Attack], ...] = (
         "pings whose pongs nobody reads", sends_made(lambda: [upgrade(), *[frame(bytes(99), Opcode.PING) * 999] * 999])
     ),
     Case("60 MiB of empty maps", sends_made(lambda: large(b"\x80")), NO_MESSAGE),
-    Case("60 MiB of empty lists", sends_made(lambda: large(b"\x90")), NO_MESSAGE),
-    Case("60 MiB of short texts", sends_made(lambda: large(b"\xa2ab")), NO_MESSAGE),
     Case("60 MiB of zeros", sends_made(lambda: [upgrade(), frame(bytes(60 * MIB))]), NO_MESSAGE),
-    Case("lists 100,000 deep", asked(frame(b"\x91" * 100_000)), NO_MESSAGE),
-    Case("dictionaries 100 deep", asked(frame(b"\x81\xa1a" * 100 + b"\x01")), "in each other"),
-    Case("an array of objects", asked(says({"a": OBJECTS})), NO_MESSAGE),
-    Case("a state that is not finite", asked(says({"state": float("inf")})), "not finite"),
     Case("a picture of 900 million pixels", sends_made(lambda: [upgrade(), says({"image": bomb()})]), "30000x30000"),
-    Case("noise as a picture", asked(says({"image": NOISE})), "neither a JPEG nor a PNG"),
     Case("200 requests in one piece", asked(GO * 200), "actions|more than two requests at once|HTTP/1.1 101 "),
     Case("gone in the middle of an answer", asked(GO, then="goes")),
     Case("reset in the middle of an answer", asked(GO, then="resets")),
-    Case("reset in the middle of a stream", sends(upgrade(path="/stream"), GO, then="resets")),
     Case("100 clients at once", crowd(100, asked(GO)), "actions"),
-    Case("100 clients that go", crowd(100, asked(GO, then="resets"))),
 )
 
 
@@ -172,23 +143,14 @@ SERVERS: tuple[Case[Trap], ...] = (
         "^RequestFailed: .*extensions",
     ),
     Case("a handshake, then silence", _answers(accepted), "^RequestFailed: .*silent"),
-    Case("a handshake, then gone", _answers(accepted, then="goes"), FAILED),
     Case("a greeting that is no message", _answers(accepted, frame(b"\xc1", mask=False)), NO_MESSAGE),
-    Case("a greeting that is a list", _answers(accepted, tells([1])), "its metadata is list"),
     Case("a greeting, then silence", _greets(), "^RequestFailed: .*silent"),
-    Case("a greeting, then gone", _greets(then="goes"), FAILED),
-    Case("a greeting, then reset", _greets(then="resets"), FAILED),
     Case("a chunk, then silence", _greets(tells(CHUNK)), "^RequestFailed: .*silent"),
     Case("a chunk, then marks that are none", _greets(tells(CHUNK), tells({"s2a": [5]})), "marks is none"),
     Case("half a frame, then silence", _greets(tells(CHUNK)[:30]), "^RequestFailed: .*silent"),
-    Case("half a frame, then gone", _greets(tells(CHUNK)[:30], then="goes"), FAILED),
-    Case("half a frame, then reset", _greets(tells(CHUNK)[:30], then="resets"), FAILED),
     Case("a frame with a mask", _greets(frame(msgpack.packb(CHUNK))), "^RequestFailed: .*masking"),
     Case("1 GiB announced in a frame", _greets(announced(1 << 30, mask=False), NOISE), FAILED),
-    Case("2^63 announced in a frame", _greets(announced(1 << 63, mask=False), NOISE), FAILED),
-    Case("a closing without a word", _greets(b"\x88\x02\x03\xf3", then="goes"), FAILED),
     Case("an error that forges lines", _greets(frame(CONTROL.encode(), Opcode.TEXT, mask=False)), "all is well"),
-    Case("an error that is no UTF-8", _greets(frame(b"\xff\xfe", Opcode.TEXT, mask=False)), FAILED),
     Case(
         "an error without end",
         _greets(
@@ -196,17 +158,7 @@ SERVERS: tuple[Case[Trap], ...] = (
         ),
         FAILED,
     ),
-    Case(
-        "fragments of nothing without end",
-        _greets(frame(b"", fin=False, mask=False), again=[frame(b"", Opcode.CONT, fin=False, mask=False) * 1000]),
-        FAILED,
-    ),
     Case("pings without end", _greets(again=[frame(b"", Opcode.PING, mask=False) * 1000]), FAILED),
-    Case("chunks without actions", _greets(tells({"action": 5})), "without actions"),
-    Case("actions that are text", _greets(tells({"actions": "up"})), FAILED),
-    Case("actions that are not finite", _greets(tells({"actions": [[float("nan")]]})), "not finite"),
-    Case("actions of three axes", _greets(tells({"actions": array(bytes(32), shape=(2, 2, 2))})), "shape"),
-    Case("an array of objects", _greets(tells({"actions": OBJECTS})), NO_MESSAGE),
     Case(
         "a chunk of 100,000 actions",
         _greets(tells({"actions": array(bytes(400_000), shape=(100_000, 1))})),

@@ -43,7 +43,6 @@ def test_one_action_at_a_time_is_all_at_once(plant: Plant, actions: list[np.ndar
     motion = plant.respond(as_array(actions), PERIOD_S)
     np.testing.assert_allclose(np.array(seen[1:]), motion.position[1:, 0], atol=1e-9)
     moved = robot.moved(len(actions))
-    assert moved is not None
     mine, _ = moved
     np.testing.assert_array_equal(mine.position, motion.position)
     np.testing.assert_array_equal(mine.jerk, motion.jerk)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import random
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -61,14 +61,9 @@ def policy(*replies: Callable[[Any], bytes | None], port: int = 0) -> Iterator[t
         yield server, url
 
 
-@contextmanager
-def robot(url: str, timeout_s: float = 20, **more: Any) -> Iterator[Client]:
+def robot(url: str, timeout_s: float = 20, **more: Any) -> closing[Client]:
     options = {"policy_type": "act", "pretrained": "me/act", **more}
-    opened = open_client(wiring_of("grpc/lerobot", url=url, timeout_s=timeout_s, **options))
-    try:
-        yield opened
-    finally:
-        opened.close()
+    return closing(open_client(wiring_of("grpc/lerobot", url=url, timeout_s=timeout_s, **options)))
 
 
 def request(*frames: Any, state: tuple[float, ...] = STATE) -> Request:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -17,44 +18,44 @@ from s2a_bench.frames.convert import decode_image, yuyv_to_rgb
 from s2a_bench.testing.transport import ask, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import open_client
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.types import Frame, Request
 from tests.servers.sockets import Received, Reply, head, serving
 
 STATE = (0.5, -0.25, 1.0)
 ACTION = np.array([0.5, -0.25, 0.0, 1e-3, 0.0, 0.0, 1.0])
 
 
-def json_head(body: bytes) -> bytes:
-    return head(kind="application/json") + body
-
-
-def act(reply: Reply, frame: Frame | None = None, **more: str) -> tuple[list[Token], Trace]:
+def asked(reply: Reply, *frames: Frame, state: tuple[float, ...] = (), **more: str) -> tuple[Any, Trace]:
+    """Ask a server for a token, or with a template for actions."""
     with serving(reply) as url:
-        client = open_client(wiring_of("http/as-deployed", url=url, payload="raw", dialect="openvla", **more))
-        try:
-            return ask(client, Request("a", "pick up the cup", (frame,) if frame else ()))
-        finally:
-            client.close()
+        wiring = wiring_of("http/as-deployed", url=url, **{"payload": "raw", "dialect": "openvla", **more})
+        with closing(open_client(wiring)) as client:
+            return ask(client, Request("a", "pick up the cup", frames, state=state))
+
+
+def answering(body: str) -> tuple[Reply, list[Received]]:
+    """Answer with a body; returns the reply, and what will have come."""
+    seen: list[Received] = []
+
+    def reply(received: Received) -> list[bytes]:
+        seen.append(received)
+        return [head(kind="application/json") + body.encode()]
+
+    return reply, seen
 
 
 def says(body: str) -> Reply:
-    return lambda _: [json_head(body.encode())]
+    return answering(body)[0]
 
 
 @pytest.mark.parametrize("encoding", ["yuv422_yuy2", "bgr8", "rgb8"])
 def test_the_pixels_arrive_as_rgb_and_the_action_comes_back_as_one_token(encoding: str) -> None:
-    seen: list[Received] = []
     yuyv = yuyv_frame()
     rgb = yuyv_to_rgb(yuyv.data)
     data = {"yuv422_yuy2": yuyv.data, "bgr8": np.ascontiguousarray(rgb[:, :, ::-1]), "rgb8": rgb}[encoding]
     frame = Frame(0, 0, 64, 48, encoding, data)  # type: ignore[arg-type]
-
-    def deploy(received: Received) -> list[bytes]:
-        """``vla-scripts/deploy.py`` after ``json_numpy.patch()``."""
-        seen.append(received)
-        return [json_head(json_numpy.dumps(ACTION).encode())]
-
-    (token,), trace = act(deploy, frame, served_model="bridge_orig")
+    deploy, seen = answering(json_numpy.dumps(ACTION))  # ``vla-scripts/deploy.py`` after ``json_numpy.patch()``
+    (token,), trace = asked(deploy, frame, served_model="bridge_orig")
     payload = json_numpy.loads(seen[0].body)
     assert payload["instruction"] == "pick up the cup"
     assert payload["unnorm_key"] == "bridge_orig"
@@ -68,8 +69,8 @@ def test_the_pixels_arrive_as_rgb_and_the_action_comes_back_as_one_token(encodin
 
 
 def test_without_a_key_of_statistics_none_is_sent() -> None:
-    seen: list[Received] = []
-    act(lambda received: seen.append(received) or [json_head(json_numpy.dumps(ACTION).encode())])
+    deploy, seen = answering(json_numpy.dumps(ACTION))
+    asked(deploy)
     assert seen[0].json == {"instruction": "pick up the cup"}
 
 
@@ -84,35 +85,36 @@ def test_without_a_key_of_statistics_none_is_sent() -> None:
     ],
 )
 def test_an_action_in_any_of_its_forms_is_read(encode: Callable[[np.ndarray], str]) -> None:
-    (token,), trace = act(says(encode(ACTION)))
+    (token,), trace = asked(says(encode(ACTION)))
     np.testing.assert_allclose(np.array(json.loads(token.text)).reshape(-1)[:7], ACTION, rtol=1e-6)
     assert trace.facts["action_n"] in {7, 14}
 
 
 @pytest.mark.parametrize(
-    ("body", "message"),
+    ("template", "body", "message"),
     [
-        ('"error"', "the server answered 'error'; the reason is in the server's output"),
-        ('{"detail": "no such route"}', "broke off: no such route"),
-        ("[]", "no finite numbers"),
-        ("null", "no finite numbers"),
-        ("[[1], [1, 2]]", "not the dialect 'openvla'"),
-        ("[NaN]", "no finite numbers"),
-        ('{"__numpy__": "AAAA", "dtype": "O", "shape": [1]}', "an action of type O"),
-        ('{"__numpy__": "AAAA", "dtype": "<f8", "shape": [7]}', "not the dialect 'openvla'"),
-        ("{}", "not the dialect 'openvla'"),
-        ('"pick"', "not the dialect 'openvla'"),
-        ("", "not the dialect 'openvla'"),
+        ("", '"error"', "the server answered 'error'; the reason is in the server's output"),
+        ("", '{"detail": "no such route"}', "broke off: no such route"),
+        ("", "[]", "no finite numbers"),
+        ("", "null", "no finite numbers"),
+        ("", "[[1], [1, 2]]", "not the dialect 'openvla'"),
+        ("", "[NaN]", "no finite numbers"),
+        ("", '{"__numpy__": "AAAA", "dtype": "O", "shape": [1]}', "an action of type O"),
+        ("", '{"__numpy__": "AAAA", "dtype": "<f8", "shape": [7]}', "not the dialect 'openvla'"),
+        ("", "{}", "not the dialect 'openvla'"),
+        ("", '"pick"', "not the dialect 'openvla'"),
+        ("", "", "not the dialect 'openvla'"),
+        ("x-vla", '{"actions": [[1]]}', "an answer without action: actions"),
+        ("x-vla", '{"action": [[NaN]]}', "actions: not finite numbers"),
+        ("x-vla", '{"action": null}', "not numbers of shape"),
+        ("x-vla", '{"error": "Request failed"}', "broke off: Request failed"),
+        ("openvla-oft", '"error"', "the server answered 'error'; the reason is in the server's output"),
+        ("openvla-oft", "[[1], [1, 2]]", "no array of numbers"),
     ],
 )
-def test_what_is_no_action_is_a_failure(body: str, message: str) -> None:
+def test_what_is_no_action_is_a_failure(template: str, body: str, message: str) -> None:
     with pytest.raises(RequestFailed, match=message):
-        act(says(body))
-
-
-def test_a_body_of_another_type_is_a_failure() -> None:
-    with pytest.raises(RequestFailed, match="answered 500: Internal Server Error"):
-        act(lambda _: [head("500 Internal Server Error", "text/plain") + b"Internal Server Error"])
+        asked(says(body), yuyv_frame(), state=STATE if template else (), **({"template": template} if template else {}))
 
 
 OFT = [np.array([0.5, -0.25, float(tick)]) for tick in range(4)]
@@ -120,25 +122,10 @@ CHUNK = [[0.5, -0.25, 0.0], [0.5, -0.25, 1.0]]
 PICTURES = (yuyv_frame(seed=1), yuyv_frame(seed=2), yuyv_frame(seed=3))
 
 
-def chunk(reply: Reply, template: str, cameras: int, state: tuple[float, ...] = (), **more: str) -> tuple[Any, Trace]:
-    with serving(reply) as url:
-        more = {"payload": "raw", "dialect": "openvla", "template": template, **more}
-        client = open_client(wiring_of("http", url=url, **more))
-        try:
-            return ask(client, Request("a", "pick up the cup", PICTURES[:cameras], state=state))
-        finally:
-            client.close()
-
-
 def test_openvla_oft_is_sent_its_observation_and_answers_a_list_of_arrays() -> None:
-    seen: list[Received] = []
-
-    def deploy(received: Received) -> list[bytes]:
-        """``JSONResponse(action)`` of ``get_vla_action``'s list, after ``json_numpy.patch()``."""
-        seen.append(received)
-        return [json_head(json_numpy.dumps(OFT).encode())]
-
-    actions, trace = chunk(deploy, "openvla-oft", 3, STATE, served_model="libero")
+    """``JSONResponse(action)`` of ``get_vla_action``'s list, after ``json_numpy.patch()``."""
+    deploy, seen = answering(json_numpy.dumps(OFT))
+    actions, trace = asked(deploy, *PICTURES, state=STATE, template="openvla-oft", served_model="libero")
     payload = json_numpy.loads(seen[0].body)
     assert (seen[0].path, payload.pop("instruction"), payload.pop("unnorm_key")) == (
         "/act",
@@ -156,13 +143,8 @@ def test_openvla_oft_is_sent_its_observation_and_answers_a_list_of_arrays() -> N
 
 
 def test_x_vla_is_sent_arrays_as_texts_and_answers_an_object() -> None:
-    seen: list[Received] = []
-
-    def act_of(received: Received) -> list[bytes]:
-        seen.append(received)
-        return [json_head(json.dumps({"action": CHUNK}).encode())]
-
-    actions, _ = chunk(act_of, "x-vla", 2, STATE, extra_body='{"domain_id": 3}')
+    act, seen = answering(json.dumps({"action": CHUNK}))
+    actions, _ = asked(act, *PICTURES[:2], state=STATE, template="x-vla", extra_body='{"domain_id": 3}')
     payload = seen[0].json
     assert (payload["language_instruction"], payload["domain_id"], payload["steps"]) == ("pick up the cup", 3, 10)
     assert "image2" not in payload
@@ -172,16 +154,11 @@ def test_x_vla_is_sent_arrays_as_texts_and_answers_an_object() -> None:
 
 
 def test_sglang_is_sent_lists_and_answers_an_envelope() -> None:
-    seen: list[Received] = []
-
-    def generations(received: Received) -> list[bytes]:
-        """sgl-project/sglang 0350f48f, action/protocol.py: action_generation_response, as JSON."""
-        seen.append(received)
-        action = {"type": "continuous", "dtype": "float32", "shape": [2, 3], "values": CHUNK}
-        answer = {"object": "action.generation", "data": [{"index": 0, "input_index": 0, "action": action}]}
-        return [json_head(json.dumps(answer).encode())]
-
-    actions, _ = chunk(generations, "sglang-http", 2, STATE)
+    """sgl-project/sglang 0350f48f, action/protocol.py: action_generation_response, as JSON."""
+    action = {"type": "continuous", "dtype": "float32", "shape": [2, 3], "values": CHUNK}
+    answer = {"object": "action.generation", "data": [{"index": 0, "input_index": 0, "action": action}]}
+    generations, seen = answering(json.dumps(answer))
+    actions, _ = asked(generations, *PICTURES[:2], state=STATE, template="sglang-http")
     given = seen[0].json["input"]
     assert (seen[0].path, given["task"]) == ("/v1/actions/generations", "pick up the cup")
     assert list(given["observation"]["images"]) == ["base_0_rgb", "left_wrist_0_rgb"]
@@ -191,35 +168,13 @@ def test_sglang_is_sent_lists_and_answers_an_envelope() -> None:
 
 
 def test_the_file_of_a_picture_is_an_array_of_its_bytes(tmp_path: Path) -> None:
-    seen: list[Received] = []
     mine = tmp_path / "mine.toml"
     mine.write_text('images = ["{image:0|bytes}", "{prompt}"]\ns2a = {answer = "", path = "/v1/act"}\n')
-
-    def answers(received: Received) -> list[bytes]:
-        seen.append(received)
-        return [json_head(b"[1, 2]")]
-
-    chunk(answers, str(mine), 1, payload="jpeg")
+    reply, seen = answering("[1, 2]")
+    asked(reply, PICTURES[0], template=str(mine), payload="jpeg")
     picture, prompt = json_numpy.loads(seen[0].body)["images"]
     assert decode_image(picture.tobytes()).shape == (48, 64, 3)
     assert (prompt, seen[0].path) == ("pick up the cup", "/v1/act")
-
-
-@pytest.mark.parametrize(
-    ("template", "body", "message"),
-    [
-        ("x-vla", '{"actions": [[1]]}', "an answer without action: actions"),
-        ("x-vla", '{"action": [[NaN]]}', "actions: not finite numbers"),
-        ("x-vla", '{"action": null}', "not numbers of shape"),
-        ("x-vla", '{"error": "Request failed"}', "broke off: Request failed"),
-        ("openvla-oft", '"error"', "the server answered 'error'; the reason is in the server's output"),
-        ("openvla-oft", '[{"__numpy__": "AAAA", "dtype": "O", "shape": [1]}]', "an action of type O"),
-        ("openvla-oft", "[[1], [1, 2]]", "no array of numbers"),
-    ],
-)
-def test_an_answer_that_is_no_chunk_is_a_failure(template: str, body: str, message: str) -> None:
-    with pytest.raises(RequestFailed, match=message):
-        chunk(says(body), template, 1, STATE)
 
 
 @pytest.mark.parametrize(

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 import re
-import socket
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager
 from http import HTTPStatus
 from io import BytesIO
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import numpy as np
 import pytest
-import uvicorn
-from fastapi import FastAPI, WebSocket
 from PIL import Image
-from websockets.sync.server import serve
 
 from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.frames.convert import yuyv_to_rgb
@@ -30,6 +25,7 @@ from s2a_bench.transport import TRANSPORTS, Choice, Client, open_client
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.risks import examine
 from s2a_bench.types import Request
+from tests.plugins.policy_servers.test_websocket import handled_by
 from tests.waiting import until
 
 CHUNK = np.arange(12, dtype=np.float32).reshape(4, 3) / 8
@@ -74,71 +70,30 @@ def relative(
 
     def handle(socket: Any) -> None:
         heard.append(socket.request.path)
-        if greets:
-            socket.send(packb(greeting))
         for message in socket:
             heard.append(unpackb(message) if message else b"")
             if message:
                 said = answer(heard[-1])
                 socket.send(said if isinstance(said, str) else packb(said, **packing))
 
-    with serve(handle, "127.0.0.1", 0, compression=None, max_size=None) as server:
-        thread = Thread(target=server.serve_forever)
-        thread.start()
-        try:
-            yield "ws://{}:{}".format(*server.socket.getsockname()[:2]), heard
-        finally:
-            server.shutdown()
-            thread.join()
+    with handled_by(handle, greeting if greets else None) as address:
+        yield address, heard
 
 
-@contextmanager
-def fastapi(path: str, key: str = "") -> Iterator[str]:
-    """A server as SGLang's and vLLM-Omni's: FastAPI's, which answers an unknown path with 403."""
-    app = FastAPI()
-
-    @app.websocket(path)
-    async def policy(client: WebSocket) -> None:
-        if key and client.headers.get("authorization") != key:
-            await client.close()
-            return
-        await client.accept()
-        await client.send_bytes(packb({"model": "pi0"}))
-        await client.receive()
-
-    with closing(socket.create_server(("127.0.0.1", 0))) as listener:
-        server = uvicorn.Server(uvicorn.Config(app, log_level="critical", lifespan="off", timeout_graceful_shutdown=1))
-        thread = Thread(target=server.run, args=([listener],))
-        thread.start()
-        until(lambda: server.started)
-        try:
-            yield "ws://{}:{}".format(*listener.getsockname())
-        finally:
-            server.should_exit = True
-            thread.join()
+def robot(address: str, template: str, name: str = "websocket") -> closing[Client]:
+    return closing(open_client(wiring_of(name, url=address, template=template)))
 
 
-@contextmanager
-def robot(address: str, template: str, name: str = "websocket") -> Iterator[Client]:
-    client = open_client(wiring_of(name, url=address, template=template))
-    try:
-        yield client
-    finally:
-        client.close()
-
-
-def asked(address: str, template: str, name: str = "websocket") -> np.ndarray[Any, Any]:
+def asked(address: str, template: str, name: str = "websocket", request: Request = REQUEST) -> np.ndarray[Any, Any]:
     with robot(address, template, name) as client:
-        actions, trace = ask(client, REQUEST)
+        actions, trace = ask(client, request)
     assert "server" in budget(trace.chain()).stages_ns
     return np.stack([action.values for action in actions])
 
 
 def asked_with(address: str, template: str, cameras: int, state: int) -> np.ndarray[Any, Any]:
     frames = tuple(yuyv_frame(64, 48, index) for index in range(cameras))
-    with robot(address, template) as client:
-        actions, _ = ask(client, Request("a", "go", frames, state=tuple(np.arange(state) / 8)))
-    return np.stack([action.values for action in actions])
+    return asked(address, template, request=Request("a", "go", frames, state=tuple(np.arange(state) / 8)))
 
 
 PICTURE, TWICE = (48, 64, 3), (1, 2, 48, 64, 3)
@@ -331,8 +286,18 @@ def test_a_camera_that_the_request_lacks_is_not_looked_for_in_the_servers_list()
         np.testing.assert_array_equal(asked_with(address, "sglang", 1, 2), CHUNK)
 
 
+def gated(statuses: dict[str, HTTPStatus], others: HTTPStatus = HTTPStatus.FORBIDDEN) -> AbstractContextManager[str]:
+    """Let clients in at a path of status OK; others have 403, as of FastAPI, of which SGLang's and vLLM-Omni's are."""
+
+    def gate(connection: Any, request: Any) -> Any:
+        status = statuses.get(request.path, others)
+        return None if status == HTTPStatus.OK else connection.respond(status, "no\n")
+
+    return handled_by(lambda socket: socket.recv(), PLAIN, process_request=gate)
+
+
 def test_a_path_that_fastapi_refuses_is_not_taken_for_a_key() -> None:
-    with fastapi("/openpi/policy") as address:
+    with gated({"/openpi/policy": HTTPStatus.OK}) as address:
         found = {finding.code: finding for finding in examine(address)}
         assert found["path"].message.endswith("lets clients in at /openpi/policy")
         assert found["path"].fix == f"name {address}/openpi/policy"
@@ -340,24 +305,17 @@ def test_a_path_that_fastapi_refuses_is_not_taken_for_a_key() -> None:
         assert "path" not in {finding.code for finding in examine(address + "/openpi/policy")}
         with pytest.raises(RequestFailed, match=r"403.*refused: a wrong path or a key; see `url` and `api_key_env`"):
             asked(address, "openpi")
-    with fastapi("/openpi/policy", key="Api-Key k") as address:
+    with gated({}) as address:
         found = {finding.code: finding for finding in examine(address)}
     assert set(found) == {"server"}
     assert "refused: a wrong path or a key" in found["server"].message
-    with fastapi("/") as address:
+    with gated({"/": HTTPStatus.OK}) as address:
         assert f"name {address}/" in {finding.fix for finding in examine(address + "/wrong")}
 
 
 def test_of_paths_that_are_refused_the_one_that_wants_a_key_is_told() -> None:
-    def gate(connection: Any, request: Any) -> Any:
-        status = HTTPStatus.UNAUTHORIZED if request.path == "/openpi/policy" else HTTPStatus.NOT_FOUND
-        return connection.respond(status, "no\n")
-
-    with serve(lambda _: None, "127.0.0.1", 0, process_request=gate) as server:
-        Thread(target=server.serve_forever, daemon=True).start()
-        address = f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+    with gated({"/openpi/policy": HTTPStatus.UNAUTHORIZED}, HTTPStatus.NOT_FOUND) as address:
         found = {finding.code: finding.message for finding in examine(address)}
-        server.shutdown()
     assert f"{address}/openpi/policy answered 401" in found["server"]
 
 

@@ -7,8 +7,8 @@ import io
 import json
 import pickle
 import warnings
-from collections.abc import Callable, Generator, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
@@ -19,22 +19,21 @@ import numpy as np
 import pytest
 import zmq
 
-from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.frames.convert import yuyv_to_rgb
-from s2a_bench.plugins.policy_servers.zmq.layouts import modalities_in, template_of
 from s2a_bench.plugins.policy_servers.zmq.watch import ConnectionWatch
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
-from s2a_bench.trace import Trace, budget
+from s2a_bench.trace import budget
 from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.risks import examine
-from s2a_bench.types import Action, Piece, Request
+from s2a_bench.types import Request
+from tests.transport.test_every_server import Gate
 from tests.waiting import until
 
 CHUNK = np.arange(12, dtype=np.float32).reshape(4, 3) / 8
@@ -49,15 +48,9 @@ def serving(handler: Handler, limits: Limits | None = None, **options: Any) -> I
         yield server
 
 
-@contextmanager
-def robot(server: str, **more: Any) -> Iterator[Client]:
+def robot(server: str, timeout_s: float = 20, **more: Any) -> closing[Client]:
     """Our own client."""
-    timeout_s = more.pop("timeout_s", 20)
-    client = open_client(wiring_of("zmq/gr00t", server, timeout_s=timeout_s, **more))
-    try:
-        yield client
-    finally:
-        client.close()
+    return closing(open_client(wiring_of("zmq/gr00t", server, timeout_s=timeout_s, **more)))
 
 
 def encoded(value: Any) -> Any:
@@ -149,23 +142,6 @@ def nested() -> dict[str, Any]:
     }
 
 
-class Held:
-    """An engine that answers when it is let."""
-
-    def __init__(self) -> None:
-        self.begun, self.let = Event(), Event()
-        self.ids: list[str] = []
-
-    def __call__(self, request: Request, trace: Trace) -> Generator[Piece, None, None]:
-        self.ids.append(request.id)
-        self.begun.set()
-        assert self.let.wait(20)
-        now = now_ns()
-        trace.marks.append(("inference", now))
-        trace.token_ns.append(now)
-        yield Action(0, CHUNK[0])
-
-
 @pytest.fixture
 def peer() -> Any:
     return pytest.importorskip("msgpack_numpy")
@@ -213,32 +189,16 @@ class TestClientsOfOthers:
                 assert list(answer) == ["action.robot"]
                 assert answer["action.robot"].shape == ((1, 4, 3) if batched else (4, 3))
 
-    def test_n1_6_is_answered_with_a_list(self) -> None:
+    @pytest.mark.parametrize("codec", ["files", "maps"])
+    def test_n1_6_and_n1_7_are_answered_with_a_list_each_in_its_own_codec(self, codec: str, peer: Any) -> None:
         handler = RecordingHandler(list(CHUNK))
-        with serving(handler) as server, plain(server.address) as call:
+        with serving(handler) as server, plain(server.address, **FILES if codec == "files" else mapped(peer)) as call:
             actions, info = call("get_action", {"observation": nested(), "options": {"words": "not the prompt"}})
         assert info == {}
         np.testing.assert_array_equal(actions["robot"], CHUNK[np.newaxis])
         (got,) = handler.requests
         assert (got.prompt, got.state) == ("pick it up", (0.0,) * 5)
         assert [image.data.shape for image in got.images] == [(48, 64, 3), (48, 64, 3), (32, 32, 3)]
-
-    def test_n1_7_is_answered_in_its_own_codec(self, peer: Any) -> None:
-        handler = RecordingHandler(list(CHUNK))
-        with serving(handler) as server, plain(server.address, **mapped(peer)) as call:
-            actions, info = call("get_action", {"observation": nested(), "options": None})
-            with plain(server.address) as older:
-                files, _ = older("get_action", {"observation": nested(), "options": None})
-        assert info == {}
-        np.testing.assert_array_equal(actions["robot"], CHUNK[np.newaxis])
-        np.testing.assert_array_equal(files["robot"], CHUNK[np.newaxis])
-        assert [(got.prompt, got.state) for got in handler.requests] == [("pick it up", (0.0,) * 5)] * 2
-        assert [image.data.shape for image in handler.requests[0].images] == [(48, 64, 3), (48, 64, 3), (32, 32, 3)]
-
-    def test_objects_of_msgpack_numpy_are_refused_in_a_line(self, peer: Any) -> None:
-        with serving(RecordingHandler(list(CHUNK))) as server, plain(server.address, **mapped(peer)) as call:
-            error = call("get_action", {"observation": {"state": {"arm": np.array([{}], object)}}})["error"]
-        assert "nothing is unpickled" in error
 
     def test_other_endpoints_answer_as_gr00ts(self) -> None:
         with serving(RecordingHandler([])) as server, plain(server.address) as call:
@@ -249,40 +209,26 @@ class TestClientsOfOthers:
         assert set(configs) == {"video", "state", "action", "language"}
         assert configs["language"]["as_json"]["modality_keys"] == [TASK]
 
-    def test_n1_5s_modalities_are_json(self) -> None:
-        with serving(RecordingHandler([]), layout="n1.5") as server, plain(server.address) as call:
-            video = call("get_modality_config")["video"]
-        assert json.loads(video["as_json"]) == {"delta_indices": [0], "modality_keys": ["video.ego_view"]}
-
-    def test_n1_7s_modalities_have_a_mark_of_their_own(self) -> None:
-        with serving(RecordingHandler([]), layout="n1.7") as server, plain(server.address) as call:
+    @pytest.mark.parametrize(
+        ("layout", "marks", "key"),
+        [
+            ("auto", ["__ModalityConfig_class__", "__ModalityConfig__"], "ego_view"),
+            ("n1.5", ["__ModalityConfig_class__"], "video.ego_view"),
+            ("n1.6", ["__ModalityConfig_class__"], "ego_view"),
+            ("n1.7", ["__ModalityConfig__"], "ego_view"),
+        ],
+    )
+    def test_its_modalities_have_the_marks_of_its_layout(self, layout: str, marks: list[str], key: str) -> None:
+        with serving(RecordingHandler([]), layout=layout) as server, plain(server.address) as call:
             configs = call("get_modality_config")
-        assert [list(config) for config in configs.values()] == [["__ModalityConfig__", "s2a-bench", "as_json"]] * 4
-        assert configs["video"]["as_json"]["modality_keys"] == ["ego_view"]
+        assert {tuple(config) for config in configs.values()} == {(*marks, "as_json")}
+        video = configs["video"]["as_json"]
+        assert (json.loads(video) if layout == "n1.5" else video)["modality_keys"] == [key]
 
     def test_nobody_ends_the_server_over_the_network(self) -> None:
         with serving(RecordingHandler([])) as server, plain(server.address) as call:
             assert "stop its process" in call("kill")["error"]
             assert call("ping")["status"] == "ok"
-
-    def test_an_engine_of_tokens_is_refused_in_a_line(self) -> None:
-        with serving(RecordingHandler(["go"])) as server, plain(server.address) as call:
-            assert "choose `answer` actions" in call("get_action", flat())["error"]
-
-    def test_marks_are_computed_when_they_are_requested(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("s2a_bench.plugins.policy_servers.zmq.server.WANTED_S", 20)
-        arrived, recording = Event(), RecordingHandler(list(CHUNK))
-
-        def handler(request: Request, trace: Trace) -> Generator[Piece, None, None]:
-            trace.later["had_arrived"] = lambda: float(arrived.is_set())
-            yield from recording(request, trace)
-
-        with serving(handler) as server, robot(server.address) as client:
-            trace = Trace()
-            for piece in client.request(Request("a", "plan"), trace):
-                if piece.index == len(CHUNK) - 1:
-                    arrived.set()
-        assert trace.facts["had_arrived"] == 1
 
     def test_marks_are_for_who_said_an_id_and_once(self) -> None:
         with serving(RecordingHandler(list(CHUNK))) as server, plain(server.address) as call:
@@ -298,17 +244,17 @@ class TestClientsOfOthers:
 
 class TestServer:
     def test_it_answers_others_while_a_request_is_under_way(self) -> None:
-        held = Held()
-        with serving(held) as server, ExitStack() as stack:
+        gate = Gate("zmq/gr00t")
+        with serving(gate) as server, ExitStack() as stack:
             first, second = (stack.enter_context(plain(server.address)) for _ in range(2))
             answers: list[Any] = []
             asking = Thread(target=lambda: answers.append(first("get_action", flat())))
             asking.start()
-            assert held.begun.wait(20)
+            until(lambda: gate.began)
             assert second("ping")["status"] == "ok"
-            held.let.set()
+            gate.go.set()
             asking.join()
-        np.testing.assert_array_equal(answers[0]["action.robot"], CHUNK[:1])
+        np.testing.assert_array_equal(answers[0]["action.robot"], np.zeros((2, 2)))
 
     def test_without_its_key_nothing_is_told(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("ROBOT_KEY", KEY)
@@ -378,23 +324,6 @@ class TestBlackBox:
         assert trace.chain()[-1][0] == "server"
         assert {"convert", "msgpack_pack", "server"} <= set(spent.stages_ns)
 
-    def test_a_template_of_ones_own(self) -> None:
-        requests: list[Any] = []
-
-        def answers(request: Any) -> Any:
-            requests.append(request["data"]["observation"])
-            return [{"robot": CHUNK[np.newaxis]}, {}]
-
-        frames = (yuyv_frame(seed=1), yuyv_frame(seed=2))
-        with policy(answers) as url, robot("", url=url, layout="n1.6", template="gr00t-so100") as client:
-            ask(client, Request("a", "go", frames, state=(1, 2, 3, 4, 5, 6)))
-            with pytest.raises(RequestFailed, match=r"video\.wrist.* wants 2 pictures"):
-                ask(client, Request("a", "go", frames[:1], state=(1, 2, 3, 4, 5, 6)))
-        assert {key: value.shape for key, value in requests[0]["state"].items()} == {
-            "single_arm": (1, 1, 5),
-            "gripper": (1, 1, 1),
-        }
-
     def test_an_error_is_told_and_the_next_request_goes_on(self) -> None:
         answers = iter([{"error": "no such\nrobot"}, b"ERROR", [{"robot": CHUNK[np.newaxis]}, {}]])
         with policy(lambda _: next(answers)) as url, robot("", url=url, layout="n1.6") as client:
@@ -403,27 +332,6 @@ class TestBlackBox:
             with pytest.raises(RequestFailed, match="another kind of policy"):
                 ask(client, Request("a", "go"))
             assert len(ask(client, Request("a", "go"))[0]) == 4
-
-    def test_a_silent_server_is_given_up_and_the_socket_with_it(self) -> None:
-        begun = Event()
-
-        def answers(_: Any) -> Any:
-            if begun.is_set():
-                return [{"robot": CHUNK[np.newaxis]}, {}]
-            begun.set()
-            Event().wait(1.0)
-            return [{"robot": np.zeros((1, 4, 3), np.float32)}, {}]  # nobody waits for it
-
-        with policy(answers) as url:
-            wiring = wiring_of("zmq/gr00t", url=url, layout="n1.6", timeout_s=0.5)
-            client = open_client(wiring)
-            with pytest.raises(RequestFailed, match=r"silent for too long: 0\.5 s"):
-                ask(client, Request("a", "go"))
-            client.close()
-            with robot("", url=url, layout="n1.6") as patient:
-                actions, trace = ask(patient, Request("a", "go"))
-        np.testing.assert_array_equal(actions[1].values, CHUNK[1])  # type: ignore[union-attr]
-        assert trace.facts.get("reconnects") is None
 
     def test_the_same_client_connects_anew_after_a_failure(self) -> None:
         calls: list[int] = []
@@ -455,23 +363,12 @@ class TestBlackBox:
     def test_a_server_that_dies_is_told_at_once(self) -> None:
         alive = Event()
         alive.set()
-        with policy(lambda _: None) as url:
-            wiring = wiring_of("zmq/gr00t", url, timeout_s=30)
-            client = open_client(wiring, alive.is_set)
-            failed: list[Any] = []
-
-            def asks() -> None:
-                try:
-                    ask(client, Request("a", "go"))
-                except ServerDied as error:
-                    failed.append(error)
-
-            asking = Thread(target=asks)
-            asking.start()
-            alive.clear()
-            asking.join(20)
-            client.close()
-        assert failed
+        with (
+            policy(lambda _: alive.clear()) as url,
+            closing(open_client(wiring_of("zmq/gr00t", url, timeout_s=30), alive.is_set)) as client,
+            pytest.raises(ServerDied),
+        ):
+            ask(client, Request("a", "go"))
 
     @pytest.mark.parametrize("url", ["http://a:1", "tcp://", "tcp://a", "tcp://a:1/x", "tcp://a:b", "tcp://u:p@a:1"])
     def test_other_urls_are_refused(self, url: str) -> None:
@@ -514,11 +411,6 @@ class TestLayoutOfAServer:
                 ask(client, Request(f"{number}", "go", (yuyv_frame(),)))
         assert answers.endpoints == ["get_modality_config", "get_action", "get_action"]
 
-    def test_arrays_in_its_configurations_are_a_mark_too(self, peer: Any) -> None:
-        answers = Policy({"state": {"mean": np.zeros(2)}})
-        with policy(answers, **mapped(peer)) as url, robot("", url=url) as client:
-            ask(client, Request("a", "go", (yuyv_frame(),)))
-
     @pytest.mark.parametrize(
         "answer", [configs("__ModalityConfig_class__"), {}, {"error": "Unknown endpoint"}, {"state": np.zeros(2)}, [1]]
     )
@@ -535,6 +427,8 @@ class TestLayoutOfAServer:
         parts = {"state.single_arm": ["{state:0:2}"], "state.gripper": ["{state:2:3}"]}
         template.write_text(json.dumps({"video.front": ["{image}"], **parts, TASK: ["{prompt}"]}))
 
+        seen: list[Any] = []
+
         def answers(request: Any) -> Any:
             """As gr00t/eval/service.py of NVIDIA/Isaac-GR00T at 0a015f63 and model/policy.py at 16c4f7b3."""
             if request["endpoint"] == "get_modality_config":
@@ -544,36 +438,25 @@ class TestLayoutOfAServer:
                 return {"status": "ok", "message": "Server is running"}
             for key in (key for each in keys.values() for key in each if key not in request["data"]):
                 return {"error": str(KeyError(key))}
-            assert request["data"]["video.front"].shape == (1, 48, 64, 3)
+            seen.append({key: np.shape(value) for key, value in request["data"].items()})
             return {"action.single_arm": CHUNK[:, :2], "action.gripper": CHUNK[:, 2]}
 
         with policy(answers) as url:
             with robot("", url=url) as client:
                 assert client.describe() == {"url": url, "template": "get_modality_config", "layout": "n1.5"}
+                ask(client, numbered(6, 1))
             with robot("", url=url, template=str(template)) as client:
                 actions, _ = ask(client, Request("a", "go", (yuyv_frame(),), state=(1, 2, 3)))
             assert [each.message for each in examine(url)] == ["127.0.0.1: no key"]
         np.testing.assert_array_equal(np.stack([action.values for action in actions]), CHUNK)  # type: ignore[union-attr]
+        common = {"video.front": (1, 48, 64, 3), "state.gripper": (1, 1), TASK: (1,)}
+        assert seen == [{**common, "state.single_arm": (1, 5)}, {**common, "state.single_arm": (1, 2)}]
 
     def test_the_key_goes_with_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("ROBOT_KEY", KEY)
         answers = Policy({})
         with policy(answers) as url, robot("", url=url, api_key_env="ROBOT_KEY"):
             assert answers.requests == [{"endpoint": "get_modality_config", "api_token": KEY}]
-
-    def test_a_silent_server_and_one_of_another_kind_are_told(self) -> None:
-        begun = Event()
-        for answers, timeout_s, why in (
-            (lambda _: begun.wait(1) or {}, 0.5, r"silent for too long: 0\.5 s"),
-            (lambda _: b"ERROR", 20, "another kind of policy"),
-            (lambda _: b"PK\x03\x04", 20, "no message"),
-        ):
-            with (
-                policy(answers) as url,
-                pytest.raises(RequestFailed, match=why),
-                robot("", url=url, timeout_s=timeout_s),
-            ):
-                pass
 
     @pytest.mark.parametrize(
         ("layout", "found"), [("auto", "n1.6"), ("n1.5", "n1.5"), ("n1.6", "n1.6"), ("n1.7", "n1.7")]
@@ -587,12 +470,6 @@ class TestLayoutOfAServer:
                 assert own.describe()["layout"] == "n1.6"
                 ask(own, Request("b", "go", (yuyv_frame(),)))
         assert [request.images[0].data.shape for request in handler.requests] == [(48, 64, 3)] * 2
-
-    def test_unless_told_it_has_the_marks_of_all_who_nest(self) -> None:
-        with serving(RecordingHandler([])) as server, plain(server.address) as call:
-            video = call("get_modality_config")["video"]
-        assert (video.pop("__ModalityConfig_class__"), video.pop("__ModalityConfig__")) == (True, True)
-        assert video["as_json"]["modality_keys"] == ["ego_view"]
 
     def test_a_run_records_it_and_no_sample_waits_for_it(self, peer: Any, tmp_path: Path) -> None:
         answers = Policy(configs("__ModalityConfig__"))
@@ -730,48 +607,31 @@ class TestEmbodiments:
         ):
             ask(client, numbered(state, cameras))
 
-    def test_two_parts_of_unknown_width_are_told(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setitem(EMBODIMENTS, "ours", (("front",), 1, ("tail", "x", "wing"), "task"))
-        with (
-            policy(Embodied("ours", "n1.6")) as url,
-            robot("", url=url) as client,
-            pytest.raises(RequestFailed, match=r"state is tail \(\?\), x \(1\), wing \(\?\), not 5 numbers"),
-        ):
-            ask(client, numbered(5, 1))
-
     def test_a_template_goes_first(self) -> None:
-        with policy(Embodied("unitree_g1", "n1.6")) as url, robot("", url=url, template="gr00t-so100") as client:
+        server = Embodied("unitree_g1", "n1.6")
+        with policy(server) as url, robot("", url=url, template="gr00t-so100") as client:
             assert client.describe()["template"] == "gr00t-so100"
-
-    def test_n1_5_is_flat_and_its_configurations_are_text(self) -> None:
-        told = {"video": ["video.front"], "state": ["state.single_arm", "state.gripper"], "language": [TASK]}
-        answer = {
-            modality: {"as_json": json.dumps({"delta_indices": [0], "modality_keys": keys})}
-            for modality, keys in told.items()
-        }
-        picture = np.zeros((4, 4, 3), np.uint8)
-        filled = template_of("n1.5", modalities_in(answer), 6).fill([picture], range(6), "go")
-        assert {key: np.shape(value) for key, value in filled.items()} == {
-            "video.front": (1, 4, 4, 3),
-            "state.single_arm": (1, 5),
-            "state.gripper": (1, 1),
-            TASK: (1,),
-        }
+            with pytest.raises(RequestFailed, match="KeyError 'ego_view'"):
+                ask(client, numbered(6, 2))
+        shapes = {key: part.shape for key, part in server.seen["state"].items()}
+        assert shapes == {"single_arm": (1, 1, 5), "gripper": (1, 1, 1)}
 
 
 class TestDangers:
-    def test_who_answers_everybody_is_told_of_by_a_ping(self) -> None:
-        requests: list[Any] = []
-
-        def answers(request: Any) -> Any:
-            requests.append(request)
-            return {"status": "ok"}
-
+    @pytest.mark.parametrize(
+        ("configured", "may"),
+        [
+            ({"status": "ok"}, ", may unpickle what it receives (early GR00T N1.7)"),
+            (configs("__ModalityConfig__"), ", may unpickle what it receives (early GR00T N1.7)"),
+            (configs("__ModalityConfig_class__"), ""),
+        ],
+    )
+    def test_which_gr00t_answers_everybody_a_ping_and_its_configurations_tell(self, configured: Any, may: str) -> None:
+        answers = Policy(configured)
         with policy(answers) as url:
             (found,) = examine(url)
-        assert requests == [{"endpoint": "ping"}, {"endpoint": "get_modality_config"}]
-        assert found.level == "advice"
-        assert found.message == "127.0.0.1: no key, may unpickle what it receives (early GR00T N1.7)"
+        assert answers.requests == [{"endpoint": "ping"}, {"endpoint": "get_modality_config"}]
+        assert (found.level, found.message) == ("advice", f"127.0.0.1: no key{may}")
 
     @pytest.mark.parametrize("answer", [b"ERROR", b"PK\x03\x04" + bytes(9), pickle.dumps({"status": "ok"})])
     def test_n1_is_known_by_its_answer_to_a_ping(self, answer: bytes) -> None:
@@ -781,13 +641,6 @@ class TestDangers:
         assert requests == [{"endpoint": "ping"}]
         assert found.level == "warning"
         assert "127.0.0.1: unpickles what it receives (GR00T N1," in found.message
-
-    @pytest.mark.parametrize(("mark", "may"), [("__ModalityConfig__", True), ("__ModalityConfig_class__", False)])
-    def test_which_gr00t_may_unpickle_its_configurations_tell(self, mark: str, may: bool) -> None:
-        with policy(Policy(configs(mark))) as url:
-            (found,) = examine(url)
-        assert found.level == "advice"
-        assert ("may unpickle" in found.message) == may
 
     @pytest.mark.parametrize("answer", [b"hello", [1], msgpack.packb(5)])
     def test_what_is_no_gr00t_is_an_error(self, answer: Any) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import EngineError, RequestFailed
-from s2a_bench.plugins.policy_servers.zmq.layouts import actions_in, answer_of, modalities
+from s2a_bench.plugins.policy_servers.zmq.layouts import actions_in, answer_of
 from s2a_bench.plugins.policy_servers.zmq.npy import PictureFile, array_of, file_of
 from s2a_bench.plugins.policy_servers.zmq.wire import pack, read
 from s2a_bench.types import Token
@@ -55,7 +55,6 @@ def test_a_picture_is_packed_from_its_room(outer: tuple[int, ...]) -> None:
     room.pixels[:] = np.random.default_rng(1).integers(0, 256, room.pixels.shape)
     picture = room.pixels.reshape(*outer, 48, 64, 3)
     file = room.file(picture)
-    assert file is not None
     assert bytes(file) == saved(picture)
     assert pack({"a": picture}, {room.address: room}) == pack({"a": picture})
 
@@ -75,11 +74,14 @@ def test_only_numbers_are_read(array: Any) -> None:
         array_of(saved(array, allow_pickle=True))
 
 
-def test_nothing_is_unpickled() -> None:
-    class Trap:
-        def __reduce__(self) -> Any:
-            return pytest.fail, ("it was unpickled",)
+class Trap:
+    """What fails the test if it is unpickled."""
 
+    def __reduce__(self) -> Any:
+        return pytest.fail, ("it was unpickled",)
+
+
+def test_nothing_is_unpickled() -> None:
     for data in (pickle.dumps(Trap()), saved(np.array([Trap()], object), allow_pickle=True)):
         with pytest.raises(RequestFailed):
             unpack(msgpack.packb({"__ndarray_class__": True, "as_npy": data}))
@@ -158,10 +160,6 @@ def test_a_map_that_lies_is_refused_in_a_line(fields: dict[str, Any], why: str) 
 
 
 def test_a_pickle_in_a_map_is_refused_unread(peer: Any) -> None:
-    class Trap:
-        def __reduce__(self) -> Any:
-            return pytest.fail, ("it was unpickled",)
-
     message = peer.packb(np.array([Trap()], object))
     with pytest.raises(RequestFailed, match=r"kind 'O'.*nothing is unpickled"):
         unpack(message)
@@ -186,6 +184,29 @@ def test_the_marks_of_a_message_are_those_of_its_arrays_and_configurations() -> 
 def test_no_other_class_becomes_anything() -> None:
     told = {"__ModalityConfig_class__": True, "as_json": "{}"}
     assert unpack(pack(told)) == told
+
+
+def lying(shape: str, descr: str = "'|u1'", version: bytes = b"\x01\x00") -> bytes:
+    """A file of 12 bytes whose header may lie."""
+    text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}".encode()
+    return b"\x93NUMPY" + version + len(text).to_bytes(2, "little") + text + bytes(12)
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        *("text", 5, None, b"", b"\x93NUMPY", b"\x93NUMPY\x01\x00\xff\xff{", b"\x93NUMPY\x02\x00\xff\xff\xff\xff{"),
+        lying("(12,)", version=b"\x09\x00"),
+        lying("(1,)", "[('a', '<i4'), ('b', '|O')]"),
+        *map(lying, ["(3,)", "(-1, 4, 3)", "('a',)", f"({10**30}, {10**30})", f"(0, {2**60}, 3)", f"({'1, ' * 1000})"]),
+    ],
+    ids=lambda file: repr(file)[:60],
+)
+def test_a_file_that_is_none_is_refused_in_a_line(file: Any) -> None:
+    with pytest.raises(RequestFailed) as failed:
+        array_of(file)
+    assert str(failed.value).isprintable()
+    assert len(str(failed.value)) < 200
 
 
 @pytest.mark.parametrize("size", [-1, 1, 100])
@@ -214,8 +235,3 @@ def test_neither_tokens_nor_nothing_are_an_answer() -> None:
         answer_of({}, "n1.6", [Token(0, "go")])
     with pytest.raises(EngineError, match="no action at all"):
         answer_of({}, "n1.6", [])
-
-
-@pytest.mark.parametrize("layout", ["n1.5", "n1.6"])
-def test_every_modality_has_keys(layout: str) -> None:
-    assert {config["__ModalityConfig_class__"] for config in modalities(layout).values()} == {True}

@@ -49,10 +49,10 @@ def ros_2() -> Iterator[None]:
                 prefix = f"{package}/{kind}/"
                 vars(sys.modules[name])["__getattr__"] = lambda part, make=make, prefix=prefix: make(prefix + part)
         for part in GLUE:
-            patch.delitem(sys.modules, f"s2a_bench.ros.rclpy_{part}", raising=False)
+            patch.delitem(sys.modules, f"s2a_bench.plugins.rclpy.{part}", raising=False)
         yield
         for part in GLUE:
-            sys.modules.pop(f"s2a_bench.ros.rclpy_{part}", None)
+            sys.modules.pop(f"s2a_bench.plugins.rclpy.{part}", None)
 
 
 @pytest.fixture
@@ -74,16 +74,6 @@ def test_a_goal_that_has_ended_goes_with_its_pictures_at_once() -> None:
         assert gone() is None
     finally:
         gc.enable()
-
-
-def test_llama_msgs_is_needed_where_its_version_is_an_option(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    without_llama_msgs(monkeypatch)
-    wiring = wiring_of("ros/topic", "/s2a", middleware="rclpy", domain_id=7, llama_msgs="4.4")
-    with pytest.raises(MissingInterface, match="colcon build --packages-select llama_msgs"):
-        open_server(wiring, RecordingHandler([]))
-    assert GRAPH == []
 
 
 @pytest.mark.parametrize(
@@ -132,7 +122,6 @@ def test_an_image_is_published_as_ready_cdr_and_its_pixels_are_views_of_what_arr
     assert type(packed) is bytes
     publisher.send(packed)
     got = subscription.take(5)
-    assert got is not None
     data = subscription.unpack(got).data
     assert data.tobytes() == pixels.tobytes()
     assert not data.flags.owndata
@@ -155,7 +144,6 @@ def test_a_result_is_given_out_after_all_feedback(join: Join) -> None:
     client: Any = join().action_client(NAME, llama.GENERATE_RESPONSE)
     goal_id = client.send(client.pack(llama.generate_goal("p")))
     goal = server.next_goal(5)
-    assert goal is not None
     goal.accept()
     goal.executing()
     with client.lock:  # the client's thread stops after its first take, while all of this arrives
@@ -194,10 +182,17 @@ def test_topics_are_served_without_llama_msgs_and_the_log_says_what_is_not(
     assert GRAPH == []
 
 
-def test_the_action_needs_llama_msgs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_action_needs_llama_msgs_and_so_do_topics_where_its_version_is_an_option(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     without_llama_msgs(monkeypatch)
-    wiring = wiring_of("ros/action", "/s2a", middleware="rclpy", domain_id=7)
-    for opened in (lambda: open_server(wiring, RecordingHandler([])), lambda: open_client(wiring)):
+    action = wiring_of("ros/action", "/s2a", middleware="rclpy", domain_id=7)
+    topic = wiring_of("ros/topic", "/s2a", middleware="rclpy", domain_id=7, llama_msgs="4.4")
+    for opened in (
+        lambda: open_server(action, RecordingHandler([])),
+        lambda: open_client(action),
+        lambda: open_server(topic, RecordingHandler([])),
+    ):
         with pytest.raises(MissingInterface, match="colcon build --packages-select llama_msgs"):
             opened()
     assert GRAPH == []

@@ -52,25 +52,6 @@ def read_once() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
-def over_wifi() -> Any:
-    return advise(AdviseConfig(link=LINK))
-
-
-def test_a_prediction_is_the_line_and_what_the_link_takes(over_wifi: Any) -> None:
-    found, profile, origin = over_wifi
-    raw = next(each for each in found if (each.pipeline, each.payload) == ("websocket/openpi", "raw"))
-    pixels_s = 640 * 480 * 3 * 8e-6 / 12
-    assert raw.bound_ms == pytest.approx(10 + pixels_s * 1e3, rel=0.01)
-    assert raw.link_ms == pytest.approx(10 + pixels_s * 1e3 * room.HEADERS, rel=0.01)
-    low, high = raw.ends_ms
-    assert low < raw.e2e_ms < high
-    assert raw.e2e_ms > raw.link_ms > raw.bound_ms
-    assert raw.limit == "link"
-    assert "PREDICTED" in origin
-    assert profile.name == LINK
-
-
 def test_bbr_paces_what_is_smaller_than_the_link_carries_in_a_round_trip(monkeypatch: pytest.MonkeyPatch) -> None:
     config = AdviseConfig(link="rate=1000,delay=20")
     plain = {each.name: each for each in advise(config)[0]}
@@ -122,22 +103,11 @@ def test_slow_start_after_idle_ranks_datagrams_before_tcp() -> None:
     assert next(iter(idle)) == udp
 
 
-def test_the_tcp_that_was_assumed_is_named(over_wifi: Any) -> None:
-    found, profile, origin = over_wifi
-    config = AdviseConfig(link=LINK, rate=2)
-    notes = advice_table(found, config, profile, origin).notes
-    assert "TCP: cubic, slow start after idle on, as this host's; requests come every 500 ms." in notes
-    whole = advice_json(found, AdviseConfig(link=LINK), profile, origin)
-    assert whole["tcp"] == {"congestion_control": "cubic", "slow_start_after_idle": True}
-    assert "if TCP is cubic, slow start after idle on and requests follow one another" in whole["sentence"]
-
-
 @pytest.mark.parametrize("load", [0.02, 0.06, 0.2, 0.3, 0.5, 0.92])
 def test_at_most_a_share_of_random_requests_waits_longer(load: float) -> None:
     """Poisson arrivals wait by Lindley's recursion, 10 ms a request; those of two robots wait for one request."""
     count, random = 200_000, np.random.default_rng(1)
     wait_ms = waiting_ms(load, 10)
-    assert wait_ms is not None
     steps = np.cumsum(10 - random.exponential(10 / load, count))
     waits = steps - np.minimum(np.minimum.accumulate(steps), 0)
     if 0.05 < load < 0.28:  # exact, below the time of one request
@@ -164,8 +134,6 @@ def test_a_rate_alone_is_surely_carried_up_to_its_half(load: float, meets: bool 
 
 def test_a_deadline_is_met_by_the_high_end_with_its_wait_and_missed_by_the_low_end() -> None:
     (one, *_), *_ = advise(AdviseConfig(link=LINK, rate=4))
-    assert one.ends_ms
-    assert one.wait_ms
     low, high, all_ms = *one.ends_ms, one.ends_ms[1] + one.wait_ms
 
     def meets(deadline_ms: float) -> bool | None:
@@ -174,22 +142,6 @@ def test_a_deadline_is_met_by_the_high_end_with_its_wait_and_missed_by_the_low_e
 
     assert [meets(low - 0.01), meets(low + 0.01), meets(high), meets(all_ms - 0.01)] == [False, None, None, None]
     assert meets(all_ms + 0.01)
-
-
-def test_the_load_and_the_interval_follow_from_the_links_rate_delay_and_jitter() -> None:
-    plain, link = (advise(AdviseConfig(link=each, rate=2))[0] for each in ("rate=1e5", "rate=12,delay=5,jitter=6"))
-    beside = {each.name: each for each in plain}
-    for each in link:
-        other = beside[each.name]
-        assert each.load == pytest.approx((each.bound_ms - 10) * 2e-3 * room.HEADERS, rel=1e-3)
-        assert each.ends_ms
-        assert other.ends_ms
-        assert each.wait_ms is None or each.load < 1
-        tcp_ms = each.link_ms - 10 - 6 - (each.bound_ms - 10) * room.HEADERS  # two delays, half of each jitter
-        assert tcp_ms >= -1e-3
-        if tcp_ms < 1e-3:
-            wider_ms = (each.ends_ms[1] - each.e2e_ms) - (other.ends_ms[1] - other.e2e_ms)
-            assert wider_ms == pytest.approx(0.05 * (each.link_ms - other.link_ms) + 12 / 2, abs=1e-3)
 
 
 def test_check_measures_with_the_pause_that_the_rate_leaves(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,47 +156,6 @@ def test_check_measures_with_the_pause_that_the_rate_leaves(monkeypatch: pytest.
         called("advise", "--link", LINK, "--rate", rate, "--check", code=2)
     first, second = (each.e2e_ms for each in advise(AdviseConfig(link=LINK, rate=2))[0][:2])
     assert [each.think_s for each in seen] == pytest.approx([0, 0.5 - max(first, second) / 1e3, 0])
-
-
-def test_the_quickest_comes_first_and_pictures_that_the_rate_does_not_carry_last() -> None:
-    found, *_ = advise(AdviseConfig(link=LINK, rate=4, deadline="500ms"))
-    assert [each.load > 1 for each in found] == sorted(each.load > 1 for each in found)
-    carried = [each for each in found if each.load <= 1]
-    assert [each.e2e_ms for each in carried] == sorted(each.e2e_ms for each in carried)
-    assert {each.payload for each in carried} == {"jpeg"}
-    assert all(each.meets is False for each in found if each.load > 1)
-
-
-def test_without_a_link_to_speak_of_the_coding_or_the_transport_is_the_limit() -> None:
-    found, *_ = advise(AdviseConfig(link="rate=100000"))
-    limits = {each.name: each.limit for each in found}
-    assert limits["websocket/openpi?payload=jpeg"] == "coding"
-    assert limits["http/as-deployed?payload=raw"] == "transport"
-
-
-@pytest.mark.parametrize(("deadline", "meets"), [("10s", True), ("1ms", False)])
-def test_a_deadline_is_met_where_the_interval_lies_on_one_side(deadline: str, meets: bool) -> None:
-    found, *_ = advise(AdviseConfig(link=LINK, deadline=deadline))
-    assert {each.meets for each in found} == {meets}
-
-
-def test_what_was_measured_stands_beside_its_prediction(over_wifi: Any) -> None:
-    found, profile, origin = over_wifi
-    config = AdviseConfig(link=LINK)
-    inside, outside = (replace(found[0], measured_ms=ms) for ms in (found[0].e2e_ms, found[0].e2e_ms * 3))
-    table = advice_table([inside, outside, *found[1:]], config, profile, origin)
-    at = table.header.index("measured ms")
-    assert [re.sub(r"[\d.]+", "", row[at]) for row in table.rows[:3]] == [", inside", ", outside", ABSENT]
-    assert [cell["inside"] for cell in advice_json([inside, outside], config, profile, origin)["cells"]] == [1, 0]
-
-
-def test_the_sentence_names_the_quickest_or_that_none_is_carried(over_wifi: Any) -> None:
-    found, profile, _ = over_wifi
-    assert sentence(found, AdviseConfig(link=LINK), profile).startswith(
-        f"{found[0].pipeline} with jpeg is the quickest"
-    )
-    config = AdviseConfig(link=LINK, rate=1000)
-    assert "over no transport" in sentence(advise(config)[0], config, profile)
 
 
 @pytest.mark.parametrize(
@@ -288,9 +199,7 @@ def carried_ms(up: Direction, down: Direction) -> float:
     ways = [Shaper(replace(way, queue_ms=1e9)) for way in (up, down)]
     full, rest = divmod(round(BODY * room.HEADERS), 1500)
     came_s = [ways[0].due_s(0.0, size) for size in (*[1500] * full, rest)][-1]
-    assert came_s is not None
     answered_s = ways[1].due_s(came_s, 60)
-    assert answered_s is not None
     return answered_s * 1e3
 
 
@@ -303,10 +212,8 @@ def test_a_link_that_is_off_by_all_that_it_may_be_ends_in_the_interval(
     """Rates by 5 %, delays by .3 ms and 5 %, any jitter, and the sweep's work at either end of its line."""
     with_lines(monkeypatch, RAW)
     (one,), profile, _ = advise(AdviseConfig(link=text))
-    assert one.ends_ms
     up, down = profile.directions()
     work_ms, reach_ms = RAW.line.at(BODY / 1e6), RAW.line.reach(BODY / 1e6)  # type: ignore[union-attr]
-    assert reach_ms
     found = []
     for sign, jitter in ((-1, 0.0), (1, 1.0)):
         shares = {"mbps": 1 - 0.047 * sign, "burst_mbps": 1 - 0.047 * sign}
@@ -358,7 +265,6 @@ def test_an_unlimited_link_has_no_load_and_an_interval_does_not_begin_before_not
     with_lines(monkeypatch, replace(RAW, line=line(0.1, 0, 2.0)))
     (one,), *_ = advise(AdviseConfig(link="delay=0", rate=100))
     assert (one.load, one.wait_ms, one.meets) == (0, 0, True)
-    assert one.ends_ms
     assert one.ends_ms[0] == 0
 
 
@@ -419,9 +325,11 @@ def test_the_table_has_what_was_asked(options: dict[str, Any], more: list[str], 
     lossy = advice_table(found, config, load_link("loss=1%"), "here")
     assert lossy.notes[-1].startswith("Losses are not predicted")
     assert table.provenance == "here"
-    measured = advice_table([advice(measured_ms=20.0), advice(measured_ms=20.0, ends_ms=None)], config, profile, "")
+    beside = [advice(measured_ms=20.0), advice(measured_ms=99.0), advice(measured_ms=20.0, ends_ms=None), advice()]
+    measured = advice_table(beside, config, profile, "")
     assert measured.header[3] == "measured ms"
-    assert [row[3] for row in measured.rows] == ["20.0, inside", "20.0"]
+    assert [row[3] for row in measured.rows] == ["20.0, inside", "99.0, outside", "20.0", ABSENT]
+    assert any(note.startswith("TCP: cubic, slow start after idle on, as this host's; ") for note in table.notes)
 
 
 def test_the_sentence_counts_those_that_surely_meet_the_deadline() -> None:
@@ -439,6 +347,7 @@ def test_the_sentence_counts_those_that_surely_meet_the_deadline() -> None:
     whole = advice_json(found, AdviseConfig(link="4g"), profile, "here")
     assert (whole["schema"], whole["command"], whole["provenance"]) == ("s2a-bench-advise/1", "advise", "here")
     assert (whole["cells"][0]["limit"], whole["cells"][0]["load"], whole["link"]["up_mbps"]) == ("link", 0.25, 18.75)
+    assert whole["tcp"] == {"congestion_control": "cubic", "slow_start_after_idle": True}
 
 
 def test_options_are_read_in_their_units() -> None:
@@ -484,8 +393,3 @@ def test_only_pipelines_over_a_network_of_runs_without_a_link_are_fitted(monkeyp
     monkeypatch.setattr(room, "joined", lambda origins: SimpleNamespace(line=f"{[*origins]}"))
     assert FITTED((Path("a"), Path("b"))) == ([RAW], "['', '']")
     assert seen == [runs[""], runs[""]]
-
-
-@pytest.mark.parametrize(("rate", "period_ms"), [(0, 0), (3, 1000 / 3), (30, 1000 / 30)])
-def test_requests_come_as_often_as_the_rate_says(rate: float, period_ms: float) -> None:
-    assert AdviseConfig(link=LINK, rate=rate).period_ms == pytest.approx(period_ms)

@@ -135,23 +135,6 @@ def test_a_step_more_than_a_window_ago_no_longer_counts() -> None:
     assert found.lo_ns <= simulated.offset(at_ns) <= found.hi_ns
 
 
-def test_one_exchange_bounds_its_own_one_way_times() -> None:
-    only = Exchange(sent_ns=100, received_ns=5_000_150, answered_ns=5_000_250, seen_ns=300)
-    offset = Offset()
-    offset.add(only)
-    found = offset.over(only.sent_ns, only.seen_ns)
-    assert found.lo_ns <= 5_000_000 <= found.hi_ns
-    assert found.half_ns >= found.middle_ns - found.lo_ns
-
-
-def test_far_from_its_exchange_an_offset_may_have_drifted_at_the_limit_of_the_rate_both_ways() -> None:
-    only, far_ns = Exchange(sent_ns=0, received_ns=500, answered_ns=500, seen_ns=2000), 10**9
-    drift_ns = round(RATE * far_ns)
-    after, before = interval_at(2000 + far_ns, [only]), interval_at(-far_ns, [only])
-    assert (after.lo_ns, after.hi_ns) == pytest.approx((-1500 - drift_ns, 500 + drift_ns + 200), abs=2)
-    assert (before.lo_ns, before.hi_ns) == pytest.approx((-1500 - drift_ns - 200, 500 + drift_ns), abs=2)
-
-
 def best(at_ns: int, exchanges: Sequence[Exchange], slack_ns: float) -> tuple[float, float] | None:
     """Return the least and the greatest a + b t over all lines between the bounds, by linear programming."""
     rows = [((1, (time - at_ns) / 1e6), bound + slack_ns) for time, bound in (each.upper for each in exchanges)]
@@ -194,7 +177,6 @@ def test_an_interval_is_that_of_every_line_between_the_bounds(exchanges: list[Ex
     except ClockMoved:
         assert not inner
         return
-    assert outer
     assert outer[0] - 2.1 <= found.lo_ns
     assert found.hi_ns <= outer[1] + 2.1
     if inner:
@@ -206,7 +188,6 @@ def test_with_more_bounds_than_count_an_interval_still_holds_the_offset() -> Non
     """Upper bounds on a parabola are all vertices; some 100 of 600 count, and so do the last 2000 exchanges."""
     exchanges = [Exchange(at, at + (at // 1000) ** 2, at, at + 10) for at in range(-300_000, 300_000, 1000)]
     found, tight = interval_at(0, exchanges), best(0, exchanges, 0)
-    assert tight
     assert found.lo_ns <= tight[0] <= tight[1] <= found.hi_ns <= tight[1] + 40
     offset = Offset()
     for at in (-10, *range(KEPT)):
@@ -283,7 +264,6 @@ def test_a_report_on_this_hosts_clock_is_off_by_no_more_than_it_says(
         last_ns = virtual.now_ns()
         joined = remote.join(trace, last_ns)
         report = trace.remote
-        assert report is not None
         assert report.clock == clock_id()
         for (_, stamp), true_ns in zip(report.marks, (sent_ns + 8 * MS_NS, sent_ns + 10 * MS_NS), strict=True):
             assert abs(stamp - true_ns) <= joined.error_ns

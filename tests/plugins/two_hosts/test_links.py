@@ -26,7 +26,7 @@ from s2a_bench.errors import NotPermitted, UsageError
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.plugins.two_hosts.advise.prediction import HEADERS, Tcp, tcp_adds_ms
 from s2a_bench.plugins.two_hosts.links import CLIENT, SERVER, EmulatedLink, emulated
-from s2a_bench.plugins.two_hosts.links.probe import Found, probed
+from s2a_bench.plugins.two_hosts.links.probe import probed
 from s2a_bench.plugins.two_hosts.profiles import bound_s, load_link
 from tests.cli.program import called
 
@@ -111,14 +111,6 @@ def test_the_kernel_starts_slowly_after_idle_as_advice_predicts(name: str) -> No
     on_link("rate=30,delay=30", use)
 
 
-def test_a_probe_that_is_off_names_what_was_measured(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = [Found("rate up", "Mbit/s", 100, 96, 5), Found("rate down", "Mbit/s", 100, 90, 5)]
-    monkeypatch.setattr("s2a_bench.plugins.two_hosts.links.probe._Probe.__init__", lambda *_: None)
-    monkeypatch.setattr("s2a_bench.plugins.two_hosts.links.probe._Probe.measure", lambda _: iter(found))
-    with pytest.raises(UsageError, match=r"does not carry 4g within 5%: rate down 90 instead of 100 Mbit/s;"):
-        probed(type("Link", (), {"profile": load_link("4g")})())  # type: ignore[arg-type]
-
-
 def test_the_manifest_has_both_directions_without_their_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     profile, said = load_link("rate=9,rate_cv=0.3,delay=4,seed=5"), list[str]()
     monkeypatch.setattr("s2a_bench.plugins.two_hosts.links.probed", lambda _: {"probe": {}})
@@ -178,8 +170,6 @@ def test_nothing_is_left_after_a_kill() -> None:
     with subprocess.Popen(
         [sys.executable, "-c", HOLD], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as holder:
-        assert holder.stdout is not None
-        assert holder.stderr is not None
         line = holder.stdout.readline()
         if not line:
             pytest.skip(holder.stderr.read().decode()[-200:])

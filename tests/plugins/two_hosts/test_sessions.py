@@ -97,17 +97,6 @@ def test_a_clock_that_is_set_ends_the_run_with_one_line(elsewhere: tuple[Elsewhe
     assert "chronyc waitsync" in measured.sample.error
 
 
-def test_a_server_elsewhere_without_marks_cannot_be_joined(monkeypatch: pytest.MonkeyPatch) -> None:
-    source, client = open_source("synthetic", 64, 48, fps=30.0, seed=0), ElsewhereClient()
-    monkeypatch.setattr(Trace, "receive", lambda trace, remote: setattr(trace, "remote", replace(remote, marks=[])))
-    feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request
-    measured = Session(one_pipeline("http/as-deployed"), client, feed, plan, clocks={}).measure(
-        Place(0, 0, warmup=False)
-    )
-    source.close()
-    assert "the server reported no marks" in measured.sample.error
-
-
 def test_without_what_knows_the_other_clock_all_up_to_the_answer_is_the_server(
     elsewhere: tuple[ElsewhereClient, Session],
 ) -> None:

@@ -54,7 +54,6 @@ def peer(ours: Middleware, stack: ExitStack, tmp_path: Path) -> Peer:
         alone = {**os.environ, "HOME": str(tmp_path), "GIT_ALLOW_PROTOCOL": "file"}  # it would fetch definitions
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=alone)
         stack.callback(process.communicate)
-        assert process.stdout is not None
         lines = process.stdout
 
         def read() -> Any:

@@ -66,8 +66,6 @@ def test_the_operating_point_is_within_a_tenth_of_what_is_listed(world: str, pol
 def test_the_bare_integrator_agrees_with_the_full_simulator(policy: str, gap: str) -> None:
     bare, full = driven("longitudinal", policy, gap=gap), driven("embedded", policy, gap=gap)
     assert bare.outcomes.name(0) == full.outcomes.name(0)
-    assert bare.trajectory is not None
-    assert full.trajectory is not None
     steps = min(len(bare.trajectory.time_s), len(full.trajectory.time_s))
     apart = bare.trajectory.position_m[:steps] - full.trajectory.position_m[:steps]
     assert np.abs(apart).max() < 0.15
@@ -99,7 +97,6 @@ def test_nobody_stalls_or_is_hit_where_tokens_come_fast() -> None:
 
 def test_before_the_first_skill_the_ego_cruises_and_in_a_gap_it_brakes() -> None:
     path = driven("longitudinal", "naive").trajectory
-    assert path is not None
     waiting, between = path.phase[:, 0] == WAITING, path.phase[:, 0] == GAP
     assert path.speed_mps[waiting, EGO, 0] == pytest.approx(50 / 3.6)
     assert path.time_s[waiting][-1] == pytest.approx(1.75, abs=0.011)
@@ -148,7 +145,6 @@ def test_the_embedded_simulator_changes_lanes_and_passes_the_lead() -> None:
     found = drive(SIMULATORS["embedded"](), cars, braking_plan(cars, 5, 0.8, lane_change=True), each, record=True)
     assert found.outcomes.name(0) == "none"
     path = found.trajectory
-    assert path is not None
     assert path.lateral_m[-1, EGO, 0] == pytest.approx(4.0, abs=0.3)
     assert path.position_m[-1, EGO, 0] > path.position_m[-1, LEAD, 0]
 
@@ -203,7 +199,6 @@ def go(cars: Cars, many: Schedule, *, record: bool = False) -> Driven:
 def test_physics_holds_in_any_scenario(seed: int, follower: str) -> None:
     found = go(*draw(seed, follower, reflex=bool(seed)), record=True)
     path, outcomes = found.trajectory, found.outcomes
-    assert path is not None
     assert (path.speed_mps >= 0).all()
     assert (np.diff(path.position_m, axis=0) >= -1e-9).all()
     ego = path.acceleration_mps2[:, EGO]
@@ -234,7 +229,5 @@ def test_the_ego_does_not_look_behind(seed: int) -> None:
     cars, many = draw(seed, "careful", reflex=False)
     here = go(cars, many, record=True).trajectory
     elsewhere = go(replace(cars, rear_gap_m=100.0, reaction_s=0.1), many, record=True).trajectory
-    assert here is not None
-    assert elsewhere is not None
     steps = min(len(here.time_s), len(elsewhere.time_s))
     assert (here.position_m[:steps, [LEAD, EGO]] == elsewhere.position_m[:steps, [LEAD, EGO]]).all()

@@ -6,7 +6,7 @@ them. Arrays are of numbers and texts: no objects (dtype kind O), no records (V)
 refuses too.
 
 Our client says who it is in a header of its handshake, `MARKS_HEADER`. Then its observations have what
-`transport.observed` adds, and each answer is followed by one more frame with the server's marks.
+`observed` adds, and each answer is followed by one more frame with the server's marks.
 """
 
 from __future__ import annotations

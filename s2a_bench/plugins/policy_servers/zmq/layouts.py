@@ -5,7 +5,7 @@ N1.5 is flat: ``video.<camera>`` (T, H, W, 3) uint8, ``state.<part>`` (T, D), ``
 in front, as (B, T, H, W, 3), (B, T, D), [[text]]; its answer is [{part: (B, H, D)}, info]. N1.7 nests as N1.6 does, and
 packs arrays and marks configurations in another way (`wire`). Our server reads all of them, and answers in the same.
 
-A request of our client has what `transport.observed` adds beside GR00T's keys. Once it is answered the client asks
+A request of our client has what `observed` adds beside GR00T's keys. Once it is answered the client asks
 `MARKS`, by that request's id, for what the server marked; nothing of it is measured.
 """
 

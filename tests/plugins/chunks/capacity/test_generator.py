@@ -41,15 +41,12 @@ class Over:
     """An event whose waits move a virtual clock."""
 
     def __init__(self, clock: VirtualClock) -> None:
-        """Be not set."""
         self._clock, self._set = clock, False
 
     def set(self) -> None:
-        """End the waits."""
         self._set = True
 
     def wait(self, timeout_s: float) -> bool:
-        """Move the clock."""
         self._clock.sleep_until_ns(self._clock.now_ns() + round(timeout_s * 1e9))
         return self._set
 

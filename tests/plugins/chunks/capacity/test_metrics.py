@@ -155,16 +155,6 @@ def test_robots_that_differ_have_the_variance_between_them() -> None:
     assert interval(flags, 6, cycle=4) == pytest.approx((low / 6000, high / 6000))
 
 
-def test_stalls_that_come_together_and_robots_that_differ_widen_the_interval() -> None:
-    rng = np.random.default_rng(0)
-    apart = rng.random(10_000) < 0.1
-    together = np.repeat(rng.random(100) < 0.1, 100)
-    unlike = rng.random((10, 1000)) < np.linspace(0, 0.2, 10)[:, np.newaxis]
-    widths = [high - low for low, high in (interval(apart), interval(together), interval(unlike, 10))]
-    assert widths[0] < 0.03
-    assert min(widths[1:]) > 0.06
-
-
 @pytest.mark.parametrize("expected", [0.3, 1, 3, 10, 40])
 @pytest.mark.parametrize("confidence", [0.95, 0.99])
 def test_the_interval_holds_the_share_of_few_events_of_unlike_size(expected: float, confidence: float) -> None:

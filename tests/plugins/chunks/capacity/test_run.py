@@ -15,7 +15,7 @@ from s2a_bench.plugins.chunks.capacity import run as run_module
 from s2a_bench.plugins.chunks.capacity.config import CapacityConfig
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, REQUESTS, ROBOTS
-from s2a_bench.plugins.chunks.capacity.run import _Robots, run_capacity
+from s2a_bench.plugins.chunks.capacity.run import _Robots
 from s2a_bench.plugins.chunks.capacity.search import Judge, Tried
 from s2a_bench.plugins.chunks.modes import Ticks
 from s2a_bench.testing import NullProgress
@@ -37,17 +37,14 @@ class Looks:
     """Robots that did the same in every look."""
 
     def __init__(self, one: RobotTrace) -> None:
-        """Have looked at nothing."""
         self.name, self.trace, self.looked, self.stopped = "c", one, 0, False
         self.session: Any = SimpleNamespace(cell=SimpleNamespace(name="c"), origin=SimpleNamespace(to_dict=dict))
 
     def looks(self, _number: int) -> Iterator[Any]:
-        """Yield four times."""
         for self.looked in (1, 2, 3, 4):
             yield [self.trace], {}
 
     def stop(self) -> None:
-        """Note that."""
         self.stopped = True
 
 
@@ -164,8 +161,8 @@ def test_robots_are_in_as_many_processes_as_their_server_lets_them(
 @pytest.mark.parametrize(
     ("mode", "options", "cycle_ms"),
     [
-        ("sync", {}, 16 * 20),
-        ("queue?trigger=8", {"control_hz": 100}, 16 * 10),
+        ("sync", {"modes": "sync"}, 16 * 20),
+        ("queue?trigger=8", {"modes": "queue?trigger=8", "control_hz": 100}, 16 * 10),
         ("", {"plan_every_s": 2, "limit": "stalled=50%"}, 2000),
         ("", {"closed_loop": True, "think_s": 0.5}, 500),
     ],
@@ -173,51 +170,8 @@ def test_robots_are_in_as_many_processes_as_their_server_lets_them(
 def test_robots_start_at_random_moments_of_a_cycle(
     monkeypatch: pytest.MonkeyPatch, mode: str, options: Any, cycle_ms: float
 ) -> None:
-    more = {"modes": mode} if mode else {}
-    robots = robots_of(monkeypatch, mode=mode, requests={"transports": "loopback"}, **options, **more)
-    cycle_ns = cycle_ms * MS
-    if mode:
-        made = robots._config.made[mode]
-        assert made.execution_horizon(robots._config.setting) * robots._config.setting.period_ns <= cycle_ns
-        cycle_ns = made.execution_horizon(robots._config.setting) * robots._config.setting.period_ns
+    robots, cycle_ns = robots_of(monkeypatch, mode=mode, requests={"transports": "loopback"}, **options), cycle_ms * MS
     phases_ns = np.array([*robots._phases(2000).values()])
     assert 0 <= phases_ns.min() < 0.01 * cycle_ns
     assert 0.99 * cycle_ns < phases_ns.max() <= cycle_ns
     assert phases_ns.mean() == pytest.approx(cycle_ns / 2, rel=0.05)
-
-
-@pytest.mark.parametrize(
-    ("options", "cadence", "fleets"),
-    [
-        ({}, "control loops at 50 Hz", 5),  # 1, 2, 4, and two by bisection at most
-        ({"modes": "sync,queue", "robots": "1,2"}, "control loops at 50 Hz", 4),
-        ({"plan_every_s": 2.5}, "a plan every 2.5 s", 5),
-        (
-            {"closed_loop": True, "think_s": 0.5, "robots": "1,2,3"},
-            "closed loop, 0.5 s from an answer to the next request",
-            3,
-        ),
-    ],
-)
-def test_the_manifest_says_when_requests_are_made_and_as_many_fleets_are_expected(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Any, options: Any, cadence: str, fleets: int
-) -> None:
-    progress, cadences = NullProgress(), []
-
-    def run(task: Any, plan: Any, *_: Any) -> Any:
-        cadences.append(plan.manifest["cadence"])
-        count = len(plan.cells) // (1 if config.load == "closed" else 2)
-        sessions = [SimpleNamespace(cell=cell, measure=lambda _: None, origin=None) for cell in plan.cells]
-        keep = lambda *_: None  # noqa: E731
-        launch = SimpleNamespace(sessions=sessions, progress=progress, plan=plan, keep=keep)
-        monkeypatch.setattr(run_module._Cell, "run", lambda cell: cells.append((cell.mode, cell.instant is None)))
-        task.drive(launch)
-        assert len(cells) == count * max(1, len(config.made) * (config.load == "chunks"))
-        return tmp_path
-
-    cells: list[tuple[str, bool]] = []
-    monkeypatch.setattr(run_module, "run_requests", run)
-    config = CapacityConfig(requests={"transports": "loopback"}, **{"robots": "1..4", "seconds": 10, **options})
-    run_capacity(config, tmp_path, progress)
-    assert (cadences, progress.expected) == ([cadence], fleets)
-    assert cells[0] == ("" if config.load != "chunks" else next(iter(config.made)), config.load == "closed")

@@ -16,20 +16,21 @@ from s2a_bench.harness.session import PLAIN, Measured, Place, RequestContext, Se
 from s2a_bench.inference import EngineConfig, chunk
 from s2a_bench.library import Run
 from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
+from s2a_bench.plugins.chunks.chunks.rows import CHUNKS
 from s2a_bench.plugins.chunks.chunks.run import run_chunks
 from s2a_bench.plugins.chunks.chunks.view import show
 from s2a_bench.plugins.chunks.modes.append import QueueStepper, Sync
-from s2a_bench.progress import NullProgress
 from s2a_bench.store.run import read_run
+from s2a_bench.testing import NullProgress
 from s2a_bench.types import Action, Request, Token, Vector
+from tests.servers.policy_websocket import policy_server
 
-ECHO = {"name": "echo"}
 TRIES = 5
 
 
-def act(tmp_path: Path, *, transport: str = "loopback", **options: object) -> pd.DataFrame:
+def act(tmp_path: Path, *, transport: str = "loopback", warmup: int = 1, **options: object) -> pd.DataFrame:
     """Act for a moment and return a row a mode."""
-    requests = {"transports": transport, "engine": ECHO, "size": "64x48", "warmup": 1}
+    requests = {"transports": transport, "engine": {"name": "echo"}, "size": "64x48", "warmup": warmup}
     config = ChunksConfig(**{"live": True, "seconds": 1.5, "requests": requests, **options})
     folder = run_chunks(config, tmp_path, NullProgress())
     return pd.read_csv(folder / "chunks.csv")
@@ -131,9 +132,8 @@ def test_delays_of_a_live_run_are_exported(tmp_path: Path) -> None:
 
 
 def test_rules_choose_triggers_as_they_go(tmp_path: Path) -> None:
-    requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
     options = {"rules": "calibrated,tracked,maximum,mean", "epsilon": 0.05, "latency": "lognormal:mean_ms=50,cv=.5"}
-    rows = act(tmp_path, modes="queue,sync", requests=requests, seconds=2.5, **options)
+    rows = act(tmp_path, modes="queue,sync", warmup=19, seconds=2.5, **options)
     assert rows["rule"].value_counts().to_dict() == {"given": 2, "calibrated": 1, "tracked": 1, "maximum": 1, "mean": 1}
     trigger = rows.set_index("rule")["trigger"]
     assert 0 < trigger["mean"] < trigger["maximum"]
@@ -156,8 +156,7 @@ def test_a_calibrated_trigger_covers_the_way_from_the_tick_to_the_capture(
         return measure(session, place, context)
 
     monkeypatch.setattr(Session, "measure", starts_late)
-    requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
-    rows = act(tmp_path, modes="queue", rules="calibrated", epsilon=0.05, latency="10", requests=requests)
+    rows = act(tmp_path, modes="queue", rules="calibrated", epsilon=0.05, latency="10", warmup=19)
     assert rows.set_index("rule").loc["calibrated", "trigger"] >= 2  # of 40 ms at 50 Hz
     assert read_run(folder_of(tmp_path)).samples["warmup"].sum() == 19
 
@@ -165,9 +164,8 @@ def test_a_calibrated_trigger_covers_the_way_from_the_tick_to_the_capture(
 def test_delays_that_changed_since_the_warm_up_are_named(tmp_path: Path) -> None:
     file = tmp_path / "delays.csv"
     file.write_text("latency_ms\n" + "30\n50\n30\n30\n" * 5 + "90\n110\n90\n90\n" * 100)
-    requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 20}
     options = {"rules": "calibrated,tracked", "epsilon": 0.05, "latency": str(file), "horizon": 5}
-    act(tmp_path, modes="queue?trigger=1", requests=requests, seconds=2, **options)
+    act(tmp_path, modes="queue?trigger=1", warmup=20, seconds=2, **options)
     run = read_run(folder_of(tmp_path))
     changed = [each["message"] for each in run.manifest["warnings"] if each["code"] == "delays-changed"]
     assert len(changed) == 2
@@ -178,9 +176,8 @@ def test_delays_that_changed_since_the_warm_up_are_named(tmp_path: Path) -> None
 
 
 def test_a_slow_server_slows_actions_down(tmp_path: Path) -> None:
-    requests = {"transports": "loopback", "engine": ECHO, "size": "64x48", "warmup": 19}
     options = {"rules": "calibrated", "epsilon": 0.05, "latency": "150", "slowest": 4.0, "horizon": 4}
-    rows = act(tmp_path, modes="queue", requests=requests, seconds=4, **options).set_index("rule")
+    rows = act(tmp_path, modes="queue", warmup=19, seconds=4, **options).set_index("rule")
     assert rows.loc["given", "p_stall_cycle"] == 1
     assert rows.loc["calibrated", "slower"] > 150 / 60
     assert rows.loc["calibrated", "delta_t_s"] == pytest.approx(0.02 * rows.loc["calibrated", "slower"], rel=1e-3)
@@ -237,7 +234,7 @@ def test_a_robot_that_breaks_ends_the_run_with_one_line(tmp_path: Path) -> None:
 
 def test_another_state_than_the_robot_has_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="`state`: `robot` plant has 7 numbers, not 3"):
-        act(tmp_path, modes="sync", requests={"transports": "loopback", "engine": ECHO, "size": "64x48", "state": 3})
+        act(tmp_path, modes="sync", requests={"transports": "loopback", "state": 3})
 
 
 @pytest.mark.parametrize("transport", ["websocket/openpi", "ros/topic"])
@@ -276,24 +273,28 @@ def test_the_last_answer_of_a_mode_is_waited_for_and_is_none_of_the_next(tmp_pat
     assert sorted(rows["latency_s_p99"] > 1.9) == [False, True]
 
 
-def test_where_no_warm_up_succeeds_it_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails(*_: object) -> None:
-        raise EngineError("out of batteries")
-
-    monkeypatch.setattr("s2a_bench.inference.echo.chunk", fails)
-    with pytest.raises(S2AError, match="out of batteries"):
-        act(tmp_path, modes="sync")
+def fails(*_: object) -> None:
+    raise EngineError("out of batteries")
 
 
-def test_a_chunk_of_another_length_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.inference.echo.chunk", lambda *args: islice(chunk(*args), 5))
-    with pytest.raises(UsageError, match=r"`horizon`: loopback answers with chunks of 5 actions, not 16"):
-        act(tmp_path, modes="sync")
-
-
-def test_a_robot_needs_actions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.inference.echo.chunk", lambda *_: [Token(0, "go")])
-    with pytest.raises(RequestFailed, match="chunks of actions"):
+@pytest.mark.parametrize(
+    ("answers", "error", "says"),
+    [
+        (fails, S2AError, "out of batteries"),
+        (
+            lambda *args: islice(chunk(*args), 5),
+            UsageError,
+            "`horizon`: loopback answers with chunks of 5 actions",
+        ),
+        (lambda *_: [Token(0, "go")], RequestFailed, "chunks of actions"),
+    ],
+    ids=["no warm-up succeeds", "another length", "no actions"],
+)
+def test_answers_that_no_robot_can_act_on_are_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, answers: object, error: type[S2AError], says: str
+) -> None:
+    monkeypatch.setattr("s2a_bench.inference.echo.chunk", answers)
+    with pytest.raises(error, match=says):
         act(tmp_path, modes="sync")
 
 
@@ -338,3 +339,17 @@ print(*ChunksConfig(live=True).live_requests.transports)
 """
     program_run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert program_run.stdout.split() == ["http/binary"]
+
+
+def test_a_policy_server_of_somebody_elses_moves_the_loop(tmp_path: Path) -> None:
+    requests = {"transports": "websocket", "size": "64x48", "state": 3, "warmup": 1}
+    with policy_server() as url:
+        config = ChunksConfig(
+            live=True, seconds=2, horizon=10, modes="queue?trigger=4,sync", requests={**requests, "url": url}
+        )
+        run = read_run(run_chunks(config, tmp_path, NullProgress()))
+    table = run.table(CHUNKS)
+    assert table["agreement"].notna().all()
+    assert (table["latency_s"] >= 0.05).all()
+    assert (table.loc[table["mode"] == "sync", "stall_ticks"] > 0).all()
+    assert run.origins.of(table["cell"].iloc[0]).engine == "unknown"

@@ -19,6 +19,7 @@ from s2a_bench.plugins.chunks.chunks.run import run_chunks
 from s2a_bench.plugins.chunks.chunks.view import chunk_sentences, show
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
+from tests.cli.program import called, printed
 
 LATENCIES = "40,lognormal:mean_ms=80,cv=.5"
 
@@ -242,10 +243,13 @@ def test_where_no_trigger_is_enough_calibrated_and_oracle_slow_actions_down(tmp_
     assert row(never, "queue", "400", "calibrated")["slower"] == 1
 
 
-def test_slowed_down_by_the_closed_forms_factor_no_cycle_stalls(tmp_path: Path) -> None:
-    stalls = ran(tmp_path, latency="320", modes="replace", rules="")
-    factor = row(stalls, "replace", "320")["slow_down"]
-    assert row(stalls, "replace", "320")["stall_ticks"] > 0
-    slowed = ran(tmp_path, latency="320", modes="replace", rules="", slow_down=factor)
-    assert row(slowed, "replace", "320")["stall_ticks"] == 0
-    assert row(slowed, "replace", "320")["slow_down"] == 1
+def test_json_keeps_its_schema(tmp_path: Path) -> None:
+    latencies = "40,bimodal:mean_ms=80,cv=.2,pause_share=.1,pause_ratio=3"
+    done = called("chunks", "--json", "--cycles", "200", "--latency", latencies, "--output", tmp_path)
+    found = printed(done)
+    assert found["command"] == "chunks"
+    assert all(cell["emulated"] is True for cell in found["cells"])
+    assert len(found["cells"]) == 18
+    assert any("trigger" in cell for cell in found["cells"])
+    for cell in found["provenance"]["cells"].values():
+        assert (cell["tokens"], cell["clock"]) == ("emulated", "virtual")

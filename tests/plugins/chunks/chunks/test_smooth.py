@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from s2a_bench.act import Motion
 from s2a_bench.errors import UsageError
 from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, METRICS
-from s2a_bench.plugins.chunks.chunks.run import run_chunks
 from s2a_bench.plugins.chunks.chunks.smooth import (
     RATE,
     TargetPath,
@@ -27,17 +25,13 @@ from s2a_bench.plugins.chunks.chunks.smooth import (
 from s2a_bench.plugins.chunks.modes import ControlSetting, Ticks, mode
 from s2a_bench.plugins.chunks.modes.aggregate import WEIGHTS, Aggregate
 from s2a_bench.plugins.chunks.plant import Plant
-from s2a_bench.store.run import StoredRun, read_run
-from s2a_bench.testing import NullProgress
+from s2a_bench.store.run import StoredRun
+from tests.plugins.chunks.chunks.test_run import ran
 
 MS = 1_000_000
 SETTING = ControlSetting(20 * MS, 16)
 PERIOD_S = 0.02
 NAMES = [name for name in METRICS if name.startswith(("tracking", "jerk", "boundary_jump", "action_step"))]
-
-
-def ran(folder: Path, **options: Any) -> StoredRun:
-    return read_run(run_chunks(ChunksConfig(**options), folder, NullProgress()))
 
 
 @pytest.fixture(scope="module")
@@ -123,15 +117,6 @@ class TestWhatIsExecuted:
             expected.append(queue.get(executed_so_far, math.nan))
             executed_so_far += executed_so_far in queue
         np.testing.assert_allclose(executed(made, cycles, done, target), expected, atol=1e-12)
-
-    def test_the_weights_of_a_tick_add_up_to_one(self) -> None:
-        latency_ns = np.random.default_rng(3).integers(0, 250 * MS, 80)
-        made = Aggregate(9, "conservative")
-        cycles = made.cycles(latency_ns, SETTING)
-        total = np.zeros(cycles.ticks)
-        for tick, _, _, share in made.blend(cycles, made.ticks(latency_ns, SETTING)):
-            total[tick] += share
-        np.testing.assert_allclose(total, made.ticks(latency_ns, SETTING).chunk >= 0)
 
 
 def measured(written: str, latency_ns: np.ndarray, target: TargetPath) -> dict[str, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,13 @@ from s2a_bench.plugins.chunks.modes.aggregate import WEIGHTS, Aggregate
 from s2a_bench.plugins.chunks.modes.append import Queue, Streamed, Sync
 from s2a_bench.plugins.chunks.modes.replace import Replace
 from tests.plugins.chunks.modes.plain import Aggregates, Appends, Log, Replaces
+
+
+def agree(some: tuple[Any, ...], others: tuple[Any, ...]) -> None:
+    """Compare arrays field by field."""
+    for one, other in zip(some, others, strict=True):
+        for field in fields(one):
+            np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name), field.name)
 
 
 @st.composite

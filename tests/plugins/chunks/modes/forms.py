@@ -23,15 +23,6 @@ class Span:
     most: float
 
 
-def queue_stall_s(latency_s: ArrayLike, trigger: int, period_s: float) -> Floats:
-    """Return max(0, L - m Delta t), the stall at each boundary in continuous time, for m <= s and any L.
-
-    On a robot with a fixed tick it is rounded to `queue_stall_ticks`: none iff m >= d, that is m >= ceil(L / Delta t)
-    where actions leave at the start of their tick, one less (but for whole L / Delta t) where they leave at its end.
-    """
-    return np.maximum(0.0, np.asarray(latency_s, dtype=np.float64) - trigger * period_s)
-
-
 def queue_stall_ticks(delay_ticks: Ints, trigger: int) -> Ints:
     """Return max(0, d - m): the stall at each boundary under queue, and under aggregate too.
 
@@ -51,12 +42,6 @@ def steady_stall_ticks(ready_ticks: Ints, known_ticks: Ints, trigger: int, execu
     return np.maximum(np.maximum(0, ready_ticks - trigger), known_ticks - execute)
 
 
-def sync_motion_share(latency_s: ArrayLike, execute: int, period_s: float) -> Floats:
-    """Return s Delta t / (s Delta t + L), the share of time in motion under sync; random L counts with its mean."""
-    busy_s = execute * period_s
-    return busy_s / (busy_s + np.asarray(latency_s, dtype=np.float64))
-
-
 def replace_stall_ticks(delay_ticks: Ints, cycle_ticks: ArrayLike, horizon: int) -> Ints:
     """Return min(c, max(0, c + d - H)), the stall between a chunk's takeover and the next one's, at constant d.
 
@@ -70,10 +55,8 @@ def replace_stall_ticks(delay_ticks: Ints, cycle_ticks: ArrayLike, horizon: int)
 def replace_age_ticks(delay: int, cycle: int, horizon: int) -> Span:
     """Return the age of the observation behind the executed actions: d to c + d - 1 ticks, mean d + (c - 1) / 2.
 
-    Where the chunk runs out before (c + d > H), d to H - 1. Raises ValueError for d >= H, which executes nothing.
+    Where the chunk runs out before (c + d > H), d to H - 1. With d >= H nothing is executed.
     """
-    if delay >= horizon:
-        raise ValueError(f"a delay of {delay} ticks leaves no action of {horizon}")
     last = min(cycle + delay, horizon) - 1
     return Span(delay, (delay + last) / 2, last)
 

@@ -28,16 +28,13 @@ from tests.plugins.chunks.modes.drawn import plainly
 from tests.plugins.chunks.modes.forms import (
     jump_actions,
     queue_age_ticks,
-    queue_stall_s,
     queue_stall_ticks,
     reaction_s,
     replace_age_ticks,
     replace_stall_ticks,
     steady_stall_ticks,
-    sync_motion_share,
 )
 from tests.plugins.chunks.modes.plain import Log
-from tests.plugins.chunks.modes.plans import earliest_arrivals, safe_start_ticks
 
 PERIOD = 20
 ROUNDINGS = st.sampled_from(["floor", "ceil"])
@@ -117,37 +114,6 @@ def test_with_any_trigger_it_stalls_for_what_answers_take_longer_than_they_last_
     assert boundaries(log)[40] == int(steady_stall_ticks(ready, known, trigger, s))
 
 
-@given(latency=st.integers(0, 400), trigger=st.integers(0, 8), s=st.integers(1, 9))
-def test_without_a_tick_the_stall_is_the_latency_less_what_is_left(latency: int, trigger: int, s: int) -> None:
-    assume(trigger <= s)
-    end = latency + s * PERIOD
-    for _ in range(5):
-        arrival = end - trigger * PERIOD + latency
-        stall = max(end, arrival) - end
-        assert stall == queue_stall_s(latency, trigger, PERIOD)
-        end += stall + s * PERIOD
-
-
-def test_a_queue_that_asks_before_it_has_what_it_asked_for_stalls_otherwise() -> None:
-    # m = s = 2 and 2.5 ticks: no request can follow from the answer before one of its two actions has left.
-    setting = ControlSetting(PERIOD, 2)
-    assert int(queue_stall_ticks(np.array(2), 2)) == 0
-    assert int(steady_stall_ticks(np.array(2), np.array(3), 2, 2)) == 1
-    assert boundaries(plainly(Queue(2), constant(50), setting)) == [1] * 7
-    assert not any(boundaries(plainly(Queue(2), constant(50), ControlSetting(PERIOD, 3))))
-    # m = 9 > s = 2 and d = 3 > s: an answer takes longer than it lasts, whatever the trigger.
-    assert boundaries(plainly(Queue(9), constant(60), setting))[2:] == [1] * 4
-
-
-@given(latency=st.integers(0, 400), s=st.integers(1, 9), rounding=ROUNDINGS)
-def test_sync_moves_for_the_share_of_its_actions(latency: int, s: int, rounding: Rounding) -> None:
-    setting = ControlSetting(PERIOD, 9, rounding)
-    log = plainly(Sync(s), constant(latency), setting)
-    share = sum(act is not None for act in log.acts) / len(log.acts)
-    delay = int(setting.delay_ticks(np.array(latency)))
-    assert share == pytest.approx(float(sync_motion_share(delay * PERIOD, s, PERIOD)))
-
-
 # (b) replace
 
 
@@ -183,21 +149,6 @@ def test_replace_stalls_for_what_a_cycle_and_a_delay_exceed_the_chunk_by(
         assert spread(found) == (age.least, age.mean, age.most)
 
 
-def test_with_one_request_under_way_a_delay_above_s_stalls_though_s_plus_d_fits() -> None:
-    # H = 8, s = 2, d = 5: s + d - H < 0, but a cycle lasts 5 ticks, and 5 + 5 - 8 = 2.
-    setting = ControlSetting(PERIOD, 8)
-    assert boundaries(plainly(Replace(2), constant(100), setting))[1:] == [2] * 5
-    assert int(replace_stall_ticks(np.array(5), 5, 8)) == 2
-    assert not any(boundaries(plainly(Replace(2, "many"), constant(100), setting))[1:])
-
-
-def test_a_delay_of_a_whole_chunk_executes_nothing() -> None:
-    log = plainly(Replace(4), constant(160), ControlSetting(PERIOD, 8))
-    assert {act[0] for act in log.acts if act} == {0}  # only the first, which is due when it arrives
-    with pytest.raises(ValueError, match="no action of 8"):
-        replace_age_ticks(8, 8, 8)
-
-
 # (c) reaction
 
 
@@ -225,10 +176,6 @@ def test_a_reaction_takes_the_wait_and_up_to_a_cycle(latency: int, s: int, trigg
     expected = reaction_s(wait * PERIOD, cycle * PERIOD)
     assert (min(reactions), max(reactions) + 1) == (expected.least, expected.most)
     assert np.mean(reactions) + 0.5 == expected.mean  # moments are whole ns
-
-
-def test_of_a_blocking_robot_the_mean_reaction_is_one_and_a_half_latencies_and_half_a_chunk() -> None:
-    assert reaction_s(0.3, 8 * 0.02 + 0.3).mean == pytest.approx(1.5 * 0.3 + 8 * 0.02 / 2)
 
 
 def test_random_latencies_cost_a_blocking_robot_more_than_their_mean() -> None:
@@ -279,16 +226,6 @@ def test_a_cycle_stalls_as_often_as_its_latency_exceeds_the_slack(made: Mode, sl
     law = stats.lognorm(variance**0.5, scale=60 * MS * np.exp(-variance / 2))
     at = slack * 20 * MS if rounding == "ceil" else (slack + 1) * 20 * MS
     assert within(stalls, count - 1, float(law.sf(at)))
-
-
-@pytest.mark.parametrize(("made", "slack"), [(Queue(2, 4), 2), (Replace(3, "one"), 1), (Aggregate(1), 1)])
-def test_so_it_does_for_a_robot_in_continuous_time(made: Mode, slack: int) -> None:
-    setting, count = ControlSetting(20 * MS, 4, "ceil"), 100_001
-    latency = np.minimum(lognormal(np.random.default_rng(6), 18 * MS, 0.5, count), 60 * MS)
-    stalls = np.count_nonzero(boundaries(plainly(made, latency, setting)))
-    variance = np.log1p(0.5**2)
-    law = stats.lognorm(variance**0.5, scale=18 * MS * np.exp(-variance / 2))
-    assert within(int(stalls), count - 1, float(law.sf(slack * 20 * MS)))
 
 
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
@@ -353,16 +290,13 @@ def test_the_slack_h_less_s_is_not_enough_with_one_request_under_way() -> None:
         slow_down(1.0, 0, 0.02)
 
 
-def test_no_start_delay_helps_where_progress_asks_but_playing_back_late_does() -> None:
+def test_no_start_delay_helps_where_progress_asks() -> None:
     # H = 8, s = 6, d = 4. A robot that begins late asks late.
     setting = ControlSetting(PERIOD, 8)
     for first in (80, 800, 8000):
         latency_ns = np.concatenate(([first], constant(80)))
         assert (Replace(6).cycles(latency_ns, setting).stall_ticks[1:] == 2).all()
         assert (Aggregate(2).cycles(latency_ns, setting).stall_ticks[1:] == 2).all()
-    # One that asks by the clock and executes what was due S0 = d ticks ago never stalls, for older actions.
-    left_at = 6 * np.arange(20)
-    assert safe_start_ticks(earliest_arrivals(left_at, np.full(20, 4), 8)) == 4
 
 
 # (g) a wrong estimate

@@ -1,8 +1,8 @@
-"""Every mode does in ticks what a robot in continuous time does, step by step and over arrays."""
+"""Every mode does in ticks what a robot in continuous time does, over arrays too; and the numbers of such a run."""
 
 from __future__ import annotations
 
-from dataclasses import fields
+import math
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,13 @@ from hypothesis import strategies as st
 from s2a_bench.errors import UsageError
 from s2a_bench.plugins.chunks.modes import MODES, ControlSetting, Mode, mode
 from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
-from s2a_bench.plugins.chunks.modes.append import Queue, Streamed, Sync
+from s2a_bench.plugins.chunks.modes.append import Queue, Sync, VariedQueue
 from s2a_bench.plugins.chunks.modes.cycles import follow, step
+from s2a_bench.plugins.chunks.modes.metrics import margin_ticks, measure, reaction_ticks
 from s2a_bench.plugins.chunks.modes.replace import Replace
-from tests.plugins.chunks.modes.drawn import cases, latencies, modes, plainly, settings_of_chunks
+from s2a_bench.plugins.chunks.modes.trigger import Varied
+from s2a_bench.plugins.chunks.testing.mode import ModeSuite
+from tests.plugins.chunks.modes.drawn import agree, cases, latencies, modes, plainly, settings_of_chunks
 
 named = pytest.mark.parametrize("name", MODES)
 many = settings(max_examples=300)
@@ -43,9 +46,7 @@ def test_ticks_are_those_of_a_robot_in_continuous_time(name: str, data: st.DataO
 @given(data=st.data())
 def test_the_stepper_and_the_arrays_agree(name: str, data: st.DataObject) -> None:
     made, latency_ns, setting = data.draw(cases(name))
-    for arrays, stepped in zip(simulate(made, latency_ns, setting)[::-1], step(made, latency_ns, setting), strict=True):
-        for field in fields(arrays):
-            np.testing.assert_array_equal(getattr(arrays, field.name), getattr(stepped, field.name), field.name)
+    agree(simulate(made, latency_ns, setting)[::-1], step(made, latency_ns, setting))
 
 
 @many
@@ -61,8 +62,8 @@ def test_arrays_of_streamed_actions_are_the_stepper_s_at_any_gaps(data: st.DataO
     length = made.execution_horizon(setting)
     waits = (np.diff(setting.delay_ticks(arrival_ns[:, :length])) > 1).any()
     assert arrays is not None or waits or made.trigger >= length
-    for field in fields(stepped) if arrays is not None else ():
-        np.testing.assert_array_equal(getattr(arrays, field.name), getattr(stepped, field.name), field.name)
+    if arrays is not None:
+        agree((arrays,), (stepped,))
 
 
 @named
@@ -107,9 +108,7 @@ def test_blended_ages_are_those_of_the_weights(data: st.DataObject) -> None:
 @given(data=st.data(), setting=settings_of_chunks())
 def test_sync_is_a_queue_that_is_empty_when_it_asks(data: st.DataObject, setting: ControlSetting) -> None:
     latency_ns = data.draw(latencies(setting))
-    for each, same in zip(simulate(Sync(), latency_ns, setting), simulate(Queue(), latency_ns, setting), strict=True):
-        for field in fields(each):
-            np.testing.assert_array_equal(getattr(each, field.name), getattr(same, field.name))
+    agree(simulate(Sync(), latency_ns, setting), simulate(Queue(), latency_ns, setting))
 
 
 def test_a_mode_by_hand() -> None:
@@ -149,20 +148,12 @@ def test_time_scaling_takes_longer_ticks_and_never_shorter_ones_than_asked() -> 
         ("wait", "`modes`: 'wait' is none of sync, queue, streamed, replace, aggregate"),
         ("queue?trigger=-1", "`modes`: queue: trigger = '-1': input should be greater than or equal to 0"),
         ("replace?execute=0", "`modes`: replace: execute = '0'"),
-        ("replace?s=2", "`modes`: replace: 's' is no parameter; its parameters are execute, under_way, assumed"),
-        ("aggregate?kind=best", "`modes`: aggregate: kind = 'best'"),
     ],
 )
 def test_a_mode_that_is_none_is_refused(written: str, message: str) -> None:
     with pytest.raises(UsageError) as caught:
         mode(written)
     assert message in str(caught.value)
-
-
-def test_a_mode_has_its_name_and_its_parameters() -> None:
-    assert [mode(name).name for name in MODES] == list(MODES)
-    assert mode("streamed?gap_s=0.01&start=naive&trigger=3") == Streamed(3, 0, 0.01, "naive")
-    assert mode("replace?execute=3&under_way=many") == Replace(3, "many")
 
 
 def test_what_is_no_setting_is_refused() -> None:
@@ -178,3 +169,122 @@ def test_what_is_no_setting_is_refused() -> None:
 
 def simulate(made: Mode, latency_ns: Any, setting: ControlSetting) -> tuple[Any, Any]:
     return made.ticks(latency_ns, setting), made.cycles(latency_ns, setting)
+
+
+@pytest.mark.parametrize("name", MODES)
+class TestDefaults(ModeSuite):
+    @pytest.fixture
+    def mode(self, name: str) -> Mode:
+        return mode(name)
+
+
+@pytest.mark.parametrize(
+    "written",
+    [
+        "queue?trigger=3",
+        "queue?trigger=9&execute=4",
+        "sync?execute=2",
+        "streamed?trigger=2&gap_s=3e-8&start=naive",
+        "streamed?trigger=2&gap_s=3e-8",
+        "streamed?trigger=2&gap_s=4e-9&execute=5",
+        "replace?execute=3&under_way=many",
+        "replace?execute=2&assumed=3",
+        "aggregate?trigger=3",
+        "aggregate?trigger=7&kind=average",
+    ],
+)
+class TestParameters(ModeSuite):
+    @pytest.fixture
+    def mode(self, written: str) -> Mode:
+        return mode(written)
+
+
+@st.composite
+def varied(draw: st.DrawFn) -> tuple[Varied, Any, ControlSetting]:
+    setting = draw(settings_of_chunks())
+    triggers = draw(st.lists(st.integers(0, setting.horizon), min_size=1, max_size=14))
+    execute = draw(st.integers(0, setting.horizon))
+    return VariedQueue(Queue(0, execute), tuple(triggers)), draw(latencies(setting)), setting
+
+
+@settings(max_examples=300)
+@given(case=varied())
+def test_its_arrays_and_its_stepper_agree(case: tuple[Varied, Any, ControlSetting]) -> None:
+    mode, latency_ns, setting = case
+    agree((mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)), step(mode, latency_ns, setting))
+
+
+@given(case=varied())
+def test_with_one_trigger_it_is_queue(case: tuple[Varied, Any, ControlSetting]) -> None:
+    mode, latency_ns, setting = case
+    queue = mode.mode.varied(mode.triggers[:1])
+    assert isinstance(queue, Queue)
+    same = VariedQueue(mode.mode, mode.triggers[:1])
+    agree((same.cycles(latency_ns, setting),), (queue.cycles(latency_ns, setting),))
+
+
+@given(case=varied())
+def test_a_mode_without_arrays_of_its_own_does_the_same(case: tuple[Varied, Any, ControlSetting]) -> None:
+    mode, latency_ns, setting = case
+    stepped = Varied(mode.mode, mode.triggers)
+    agree((stepped.cycles(latency_ns, setting),), (mode.cycles(latency_ns, setting),))
+
+
+SETTING = ControlSetting(10, 4)
+
+
+def test_a_run_by_hand() -> None:
+    latency_ns = np.array([15, 15, 35, 5])
+    replace = Replace(2)
+    # chunk -1 0 0 0 1 1 1 -1 2 3 3, requested at 0, 3, 5, 9
+    found = measure(replace, replace.cycles(latency_ns, SETTING), replace.ticks(latency_ns, SETTING))
+    assert (found.first_action_tick, found.ticks, found.requests) == (1, 10, 4)
+    assert (found.stall_ticks, found.stall_share, found.longest_stall_ticks) == (1, 0.1, 1)
+    assert found.p_stall_cycle == pytest.approx(1 / 3)
+    ages = [1, 2, 3, 1, 2, 3, 3, 0, 1]
+    assert found.age_ticks_mean == pytest.approx(np.mean(ages))
+    assert (found.age_ticks_max, found.age_ticks_p99) == (3, pytest.approx(3))
+    assert found.thrown_away_share == pytest.approx((1 + 1 + 3) / 12)
+    assert (found.jump_mean, found.jump_max) == (pytest.approx(1 / 3), 1)
+    assert found.blocked_ticks == 0
+
+
+def test_only_a_blocking_robot_is_blocked() -> None:
+    latency_ns = np.array([25, 15, 35])
+    sync = Sync()
+    found = measure(sync, sync.cycles(latency_ns, SETTING), sync.ticks(latency_ns, SETTING))
+    assert (found.first_action_tick, found.stall_ticks, found.blocked_ticks) == (2, 4, 6)
+    assert found.longest_stall_ticks == 3
+    queue = Queue()
+    assert measure(queue, queue.cycles(latency_ns, SETTING), queue.ticks(latency_ns, SETTING)).blocked_ticks == 0
+
+
+def test_of_nothing_there_is_nothing_to_count() -> None:
+    none = np.array([], np.int64)
+    for name in MODES:
+        mode = MODES[name]()
+        found = measure(mode, mode.cycles(none, ControlSetting(10, 16)), mode.ticks(none, ControlSetting(10, 16)))
+        assert (found.ticks, found.requests, found.stall_ticks) == (0, 0, 0)
+        assert math.isnan(found.age_ticks_mean)
+        assert math.isnan(found.p_stall_cycle)
+        assert math.isnan(found.jump_max)
+
+
+@pytest.mark.parametrize("name", MODES)
+@given(data=st.data())
+def test_reactions_are_those_of_the_first_chunk_observed_afterwards(name: str, data: st.DataObject) -> None:
+    mode, latency_ns, setting = data.draw(cases(name))
+    cycles, ticks = mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)
+    moments = np.linspace(0, cycles.ticks, 17)
+    for moment, found in zip(moments, reaction_ticks(cycles, moments), strict=True):
+        knowing = [t for t, chunk in enumerate(ticks.chunk) if chunk >= 0 and cycles.request_tick[chunk] >= moment]
+        assert found == min(knowing) - moment if knowing else math.isnan(found)
+
+
+def test_the_margin_is_the_greatest_added_delay_without_a_stall() -> None:
+    latency_ns = np.array([20, 25, 10, 35, 20])
+    setting = ControlSetting(10, 16)
+    assert margin_ticks(Queue(5, 16), latency_ns, setting) == 2  # d is 3 at most
+    assert margin_ticks(Queue(3, 16), latency_ns, setting) == 0
+    assert margin_ticks(Queue(2, 16), latency_ns, setting) == -1
+    assert margin_ticks(Replace(8), latency_ns, setting) == 5  # d = 3 + 5 is H - s

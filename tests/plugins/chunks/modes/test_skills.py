@@ -7,14 +7,28 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from s2a_bench.plugins.chunks.modes import ControlSetting
+from s2a_bench.plugins.chunks.modes import ControlSetting, Ints
 from s2a_bench.plugins.chunks.modes.append import Streamed
-from s2a_bench.policy import policy
+from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.schedule import safe_start
 from tests.plugins.chunks.modes.forms import start_s
-from tests.plugins.chunks.modes.plans import as_plans, earliest_arrivals, safe_start_ticks, streamed_arrivals
 
 PERIOD = 20_000_000
+NS = 1e9
+
+
+def as_plans(arrival_ns: Ints, period_ns: int, *, slowest: float = 1.0) -> Plans:
+    """Take M chunks for plans: actions' arrivals after the request, shape (H, M), in ns, and Delta t.
+
+    ``slowest`` is by how much time-scaling may stretch an action.
+    """
+    nominal_s = np.full((arrival_ns.shape[0], 1), period_ns / NS)
+    return Plans(arrival_ns / NS, nominal_s, nominal_s, slowest * nominal_s)
+
+
+def streamed_arrivals(latency_ns: Ints, gap_ns: int, horizon: int) -> Ints:
+    """Return when each action arrives, shape (H, M): the first after its latency, then one every ``gap_ns``."""
+    return latency_ns + gap_ns * np.arange(horizon, dtype=np.int64)[:, np.newaxis]
 
 
 @given(first=st.integers(0, 10**9), gap=st.integers(0, 10**8), horizon=st.integers(1, 60), period=st.integers(1, 10**8))
@@ -67,27 +81,3 @@ def test_a_safe_start_is_never_early_and_at_most_a_tick_late(latency: int, gap: 
     assert ticks.chunk[first:].tolist() == [0] * s  # no stall within the chunk
     last = int(np.flatnonzero(naive.ticks(latency_ns, setting).chunk == 0)[-1])
     assert last == exact + s - 1  # T1: naive ends when an exact start does
-
-
-@given(gaps=st.lists(st.integers(0, 5), min_size=1, max_size=8), delays=st.data(), horizon=st.integers(1, 9))
-def test_the_earliest_arrival_is_the_least_over_the_chunks_that_cover_an_action(
-    gaps: list[int], delays: st.DataObject, horizon: int
-) -> None:
-    request = np.cumsum(gaps)
-    delay = np.array(delays.draw(st.lists(st.integers(0, 12), min_size=len(gaps), max_size=len(gaps))))
-    found = earliest_arrivals(request, delay, horizon)
-    for tick, at in enumerate(found.tolist(), int(request[0])):
-        covering = [r + d - request[0] for r, d in zip(request, delay, strict=True) if r <= tick < r + horizon]
-        assert at == min(covering, default=np.iinfo(np.int64).max)
-
-
-@given(s=st.integers(1, 9), horizon=st.integers(1, 9), delays=st.lists(st.integers(0, 20), min_size=2, max_size=12))
-def test_played_back_from_s0_on_no_action_is_late_and_from_before_one_is(
-    s: int, horizon: int, delays: list[int]
-) -> None:
-    s = min(s, horizon)
-    earliest = earliest_arrivals(s * np.arange(len(delays)), np.array(delays), horizon)
-    start = safe_start_ticks(earliest)
-    ticks = np.arange(earliest.size)
-    assert (earliest <= start + ticks).all()
-    assert (earliest > start - 1 + ticks).any()

@@ -12,15 +12,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy import stats
 
 from s2a_bench.boards.gaps import Gaps, Lognormal, Markov
 from s2a_bench.errors import UsageError
 from s2a_bench.plugins.chunks.modes import ControlSetting, Rounding
-from s2a_bench.plugins.chunks.modes.aggregate import Aggregate
 from s2a_bench.plugins.chunks.modes.append import Queue
-from s2a_bench.plugins.chunks.modes.replace import Replace
+from s2a_bench.plugins.chunks.modes.cycles import step
 from s2a_bench.plugins.chunks.modes.trigger import (
+    Learning,
+    LearningStepper,
     Maximum,
     Mean,
     TrackedLatency,
@@ -30,7 +32,7 @@ from s2a_bench.plugins.chunks.modes.trigger import (
     follow,
     trigger,
 )
-from s2a_bench.policy.conformal import EPSILON, upper_bound
+from s2a_bench.policy.conformal import EPSILON
 
 MS = 1_000_000
 CALIBRATION, FRESH = 8_000, 100_000
@@ -227,34 +229,6 @@ def test_a_trigger_is_safe_at_its_latency_slowed_down_or_not(
         assert Queue(found.ticks - 1, 13).cycles(latencies, setting).stall_ticks[1:].all()
 
 
-@pytest.mark.parametrize("rounding", ["floor", "ceil"])
-def test_where_no_trigger_helps_slowing_down_keeps_epsilon(rounding: Rounding) -> None:
-    # H = 16, s = 12: four actions are left, 80 ms, for latencies of 120 ms in the mean.
-    setting, latencies = ControlSetting(20 * MS, 16, rounding), Lognormal(0.12, 0.2)
-    known = draw(latencies, np.random.default_rng(1), CALIBRATION)
-    fresh = draw(latencies, np.random.default_rng(2), FRESH)
-    found = trigger(calibrate(known).caution, setting, 4)
-    assert found.ticks == 4
-    assert found.beta == pytest.approx(0.189 / 0.08, rel=0.05)
-    slowed = setting.slowed(found.beta)
-    for mode in (Replace(12), Aggregate(4)):
-        assert np.mean(mode.cycles(fresh, setting).stall_ticks[1:] > 0) > 0.5
-        stalls = int(np.count_nonzero(mode.cycles(fresh, slowed).stall_ticks[1:]))
-        assert upper_bound(stalls, FRESH - 1, 0.975) < 0.015
-
-
-@pytest.mark.parametrize("rounding", ["floor", "ceil"])
-def test_the_oracle_s_trigger_is_the_smallest_safe_one(rounding: Rounding) -> None:
-    setting = ControlSetting(20 * MS, 64, rounding)
-    for seed in range(40):
-        survival = law(world(seed, "bimodal")[0])
-        for epsilon in (0.001, 0.01, 0.2):
-            ticks = oracle_ticks(survival, setting, epsilon)
-            at = [(m + (rounding == "floor")) * 0.02 for m in range(ticks + 1)]
-            assert survival(at[-1]) <= epsilon
-            assert all(survival(x) > epsilon for x in at[:-1])
-
-
 def test_a_rule_that_needs_the_greatest_trigger_gets_it() -> None:
     assert trigger(math.inf, ControlSetting(20, 8), 5) == Trigger(5, 1.0)
     assert TrackedLatency.begin([1.0] * 50, 0.01).latency_ns == math.inf  # too few to promise 1 %
@@ -276,3 +250,58 @@ def test_a_tracked_robot_stalls_while_its_latencies_exceed_the_slack(rounding: R
         calibrate(np.arange(98))
     with pytest.raises(ValueError, match="any speed"):
         trigger(50, ControlSetting(20, 8), 0)
+
+
+SETTING = ControlSetting(20_000_000, 16)
+
+
+def drawn(count: int, seed: int, scale: float = 80e6) -> NDArray[np.int64]:
+    rng = np.random.default_rng(seed)
+    ticks = rng.lognormal(np.log(scale), 0.5, count) // SETTING.period_ns
+    return ticks.astype(np.int64) * SETTING.period_ns + SETTING.period_ns // 2
+
+
+def tracked() -> TriggerRule:
+    return TrackedLatency.begin(drawn(500, 1).tolist(), 0.05)
+
+
+@pytest.mark.parametrize("begin", [Maximum, Mean, tracked])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_robot_chooses_what_is_computed_of_its_latencies(begin: Callable[[], TriggerRule], seed: int) -> None:
+    latency_ns = drawn(300, 100 + seed)
+    mode = Learning(Queue(), begin)
+    steppers: list[LearningStepper] = []
+
+    class Watched(Learning):
+        def stepper(self, setting: ControlSetting) -> LearningStepper:
+            steppers.append(mode.stepper(setting))
+            return steppers[-1]
+
+    cycles, _ = step(Watched(Queue(), begin), latency_ns, SETTING)
+    triggers = follow(begin(), latency_ns, SETTING, 15)
+    assert steppers[0].triggers[: latency_ns.size] == triggers.tolist()
+    late = cycles.settled
+    stall_ticks = np.maximum(0, SETTING.delay_ticks(latency_ns) - triggers)
+    np.testing.assert_array_equal(cycles.stall_ticks[late], stall_ticks[late])
+
+
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+def test_a_mean_of_ticks_is_the_mean(rounding: Rounding) -> None:
+    setting = ControlSetting(SETTING.period_ns, 16, rounding)
+    latency_ns = np.random.default_rng(7).lognormal(np.log(70e6), 0.5, 4000).astype(np.int64)
+    stepper = Learning(Queue(), Mean).stepper(setting)
+    tick = 0
+    for request, delay in enumerate(setting.delay_ticks(latency_ns).tolist()):
+        while not stepper.ask(tick):
+            stepper.act(tick)
+            tick += 1
+        stepper.arrived(request, 16, tick + delay)
+    assert stepper.rule.latency_ns == pytest.approx(latency_ns.mean(), rel=0.01)
+
+
+def test_each_robot_has_a_rule_of_its_own() -> None:
+    mode = Learning(Queue(), Maximum)
+    one, other = mode.stepper(SETTING), mode.stepper(SETTING)
+    assert one.ask(0)
+    one.arrived(0, 16, 9)
+    assert (one.rule.latency_ns, other.rule.latency_ns) == (19 * SETTING.period_ns // 2, 0)
