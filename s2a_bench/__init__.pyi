@@ -203,7 +203,6 @@ class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThr
     action_dim: int
     answer: Literal["auto", "tokens", "actions"]
     chat_template: str
-    clock: str
     context: int
     engine: str
     flash_attention: str
@@ -230,7 +229,6 @@ class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThr
 class _Throughput(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
     batch: int
     chat_template: str
-    clock: str
     context: int
     engine: str
     flash_attention: str

@@ -6,7 +6,6 @@ import json
 import shlex
 from collections.abc import Collection, Sequence
 from contextlib import ExitStack
-from ipaddress import ip_address
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -29,6 +28,7 @@ from s2a_bench.sweep.json import plan_json, sweep_json
 from s2a_bench.sweep.plan import SweepPlan, plan_sweep
 from s2a_bench.sweep.run import SweepRun, check_resume, only_one, pending, start_sweep
 from s2a_bench.text import none_of, visible
+from s2a_bench.transport.listening import is_loopback
 from s2a_bench.writers.tables import TextTable
 
 
@@ -178,8 +178,4 @@ def _risk(risks: Sequence[tuple[str, str, str]]) -> str:
 
 def _is_loopback(url: str) -> bool:
     """Return True if a URL, or an endpoint as tcp/HOST:PORT, is on loopback; no name is resolved."""
-    host = urlsplit(url if "://" in url else url.replace("/", "://", 1)).hostname or ""
-    try:
-        return ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+    return is_loopback(urlsplit(url if "://" in url else url.replace("/", "://", 1)).hostname or "")

@@ -26,11 +26,6 @@ AS_IT_IS: Final = -1
 """Instead of a code of OpenCV: no conversion."""
 
 
-def yuyv_to_bgr(data: Pixels, out: Pixels | None = None) -> Pixels:
-    """Convert (h, w, 2) ``yuv422_yuy2`` to (h, w, 3) ``bgr8``, into ``out`` if given; ValueError on a wrong shape."""
-    return _convert(data, 2, cv2.COLOR_YUV2BGR_YUY2, out)
-
-
 def yuyv_to_rgb(data: Pixels, out: Pixels | None = None) -> Pixels:
     """Convert (h, w, 2) ``yuv422_yuy2`` to (h, w, 3) ``rgb8``, into ``out`` if given; ValueError on a wrong shape."""
     return _convert(data, 2, cv2.COLOR_YUV2RGB_YUY2, out)

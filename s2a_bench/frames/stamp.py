@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from hashlib import blake2b
-from secrets import token_hex
 
 import numpy as np
 
@@ -19,10 +18,6 @@ SIDE = 8
 """Cells of the stamp in each direction, one bit each; 2x2 pixels are large enough to survive JPEG."""
 BLACK, WHITE, GREY = 16, 235, 128
 """Luma of 0 and 1, and the chroma."""
-
-
-def new_nonce() -> str:
-    return token_hex(8)
 
 
 class Stamped:

@@ -13,16 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench.facts import Fact
-from s2a_bench.frames.convert import to_rgb
-from s2a_bench.types import Frame, Pixels
+from s2a_bench.types import Pixels
 
 RGB_ENGINE = Fact("rgb_engine", "", "checksum of the engine's pixels")
 """A server's fact that becomes a column."""
-
-
-def fingerprint(frame: Frame) -> int:
-    """Return a checksum, of 52 bits, of a picture's bytes in memory."""
-    return _checksum(frame.data)
 
 
 def together(checksums: Iterable[int]) -> int:
@@ -33,12 +27,7 @@ def together(checksums: Iterable[int]) -> int:
     return first
 
 
-def rgb_fingerprint(frame: Frame) -> int:
-    """Return the checksum of the RGB that a direct conversion of the frame gives."""
-    return _checksum(to_rgb(frame))
-
-
-def _checksum(pixels: Pixels) -> int:
+def fingerprint(pixels: Pixels) -> int:
     """Weight each group of eight bytes by a different odd number and sum, modulo 2^64; fold to 52 bits.
 
     A changed group changes the sum, and so do groups that change places. It is no defence against forgery.

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from secrets import token_hex
 from typing import Any
 
 from s2a_bench import extras
 from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, facts_json
 from s2a_bench.frames import FrameSource, open_source
-from s2a_bench.frames.stamp import new_nonce
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.recording import namespace_of
 from s2a_bench.inference import EngineConfig, need_engine
@@ -127,7 +127,7 @@ def resolve(config: RequestsConfig) -> RunPlan:
     facts += (FRAMES_PUBLISHED, FRAMES_LOST) if stream else ()
     facts += SPENT if config.sample_resources_hz else ()
     max_pieces = engine.horizon if config.answer == ACTIONS else config.max_tokens
-    seed, nonce, size = config.seed, config.nonce or new_nonce(), "{}x{}".format(*config.size)
+    seed, nonce, size = config.seed, config.nonce or token_hex(8), "{}x{}".format(*config.size)
     return RunPlan(
         cells=cells,
         blocks=BlocksPlan(config.requests, config.warmup, config.launches, seed),

@@ -60,7 +60,7 @@ def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMI
                 tokens.close()
             turn.leave()
         if pixels and request.images:
-            trace.later[RGB_ENGINE] = lambda: float(together(fingerprint(image) for image in request.images))
+            trace.later[RGB_ENGINE] = lambda: float(together(fingerprint(image.data) for image in request.images))
 
     return Queued(answer, limits, Provenance.of_engine(engine.describe()).to_dict())
 

@@ -31,8 +31,9 @@ from s2a_bench.facts import (
     PROMPT_N,
 )
 from s2a_bench.frames import open_source
+from s2a_bench.frames.convert import to_rgb
 from s2a_bench.harness.feed import Feed, RequestFeed, StreamedFrame, StreamFeed
-from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, rgb_fingerprint, together
+from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, together
 from s2a_bench.harness.plan import RequestPlan
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.inference import swing
@@ -205,13 +206,14 @@ class Session:
         source = open_source("synthetic", *SMALL, fps=30, seed=0)
         return RequestFeed(source, preencoded=self.cell.payload == "jpeg-preencoded", cameras=self._pictures)
 
-    def _exchange(self, system: str) -> Trace:
-        """Make a request that our server answers without its engine, with its wall clock by a ``system`` if named."""
+    def _exchange(self) -> Trace:
+        """Make a request that our server answers without its engine."""
         trace, plan = Trace(), self.request
         self._small.get_ready()
         frames, kind = self._small.capture(trace), self.cell.capabilities.answer_kinds[0]
-        prompt = f"{CLOCK_PROMPT}{kind} {system}".rstrip()
-        for _ in self.client.request(Request("clock", prompt, frames, 1, state=(0.0,) * plan.state), trace):
+        for _ in self.client.request(
+            Request("clock", CLOCK_PROMPT + kind, frames, 1, state=(0.0,) * plan.state), trace
+        ):
             pass
         return trace
 
@@ -257,12 +259,12 @@ class Session:
             index, captured_ns, picture = streamed.index, streamed.captured_ns, streamed.index
         elif frames:
             index, captured_ns = frames[0].index, frames[0].stamp_ns
-            picture = together(fingerprint(frame) for frame in frames)
+            picture = together(fingerprint(frame.data) for frame in frames)
         else:
             index, captured_ns, picture = -1, -1, place.block
         if isinstance(self.feed, StreamFeed) and streamed is None:
             error = error or "RequestFailed: the server knew no frame of this camera"
-        rgb_source = together(rgb_fingerprint(frame) for frame in frames) if frames else None
+        rgb_source = together(fingerprint(to_rgb(frame)) for frame in frames) if frames else None
         rgb_engine = _whole(facts.pop(RGB_ENGINE, None))
         error = error or self._doubt(trace, rgb_source, rgb_engine)
         started_ns = inference_start_ns(trace)

@@ -10,15 +10,13 @@ import hmac
 import re
 from collections.abc import Iterable
 from http import HTTPStatus
-from ipaddress import ip_address
 from typing import Any, Final
 
 from s2a_bench.options import option
 from s2a_bench.transport import SERVING, Handler, Wiring
-from s2a_bench.transport.listening import ListeningOptions, bound_socket, in_url
+from s2a_bench.transport.listening import ListeningOptions, bound_socket, in_url, is_loopback
 from s2a_bench.transport.serving import Core
 
-LOCAL: Final = "localhost"
 HOST: Final = re.compile(r"(\[[0-9A-Fa-f:.]*\]|[^:\[\]]*)(?::[0-9]*)?")
 
 
@@ -33,8 +31,8 @@ class Access:
 
     def __init__(self, options: WebOptions, bound_host: str, key: str, scheme: str) -> None:
         self._key, self._scheme = key.encode(), scheme
-        self._names = {LOCAL, *(name.strip().lower() for name in options.allow_host.split(","))}  # "" among them
-        self._on_loopback = ip_address(bound_host).is_loopback
+        self._names = {name.strip().lower() for name in options.allow_host.split(",")}  # "" among them
+        self._on_loopback = is_loopback(bound_host)
 
     def refusal(self, path_is_open: bool, headers: Iterable[tuple[str, str]]) -> tuple[int, str] | None:
         """Return the status and one line for a refused request; the names of ``headers`` are in lower case."""
@@ -54,11 +52,8 @@ class Access:
         match = HOST.fullmatch(host)
         if match is None:
             return False
-        name = match[1].strip("[]")
-        try:
-            return name.lower() in self._names or ip_address(name).is_loopback
-        except ValueError:
-            return False
+        name = match[1].strip("[]").lower()
+        return name in self._names or is_loopback(name)
 
     def _has_key(self, value: str) -> bool:
         """Return True if an Authorization header has the key, compared in constant time (RFC 6750, 2.1)."""

@@ -82,6 +82,14 @@ def in_url(host: str) -> str:
     return f"[{host}]" if ":" in host else host
 
 
+def is_loopback(host: str) -> bool:
+    """Return True for localhost and an address of loopback; no name is resolved."""
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
 def bound_socket(address: str, scheme: str, options: ListeningOptions) -> tuple[socket.socket, str]:
     """Return a TCP socket that listens at an address (see `split_address`), and the key that clients must send.
 
@@ -152,7 +160,7 @@ def key_for(host: str, variable: str, *, no_auth: bool) -> str:
     Raises UsageError if other hosts can connect to ``host`` without a key and `no_auth` is not set.
     """
     key = read_key(variable)
-    if not (key or no_auth or ip_address(host).is_loopback):
+    if not (key or no_auth or is_loopback(host)):
         raise UsageError(
             f"`host`: others reach {host}; name the environment variable that holds the key that they must send with "
             "`api_key_env`, or serve every client with `no_auth`"

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 from s2a_bench.errors import SourceError, UsageError
 from s2a_bench.frames import open_source
 from s2a_bench.frames.bag import Recording
-from s2a_bench.frames.convert import yuyv_to_bgr
+from s2a_bench.frames.convert import yuyv_to_rgb
 from s2a_bench.ros.messages import COMPRESSED_IMAGE, IMAGE
 from s2a_bench.testing.frame_source import FrameSourceSuite, MakeSource
 
@@ -111,7 +111,7 @@ def test_a_compressed_picture_is_decoded_to_bgr(tmp_path: Path, opened: Open) ->
 def test_yuyv_of_another_size_comes_as_bgr(tmp_path: Path, opened: Open) -> None:
     frame = opened(record(tmp_path / "bag", camera("yuv422_yuy2")), 32, 24).read()
     assert frame.encoding == "bgr8"
-    expected = cv2.resize(yuyv_to_bgr(pictures("yuv422_yuy2")[0]), (32, 24), interpolation=cv2.INTER_AREA)
+    expected = cv2.resize(yuyv_to_rgb(pictures("yuv422_yuy2")[0])[..., ::-1], (32, 24), interpolation=cv2.INTER_AREA)
     np.testing.assert_array_equal(frame.data, expected)
 
 

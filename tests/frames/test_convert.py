@@ -16,7 +16,6 @@ from s2a_bench.frames.convert import (
     encode_png,
     resize,
     to_bgr,
-    yuyv_to_bgr,
     yuyv_to_rgb,
 )
 from s2a_bench.types import Encoding, Frame
@@ -49,39 +48,43 @@ def bt601_fixed_point(yuyv: Array) -> Array:
     return np.stack([((channel + (1 << 19)) >> 20).clip(0, 255) for channel in rgb], axis=-1).astype(np.uint8)
 
 
+def yuyv_frame(yuyv: Array) -> Frame:
+    return Frame(0, 0, yuyv.shape[1], yuyv.shape[0], "yuv422_yuy2", yuyv)
+
+
 @given(pictures(2, even=True))
 def test_yuyv_is_bt601_in_fixed_point_exactly(yuyv: Array) -> None:
     np.testing.assert_array_equal(yuyv_to_rgb(yuyv), bt601_fixed_point(yuyv))
-    np.testing.assert_array_equal(yuyv_to_bgr(yuyv), bt601_fixed_point(yuyv)[..., ::-1])
+    np.testing.assert_array_equal(to_bgr(yuyv_frame(yuyv)), bt601_fixed_point(yuyv)[..., ::-1])
 
 
 def test_a_given_buffer_is_filled_and_returned() -> None:
     yuyv = _noise(8, 10, 2)
     out = np.zeros((8, 10, 3), np.uint8)
-    assert yuyv_to_bgr(yuyv, out) is out
-    np.testing.assert_array_equal(out, yuyv_to_bgr(yuyv))
+    assert yuyv_to_rgb(yuyv, out) is out
+    np.testing.assert_array_equal(out, yuyv_to_rgb(yuyv))
     swapped = np.zeros_like(out)
     assert bgr_to_rgb(out, swapped) is swapped
-    np.testing.assert_array_equal(swapped, yuyv_to_rgb(yuyv))
+    np.testing.assert_array_equal(swapped, out[..., ::-1])
 
 
 def test_read_only_pixels_and_windows_convert_as_well() -> None:
     yuyv = _noise(20, 40, 2)
     received = np.frombuffer(yuyv.tobytes(), np.uint8).reshape(yuyv.shape)
     assert not received.flags.writeable
-    np.testing.assert_array_equal(yuyv_to_bgr(received), yuyv_to_bgr(yuyv))
-    np.testing.assert_array_equal(yuyv_to_bgr(yuyv[3:9, 4:20]), yuyv_to_bgr(yuyv)[3:9, 4:20])
+    np.testing.assert_array_equal(yuyv_to_rgb(received), yuyv_to_rgb(yuyv))
+    np.testing.assert_array_equal(yuyv_to_rgb(yuyv[3:9, 4:20]), yuyv_to_rgb(yuyv)[3:9, 4:20])
 
 
 @pytest.mark.parametrize("shape", [(4, 4, 3), (4, 4), (4, 5, 2)])
 def test_pixels_that_are_no_yuyv_are_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"\(h, w, 2\)|width cannot be 5"):
-        yuyv_to_bgr(np.zeros(shape, np.uint8))
+        yuyv_to_rgb(np.zeros(shape, np.uint8))
 
 
 def test_a_buffer_that_does_not_fit_is_refused_and_not_passed_over() -> None:
     with pytest.raises(ValueError, match=r"out should be uint8 of shape \(4, 4, 3\)"):
-        yuyv_to_bgr(np.zeros((4, 4, 2), np.uint8), np.zeros((4, 6, 3), np.uint8))
+        yuyv_to_rgb(np.zeros((4, 4, 2), np.uint8), np.zeros((4, 6, 3), np.uint8))
 
 
 def test_jpeg_keeps_colours_and_their_order() -> None:
@@ -111,9 +114,9 @@ def test_to_bgr_undoes_every_lossless_encoding(encoding: Encoding, make: object)
 
 def test_to_bgr_converts_cameras_grey_and_jpeg() -> None:
     yuyv, grey = _noise(6, 8, 2), _noise(6, 8)
-    np.testing.assert_array_equal(to_bgr(Frame(0, 0, 8, 6, "yuv422_yuy2", yuyv)), yuyv_to_bgr(yuyv))
+    np.testing.assert_array_equal(to_bgr(yuyv_frame(yuyv)), yuyv_to_rgb(yuyv)[..., ::-1])
     np.testing.assert_array_equal(to_bgr(Frame(0, 0, 8, 6, "mono8", grey)), grey[..., None].repeat(3, axis=2))
-    jpeg = encode_jpeg(yuyv_to_bgr(yuyv))
+    jpeg = encode_jpeg(yuyv_to_rgb(yuyv))
     np.testing.assert_array_equal(to_bgr(Frame(0, 0, 8, 6, "jpeg", jpeg)), bgr_to_rgb(decode_image(jpeg)))
 
 

@@ -202,7 +202,7 @@ def test_what_cannot_carry_the_usual_payload_keeps_its_own() -> None:
 
 
 def test_a_namespace_in_a_url_names_our_server_there() -> None:
-    (cell,) = RequestsConfig(url="ros:///robot/llama", clock="ptp").pipelines
+    (cell,) = RequestsConfig(url="ros:///robot/llama").pipelines
     assert (cell.transport.name, cell.variant, cell.options.external_address) == ("ros", "topic", "/robot/llama")
     assert namespace_of(cell.wiring(cell.options.external_address)) == "/robot/llama"
 
@@ -278,7 +278,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"options": URL, "payload": "raw"}, "can send a picture as jpeg, jpeg-preencoded, png, not as raw"),
         ({"options": {"http": {"url": "http://x", "dialect": "openvla"}}, "payload": "jpeg"}, "as raw, not as jpeg"),
         ({"options": {"http": {"url": "http://x", "dialect": "smoke"}}}, "`dialect`: 'smoke' is none of s2a, openai"),
-        ({"options": {"http": {"dialect": "tgi"}}}, "`dialect` is about a server that runs already"),
+        ({"options": {"http": {"dialect": "ollama"}}}, "`dialect` is about a server that runs already"),
         ({"options": {"http": {"llama_server": "x", "extra_body": "{}"}}}, "`extra_body` is about a server that runs"),
         ({"options": {"http": {"url": "http://x", "extra_body": "{"}}}, "`extra_body`: no JSON"),
         ({"options": {"http": {"url": "http://x", "api_key_env": "sk-1"}}}, "`api_key_env` takes the name of an env"),
@@ -291,7 +291,6 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ),
         ({"url": "ros://llama"}, "'ros://llama' should look like ros:///llama"),
         ({"options": {"ros": {"url": "ros:///a", "action": "/b"}}}, "`url` and `action` name two servers"),
-        ({"clock": "chrony"}, "`clock` is about a server of ours on another host; name it with `url`"),
         ({"mode": "stream", "payload": "jpeg-preencoded"}, "jpeg-preencoded has no meaning in `mode` stream"),
     ],
 )

@@ -11,9 +11,9 @@ import pytest
 
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.frames import open_source
-from s2a_bench.frames.convert import bgr_to_rgb, encode_jpeg, yuyv_to_bgr
+from s2a_bench.frames.convert import bgr_to_rgb, encode_jpeg, to_bgr, to_rgb
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.pixels import rgb_fingerprint
+from s2a_bench.harness.pixels import fingerprint
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.serving import engine_handler
 from s2a_bench.harness.session import Measured, Place, Session
@@ -90,8 +90,8 @@ def test_a_server_that_tells_nothing_leaves_the_engines_pixels_unknown(measure: 
 
 def test_a_picture_has_one_checksum_however_it_is_given() -> None:
     frame = yuyv_frame()
-    bgr = yuyv_to_bgr(frame.data)
+    bgr = to_bgr(frame)
     jpeg = encode_jpeg(bgr)
     same = [frame, replace(frame, encoding="bgr8", data=bgr), replace(frame, encoding="rgb8", data=bgr_to_rgb(bgr))]
-    assert len({rgb_fingerprint(each) for each in same}) == 1
-    assert rgb_fingerprint(Frame(0, 0, 64, 48, "jpeg", jpeg)) != rgb_fingerprint(frame)
+    assert len({fingerprint(to_rgb(each)) for each in same}) == 1
+    assert fingerprint(to_rgb(Frame(0, 0, 64, 48, "jpeg", jpeg))) != fingerprint(to_rgb(frame))

@@ -17,13 +17,13 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.ros import Middleware, Publisher, QoS, Result, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
-from s2a_bench.ros.diagnostics import ARRAY, Level
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.ros import camera as camera_module
 from s2a_bench.transport.ros.camera import CAMERA, CAMERA_QOS, CLOCK_QOS
 from s2a_bench.transport.ros.joining import join
+from s2a_bench.transport.ros.node import ARRAY, Level
 from s2a_bench.types import Frame, Request
 from tests.waiting import until
 

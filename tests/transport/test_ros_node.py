@@ -16,13 +16,22 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.inference import EngineConfig
 from s2a_bench.ros import Middleware, QoS, Subscription
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.diagnostics import ARRAY, LOG, LONGEST, Level, PartHealth, diagnostic_array, log_message
 from s2a_bench.ros.parameters import PARAMETER, SERVICE, value_message, value_of
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring, open_client
 from s2a_bench.transport.ros.joining import join
-from s2a_bench.transport.ros.node import EVENT, Activity
+from s2a_bench.transport.ros.node import (
+    ARRAY,
+    EVENT,
+    LOG,
+    LONGEST,
+    Activity,
+    Level,
+    PartHealth,
+    diagnostic_array,
+    log_message,
+)
 from s2a_bench.transport.ros.server import RosServer
 from s2a_bench.transport.serving import STUCK_S, Queued
 from s2a_bench.types import Request

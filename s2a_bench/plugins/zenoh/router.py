@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import ipaddress
 import re
 import socket
 from contextlib import closing
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.extras import how_to_install
-
-if TYPE_CHECKING:
-    from s2a_bench.machine.doctor import Finding, Machine
+from s2a_bench.machine.doctor import Finding, Machine
+from s2a_bench.transport.listening import is_loopback
 
 ROUTER: Final = "tcp/127.0.0.1:7447"
 """Where rmw_zenoh's nodes look for their router."""
@@ -46,10 +44,7 @@ def listens(endpoint: str) -> bool:
 def may_host(endpoint: str) -> bool:
     """Return whether a server of ours may be the router there without authentication: on loopback only."""
     protocol, host, _ = endpoint_of(endpoint)
-    try:
-        return protocol == "tcp" and (host == "localhost" or ipaddress.ip_address(host).is_loopback)
-    except ValueError:
-        return False
+    return protocol == "tcp" and is_loopback(host)
 
 
 def to_host(endpoint: str) -> str:
@@ -67,8 +62,6 @@ def free_endpoint() -> str:
 
 def check(machine: Machine) -> Finding:
     """Return whether Zenoh can be spoken, and whether a router listens where rmw_zenoh's nodes look for one."""
-    from s2a_bench.machine.doctor import Finding
-
     if not machine.finds("zenoh"):
         return Finding("zenoh", "state", "not installed", how_to_install("zenoh"))
     port = f":{endpoint_of(ROUTER)[2]:04X}"

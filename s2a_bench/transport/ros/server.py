@@ -18,7 +18,6 @@ from typing import Any, TypeAlias
 from s2a_bench.errors import MissingInterface, TransportError
 from s2a_bench.ros import QoS
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.diagnostics import PartHealth
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros import ACTION
@@ -26,7 +25,7 @@ from s2a_bench.transport.ros.action_source import ActionSource
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
 from s2a_bench.transport.ros.exchange import Shared
 from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company, server_name, settled
-from s2a_bench.transport.ros.node import Activity, NodeApi, declared
+from s2a_bench.transport.ros.node import Activity, NodeApi, PartHealth, declared
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.transport.ros.topic import TopicSource
 from s2a_bench.transport.ros.wire import PROVENANCE_TOPIC, provenance_message

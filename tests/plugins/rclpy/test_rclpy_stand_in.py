@@ -20,14 +20,13 @@ from s2a_bench.errors import MissingInterface, TransportError
 from s2a_bench.ros import Accepted, Feedback, QoS, Result, Tuning, llama, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.config import CYCLONE_URI, LARGE_PICTURES, RMW_CYCLONE
-from s2a_bench.ros.diagnostics import LOG, ROSOUT_QOS
 from s2a_bench.ros.parameters import SERVICE, Parameter, value_of
 from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.scenario.ros import EgoParameters, RosEgo
 from s2a_bench.testing.transport import RecordingHandler, ask, connector, wiring_of, yuyv_frame
 from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.ros import ROS
-from s2a_bench.transport.ros.node import NodeApi
+from s2a_bench.transport.ros.node import LOG, ROSOUT_QOS, NodeApi
 from s2a_bench.types import Frame, Request
 from tests.plugins.rclpy.rclpy_stand_in import GRAPH, INTERFACES, PACKAGES, action, generated, modules
 from tests.ros.action_suite import NAME, ActionSuite
