@@ -221,7 +221,7 @@ class TestClientsOfOthers:
     def test_its_modalities_have_the_marks_of_its_layout(self, layout: str, marks: list[str], key: str) -> None:
         with serving(RecordingHandler([]), layout=layout) as server, plain(server.address) as call:
             configs = call("get_modality_config")
-        assert {tuple(config) for config in configs.values()} == {(*marks, "as_json")}
+        assert {tuple(config) for config in configs.values()} == {(*marks, "s2a-bench", "as_json")}
         video = configs["video"]["as_json"]
         assert (json.loads(video) if layout == "n1.5" else video)["modality_keys"] == [key]
 
