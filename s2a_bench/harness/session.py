@@ -206,14 +206,13 @@ class Session:
         source = open_source("synthetic", *SMALL, fps=30, seed=0)
         return RequestFeed(source, preencoded=self.cell.payload == "jpeg-preencoded", cameras=self._pictures)
 
-    def _exchange(self) -> Trace:
-        """Make a request that our server answers without its engine."""
+    def _exchange(self, system: str) -> Trace:
+        """Make a request that our server answers without its engine, with its wall clock by a ``system`` if named."""
         trace, plan = Trace(), self.request
         self._small.get_ready()
         frames, kind = self._small.capture(trace), self.cell.capabilities.answer_kinds[0]
-        for _ in self.client.request(
-            Request("clock", CLOCK_PROMPT + kind, frames, 1, state=(0.0,) * plan.state), trace
-        ):
+        prompt = f"{CLOCK_PROMPT}{kind} {system}".rstrip()
+        for _ in self.client.request(Request("clock", prompt, frames, 1, state=(0.0,) * plan.state), trace):
             pass
         return trace
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import Busy, EngineError, Overdue, S2AError, TooLarge
+from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WALL_CLOCKS
 from s2a_bench.machine.tuning import give_back_memory
 from s2a_bench.options import Options
 from s2a_bench.trace import RESIDUAL, Trace
@@ -29,7 +30,10 @@ from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.types import Action, Piece, Request, Token
 
 CLOCK_PROMPT: Final = "s2a-bench exchanges time stamps: "
-"""Followed by `TOKENS` or `ACTIONS`, the prompt of a request that is answered without the engine, for its marks."""
+"""Followed by `TOKENS` or `ACTIONS`, the prompt of a request that is answered without the engine, for its marks.
+
+With one of `machine.clocks.WALL_CLOCKS` after that, the facts are those of the wall clock.
+"""
 RETRY_AFTER_S = 1.0
 STUCK_S = 120
 """Silence after which a running answer counts as stuck: a long prompt on a small board takes its time."""
@@ -183,7 +187,10 @@ class Queued:
 
 def _stamped(request: Request, trace: Trace, turn: Turn) -> Generator[Piece, None, None]:  # noqa: ARG001
     """Answer a client that compares its clock with this host's; at the piece the answer leaves."""
-    kind = request.prompt.removeprefix(CLOCK_PROMPT)
+    kind, _, system = request.prompt.removeprefix(CLOCK_PROMPT).partition(" ")
+    if system in WALL_CLOCKS:
+        found = WALL_CLOCKS[system]()
+        trace.facts |= {REALTIME_MS: found.offset_ns / 1e6, REALTIME_ERROR_MS: found.error_ns / 1e6}
     trace.mark("inference")
     trace.token_ns.append(trace.marks[-1][1])
     yield Action(0, np.zeros(1, np.float32)) if kind == ACTIONS else Token(0, ".")

@@ -18,8 +18,11 @@ from s2a_bench.registry import Registry
 from s2a_bench.trace import Trace
 from s2a_bench.transport.pipeline import Pipeline
 
-Exchange: TypeAlias = Callable[[], Trace]
-"""Makes a request that our server answers without its engine, for its marks; raises S2AError."""
+Exchange: TypeAlias = Callable[[str], Trace]
+"""Makes a request that our server answers without its engine, for its marks; raises S2AError.
+
+The argument is one of `machine.clocks.WALL_CLOCKS`, by which the server then bounds its wall clock, or "".
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -202,7 +202,7 @@ def test_what_cannot_carry_the_usual_payload_keeps_its_own() -> None:
 
 
 def test_a_namespace_in_a_url_names_our_server_there() -> None:
-    (cell,) = RequestsConfig(url="ros:///robot/llama").pipelines
+    (cell,) = RequestsConfig(url="ros:///robot/llama", clock="ptp").pipelines
     assert (cell.transport.name, cell.variant, cell.options.external_address) == ("ros", "topic", "/robot/llama")
     assert namespace_of(cell.wiring(cell.options.external_address)) == "/robot/llama"
 
@@ -291,6 +291,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ),
         ({"url": "ros://llama"}, "'ros://llama' should look like ros:///llama"),
         ({"options": {"ros": {"url": "ros:///a", "action": "/b"}}}, "`url` and `action` name two servers"),
+        ({"clock": "chrony"}, "`clock` is about a server of ours on another host; name it with `url`"),
         ({"mode": "stream", "payload": "jpeg-preencoded"}, "jpeg-preencoded has no meaning in `mode` stream"),
     ],
 )

@@ -36,6 +36,7 @@ PLUGINS = {
     ],
     "two_hosts": [
         Named("latency --link 4g", "No such option: --link", "latency --help-all", "--link "),
+        Named("latency --clock ptp", "No such option: --clock", "latency --help-all", "--clock "),
         Named("advise --link 4g", "No such command 'advise'", "--help", "advise  "),
         Named("sweep links", "'links' is none of ", "sweep --help", "links"),
     ],

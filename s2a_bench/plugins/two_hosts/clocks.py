@@ -25,6 +25,8 @@ import numpy as np
 
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import ClockMoved, RequestFailed, S2AError
+from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WALL_CLOCKS
+from s2a_bench.plugins.two_hosts.wall_clocks import FRESH_NS
 from s2a_bench.trace import Trace
 from s2a_bench.transport.surroundings import Joined
 
@@ -42,6 +44,10 @@ FIRST: Final = 20
 FIRST_PAUSE_NS: Final = 50_000_000
 """Time between these: a second together, which bounds the clocks' rate."""
 BURST: Final = 5
+FLOAT_NS: Final = 1000
+"""What a wall clock loses as a float of ms."""
+WANDER: Final = 1e-5
+"""Rate at which a disciplined wall clock may leave its bound while a reading is fresh."""
 PERIOD_NS: Final = 10**9
 """Between requests, one burst of exchanges in this time at most."""
 
@@ -68,6 +74,11 @@ class Exchange:
         if remote is None or not remote.marks:
             raise RequestFailed("the server reported no marks, so that its clock cannot be compared with this host's")
         return Exchange(trace.marks[-2][1], remote.marks[0][1], remote.marks[-1][1], trace.marks[-1][1])
+
+    @staticmethod
+    def bounded(at_ns: int, middle_ns: int, error_ns: int) -> Exchange:
+        """Return an exchange in no time, for an offset as both wall clocks and the bounds of their errors give it."""
+        return Exchange(at_ns, at_ns + middle_ns + error_ns, at_ns + middle_ns - error_ns, at_ns)
 
     @property
     def upper(self) -> Point:
@@ -105,7 +116,7 @@ class Offset:
         self._exchanges: deque[Exchange] = deque(maxlen=KEPT)
 
     def add(self, exchange: Exchange) -> None:
-        """Add an exchange, on any thread."""
+        """Add an exchange, or what the wall clocks say, on any thread."""
         self._exchanges.append(exchange)
 
     def over(self, *times_ns: int) -> Interval:
@@ -147,7 +158,7 @@ def interval_at(at_ns: int, exchanges: Sequence[Exchange]) -> Interval:
         raise ClockMoved(
             f"the clocks of the two hosts moved against each other by about {2 * beyond.min() / 1e6:.2g} ms within "
             f"{WINDOW_NS // 10**9} s: one was stepped or slewed, and one-way times cannot be told; wait until NTP has "
-            "settled (chronyc waitsync), or stop it for the run"
+            "settled (chronyc waitsync), or stop it for the run, and leave `clock` out"
         )
     possible = at[beyond <= ROUNDING_NS / 2]
     return Interval(base_ns + floor(possible.min()) - ROUNDING_NS, base_ns + ceil(possible.max()) + ROUNDING_NS)
@@ -168,14 +179,15 @@ def _lower_hull(points: Iterable[Point]) -> list[Point]:
 class RemoteClock:
     """The offset of one server's clock; nothing is exchanged before `join` has met it."""
 
-    def __init__(self, exchange: Callable[[], Trace], offsets: dict[str, Any] | None) -> None:
+    def __init__(self, exchange: Callable[[str], Trace], offsets: dict[str, Any] | None, system: str = "") -> None:
         """``exchange`` makes a request for its marks alone; ``offsets``, by clock, are those that others estimate too.
 
         Without ``offsets`` nothing is exchanged, and the requests alone bound the offset, more widely.
 
-        ``exchange`` raises S2AError.
+        ``exchange`` raises S2AError; its argument is ``system``, one of `WALL_CLOCKS` or "", where the
+        server's wall clock is wanted.
         """
-        self._exchange = exchange
+        self._exchange, self._system = exchange, system
         self._exchanges = offsets is not None
         self._offsets: dict[str, Offset] = {} if offsets is None else offsets
         self._id = ""
@@ -200,6 +212,8 @@ class RemoteClock:
             self.refresh()
         elif self._exchanges:
             self._burst(FIRST, FIRST_PAUSE_NS)
+            if self._system:
+                self._compare_wall_clocks()
         early_ns = min((stamp - own.upper[1] for _, stamp in remote.frame_marks), default=own.sent_ns)
         near = offset.over(own.sent_ns, own.seen_ns)
         whole = near | offset.over(min(early_ns, own.sent_ns), last_ns)
@@ -211,6 +225,17 @@ class RemoteClock:
         offset = self._offsets[self._id]
         with suppress(S2AError):  # the next request meets what is wrong, and reports it
             for _ in range(count):
-                offset.add(Exchange.of(self._exchange()))
+                offset.add(Exchange.of(self._exchange("")))
                 clock.sleep_until_ns(now_ns() + pause_ns)
+            if self._system and count == BURST:
+                self._compare_wall_clocks()
         self._last_ns = now_ns()
+
+    def _compare_wall_clocks(self) -> None:
+        """Bound the offset by what both hosts know of their wall clocks' errors; raises S2AError."""
+        trace, ours = self._exchange(self._system), WALL_CLOCKS[self._system]()
+        if not trace.facts.keys() >= {REALTIME_MS, REALTIME_ERROR_MS}:
+            raise RequestFailed(f"`clock` {self._system}: the server does not tell its wall clock; leave it out")
+        theirs_ns, error_ns = (round(trace.facts[name] * 1e6) for name in (REALTIME_MS, REALTIME_ERROR_MS))
+        error_ns += ours.error_ns + FLOAT_NS + round(2 * FRESH_NS * WANDER)
+        self._offsets[self._id].add(Exchange.bounded(now_ns(), ours.offset_ns - theirs_ns, error_ns))

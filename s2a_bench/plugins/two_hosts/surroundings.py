@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, option
@@ -24,12 +24,19 @@ class HostOptions(Options):
         "rate=UP/DOWN,delay=MS,jitter=MS,loss=SHARE, also after a name [default: none]",
         names=published,
     )
+    clock: Literal["", "chrony", "ptp"] = option(
+        "",
+        "with a server of ours on another host: chrony, ptp also bound the clocks' offset, if they run on both hosts "
+        "[default: exchanges alone]",
+    )
 
 
 @dataclass(frozen=True)
 class TwoHosts(Surroundings):
     profile: LinkProfile | None = None
     """Of the link, if one is emulated."""
+    system: str = ""
+    """What bounds the wall clocks of both hosts, one of `WALL_CLOCKS`, or nothing."""
 
     options: ClassVar[type[Options]] = HostOptions
     columns: ClassVar[str] = "s2a_bench.plugins.two_hosts.view:bounded"
@@ -39,12 +46,14 @@ class TwoHosts(Surroundings):
     @classmethod
     def of(cls, config: HostOptions, pipelines: Sequence[Pipeline]) -> TwoHosts:
         running = next((each.options.external for each in pipelines if each.options.external_address), "")
+        if config.clock and not running:
+            raise UsageError("`clock` is about a server of ours on another host; name it with `url`")
         profile = load_link(config.link) if config.link else None
         if profile and running:
             raise UsageError(f"`link`: a server that runs already is not behind it; leave out `{running}`")
         if profile and (local := [each.name for each in pipelines if not each.transport.crosses_links]):
             raise UsageError(f"`link`: {', '.join(local)} sends nothing over a network; leave it out of `transport`")
-        return cls(profile)
+        return cls(profile, config.clock)
 
     def around(self) -> AbstractContextManager[Around]:
         from s2a_bench.plugins.two_hosts.links import emulated
@@ -54,4 +63,4 @@ class TwoHosts(Surroundings):
     def clock(self, exchange: Exchange, shared: dict[str, Any] | None) -> OtherClock:
         from s2a_bench.plugins.two_hosts.clocks import RemoteClock
 
-        return RemoteClock(exchange, shared)
+        return RemoteClock(exchange, shared, self.system)

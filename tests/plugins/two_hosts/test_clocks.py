@@ -1,13 +1,16 @@
-"""Offsets between clocks: simulated exchanges, whose true offset is known."""
+"""Offsets between clocks: simulated exchanges, whose true offset is known, and what chrony and PTP say of an error."""
 
 from __future__ import annotations
 
 import re
+import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint
 from itertools import pairwise
 from random import Random
 from statistics import mean
+from typing import Any
 
 import pytest
 from hypothesis import example, given, settings
@@ -15,7 +18,9 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 
 from s2a_bench.clock import VirtualClock, clock_id
-from s2a_bench.errors import ClockMoved, RequestFailed
+from s2a_bench.errors import ClockMoved, RequestFailed, UsageError
+from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WALL_CLOCKS, WallClock
+from s2a_bench.plugins.two_hosts import wall_clocks as clocks
 from s2a_bench.plugins.two_hosts.clocks import (
     KEPT,
     RATE,
@@ -26,6 +31,7 @@ from s2a_bench.plugins.two_hosts.clocks import (
     RemoteClock,
     interval_at,
 )
+from s2a_bench.plugins.two_hosts.surroundings import HostOptions
 from s2a_bench.trace import Remote, Trace
 
 SECOND_NS, MS_NS = 10**9, 10**6
@@ -147,12 +153,7 @@ def best(at_ns: int, exchanges: Sequence[Exchange], slack_ns: float) -> tuple[fl
 
 ONE = st.builds(
     lambda sent, wide, offset, up, bounded: (
-        Exchange(
-            (sent + wide) * 1000,
-            (sent + wide) * 1000 + offset + up,
-            (sent + wide) * 1000 + offset - up,
-            (sent + wide) * 1000,
-        )
+        Exchange.bounded((sent + wide) * 1000, offset, up)
         if bounded
         else Exchange(sent * 1000, sent * 1000 + offset + up, sent * 1000 + offset + up, (sent + wide) * 1000)
     ),
@@ -207,6 +208,9 @@ def test_only_exchanges_within_a_window_around_an_instant_count() -> None:
     assert offset.over(half_ns - 9, half_ns).lo_ns == pytest.approx(0, abs=2)
 
 
+REAL_NS = 17 * 10**17
+
+
 @dataclass
 class Elsewhere:
     """A server with another clock, in virtual time: an exchange takes 8 ms up and 1 ms down."""
@@ -214,8 +218,11 @@ class Elsewhere:
     clock: VirtualClock
     ahead_ns: int = 0
     drift: float = 0.0
+    wall_off_ns: int = 0
+    """By how much its wall clock is off, and how much it says it may be."""
+    wall_error_ns: int = 0
     busy_ns: int = 2 * MS_NS
-    asked: list[int] = field(default_factory=list)
+    asked: list[tuple[int, str]] = field(default_factory=list)
     fails: bool = False
 
     def offset(self, at_ns: int) -> int:
@@ -224,10 +231,10 @@ class Elsewhere:
     def there(self, at_ns: int) -> int:
         return at_ns + self.offset(at_ns)
 
-    def exchange(self, frame_ns: int | None = None) -> Trace:
+    def exchange(self, system: str = "", frame_ns: int | None = None) -> Trace:
         """Answer a request, after one more mark of the client, and one of a frame that came at ``frame_ns``."""
         sent_ns = self.clock.now_ns()
-        self.asked.append(sent_ns)
+        self.asked.append((sent_ns, system))
         if self.fails:
             raise RequestFailed("gone")
         came_ns = sent_ns + 8 * MS_NS
@@ -236,7 +243,9 @@ class Elsewhere:
         self.clock.sleep_until_ns(seen_ns)
         marks = [(stage, self.there(at)) for stage, at in (("network", came_ns), ("inference", left_ns))]
         frames = [] if frame_ns is None else [("", self.there(frame_ns)), ("decode", self.there(frame_ns + MS_NS))]
-        remote = Remote("elsewhere", marks, [marks[-1][1]], frame_marks=frames)
+        real_ms = (REAL_NS - self.offset(left_ns) + self.wall_off_ns) / 1e6
+        facts = {REALTIME_MS: real_ms, REALTIME_ERROR_MS: self.wall_error_ns / 1e6} if system else {}
+        remote = Remote("elsewhere", marks, [marks[-1][1]], frame_marks=frames, facts=facts)
         trace = Trace([("", sent_ns - MS_NS), ("pack", sent_ns), ("return", seen_ns)])
         trace.receive(remote)
         return trace
@@ -292,13 +301,34 @@ def test_a_request_alone_bounds_the_offset_from_its_first_to_its_last_stamp(
             assert abs(stamp - true_ns) <= joined.error_ns
 
 
+@pytest.mark.parametrize("off", [-1, 0, 1])
+def test_wall_clocks_that_are_off_by_all_that_they_say_still_hold_the_offset(
+    virtual: VirtualClock, off: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Either host's clock may be off by its error, and wander by 10 ppm while a reading is up to 1 s old."""
+    ours, theirs, wander = 300_000, 200_000, 10_000
+    server = Elsewhere(virtual, 10**12, 0.0, -off * (theirs + wander), theirs)
+    mine = WallClock(REAL_NS + off * (ours + wander), ours, 0)
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.WALL_CLOCKS", {"chrony": lambda: mine})
+    offsets: dict[str, Offset] = {}
+    remote = RemoteClock(server.exchange, offsets, "chrony")
+    for _ in range(3):
+        remote.join(server.exchange(), virtual.now_ns())
+        found = offsets["elsewhere"].over(virtual.now_ns())
+        assert found.lo_ns <= 10**12 <= found.hi_ns
+        assert found.hi_ns - found.lo_ns <= 2 * (ours + theirs + 2 * wander) + 3000
+        virtual.sleep_until_ns(virtual.now_ns() + 2 * SECOND_NS)
+    systems = [system for _, system in server.asked]
+    assert systems == ["", *[""] * 20, "chrony", *["", *[""] * 5, "chrony"] * 2]
+
+
 def test_exchanges_are_made_over_a_second_when_met_and_then_in_one_burst_a_second(virtual: VirtualClock) -> None:
     server = Elsewhere(virtual, 7)
     remote = RemoteClock(server.exchange, {})
     remote.refresh()
     assert not server.asked
     remote.join(server.exchange(), virtual.now_ns())
-    times = server.asked[1:]
+    times = [at for at, _ in server.asked[1:]]
     assert [two - one for one, two in pairwise(times)] == [61 * MS_NS] * 19
     met_ns, counts = virtual.now_ns(), []
     for after_ns in (SECOND_NS, SECOND_NS + 1, SECOND_NS + 2, 3 * SECOND_NS):
@@ -318,8 +348,86 @@ def test_exchanges_are_made_over_a_second_when_met_and_then_in_one_burst_a_secon
     assert len(server.asked) == 21 + 12
 
 
-def test_a_server_that_tells_no_marks_is_refused(virtual: VirtualClock) -> None:
-    remote = RemoteClock(Elsewhere(virtual).exchange, {})
+def test_a_server_that_tells_less_than_its_wall_clock_or_no_marks_is_refused(
+    virtual: VirtualClock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = Elsewhere(virtual)
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.WALL_CLOCKS", {"ptp": lambda: WallClock(REAL_NS, 1, 0)})
+    remote = RemoteClock(lambda _: server.exchange(), {}, "ptp")
+    with pytest.raises(RequestFailed, match="`clock` ptp: the server does not tell its wall clock"):
+        remote.join(server.exchange(), virtual.now_ns())
     for silent in (Trace(), Trace([("", 1), ("", 2)], remote=Remote("elsewhere"))):
         with pytest.raises(RequestFailed, match="no marks"):
             remote.join(silent, virtual.now_ns())
+
+
+CHRONY = (
+    "01020304,a.b.c,3,1328281229.000000000,-0.000001501,-0.000001632,0.000002360,331.898,0.004,0.154,"
+    "0.373169000,0.024780000,64.2,Normal\n"
+)
+PTP = """sending: GET CURRENT_DATA_SET
+\t90e2ba.fffe.20c7f8-0 seq 0 RESPONSE MANAGEMENT CURRENT_DATA_SET
+\t\tstepsRemoved        1
+\t\toffsetFromMaster  -142.0
+\t\tmeanPathDelay     9310.0
+"""
+
+
+@pytest.fixture(autouse=True)
+def nothing_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    for each in (clocks.CHRONY, clocks.PTP):
+        monkeypatch.setattr(each, "known", None)
+
+
+def test_chronys_bound_is_the_root_distance_and_the_offset() -> None:
+    assert clocks.chrony_error_s(CHRONY) == pytest.approx(1.501e-6 + 0.024780 + 0.373169 / 2)
+
+
+def test_ptps_bound_is_the_offset_and_the_path() -> None:
+    assert clocks.ptp_error_s(PTP) == pytest.approx(9452e-9)
+
+
+@pytest.mark.parametrize(
+    ("system", "output", "message"),
+    [
+        ("chrony", CHRONY.replace("Normal", "Not synchronised"), "chronyd is not synchronised (Not synchronised)"),
+        ("chrony", "506 Cannot talk to daemon\n", "'chronyc -c tracking'"),
+        ("ptp", "sending: GET CURRENT_DATA_SET\n", "'pmc -u -b 0 GET CURRENT_DATA_SET'"),
+        ("ptp", FileNotFoundError("No such file"), "tells no bound on the host "),
+    ],
+)
+def test_a_system_without_a_bound_is_one_line(
+    system: str, output: Any, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run(command: tuple[str, ...], **_: Any) -> subprocess.CompletedProcess[str]:
+        if isinstance(output, Exception):
+            raise output
+        return subprocess.CompletedProcess(command, 0, output, "")
+
+    monkeypatch.setattr(clocks.subprocess, "run", run)
+    with pytest.raises(RequestFailed, match="`clock` ") as error:
+        WALL_CLOCKS[system]()
+    assert message in str(error.value)
+
+
+def test_a_reading_is_used_for_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = []
+
+    def run(command: tuple[str, ...], **_: Any) -> subprocess.CompletedProcess[str]:
+        runs.append(command)
+        return subprocess.CompletedProcess(command, 0, PTP, "")
+
+    monkeypatch.setattr(clocks.subprocess, "run", run)
+    monkeypatch.setattr(clocks, "FRESH_NS", 10**15)
+    first = clocks.PTP()
+    assert clocks.PTP() is first
+    assert runs == [("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET")]
+    assert first.error_ns >= 9452
+
+
+def test_any_packages_wall_clock_may_be_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    offered = EntryPoint("gps", "somebodys_gps:clock", WALL_CLOCKS.group)
+    monkeypatch.setitem(WALL_CLOCKS._offered, "gps", offered)
+    assert HostOptions(clock="gps").clock == "gps"
+    with pytest.raises(UsageError, match="'sundial' is none of chrony, ptp, gps"):
+        HostOptions(clock="sundial")

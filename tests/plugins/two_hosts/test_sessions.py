@@ -13,7 +13,9 @@ from s2a_bench.frames import open_source
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.plan import resolve
-from s2a_bench.harness.session import Place, Session
+from s2a_bench.harness.session import Measured, Place, Session
+from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WallClock
+from s2a_bench.plugins.two_hosts.surroundings import TwoHosts
 from s2a_bench.store.requests import samples_table
 from s2a_bench.trace import STAGES as COMMON
 from s2a_bench.trace import Remote, Trace
@@ -31,6 +33,7 @@ class ElsewhereClient:
     def __init__(self) -> None:
         self.ahead_ns = 10**12
         self.prompts: list[str] = []
+        self.facts: dict[str, float] = {}
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         self.prompts.append(request.prompt)
@@ -43,7 +46,7 @@ class ElsewhereClient:
         if not request.prompt.startswith(CLOCK_PROMPT):
             self.true = came_ns - sent_ns, trace.marks[-1][1] - left_ns
         marks = [("network", came_ns + self.ahead_ns), ("inference", left_ns + self.ahead_ns)]
-        trace.receive(Remote(ELSEWHERE, marks, [left_ns + self.ahead_ns]))
+        trace.receive(Remote(ELSEWHERE, marks, [left_ns + self.ahead_ns], facts=self.facts))
 
 
 @pytest.fixture
@@ -95,6 +98,33 @@ def test_a_clock_that_is_set_ends_the_run_with_one_line(elsewhere: tuple[Elsewhe
     assert isinstance(measured.fatal, ClockMoved)
     assert measured.sample.error.startswith("ClockMoved: the clocks of the two hosts moved against each other by about")
     assert "chronyc waitsync" in measured.sample.error
+
+
+def with_wall_clocks(client: ElsewhereClient, monkeypatch: pytest.MonkeyPatch, *, off_ms: float = 0) -> Measured:
+    """Measure where both wall clocks are known to 20 us, the server's after all off by ``off_ms``."""
+    ours = WallClock(17 * 10**17, 20_000, 0)
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.WALL_CLOCKS", {"chrony": lambda: ours})
+    theirs_ms = (ours.offset_ns - client.ahead_ns) / 1e6 + off_ms
+    client.facts = {REALTIME_MS: theirs_ms, REALTIME_ERROR_MS: ours.error_ns / 1e6}
+    source, plan = open_source("synthetic", 64, 48, fps=30.0, seed=0), resolve(RequestsConfig()).request
+    feed = RequestFeed(source, preencoded=False)
+    plan = replace(plan, surroundings=(TwoHosts(system="chrony"),))
+    session = Session(one_pipeline("http/as-deployed"), client, feed, plan, clocks={})
+    measured = session.measure(Place(0, 0, warmup=False))
+    source.close()
+    return measured
+
+
+def test_a_server_is_asked_for_its_wall_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    client = ElsewhereClient()
+    measured = with_wall_clocks(client, monkeypatch)
+    assert not measured.sample.error
+    assert client.prompts[-1] == f"{CLOCK_PROMPT}tokens chrony"
+
+
+def test_wall_clocks_that_contradict_the_exchanges_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    measured = with_wall_clocks(ElsewhereClient(), monkeypatch, off_ms=60_000)
+    assert isinstance(measured.fatal, ClockMoved)
 
 
 def test_without_what_knows_the_other_clock_all_up_to_the_answer_is_the_server(
