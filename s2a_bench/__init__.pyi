@@ -203,7 +203,7 @@ class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThr
     action_dim: int
     answer: Literal["auto", "tokens", "actions"]
     chat_template: str
-    clock: Literal["", "chrony", "ptp"]
+    clock: str
     context: int
     engine: str
     flash_attention: str
@@ -230,7 +230,7 @@ class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThr
 class _Throughput(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
     batch: int
     chat_template: str
-    clock: Literal["", "chrony", "ptp"]
+    clock: str
     context: int
     engine: str
     flash_attention: str

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 from s2a_bench.errors import UsageError
-from s2a_bench.options import Options, option
+from s2a_bench.machine.clocks import WALL_CLOCKS
+from s2a_bench.options import Options, one_of, option
 from s2a_bench.plugins.two_hosts.profiles import LinkProfile, load_link, published
 from s2a_bench.transport import TRANSPORT
 from s2a_bench.transport.pipeline import Pipeline
@@ -24,10 +25,10 @@ class HostOptions(Options):
         "rate=UP/DOWN,delay=MS,jitter=MS,loss=SHARE, also after a name [default: none]",
         names=published,
     )
-    clock: Literal["", "chrony", "ptp"] = option(
+    clock: Annotated[str, one_of(lambda: ("", *WALL_CLOCKS))] = option(
         "",
-        "with a server of ours on another host: chrony, ptp also bound the clocks' offset, if they run on both hosts "
-        "[default: exchanges alone]",
+        f"with a server of ours on another host: {', '.join(WALL_CLOCKS)} also bound the clocks' offset, if they run "
+        "on both hosts [default: exchanges alone]",
     )
 
 
