@@ -75,7 +75,6 @@ class Run:
 
     @property
     def tables(self) -> tuple[str, ...]:
-        """The names of the tables."""
         return tuple(self._shown.tables)
 
     def table(self, name: str) -> pd.DataFrame:
@@ -230,7 +229,6 @@ def _read_csv(text: str, origins: Origins) -> pd.DataFrame:
 
 
 def _png(figure: Figure) -> tuple[bytes, dict[str, int]]:
-    """Return a figure as PNG, and its size in a notebook."""
     drawn = io.BytesIO()
     with paper_column():
         figure.savefig(drawn, dpi=2 * SHOWN_DPI)

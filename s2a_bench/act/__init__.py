@@ -23,8 +23,6 @@ Report: TypeAlias = Callable[[str], None]
 
 
 class Running(Protocol):
-    """A skill in progress."""
-
     def retime(self, end_ns: int) -> None:
         """End at ``end_ns`` instead: later (extend) or sooner, perhaps now (compress)."""
 

@@ -57,8 +57,6 @@ class PythonCall(SkillKind, ActionKind):
 
 
 class CallableActions(ActionRobot):
-    """Calls a function."""
-
     def __init__(self, name: str, function: Callable[[Vector], object]) -> None:
         self._name, self._function = name, function
 

@@ -27,8 +27,6 @@ class Requested:
 
 @dataclass(frozen=True, slots=True)
 class TokenArrived:
-    """A token arrived."""
-
     at_ns: int
 
 
@@ -42,8 +40,6 @@ class SkillArrived:
 
 @dataclass(frozen=True, slots=True)
 class StreamEnded:
-    """The answer is complete."""
-
     at_ns: int
 
 

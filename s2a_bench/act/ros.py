@@ -88,8 +88,6 @@ class RosRobot(RosParameters, SkillKind, ActionKind):
 
 
 class RosActions(ActionRobot):
-    """Publishes actions."""
-
     def __init__(self, kind: RosRobot, middleware: Middleware, joints: list[str], period_ns: int) -> None:
         self._kind, self._middleware = kind, middleware
         type_name = TRAJECTORY if kind.type == "JointTrajectory" else ARRAY

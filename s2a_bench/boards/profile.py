@@ -171,14 +171,9 @@ def _without_none(table: Mapping[str, Any]) -> dict[str, Any]:
     return {key: _without_none(value) if isinstance(value, Mapping) else value for key, value in given.items()}
 
 
-def shipped() -> list[Path]:
-    """Return the folders of the package and its plug-ins."""
-    return [SHIPPED, *(folder for _, folder in OFFERED.loaded())]
-
-
 def search_path() -> list[Path]:
     config = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-    return [Path("profiles"), config / "s2a-bench" / "profiles", *shipped()]
+    return [Path("profiles"), config / "s2a-bench" / "profiles", SHIPPED, *(folder for _, folder in OFFERED.loaded())]
 
 
 def profile_files() -> dict[str, Path]:

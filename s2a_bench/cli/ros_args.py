@@ -55,8 +55,6 @@ def folded(arguments: Sequence[str]) -> list[str]:
 
 @dataclass(slots=True)
 class Read:
-    """The parsed arguments."""
-
     options: dict[str, Any] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     environ: dict[str, str] = field(default_factory=dict)

@@ -37,7 +37,6 @@ class CallLabels:
         return skill.name
 
     def value(self, vocabulary: str, value: Value) -> str:  # noqa: ARG002 the same in every vocabulary
-        """Return the label of a value."""
         return str(value)
 
     def fields(self, line: str) -> list[str] | None:

@@ -180,7 +180,6 @@ def _skill(table: _Skill, file: _SkillFile) -> Skill:
 
 
 def _argument(text: str, vocabularies: Mapping[str, tuple[Value, ...]]) -> Argument:
-    """Read ``vocabulary``, or ``name:vocabulary``."""
     name, _, vocabulary = text.partition(":")
     vocabulary = vocabulary or name
     _identifier(name)

@@ -24,8 +24,6 @@ AT_ONCE: Final = 512
 
 @dataclass(slots=True)
 class TrackedPolicy:
-    """A policy and the tracker of its lambda."""
-
     made: Policy
     """The policy with its prior; its lambda does not matter."""
     tracker: Tracker

@@ -323,5 +323,4 @@ def refuse_depth(encoding: str) -> None:
 
 
 def nanoseconds(time: Any) -> int:
-    """Return a builtin_interfaces/Time in ns."""
     return int(time.sec) * 1_000_000_000 + int(time.nanosec)

@@ -18,7 +18,7 @@ from typing import Any, Final, Literal, Protocol, TypeAlias
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, Options, option
 from s2a_bench.store.run import read_run
-from s2a_bench.sweep.file import find_sweep, shipped_sweeps, sweep_files
+from s2a_bench.sweep.file import find_sweep, sweep_files
 
 Flag: TypeAlias = Literal["value", "hidden", "switch", "toggle", "argument"]
 """A switch is given or not; a toggle has an opposite, as --flag and --no-flag; no hint names a hidden
@@ -90,7 +90,7 @@ COPY: Final = "sweep.toml"
 class SweepConfig(Options):
     file: str = option(
         "",
-        f"sweep file (TOML), or the name of one: {', '.join(shipped_sweeps())}; not needed with --resume",
+        f"sweep file (TOML), or the name of one: {', '.join(sweep_files())}; not needed with --resume",
         argument=True,
         names=sweep_files,
     )

@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeAlias, TypeVar
 
 from pydantic import Field
 
-from s2a_bench.boards.profile import search_path, shipped
+from s2a_bench.boards.profile import search_path
 from s2a_bench.errors import UsageError
 from s2a_bench.text import like, none_of
 from s2a_bench.toml_file import TomlTable, parse, read
@@ -81,16 +81,8 @@ class SweepFile:
 
 def sweep_files() -> dict[str, Path]:
     """Return name -> file, sorted; of two files with one name, that in the first folder of the search path."""
-    return dict(sorted(item for folder in reversed(search_path()) for item in _sweeps_in(folder)))
-
-
-def shipped_sweeps() -> list[str]:
-    """Return the names of the package's sweeps and its plug-ins'."""
-    return sorted(name for folder in shipped() for name, _ in _sweeps_in(folder))
-
-
-def _sweeps_in(folder: Path) -> Iterator[tuple[str, Path]]:
-    return ((path.stem, path) for path in (folder / "sweeps").glob("*.toml"))
+    folders = [folder / "sweeps" for folder in search_path()]
+    return dict(sorted((path.stem, path) for folder in reversed(folders) for path in folder.glob("*.toml")))
 
 
 def find_sweep(name: str) -> Path:

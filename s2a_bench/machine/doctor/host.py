@@ -130,7 +130,6 @@ def clock_source(machine: Machine) -> Finding | None:
 
 
 def _listed(text: str | None) -> list[int]:
-    """Parse a list of the kernel, as 0-3,6."""
     found: list[int] = []
     for part in (text or "").split(","):
         first, _, last = part.partition("-")

@@ -46,8 +46,6 @@ class Trajectory:
 
 @dataclass(frozen=True, slots=True)
 class Driven:
-    """Result of a drive."""
-
     outcomes: Outcomes
     trajectory: Trajectory | None
 

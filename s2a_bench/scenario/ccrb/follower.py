@@ -97,8 +97,6 @@ class Brake(LockStep):
 
 
 class Careful(Follower):
-    """The careful driver."""
-
     law: ClassVar[str] = (
         "careful follower (ours): brakes as needed to stay 1 m behind the ego, seen {reaction:g} s ago and "
         f"extrapolated; {BRAKE}"

@@ -89,7 +89,6 @@ def twin(cell: Pipeline) -> Pipeline:
 
 
 def cell_name(session: Session, mode: str) -> str:
-    """Return the name of a cell: its pipeline and mode."""
     return f"{session.cell.name}, {mode}" if mode else session.cell.name
 
 

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Tried:
-    """A fleet that was tried."""
-
     robots: int
     verdict: Verdict
     within: bool

@@ -92,5 +92,4 @@ def margin_ticks(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> int:
 
 
 def mean(values: NDArray[Any]) -> float:
-    """Return the mean; NaN without values."""
     return float(values.mean()) if values.size else float("nan")

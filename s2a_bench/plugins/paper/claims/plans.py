@@ -241,7 +241,6 @@ def _at(part: RunPart, texts: Sequence[str]) -> str:
 
 
 def _signed(share: float) -> str:
-    """Format a share with its sign; zero is +0.0%."""
     return f"{round(share, 3) + 0.0:+.1%}"
 
 

@@ -265,7 +265,6 @@ def _kind(answer: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """Return a number as Python's."""
     if isinstance(value, np.generic):
         value = value.item()
     return float(value) if type(value) in {int, float} and isfinite(value) else value

@@ -39,10 +39,6 @@ from s2a_bench.types import Action, Piece, Request
 
 PIECE: Final = 1 << 16
 """Bytes that are read at once."""
-SMALL: Final = 125
-"""Bytes of the largest control frame (RFC 6455, 5.5); a fragment of no more counts as one."""
-SMALL_AT_ONCE, SMALL_A_SECOND = 1000, 10
-"""The most small frames of a connection: so many, and so many more each second."""
 ERROR_LETTERS: Final = 1000
 END_OF_HEAD: Final = b"\r\n\r\n"
 
@@ -86,7 +82,6 @@ class PolicyConnection:
         self._lock = RLock()  # of the protocol, and of what is sent
         self._message = bytearray()
         self._timed = False
-        self._small_s = 0.0
         self._requests: SimpleQueue[tuple[Exchange, ExitStack] | None] = SimpleQueue()
         self._room = Semaphore(2)
         self._held = ExitStack()
@@ -208,16 +203,9 @@ class PolicyConnection:
             self.wire.read_until(now_ns() + round(self.core.limits.body_s * 1e9))
 
     def _join(self, frame: Frame) -> None:
-        data = frame.opcode in DATA_OPCODES
-        if len(frame.data) <= SMALL and not (data and frame.fin):
-            now_s = now_ns() / 1e9
-            self._small_s = max(self._small_s, now_s) + 1 / SMALL_A_SECOND
-            if self._small_s - now_s > SMALL_AT_ONCE / SMALL_A_SECOND:
-                reason = f"more than {SMALL_AT_ONCE} pings, pongs or small fragments, and {SMALL_A_SECOND} a second"
-                raise _Refused(CloseCode.POLICY_VIOLATION, reason)
         if frame.opcode is Opcode.TEXT:
             raise _Refused(CloseCode.UNSUPPORTED_DATA, "an observation is a binary message, not a text")
-        if not data:
+        if frame.opcode not in DATA_OPCODES:
             return
         if frame.fin and not self._message:
             message = bytes(frame.data)

@@ -81,8 +81,6 @@ def probed(link: EmulatedLink) -> dict[str, Any]:
 
 
 class _Probe:
-    """One attempt."""
-
     def __init__(self, link: EmulatedLink, stack: ExitStack) -> None:
         with link.server_side():
             self._server, self._beside = (_socket(SERVER, stack) for _ in range(2))
