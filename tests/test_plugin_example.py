@@ -276,10 +276,10 @@ def test_its_dialect_is_known_by_name(command: Command) -> None:
     spoken = ["--dialect", "toy-chat", "--served-model", "toy"]
     done = command("latency", "--url", "http://127.0.0.1:9", *spoken, "--transport", "http", *SMALL, code=1)
     assert "nothing answers at http://127.0.0.1:9/toy/chat" in done.stderr
-    closed = ("latency", "--url", "http://127.0.0.1:9", "--transport", "http", "--toy-room", "blue", *SMALL)
+    closed = ("latency", "--url", "http://127.0.0.1:9", "--transport", "http", "--toy-channel", "blue", *SMALL)
     assert "nothing answers at http://127.0.0.1:9/toy/chat/blue" in command(*closed, *spoken, code=1).stderr
     refused = command(*closed, "--dialect", "openai", code=2).stderr
-    assert "--toy-room: the dialect 'openai' takes none; leave it out, or choose --dialect toy-chat" in refused
+    assert "--toy-channel: the dialect 'openai' takes none; leave it out, or choose --dialect toy-chat" in refused
 
 
 def test_its_experiment_is_a_command_and_a_function(
@@ -324,9 +324,7 @@ def test_its_command_is_one_of_the_commands(command: Command) -> None:
 def test_its_reference_stands_beside_measurements_and_its_claim_is_judged(
     measured: Path, command: Command, tmp_path: Path
 ) -> None:
-    assert "toy-study: draw the toy study's values beside ours" in " ".join(
-        command("latency", "--help-all").stdout.split()
-    )
+    assert "draw the toy study's values beside ours" in " ".join(command("latency", "--help-all").stdout.split())
     done = command("latency", "--transport", "loopback", "--against", "toy-study", *SMALL)
     assert "Grey: of toys." in (folder_of(done, tmp_path) / "figures" / "captions.md").read_text()
     outputs = ("--output", "page.html", "--csv", "csv", "--markdown", "all.md", "--latex", "tex")

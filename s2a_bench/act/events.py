@@ -109,8 +109,6 @@ class PlanFeed:
 
 
 class EventQueue(Protocol):
-    """Events for one executor."""
-
     def put(self, event: Event) -> None:
         """Deliver an event, from any thread."""
 

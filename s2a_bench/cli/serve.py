@@ -34,7 +34,6 @@ _NUMBER = EngineConfig.model_fields["threads"]
 
 
 def served_options(transport: Transport[Any]) -> list[str]:
-    """Return the names of the options that the server of a transport has."""
     return list(transport.options.of_sides(SERVER, SERVING))
 
 

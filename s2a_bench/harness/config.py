@@ -56,8 +56,6 @@ else:  # a group of options for each transport; options that only `serve` has ar
 
 
 class SentConfig(Options):
-    """What is sent, and how."""
-
     transports: Names = option(
         COMPARED,
         f"{', '.join(dict(TRANSPORTS.loaded()))}; several with commas, with /VARIANT and ?OPTION=VALUE: "

@@ -25,7 +25,8 @@ from s2a_bench.harness.session import LONGEST_PAUSE_S, Measured, Place, Session
 from s2a_bench.harness.warnings import Counters, SampleGuard, before_run
 from s2a_bench.machine import environment
 from s2a_bench.machine.doctor import Machine
-from s2a_bench.machine.resources.sampler import ResourceSampler, open_sampler
+from s2a_bench.machine.resources import open_readers
+from s2a_bench.machine.resources.sampler import ResourceSampler
 from s2a_bench.machine.tuning import is_allowed, keep_large_blocks, limit_threads
 from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins, Provenance
@@ -207,7 +208,9 @@ class _Run:
         model = servers.model(facts)
         writer.update(servers=facts, model=model)
         pids = [server["pid"] for server in facts.values()]
-        sampler = stack.enter_context(open_sampler(self.plan.sample_resources_hz, pids))
+        hz = self.plan.sample_resources_hz
+        readers, left_out = open_readers(pids) if hz else ({}, {})
+        sampler = stack.enter_context(ResourceSampler(readers, hz or 1, left_out))
         for cell in self.plan.cells:
             if cell.options.external_address and self.plan.wait_s:
                 self._wait_for(servers, cell)

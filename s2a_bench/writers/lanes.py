@@ -46,13 +46,10 @@ class LanePanel:
     @property
     def ticks(self) -> tuple[float, ...]:
         """Return round times from 0 to the end."""
-        step = next(
-            each
-            for power in range(-6, 12)
-            for each in (1 * 10.0**power, 2 * 10.0**power, 5 * 10.0**power)
-            if self.end_s <= TICKS * each
-        )
-        return tuple(place * step for place in range(int(self.end_s / step) + 1))
+        from matplotlib.ticker import MaxNLocator
+
+        times = MaxNLocator(TICKS, steps=[1, 2, 5, 10]).tick_values(0, self.end_s)
+        return tuple(float(time) for time in times if time <= self.end_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,8 +69,8 @@ def complete(
     schedules = {name: policy.schedule(plans) for name, policy in policies.items()}
     late = None
     if config.ttc:
-        timed = ttc_aware(plans, scenario.deadline_s)
-        schedules[TTC], late = timed.schedule, bool(timed.late[0])
+        schedules[TTC], (is_late,) = ttc_aware(plans, scenario.deadline_s)
+        late = bool(is_late)
     return Prepared(setting, request_id, plans, policies, schedules, late)
 
 

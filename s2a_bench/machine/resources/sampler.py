@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from statistics import fmean, median
 from threading import Event, Lock, Thread
 from typing import Any
 
 from s2a_bench.clock import now_ns
-from s2a_bench.machine.resources import BOARD_ENERGY_J, ENERGY_J, POWER_W, RESOURCES, Reader, ResourceRow, open_readers
+from s2a_bench.machine.resources import BOARD_ENERGY_J, ENERGY_J, POWER_W, RESOURCES, Reader, ResourceRow
 from s2a_bench.store.run import RunWriter
 
 COUNTERS = ("client_cpu_ns", "server_cpu_ns", "package_energy_j", "gpu_energy_j")
@@ -47,12 +47,6 @@ class _Source:
     costs_ns: deque[int] = field(default_factory=lambda: deque(maxlen=KEPT))
     lock: Lock = field(default_factory=Lock)
     broken: bool = False
-
-
-def open_sampler(hz: float, pids: Sequence[int]) -> ResourceSampler:
-    """Make the sampler of a run whose servers have ``pids``; with ``hz`` 0 it reads nothing."""
-    readers, left_out = open_readers(pids) if hz else ({}, {})
-    return ResourceSampler(readers, hz or 1, left_out)
 
 
 class ResourceSampler:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -12,24 +11,15 @@ from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.schedule import align, safe_start, work_conserving
 
 NAME: Final = "s2a-ttc"
-"""Name of the rule in reports."""
 
 
-@dataclass(frozen=True, slots=True)
-class TimedStart:
-    """Schedules of M plans, and a mask of those that cannot keep the deadline without stalls."""
-
-    schedule: Schedule
-    late: NDArray[np.bool_]
-
-
-def ttc_aware(plans: Plans, deadline_s: ArrayLike) -> TimedStart:
+def ttc_aware(plans: Plans, deadline_s: ArrayLike) -> tuple[Schedule, NDArray[np.bool_]]:
     """Start at S0 if that keeps the deadline; else at the deadline, if stretching makes that stall-free.
 
     Starts from S_lo on are stall-free, so [S_lo, deadline] is feasible, and the deadline stretches skills least. If
     S_lo is past the deadline too, the plan starts with its first skill, each skill is held on up to T_max, and the
-    roll-out is flagged ``late``: safety goes before smoothness. All arrivals are known; ``deadline_s`` is one number,
-    or of shape (M,).
+    roll-out is late, as the mask says: safety goes before smoothness. All arrivals are known; ``deadline_s`` is one
+    number, or of shape (M,).
     """
     arrival_s, nominal_s, most_s = align(plans.arrival_s, plans.nominal_s, plans.most_s)
     deadline = np.broadcast_to(np.asarray(deadline_s, float), arrival_s.shape[1:])
@@ -42,4 +32,4 @@ def ttc_aware(plans: Plans, deadline_s: ArrayLike) -> TimedStart:
         np.maximum(start[i], start[i + 1] - most_s[i], out=start[i], where=~late)
     duration = nominal_s.copy()
     np.minimum(np.diff(start, axis=0), most_s[:-1], out=duration[:-1])
-    return TimedStart(Schedule(start, duration), late)
+    return Schedule(start, duration), late

@@ -13,7 +13,7 @@ from s2a_bench.transport.http.dialects.ollama import Ollama
 class ToyChatOptions(TransportOptions):
     """Options that HTTP gets with the dialect."""
 
-    toy_room: str = option("", "the room of the chat, a part of its route")
+    toy_channel: str = option("", "the room of the chat, a part of its route")
 
 
 class ToyChat(Ollama):
@@ -25,7 +25,7 @@ class ToyChat(Ollama):
 
     def configure(self, options: Any) -> None:
         """Read the room."""
-        self.room = options.toy_room and f"/{options.toy_room}"
+        self.room = options.toy_channel and f"/{options.toy_channel}"
 
     def url(self, base: str, model: str) -> str:  # noqa: ARG002 - the model is in the body
         """Return the route."""

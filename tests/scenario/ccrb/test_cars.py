@@ -117,17 +117,17 @@ def plans_at(rate: float) -> Plans:
 def test_the_ttc_aware_start_keeps_the_deadline_wherever_that_is_stall_free(rate: float, deadline_s: float) -> None:
     plans = plans_at(rate)
     safe, least = (float(safe_start(plans.arrival_s, span)[0]) for span in (plans.nominal_s, plans.most_s))
-    timed = ttc_aware(plans, deadline_s)
-    first = float(timed.schedule.start_s[0, 0])
-    assert bool(timed.late[0]) == (least > deadline_s)
-    assert (timed.schedule.start_s >= plans.arrival_s - 1e-9).all()
-    assert (timed.schedule.duration_s <= plans.most_s + 1e-9).all()
+    schedule, (late,) = ttc_aware(plans, deadline_s)
+    first = float(schedule.start_s[0, 0])
+    assert bool(late) == (least > deadline_s)
+    assert (schedule.start_s >= plans.arrival_s - 1e-9).all()
+    assert (schedule.duration_s <= plans.most_s + 1e-9).all()
     if safe <= deadline_s:
         assert first == pytest.approx(safe)
-        assert timed.schedule.duration_s == pytest.approx(plans.nominal_s)
+        assert schedule.duration_s == pytest.approx(plans.nominal_s)
     elif least <= deadline_s:
         assert first == pytest.approx(deadline_s)
     else:
         assert first == pytest.approx(float(plans.arrival_s[0, 0]))
-    if not timed.late[0]:
-        assert stalls(timed.schedule).max() <= 1e-9
+    if not late:
+        assert stalls(schedule).max() <= 1e-9

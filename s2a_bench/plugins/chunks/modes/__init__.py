@@ -261,7 +261,6 @@ class Mode(Protocol):
         return self.arrays(arrivals(self, latency_ns, setting), setting) or step(self, latency_ns, setting)[0]
 
     def ticks(self, latency_ns: Ints, setting: ControlSetting) -> Ticks:
-        """Return the ticks of the same requests."""
         from s2a_bench.plugins.chunks.modes.cycles import arrivals, lay, step
 
         cycles = self.arrays(arrivals(self, latency_ns, setting), setting)

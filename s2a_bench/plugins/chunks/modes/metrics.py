@@ -38,7 +38,6 @@ class ChunkMetrics:
     jump_mean: float
     """Mean of |jump| over the boundaries."""
     jump_max: float
-    requests: int
     blocked_ticks: int
     """Ticks in which the control loop waits for an answer, the first included; 0 unless the mode blocks."""
 
@@ -63,7 +62,6 @@ def measure(mode: Mode, cycles: Cycles, ticks: Ticks) -> ChunkMetrics:
         thrown_away_share=mean(cycles.thrown_away[:last]) / cycles.horizon,
         jump_mean=mean(jump),
         jump_max=float(jump.max()) if jump.size else np.nan,
-        requests=cycles.request_tick.size,
         blocked_ticks=(stall_ticks + first) if mode.blocks else 0,
     )
 

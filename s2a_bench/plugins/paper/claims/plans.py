@@ -59,12 +59,10 @@ _UNMODELLED: Final = {"t_nom_cv": 0.0, "prompt_s": None, "jitter": "none"}
 
 
 def listed(name: str, *values: str) -> Need:
-    """Return the need that a fact lists all of these."""
     return Need(name, ", ".join(dict.fromkeys(values)), lambda found: set(values) <= set(found.split(", ")))
 
 
 def more(name: str, limit: float) -> Need:
-    """Return the need that a number exceeds the limit."""
     return Need(name, f"more than {limit:g}", lambda found: found > limit)
 
 

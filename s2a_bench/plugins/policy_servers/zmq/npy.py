@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import io
-import re
 from functools import lru_cache
 from typing import Any, Final
 
@@ -24,13 +23,6 @@ BEFORE: Final = 128
 """Bytes of the header of a picture, and of most."""
 PREFIX: Final = {b"\x01\x00": 10, b"\x02\x00": 12, b"\x03\x00": 12}
 """Version -> bytes before the header's text: the magic, the version, the text's length."""
-
-
-_HEADER = re.compile(
-    rb"\{'descr': '([<>|=][biuf][1248])', 'fortran_order': (True|False), "
-    rb"'shape': \(((?:\d{1,18}, ?)*\d{0,18})\), ?\} *\n"
-)
-"""As NumPy writes it for numbers."""
 
 
 class PictureFile:
@@ -80,15 +72,15 @@ def _head_in(data: bytes) -> bytes:
 @lru_cache(64)
 def _read_head(head: bytes) -> tuple[int, tuple[int, ...], bool, np.dtype[Any]]:
     """Return where the array begins, its shape, whether it is in Fortran's order, and its type."""
-    found = _HEADER.fullmatch(head, PREFIX[head[6:8]])
-    if found is None:
-        raise RequestFailed(f"a NumPy file of {head[10:90]!r}; numbers are taken, nothing else")
-    shape = tuple(int(axis) for axis in found[3].split(b",") if axis.strip())
+    file, wrong = io.BytesIO(head), RequestFailed(f"a NumPy file of {head[10:90]!r}; numbers are taken, nothing else")
+    read = npy.read_array_header_1_0 if npy.read_magic(file) == (1, 0) else npy.read_array_header_2_0
     try:
-        dtype = np.dtype(found[1].decode())
-    except TypeError as error:
-        raise RequestFailed(f"a NumPy file whose type is none: {error}") from error
-    return len(head), shape, found[2] == b"True", dtype
+        shape, fortran, dtype = read(file)
+    except Exception as error:  # NumPy's reader raises whatever Python's tokenizer does
+        raise wrong from error
+    if dtype.kind not in "biuf":
+        raise wrong
+    return len(head), shape, fortran, dtype
 
 
 @lru_cache(64)
