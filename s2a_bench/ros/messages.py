@@ -6,7 +6,7 @@ and what rosbags lacks of others, adds the types ROS derives from them, and keep
 A service gives ``X_Request`` and ``X_Response``; an action gives goal, result and feedback, the two services around
 them and the feedback message. Beside each request and response stands ``...__wire``: the body behind the header
 ``uint64 guid, int64 seq`` with which rmw_cyclonedds sends it. ``X`` and ``X_Event`` are never sent: the hash of a
-service, which rmw_zenoh has in its keys, is that of ``X``.
+service, which an RMW may have in its keys, is that of ``X``.
 """
 
 from __future__ import annotations
