@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from pathlib import Path
@@ -21,6 +21,7 @@ from s2a_bench.text import none_of
 
 T = TypeVar("T")
 OURS: Final = "s2a_bench."
+installed_points = cache(entry_points)  # each call reads the metadata of all packages
 
 
 class Registry(Mapping[str, T], Generic[T]):
@@ -38,7 +39,8 @@ class Registry(Mapping[str, T], Generic[T]):
 
         Of two with one name it is that of s2a-bench, else the first by module, wherever they are installed.
         """
-        points = sorted(entry_points(group=self.group), key=lambda each: (not each.value.startswith(OURS), each.value))
+        known = installed_points().select(group=self.group)
+        points = sorted(known, key=lambda each: (not each.value.startswith(OURS), each.value))
         found = {point.name: point for point in reversed(points)}
         return {name: point for name, point in sorted(found.items()) if name not in self._builtins}
 

@@ -1,4 +1,4 @@
-from importlib.metadata import EntryPoint
+from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ def registry(monkeypatch: pytest.MonkeyPatch) -> Registry[object]:
         EntryPoint("join", "json:dumps", "s2a_bench.things"),
         EntryPoint("broken", "no_such_module:thing", "s2a_bench.things"),
     ]
-    monkeypatch.setattr("s2a_bench.registry.entry_points", lambda *, group: offered if group else [])
+    monkeypatch.setattr("s2a_bench.registry.installed_points", lambda: EntryPoints(offered))
     return Registry("things", "the_thing", {"join": "os.path:join"})
 
 
@@ -33,7 +33,7 @@ def test_of_two_packages_with_one_name_ours_counts_else_the_first_by_module(
 ) -> None:
     modules = {"x": ("a:join", "s2a_bench.text:like"), "y": ("ntpath:join", "posixpath:join")}
     offered = [EntryPoint(name, each, "s2a_bench.things") for name, found in modules.items() for each in found]
-    monkeypatch.setattr("s2a_bench.registry.entry_points", lambda **_: offered[::turn])
+    monkeypatch.setattr("s2a_bench.registry.installed_points", lambda: EntryPoints(offered[::turn]))
     things = Registry[Any]("things", "thing", {})
     assert [things[name].__module__ for name in things] == ["s2a_bench.text", "ntpath"]
 

@@ -72,7 +72,8 @@ HIDING = """
 import importlib.metadata as metadata
 found = metadata.entry_points
 hidden = {hidden!r}
-metadata.entry_points = lambda **by: [point for point in found(**by) if not point.value.startswith(hidden)]
+kept = metadata.EntryPoints(point for point in found().select() if not point.value.startswith(hidden))
+metadata.entry_points = lambda: kept
 """
 LIBRARY = """
 import s2a_bench as s2a
