@@ -278,7 +278,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"options": URL, "payload": "raw"}, "can send a picture as jpeg, jpeg-preencoded, png, not as raw"),
         ({"options": {"http": {"url": "http://x", "dialect": "openvla"}}, "payload": "jpeg"}, "as raw, not as jpeg"),
         ({"options": {"http": {"url": "http://x", "dialect": "smoke"}}}, "`dialect`: 'smoke' is none of s2a, openai"),
-        ({"options": {"http": {"dialect": "ollama"}}}, "`dialect` is about a server that runs already"),
+        ({"options": {"http": {"dialect": "tgi"}}}, "`dialect` is about a server that runs already"),
         ({"options": {"http": {"llama_server": "x", "extra_body": "{}"}}}, "`extra_body` is about a server that runs"),
         ({"options": {"http": {"url": "http://x", "extra_body": "{"}}}, "`extra_body`: no JSON"),
         ({"options": {"http": {"url": "http://x", "api_key_env": "sk-1"}}}, "`api_key_env` takes the name of an env"),

@@ -35,6 +35,7 @@ TOLD = [
     ("vllm", '{"choices": [], "metrics": {"queue_time_ms": %s}}', "queue_ms"),
     ("ollama", '{"done": true, "prompt_eval_count": %s}', "prompt_with_cached_n"),
     ("ollama", '{"done": true, "eval_duration": %s}', "predicted_ms"),
+    ("tgi", '{"details": {"generated_tokens": %s}}', "predicted_n"),
     ("gemini", '{"usageMetadata": {"promptTokenCount": %s}}', "prompt_n"),
 ]
 
@@ -82,6 +83,7 @@ def test_more_cached_than_there_was_is_odd() -> None:
 
 @pytest.mark.parametrize("value", [1e300, 1.5, -1, "7", None, 2**70, True, [3]])
 def test_a_token_s_id_that_can_be_none_is_unknown(value: Any) -> None:
+    assert open_dialect("tgi").event({"token": {"id": value, "text": "x"}}).token_id == -1
     choice = {"delta": {"content": "x"}, "token": value}
     assert open_dialect("s2a").event({"choices": [choice]}).token_id == -1
 

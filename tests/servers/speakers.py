@@ -233,6 +233,58 @@ class Ollama:
         return compact({"error": message})
 
 
+class Tgi:
+    """Text Generation Inference's native stream; its last token is in the closing event, here a special one."""
+
+    dialect = "tgi"
+    kind = "text/event-stream"
+    path = "/generate_stream"
+    marked = re.compile(r"!\[\]\((data:image/[^)]*)\)")
+
+    def read(self, received: Received) -> Request:
+        body = received.json
+        assert set(body) == {"inputs", "parameters"}
+        uris = [DATA_URI.fullmatch(uri) for uri in self.marked.findall(body["inputs"])]
+        frames = tuple(picture(uri[1]) for uri in uris if uri)
+        parameters = body["parameters"]
+        assert parameters["details"] is True
+        prompt = self.marked.sub("", body["inputs"])
+        return Request("", prompt, frames, parameters["max_new_tokens"], "", parameters["seed"])
+
+    def _event(self, index: int, token: Token, text: str | None = None, **more: Any) -> bytes:
+        special = token.text == "</s>"
+        said = {"id": token.id, "text": token.text, "logprob": -0.5, "special": special}
+        return (
+            b"data:"
+            + compact({"index": index, "token": said, "generated_text": text, "details": None, **more})
+            + (b"\n\n")
+        )
+
+    def opening(self) -> bytes:
+        return b":\n\n"
+
+    def token(self, token: Token) -> bytes:
+        return self._event(token.index + 1, token)
+
+    def thinking(self, text: str) -> bytes:
+        raise NotImplementedError
+
+    def closing(self, tokens: list[Token]) -> bytes:
+        details = {"finish_reason": "eos_token", "generated_tokens": len(tokens), "seed": 1, "input_length": 8}
+        whole = "".join(token.text for token in tokens)
+        return self._event(len(tokens) + 1, Token(0, "</s>", 2), whole, details=details)
+
+    def bare_closing(self, tokens: list[Token]) -> bytes:
+        return self._event(len(tokens) + 1, Token(0, "</s>", 2), "".join(token.text for token in tokens))
+
+    def error(self, message: str) -> bytes:
+        return b"data:" + compact({"error": message, "error_type": "generation"}) + b"\n\n"
+
+    def refusal(self, status: int, message: str) -> bytes:
+        del status
+        return compact({"error": message, "error_type": "validation"})
+
+
 class Gemini:
     """Google's; the last chunk may carry text, and the body's end is the stream's."""
 
@@ -281,7 +333,7 @@ class Gemini:
         return json.dumps([{"error": {"code": status, "message": message, "status": "X"}}], indent=2).encode()
 
 
-SPEAKERS: tuple[Speaker, ...] = (Cloud(), LlamaServer(), Vllm(), Ollama(), Gemini())
+SPEAKERS: tuple[Speaker, ...] = (Cloud(), LlamaServer(), Vllm(), Ollama(), Tgi(), Gemini())
 
 
 def answering(speaker: Speaker, handler: Handler) -> Reply:
@@ -293,7 +345,10 @@ def answering(speaker: Speaker, handler: Handler) -> Reply:
             tokens = handler(speaker.read(received), Trace())
             first = list(next_of(tokens))
         except (AssertionError, EngineError, KeyError, ValueError) as error:
-            yield head("400 Bad Request", "application/json") + speaker.refusal(400, str(error))
+            if speaker.dialect == Tgi.dialect:  # its stream has begun, whatever comes of it
+                yield head(kind=speaker.kind) + speaker.error(str(error))
+            else:
+                yield head("400 Bad Request", "application/json") + speaker.refusal(400, str(error))
             return
         said: list[Token] = []
         yield kept_head(speaker.kind)

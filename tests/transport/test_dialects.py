@@ -21,7 +21,7 @@ from s2a_bench.transport.http import HTTP
 from s2a_bench.transport.http.dialects import DIALECTS
 from s2a_bench.types import Request, Token
 from tests.servers.sockets import CLOSE, Received, Reply, chunk, head, kept_head, serving
-from tests.servers.speakers import SPEAKERS, Cloud, Gemini, LlamaServer, Ollama, Speaker, answering
+from tests.servers.speakers import SPEAKERS, Cloud, Gemini, LlamaServer, Ollama, Speaker, Tgi, answering
 
 GO_TO = [Token(0, "go", 11), Token(1, "_to", 12)]
 Pieces = list[bytes]
@@ -114,6 +114,7 @@ FACTS = {
     },
     "ollama": {"prompt_with_cached_n": 8, "predicted_n": 2}
     | {"total_ms": 150.0, "load_ms": 10.0, "prompt_ms": 100.0, "predicted_ms": 30.0, "outside_model_ms": 10.0},
+    "tgi": {"prompt_n": 8, "predicted_n": 2},
     "gemini": {"prompt_n": 8, "predicted_n": 2},
 }
 
@@ -252,7 +253,7 @@ def test_the_clock_stops_at_the_first_piece_that_is_not_empty(speaker: Speaker) 
     assert trace.chain()[-1][1] >= stamps[0]
 
 
-@pytest.mark.parametrize("speaker", SPEAKERS, ids=lambda one: one.dialect)
+@pytest.mark.parametrize("speaker", [one for one in SPEAKERS if one.dialect != "tgi"], ids=lambda one: one.dialect)
 class TestThinking:
     def test_is_no_token_and_becomes_a_fact(self, speaker: Speaker) -> None:
         thoughts = [speaker.thinking("hm"), speaker.thinking(", well")]
@@ -374,6 +375,8 @@ class TestKeys:
         ("openai", "/v1?api-version=2", "/v1/chat/completions?api-version=2"),
         ("ollama", "", "/api/chat"),
         ("ollama", "/api", "/api/chat"),
+        ("tgi", "", "/generate_stream"),
+        ("tgi", "/generate_stream", "/generate_stream"),
         ("gemini", "/v1beta/", "/v1beta/models/a%2Fb:streamGenerateContent?alt=sse"),
         ("gemini", "/v1", "/v1/models/a%2Fb:streamGenerateContent?alt=sse"),
         ("openvla", "", "/act"),
@@ -548,7 +551,7 @@ def test_a_model_that_is_not_there_has_its_hint_whatever_the_status(status: str,
 def test_an_overloaded_tgi_says_so_in_its_stream_and_has_the_advice_of_a_429() -> None:
     refusal = b'data:{"error":"Model is overloaded","error_type":"overloaded"}\n\n'
     with pytest.raises(RequestFailed, match="Model is overloaded; it wants fewer requests: see its quota"):
-        answered(Cloud(), [head(), refusal])
+        answered(Tgi(), [head(kind=Tgi().kind), refusal])
 
 
 @pytest.mark.parametrize("speaker", [Cloud(), Gemini()], ids=lambda one: one.dialect)

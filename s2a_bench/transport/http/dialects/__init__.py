@@ -61,6 +61,7 @@ DIALECTS: Final[Registry[type[Dialect]]] = Registry(
         "llama-server": "s2a_bench.transport.http.dialects.openai:LlamaServer",
         "vllm": "s2a_bench.transport.http.dialects.openai:Vllm",
         "ollama": "s2a_bench.transport.http.dialects.ollama:Ollama",
+        "tgi": "s2a_bench.transport.http.dialects.tgi:Tgi",
         "gemini": "s2a_bench.transport.http.dialects.gemini:Gemini",
     },
 )

@@ -1,4 +1,4 @@
-"""OpenAI's ``chat/completions`` with server-sent events: clouds, TGI, llama-server, vLLM and our server.
+"""OpenAI's ``chat/completions`` with server-sent events: clouds, TGI's chat route, llama-server, vLLM and our server.
 
 *openai* sends standard fields only, because strict clouds refuse others. *llama-server* and *vllm* add the fields that
 turn their prompt caches off, and their names for a GBNF grammar.
