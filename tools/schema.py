@@ -18,15 +18,16 @@ from pkgutil import resolve_name
 from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from s2a_bench.experiments import EXPERIMENTS
-from s2a_bench.experiments.ccrb.view.tables import CcrbStudy
+from s2a_bench.experiments.ccrb.view.tables import ORDERINGS
 from s2a_bench.experiments.profile_capture import ProfileJson
 from s2a_bench.experiments.throughput.metrics import Reference
 from s2a_bench.inference.fetch import FetchedFile
 from s2a_bench.inference.model_list import ListedModel
+from s2a_bench.plan.skillset import GAPS
 from s2a_bench.provenance import Origins
 from s2a_bench.report.compare.shown import CompareJson
 from s2a_bench.store.manifest import RunWarning
-from s2a_bench.store.schema import Many, about
+from s2a_bench.store.schema import Count, Fraction, Many, about
 from s2a_bench.sweep.json import PlannedCell, SweptCell
 from s2a_bench.writers.json import RatioJson
 
@@ -113,6 +114,39 @@ def frame_schema() -> dict[str, Any]:
     named |= {_name(each): each for each in (*cells, Reference, CcrbStudy)}
     named["sweep_cell"] = PlannedCell | SweptCell
     return _redefined("s2a-bench-1", named, kept=("level", "check"))
+
+
+@dataclasses.dataclass(frozen=True)
+class OrderingShare:
+    """The number and share of the scenarios in which an ordering holds."""
+
+    k: Count
+    value: Fraction
+    ci95: Annotated[tuple[float, float] | None, about("Clopper-Pearson; random scenarios only.")] = None
+
+
+@dataclasses.dataclass(frozen=True)
+class CcrbStudy:
+    """The shares of one study under one gap behaviour.
+
+    Orderings: the paper's; a policy's impact is more than 0.5 m/s faster (worse) or slower (better) than
+    stream-to-act's, of any kind or from behind.
+    """
+
+    study: Literal["phase", "random"]
+    gap_behaviour: Annotated[str, {"enum": list(GAPS)}]
+    scenarios: Many
+    orderings: Annotated[
+        dict[str, OrderingShare], {"required": list(ORDERINGS), "propertyNames": {"enum": list(ORDERINGS)}}
+    ]
+    follower_survives: Annotated[
+        OrderingShare | None,
+        about("Where the car behind avoids an ego with immediate tokens; otherwise a rear impact proves nothing."),
+    ] = None
+    paper_rates_tokens_per_s: Annotated[
+        tuple[float, float] | None,
+        about("Least and greatest R at which the paper's ordering holds; absent if it never does."),
+    ] = None
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

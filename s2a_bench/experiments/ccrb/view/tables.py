@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.experiments import TIME, Shown, Tables, requests
 from s2a_bench.experiments.ccrb.rows import (
@@ -30,14 +30,8 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     tokens_line,
 )
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.scenario.ccrb.labels import (
-    NO_SCORE,
-    ORDERING,
-    law,
-    operating_point,
-    outcome_label,
-)
-from s2a_bench.store.schema import Count, Facts, Fraction, Many, Positive, about
+from s2a_bench.scenario.ccrb.labels import NO_SCORE, ORDERING, law, operating_point, outcome_label
+from s2a_bench.store.schema import Facts, Positive
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, entries, number
@@ -113,39 +107,6 @@ CcrbCell = cell_of_row(
         **{metric.name: Annotated[float, Facts(metric.schema)] for metric in _TIMES},
     },
 )
-
-
-@dataclass(frozen=True)
-class OrderingShare:
-    """The number and share of the scenarios in which an ordering holds."""
-
-    k: Count
-    value: Fraction
-    ci95: Annotated[tuple[float, float] | None, about("Clopper-Pearson; random scenarios only.")] = None
-
-
-@dataclass(frozen=True)
-class CcrbStudy:
-    """The shares of one study under one gap behaviour.
-
-    Orderings: the paper's; a policy's impact is more than 0.5 m/s faster (worse) or slower (better) than
-    stream-to-act's, of any kind or from behind.
-    """
-
-    study: Literal["phase", "random"]
-    gap_behaviour: Annotated[str, {"enum": list(GAPS)}]
-    scenarios: Many
-    orderings: Annotated[
-        dict[str, OrderingShare], {"required": list(ORDERINGS), "propertyNames": {"enum": list(ORDERINGS)}}
-    ]
-    follower_survives: Annotated[
-        OrderingShare | None,
-        about("Where the car behind avoids an ego with immediate tokens; otherwise a rear impact proves nothing."),
-    ] = None
-    paper_rates_tokens_per_s: Annotated[
-        tuple[float, float] | None,
-        about("Least and greatest R at which the paper's ordering holds; absent if it never does."),
-    ] = None
 
 
 def _outcome_table(run: StoredRun) -> TextTable:
