@@ -70,10 +70,10 @@ PLUGINS = {
 
 HIDING = """
 import importlib.metadata as metadata
-found = metadata.entry_points
 hidden = {hidden!r}
-kept = metadata.EntryPoints(point for point in found().select() if not point.value.startswith(hidden))
-metadata.entry_points = lambda: kept
+points = [point for each in metadata.distributions() for point in each.entry_points]
+kept = metadata.EntryPoints(point for point in points if not point.value.startswith(hidden))
+metadata.entry_points = lambda **by: kept.select(**by)
 """
 LIBRARY = """
 import s2a_bench as s2a
