@@ -324,7 +324,8 @@ def test_its_command_is_one_of_the_commands(command: Command) -> None:
 def test_its_reference_stands_beside_measurements_and_its_claim_is_judged(
     measured: Path, command: Command, tmp_path: Path
 ) -> None:
-    assert "draw the toy study's values beside ours" in " ".join(command("latency", "--help-all").stdout.split())
+    about = "".join(command("latency", "--help-all").stdout.split())
+    assert "toy-study:drawthetoy-study'svaluesbesideours" in about
     done = command("latency", "--transport", "loopback", "--against", "toy-study", *SMALL)
     assert "Grey: of toys." in (folder_of(done, tmp_path) / "figures" / "captions.md").read_text()
     outputs = ("--output", "page.html", "--csv", "csv", "--markdown", "all.md", "--latex", "tex")

@@ -47,8 +47,11 @@ REFERENCES: Final[Registry[Reference]] = Registry("references", "against", {})
 
 
 def against(about: str) -> str:
-    """Return the option of a reference's name; ``about`` says what is done with each, {} being its title."""
-    offered = [f"{name}: {about.format(reference.title)}" for name, reference in REFERENCES.loaded()]
+    """Return the option of a reference's name; ``about`` says what is done with each, {} being what it is called.
+
+    No reference is loaded: this runs while its module may be under way.
+    """
+    offered = [f"{name}: {about.format(f'the {name}')}" for name in REFERENCES]
     made: str = option("", "; ".join(offered), hidden=not offered)
     return made
 

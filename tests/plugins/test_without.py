@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from importlib.metadata import distribution
 from pathlib import Path
 from typing import NamedTuple
 
@@ -133,3 +134,19 @@ def test_without_plug_ins_everything_else_works(hidden: tuple[str, ...], wheel: 
     with subprocess.Popen(line, stdout=subprocess.PIPE, **started) as server:
         assert "http://127.0.0.1:" in server.stdout.readline()
         server.send_signal(signal.SIGINT)
+
+
+MODULES = sorted({point.module for point in distribution("s2a-bench").entry_points} - {"s2a_bench.cli"})
+OPTIONS = """
+from s2a_bench.experiments.latency.config import LatencyConfig
+from s2a_bench.experiments.references import AgainstReference
+from s2a_bench.options import places
+print(*places(LatencyConfig), AgainstReference.model_fields["against"].description)
+"""
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_a_plug_in_may_be_imported_before_what_it_adds_options_to(module: str) -> None:
+    code = f"import {module}{OPTIONS}"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert {"link", "clock", "router", "template", "paper:"} <= {*done.stdout.split()}

@@ -98,8 +98,11 @@ class HttpOptions(WebOptions):
 
     @property
     def of_dialects(self) -> set[str]:
-        """Return the given options that dialects declare."""
-        return self.model_fields_set.difference(HttpOptions.model_fields)
+        """Return the options that dialects declare, of which the value is not the default."""
+        fields = type(self).model_fields
+        return {
+            each for each in fields.keys() - HttpOptions.model_fields if getattr(self, each) != fields[each].default
+        }
 
     @property
     def without_effect(self) -> set[str]:

@@ -6,15 +6,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.experiments import TIME, Shown, Tables, requests
-from s2a_bench.experiments.ccrb.rows import (
-    IMPACTS,
-    LOOP,
-    MARGINS,
-    METRICS,
-    MOTION,
-    TIMES,
-    RolloutRow,
-)
+from s2a_bench.experiments.ccrb.rows import IMPACTS, LOOP, MARGINS, METRICS, MOTION, TIMES, RolloutRow
 from s2a_bench.experiments.ccrb.view.figures import ccrb_figures
 from s2a_bench.experiments.ccrb.view.outcomes import (
     Share,
