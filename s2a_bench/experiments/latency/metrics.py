@@ -38,14 +38,16 @@ AROUND: Final[tuple[RequestMetric, ...]] = tuple(chain.from_iterable(shown("metr
 METRICS: Final = (
     in_ms("e2e_without_inference", "e2e w/o infer.", "Absent if the server does not report its inference time."),
     in_ms(
-        *("e2e_without_model", "e2e w/o model"),
+        "e2e_without_model",
+        "e2e w/o model",
         "e2e less the model's time up to the first token; preprocessing is included. Of a llama-server: "
         "e2e less the prompt_ms it reports.",
     ),
     in_ms("e2e", "e2e"),
     in_ms("ttft", about="From the prompt: e2e without capture."),
     in_ms(
-        *("round_trip", "round trip"),
+        "round_trip",
+        "round trip",
         "network and return together: exact, where a server on another host has them as intervals.",
     ),
     in_ms("frame_age", about="Age of the frame when inference starts.", ends=lambda cell: cell.ends("frame_age")),

@@ -34,7 +34,7 @@ def ahead(options: Mapping[str, Any]) -> str:
 
 def outcome_label(outcome: str, survives: bool) -> str:
     """Describe an outcome; a rear one is marked if the car behind would hit any ego, as it says nothing of a policy."""
-    return OUTCOME_LABELS[outcome] + f" {MARK}" * (outcome in {"rear", "both"} and not survives)
+    return OUTCOME_LABELS[outcome] + (f" {MARK}" if outcome in {"rear", "both"} and not survives else "")
 
 
 def follower_check(options: Mapping[str, Any], survives: bool) -> str:

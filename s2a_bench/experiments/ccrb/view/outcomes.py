@@ -91,8 +91,9 @@ def rate_span(run: StoredRun, gap: str, *, at_point: bool = False) -> tuple[floa
     """
     scenes = scenes_of(run, "phase", gap)
     if at_point:
-        away = (scenes["rear_gap_m"] - configuration(run)["rear_gap_m"]).abs()
-        scenes = scenes[away == away.min()]
+        wanted = configuration(run)["rear_gap_m"]
+        nearest = min(scenes["rear_gap_m"].unique(), key=lambda gap_m: abs(gap_m - wanted))
+        scenes = scenes[scenes["rear_gap_m"] == nearest]
     rates = scenes[scenes["paper"]]["tokens_per_s"]
     return (float(rates.min()), float(rates.max())) if len(rates) else None
 
