@@ -205,7 +205,7 @@ class RequestsConfig(Surrounded):
     @property
     def tuned(self) -> bool:
         """Whether this process and the servers keep large blocks of memory for the next picture."""
-        return all(options.tuned for _, options in self.options)
+        return all(TRANSPORTS[name].tuned(options) for name, options in self.options)
 
     @property
     def serves_engine(self) -> bool:
@@ -215,7 +215,7 @@ class RequestsConfig(Surrounded):
     @property
     def starts_program(self) -> bool:
         """Whether an external server program is started on the model's files."""
-        return any(pipeline.options.program for pipeline in self.pipelines)
+        return any(pipeline.transport.program(pipeline.options) for pipeline in self.pipelines)
 
     @property
     def foreign(self) -> str:

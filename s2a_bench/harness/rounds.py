@@ -129,7 +129,8 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
         if plan.finds_model and extras.installed("gguf"):  # without gguf no file is read
             plan = replace(plan, engine=on_files(plan.engine, progress))
         sleeps = {cell.name: sleep for cell in plan.cells if (sleep := cell.transport.sleep)}
-        guard = SampleGuard({cell.name: cell.options.against_loss for cell in plan.cells}, sleeps)
+        against_loss = {cell.name: cell.transport.against_loss(cell.options) for cell in plan.cells}
+        guard = SampleGuard(against_loss, sleeps)
         run = _Run(task, plan, sources, writer, progress, guard, around)
         if plan.record is not None:
             run.recorder = RunRecorder(plan.record, plan.namespace, live=plan.feed.stream)

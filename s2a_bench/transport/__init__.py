@@ -64,7 +64,7 @@ EXTERNAL: Final = "external"
 """``side`` of an option that holds the address of a running external server."""
 
 PROGRAM: Final = "program"
-"""``side`` of an option that names an external server for the run to start: see `TransportOptions.program`."""
+"""``side`` of an option that names an external server for the run to start: see `Transport.program`."""
 
 
 Payload = Annotated[str, base.one_of(lambda: ("", *PAYLOADS))]
@@ -105,31 +105,9 @@ class TransportOptions(base.Options):
         return next((getattr(self, name) for name in self.of_sides(EXTERNAL)), "")
 
     @property
-    def program(self) -> Program | None:
-        return None
-
-    @property
     def without_effect(self) -> set[str]:
         """Return the given options that only a server at a `url` reads, where there is none."""
         return set()
-
-    @property
-    def tuned(self) -> bool:
-        """Whether processes are tuned: they keep large blocks of memory for the next picture, for example."""
-        return True
-
-    @property
-    def datagrams(self) -> bool:
-        """Whether requests travel as UDP datagrams rather than over TCP."""
-        return False
-
-    @property
-    def against_loss(self) -> str:
-        return "check the network"
-
-    def addresses(self) -> Iterable[str]:
-        """Return the addresses that a new server tries to bind, in order."""
-        return ("",)
 
 
 O = TypeVar("O", bound=TransportOptions)  # noqa: E741 - the one type variable here
@@ -349,6 +327,26 @@ class Transport(Generic[O]):
     def require(self, choice: Choice[O]) -> None:  # noqa: ARG002 - for those that depend on it
         """Raise UsageError for options that conflict with the rest of a choice, or with this machine."""
         self.check_machine()
+
+    def tuned(self, options: O) -> bool:  # noqa: ARG002 - for those whose options decide, here and below
+        """Return whether processes are tuned: they keep large blocks of memory for the next picture, for example."""
+        return True
+
+    def datagrams(self, options: O) -> bool:  # noqa: ARG002
+        """Return whether requests travel as UDP datagrams rather than over TCP."""
+        return False
+
+    def against_loss(self, options: O) -> str:  # noqa: ARG002
+        """Return what to do where messages are lost."""
+        return "check the network"
+
+    def addresses(self, options: O) -> Iterable[str]:  # noqa: ARG002
+        """Return the addresses that a new server tries to bind, in order."""
+        return ("",)
+
+    def program(self, options: O) -> Program | None:  # noqa: ARG002
+        """Return the external server that a run starts, if the options name one."""
+        return None
 
     def ready(self, wiring: Wiring[O]) -> str:
         """Return the line that `serve` prints once the server is bound at ``wiring.address``."""

@@ -8,11 +8,11 @@ from typing import Any, Final, Generic
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.convert import to_rgb
-from s2a_bench.plugins.policy_servers.observation import template_of
+from s2a_bench.plugins.policy_servers.observation import Template
 from s2a_bench.plugins.policy_servers.policies import P
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Client, Wiring
+from s2a_bench.transport import TRANSPORTS, Client, Wiring
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Frame, Piece, Pixels, Request
@@ -39,7 +39,8 @@ class PolicyClient(Client, Generic[P]):
     def __init__(self, wiring: Wiring[P], alive: Callable[[], bool]) -> None:
         self._wiring, self._alive = wiring, alive
         self._native = not wiring.black_box
-        self._template = template_of(wiring.options.template_name)
+        declared: Any = TRANSPORTS[wiring.transport]
+        self._template: Template = declared.template(wiring.options)
         self._url = wiring.address
         self._listed: list[str] = []
 
