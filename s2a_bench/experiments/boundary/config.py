@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
 from typing import Final
 
-from s2a_bench.boards.profile import Profile, load_profile
 from s2a_bench.boards.tokens import NO_JITTER, gaps_of
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, Numbers, Options, WholeNumbers, option
@@ -43,25 +40,9 @@ class BoundaryConfig(Options):
     plans: int | None = option(None, f"plans a point [default: 1; with jitter {PLANS}]", ge=1, le=1_000_000)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
 
-    @cached_property
-    def boards(self) -> list[Profile]:
-        return [load_profile(name) for name in self.profiles]
-
     @property
     def virtual(self) -> bool:
         return True
-
-    @property
-    def durations(self) -> dict[str, float]:
-        """The durations of a skill in s: as naive runs it, and the least."""
-        return {"t_nom": self.t_nom_s, "t_min": self.t_min * self.t_nom_s}
-
-    @property
-    def grid(self) -> tuple[Sequence[int], Sequence[float]]:
-        """The values of L and R at whose every pair there is a point."""
-        import numpy as np
-
-        return range(1, self.most_tokens + 1), np.geomspace(self.rates[0], self.rates[1], self.rates_tried).tolist()
 
     @property
     def rates_tried(self) -> int:
