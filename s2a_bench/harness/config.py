@@ -20,6 +20,7 @@ from s2a_bench.transport import (
     EXTERNAL,
     PAYLOADS,
     PROGRAM,
+    RAW,
     SERVER,
     TRANSPORT,
     TRANSPORTS,
@@ -192,7 +193,7 @@ class RequestsConfig(Surrounded):
     @property
     def usual_payloads(self) -> tuple[str, ...]:
         """Return the default payloads, for the pipelines that can carry them."""
-        return ("raw",)
+        return (RAW,)
 
     @cached_property
     def answer(self) -> str:
@@ -285,8 +286,6 @@ class RequestsConfig(Surrounded):
         _ = self.surroundings  # raises UsageError
 
     def _check(self, pipeline: Pipeline) -> None:
-        if self.resize and pipeline.payload in {"yuyv", "jpeg-preencoded"}:
-            raise UsageError(f"`resize`: {pipeline.payload} is what the camera gave; use `payload` raw, jpeg or png")
         if self.state and not pipeline.capabilities.accepts_state:
             raise UsageError(f"`state`: a request of {pipeline.name} has no place for it; leave one of them out")
         if not (pipeline.transport.serves or pipeline.black_box):
@@ -294,12 +293,10 @@ class RequestsConfig(Surrounded):
             raise UsageError(f"`transport` {pipeline.name} is a client alone: name its `url`, {scheme}://HOST:PORT")
         chosen = Choice(pipeline.options, pipeline.variant, self.mode, self.engine.name, self.cameras, self.state)
         pipeline.transport.require(chosen)
-        require_payload(pipeline)
+        require_payload(pipeline, self.mode, resized=self.resize is not None)
         self.served_engine.but(**dict(pipeline.engine))  # raises UsageError for a value in its name
         if pipeline.engine and pipeline.options.external_address:
             raise UsageError(f"`{pipeline.engine[0][0]}`: the server of {pipeline.name} runs already, as it was set")
-        if self.mode == "stream" and pipeline.payload == "jpeg-preencoded":
-            raise UsageError("`payload` jpeg-preencoded has no meaning in `mode` stream; use jpeg")
 
     def _check_answer(self) -> None:
         if self.answer != ACTIONS:

@@ -252,8 +252,8 @@ class _Run:
     def _wait_for(self, servers: ServerSet, cell: Pipeline) -> None:
         """Return when the server answers a request that is not measured, be it with an error that the run meets too."""
         plan, request, begun_ns = self.plan.feed, self.plan.request, now_ns()
-        source, preencoded = replace(plan, source="synthetic").open(), cell.payload == "jpeg-preencoded"
-        feed = RequestFeed(source, preencoded=preencoded, cameras=plan.cameras, size=plan.resize)
+        source = replace(plan, source="synthetic").open()
+        feed = RequestFeed(source, preencoded=cell.preencoded, cameras=plan.cameras, size=plan.resize)
         while True:
             trace = Trace()
             feed.get_ready()
@@ -293,8 +293,7 @@ class _Run:
             else:
                 user = f"{cell.name} {place}" if place else cell.name
                 source = self.sources.of(user, user if cell.black_box or place else "")
-                preencoded = cell.payload == "jpeg-preencoded"
-                feed = RequestFeed(source, preencoded=preencoded, cameras=plan.cameras, size=plan.resize)
+                feed = RequestFeed(source, preencoded=cell.preencoded, cameras=plan.cameras, size=plan.resize)
             about = self.plan.request, recorder, sampler, servers.origin(cell), clocks
             made.append(Session(cell, client, feed, *about))
             yield made[0]

@@ -47,9 +47,10 @@ if TYPE_CHECKING:
     from s2a_bench.types import Frame, Piece, Request
 
 PAYLOADS: Final = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
-"""Forms of a picture: ``bgr8`` pixels, the camera's YUYV, JPEG, a JPEG encoded before the run, PNG."""
+"""Forms of a picture, as tables order them: ``bgr8`` pixels, the camera's YUYV, JPEG, the camera's own JPEG, PNG."""
+RAW, YUYV, JPEG, PREENCODED, PNG = PAYLOADS
 
-LOSSLESS: Final = frozenset({"", "raw", "yuyv", "png"})
+LOSSLESS: Final = frozenset({"", RAW, YUYV, PNG})
 """Payloads that give the engine the camera's exact pixels; "" where no picture is sent."""
 
 TRANSPORT: Final = "Transport"
@@ -69,6 +70,11 @@ PROGRAM: Final = "program"
 
 Payload = Annotated[str, base.one_of(lambda: ("", *PAYLOADS))]
 Payloads = Annotated[tuple[Payload, ...], base.SEVERAL]
+
+
+def payload_order(payload: str) -> int:
+    """Return the place of a payload in tables; what is none of `PAYLOADS` comes last."""
+    return PAYLOADS.index(payload) if payload in PAYLOADS else len(PAYLOADS)
 
 
 @dataclass(frozen=True, slots=True)
