@@ -194,25 +194,20 @@ def _completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]
 
 
 def distinct(flags: Sequence[Flag], taken: Iterable[str] = ()) -> list[Flag]:
-    """Return the flags whose names are not ``taken``, one for each name.
-
-    Of several it is that in the fewest groups, the first. It sets all of them that are in groups beside its own.
-    """
+    """Return the flags whose names are not ``taken``, one for each name."""
     names = {name.strip("_").replace("_", "-") for name in taken}
-    chosen = _owners(flags)
-    typed = [flag for flag in flags if flag.name not in names and chosen[flag.name] is flag]
-    return [_shared([each for each in flags if each.name == flag.name and _same(each, flag)]) for flag in typed]
+    return [_shared(same) for same in _by_name(flags) if same[0].name not in names]
 
 
-def _owners(flags: Iterable[Flag]) -> dict[str, Flag]:
-    """Return, by name, the flag that is typed: that in the fewest groups, the first of several."""
-    return {flag.name: flag for flag in sorted(flags, key=lambda flag: len(flag.path))[::-1]}
-
-
-def _same(flag: Flag, other: Flag) -> bool:
+def _by_name(flags: Sequence[Flag]) -> Iterator[list[Flag]]:
+    """Yield for each name the flags that it sets: the first in the fewest groups, and those in groups beside it."""
     from s2a_bench.options import beside
 
-    return flag.path == other.path or beside(flag.path, other.path)
+    owners = {flag.name: flag for flag in sorted(flags, key=lambda flag: len(flag.path))[::-1]}
+    for owner in flags:
+        if owners[owner.name] is owner:
+            same = (each for each in flags if each.name == owner.name and beside(each.path, owner.path))
+            yield [owner, *(each for each in same if each is not owner)]
 
 
 def _shared(flags: Sequence[Flag]) -> Flag:
@@ -238,12 +233,8 @@ def build(options: type[Options] | OneOf, given: Mapping[str, Any]) -> Options:
 
     if isinstance(options, OneOf):
         return options.build(given)
-    flags = [*flags_of(options)]
-    owners = _owners(flags)
-    values = ((flag, owners[flag.name], given.get(flag.key)) for flag in flags)
-    return options(
-        **nested((flag.path, value) for flag, owner, value in values if value is not None and _same(flag, owner))
-    )
+    typed = (flag for same in _by_name([*flags_of(options)]) for flag in same)
+    return options(**nested((flag.path, given[flag.key]) for flag in typed if given.get(flag.key) is not None))
 
 
 @contextmanager
