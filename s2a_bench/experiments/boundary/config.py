@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import ClassVar, Final
 
 from s2a_bench.boards.tokens import NO_JITTER, gaps_of
 from s2a_bench.errors import UsageError
@@ -16,6 +16,8 @@ MARKS, SHADES = 25, 73
 
 class BoundaryConfig(Options):
     """The plane of tokens per skill and rate."""
+
+    virtual: ClassVar[bool] = True
 
     profiles: Names = option(
         ("rtx-4080", "jetson-agx-orin", "jetson-orin-nano"),
@@ -41,16 +43,12 @@ class BoundaryConfig(Options):
     seed: int = option(0, "seed of everything that is drawn", ge=0)
 
     @property
-    def virtual(self) -> bool:
-        return True
-
-    @property
     def rates_tried(self) -> int:
-        return self.points if self.points is not None else MARKS if self.jitter == NO_JITTER else SHADES
+        return self.points or (MARKS if self.jitter == NO_JITTER else SHADES)
 
     @property
     def plans_a_point(self) -> int:
-        return self.plans if self.plans is not None else 1 if self.jitter == NO_JITTER else PLANS
+        return self.plans or (1 if self.jitter == NO_JITTER else PLANS)
 
     def check(self) -> None:
         if len(self.rates) != 2 or not 0 < self.rates[0] < self.rates[1] < float("inf"):  # noqa: PLR2004 - from, to
