@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import product
 from math import ceil
 from pathlib import Path
 from random import Random
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 from s2a_bench import extras
 from s2a_bench.clock import Clock, SystemClock, now_ns
@@ -49,14 +48,6 @@ Slot: TypeAlias = Callable[[Place], None]
 """Measures once and writes the result; called once per block."""
 
 
-class Keep(Protocol):
-    def __call__(self, session: Session, measured: Measured, client: int = 0, clients: int = 1) -> None:
-        """Write a request of one of the ``clients`` of a cell, and raise what makes the next one useless.
-
-        Not thread-safe.
-        """
-
-
 @dataclass(frozen=True, slots=True)
 class RunningLaunch:
     """One running set of servers, and their clients."""
@@ -67,15 +58,36 @@ class RunningLaunch:
     writer: RunWriter
     sessions: Sequence[Session]
     """In the order of the cells, `Task.clients` of each cell one after the other."""
-    keep: Keep
+    servers: ServerSet
     guard: SampleGuard
     progress: Progress
     warnings: list[RunWarning]
     """Warnings of the run besides those about its requests."""
-    wiring: Callable[[Pipeline], Wiring[Any]]
-    """Returns the wiring of further clients of a cell."""
     sampler: ResourceSampler
-    recorder: RunRecorder | None = None
+    recorder: RunRecorder | None
+
+    def wiring(self, cell: Pipeline) -> Wiring[Any]:
+        """Return the wiring of further clients of a cell."""
+        return self.servers.wiring(cell)
+
+    def keep(self, session: Session, measured: Measured, client: int = 0, clients: int = 1) -> None:
+        """Write a request of one of the ``clients`` of a cell, and raise what makes the next one useless.
+
+        Not thread-safe.
+        """
+        name, sample, writer = session.cell.name, measured.sample, self.writer
+        keep_origin(writer, name, session.origin)
+        writer.sample(sample)
+        writer.tokens(measured.tokens)
+        self.sampler.flush(writer)
+        for row in session.frames():
+            writer.frame(row)
+        self.guard.see(sample, measured.fingerprint, measured.odd, client)
+        self.servers.raise_if_over(session.cell, measured, suspect=bool(sample.error) and clients == 1)
+        most = GIVE_UP_AFTER + session.answered * ceil(self.plan.wait_s / LONGEST_PAUSE_S)
+        if sum(failures >= most for failures in self.guard.in_a_row[name].values()) >= clients:
+            raise TransportError(f"{name} failed {most} times in a row, at last with {sample.error}")
+        back_off(name, measured.retry_after_s, SystemClock(), self.progress.stage)
 
 
 def in_blocks(launch: RunningLaunch, others: Sequence[Slot] = ()) -> None:
@@ -220,18 +232,16 @@ class _Run:
         origins = {session.cell.name: session.origin for session in sessions}
         writer.update(asked=described, provenance=Origins(Provenance.of_engine(model), origins).to_manifest())
         hits = servers.cache_hits()
-        keep = partial(self.keep, servers, sampler)
         try:
             launch = RunningLaunch(
                 number,
                 self.plan,
                 writer,
                 sessions,
-                keep,
+                servers,
                 self.guard,
                 self.progress,
                 self.warnings,
-                servers.wiring,
                 sampler,
                 self.recorder,
             )
@@ -297,29 +307,6 @@ class _Run:
             about = self.plan.request, recorder, sampler, servers.origin(cell), clocks
             made.append(Session(cell, client, feed, *about))
             yield made[0]
-
-    def keep(
-        self,
-        servers: ServerSet,
-        sampler: ResourceSampler,
-        session: Session,
-        measured: Measured,
-        client: int = 0,
-        clients: int = 1,
-    ) -> None:
-        name, sample, writer = session.cell.name, measured.sample, self.writer
-        keep_origin(writer, name, session.origin)
-        writer.sample(sample)
-        writer.tokens(measured.tokens)
-        sampler.flush(writer)
-        for row in session.frames():
-            writer.frame(row)
-        self.guard.see(sample, measured.fingerprint, measured.odd, client)
-        servers.raise_if_over(session.cell, measured, suspect=bool(sample.error) and clients == 1)
-        most = GIVE_UP_AFTER + session.answered * ceil(self.plan.wait_s / LONGEST_PAUSE_S)
-        if sum(failures >= most for failures in self.guard.in_a_row[name].values()) >= clients:
-            raise TransportError(f"{name} failed {most} times in a row, at last with {sample.error}")
-        back_off(name, measured.retry_after_s, SystemClock(), self.progress.stage)
 
 
 def _close_idle(client: Client, sessions: Sequence[Session]) -> None:
