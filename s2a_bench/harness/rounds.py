@@ -140,10 +140,7 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
             writer.update(**each.facts(progress.stage))
         if plan.finds_model and extras.installed("gguf"):  # without gguf no file is read
             plan = replace(plan, engine=on_files(plan.engine, progress))
-        sleeps = {cell.name: sleep for cell in plan.cells if (sleep := cell.transport.sleep)}
-        against_loss = {cell.name: cell.transport.against_loss(cell.options) for cell in plan.cells}
-        guard = SampleGuard(against_loss, sleeps)
-        run = _Run(task, plan, sources, writer, progress, guard, around)
+        run = _Run(task, plan, sources, writer, progress, SampleGuard(plan.cells), around)
         if plan.record is not None:
             run.recorder = RunRecorder(plan.record, plan.namespace, live=plan.feed.stream)
             stack.enter_context(run.recorder)
