@@ -39,7 +39,7 @@ from s2a_bench import extras
 from s2a_bench import options as base
 from s2a_bench.errors import UsageError
 from s2a_bench.registry import Registry
-from s2a_bench.transport.limits import LIMITS, Limits
+from s2a_bench.transport.limits import LIMITS, Bounds, Limits
 
 if TYPE_CHECKING:
     from s2a_bench.facts import Fact
@@ -196,7 +196,7 @@ class Wiring(Generic[O]):
     timeout_s: float = 300.0
     """The longest silence before a request counts as failed."""
     deadline_s: float = 0.0
-    """The longest time for a whole answer; 0: see `deadline_of`."""
+    """The longest time for a whole answer; 0: the longest silence, and `TOKEN_S` for each token."""
     max_tokens: int = 512
     """The most tokens of a request that has no such field."""
     limits: Limits = LIMITS
@@ -211,8 +211,9 @@ class Wiring(Generic[O]):
     def capabilities(self) -> Capabilities[O]:
         return TRANSPORTS[self.transport].capabilities(Choice(self.options, self.variant))
 
-    def deadline_of(self, max_tokens: int) -> float:
-        return self.deadline_s or self.timeout_s + TOKEN_S * max_tokens
+    def bounds(self, server: str, max_tokens: int) -> Bounds:
+        """Return the bounds of an answer that begins now; errors call the server ``server``."""
+        return Bounds(server, self.deadline_s or self.timeout_s + TOKEN_S * max_tokens, max_tokens)
 
     @staticmethod
     def from_json(settings: Mapping[str, Any]) -> Wiring[Any]:

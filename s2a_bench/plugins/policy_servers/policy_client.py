@@ -45,7 +45,7 @@ class PolicyClient(Client, Generic[P]):
         self._listed: list[str] = []
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        bounds = self._bounds(request.max_tokens)
+        bounds = self._wiring.bounds(self._url, request.max_tokens)
         try:
             for piece in self._answer(request, bounds, trace):
                 bounds.count_piece()
@@ -66,9 +66,6 @@ class PolicyClient(Client, Generic[P]):
 
     def close(self) -> None:
         self._abandon()
-
-    def _bounds(self, max_tokens: int) -> Bounds:
-        return Bounds(self._url, self._wiring.deadline_of(max_tokens), max_tokens)
 
     def _observation(self, request: Request, trace: Trace) -> dict[str, Any]:
         """Fill the template, marking the stages of each picture."""

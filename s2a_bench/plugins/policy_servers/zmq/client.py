@@ -66,7 +66,7 @@ class ZmqClient(PolicyClient[ZmqOptions]):
 
     def _configurations(self) -> tuple[Any, set[str]]:
         """Return the server's modality configurations and their marks: its layout, and whether it is ours."""
-        bounds = self._bounds(1)
+        bounds = self._wiring.bounds(self._url, 1)
         with closing(ReqSocket(self._url, self._wiring.timeout_s, self._alive)) as link:
             link.greet(bounds)
             return self._read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))
