@@ -53,7 +53,7 @@ class Pipeline:
 
     @property
     def preencoded(self) -> bool:
-        """Whether the camera itself delivers JPEG."""
+        """Whether pictures are JPEGs before the run, as of a camera that delivers them."""
         return self.payload == PREENCODED
 
     @property
