@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.ccrb.config import CcrbConfig
 from s2a_bench.experiments.ccrb.rows import (
     IMPACTS,
     MARGINS,
@@ -30,10 +29,11 @@ from s2a_bench.scenario import EGO, ROLES
 from s2a_bench.scenario.ccrb.cars import start_deadline
 from s2a_bench.scenario.ccrb.drive import Trajectory
 from s2a_bench.scenario.ccrb.ego import PHASES
+from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.outcome import Outcomes
-from s2a_bench.scenario.ccrb.studies import Scenes, draw, drive_along, plane, survived
+from s2a_bench.scenario.ccrb.studies import Scenes, drive_along, survived
 from s2a_bench.scenario.longitudinal import Longitudinal
-from s2a_bench.stats.seeds import generator
+from s2a_bench.types import Timing
 
 
 def rollout_rows(
@@ -91,36 +91,17 @@ SCENES: Final = 1366
 """Scenarios of a block, driven in lock step: about 8,000 roll-outs."""
 
 
-def studies(config: CcrbConfig) -> Iterator[tuple[str, Scenes]]:
-    """Yield the studies beside the operating point, with their scenarios."""
-    if config.phase:
-        yield (
-            "phase",
-            plane(
-                config.scenario,
-                config.phase_rates,
-                config.phase_gaps_m,
-                config.phase_points,
-                prompt_s=config.timeline.boards[0].prompt_s,
-                tokens_per_skill=config.tokens_per_skill,
-            ),
-        )
-    if config.random:
-        yield "random", draw(generator(config.seed, "ccrb", "random"), config.random)
-
-
-def drive_block(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[AboutRollout]]:
+def drive_block(scenario: CcrbOptions, study: str, scenes: Scenes) -> tuple[int, list[AboutRollout]]:
     """Drive every scenario with every gap behaviour and policy; return the number of roll-outs, and the rows.
 
     The check on the car behind is one more roll-out a scenario. A policy that never stalls is driven once, with a row
     for every gap behaviour.
     """
-    scenario = config.scenario
     cases = [(name, gap) for name, form in FORMS.items() for gap in (GAPS if form.stalls else (scenario.gap,))]
     gaps = np.repeat([gap for _, gap in cases], len(scenes))
     every = scenes.times(len(cases))
     cars = every.cars(gaps, scenario)
-    schedule = schedules(config, scenes, [name for name, _ in cases])
+    schedule = schedules(scenario.durations, scenes, [name for name, _ in cases])
     deadline_s = start_deadline(cars, every.numbers["plan_decel_mps2"])
     about: dict[str, Any] = {
         **every.numbers,
@@ -150,8 +131,12 @@ def drive_block(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, li
     return len(scenes) + len(rows), rows + again
 
 
-def schedules(config: CcrbConfig, scenes: Scenes, names: Sequence[str]) -> Schedule:
-    """Concatenate the policies' schedules; shorter plans are padded with skills of no length."""
+def schedules(durations: Timing, scenes: Scenes, names: Sequence[str]) -> Schedule:
+    """Concatenate the policies' schedules, with skills in proportion to ``durations``.
+
+    Shorter plans are padded with skills of no length.
+    """
+    t_min, t_max = durations.least_s / durations.nominal_s, durations.most_s / durations.nominal_s
     at, count = scenes.numbers, len(scenes)
     longest = int(at["n_skills"].max())
     start_s = {name: np.empty((longest, count)) for name in FORMS}
@@ -160,7 +145,7 @@ def schedules(config: CcrbConfig, scenes: Scenes, names: Sequence[str]) -> Sched
         mine = at["n_skills"] == length
         arrival_s = uniform(at["prompt_s"][mine], at["tokens_per_skill"][mine], at["tokens_per_s"][mine], length)
         nominal_s = np.broadcast_to(at["t_nom_s"][mine], arrival_s.shape)
-        plans = Plans(arrival_s, nominal_s, config.timeline.t_min * nominal_s, config.timeline.t_max * nominal_s)
+        plans = Plans(arrival_s, nominal_s, t_min * nominal_s, t_max * nominal_s)
         for name, form in FORMS.items():
             found = form.schedule(plans)
             start_s[name][:length, mine], duration_s[name][:length, mine] = found.start_s, found.duration_s

@@ -16,7 +16,8 @@ from s2a_bench.harness.plan import RunPlan, resolve
 from s2a_bench.harness.rounds import RunningLaunch
 from s2a_bench.harness.servers import on_files
 from s2a_bench.harness.session import Measured, Place, RequestContext
-from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, requests_of
+from s2a_bench.harness.timelines.cases import PlanSetting
+from s2a_bench.harness.timelines.config import PlanRequests
 from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.harness.warnings import change_warnings
 from s2a_bench.inference import need_engine
@@ -63,57 +64,59 @@ class PlanPrompt:
         return PlanShape(self.n_skills, self.tokens_per_skill, timing, float(nominal_s.std()) / mean_s)
 
 
-def plan_prompts(config: TimelineConfig, model: Path | None) -> list[PlanPrompt]:
-    """Write the prompts of all settings for the tokenizer of ``model``; raises UsageError if no format fits."""
+@dataclass(frozen=True, slots=True)
+class PromptPlan:
+    """The plans that a run requests: a prompt for each length, number of skills and skill set."""
+
+    skill_sets: Sequence[SkillSet]
+    """One skill set, a copy for each duration of its skills."""
+    tokens_per_skill: Sequence[int]
+    n_skills: Sequence[int]
+    task: str = ""
+    grammar: bool = True
+    """Whether a grammar holds the answers to their form."""
+
+
+def plan_requests(requests: PlanRequests, plan: PromptPlan, progress: Progress) -> tuple[RunPlan, list[PlanPrompt]]:
+    """Find the model's files, write the prompts, and plan requests of sufficient length; raises S2AError."""
+    limit_threads()
+    model, (cell,) = None, requests.pipelines
+    if requests.engine.kind.needs_model and not cell.options.external_address:
+        need_engine(requests.engine)
+        requests = requests.but(engine=on_files(requests.engine, progress))
+        model = requests.engine.model
+    prompts = write_prompts(plan, model, exact=model is not None or requests.engine.kind.plays is not None)
+    run = resolve(requests.but(max_tokens=max(each.max_tokens for each in prompts)), progress.say)
+    return replace(run, finds_model=False), prompts
+
+
+def write_prompts(plan: PromptPlan, model: Path | None, *, exact: bool) -> list[PlanPrompt]:
+    """Write the prompts for the tokenizer of ``model``, in the paper's format if it is unknown.
+
+    ``exact``: every skill has the planned number of tokens. Raises UsageError if no format fits.
+    """
     tokenize = None
-    if not in_paper_format(config):
+    if model is not None:
         from s2a_bench.inference.tokenizer import Tokenizer
 
         tokenize = Tokenizer(model)
-    found = []
-    for tokens, n_skills, t_nom_s in product(config.lengths, config.n_skills, config.t_nom_s or (None,)):
-        skills = skills_lasting(config, t_nom_s)
+    prompts = []
+    for tokens, n_skills, skills in product(plan.tokens_per_skill, plan.n_skills, plan.skill_sets):
         format_ = paper_format(skills) if tokenize is None else choose_format(skills, tokens, tokenize, n_skills)
-        pinned = None if config.url else tokenize  # only the package's server has the same model files, and token ids
-        rules = grammar(format_, n_skills, pinned) if not config.no_grammar else ""
-        most = n_skills * (tokens if tokenize is not None or config.engine.kind.plays else TOKENS_A_SKILL)
-        text = prompt(format_, n_skills, config.task)
-        found.append(PlanPrompt(skills, format_, tokens, n_skills, text, rules, most))
-    return found
-
-
-def in_paper_format(config: TimelineConfig) -> bool:
-    """Return True if plans have the paper's format, as no tokenizer is known."""
-    return not config.engine.kind.needs_model or bool(config.url)
-
-
-def skills_lasting(config: TimelineConfig, t_nom_s: float | None) -> SkillSet:
-    """Return the skill set; ``t_nom_s`` replaces the duration of every skill."""
-    if t_nom_s is None:
-        return config.skill_set
-    times = Timing(t_nom_s, config.t_min * t_nom_s, config.t_max * t_nom_s)
-    skills = tuple(replace(skill, durations=times) for skill in config.skill_set.skills)
-    return replace(config.skill_set, skills=skills)
-
-
-def prepare_requests(config: TimelineConfig, progress: Progress) -> tuple[RunPlan, list[PlanPrompt]]:
-    """Find the model's files, write the prompts, and plan requests of sufficient length; raises S2AError."""
-    limit_threads()
-    requests = requests_of(config)
-    if not in_paper_format(config):
-        need_engine(requests.engine)
-        requests = requests.but(engine=on_files(requests.engine, progress))
-    prompts = plan_prompts(config, requests.engine.model)
-    plan = resolve(requests.but(max_tokens=max(each.max_tokens for each in prompts)), progress.say)
-    return replace(plan, finds_model=False), prompts
+        rules = grammar(format_, n_skills, tokenize) if plan.grammar else ""
+        most = n_skills * (tokens if exact else TOKENS_A_SKILL)
+        text = prompt(format_, n_skills, plan.task)
+        prompts.append(PlanPrompt(skills, format_, tokens, n_skills, text, rules, most))
+    return prompts
 
 
 @dataclass
 class ModelLink:
     """The requests of one run to one model."""
 
-    config: TimelineConfig
     launch: RunningLaunch
+    first: PlanPrompt
+    """The prompt of the warm-up requests."""
     robot: str
     """For the manifest."""
     blocks: Iterator[int] = field(default_factory=count)
@@ -134,8 +137,8 @@ class ModelLink:
             live={
                 "transport": self.cell.name,
                 **({"paced_tokens_per_s": self.pace} if self.pace else {}),
-                "grammar": not self.config.no_grammar,
-                "skills": self.config.skill_set.name,
+                "grammar": bool(self.first.grammar),
+                "skills": self.first.skills.name,
                 "robot": self.robot,
             },
         )
@@ -148,13 +151,13 @@ class ModelLink:
             provenance=Origins(self.origin).to_manifest(), live=live if dummy is None else {**live, "dummy": dummy}
         )
 
-    def warm_up(self, of: PlanPrompt) -> GapPrior | None:
+    def warm_up(self) -> GapPrior | None:
         """Make the warm-up requests and return the prior that policies learn from them."""
         warmups, progress = self.launch.plan.blocks.warmup, self.launch.progress
         arrivals_ns = []
         for _ in range(warmups):
             progress.stage("warming up")
-            measured = self.request(of, 0, None)
+            measured = self.request(self.first, 0, None)
             arrivals_ns.append([token.client_ns for token in measured.tokens])
             progress.advance()
         self.learned_ms += filter(np.size, (np.diff(times) / 1e6 for times in arrivals_ns))

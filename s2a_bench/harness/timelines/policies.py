@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from s2a_bench.act.record import Record, observed
-from s2a_bench.boards.tokens import Board
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.timelines.config import MOST_CV, PlanSetting, TimelineConfig
+from s2a_bench.harness.timelines.cases import MOST_CV, LearningPlan, PlanCase, PlanSetting
 from s2a_bench.policy import CAUTION, ONLINE, TOLERANCE_S, Floats, Plans, PlanShape, Policy
 from s2a_bench.policy.arrivals import recorded_plans, with_skills
-from s2a_bench.policy.conformal import PLANS, Calibration, Guarantee, Tracker, choose, scores
+from s2a_bench.policy.conformal import EPSILON, PLANS, Calibration, Guarantee, Tracker, choose, scores
 from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
 from s2a_bench.policy.parameters import canonical
 from s2a_bench.policy.tracking import TrackedPolicy
@@ -74,44 +73,43 @@ def finite(caution: float | None) -> float | None:
     return None if caution is None or caution == float("inf") else caution
 
 
-def learn(config: TimelineConfig, board: Board, setting: PlanSetting, answers: Sequence[Floats] = ()) -> Knowledge:
-    """Learn a prior, and get plans for calibration, from drawn plans of the same kind or recorded ``answers``.
+def learn(case: PlanCase, plan: LearningPlan) -> Knowledge:
+    """Learn a prior, and get plans for calibration, from drawn plans of the same kind or recorded answers.
 
     If nothing is random the prior is as certain as the arrivals, and the online rule starts at S0.
     """
     plans = None
-    if answers:
-        plans = plans_of(config, setting, answers)
+    if plan.answers:
+        plans = plans_of(case, plan)
         prior = GapPrior.fit(plans.token_s)  # type: ignore[arg-type]  # recorded plans have tokens
-    elif config.random and any(policy.learns for policy in config.chosen.values()):
-        count = max(setting.n_skills * setting.tokens_per_skill, 3)  # a spread needs two gaps
-        rng = generator(config.seed, "timeline", "prior", setting.key)
-        prior = GapPrior.fit(board.tokens(count, rng, config.calibration_plans))
-        _, plans = draw(config, board, setting, config.calibration_plans, "calibration")
+    elif plan.random:
+        count = max(case.tokens, 3)  # a spread needs two gaps
+        rng = generator(plan.seed, "timeline", "prior", case.setting.key)
+        prior = GapPrior.fit(case.board.tokens(count, rng, plan.calibration_plans))
+        _, plans = draw(case, plan.seed, plan.calibration_plans, "calibration")
     else:
-        prior = GapPrior(1 / board.tokens_per_s, LEAST_CV, LEAST_CV)
-    return Knowledge(prior, plans, config.epsilon, config.guarantee)
+        prior = GapPrior(1 / case.board.tokens_per_s, LEAST_CV, LEAST_CV)
+    return Knowledge(prior, plans, plan.epsilon, plan.guarantee)
 
 
-def plans_of(config: TimelineConfig, setting: PlanSetting, answers: Sequence[Floats]) -> Plans:
+def plans_of(case: PlanCase, plan: LearningPlan) -> Plans:
     """Make plans of recorded answers; raises UsageError if too few are long enough."""
-    rng = generator(config.seed, "timeline", "calibration", setting.key)
-    plans = recorded_plans(answers, config.shape(setting), rng)
-    count, tokens = plans.arrival_s.shape[1], setting.n_skills * setting.tokens_per_skill
-    if (count + 1) * config.epsilon < 1:
+    rng = generator(plan.seed, "timeline", "calibration", case.setting.key)
+    plans = recorded_plans(plan.answers, case.shape, rng)
+    count = plans.arrival_s.shape[1]
+    if (count + 1) * plan.epsilon < 1:
         raise UsageError(
-            f"`calibrate`: {count} of {len(answers)} answers have the {tokens} tokens of {setting.name}; "
-            f"`epsilon` {config.epsilon:g} needs {math.ceil(1 / config.epsilon) - 1}"
+            f"`calibrate`: {count} of {len(plan.answers)} answers have the {case.tokens} tokens of "
+            f"{case.setting.name}; `epsilon` {plan.epsilon:g} needs {math.ceil(1 / plan.epsilon) - 1}"
         )
     return plans
 
 
-def draw(config: TimelineConfig, board: Board, setting: PlanSetting, plans: int, purpose: str) -> tuple[Floats, Plans]:
+def draw(case: PlanCase, seed: int, plans: int, purpose: str) -> tuple[Floats, Plans]:
     """Draw the arrivals of tokens, and the plans in them; each purpose has separate random numbers."""
-    rng = generator(config.seed, "timeline", purpose, setting.key)
-    shape = config.shape(setting)
-    token_s = board.tokens(setting.n_skills * setting.tokens_per_skill, rng, plans)
-    return token_s, with_skills(token_s, shape, rng)
+    rng = generator(seed, "timeline", purpose, case.setting.key)
+    token_s = case.board.tokens(case.tokens, rng, plans)
+    return token_s, with_skills(token_s, case.shape, rng)
 
 
 @dataclass(slots=True)
@@ -134,17 +132,27 @@ class Following:
                 self.tracked[record.policy].learn(plan, stalled=stalled)
 
 
-def prepare(config: TimelineConfig, shape: PlanShape, prior: GapPrior | None) -> Following:
-    """Give online policies the prior, and a lambda that is tracked, not calibrated, unless it is set."""
-    made, tracked = dict(config.chosen), {}
-    for name, policy in config.chosen.items():
-        made[name] = policy.informed(prior)
-        if _open(policy) and config.track:
-            plans = drawn(made[name].prior, shape, generator(config.seed, "tracking", shape.key), PLANS)
-            tracked[name] = TrackedPolicy.begin(made[name], plans, config.epsilon)
-        elif _open(policy):
-            made[name] = policy.informed(prior, CAUTION)
-    return Following(shape, made, tracked)
+@dataclass(frozen=True, slots=True)
+class LivePolicies:
+    """Policies by name that execute a model's plans; lambda is tracked, not calibrated."""
+
+    made: Mapping[str, Policy]
+    seed: int
+    epsilon: float = EPSILON
+    track: bool = False
+    """Whether policies whose lambda is not set follow it from plan to plan."""
+
+    def prepare(self, shape: PlanShape, prior: GapPrior | None) -> Following:
+        """Give online policies the prior, and a lambda unless it is set."""
+        made, tracked = dict(self.made), {}
+        for name, policy in self.made.items():
+            made[name] = policy.informed(prior)
+            if _open(policy) and self.track:
+                plans = drawn(made[name].prior, shape, generator(self.seed, "tracking", shape.key), PLANS)
+                tracked[name] = TrackedPolicy.begin(made[name], plans, self.epsilon)
+            elif _open(policy):
+                made[name] = policy.informed(prior, CAUTION)
+        return Following(shape, made, tracked)
 
 
 def drawn(prior: GapPrior, shape: PlanShape, rng: np.random.Generator, plans: int) -> Plans:
