@@ -2,33 +2,24 @@
 
 from s2a_bench.experiments import Experiment, RunMode
 
+HERE = "s2a_bench.experiments.ccrb"
+LIVE = "take the tokens of a model that really answers, about the rendered scene"
+LOOP = "let the world run while the plan arrives: with --live on the clock, else in virtual time"
+
 EXPERIMENT = Experiment(
     name="ccrb",
     about="Drive car-to-car rear braking with a car behind, under each policy: who hits whom, and when.",
-    config="s2a_bench.experiments.ccrb.config:CcrbComputed",
-    run="s2a_bench.experiments.ccrb.run:run_computed",
+    config=f"{HERE}.config:CcrbComputed",
+    run=f"{HERE}.run:run_ccrb",
     mode="computed",
     modes=(
+        RunMode("live", f"{HERE}.config:CcrbLive", f"{HERE}.live:run_live", {"live": LIVE}),
+        RunMode("closed-loop", f"{HERE}.config:CcrbClosedLoop", f"{HERE}.run:run_closed_loop", {"closed_loop": LOOP}),
         RunMode(
-            "live",
-            "s2a_bench.experiments.ccrb.config:CcrbLive",
-            "s2a_bench.experiments.ccrb.live:run_live",
-            {"live": "take the tokens of a model that really answers, about the rendered scene"},
-        ),
-        RunMode(
-            "closed-loop",
-            "s2a_bench.experiments.ccrb.config:CcrbClosedLoop",
-            "s2a_bench.experiments.ccrb.run:run_closed_loop",
-            {"closed_loop": "let the world run while the plan arrives: with --live on the clock, else in virtual time"},
-        ),
-        RunMode(
-            "live-loop",
-            "s2a_bench.experiments.ccrb.config:CcrbLiveLoop",
-            "s2a_bench.experiments.ccrb.live:run_live_loop",
-            {"live": "", "closed_loop": ""},
+            "live-loop", f"{HERE}.config:CcrbLiveLoop", f"{HERE}.live:run_live_loop", {"live": "", "closed_loop": ""}
         ),
     ),
-    view="s2a_bench.experiments.ccrb.view.tables:show",
-    cell="s2a_bench.experiments.ccrb.view.tables:CcrbCell",
+    view=f"{HERE}.view.tables:show",
+    cell=f"{HERE}.view.tables:CcrbCell",
     unit="parts",
 )

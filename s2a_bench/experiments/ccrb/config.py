@@ -11,10 +11,9 @@ from s2a_bench.boards.profile import load_profile, profile_files
 from s2a_bench.boards.tokens import NO_JITTER, PROMPT_TIME, Board, board_of_profile, board_of_rate
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import GROUPED
-from s2a_bench.harness.timelines.config import POLICY_NAMES, PlanRequests, check_steppers
+from s2a_bench.harness.timelines.config import PlanRequests, PolicyOptions, check_steppers
 from s2a_bench.inference import ENGINES
-from s2a_bench.options import Names, Numbers, Options, group, option
-from s2a_bench.policy import Policy, policies
+from s2a_bench.options import Numbers, Options, group, option
 from s2a_bench.scenario import SIMULATORS, simulator_class
 from s2a_bench.scenario.ccrb.options import SKILL_SET, CcrbOptions
 
@@ -26,7 +25,7 @@ TTC_POLICY: Final[Any] = option(False, "add s2a-ttc: stream-to-act that starts b
 """The option of roll-outs, whose arrivals are known beforehand."""
 
 
-class CcrbDrives(Options):
+class CcrbDrives(PolicyOptions):
     """What is driven; the defaults are an operating point with the paper's outcome."""
 
     PANEL: ClassVar[str] = "Drives"
@@ -35,17 +34,11 @@ class CcrbDrives(Options):
     time: ClassVar[str] = "virtual"
     """The clock of the world."""
 
-    policies: Names = POLICY_NAMES
     tokens_per_skill: int = option(6, "L, the delimiter included", ge=1, le=1000)
     scenario: CcrbOptions = Field(default_factory=CcrbOptions)
     simulator: str = option(
         "longitudinal", f"{', '.join(SIMULATORS)}; or NAME?parameter=value", first=True, names=lambda: SIMULATORS
     )
-    seed: int = option(0, "seed of everything that is drawn", ge=0)
-
-    @cached_property
-    def chosen(self) -> dict[str, Policy]:
-        return policies(self.policies)
 
     @property
     def board(self) -> Board:
@@ -116,7 +109,7 @@ class DrivingRequests(PlanRequests):
     def __init__(self, **given: Any) -> None:
         engine = given.get("engine") or {}
         engine = engine.given_values() if isinstance(engine, Options) else engine
-        name = engine.get("name")
+        name = engine.get("name", "")
         if name in ENGINES and ENGINES[name].plays and not engine.get("profile"):
             given["engine"] = {**engine, "profile": BOARD}
         super().__init__(**given)
@@ -135,10 +128,6 @@ class CcrbRequested(CcrbDrives):
         return played[0] if played else SKILL_SET
 
     @cached_property
-    def seeded_requests(self) -> DrivingRequests:
-        return self.requests.but(seed=self.seed)
-
-    @cached_property
     def board(self) -> Board:
         engine = self.requests.engine
         if engine.pace is not None:
@@ -147,7 +136,7 @@ class CcrbRequested(CcrbDrives):
 
     def check(self) -> None:
         check_steppers(self.chosen.values())
-        self.seeded_requests.require_played(self.skill_set, (self.tokens_per_skill,), "`tokens_per_skill`")
+        self.requests.require_played(self.skill_set, (self.tokens_per_skill,), "`tokens_per_skill`")
         super().check()
 
 

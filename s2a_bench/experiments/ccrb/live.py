@@ -21,7 +21,7 @@ from s2a_bench.clock import SystemClock, now_ns, quick_switching
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbLive, CcrbLiveLoop
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, Looped
-from s2a_bench.experiments.ccrb.plan import CcrbLivePlan, resolve_live, resolve_live_loop
+from s2a_bench.experiments.ccrb.plan import CcrbLivePlan, resolve_live
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.run import Prepared, complete, drive_point, keep_loop
 from s2a_bench.frames import FrameSource
@@ -31,6 +31,7 @@ from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
 from s2a_bench.harness.session import Measured
 from s2a_bench.harness.timelines.link import ModelLink
+from s2a_bench.harness.timelines.policies import prepare
 from s2a_bench.plan import Parser
 from s2a_bench.policy import Policy
 from s2a_bench.ros import messages as ros
@@ -55,13 +56,13 @@ def run_live(config: CcrbLive, output: Path, progress: Progress) -> Path:
     """Request one plan and drive it under every policy; raises S2AError. The folder keeps the requests so far."""
     plan = resolve_live(config, progress)
     with closing(open_simulator(plan.simulator)) as world:
-        return _run(plan, world, _roll_out, output, progress)
+        return _run(plan, world, partial(_roll_out, ttc=config.ttc), output, progress)
 
 
 def run_live_loop(config: CcrbLiveLoop, output: Path, progress: Progress) -> Path:
     """Request a plan a policy and execute it as it arrives; raises S2AError. The folder keeps the loops so far."""
-    plan = resolve_live_loop(config, progress)
-    with closing(open_simulator(plan.simulator)) as bare, closing(with_ego(bare, plan.ego)) as world:
+    plan = resolve_live(config, progress)
+    with closing(open_simulator(plan.simulator)) as bare, closing(with_ego(bare, config.ego)) as world:
         if not world.real:
             world.step_s = STEP_S
         return _run(plan, world, _close_loops, output, progress)
@@ -84,11 +85,11 @@ def _run(
     return run_requests(task, plan.requests, output, progress)
 
 
-def _roll_out(plan: CcrbLivePlan, world: Simulator, launch: RunningLaunch) -> None:
+def _roll_out(plan: CcrbLivePlan, world: Simulator, launch: RunningLaunch, *, ttc: bool) -> None:
     """Request a plan, and drive it in virtual time."""
     link = ModelLink(launch, plan.prompt, f"{world.name} simulator")
     launch.progress.expect(launch.plan.blocks.warmup + 1)
-    policies = plan.policies.prepare(plan.shape, link.warm_up()).policies()
+    policies = prepare(plan.learning, plan.shape, link.warm_up()).policies()
     launch.progress.stage(f"{', '.join(policies)}: a plan over {link.cell.name}")
     events: list[Event] = []
     feed = PlanFeed(Parser(plan.prompt.format), events.append)
@@ -97,15 +98,15 @@ def _roll_out(plan: CcrbLivePlan, world: Simulator, launch: RunningLaunch) -> No
     arrivals = list(zip(arrivals_ns, plan.scenario.calls, strict=False))
     record = Record("", feed.requested_ns, feed.token_ns, arrivals)
     ready = _arrived(plan, link, record, measured, policies)
-    drive_point(ready.with_ttc() if plan.ttc else ready, world, link.writer)
+    drive_point(ready.with_ttc() if ttc else ready, world, link.writer)
     launch.progress.advance()
 
 
 def _close_loops(plan: CcrbLivePlan, world: Simulator, launch: RunningLaunch) -> None:
     view = world.camera(*PICTURE) if launch.recorder else None
     link = ModelLink(launch, plan.prompt, f"{world.name} simulator")
-    launch.progress.expect(launch.plan.blocks.warmup + len(plan.policies.made))
-    policies = plan.policies.prepare(plan.shape, link.warm_up()).policies()
+    launch.progress.expect(launch.plan.blocks.warmup + len(plan.learning.policies))
+    policies = prepare(plan.learning, plan.shape, link.warm_up()).policies()
     for name, policy in policies.items():
         launch.progress.stage(f"{name}: a plan over {link.cell.name}")
         loop = ClosedLoop(plan.scenario, world, LiveInbox(), SystemClock(), view)

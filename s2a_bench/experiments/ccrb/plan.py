@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any, Final
 
-from s2a_bench.experiments.ccrb.config import CcrbComputed, CcrbLive, CcrbLiveLoop, CcrbModelled, CcrbRequested
+from s2a_bench.experiments.ccrb.config import CcrbComputed, CcrbModelled, CcrbRequested
 from s2a_bench.harness.plan import RunPlan
 from s2a_bench.harness.timelines.cases import LearningPlan, PlanCase
 from s2a_bench.harness.timelines.link import PlanPrompt, PromptPlan, plan_requests
-from s2a_bench.harness.timelines.policies import LivePolicies
 from s2a_bench.machine import environment
 from s2a_bench.plan import load_skills
-from s2a_bench.policy import PlanShape, Policy
+from s2a_bench.policy import PlanShape
 from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins
 from s2a_bench.scenario import simulator_class
@@ -32,11 +31,7 @@ class CcrbPlan:
     simulator: str
     case: PlanCase
     learning: LearningPlan
-    policies: Mapping[str, Policy]
-    manifest: Mapping[str, Any]
-    ttc: bool = False
-    studies: Sequence[tuple[str, Scenes]] = ()
-    """Name and scenarios of each study beside the operating point."""
+    manifest: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,9 +43,7 @@ class CcrbLivePlan:
     requests: RunPlan
     prompt: PlanPrompt
     shape: PlanShape
-    policies: LivePolicies
-    ttc: bool = False
-    ego: str = ""
+    learning: LearningPlan
 
 
 def resolve(config: CcrbModelled) -> CcrbPlan:
@@ -65,15 +58,11 @@ def resolve(config: CcrbModelled) -> CcrbPlan:
         "provenance": Origins(board.provenance).to_manifest(),
     }
     case = PlanCase.of(board, PlanShape(scenario.skills, config.tokens_per_skill, scenario.durations, 0.0))
-    return CcrbPlan(scenario, config.simulator, case, LearningPlan(config.seed), config.chosen, manifest)
+    return CcrbPlan(scenario, config.simulator, case, LearningPlan(config.chosen, config.seed), manifest)
 
 
-def resolve_computed(config: CcrbComputed) -> CcrbPlan:
-    """Decide as `resolve` does, with the studies beside the operating point."""
-    return replace(resolve(config), ttc=config.ttc, studies=tuple(_studies(config)))
-
-
-def _studies(config: CcrbComputed) -> Iterator[tuple[str, Scenes]]:
+def studies(config: CcrbComputed) -> Iterator[tuple[str, Scenes]]:
+    """Yield the studies beside the operating point, with their scenarios."""
     if config.phase:
         axes = config.phase_rates, config.phase_gaps_m, config.phase_points
         prompt_s, tokens = config.board.prompt_s, config.tokens_per_skill
@@ -82,25 +71,16 @@ def _studies(config: CcrbComputed) -> Iterator[tuple[str, Scenes]]:
         yield "random", draw(generator(config.seed, "ccrb", "random"), config.random)
 
 
-def resolve_live(config: CcrbLive, progress: Progress) -> CcrbLivePlan:
+def resolve_live(config: CcrbRequested, progress: Progress) -> CcrbLivePlan:
     """Decide what follows from a configuration, with the model's files; raises S2AError."""
-    return replace(_requested(config, progress), ttc=config.ttc)
-
-
-def resolve_live_loop(config: CcrbLiveLoop, progress: Progress) -> CcrbLivePlan:
-    return replace(_requested(config, progress), ego=config.ego)
-
-
-def _requested(config: CcrbRequested, progress: Progress) -> CcrbLivePlan:
     scenario, tokens = config.scenario, config.tokens_per_skill
     prompts = PromptPlan([load_skills(config.skill_set)], [tokens], [scenario.skills])
-    requests, (prompt,) = plan_requests(config.seeded_requests, prompts, progress)
+    requests, (prompt,) = plan_requests(config.requests.but(seed=config.seed), prompts, progress)
     source = f"camera of {simulator_class(config.simulator).name}"
     requests = requests.with_manifest(
         configuration={**config.to_manifest(), "live": {**requests.manifest["configuration"], "source": source}},
         follower_law=scenario.follower_law,
         seeds={"sampling": config.seed, "nonce": requests.feed.nonce},
     )
-    shape = PlanShape(scenario.skills, tokens, scenario.durations)
-    policies = LivePolicies(config.chosen, config.seed)
-    return CcrbLivePlan(scenario, config.simulator, requests, prompt, shape, policies)
+    shape, learning = PlanShape(scenario.skills, tokens, scenario.durations), LearningPlan(config.chosen, config.seed)
+    return CcrbLivePlan(scenario, config.simulator, requests, prompt, shape, learning)

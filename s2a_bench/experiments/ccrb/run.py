@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 from s2a_bench.act.record import executed
 from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbComputed
 from s2a_bench.experiments.ccrb.loop import Looped, replayed
-from s2a_bench.experiments.ccrb.plan import CcrbPlan, resolve, resolve_computed
+from s2a_bench.experiments.ccrb.plan import CcrbPlan, resolve, studies
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.studies import SCENES, drive_block, motion_of, rollout_rows, trajectory_rows
 from s2a_bench.harness.timelines.cases import PlanSetting
@@ -25,6 +25,7 @@ from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.scenario import Simulator, open_simulator
 from s2a_bench.scenario.ccrb.drive import Driven, drive
 from s2a_bench.scenario.ccrb.options import CcrbOptions
+from s2a_bench.scenario.ccrb.studies import Scenes
 from s2a_bench.scenario.ccrb.ttc import NAME as TTC
 from s2a_bench.scenario.ccrb.ttc import ttc_aware
 from s2a_bench.store.requests import SKILLS, TOKENS
@@ -54,9 +55,8 @@ class Prepared:
 
 def prepare(plan: CcrbPlan) -> Prepared:
     """Draw the board's tokens, which are the plans' ``token_s``, and schedule them under every policy."""
-    known, setting = learn(plan.case, plan.learning), plan.case.setting
+    setting, policies = plan.case.setting, learn(plan.case, plan.learning).made
     _, plans = draw(plan.case, plan.learning.seed, 1, "plans")
-    policies = {name: known.prepare(policy) for name, policy in plan.policies.items()}
     return complete(plan.scenario, setting, setting.request_id(0), plans, policies)
 
 
@@ -132,12 +132,12 @@ def _about(ready: Prepared, world: Simulator, name: str) -> dict[str, Any]:
     }
 
 
-def run_computed(config: CcrbComputed, output: Path, progress: Progress) -> Path:
-    plan = resolve_computed(config)
+def run_ccrb(config: CcrbComputed, output: Path, progress: Progress) -> Path:
+    plan = resolve(config)
     with closing(open_simulator(plan.simulator)) as world, _create(plan, output, progress) as writer:
         ready = _drawn(plan, writer)
-        drive_point(ready.with_ttc() if plan.ttc else ready, world, writer)
-        _drive_studies(plan, writer, progress)
+        drive_point(ready.with_ttc() if config.ttc else ready, world, writer)
+        _drive_studies(plan.scenario, studies(config), writer, progress)
         return writer.path
 
 
@@ -166,10 +166,12 @@ def _drawn(plan: CcrbPlan, writer: RunWriter) -> Prepared:
     return ready
 
 
-def _drive_studies(plan: CcrbPlan, writer: RunWriter, progress: Progress) -> None:
+def _drive_studies(
+    scenario: CcrbOptions, every: Iterable[tuple[str, Scenes]], writer: RunWriter, progress: Progress
+) -> None:
     blocks = [
         (study, scenes.cut(slice(first, first + SCENES)))
-        for study, scenes in plan.studies
+        for study, scenes in every
         for first in range(0, len(scenes), SCENES)
     ]
     if not blocks:
@@ -179,7 +181,7 @@ def _drive_studies(plan: CcrbPlan, writer: RunWriter, progress: Progress) -> Non
     driven, spent_s = 0, 0.0
     for study, scenes in blocks:
         before = process_time()
-        count, rows = drive_block(plan.scenario, study, scenes)
+        count, rows = drive_block(scenario, study, scenes)
         spent_s += process_time() - before
         driven += count
         writer.append(ROLLOUTS, rows)

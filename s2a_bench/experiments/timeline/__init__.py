@@ -2,28 +2,22 @@
 
 from s2a_bench.experiments import Experiment, RunMode
 
+HERE = "s2a_bench.experiments.timeline"
+PLAYED = "play the boards' tokens on the clock and execute while you watch"
+ANSWERED = "execute a model's real answers as they arrive"
+
 EXPERIMENT = Experiment(
     name="timeline",
     about="Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live.",
-    config="s2a_bench.experiments.timeline.config:TimelineComputed",
-    run="s2a_bench.experiments.timeline.run:run_computed",
+    config=f"{HERE}.config:TimelineComputed",
+    run=f"{HERE}.run:run_timeline",
     mode="computed",
     modes=(
-        RunMode(
-            "real-time",
-            "s2a_bench.experiments.timeline.config:TimelineRealTime",
-            "s2a_bench.experiments.timeline.run:run_real_time",
-            {"real_time": "play the boards' tokens on the clock and execute while you watch"},
-        ),
-        RunMode(
-            "live",
-            "s2a_bench.experiments.timeline.config:TimelineLive",
-            "s2a_bench.experiments.timeline.live:run_live",
-            {"live": "execute a model's real answers as they arrive"},
-        ),
+        RunMode("real-time", f"{HERE}.config:TimelineRealTime", f"{HERE}.run:run_real_time", {"real_time": PLAYED}),
+        RunMode("live", f"{HERE}.config:TimelineLive", f"{HERE}.live:run_live", {"live": ANSWERED}),
     ),
-    view="s2a_bench.experiments.timeline.view.tables:show",
-    cell="s2a_bench.experiments.timeline.view.cells:TimelineCell",
-    compared="s2a_bench.experiments.timeline.view.cells:COMPARED",
+    view=f"{HERE}.view.tables:show",
+    cell=f"{HERE}.view.cells:TimelineCell",
+    compared=f"{HERE}.view.cells:COMPARED",
     unit="timelines",
 )

@@ -15,11 +15,11 @@ from s2a_bench.boards.profile import load_profile, profile_files
 from s2a_bench.boards.tokens import NO_JITTER, PROMPT_TIME, Board, board_of_profile, board_of_rate
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import GROUPED
-from s2a_bench.harness.timelines.cases import MOST_CV, PlanCase, stretched
-from s2a_bench.harness.timelines.config import POLICY_NAMES, PlanRequests, check_steppers
-from s2a_bench.options import SEVERAL, Names, Options, TextOrFile, group, option
+from s2a_bench.harness.timelines.cases import MOST_CV, PlanCase
+from s2a_bench.harness.timelines.config import PlanRequests, PolicyOptions, check_steppers
+from s2a_bench.options import SEVERAL, Names, TextOrFile, group, option
 from s2a_bench.plan import SKILL_SETS, SkillSet, load_skills
-from s2a_bench.policy import PlanShape, Policy, policies
+from s2a_bench.policy import PlanShape, Timing
 from s2a_bench.policy.conformal import GUARANTEE, Guarantee
 from s2a_bench.policy.conformal import check as check_calibration
 
@@ -42,24 +42,21 @@ ABOUT_T_NOM: Final = "seconds a skill takes; several with commas"
 ABOUT_PROFILES: Final = "boards: names of 'profile list', or paths; none by default with --rate"
 
 
-class TimelineOptions(Options):
+class TimelineOptions(PolicyOptions):
     """Options for tokens of any source."""
 
     PANEL: ClassVar[str] = "Plans"
 
-    policies: Names = POLICY_NAMES
     tokens_per_skill: Counts = option(LENGTHS, ABOUT_L, min_length=1, first=True)
     n_skills: Counts = option((8,), "N, skills a plan; several with commas", min_length=1)
     t_nom_s: Seconds = option((1.0,), ABOUT_T_NOM, flag="t-nom", min_length=1)
     t_min: float = option(0.8, "least duration of a skill, as a factor of T_nom", gt=0, le=1)
     t_max: float = option(1.5, "longest duration of a skill, as a factor of T_nom", ge=1, allow_inf_nan=False)
-    seed: int = option(0, "seed of everything that is drawn", ge=0)
     epsilon: float = option(0.01, "share of plans that may stall: lambda is calibrated or tracked for it")
     track: bool = option(False, "let online policies follow lambda from plan to plan (modelled tokens need jitter)")
 
-    @cached_property
-    def chosen(self) -> dict[str, Policy]:
-        return policies(self.policies)
+    def lasting(self, t_nom_s: float) -> Timing:
+        return Timing(t_nom_s, self.t_min * t_nom_s, self.t_max * t_nom_s)
 
     def check(self) -> None:
         if self.track and not any(each.learns and each.caution is None for each in self.chosen.values()):
@@ -100,12 +97,10 @@ class TimelineComputed(TimelineOptions):
 
     @cached_property
     def cases(self) -> tuple[PlanCase, ...]:
-        every = product(self.n_skills, self.t_nom_s, self.boards, self.tokens_per_skill)
+        every = product(self.n_skills, map(self.lasting, self.t_nom_s), self.boards, self.tokens_per_skill)
         return tuple(
-            PlanCase.of(
-                board, PlanShape(n_skills, tokens, stretched(t_nom_s, self.t_min, self.t_max), self.t_nom_cv), self.MODE
-            )
-            for n_skills, t_nom_s, board, tokens in every
+            PlanCase.of(board, PlanShape(n_skills, tokens, durations, self.t_nom_cv), self.MODE)
+            for n_skills, durations, board, tokens in every
         )
 
     @property
@@ -169,10 +164,6 @@ class TimelineLive(TimelineOptions):
     def skill_set(self) -> SkillSet:
         return load_skills(self.skills)
 
-    @cached_property
-    def seeded_requests(self) -> PlanRequests:
-        return self.requests.but(seed=self.seed)
-
     def check(self) -> None:
         super().check()
         if "epsilon" in self.model_fields_set and not self.track:
@@ -181,7 +172,7 @@ class TimelineLive(TimelineOptions):
         check_steppers(self.chosen.values())
         if not kind(self.robot, SkillKind).several and len(self.chosen) > 1:
             raise UsageError(f"`robot`: {self.robot} follows one policy at a time; choose it with `policies`")
-        self.seeded_requests.require_played(self.skills, self.tokens_per_skill, "`skills` and `tokens_per_skill`")
+        self.requests.require_played(self.skills, self.tokens_per_skill, "`skills` and `tokens_per_skill`")
 
     def risks(self) -> Iterator[tuple[str, str, str]]:
         yield from super().risks()

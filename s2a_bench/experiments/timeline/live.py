@@ -24,7 +24,7 @@ from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
 from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt
-from s2a_bench.harness.timelines.policies import Following
+from s2a_bench.harness.timelines.policies import Following, prepare
 from s2a_bench.plan import Parser
 from s2a_bench.progress import Progress, watching
 from s2a_bench.store.requests import SKILLS
@@ -37,7 +37,7 @@ def run_live(config: TimelineLive, output: Path, progress: Progress) -> Path:
     """
     plan = resolve_live(config, progress)
     with ExitStack() as stack:  # first, as a model may take long to load
-        robots = [stack.enter_context(closing(plan.open_robot())) for _ in plan.policies.made]
+        robots = [stack.enter_context(closing(plan.open_robot())) for _ in plan.learning.policies]
         stack.enter_context(quick_switching())
         drive, tables = partial(_drive, plan, robots), (TIMELINES, SKILLS)
         task = Task("timeline", drive, tables=tables, source=lambda feed: Stamped(feed.open(), feed.nonce))
@@ -51,7 +51,7 @@ def _drive(plan: LivePlan, robots: Sequence[SkillRobot], launch: RunningLaunch) 
     try:
         prior = link.warm_up()
         for ask in plan.prompts:
-            following = plan.policies.prepare(ask.shape, prior)
+            following = prepare(plan.learning, ask.shape, prior)
             for number in range(blocks.requests):
                 _execute(link, ask, number, following, robots, records)
                 progress.advance()

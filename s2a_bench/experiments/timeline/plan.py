@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,12 +13,11 @@ from s2a_bench.boards.tokens import Board
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.config import TimelineComputed, TimelineLive
 from s2a_bench.harness.plan import RunPlan
-from s2a_bench.harness.timelines.cases import LearningPlan, PlanCase, stretched
+from s2a_bench.harness.timelines.cases import LearningPlan, PlanCase
 from s2a_bench.harness.timelines.link import PlanPrompt, PromptPlan, plan_requests
-from s2a_bench.harness.timelines.policies import LivePolicies, plans_of
+from s2a_bench.harness.timelines.policies import plans_of
 from s2a_bench.machine import environment
 from s2a_bench.plan import SkillSet
-from s2a_bench.policy import Policy
 from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.run import read_run
@@ -33,14 +32,10 @@ class ModelledPlan:
     """A run of timelines on modelled tokens, computed or played."""
 
     cases: Sequence[PlanCase]
-    policies: Mapping[str, Policy]
     plans: int
     """Plans of a case."""
-    random: bool
-    """Whether the plans of a case differ."""
-    track: bool
     learning: LearningPlan
-    manifest: Mapping[str, Any]
+    manifest: dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +44,7 @@ class LivePlan:
 
     requests: RunPlan
     prompts: Sequence[PlanPrompt]
-    policies: LivePolicies
+    learning: LearningPlan
     robot: str
     skills: SkillSet
 
@@ -60,12 +55,14 @@ class LivePlan:
 def resolve(config: TimelineComputed) -> ModelledPlan:
     """Decide what follows from a configuration; raises S2AError for recorded answers that are missing or too short."""
     learning = LearningPlan(
-        seed=config.seed,
-        random=config.random and any(policy.learns for policy in config.chosen.values()),
-        calibration_plans=config.calibration_plans,
-        epsilon=config.epsilon,
-        guarantee=config.guarantee,
-        answers=recordings(config.calibrate) if config.calibrate else (),
+        config.chosen,
+        config.seed,
+        config.epsilon,
+        config.track,
+        config.random,
+        config.calibration_plans,
+        config.guarantee,
+        recordings(config.calibrate) if config.calibrate else (),
     )
     for case in config.cases if learning.answers else ():
         plans_of(case, learning)  # refuse before the folder is created
@@ -76,25 +73,23 @@ def resolve(config: TimelineComputed) -> ModelledPlan:
         "boards": [_facts(board) for board in config.boards],
         "provenance": _origins(config).to_manifest(),
     }
-    return ModelledPlan(
-        config.cases, config.chosen, config.plans_a_cell, config.random, config.track, learning, manifest
-    )
+    return ModelledPlan(config.cases, config.plans_a_cell, learning, manifest)
 
 
 def resolve_live(config: TimelineLive, progress: Progress) -> LivePlan:
     """Decide what follows from a configuration, with the model's files; raises S2AError."""
-    requests, prompts = plan_requests(config.seeded_requests, prompt_plan(config), progress)
+    requests, prompts = plan_requests(config.requests.but(seed=config.seed), prompt_plan(config), progress)
     requests = requests.with_manifest(
         configuration={**requests.manifest["configuration"], **config.to_manifest()},
         seeds={"sampling": config.seed, "source": config.seed, "nonce": requests.feed.nonce},
     )
-    policies = LivePolicies(config.chosen, config.seed, config.epsilon, config.track)
-    return LivePlan(requests, prompts, policies, config.robot, config.skill_set)
+    learning = LearningPlan(config.chosen, config.seed, config.epsilon, config.track)
+    return LivePlan(requests, prompts, learning, config.robot, config.skill_set)
 
 
 def prompt_plan(config: TimelineLive) -> PromptPlan:
-    skills, every_s = config.skill_set, config.t_nom_s
-    given = [_lasting(skills, stretched(t_nom_s, config.t_min, config.t_max)) for t_nom_s in every_s]
+    skills = config.skill_set
+    given = [_lasting(skills, config.lasting(t_nom_s)) for t_nom_s in config.t_nom_s]
     return PromptPlan(given or [skills], config.tokens_per_skill, config.n_skills, config.task, not config.no_grammar)
 
 

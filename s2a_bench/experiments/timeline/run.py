@@ -19,11 +19,11 @@ from s2a_bench.experiments.timeline.plan import ModelledPlan, resolve
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.harness.timelines.cases import PlanCase, PlanSetting
-from s2a_bench.harness.timelines.policies import Following, Knowledge, draw, finite, learn
+from s2a_bench.harness.timelines.policies import Following, draw, finite, learn
 from s2a_bench.harness.timelines.rows import KEPT_PLANS, skill_rows, token_rows
 from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.plan import Call, Skill
-from s2a_bench.policy import Plans, Policy, Schedule
+from s2a_bench.policy import Plans
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.progress import Progress, watching
 from s2a_bench.store.manifest import RunWarning
@@ -37,46 +37,39 @@ if TYPE_CHECKING:
 TABLES: Final = (TIMELINES, SKILLS, TOKENS)
 
 
-def run_computed(config: TimelineComputed, output: Path, progress: Progress) -> Path:
+def run_timeline(config: TimelineComputed, output: Path, progress: Progress) -> Path:
     plan = resolve(config)
     with RunWriter.create(output, "timeline", plan.manifest, TABLES) as writer:
         progress.opened(writer.path)
         progress.stage("computing timelines")
-        if plan.random:
+        if plan.learning.random:
             progress.expect(len(plan.cases))
         calibrations: dict[str, Any] = {}
         for case in plan.cases:
-            calibrations |= _compute(case, plan, writer)
-            if plan.random:
+            following = learn(case, plan.learning)
+            _compute(case, following, draw(case, plan.learning.seed, plan.plans, "plans"), writer)
+            calibrations |= following.facts(case.setting)
+            if plan.learning.random:
                 progress.advance()
         warnings = calibration_warnings(calibrations)
         writer.update(calibrations=calibrations, warnings=[warning.to_manifest() for warning in warnings])
         return writer.path
 
 
-def _compute(case: PlanCase, plan: ModelledPlan, writer: RunWriter) -> dict[str, Any]:
-    known, setting = learn(case, plan.learning), case.setting
-    token_s, plans = draw(case, plan.learning.seed, plan.plans, "plans")
-    request_ids = [setting.request_id(place) for place in range(plan.plans)]
+def _compute(case: PlanCase, following: Following, drawn: tuple[Floats, Plans], writer: RunWriter) -> None:
+    setting, (token_s, plans) = case.setting, drawn
+    request_ids = [setting.request_id(plan) for plan in range(token_s.shape[1])]
     writer.append(TOKENS, token_rows(setting.name, token_s, request_ids))
-    for name, chosen in plan.policies.items():
-        caution, schedule = _decide(known, chosen, plans, track=plan.track)
+    for name, policy in following.made.items():
+        caution: float | Sequence[float | None] | None = finite(policy.caution)
+        if name in following.tracked:
+            cautions, schedule = following.tracked[name].follow(plans)
+            caution = [finite(float(each)) for each in cautions]
+        else:
+            schedule = policy.schedule(plans)
         rows = timeline_rows(setting, name, plans, schedule, request_ids, caution=caution)
         writer.append(TIMELINES, rows)
         writer.append(SKILLS, skill_rows(rows[0].cell, plans, schedule, request_ids))
-    return known.facts(setting)
-
-
-def _decide(
-    known: Knowledge, chosen: Policy, plans: Plans, *, track: bool
-) -> tuple[float | Sequence[float | None] | None, Schedule]:
-    """Return a policy's lambda, one a plan if it tracks them, and its schedule."""
-    tracked = known.tracked(chosen) if track else None
-    if tracked is not None:
-        cautions, schedule = tracked.follow(plans)
-        return [finite(float(caution)) for caution in cautions], schedule
-    policy = known.prepare(chosen)
-    return finite(policy.caution), policy.schedule(plans)
 
 
 def calibration_warnings(calibrations: dict[str, Any]) -> list[RunWarning]:
@@ -125,16 +118,11 @@ class _RealTime:
     calibrations: dict[str, Any] = field(default_factory=dict)
 
     def play(self, case: PlanCase) -> None:
-        plan = self.plan
         self.progress.stage(f"learning {case.setting.title}")
-        known = learn(case, plan.learning)
-        made = {name: known.prepare(policy) for name, policy in plan.policies.items()}
-        self.calibrations |= known.facts(case.setting)
-        every = {name: known.tracked(policy) for name, policy in plan.policies.items() if plan.track}
-        tracked = {name: each for name, each in every.items() if each is not None}
-        following = Following(case.shape, made, tracked)
-        token_s, plans = draw(case, plan.learning.seed, plan.plans, "plans")
-        for place in range(plan.plans):
+        following = learn(case, self.plan.learning)
+        self.calibrations |= following.facts(case.setting)
+        token_s, plans = draw(case, self.plan.learning.seed, self.plan.plans, "plans")
+        for place in range(self.plan.plans):
             cut = slice(place, place + 1)
             one = Plans(plans.arrival_s[:, cut], plans.nominal_s[:, cut], plans.least_s[:, cut], plans.most_s[:, cut])
             self._execute(case.setting, place, token_s[:, place], one, following)

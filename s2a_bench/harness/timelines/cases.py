@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Final
 
 from s2a_bench.boards.tokens import Board
-from s2a_bench.policy import Floats, PlanShape
+from s2a_bench.policy import Floats, PlanShape, Policy
 from s2a_bench.policy.conformal import EPSILON, PLANS, Guarantee
 from s2a_bench.stats.seeds import Verbatim
-from s2a_bench.types import Timing
 
 MOST_CV: Final = 3**-0.5
 """Uniform durations of a larger spread could be negative."""
@@ -57,21 +56,8 @@ class PlanCase:
 
     @classmethod
     def of(cls, board: Board, shape: PlanShape, mode: str = "virtual") -> PlanCase:
-        """Return the case of a board and plans of a whole number of tokens a skill."""
-        return cls(
-            PlanSetting(
-                board=board.name,
-                title=board.title,
-                tokens_per_s=board.tokens_per_s,
-                prompt_s=board.prompt_s,
-                tokens_per_skill=int(shape.tokens_per_skill),
-                n_skills=shape.n_skills,
-                t_nom_s=shape.expected.nominal_s,
-                mode=mode,
-            ),
-            board,
-            shape,
-        )
+        of_board, t_nom_s = (board.name, board.title, board.tokens_per_s, board.prompt_s), shape.expected.nominal_s
+        return cls(PlanSetting(*of_board, int(shape.tokens_per_skill), shape.n_skills, t_nom_s, mode), board, shape)
 
     @property
     def tokens(self) -> int:
@@ -81,18 +67,16 @@ class PlanCase:
 
 @dataclass(frozen=True, slots=True)
 class LearningPlan:
-    """What policies learn from before the plans of a case: drawn plans of the same kind, or recorded answers."""
+    """The policies by name, and what they learn before and from the plans of a case."""
 
+    policies: Mapping[str, Policy]
     seed: int
-    random: bool = False
-    """Whether plans of a case differ, and a policy learns from them."""
-    calibration_plans: int = PLANS
     epsilon: float = EPSILON
+    track: bool = False
+    """Whether policies whose lambda is not set follow it from plan to plan."""
+    random: bool = False
+    """Whether modelled plans of a case differ."""
+    calibration_plans: int = PLANS
     guarantee: Guarantee = "high-confidence"
     answers: Sequence[Floats] = ()
-    """The times of the tokens of recorded answers, in s from the request."""
-
-
-def stretched(t_nom_s: float, least: float, most: float) -> Timing:
-    """Return the durations of a skill, the least and the longest as factors of T_nom."""
-    return Timing(t_nom_s, least * t_nom_s, most * t_nom_s)
+    """Recorded answers to learn from instead of drawn plans: the tokens' times in s from the request."""

@@ -3,31 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, ClassVar, Final
+from functools import cached_property
+from typing import ClassVar
 
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import FirstVariants
 from s2a_bench.inference import EngineConfig
-from s2a_bench.options import Names, group, option
-from s2a_bench.policy import COMPARED, POLICIES, PlanShape, Policy, Timing
+from s2a_bench.options import Names, Options, group, option
+from s2a_bench.policy import COMPARED, POLICIES, PlanShape, Policy, Timing, policies
 from s2a_bench.transport import paths
 from s2a_bench.transport.defaults import FOLLOWED
 
-POLICY_NAMES: Final[Any] = option(
-    COMPARED,
-    f"{', '.join(POLICIES)}, with parameters as in NAME?parameter=value&other=value; several with commas",
-    flag="policy",
-    min_length=1,
-    first=True,
-    names=lambda: POLICIES,
-)
-"""The option of whatever compares policies."""
+
+class PolicyOptions(Options):
+    """The options of whatever compares policies."""
+
+    PANEL: ClassVar[str] = "Policies"
+
+    policies: Names = option(
+        COMPARED,
+        f"{', '.join(POLICIES)}, with parameters as in NAME?parameter=value&other=value; several with commas",
+        flag="policy",
+        min_length=1,
+        first=True,
+        names=lambda: POLICIES,
+    )
+    seed: int = option(0, "seed of everything that is drawn", ge=0)
+
+    @cached_property
+    def chosen(self) -> dict[str, Policy]:
+        return policies(self.policies)
 
 
 class PlanRequests(FirstVariants):
     """The requests for plans: one stream of tokens, of an engine that takes a model's time."""
 
-    COMPUTES: ClassVar[str] = "plans take a model's time"
+    COMPUTES: ClassVar[str] = "a plan takes a model's time"
 
     transports: Names = option(
         (FOLLOWED,),
@@ -69,7 +80,7 @@ class PlanRequests(FirstVariants):
             )
 
 
-def check_steppers(policies: Iterable[Policy]) -> None:
+def check_steppers(chosen: Iterable[Policy]) -> None:
     """Raise UsageError for a policy that cannot follow a plan as it arrives."""
-    for policy in policies:
+    for policy in chosen:
         policy.stepper(PlanShape(1, 1, Timing(1.0, 1.0, 1.0)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -14,58 +14,45 @@ from s2a_bench.errors import UsageError
 from s2a_bench.harness.timelines.cases import MOST_CV, LearningPlan, PlanCase, PlanSetting
 from s2a_bench.policy import CAUTION, ONLINE, TOLERANCE_S, Floats, Plans, PlanShape, Policy
 from s2a_bench.policy.arrivals import recorded_plans, with_skills
-from s2a_bench.policy.conformal import EPSILON, PLANS, Calibration, Guarantee, Tracker, choose, scores
+from s2a_bench.policy.conformal import PLANS, Calibration, Tracker, choose, scores
 from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
-from s2a_bench.policy.parameters import canonical
 from s2a_bench.policy.tracking import TrackedPolicy
 from s2a_bench.stats.seeds import generator
 
 
 @dataclass(slots=True)
-class Knowledge:
-    """Knowledge about one setting before its plans."""
+class Following:
+    """The policies of one case by name, prepared for its plans."""
 
-    prior: GapPrior
-    plans: Plans | None
-    """The plans for calibrating lambda; None if nothing is random."""
-    epsilon: float
-    guarantee: Guarantee
-    calibrations: dict[Policy, Calibration] = field(default_factory=dict)
-    """Of each online policy."""
-    scores: dict[Policy, Floats] = field(default_factory=dict)
+    shape: PlanShape
+    made: dict[str, Policy]
+    tracked: dict[str, TrackedPolicy] = field(default_factory=dict)
+    """The trackers of lambda."""
+    calibrations: dict[str, Calibration] = field(default_factory=dict)
 
-    def prepare(self, policy: Policy) -> Policy:
-        """Give a policy the prior, and lambda if it is not set."""
-        return policy.informed(self.prior, self._caution(policy) if _open(policy) else None)
+    @property
+    def unset(self) -> dict[str, Policy]:
+        """Return the policies whose lambda is not set."""
+        return {name: policy for name, policy in self.made.items() if policy.learns and policy.caution is None}
 
-    def tracked(self, policy: Policy) -> TrackedPolicy | None:
-        """Return the tracker of a policy's lambda; None if it has none, or a set one."""
-        if not _open(policy) or self.plans is None:
-            return None
-        self._caution(policy)
-        return TrackedPolicy(policy.informed(self.prior), Tracker(self.scores[policy], self.epsilon))
+    def policies(self) -> dict[str, Policy]:
+        return {name: self.tracked[name].policy if name in self.tracked else each for name, each in self.made.items()}
 
-    def _caution(self, policy: Policy) -> float:
-        if self.plans is None:
-            return CAUTION
-        if policy not in self.calibrations:
-            self.scores[policy] = scores(policy.informed(self.prior), self.plans)
-            last_s = self.plans.arrival_s[-1]
-            self.calibrations[policy] = choose(self.scores[policy], self.epsilon, self.guarantee, last_s)
-        return self.calibrations[policy].caution
+    def learn(self, records: Sequence[Record]) -> None:
+        """Learn from the records of an executed plan; an incomplete one is ignored."""
+        for record in records:
+            plan = observed(record, self.shape)
+            if plan is not None and record.policy in self.tracked:
+                stalled = any(stall_ns > TOLERANCE_S * 1e9 for stall_ns in record.stalls_ns)
+                self.tracked[record.policy].learn(plan, stalled=stalled)
 
     def facts(self, setting: PlanSetting) -> dict[str, Any]:
         """Return the calibrations as plain data, stream-to-act's by the setting's name, others by the cell's."""
-        named = {canonical(policy.name, policy): found for policy, found in self.calibrations.items()}
         return {
-            setting.name if name == ONLINE else f"{setting.name}/{name}": asdict(found)
-            | {"caution": finite(found.caution)}
-            for name, found in named.items()
+            setting.name if name == ONLINE else f"{setting.name}/{name}": asdict(calibration)
+            | {"caution": finite(calibration.caution)}
+            for name, calibration in self.calibrations.items()
         }
-
-
-def _open(policy: Policy) -> bool:
-    return policy.learns and policy.caution is None
 
 
 def finite(caution: float | None) -> float | None:
@@ -73,8 +60,8 @@ def finite(caution: float | None) -> float | None:
     return None if caution is None or caution == float("inf") else caution
 
 
-def learn(case: PlanCase, plan: LearningPlan) -> Knowledge:
-    """Learn a prior, and get plans for calibration, from drawn plans of the same kind or recorded answers.
+def learn(case: PlanCase, plan: LearningPlan) -> Following:
+    """Give policies a prior, and calibrate lambda, from drawn plans of the same kind or recorded answers.
 
     If nothing is random the prior is as certain as the arrivals, and the online rule starts at S0.
     """
@@ -82,14 +69,40 @@ def learn(case: PlanCase, plan: LearningPlan) -> Knowledge:
     if plan.answers:
         plans = plans_of(case, plan)
         prior = GapPrior.fit(plans.token_s)  # type: ignore[arg-type]  # recorded plans have tokens
-    elif plan.random:
+    elif plan.random and any(policy.learns for policy in plan.policies.values()):
         count = max(case.tokens, 3)  # a spread needs two gaps
         rng = generator(plan.seed, "timeline", "prior", case.setting.key)
         prior = GapPrior.fit(case.board.tokens(count, rng, plan.calibration_plans))
         _, plans = draw(case, plan.seed, plan.calibration_plans, "calibration")
     else:
         prior = GapPrior(1 / case.board.tokens_per_s, LEAST_CV, LEAST_CV)
-    return Knowledge(prior, plans, plan.epsilon, plan.guarantee)
+    following = _informed(plan, case.shape, prior)
+    for name, policy in following.unset.items():
+        if plans is None:
+            following.made[name] = policy.informed(caution=CAUTION)
+            continue
+        score = scores(policy, plans)
+        chosen = choose(score, plan.epsilon, plan.guarantee, plans.arrival_s[-1])
+        following.calibrations[name], following.made[name] = chosen, policy.informed(caution=chosen.caution)
+        if plan.track:
+            following.tracked[name] = TrackedPolicy(policy, Tracker(score, plan.epsilon))
+    return following
+
+
+def prepare(plan: LearningPlan, shape: PlanShape, prior: GapPrior | None) -> Following:
+    """Give policies the prior of a model's answers, and a lambda that is tracked, not calibrated."""
+    following = _informed(plan, shape, prior)
+    for name, policy in following.unset.items():
+        if plan.track:
+            plans = drawn(policy.prior, shape, generator(plan.seed, "tracking", shape.key), PLANS)
+            following.tracked[name] = TrackedPolicy.begin(policy, plans, plan.epsilon)
+        else:
+            following.made[name] = policy.informed(caution=CAUTION)
+    return following
+
+
+def _informed(plan: LearningPlan, shape: PlanShape, prior: GapPrior | None) -> Following:
+    return Following(shape, {name: policy.informed(prior) for name, policy in plan.policies.items()})
 
 
 def plans_of(case: PlanCase, plan: LearningPlan) -> Plans:
@@ -110,49 +123,6 @@ def draw(case: PlanCase, seed: int, plans: int, purpose: str) -> tuple[Floats, P
     rng = generator(seed, "timeline", purpose, case.setting.key)
     token_s = case.board.tokens(case.tokens, rng, plans)
     return token_s, with_skills(token_s, case.shape, rng)
-
-
-@dataclass(slots=True)
-class Following:
-    """The policies of one setting by name, and the trackers of their lambda."""
-
-    shape: PlanShape
-    made: Mapping[str, Policy]
-    tracked: dict[str, TrackedPolicy] = field(default_factory=dict)
-
-    def policies(self) -> dict[str, Policy]:
-        return {name: self.tracked[name].policy if name in self.tracked else each for name, each in self.made.items()}
-
-    def learn(self, records: Sequence[Record]) -> None:
-        """Learn from the records of an executed plan; an incomplete one is ignored."""
-        for record in records:
-            plan = observed(record, self.shape)
-            if plan is not None and record.policy in self.tracked:
-                stalled = any(stall_ns > TOLERANCE_S * 1e9 for stall_ns in record.stalls_ns)
-                self.tracked[record.policy].learn(plan, stalled=stalled)
-
-
-@dataclass(frozen=True, slots=True)
-class LivePolicies:
-    """Policies by name that execute a model's plans; lambda is tracked, not calibrated."""
-
-    made: Mapping[str, Policy]
-    seed: int
-    epsilon: float = EPSILON
-    track: bool = False
-    """Whether policies whose lambda is not set follow it from plan to plan."""
-
-    def prepare(self, shape: PlanShape, prior: GapPrior | None) -> Following:
-        """Give online policies the prior, and a lambda unless it is set."""
-        made, tracked = dict(self.made), {}
-        for name, policy in self.made.items():
-            made[name] = policy.informed(prior)
-            if _open(policy) and self.track:
-                plans = drawn(made[name].prior, shape, generator(self.seed, "tracking", shape.key), PLANS)
-                tracked[name] = TrackedPolicy.begin(made[name], plans, self.epsilon)
-            elif _open(policy):
-                made[name] = policy.informed(prior, CAUTION)
-        return Following(shape, made, tracked)
 
 
 def drawn(prior: GapPrior, shape: PlanShape, rng: np.random.Generator, plans: int) -> Plans:
