@@ -18,12 +18,12 @@ from s2a_bench.cli.progress import RunProgress
 from s2a_bench.clock import SystemClock, VirtualClock
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbLiveLoop, DrivingRequests
+from s2a_bench.experiments.ccrb.drives import Prepared, TableRows, loop_rows, motion_of
 from s2a_bench.experiments.ccrb.live import run_live_loop
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
 from s2a_bench.experiments.ccrb.plan import resolve
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.ccrb.run import Prepared, keep_loop, prepare
-from s2a_bench.experiments.ccrb.studies import motion_of
+from s2a_bench.experiments.ccrb.run import prepare
 from s2a_bench.frames import FrameSource
 from s2a_bench.inference import EngineConfig
 from s2a_bench.plan.skillset import GAPS, Gap
@@ -233,17 +233,15 @@ def test_an_extended_skill_keeps_the_speed_that_it_has_reached() -> None:
 def test_a_world_that_is_lost_ends_the_run_and_keeps_what_was_driven(
     fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keep = keep_loop
-
-    def lose(*given: Any) -> None:
-        keep(*given)
+    def lose(*given: Any) -> Iterator[TableRows]:
+        yield from loop_rows(*given)
 
         def lost(*_: object) -> State:
             raise TransportError("`simulator`: the server is gone")
 
         monkeypatch.setattr(Longitudinal, "step", lost)
 
-    monkeypatch.setattr("s2a_bench.experiments.ccrb.live.keep_loop", lose)
+    monkeypatch.setattr("s2a_bench.experiments.ccrb.live.loop_rows", lose)
     options = CcrbOptions(n_skills=3, speed_kmh=20)
     with pytest.raises(TransportError, match="`simulator`: the server is gone"):
         run(tmp_path, scenario=options, profile=fast_board, policies=("naive", "wait-then-act", "stream-to-act"))

@@ -322,7 +322,10 @@ def test_a_board_is_played_in_real_time(fast_board: str, tmp_path: Path) -> None
         ({"robot": "ros"}, "`robot`: ros follows one policy at a time"),
         ({"tokens_per_skill": (4,)}, "`engine` replay writes plans of the household skills in 6 tokens a skill"),
         ({"skills": "driving"}, "`engine` replay writes plans of the household skills in 6 tokens a skill"),
-        ({"requests": {"transports": "http,ros"}}, "`transport`: one stream is followed; name one"),
+        (
+            {"requests": {"transports": "http,ros"}},
+            "`transport`: one stream is followed, not http",
+        ),
     ],
 )
 def test_what_makes_no_sense_is_named(config: TimelineLive, fields: dict[str, Any], message: str) -> None:

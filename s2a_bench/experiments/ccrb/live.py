@@ -20,10 +20,10 @@ from s2a_bench.act.ros import STRING
 from s2a_bench.clock import SystemClock, now_ns, quick_switching
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbLive, CcrbLiveLoop
+from s2a_bench.experiments.ccrb.drives import Prepared, complete, loop_rows, point_rows
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, Looped
 from s2a_bench.experiments.ccrb.plan import CcrbLivePlan, resolve_live
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.ccrb.run import Prepared, complete, drive_point, keep_loop
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.plan import FeedPlan
@@ -98,7 +98,8 @@ def _roll_out(plan: CcrbLivePlan, world: Simulator, launch: RunningLaunch, *, tt
     arrivals = list(zip(arrivals_ns, plan.scenario.calls, strict=False))
     record = Record("", feed.requested_ns, feed.token_ns, arrivals)
     ready = _arrived(plan, link, record, measured, policies)
-    drive_point(ready.with_ttc() if ttc else ready, world, link.writer)
+    for table, rows in point_rows(ready.with_ttc() if ttc else ready, world):
+        link.writer.append(table, rows)
     launch.progress.advance()
 
 
@@ -106,6 +107,7 @@ def _close_loops(plan: CcrbLivePlan, world: Simulator, launch: RunningLaunch) ->
     view = world.camera(*PICTURE) if launch.recorder else None
     link = ModelLink(launch, plan.prompt, f"{world.name} simulator")
     launch.progress.expect(launch.plan.blocks.warmup + len(plan.learning.policies))
+    link.writer.update(step_s=world.step_s)
     policies = prepare(plan.learning, plan.shape, link.warm_up()).policies()
     for name, policy in policies.items():
         launch.progress.stage(f"{name}: a plan over {link.cell.name}")
@@ -114,7 +116,8 @@ def _close_loops(plan: CcrbLivePlan, world: Simulator, launch: RunningLaunch) ->
         if launch.recorder:
             _record(launch.recorder, name, loop.pictures, looped)
         ready = _arrived(plan, link, looped.record, measured, {name: policy})
-        keep_loop(ready, world, name, looped, link.writer)
+        for table, rows in loop_rows(ready, world, name, looped):
+            link.writer.append(table, rows)
         launch.progress.advance()
 
 

@@ -1,4 +1,4 @@
-"""Roll-outs as rows, and the studies: phase diagram, and random scenarios.
+"""The studies of a CCRB run: phase diagram, and random scenarios.
 
 Tokens arrive evenly, so that stream-to-act starts at S0 (closed form: the online rule does the same with even tokens),
 and the ego is the bare integrator.
@@ -6,85 +6,22 @@ and the ego is the bare integrator.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.ccrb.rows import (
-    IMPACTS,
-    MARGINS,
-    AboutRollout,
-    RolloutRow,
-    TrajectoryRow,
-)
-from s2a_bench.harness.timelines.rows import to_ns
+from s2a_bench.experiments.ccrb.drives import rollout_rows
+from s2a_bench.experiments.ccrb.rows import AboutRollout
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.policy import COMPARED, TOLERANCE_S, Plans, Schedule, policy
+from s2a_bench.policy import COMPARED, Plans, Schedule, policy
 from s2a_bench.policy.arrivals import uniform
-from s2a_bench.policy.metrics import peak_jerk, rms_jerk, sparc, stalls
-from s2a_bench.scenario import EGO, ROLES
 from s2a_bench.scenario.ccrb.cars import start_deadline
-from s2a_bench.scenario.ccrb.drive import Trajectory
-from s2a_bench.scenario.ccrb.ego import PHASES
 from s2a_bench.scenario.ccrb.options import CcrbOptions
-from s2a_bench.scenario.ccrb.outcome import Outcomes
 from s2a_bench.scenario.ccrb.studies import Scenes, drive_along, survived
 from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.types import Timing
-
-
-def rollout_rows(
-    about: Mapping[str, Any], schedule: Schedule, outcomes: Outcomes, *, motion: Mapping[str, Any] | None = None
-) -> Iterator[AboutRollout]:
-    """Yield the rows of M roll-outs; a value of ``about`` is common to all, or an array of M."""
-    stall_s = stalls(schedule)
-    end_s = schedule.start_s[-1] + schedule.duration_s[-1]
-    shared = {name: value for name, value in about.items() if not isinstance(value, np.ndarray)}
-    each = {name: value for name, value in about.items() if isinstance(value, np.ndarray)}
-    found = {metric.name: getattr(outcomes, metric.name) for metric in (*IMPACTS, *MARGINS)}
-    for place in range(len(outcomes.code)):
-        metrics: dict[str, Any] = {name: float(values[place]) for name, values in found.items()}
-        yield RolloutRow(
-            **shared,
-            **{name: value[place].item() for name, value in each.items()},
-            start_ns=to_ns(schedule.start_s[0, place]),
-            end_ns=to_ns(end_s[place]),
-            stalls=int((stall_s[:, place] > TOLERANCE_S).sum()),
-            stall_ns=to_ns(stall_s[:, place].sum()),
-            outcome=outcomes.name(place),
-            **{name: value if math.isfinite(value) else None for name, value in metrics.items()},
-            **(motion or {}),
-        )
-
-
-def motion_of(path: Trajectory) -> dict[str, float]:
-    """Return jerk and smoothness of the ego in a single roll-out, from the request to rest or impact."""
-    speed = path.speed_mps[:, EGO, 0]
-    if len(speed) < 3:  # noqa: PLR2004 - over at once
-        return {}
-    step_s = float(path.time_s[1] - path.time_s[0])
-    return {"rms_jerk": rms_jerk(speed, step_s), "peak_jerk": peak_jerk(speed, step_s), "sparc": sparc(speed, step_s)}
-
-
-def trajectory_rows(cell: str, path: Trajectory) -> Iterator[TrajectoryRow]:
-    cars: dict[str, Any] = {
-        f"{role}_{what}": getattr(path, what)[:, place, 0].tolist()
-        for what in ("position_m", "speed_mps", "acceleration_mps2")
-        for place, role in enumerate(ROLES)
-    }
-    for step, at_s in enumerate(path.time_s):
-        yield TrajectoryRow(
-            cell=cell,
-            at_ns=to_ns(at_s),
-            phase=PHASES[int(path.phase[step, 0])],
-            skill=int(path.skill[step, 0]),
-            ego_lateral_m=float(path.lateral_m[step, EGO, 0]),
-            **{name: values[step] for name, values in cars.items()},
-        )
-
 
 FORMS: Final = {name: policy(name).foreseeing for name in COMPARED}
 SCENES: Final = 1366

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -29,6 +29,7 @@ from s2a_bench.progress import Progress, watching
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SKILLS, TOKENS, TokenRow
 from s2a_bench.store.run import RunWriter
+from s2a_bench.store.schema import Table
 from s2a_bench.types import Timing
 
 if TYPE_CHECKING:
@@ -47,7 +48,9 @@ def run_timeline(config: TimelineComputed, output: Path, progress: Progress) -> 
         calibrations: dict[str, Any] = {}
         for case in plan.cases:
             following = learn(case, plan.learning)
-            _compute(case, following, draw(case, plan.learning.seed, plan.plans, "plans"), writer)
+            token_s, plans = draw(case, plan.learning.seed, plan.plans, "plans")
+            for table, rows in computed_rows(case.setting, following, token_s, plans):
+                writer.append(table, rows)
             calibrations |= following.facts(case.setting)
             if plan.learning.random:
                 progress.advance()
@@ -56,10 +59,12 @@ def run_timeline(config: TimelineComputed, output: Path, progress: Progress) -> 
         return writer.path
 
 
-def _compute(case: PlanCase, following: Following, drawn: tuple[Floats, Plans], writer: RunWriter) -> None:
-    setting, (token_s, plans) = case.setting, drawn
+def computed_rows(
+    setting: PlanSetting, following: Following, token_s: Floats, plans: Plans
+) -> Iterator[tuple[Table[Any], Iterable[Any]]]:
+    """Decide plans under every policy, and yield their rows for each table."""
     request_ids = [setting.request_id(plan) for plan in range(token_s.shape[1])]
-    writer.append(TOKENS, token_rows(setting.name, token_s, request_ids))
+    yield TOKENS, token_rows(setting.name, token_s, request_ids)
     for name, policy in following.made.items():
         caution: float | Sequence[float | None] | None = finite(policy.caution)
         if name in following.tracked:
@@ -68,8 +73,8 @@ def _compute(case: PlanCase, following: Following, drawn: tuple[Floats, Plans], 
         else:
             schedule = policy.schedule(plans)
         rows = timeline_rows(setting, name, plans, schedule, request_ids, caution=caution)
-        writer.append(TIMELINES, rows)
-        writer.append(SKILLS, skill_rows(rows[0].cell, plans, schedule, request_ids))
+        yield TIMELINES, rows
+        yield SKILLS, skill_rows(rows[0].cell, plans, schedule, request_ids)
 
 
 def calibration_warnings(calibrations: dict[str, Any]) -> list[RunWarning]:

@@ -63,7 +63,10 @@ class PlanRequests(FirstVariants):
     def check(self) -> None:
         super().check()
         if len(self.pipelines) != 1:
-            raise UsageError("`transport`: one stream is followed; name one, as ros, ros/action or http/binary")
+            names = ", ".join(each.name for each in self.pipelines)
+            raise UsageError(
+                f"`transport`: one stream is followed, not {names}; name one, as ros/action or http/binary"
+            )
         if self.engine.pace and self.foreign:
             where = f"leave out `{self.foreign}`"
             raise UsageError(f"`pace` needs the package's server, which holds its engine back; {where}")
