@@ -363,10 +363,10 @@ def test_skills_keep_their_own_durations_unless_they_are_given(config: TimelineL
 
     own = prompt(config.but(t_nom_s=()))
     times = [call.skill.durations.nominal_s for call in own.skills.calls]
-    assert own.t_nom_s == pytest.approx(np.mean(times))
+    assert own.shape.expected.nominal_s == pytest.approx(np.mean(times))
     assert own.shape.expected_cv == pytest.approx(np.std(times) / np.mean(times))
     given = prompt(config)
-    assert (given.t_nom_s, given.shape.expected_cv) == (pytest.approx(0.03), 0.0)
+    assert (given.shape.expected.nominal_s, given.shape.expected_cv) == (pytest.approx(0.03), 0.0)
     assert given.shape.expected.most_s == pytest.approx(0.045)
     assert "Output exactly 8 of them." in given.prompt
     assert (bool(given.grammar), given.max_tokens) == (True, 48)

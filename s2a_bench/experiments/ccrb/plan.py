@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -10,9 +10,10 @@ from s2a_bench.experiments.ccrb.config import CcrbComputed, CcrbModelled, CcrbRe
 from s2a_bench.harness.plan import RunPlan
 from s2a_bench.harness.timelines.cases import LearningPlan, PlanCase
 from s2a_bench.harness.timelines.link import PlanPrompt, PromptPlan, plan_requests
+from s2a_bench.harness.timelines.policies import certain
 from s2a_bench.machine import environment
 from s2a_bench.plan import load_skills
-from s2a_bench.policy import PlanShape
+from s2a_bench.policy import PlanShape, Policy
 from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins
 from s2a_bench.scenario import simulator_class
@@ -30,7 +31,8 @@ class CcrbPlan:
     scenario: CcrbOptions
     simulator: str
     case: PlanCase
-    learning: LearningPlan
+    policies: Mapping[str, Policy]
+    seed: int
     manifest: dict[str, Any]
 
 
@@ -58,7 +60,7 @@ def resolve(config: CcrbModelled) -> CcrbPlan:
         "provenance": Origins(board.provenance).to_manifest(),
     }
     case = PlanCase.of(board, PlanShape(scenario.skills, config.tokens_per_skill, scenario.durations, 0.0))
-    return CcrbPlan(scenario, config.simulator, case, LearningPlan(config.chosen, config.seed), manifest)
+    return CcrbPlan(scenario, config.simulator, case, certain(config.chosen, board), config.seed, manifest)
 
 
 def studies(config: CcrbComputed) -> Iterator[tuple[str, Scenes]]:

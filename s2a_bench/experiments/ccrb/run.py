@@ -14,7 +14,7 @@ from s2a_bench.experiments.ccrb.loop import replayed
 from s2a_bench.experiments.ccrb.plan import CcrbPlan, resolve, studies
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.studies import SCENES, drive_block
-from s2a_bench.harness.timelines.policies import draw, learn
+from s2a_bench.harness.timelines.policies import draw
 from s2a_bench.harness.timelines.rows import token_rows
 from s2a_bench.scenario import open_simulator
 from s2a_bench.scenario.ccrb.options import CcrbOptions
@@ -50,9 +50,8 @@ def run_closed_loop(config: CcrbClosedLoop, output: Path, progress: Progress) ->
 
 def prepare(plan: CcrbPlan) -> Prepared:
     """Draw the board's tokens, which are the plans' ``token_s``, and schedule them under every policy."""
-    setting, policies = plan.case.setting, learn(plan.case, plan.learning).made
-    _, plans = draw(plan.case, plan.learning.seed, 1, "plans")
-    return complete(plan.scenario, setting, setting.request_id(0), plans, policies)
+    setting, (_, plans) = plan.case.setting, draw(plan.case, plan.seed, 1, "plans")
+    return complete(plan.scenario, setting, setting.request_id(0), plans, plan.policies)
 
 
 def _create(plan: CcrbPlan, ready: Prepared, output: Path, progress: Progress) -> RunWriter:

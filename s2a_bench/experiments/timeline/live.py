@@ -11,7 +11,7 @@ from contextlib import ExitStack, closing
 from functools import partial
 from pathlib import Path
 
-from s2a_bench.act import SkillRobot
+from s2a_bench.act import SkillKind, SkillRobot, kind
 from s2a_bench.act.events import PlanFeed, StreamBroke
 from s2a_bench.act.record import Record
 from s2a_bench.clock import now_ns, quick_switching
@@ -36,8 +36,9 @@ def run_live(config: TimelineLive, output: Path, progress: Progress) -> Path:
     The folder keeps the timelines so far; the robots hold before KeyboardInterrupt passes through.
     """
     plan = resolve_live(config, progress)
+    robot = kind(plan.robot, SkillKind)
     with ExitStack() as stack:  # first, as a model may take long to load
-        robots = [stack.enter_context(closing(plan.open_robot())) for _ in plan.learning.policies]
+        robots = [stack.enter_context(closing(robot.open_skills(plan.skills))) for _ in plan.learning.policies]
         stack.enter_context(quick_switching())
         drive, tables = partial(_drive, plan, robots), (TIMELINES, SKILLS)
         task = Task("timeline", drive, tables=tables, source=lambda feed: Stamped(feed.open(), feed.nonce))
@@ -71,7 +72,8 @@ def _execute(
 ) -> None:
     """Request one plan, execute it under every policy as it arrives, and extend ``records``."""
     policies, progress = following.policies(), link.launch.progress
-    span_s = ask.n_skills * (ask.tokens_per_skill / link.rate if link.rate else 0.0) + ask.n_skills * ask.t_nom_s
+    skill_s = (ask.tokens_per_skill / link.rate if link.rate else 0.0) + ask.shape.expected.nominal_s
+    span_s = ask.n_skills * skill_s
     progress.stage(f"{link.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
     side_by_side = SideBySide(policies, ask.shape, ask.skills.gap, robots, link.launch.plan.timeout_s)
     feed = PlanFeed(Parser(ask.format), side_by_side.send)

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.act import SkillKind, SkillRobot, kind
 from s2a_bench.boards.gaps import to_table
 from s2a_bench.boards.tokens import Board
 from s2a_bench.errors import UsageError
@@ -48,12 +47,16 @@ class LivePlan:
     robot: str
     skills: SkillSet
 
-    def open_robot(self) -> SkillRobot:
-        return kind(self.robot, SkillKind).open_skills(self.skills)
-
 
 def resolve(config: TimelineComputed) -> ModelledPlan:
     """Decide what follows from a configuration; raises S2AError for recorded answers that are missing or too short."""
+    manifest = {
+        "configuration": config.to_manifest(),
+        "environment": environment.collect(),
+        "seeds": {"plans": config.seed},
+        "boards": [_facts(board) for board in config.boards],
+        "provenance": _origins(config).to_manifest(),
+    }
     learning = LearningPlan(
         config.chosen,
         config.seed,
@@ -66,21 +69,16 @@ def resolve(config: TimelineComputed) -> ModelledPlan:
     )
     for case in config.cases if learning.answers else ():
         plans_of(case, learning)  # refuse before the folder is created
-    manifest = {
-        "configuration": config.to_manifest(),
-        "environment": environment.collect(),
-        "seeds": {"plans": config.seed},
-        "boards": [_facts(board) for board in config.boards],
-        "provenance": _origins(config).to_manifest(),
-    }
     return ModelledPlan(config.cases, config.plans_a_cell, learning, manifest)
 
 
 def resolve_live(config: TimelineLive, progress: Progress) -> LivePlan:
     """Decide what follows from a configuration, with the model's files; raises S2AError."""
-    requests, prompts = plan_requests(config.requests.but(seed=config.seed), prompt_plan(config), progress)
+    plans = prompt_plan(config)
+    requests, prompts = plan_requests(config.requests.but(seed=config.seed), plans, progress)
+    engine = {"engine": requests.engine.to_manifest()}
     requests = requests.with_manifest(
-        configuration={**requests.manifest["configuration"], **config.to_manifest()},
+        configuration={**requests.manifest["configuration"], **config.to_manifest(), **engine},
         seeds={"sampling": config.seed, "source": config.seed, "nonce": requests.feed.nonce},
     )
     learning = LearningPlan(config.chosen, config.seed, config.epsilon, config.track)

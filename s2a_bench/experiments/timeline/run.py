@@ -47,8 +47,8 @@ def run_timeline(config: TimelineComputed, output: Path, progress: Progress) -> 
             progress.expect(len(plan.cases))
         calibrations: dict[str, Any] = {}
         for case in plan.cases:
-            following = learn(case, plan.learning)
             token_s, plans = draw(case, plan.learning.seed, plan.plans, "plans")
+            following = learn(case, plan.learning)
             for table, rows in computed_rows(case.setting, following, token_s, plans):
                 writer.append(table, rows)
             calibrations |= following.facts(case.setting)

@@ -20,7 +20,6 @@ from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.config import PlanRequests
 from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.harness.warnings import change_warnings
-from s2a_bench.inference import need_engine
 from s2a_bench.machine.tuning import limit_threads
 from s2a_bench.plan import Format, SkillSet, choose_format, grammar, paper_format, prompt
 from s2a_bench.policy import Floats, PlanShape, Timing
@@ -49,10 +48,6 @@ class PlanPrompt:
     max_tokens: int
 
     @property
-    def t_nom_s(self) -> float:
-        return self.shape.expected.nominal_s
-
-    @property
     def shape(self) -> PlanShape:
         """Return the facts about the plan before its first token: all calls are equally likely."""
         times = [call.skill.durations for call in self.skills.calls]
@@ -78,16 +73,15 @@ class PromptPlan:
 
 
 def plan_requests(requests: PlanRequests, plan: PromptPlan, progress: Progress) -> tuple[RunPlan, list[PlanPrompt]]:
-    """Find the model's files, write the prompts, and plan requests of sufficient length; raises S2AError."""
+    """Plan requests of sufficient length, find the model's files, and write the prompts; raises S2AError."""
     limit_threads()
-    model, (cell,) = None, requests.pipelines
-    if requests.engine.kind.needs_model and not cell.options.external_address:
-        need_engine(requests.engine)
-        requests = requests.but(engine=on_files(requests.engine, progress))
-        model = requests.engine.model
-    prompts = write_prompts(plan, model, exact=model is not None or requests.engine.kind.plays is not None)
-    run = resolve(requests.but(max_tokens=max(each.max_tokens for each in prompts)), progress.say)
-    return replace(run, finds_model=False), prompts
+    run, model = resolve(requests, progress.say), None
+    if run.finds_model:
+        run = replace(run, engine=on_files(run.engine, progress), finds_model=False)
+        model = run.engine.model
+    prompts = write_prompts(plan, model, exact=model is not None or run.engine.kind.plays is not None)
+    request = replace(run.request, max_pieces=max(each.max_tokens for each in prompts))
+    return replace(run, request=request), prompts
 
 
 def write_prompts(plan: PromptPlan, model: Path | None, *, exact: bool) -> list[PlanPrompt]:
@@ -193,7 +187,7 @@ class ModelLink:
             prompt_s=None,
             tokens_per_skill=of.tokens_per_skill,
             n_skills=of.n_skills,
-            t_nom_s=of.t_nom_s,
+            t_nom_s=of.shape.expected.nominal_s,
             mode=MODE,
             emulated=self.origin.emulated,
         )

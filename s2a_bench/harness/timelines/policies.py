@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from s2a_bench.act.record import Record, observed
+from s2a_bench.boards.tokens import Board
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.timelines.cases import MOST_CV, LearningPlan, PlanCase, PlanSetting
 from s2a_bench.policy import CAUTION, ONLINE, TOLERANCE_S, Floats, Plans, PlanShape, Policy
@@ -61,11 +62,7 @@ def finite(caution: float | None) -> float | None:
 
 
 def learn(case: PlanCase, plan: LearningPlan) -> Following:
-    """Give policies a prior, and calibrate lambda, from drawn plans of the same kind or recorded answers.
-
-    If nothing is random the prior is as certain as the arrivals, and the online rule starts at S0.
-    """
-    plans = None
+    """Give policies a prior, and calibrate lambda, from drawn plans of the same kind or recorded answers."""
     if plan.answers:
         plans = plans_of(case, plan)
         prior = GapPrior.fit(plans.token_s)  # type: ignore[arg-type]  # recorded plans have tokens
@@ -75,12 +72,9 @@ def learn(case: PlanCase, plan: LearningPlan) -> Following:
         prior = GapPrior.fit(case.board.tokens(count, rng, plan.calibration_plans))
         _, plans = draw(case, plan.seed, plan.calibration_plans, "calibration")
     else:
-        prior = GapPrior(1 / case.board.tokens_per_s, LEAST_CV, LEAST_CV)
-    following = _informed(plan, case.shape, prior)
+        return Following(case.shape, certain(plan.policies, case.board))
+    following = Following(case.shape, {name: policy.informed(prior) for name, policy in plan.policies.items()})
     for name, policy in following.unset.items():
-        if plans is None:
-            following.made[name] = policy.informed(caution=CAUTION)
-            continue
         score = scores(policy, plans)
         chosen = choose(score, plan.epsilon, plan.guarantee, plans.arrival_s[-1])
         following.calibrations[name], following.made[name] = chosen, policy.informed(caution=chosen.caution)
@@ -89,9 +83,17 @@ def learn(case: PlanCase, plan: LearningPlan) -> Following:
     return following
 
 
+def certain(policies: Mapping[str, Policy], board: Board) -> dict[str, Policy]:
+    """Give policies a prior as certain as even arrivals are: the online rule starts at S0."""
+    prior = GapPrior(1 / board.tokens_per_s, LEAST_CV, LEAST_CV)
+    return {
+        name: policy.informed(prior, CAUTION if policy.caution is None else None) for name, policy in policies.items()
+    }
+
+
 def prepare(plan: LearningPlan, shape: PlanShape, prior: GapPrior | None) -> Following:
     """Give policies the prior of a model's answers, and a lambda that is tracked, not calibrated."""
-    following = _informed(plan, shape, prior)
+    following = Following(shape, {name: policy.informed(prior) for name, policy in plan.policies.items()})
     for name, policy in following.unset.items():
         if plan.track:
             plans = drawn(policy.prior, shape, generator(plan.seed, "tracking", shape.key), PLANS)
@@ -99,10 +101,6 @@ def prepare(plan: LearningPlan, shape: PlanShape, prior: GapPrior | None) -> Fol
         else:
             following.made[name] = policy.informed(caution=CAUTION)
     return following
-
-
-def _informed(plan: LearningPlan, shape: PlanShape, prior: GapPrior | None) -> Following:
-    return Following(shape, {name: policy.informed(prior) for name, policy in plan.policies.items()})
 
 
 def plans_of(case: PlanCase, plan: LearningPlan) -> Plans:
