@@ -317,8 +317,7 @@ class Fleet:
         cell = Pipeline(plan.cell, TRANSPORTS[wiring.transport], wiring.variant, wiring.options)
         client = open_client(wiring)
         source = _Shared(self._source, f"{plan.feed.nonce}/{cell.name} {plan.mode} {robot}", self._reads)
-        preencoded = cell.payload == "jpeg-preencoded"
-        feed = RequestFeed(source, preencoded=preencoded, cameras=plan.feed.cameras, size=plan.feed.resize)
+        feed = RequestFeed(source, preencoded=cell.preencoded, cameras=plan.feed.cameras, size=plan.feed.resize)
         session = Session(cell, client, feed, plan.request, origin=plan.origin)
         session.answered = True  # its server has answered the warm-up
         self._stack.callback(lambda: None if session.busy else client.close())
