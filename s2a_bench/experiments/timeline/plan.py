@@ -58,14 +58,14 @@ def resolve(config: TimelineComputed) -> ModelledPlan:
         "provenance": _origins(config).to_manifest(),
     }
     learning = LearningPlan(
-        config.chosen,
-        config.seed,
-        config.epsilon,
-        config.track,
-        config.random,
-        config.calibration_plans,
-        config.guarantee,
-        recordings(config.calibrate) if config.calibrate else (),
+        policies=config.chosen,
+        seed=config.seed,
+        epsilon=config.epsilon,
+        track=config.track,
+        random=config.random,
+        calibration_plans=config.calibration_plans,
+        guarantee=config.guarantee,
+        answers=recordings(config.calibrate) if config.calibrate else (),
     )
     for case in config.cases if learning.answers else ():
         plans_of(case, learning)  # refuse before the folder is created
