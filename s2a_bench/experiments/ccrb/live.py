@@ -56,7 +56,8 @@ def run_live(config: CcrbLive, output: Path, progress: Progress) -> Path:
     """Request one plan and drive it under every policy; raises S2AError. The folder keeps the requests so far."""
     plan = resolve_live(config, progress)
     with closing(open_simulator(plan.simulator)) as world:
-        return _run(plan, world, partial(_roll_out, ttc=config.ttc), output, progress)
+        task = _task(plan, world, partial(_roll_out, plan, world, ttc=config.ttc))
+        return run_requests(task, plan.requests, output, progress)
 
 
 def run_live_loop(config: CcrbLiveLoop, output: Path, progress: Progress) -> Path:
@@ -65,24 +66,17 @@ def run_live_loop(config: CcrbLiveLoop, output: Path, progress: Progress) -> Pat
     with closing(open_simulator(plan.simulator)) as bare, closing(with_ego(bare, config.ego)) as world:
         if not world.real:
             world.step_s = STEP_S
-        return _run(plan, world, _close_loops, output, progress)
+        task = _task(plan, world, partial(_close_loops, plan, world))
+        return run_requests(task, plan.requests, output, progress)
 
 
-def _run(
-    plan: CcrbLivePlan,
-    world: Simulator,
-    drive: Callable[[CcrbLivePlan, Simulator, RunningLaunch], None],
-    output: Path,
-    progress: Progress,
-) -> Path:
+def _task(plan: CcrbLivePlan, world: Simulator, drive: Callable[[RunningLaunch], None]) -> Task:
     def view(feed: FeedPlan) -> FrameSource:
         camera = world.camera(*feed.size)
         place(world, plan.scenario.cars)
         return Stamped(camera, feed.nonce)
 
-    tables = (ROLLOUTS, TRAJECTORIES, SKILLS)
-    task = Task("ccrb", drive=partial(drive, plan, world), tables=tables, source=view)
-    return run_requests(task, plan.requests, output, progress)
+    return Task("ccrb", drive, tables=(ROLLOUTS, TRAJECTORIES, SKILLS), source=view)
 
 
 def _roll_out(plan: CcrbLivePlan, world: Simulator, launch: RunningLaunch, *, ttc: bool) -> None:
@@ -140,10 +134,9 @@ def _arrived(
     plan: CcrbLivePlan, link: ModelLink, record: Record, measured: Measured, policies: Mapping[str, Policy]
 ) -> Prepared:
     """Schedule a received plan; raises TransportError if it is incomplete, or was not executed to its end."""
-    link.require_answers()
     plans, request_id = observed(record, plan.shape), measured.sample.request_id
     if plans is None or record.why:
-        why = record.why or f"{len(record.arrivals)} of {plan.prompt.n_skills} skills arrived"
+        why = measured.sample.error or record.why or f"{len(record.arrivals)} of {plan.prompt.n_skills} skills arrived"
         written = link.writer.path / "tokens.csv"
         raise TransportError(f"{link.cell.name}: {why}; {written} has what the model wrote")
     link.learn_rate(record.token_ns)

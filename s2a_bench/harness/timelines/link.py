@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from s2a_bench.act.events import PlanFeed
-from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.errors import UsageError
 from s2a_bench.harness.plan import RunPlan, resolve
 from s2a_bench.harness.rounds import RunningLaunch
 from s2a_bench.harness.servers import on_files
@@ -114,8 +114,6 @@ class ModelLink:
     robot: str
     """For the manifest."""
     blocks: Iterator[int] = field(default_factory=count)
-    answers: int = 0
-    """Plans without an error."""
     learned_ms: list[Floats] = field(default_factory=list)
     """Gaps between tokens of each warm-up, from which policies learn."""
     seen_ms: list[Floats] = field(default_factory=list)
@@ -170,7 +168,6 @@ class ModelLink:
         measured = self.session.measure(place, RequestContext(plan=feed, request=request))
         if self.session.origin != self.origin:
             self._write_origin()
-        self.answers += feed is not None and not measured.sample.error
         try:
             self.launch.keep(self.session, measured)
         except UsageError as error:
@@ -210,9 +207,3 @@ class ModelLink:
         self.launch.warnings.extend(
             change_warnings(self.cell.name, self.learned_ms, self.seen_ms, "ms a token", advice)
         )
-
-    def require_answers(self) -> None:
-        if not self.answers:
-            raise TransportError(
-                f"no request of {self.cell.name} succeeded; {self.writer.path / 'samples.csv'} says why"
-            )
