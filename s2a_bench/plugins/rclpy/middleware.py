@@ -29,7 +29,7 @@ from s2a_bench.plugins.rclpy.types import from_ros, interface_class, message_cla
 from s2a_bench.ros import SERVICE_QOS, Offer, QoS, Tuning
 from s2a_bench.ros.config import CYCLONE_URI, LARGE_PICTURES, RMW_CYCLONE
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise
-from s2a_bench.ros.service import appeared
+from s2a_bench.ros.service import appeared, awaited
 
 
 class RclpyServiceClient:
@@ -94,16 +94,9 @@ class _RclpySubscription:
         self.interrupt, self.close = self._waiter.interrupt, self._waiter.close
 
     def take(self, timeout_s: float) -> bytes | None:
-        deadline_ns = now_ns() + int(timeout_s * 1e9)
         with self._waiter.consuming():
-            more = True
-            while not self._waiter.interrupted:
-                if (taken := self._subscription.handle.take_message(self._class, True)) is not None:
-                    return taken[0]  # type: ignore[no-any-return]
-                if not more:
-                    break
-                more = self._waiter.wait_until(deadline_ns)
-        return None
+            taken = awaited(lambda: self._subscription.handle.take_message(self._class, True), self._waiter, timeout_s)
+        return taken and taken[0]
 
     def unpack(self, packed: bytes) -> Any:
         return deserialise(memoryview(packed), self._type_name)

@@ -59,7 +59,7 @@ class RclpyServerGoal:
         return ""
 
     def unpack(self) -> Any:
-        return self._server.convert_goal(self._request[1].goal)
+        return from_ros(self._request[1].goal, *self._server.goal_type)
 
     def accept(self) -> None:
         self._handle = self._server.decide(self._request, accepted=True)
@@ -169,6 +169,7 @@ class RclpyActionServer:
         self.version = installed_version(self._action, type_name)
         if version not in {"", self.version}:
             raise MissingInterface(f"this workspace has llama_msgs {self.version}, not {version}")
+        self.goal_type = type_name + "_Goal", self.version
         self._lock = Lock()
         self._offered: set[bytes] = set()
         self._goals: deque[RclpyServerGoal] = deque()
@@ -235,9 +236,6 @@ class RclpyActionServer:
         verdict = GoalResponse.ACCEPT if accepted else GoalResponse.REJECT
         self._node.check_open()
         return self._server.decide(request, verdict)
-
-    def convert_goal(self, goal: Any) -> Any:
-        return from_ros(goal, self._type + "_Goal", self.version)
 
     def publish_feedback(self, handle: Any, feedback: Any) -> None:
         message = to_ros(feedback, self._action.Feedback, self._type + "_Feedback", self.version)
