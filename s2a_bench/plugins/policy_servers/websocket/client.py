@@ -206,10 +206,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
     def describe(self) -> dict[str, str]:
         """Return the server and its metadata, for the manifest; connects to a foreign server."""
         if not self._native and self._link is None:
-            try:
-                self._connected(self._bounds(1))
-            except Broken as error:
-                raise RequestFailed(str(error), starting=error.starting) from error
+            self._connected(self._bounds(1))
         return {**super().describe(), **self._metadata}
 
     def close(self) -> None:
@@ -259,7 +256,6 @@ def _with_path(url: str, path: str) -> str:
 
 
 def _kind(answer: Any) -> str:
-    """Return the type that a message states, if any."""
     kind = answer.get(codec.TYPE) if isinstance(answer, dict) else None
     return kind if isinstance(kind, str) else ""
 
