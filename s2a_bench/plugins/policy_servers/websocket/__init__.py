@@ -15,8 +15,7 @@ from s2a_bench.plugins.policy_servers.policies import PolicyTransport, TemplateO
 from s2a_bench.transport import Urls, Wiring
 from s2a_bench.transport.access import WebOptions
 
-VARIANTS = ("openpi", "openpi-stream")
-OPENPI, STREAM = VARIANTS
+OPENPI, STREAM = "openpi", "openpi-stream"
 PREV_TOTAL_MS = Fact(
     "prev_total_ms", "ms", "duration of the connection's last request, as the policy server reports it"
 )
@@ -33,7 +32,7 @@ class WebsocketOptions(WebOptions, TemplateOptions):
 class Websocket(PolicyTransport[WebsocketOptions]):
     name = "websocket"
     options = WebsocketOptions
-    variants = VARIANTS
+    variants = (OPENPI, STREAM)
     urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.plugins.policy_servers.websocket.client:examine")
     needs = ("websocket", "msgpack", "websockets")
     client_class = "s2a_bench.plugins.policy_servers.websocket.client:WebsocketClient"

@@ -45,7 +45,9 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         super().__init__(wiring, alive)
         self._streams = wiring.variant == STREAM
         self._server = ExternalServer() if self._native else self._template.server
-        self._url = _with_path(wiring.address, self._server.path)
+        parts = urlsplit(self._url)
+        if self._server.path and not parts.path.strip("/"):
+            self._url = urlunsplit(parts._replace(path=self._server.path))
         if self._native and self._streams:
             self._url += STREAM_PATH
         key = read_key(wiring.options.api_key_env)
@@ -247,12 +249,6 @@ def examine(parts: SplitResult) -> Iterator[Finding | str]:
         cure = f"--template {' or '.join(cut)}, of servers with this path: it keeps the connection open"
         yield idle_cut(min(cut.values()), cure)
     yield NO_KEY
-
-
-def _with_path(url: str, path: str) -> str:
-    """Return a URL that has no path with ``path``, any other as it is."""
-    parts = urlsplit(url)
-    return url if parts.path.strip("/") or not path else urlunsplit(parts._replace(path=path))
 
 
 def _kind(answer: Any) -> str:
