@@ -102,15 +102,6 @@ class Interval:
     lo_ns: int
     hi_ns: int
 
-    @property
-    def middle_ns(self) -> int:
-        return (self.lo_ns + self.hi_ns) // 2
-
-    @property
-    def half_ns(self) -> int:
-        """Return the distance from the middle to the farther end."""
-        return self.hi_ns - self.middle_ns
-
     def __or__(self, other: Interval) -> Interval:
         return Interval(min(self.lo_ns, other.lo_ns), max(self.hi_ns, other.hi_ns))
 
@@ -223,8 +214,9 @@ class RemoteClock:
         early_ns = min((stamp - own.upper[1] for _, stamp in remote.frame_marks), default=own.sent_ns)
         near = offset.over(own.sent_ns, own.seen_ns)
         whole = near | offset.over(min(early_ns, own.sent_ns), last_ns)
-        trace.remote = remote.shifted(near.middle_ns)
-        return Joined(near.half_ns, whole.hi_ns - near.middle_ns, near.middle_ns - whole.lo_ns)
+        middle_ns = (near.lo_ns + near.hi_ns) // 2  # its farther end is the upper one
+        trace.remote = remote.shifted(middle_ns)
+        return Joined(near.hi_ns - middle_ns, whole.hi_ns - middle_ns, middle_ns - whole.lo_ns)
 
     def _burst(self, count: int, pause_ns: int) -> None:
         clock = SystemClock()
