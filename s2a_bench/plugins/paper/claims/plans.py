@@ -24,6 +24,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
 )
 from s2a_bench.experiments.timeline.view.cells import Timelines, timelines_of
 from s2a_bench.plan.skillset import GAPS
+from s2a_bench.plugins.paper import ORIN, Published
 from s2a_bench.plugins.paper.claims import Check, Need, RunPart, Trial
 from s2a_bench.plugins.paper.claims.requests import (
     NEAR,
@@ -35,7 +36,6 @@ from s2a_bench.plugins.paper.claims.requests import (
     on_board,
     one_of,
 )
-from s2a_bench.plugins.paper.figures import ORIN, Published
 from s2a_bench.policy import TOLERANCE_S, Floats, Plans
 from s2a_bench.policy.schedule import elastic, safe_start, work_conserving
 from s2a_bench.provenance import UNKNOWN
