@@ -21,7 +21,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros import ACTION
-from s2a_bench.transport.ros.action_source import ActionSource
+from s2a_bench.transport.ros.action import ActionSource
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
 from s2a_bench.transport.ros.exchange import Shared
 from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company, server_name, settled
