@@ -250,9 +250,13 @@ class Session:
             self.origin = replace(self.origin, link="real" if trace.remote.clock == clock_id() else UNKNOWN)
         if origin.known:
             self.origin = replace(origin, link=self.origin.link, link_profile=self.origin.link_profile)
-        joined, apart = self._joined(trace, seen) if seen and not error else (None, None)
-        if apart:
-            error = f"{type(apart).__name__}: {apart}"
+        other_host = trace.remote is not None and trace.remote.clock != clock_id()
+        joined, apart = None, None
+        if self._clock and other_host and seen and not error:
+            try:
+                joined = self._clock.join(trace, seen[-1][1])
+            except TransportError as failure:
+                apart, error = failure, f"{type(failure).__name__}: {failure}"
         streamed = self._streamed(trace, request_id, joined)
         if streamed:
             index, captured_ns, picture = streamed.index, streamed.captured_ns, streamed.index
@@ -268,7 +272,7 @@ class Session:
         error = error or self._doubt(trace, rgb_source, rgb_engine)
         started_ns = inference_start_ns(trace)
         age_ns = started_ns - captured_ns if started_ns is not None and captured_ns >= 0 else None
-        if joined or (trace.remote and trace.remote.clock != clock_id()):
+        if joined or other_host:
             facts.pop(CAMERA_STAMP_AGE_MS, None)  # the difference of two hosts' wall clocks
         self.prompt_n = _whole(facts.get(PROMPT_N)) or self.prompt_n
         sample = SampleRow(
@@ -316,15 +320,6 @@ class Session:
             for left_ns in (engine_ns.get(position),)
         ]
         return Measured(sample, tokens, picture, apart, odd=frozenset(trace.odd))
-
-    def _joined(self, trace: Trace, seen: list[tuple[Piece, int]]) -> tuple[Joined | None, TransportError | None]:
-        """Put the report of a server on another host on this host's clock, or return why that cannot be done."""
-        if self._clock is None or trace.remote is None or trace.remote.clock == clock_id():
-            return None, None
-        try:
-            return self._clock.join(trace, seen[-1][1]), None
-        except TransportError as failure:
-            return None, failure
 
     def _doubt(self, trace: Trace, rgb_source: int | None, rgb_engine: int | None) -> str:
         if unknown := {stage for stage, _ in trace.chain() if stage} - self.request.stages.keys():
