@@ -10,7 +10,7 @@ sends the defaults, and then the engine's own settings hold.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, Final
 
 import numpy as np
@@ -18,34 +18,18 @@ import numpy as np
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, S2AError, ServerDied, TransportError
 from s2a_bench.facts import PAYLOAD_BYTES
-from s2a_bench.ros import ActionClient, ActionEvent, Feedback, Middleware, QoS, Rejected, Result, ServerGoal
+from s2a_bench.ros import ActionClient, ActionEvent, Feedback, Middleware, QoS, Rejected, Result, ServerGoal, llama
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
-from s2a_bench.ros.llama import (
-    GENERATE_RESPONSE,
-    generate_goal,
-    goal_images,
-    sampling_config,
-    text_result,
-    token_feedback,
-)
 from s2a_bench.ros.service import READER_QOS
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Bounds
+from s2a_bench.transport.ros import wire
 from s2a_bench.transport.ros.camera import POLL_S, picture_message, picture_of
 from s2a_bench.transport.ros.exchange import RosExchange, Shared
-from s2a_bench.transport.ros.joining import RosClient, join, namespace_of, place_of, wait_until
+from s2a_bench.transport.ros.joining import RosClient, join, namespace_of
 from s2a_bench.transport.ros.options import RosOptions
-from s2a_bench.transport.ros.wire import (
-    PROVENANCE_TOPIC,
-    TOKEN_QOS,
-    marks_message,
-    provenance_of,
-    readable,
-    remote_of,
-    token_message,
-)
 from s2a_bench.types import Piece, Request, Sampling, Token
 
 ACTION = "/generate_response"
@@ -76,41 +60,29 @@ _log = logging.getLogger(__name__)
 
 
 class GenerateClient(RosClient):
-    def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
-        """Join the domain and wait for the action; raises ServerDied if it does not appear."""
-        super().__init__(wiring, alive)
-        namespace = namespace_of(wiring)
-        self._name = wiring.options.action or namespace + ACTION
-        try:
-            self._client, self._version = self._connect()
-            self._marks = None
-            self._origin = self.middleware.subscription(
-                self._name.rpartition("/")[0] + PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
-            )
-            if not wiring.options.action:
-                self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, READER_QOS)
-                self._wait(lambda: bool(self._marks and self._marks.matched()))
-        except TransportError:
-            self.close()
-            raise
-
-    def _connect(self) -> tuple[ActionClient, str]:
-        """Find the server and speak the version of llama_msgs that its type hash shows, ours where it shows none."""
-        version = ros.DEFAULT_VERSION
-        client = self.middleware.action_client(self._name, GENERATE_RESPONSE, version)
-        self._find(client)
-        spoken = client.server_version() or version
-        if spoken != version:
+    def _meet_server(self, namespace: str) -> None:
+        action = self._wiring.options.action
+        self._name = action or namespace + ACTION
+        self._absent = f"no action server appeared at {self._name}"
+        self._version = ros.DEFAULT_VERSION  # until a server's type hash shows another
+        self._client = self._found_client()
+        if (spoken := self._client.server_version() or self._version) != self._version:
             self.middleware.close()  # a client of the other version would go on collecting messages that are never read
-            self.middleware = join(self._wiring, "client")
-            client = self.middleware.action_client(self._name, GENERATE_RESPONSE, spoken)
-            self._find(client)
-        return client, spoken
+            self.middleware, self._version = join(self._wiring, "client"), spoken
+            self._client = self._found_client()
+        self._marks = None
+        self._origin = self.middleware.subscription(
+            self._name.rpartition("/")[0] + wire.PROVENANCE_TOPIC, ros.PROVENANCE, QoS(depth=1, latched=True)
+        )
+        if not action:
+            self._marks = self.middleware.subscription(namespace + MARKS, ros.MARKS, READER_QOS)
+            self.wait_until(lambda: bool(self._marks and self._marks.matched()), self._absent)
 
-    def _find(self, client: ActionClient) -> None:
+    def _found_client(self) -> ActionClient:
         """Wait for the server; raises TransportError for one that is there and cannot be spoken to."""
+        client = self.middleware.action_client(self._name, llama.GENERATE_RESPONSE, self._version)
         try:
-            self._wait(client.server_present)
+            self.wait_until(client.server_present, self._absent)
         except ServerDied as absent:
             if other := client.other_dds():
                 raise TransportError(
@@ -118,10 +90,7 @@ class GenerateClient(RosClient):
                     "start it with RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or ask in a sourced ROS 2 of its RMW"
                 ) from absent
             raise
-
-    def _wait(self, arrived: Callable[[], bool]) -> None:
-        absent = f"no action server appeared at {self._name} in {place_of(self._wiring)}"
-        wait_until(arrived, self._alive, absent)
+        return client
 
     def request(self, request: Request, trace: Trace) -> Iterator[Token]:
         payload = self._wiring.options.payload
@@ -130,7 +99,7 @@ class GenerateClient(RosClient):
         if self._version != "4.4":
             sampling["seed"] = request.seed
         prompt = MEDIA_MARKER * len(images) + request.prompt
-        packed = self._client.pack(generate_goal(prompt, images, version=self._version, **sampling))
+        packed = self._client.pack(llama.generate_goal(prompt, images, version=self._version, **sampling))
         trace.mark("cdr_pack")
         goal_id = self._client.send(packed)
         trace.facts[PAYLOAD_BYTES] = len(packed)
@@ -192,16 +161,16 @@ class GenerateClient(RosClient):
     def _learn(self, goal_id: str, trace: Trace) -> bool:
         """Take our server's marks of a goal, which were sent before its result; of another, who it is."""
         if self._marks is None:
-            if (marked := self._origin.take(0)) and (origin := readable(self._origin, marked, trace)) is not None:
-                trace.provenance = provenance_of(origin)
+            if (marked := self._origin.take(0)) and (origin := wire.readable(self._origin, marked, trace)) is not None:
+                trace.provenance = wire.provenance_of(origin)
             return True
         deadline = now_ns() + int(MARKS_TIMEOUT_S * 1e9)
         while now_ns() < deadline:
             packed = self._marks.take(POLL_S)
             if packed is not None:
-                marks = readable(self._marks, packed, trace)
+                marks = wire.readable(self._marks, packed, trace)
                 if marks is not None and marks.id == goal_id:
-                    trace.receive(remote_of(marks))
+                    trace.receive(wire.remote_of(marks))
                     return True
         return False
 
@@ -214,11 +183,11 @@ class ActionSource:
         self._wiring = wiring
         self.tune(options)
         self._server = middleware.action_server(
-            namespace + ACTION, GENERATE_RESPONSE, options.result_timeout, options.llama_msgs
+            namespace + ACTION, llama.GENERATE_RESPONSE, options.result_timeout, options.llama_msgs
         )
         self.take, self.interrupt, self.version = self._server.next_goal, self._server.interrupt, self._server.version
         self.wishes = Wishes(honoured, self.version)
-        self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, TOKEN_QOS)
+        self._marks = middleware.publisher(namespace + MARKS, ros.MARKS, wire.TOKEN_QOS)
         self._plot = middleware.publisher(namespace + "/token", ros.TOKEN, QoS()) if options.publish_tokens else None
 
     def tune(self, options: RosOptions) -> None:
@@ -243,11 +212,11 @@ class ActionSource:
 
     def plot(self, goal_id: str, token: Piece) -> None:
         if self._plot is not None:
-            self._plot.send(self._plot.pack(token_message(goal_id, token, last=False)))
+            self._plot.send(self._plot.pack(wire.token_message(goal_id, token, last=False)))
 
     def ended(self, goal_id: str, trace: Trace) -> None:
         """Send a goal's marks, before its result."""
-        self._marks.send(self._marks.pack(marks_message(goal_id, trace.to_remote())))
+        self._marks.send(self._marks.pack(wire.marks_message(goal_id, trace.to_remote())))
 
 
 class GoalExchange(RosExchange):
@@ -274,7 +243,7 @@ class GoalExchange(RosExchange):
         return Request(
             id=self._id,
             prompt=message.prompt.replace(MEDIA_MARKER, ""),
-            images=tuple(picture_of(image, self.trace, self._source.limits) for image in goal_images(message)),
+            images=tuple(picture_of(image, self.trace, self._source.limits) for image in llama.goal_images(message)),
             max_tokens=self._source.max_tokens,
             grammar=sampling.grammar,
             seed=0 if seed == NO_SEED else seed,
@@ -304,7 +273,7 @@ class GoalExchange(RosExchange):
     def _feed(self) -> None:
         """Send what is held as one feedback: one token, or several that came faster than ROS clients' queues hold."""
         if self._held:
-            self._goal.feedback(token_feedback("".join(self._held), self._tokens[-1].id, self._source.version))
+            self._goal.feedback(llama.token_feedback("".join(self._held), self._tokens[-1].id, self._source.version))
             self._held.clear()
             self._fed_ns = now_ns()
 
@@ -318,7 +287,7 @@ class GoalExchange(RosExchange):
             self._source.ended(self._id, self.trace)
         except S2AError as failure:
             error = error or str(failure)
-        result = text_result(error or self._text(), [token.id for token in self._tokens], self._source.version)
+        result = llama.text_result(error or self._text(), [token.id for token in self._tokens], self._source.version)
         started = self._started or self._goal.executing()
         if self._goal.cancel_requested:
             self._goal.canceled(result)
@@ -331,7 +300,7 @@ class GoalExchange(RosExchange):
 class Wishes:
     def __init__(self, honoured: Collection[str], version: str) -> None:
         self._honoured = honoured
-        self._defaults = sampling_config(version)
+        self._defaults = llama.sampling_config(version)
         self._logged: set[str] = set()
 
     def of(self, config: Any) -> Sampling:

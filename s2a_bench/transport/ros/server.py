@@ -107,7 +107,7 @@ class RosServer:
     def _findings(self) -> Iterator[PartHealth]:
         return self._shared.activity.findings(*self._cache.seen(), self._cache.silence, self._options.max_frame_age)
 
-    def _take(self, source: RequestSource) -> Callable[[], None] | None:
+    def _take(self, source: RequestSource) -> Callable[[], object] | None:
         """Wait for a request and give it its place in the queue; return what answers it."""
         packed = source.take(POLL_S)
         if packed is None:
@@ -124,8 +124,4 @@ class RosServer:
                 source.refuse(packed, str(error))
                 return None
             exchange.held = held.pop_all()
-
-        def answer() -> None:
-            self._core.answer(exchange, turn)
-
-        return answer
+        return partial(self._core.answer, exchange, turn)
