@@ -48,7 +48,7 @@ class Ros(Transport[RosOptions]):
         "ros": "s2a_bench.transport.ros.checks:ros",
         "middleware": "s2a_bench.transport.ros.checks:middleware",
         **{code: check for _, kind in MIDDLEWARES.loaded() for code, check in kind.checks.items()},
-        "dds-buffers": "s2a_bench.transport.ros.buffers:check",
+        "dds-buffers": "s2a_bench.transport.ros.checks:buffers",
     }
     udp_checks = ("rmem-max",)
     urls = Urls(("ros",))
@@ -102,7 +102,7 @@ class Ros(Transport[RosOptions]):
         return not loss_advice(options.kind.dds_in(os.environ))
 
     def against_loss(self, options: RosOptions) -> str:
-        from s2a_bench.transport.ros.buffers import against_loss
+        from s2a_bench.transport.ros.checks import against_loss
 
         return against_loss(options.kind.dds_in(os.environ), os.environ)
 
@@ -114,8 +114,8 @@ class Ros(Transport[RosOptions]):
 
     def ready(self, wiring: Wiring[RosOptions]) -> str:
         from s2a_bench.ros.llama import GENERATE_RESPONSE
-        from s2a_bench.transport.ros.buffers import hint
         from s2a_bench.transport.ros.camera import CAMERA
+        from s2a_bench.transport.ros.checks import hint
         from s2a_bench.transport.ros.joining import AT, place_of, remapped
 
         kind, names = wiring.options.kind, remapped(wiring)
