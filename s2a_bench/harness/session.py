@@ -56,8 +56,6 @@ INTERRUPTED = "Interrupted: the run was ended during this request"
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """The position of a request in the run."""
-
     block: int
     position: int
     warmup: bool
