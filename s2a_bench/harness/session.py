@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeAlias
 
 from s2a_bench.act.events import PlanFeed
 from s2a_bench.clock import clock_id, now_ns
@@ -50,6 +50,9 @@ from s2a_bench.types import Frame, Piece, Request, Token
 
 FATAL = (ServerDied, SourceError, UsageError, EngineError)
 """Errors after which the next request cannot succeed either."""
+
+Seen: TypeAlias = tuple[Piece, int]
+"""A piece, and its time of arrival in ns."""
 
 INTERRUPTED = "Interrupted: the run was ended during this request"
 
@@ -152,7 +155,7 @@ class Session:
     def _measure(self, place: Place, context: RequestContext) -> Measured:
         self.feed.get_ready()
         request_id = f"{self.cell.name}-{place.block}"
-        seen: list[tuple[Piece, int]] = []
+        seen: list[Seen] = []
         trace = Trace()
         error, retry_after_s = "", 0.0
         fatal: S2AError | KeyboardInterrupt | None = None
@@ -214,7 +217,7 @@ class Session:
             pass
         return trace
 
-    def _pieces(self, request: Request, trace: Trace, context: RequestContext) -> Iterator[tuple[Piece, int]]:
+    def _pieces(self, request: Request, trace: Trace, context: RequestContext) -> Iterator[Seen]:
         plan = context.plan
         if plan is not None:
             plan.requested(trace.marks[0][1])
@@ -234,13 +237,7 @@ class Session:
             plan.ended(now_ns())
 
     def _rows(
-        self,
-        place: Place,
-        request_id: str,
-        frames: Sequence[Frame],
-        trace: Trace,
-        seen: list[tuple[Piece, int]],
-        error: str,
+        self, place: Place, request_id: str, frames: Sequence[Frame], trace: Trace, seen: list[Seen], error: str
     ) -> Measured:
         facts = trace.facts
         origin = Provenance.from_dict(trace.provenance or (trace.remote.provenance if trace.remote else {}))

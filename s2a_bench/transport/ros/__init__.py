@@ -75,8 +75,8 @@ class Ros(Transport[RosOptions]):
         return replace(can, payloads=payloads, answer_kinds=(TOKENS,), accepts_state=False)
 
     def require(self, choice: Choice[RosOptions]) -> None:
-        """Raise UsageError for what a goal cannot carry, and for a stream to an external server."""
-        variant, options, mode = choice.variant, choice.options, choice.mode
+        """Raise UsageError for options of another middleware or variant, and for a stream to an external server."""
+        variant, options = choice.variant, choice.options
         domain_id(os.environ)
         if options.kind.extra:
             extras.need(options.kind.extra, options.kind.module)
@@ -86,13 +86,8 @@ class Ros(Transport[RosOptions]):
                 raise UsageError(f"`{at.option}` is {name.title()}'s: choose `middleware` {name}, or leave it out")
         if options.action and variant != ACTION:
             raise UsageError(f"`action` is spoken by ros/{ACTION}, not by ros/{variant}")
-        if options.action and mode == "stream":
+        if options.action and choice.mode == "stream":
             raise UsageError("`action`: `mode` stream needs our own server, which keeps the camera's newest frame")
-        if variant == ACTION and mode == "request" and options.payload not in {"raw", "yuyv"}:
-            raise UsageError(
-                f"`payload`: a goal carries sensor_msgs/Image, not {options.payload}; say it for this transport alone: "
-                f"ros/{ACTION}?payload=raw"
-            )
 
     def tuned(self, options: RosOptions) -> bool:
         """Return False for DDS, and processes, as they come."""
