@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import InitVar, asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 from typing import Any, TypeAlias
@@ -105,34 +105,25 @@ KEPT_FRAMES = 90
 """Frames that a later answer may name: three seconds at 30 Hz."""
 
 
+@dataclass(eq=False)
 class Session:
-    """The client side of one cell."""
+    """The client side of one cell, with an open client."""
 
-    def __init__(
-        self,
-        cell: Pipeline,
-        client: Client,
-        feed: Feed,
-        request: RequestPlan,
-        recorder: RunRecorder | None = None,
-        sampler: ResourceSampler | None = None,
-        origin: Provenance = UNKNOWN_ORIGIN,
-        clocks: dict[str, Any] | None = None,
-    ) -> None:
-        """Measure ``cell`` with an open client. ``origin`` is replaced by the provenance that an answer carries.
+    cell: Pipeline
+    client: Client
+    feed: Feed
+    request: RequestPlan
+    recorder: RunRecorder | None = None
+    sampler: ResourceSampler = field(default_factory=lambda: ResourceSampler({}, 1))
+    origin: Provenance = UNKNOWN_ORIGIN
+    """It is replaced by the provenance that an answer carries."""
+    clocks: InitVar[dict[str, Any] | None] = None
+    """What sessions share of other hosts' clocks; see `Surroundings.clock` for none."""
 
-        ``clocks`` is what sessions share of other hosts' clocks; see `Surroundings.clock` for none.
-        """
-        self.origin = origin
-        self.cell = cell
-        self.client = client
-        self.feed = feed
-        self.request = request
-        self._recorder = recorder
-        self._sampler = sampler or ResourceSampler({}, 1)
-        self._frames: dict[int, StreamedFrame] = {}
-        others = (each.clock(self._exchange, clocks) for each in request.surroundings)
+    def __post_init__(self, clocks: dict[str, Any] | None) -> None:
+        others = (each.clock(self._exchange, clocks) for each in self.request.surroundings)
         self._clock = next(filter(None, others), None)
+        self._frames: dict[int, StreamedFrame] = {}
         self._pictures = 0
         """Of the last request."""
         self._absent, self.answered = 0, False
@@ -163,7 +154,7 @@ class Session:
         if state is None:  # another one in each block, float32
             state = tuple(swing(1, plan.state, place.block)[0].tolist()) if plan.state else ()
         started_ns = now_ns()
-        self._sampler.edge()
+        self.sampler.edge()
         frames = self.feed.capture(trace)
         sent = frames if self.origin.pictures != NOT_SENT else ()
         request = Request(request_id, plan.prompt, sent, plan.max_pieces, plan.grammar, plan.seed, state=state)
@@ -175,19 +166,19 @@ class Session:
             fatal, retry_after_s = self._failed(failure)
         except KeyboardInterrupt as interrupt:
             error, fatal = INTERRUPTED, interrupt
-        self._sampler.edge()
+        self.sampler.edge()
         self._pictures = len(frames)
         texts = iter(struck_pieces([piece.text for piece, _ in seen if isinstance(piece, Token)]))
         seen = [(replace(piece, text=next(texts)) if isinstance(piece, Token) else piece, at) for piece, at in seen]
-        trace.facts.update(self._sampler.window(started_ns, now_ns()))
+        trace.facts.update(self.sampler.window(started_ns, now_ns()))
         if not error and not seen:
             error = "RequestFailed: the answer was empty"
-        if self._recorder is not None:
+        if self.recorder is not None:
             if plan.mode == "request":  # in stream mode the camera records its frames
                 for frame in frames:
-                    self._recorder.frame(frame)
-            self._recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
-            self._recorder.flush()
+                    self.recorder.frame(frame)
+            self.recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
+            self.recorder.flush()
         rows = self._rows(place, request_id, frames, trace, seen, error)
         if not rows.sample.error:
             self._absent, self.answered = 0, True
