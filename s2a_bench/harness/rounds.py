@@ -33,7 +33,7 @@ from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.schema import Table
 from s2a_bench.trace import Trace, mark_cost_ns
-from s2a_bench.transport import Client
+from s2a_bench.transport import Client, Wiring
 from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.transport.surroundings import Around
 from s2a_bench.types import Request
@@ -65,6 +65,10 @@ class RunningLaunch:
     """Warnings of the run besides those about its requests."""
     sampler: ResourceSampler
     recorder: RunRecorder | None
+
+    def wiring(self, cell: Pipeline) -> Wiring[Any]:
+        """Return the wiring of further clients of a cell."""
+        return self.servers.wiring(cell)
 
     def keep(self, session: Session, measured: Measured, client: int = 0, clients: int = 1) -> None:
         """Write a request of one of the ``clients`` of a cell, and raise what makes the next one useless.

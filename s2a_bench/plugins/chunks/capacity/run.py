@@ -224,7 +224,7 @@ class _Robots(ExitStack):
         self.name = cell_name(session, mode)
         plan = self._plan = FleetPlan(
             session.cell.name,
-            launch.servers.wiring(session.cell).to_json(),
+            launch.wiring(session.cell).to_json(),
             launch.plan.feed,
             launch.plan.request,
             launch.plan.tuned,
