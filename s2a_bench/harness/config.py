@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, TypeAlias
 
 from pydantic import create_model
 
@@ -105,6 +105,13 @@ if TYPE_CHECKING:
 else:  # with the options of everything that may surround a run
     SURROUNDING = dict.fromkeys(each.options for _, each in SURROUNDINGS.loaded())
     Surrounded = create_model("Surrounded", __base__=(*reversed(SURROUNDING), SentConfig))
+
+
+GROUPED: Final = (
+    *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
+    *("warmup", "timeout_s", "wait_for_server", "deadline_s", "sample_resources_hz", "nonce"),
+)
+"""The flags of requests in experiments of which these are a part, a group of options."""
 
 
 class RequestsConfig(Surrounded):
