@@ -51,7 +51,7 @@ def traces(service: str, mode: str, robots: int, seconds: float, seed: int) -> l
 
 
 def _fleet(mode: str, robots: int, seconds: float, times_ns: Iterator[int], seed: int) -> list[RobotTrace]:
-    made = CONFIG.but(modes=(mode,)).made[mode]
+    made = CONFIG.but(modes=(mode,)).control.modes[mode]
     fleet = VirtualFleet(CONFIG.setting, round(seconds * 1e9) + CONFIG.settle_ns, made)
     times = (ServiceTime(UNKNOWN, each) for each in times_ns)
     return simulate(fleet, robots, times, np.random.default_rng([seed, 1]), 1, (1.0,))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,17 +13,11 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 from pydantic import BeforeValidator
 
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.config import LiveRequests
-from s2a_bench.inference import STAND_IN, EngineConfig
-from s2a_bench.options import Names, Options, group, option
-from s2a_bench.plugins.chunks.modes import MODES, ControlSetting, Mode, Rounding, modes
+from s2a_bench.inference import EngineConfig
+from s2a_bench.options import Names, group, option
+from s2a_bench.plugins.chunks.options import SHOWN, ControlOptions, LoopRequests, acting_modes
 from s2a_bench.transport import ACTIONS, TOKENS
 
-SHOWN: Final = (
-    *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
-    *("prompt", "max_tokens", "warmup", "timeout_s", "wait_for_server", "deadline_s", "sample_resources_hz", "nonce"),
-)
-"""The options of requests that are flags of `capacity`."""
 MOST_ROBOTS: Final = 10_000
 MOST_CONNECTIONS: Final = 1_000
 """Robots of a measured run, each with a connection and a thread."""
@@ -69,31 +63,23 @@ class Limit:
         return f"{self.column.removesuffix('_ns').replace('_', ' ')} of at most {self.value / 1e6:g} ms"
 
 
-class CapacityRequests(LiveRequests):
+class CapacityRequests(LoopRequests):
     engine: EngineConfig = group(EngineConfig, only=set(EngineConfig.model_fields) - {"answer", "horizon", "latency"})
     sample_resources_hz: float = option(
         2.0, "readings a second of CPU, memory, GPU and power beside the run; 0: none", flag="sample-resources", ge=0
     )
 
 
-class CapacityConfig(Options):
+class CapacityConfig(ControlOptions):
     """A fleet of robots, and what it may not exceed."""
 
     PANEL: ClassVar[str] = "Fleet"
 
-    modes: Names = option(
-        ("queue?trigger=8",),
-        f"{', '.join(MODES)}, each with ?parameter=value&...; several with commas",
-        first=True,
-        names=lambda: MODES,
-    )
+    modes: Names = acting_modes(("queue?trigger=8",))
     robots: Annotated[str, BeforeValidator(str, json_schema_input_type=str | int)] = option(
         "1..64", "FROM..TO is searched, doubling, then by bisection; a number or a list is tried", first=True
     )
     limit: str = option("stalled=1%", f"{LIMITS}; empty text: none, every number of robots is tried", first=True)
-    control_hz: float = option(50.0, "control ticks a second", ge=1e-3, le=10_000, allow_inf_nan=False, first=True)
-    horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096, first=True)
-    rounding: Rounding = option("floor", "d is the floor or ceil of latency over control tick")
     seconds: float = option(10.0, "the shortest time for which a fleet acts, and the time between looks", gt=0, le=3600)
     looks: int = option(4, "the most looks at a fleet before it counts as undecided", ge=1, le=100)
     settle_s: float | None = option(
@@ -129,8 +115,7 @@ class CapacityConfig(Options):
     batch: Path | None = option(
         None, "--predict: CSV of a batching server, columns batch and latency_ms, that of so many requests together"
     )
-    seed: int = option(0, "seed of everything that is drawn", ge=0)
-    requests: CapacityRequests = group(CapacityRequests, only=SHOWN, first=("transports", "url"))
+    requests: CapacityRequests = group(CapacityRequests, only=(*SHOWN, "max_tokens"), first=("transports", "url"))
 
     @property
     def virtual(self) -> bool:
@@ -185,21 +170,17 @@ class CapacityConfig(Options):
 
     def beyond_alone(self, mode: str) -> bool:
         """Return True if only stalls beyond those of one robot alone count, as in a mode that blocks."""
-        return bool(mode) and self.made[mode].blocks and self.limited is not None and self.limited.column == "stalled"
-
-    @property
-    def setting(self) -> ControlSetting:
-        return ControlSetting(round(1e9 / self.control_hz), self.horizon, self.rounding)
+        return (
+            bool(mode)
+            and self.control.modes[mode].blocks
+            and self.limited is not None
+            and self.limited.column == "stalled"
+        )
 
     @property
     def settle_ns(self) -> int:
         settle_s = self.settle_s if self.settle_s is not None else 0.0 if self.episodes_s else SETTLE_S
         return round(settle_s * 1e9)
-
-    @cached_property
-    def made(self) -> dict[str, Mode]:
-        """Mode by its canonical name."""
-        return modes(self.modes, self.setting)
 
     @cached_property
     def load(self) -> Literal["chunks", "plans", "closed"]:
@@ -218,17 +199,13 @@ class CapacityConfig(Options):
         return ACTIONS if able and self.plan_every_s is None else TOKENS
 
     @cached_property
-    def live_requests(self) -> LiveRequests:
+    def live_requests(self) -> LoopRequests:
         """The requests of a measured run; raises UsageError naming the field."""
-        engine: dict[str, Any] = {"answer": self._answer, "horizon": self.horizon}
-        if self.latency:
-            engine |= {"latency": self.latency} | ({} if self.requests.engine.model_fields_set else {"name": STAND_IN})
-        return self.requests.but(engine=self.requests.engine.but(**engine), seed=self.seed, requests=1)
+        return self.requests.of_robots(self._answer, self.latency, self)
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
-        if not self.modes:
-            raise UsageError("`modes`: name at least one")
+        super().check()
         most = MOST_ROBOTS if self.predict else MOST_CONNECTIONS
         if self.numbers[-1] > most:
             raise UsageError(f"`robots`: {self.numbers[-1]} are more than {most}")
@@ -236,7 +213,6 @@ class CapacityConfig(Options):
             raise UsageError(f"`episodes`: {self.episodes_s:g} s need a control clock, and two of its ticks")
         if self.episodes_s and self.settle_ns >= self.episodes_s * 1e9:
             raise UsageError(f"`settle`: {self.settle_s:g} s leave nothing of an episode of {self.episodes_s:g} s")
-        _ = self.made
         if self.predict:
             given = {"processes", "ray", "latency"} & self.model_fields_set
             if alone := next(iter((*sorted(given), *self.requests.given())), ""):
@@ -250,7 +226,7 @@ class CapacityConfig(Options):
             if name in self.model_fields_set:
                 raise UsageError(f"`{name}` needs `predict`")
         _ = self.live_requests
-        if several := [name for name, each in self.made.items() if each.several]:
+        if several := [name for name, each in self.control.modes.items() if each.several]:
             raise UsageError(
                 f"`modes`: {several[0]} has several requests under way, a robot one connection; `predict` it instead"
             )
@@ -275,17 +251,10 @@ class CapacityConfig(Options):
         if limit.column == "stalled" and self.load == "closed":
             raise UsageError("`limit`: a client without a clock never stalls; take latency_p99=300ms or ttft_p99=300ms")
 
-    def risks(self) -> Iterator[tuple[str, str, str]]:
-        yield from super().risks()
-        if not self.predict:
-            yield from self.live_requests.risks()
-
     def to_manifest(self) -> dict[str, Any]:
         return {
-            **self.model_dump(mode="json", exclude={"requests"}),
-            "modes": list(self.made),
+            **super().to_manifest(),
             "load": self.load,
             **({"plan_every_s": self.plan_ns / 1e9} if self.load == "plans" else {}),
-            "period_ns": self.setting.period_ns,
             "settle_ns": self.settle_ns,
         }

@@ -122,7 +122,7 @@ def run_predicted(config: CapacityConfig, output: Path, progress: Progress) -> P
     with RunWriter.create(output, "capacity", manifest, (FLEETS, KNEES)) as writer:
         progress.opened(writer.path)
         progress.say(f"service times: {service.about}")
-        for mode in config.made if config.load == "chunks" else ("",):
+        for mode in config.control.modes if config.load == "chunks" else ("",):
             name = f"{service.source.name}, {mode}" if mode else service.source.name
             prediction = Prediction(config, name, mode, service, slower, progress)
             knee = prediction.run(config.numbers, bisects=config.searches)
@@ -166,7 +166,7 @@ class Prediction:
         return KneeRow(self.cell, "predicted", text, median.robots, median.robots, median.high, None)
 
     def _attempt(self, judge: Judge, seed: int, robots: int) -> Tried:
-        config, mode = self.config, self.config.made.get(self.mode)
+        config, mode = self.config, self.config.control.modes.get(self.mode)
         closed = mode is None and config.load == "closed"
         fleet = VirtualFleet(
             config.setting,

@@ -98,7 +98,7 @@ def _drive(config: CapacityConfig, ray: Any, launch: RunningLaunch) -> None:
         launch.progress.stage(f"warming up: {session.cell.name}")
         for block in range(max(1, launch.plan.blocks.warmup)):
             launch.keep(session, session.measure(Place(block, position, warmup=position < count)))
-    modes = [*config.made] if config.load == "chunks" else [""]
+    modes = [*config.control.modes] if config.load == "chunks" else [""]
     launch.progress.expect(count * len(modes) * config.most_fleets)
     for session, instant in zip_longest(launch.sessions[:count], launch.sessions[count:]):
         service: Service | None = None
@@ -231,7 +231,7 @@ class _Robots(ExitStack):
             config.setting,
             mode,
             config.seed,
-            first=STRIDE * STRIDE * [*config.made].index(mode) if mode else 0,
+            first=STRIDE * STRIDE * [*config.control.modes].index(mode) if mode else 0,
             every_ns=config.plan_ns if config.load == "plans" else 0,
             think_ns=round(config.think_s * 1e9),
             origin=session.origin,
@@ -284,7 +284,7 @@ class _Robots(ExitStack):
         config, plan = self._config, self._plan
         cycle_ns = plan.every_ns or plan.think_ns
         if plan.mode:
-            cycle_ns = config.made[plan.mode].execution_horizon(config.setting) * config.setting.period_ns
+            cycle_ns = config.control.modes[plan.mode].execution_horizon(config.setting) * config.setting.period_ns
         phases_ns = generator(config.seed, "capacity phases").integers(0, cycle_ns + 1, number)
         return dict(enumerate(phases_ns.tolist()))
 

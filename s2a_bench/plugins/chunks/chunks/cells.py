@@ -87,7 +87,7 @@ def draw(config: ChunksConfig, source: Source) -> LatencyDraw:
 
 def cells(config: ChunksConfig, drawn: LatencyDraw) -> Iterator[ChunkCell]:
     """Yield the cells of one source; a live one has no judged latencies yet."""
-    for name, given in config.made.items():
+    for name, given in config.control.modes.items():
         yield ChunkCell(given, name, GIVEN, drawn)
     mode = config.triggered
     if mode is None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final
+from typing import Annotated, Final
 
 from pydantic import BeforeValidator
 
@@ -14,19 +14,12 @@ from s2a_bench.act import ROBOTS, ActionKind, kind
 from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.config import LiveRequests
-from s2a_bench.inference import STAND_IN
-from s2a_bench.options import Names, Options, group, one_of, option
+from s2a_bench.options import Names, group, one_of, option
 from s2a_bench.plugins.chunks.latencies import Source, sources, split
-from s2a_bench.plugins.chunks.modes import COMPARED, MODES, ControlSetting, Mode, Rounding, modes
+from s2a_bench.plugins.chunks.modes import ControlSetting, Mode
+from s2a_bench.plugins.chunks.options import SHOWN, ControlOptions, LoopRequests
 from s2a_bench.policy.conformal import GUARANTEE, Guarantee, fewest
-
-SHOWN: Final = (
-    *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
-    *("prompt", "warmup", "timeout_s", "wait_for_server", "deadline_s", "sample_resources_hz", "nonce"),
-)
-"""The options that are flags of `chunks`."""
-
+from s2a_bench.transport import ACTIONS
 
 RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
 PROMISING: Final = ("calibrated", "tracked")
@@ -41,17 +34,9 @@ Sources = Annotated[tuple[str, ...], BeforeValidator(split, json_schema_input_ty
 """Sources of latencies; as text they are separated by commas, and so are the parameters of a family."""
 
 
-class ChunksConfig(Options):
+class ChunksConfig(ControlOptions):
     """Modes and rules under latencies."""
 
-    PANEL: ClassVar[str] = "Control loop"
-
-    modes: Names = option(
-        COMPARED,
-        f"{', '.join(MODES)}, each with ?parameter=value&...; several with commas",
-        first=True,
-        names=lambda: MODES,
-    )
     latency: Sources = option(
         (EXAMPLE,),
         "observation to usable chunk (with streamed: to its first action): ms, FAMILY:mean_ms=...,key=value, FILE.csv, "
@@ -63,9 +48,7 @@ class ChunksConfig(Options):
     slowest: float = option(
         1.0, "so many times slower calibrated and oracle may make actions where no trigger is enough", ge=1, le=1000
     )
-    control_hz: float = option(50.0, "control ticks a second", ge=1e-3, le=1e6, allow_inf_nan=False, first=True)
-    horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096, first=True)
-    rounding: Rounding = option("floor", "d is the floor or ceil of latency over control tick")
+    control_hz: float = option(50.0, "control ticks a second", ge=1e-3, le=1e6, allow_inf_nan=False)
     rules: Annotated[Names, one_of(lambda: RULES)] = option(
         RULES,
         "further rows for the first queue, its trigger chosen by each; empty text for none "
@@ -94,29 +77,22 @@ class ChunksConfig(Options):
     export_delays: Path | None = option(
         None, "also write each request's times, L and d as CSV, for other simulators; of one source of latencies"
     )
-    seed: int = option(0, "seed of everything that is drawn", ge=0)
-
     live: bool = option(
         False,
         "act in real time on what a server answers; with `engine` echo, `latency` is how long its answers take",
         first=True,
     )
     seconds: float = option(20.0, "--live: how long each mode acts", gt=0, le=86_400)
-    requests: LiveRequests = group(LiveRequests, only=SHOWN, about="--live: ", first=("transports",))
+    requests: LoopRequests = group(LoopRequests, only=SHOWN, about="--live: ", first=("transports",))
 
     @property
     def virtual(self) -> bool:
         return not self.live
 
     @cached_property
-    def live_requests(self) -> LiveRequests:
+    def live_requests(self) -> LoopRequests:
         """The requests of a live control loop; raises UsageError naming the field."""
-        engine_settings: dict[str, Any] = {"answer": "actions", "horizon": self.horizon}
-        if self.known:
-            engine_settings |= {"latency": self.known} | (
-                {"name": STAND_IN} if not self.requests.engine.model_fields_set else {}
-            )
-        return self.requests.but(engine=self.requests.engine.but(**engine_settings), seed=self.seed, requests=1)
+        return self.requests.of_robots(ACTIONS, self.known, self)
 
     @property
     def known(self) -> str:
@@ -128,11 +104,7 @@ class ChunksConfig(Options):
 
     @property
     def setting(self) -> ControlSetting:
-        return ControlSetting(round(1e9 / self.control_hz), self.horizon, self.rounding).slowed(self.slow_down)
-
-    @cached_property
-    def made(self) -> dict[str, Mode]:
-        return modes(self.modes, self.setting)
+        return super().setting.slowed(self.slow_down)
 
     @cached_property
     def sources(self) -> tuple[Source, ...]:
@@ -180,7 +152,7 @@ class ChunksConfig(Options):
 
     @cached_property
     def triggered(self) -> Mode | None:
-        return next((each for each in self.made.values() if each.triggered), None)
+        return next((each for each in self.control.modes.values() if each.triggered), None)
 
     @property
     def with_rules(self) -> bool:
@@ -188,9 +160,9 @@ class ChunksConfig(Options):
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
-        for field in ("modes", "latency"):
-            if not getattr(self, field):
-                raise UsageError(f"`{field}`: name at least one")
+        super().check()
+        if not self.latency:
+            raise UsageError("`latency`: name at least one")
         if self.live:
             self._check_live()
             return
@@ -266,8 +238,3 @@ class ChunksConfig(Options):
         yield from super().risks()
         if self.robot and (risk := kind(self.robot, ActionKind).risk):
             yield "robot", risk, self.robot
-
-    def to_manifest(self) -> dict[str, Any]:
-        file = None if self.export_delays is None else str(self.export_delays)
-        more = {"modes": list(self.made), "period_ns": self.setting.period_ns, "export_delays": file}
-        return {**self.model_dump(exclude={"requests"}), **more}

@@ -132,14 +132,14 @@ def write(config: ChunksConfig, writer: RunWriter, live: LiveResult) -> None:
 def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
     """Act and return the run folder; raises S2AError."""
     plan = resolve(config.live_requests.answered(progress.say))
-    several = any(each.several for each in config.made.values())
+    several = any(each.several for each in config.control.modes.values())
     settings = {**plan.manifest["configuration"], **config.to_manifest()}
     plan = plan.with_manifest(configuration=settings, cadence=f"a control loop at {config.control_hz:g} Hz")
     task = Task("chunks", drive=partial(_drive, config), clients=CLIENTS if several else 1)
     folder = run_requests(task, plan, output, progress)
     if config.export_delays is not None:
         source = next(measured(folder))
-        rows = delay_rows(source, np.empty(0, np.int64), next(iter(config.made.values())), config.setting)
+        rows = delay_rows(source, np.empty(0, np.int64), next(iter(config.control.modes.values())), config.setting)
         write_delays(config.export_delays, rows)
     return folder
 

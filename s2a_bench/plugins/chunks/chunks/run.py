@@ -79,7 +79,7 @@ def mean_rows(config: ChunksConfig, drawn: LatencyDraw, follows: TrackingPlant |
     shape = judged / max(float(judged.mean()), 1.0)
     for mean_ns in np.linspace(0, setting.horizon * setting.period_ns, MEANS_TRIED):
         latency_ns = np.rint(shape * mean_ns).astype(np.int64)
-        for name, mode in config.made.items():
+        for name, mode in config.control.modes.items():
             cycles, ticks = mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)
             share = measure(mode, cycles, ticks).stall_share
             smooth = follows.measure(mode, cycles, ticks) if follows else {}

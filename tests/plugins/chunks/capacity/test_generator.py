@@ -19,7 +19,7 @@ import pytest
 import s2a_bench as s2a
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import ServerDied
-from s2a_bench.harness.config import LiveRequests, RequestsConfig
+from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.session import Measured, Place, RequestContext, Session
 from s2a_bench.plugins.chunks.capacity import generator
@@ -29,6 +29,7 @@ from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, KNEES, REQUESTS, ROBOTS
 from s2a_bench.plugins.chunks.capacity.run import twin
 from s2a_bench.plugins.chunks.modes import ControlSetting
+from s2a_bench.plugins.chunks.options import LoopRequests
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.types import Token
 from tests.cli.test_provenance import serving
@@ -144,7 +145,7 @@ def test_a_fleet_acts_on_its_own_clock_and_reports_on_that_of_the_run(monkeypatc
     ],
 )
 def test_the_twin_is_an_instant_server_of_ours_on_the_same_wire(written: str, options: Any, same: str) -> None:
-    cell = LiveRequests(transports=written, options=options).pipelines[0]
+    cell = LoopRequests(transports=written, options=options).pipelines[0]
     found = twin(cell)
     assert found.name == f"{cell.name}, instant"
     assert "/".join(filter(None, (found.transport.name, found.variant))) == same
