@@ -27,7 +27,7 @@ def main() -> None:
     parser.add_argument("--requests", type=int, default=300)
     arguments = parser.parse_args()
     cell = one_pipeline(arguments.transport)
-    plan = resolve(RequestsConfig(transports=arguments.transport, max_tokens=4))
+    plan = resolve(RequestsConfig(transports=arguments.transport, max_tokens=4), print)
     e2e_ms: dict[bool, list[float]] = {True: [], False: []}
     with ExitStack() as stack:
         sessions = {pixels: _session(cell, plan, stack, pixels=pixels) for pixels in e2e_ms}

@@ -11,16 +11,16 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from html import escape
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 from s2a_bench.errors import S2AError, UsageError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, experiment_of, write_shown
 from s2a_bench.machine import tuning
-from s2a_bench.options import Options, placed
+from s2a_bench.options import placed
 from s2a_bench.progress import NullProgress, Progress
 from s2a_bench.store import run as store
 from s2a_bench.store.schema import PROVENANCE
+from s2a_bench.text import none_of
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
@@ -166,12 +166,21 @@ def run(
 ) -> Run:
     """Run an experiment by its name; ``options`` are its fields, and those of its groups.
 
+    An experiment with modes also takes ``mode``, the name of one; without it, it runs in its first.
+
     During the run this process keeps freed memory and limits threads, as the command line does, unless ``tune``
     is False; runs with and without are not compared. Raises S2AError for what the caller can fix.
     """
     experiment: Experiment = EXPERIMENTS[name]
-    config_class: type[Options] = resolve_name(experiment.config)
-    config = config_class(**placed(config_class, options))
+    mode = experiment.every_mode[0]
+    if experiment.modes:
+        modes = {each.name: each for each in experiment.every_mode}
+        written = options.pop("mode", mode.name)
+        if written not in modes:
+            raise UsageError(f"`mode`: {none_of(written, modes)}")
+        mode = modes[written]
+        experiment.refuse_foreign(mode, options)
+    config = mode.options(**placed(mode.options, options))
     with tuning.allowed(tune):
         return Run(experiment.run_with(config, Path(output), progress or NullProgress()))
 

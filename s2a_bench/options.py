@@ -30,6 +30,8 @@ class Options(BaseModel):
 
     PANEL: ClassVar[str] = ""
     """The heading in ``--help`` of the options without a panel that this class declares."""
+    virtual: ClassVar[bool] = False
+    """Whether a run computes in virtual time, so that several may share a machine; measuring runs may not."""
 
     def __init__(self, **given: Any) -> None:
         """Raise UsageError, naming the field, for an invalid value."""
@@ -43,11 +45,6 @@ class Options(BaseModel):
 
     def check(self) -> None:
         """Raise UsageError, naming the fields, for values that contradict each other."""
-
-    @property
-    def virtual(self) -> bool:
-        """Whether a run computes in virtual time, so that several may share a machine; measuring runs may not."""
-        return False
 
     def but(self: Made, **changes: Any) -> Made:  # noqa: PYI019 - typing has Self since Python 3.11
         """Return a copy with some fields changed, checked like a new one."""

@@ -1,8 +1,8 @@
 """Write s2a_bench/__init__.pyi, the types of the library's functions: `.venv/bin/python tools/library_types.py`.
 
 A keyword of a function is an option of its command: by the field's name and, where that is another, by the flag's. Its
-type is what the field takes; a validator that reads more says so (`json_schema_input_type`). Keywords that commands
-share stand once, in a class named after them.
+type is what the field takes; a validator that reads more says so (`json_schema_input_type`). A function has a signature
+a mode. Keywords that several share stand once, in a class.
 """
 
 from __future__ import annotations
@@ -12,9 +12,8 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
-from pkgutil import resolve_name
 from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeAlias, Union, get_args, get_origin
 
 from pydantic import BeforeValidator
 from pydantic.fields import FieldInfo
@@ -27,16 +26,18 @@ from s2a_bench.options import Options, group_of
 STUB = Path(__file__).parent.parent / "s2a_bench/__init__.pyi"
 NOT_GIVEN = {"name"}
 """What `library.run` calls the experiment: an engine's name has its flag's."""
+Mode: TypeAlias = tuple[str, str]
+"""A command, and the name of one of its modes; "" for a command without."""
 WIDTH = 121
 """Longest line, its end included: as ruff formats the file."""
 TOGETHER = 8
-"""So many keywords that the same commands have stand once, in a class named after these commands."""
+"""So many keywords that the same modes have stand once, in a class."""
 HEAD = '''# ruff: noqa: PYI021 - editors show what a function does
 """The library's names, and the keywords of its functions. Written by tools/library_types.py."""
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal, TypeAlias, TypedDict, TypeVar
+from typing import Literal, TypeAlias, TypedDict, TypeVar, overload
 
 from typing_extensions import Unpack
 
@@ -97,32 +98,45 @@ def _field(options: type[Options], path: Sequence[str]) -> FieldInfo:
 def stub() -> str:
     """Return the text of the file."""
     commands = sorted(name for name, each in EXPERIMENTS.loaded() if each.config.startswith("s2a_bench."))
-    taken = {name: dict(keywords(resolve_name(EXPERIMENTS[name].config))).items() for name in commands}
-    sets: dict[tuple[str, ...], list[tuple[str, str]]] = defaultdict(list)
+    taken = {
+        (name, mode.name): dict(keywords(mode.options)).items()
+        for name in commands
+        for mode in EXPERIMENTS[name].every_mode
+    }
+    sets: dict[tuple[Mode, ...], list[tuple[str, str]]] = defaultdict(list)
     for keyword in dict.fromkeys(chain(*taken.values())):
-        sets[tuple(name for name in commands if keyword in taken[name])].append(keyword)
-    shared = {names: found for names, found in sets.items() if len(names) > 1 and len(found) >= TOGETHER}
-    parts = [HEAD, *(_class(names, ["TypedDict"], found) for names, found in shared.items())]
-    for name in commands:
-        bases = ["_Run", *(_named(names) for names in shared if name in names)]
-        parts.append(_class([name], bases, taken[name] - set(chain(*shared.values()))))
-    return "\n".join([*parts, *map(_function, commands)])
+        sets[tuple(each for each in taken if keyword in taken[each])].append(keyword)
+    shared = {modes: found for modes, found in sets.items() if len(modes) > 1 and len(found) >= TOGETHER}
+    bases = {modes: f"_Shared{number}" for number, modes in enumerate(shared, 1)}
+    parts = [HEAD, *(_class(bases[modes], ["TypedDict"], found) for modes, found in shared.items())]
+    for each, found in taken.items():
+        of_mode = [bases[modes] for modes in shared if each in modes]
+        parts.append(_class(_named(*each), ["_Run", *of_mode], found - set(chain(*shared.values()))))
+    return "\n".join([*parts, *map(_functions, commands)])
 
 
-def _named(commands: Iterable[str]) -> str:
-    return f"_{''.join(map(str.title, commands))}"
+def _named(command: str, mode: str) -> str:
+    return f"_{command.title()}{mode.title().replace('-', '')}"
 
 
-def _class(commands: Iterable[str], bases: Iterable[str], found: Iterable[tuple[str, str]]) -> str:
-    fields = "".join(f"    {name}: {kind}\n" for name, kind in sorted(found))
+def _class(name: str, bases: Iterable[str], found: Iterable[tuple[str, str]]) -> str:
+    fields = "".join(f"    {name}: {kind}\n" for name, kind in sorted(found)) or "    pass\n"
     inside = f"{', '.join(bases)}, total=False"
-    head = f"class {_named(commands)}({inside}):\n"
-    return (head if len(head) <= WIDTH else f"class {_named(commands)}(\n    {inside}\n):\n") + fields
+    head = f"class {name}({inside}):\n"
+    return (head if len(head) <= WIDTH else f"class {name}(\n    {inside}\n):\n") + fields
 
 
-def _function(command: str) -> str:
-    about = EXPERIMENTS[command].about
-    return f'def {command}(**options: Unpack[{_named([command])}]) -> Run:\n    """{about}"""\n'
+def _functions(command: str) -> str:
+    """Return the signature of a command's function, one a mode: the first without ``mode``, too."""
+    experiment, about = EXPERIMENTS[command], f'    """{EXPERIMENTS[command].about}"""\n'
+    if not experiment.modes:
+        return f"def {command}(**options: Unpack[{_named(command, '')}]) -> Run:\n{about}"
+    signatures = []
+    for place, mode in enumerate(experiment.every_mode):
+        written = f'mode: Literal["{mode.name}"]{"" if place else " = ..."}'
+        options = f"**options: Unpack[{_named(command, mode.name)}]"
+        signatures.append(f"@overload\ndef {command}(*, {written}, {options}) -> Run:\n{about}")
+    return "".join(signatures)
 
 
 if __name__ == "__main__":

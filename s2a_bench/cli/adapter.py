@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,6 +18,7 @@ from s2a_bench.errors import UsageError
 if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
+    from s2a_bench.experiments import Experiment, RunMode
     from s2a_bench.options import Options
 
 FIELD = re.compile(r"`([a-z][a-z0-9_]*)`")
@@ -75,13 +76,61 @@ class Flag:
 
     @property
     def key(self) -> str:
-        return "__".join(self.path).replace("-", "_")
+        return self.name.replace("-", "_")
 
 
-def flags_of(options: type[Options]) -> Iterator[Flag]:
+@dataclass(frozen=True, slots=True)
+class OneOf:
+    """The options of an experiment with modes: each flag once, and those that pick a mode."""
+
+    experiment: Experiment
+
+    def flags(self) -> Iterator[Flag]:
+        """Yield the flags; the headings of those that not every mode has say which flags they go with."""
+        modes = self.experiment.every_mode
+        abouts = (pair for mode in modes for pair in mode.flags.items() if pair[1])
+        for flag, about in abouts:
+            yield Flag(flag.replace("_", "-"), (flag,), bool, about, panel="Modes", first=True)
+        found: dict[str, dict[RunMode, Flag]] = {}
+        for mode in modes:
+            for each in distinct([*flags_of(mode.options)]):
+                found.setdefault(each.name, {})[mode] = each
+        for of_mode in found.values():
+            first = next(iter(of_mode.values()))
+            panel = f"{first.panel or 'Options'}{_with(modes, of_mode)}"
+            about = _with_defaults({mode.name: each.about for mode, each in of_mode.items()})
+            yield replace(first, panel=panel, about=about, needed=False)
+
+    def build(self, given: Mapping[str, Any]) -> Options:
+        """Build the configuration of the mode that the flags pick; raises UsageError for options of another."""
+        modes = self.experiment.every_mode
+        picking = {flag for mode in modes for flag in mode.flags if given.get(flag)}
+        mode = next((each for each in modes if picking == {*each.flags}), None)
+        if mode is None:
+            raise UsageError(f"{' and '.join(f'`{flag}`' for flag in sorted(picking))} exclude each other")
+        names = [flag.key for flag in self.flags() if given.get(flag.key) is not None]
+        self.experiment.refuse_foreign(mode, names)
+        return build(mode.options, given)
+
+
+def _with(modes: Sequence[RunMode], owners: Collection[RunMode]) -> str:
+    """Return what a heading adds about the flags of the modes that have its options."""
+    others = [mode for mode in modes if mode not in owners]
+    if not others:
+        return ""
+    of, word = (others, "not with") if modes[0] in owners else ([*owners], "with")
+    common = [f"--{flag}" for flag in of[0].flags if all(flag in mode.flags for mode in of)]
+    single = dict.fromkeys(f"--{flag}" for mode in of for flag in mode.flags)
+    return f" ({word} {' '.join(common) or ' or '.join(single)})".replace("_", "-")
+
+
+def flags_of(options: type[Options] | OneOf) -> Iterator[Flag]:
     """Yield the flags of a configuration in the order of its fields, groups included."""
     from s2a_bench.options import completions, extra_of, group_of, help_place
 
+    if isinstance(options, OneOf):
+        yield from options.flags()
+        return
     for name, field in options.model_fields.items():
         extra = extra_of(field)
         group = group_of(field)
@@ -99,7 +148,7 @@ def flags_of(options: type[Options]) -> Iterator[Flag]:
             yield replace(flag, panel=panel, first=first, names=completions(field))
 
 
-def command(function: Callable[..., None], *options: type[Options], about: str = "") -> Callable[..., None]:
+def command(function: Callable[..., None], *options: type[Options] | OneOf, about: str = "") -> Callable[..., None]:
     """Return a function for typer that builds every class of ``options`` from its flags and calls ``function``.
 
     ``function`` receives one configuration a class, in order. Its keyword-only parameters annotated for typer are
@@ -145,57 +194,51 @@ def _completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]
 
 
 def distinct(flags: Sequence[Flag], taken: Iterable[str] = ()) -> list[Flag]:
-    """Return the flags whose names are not ``taken``, one for each name.
-
-    Of several it is that in the fewest groups, the first. It sets all of them that are in groups beside its own.
-    """
+    """Return the flags whose names are not ``taken``, one for each name."""
     names = {name.strip("_").replace("_", "-") for name in taken}
-    chosen = _owners(flags)
-    typed = [flag for flag in flags if flag.name not in names and chosen[flag.name] is flag]
-    return [_shared([each for each in flags if each.name == flag.name and _same(each, flag)]) for flag in typed]
+    return [_shared(same) for same in _by_name(flags) if same[0].name not in names]
 
 
-def _owners(flags: Iterable[Flag]) -> dict[str, Flag]:
-    """Return, by name, the flag that is typed: that in the fewest groups, the first of several."""
-    return {flag.name: flag for flag in sorted(flags, key=lambda flag: len(flag.path))[::-1]}
-
-
-def _same(flag: Flag, other: Flag) -> bool:
+def _by_name(flags: Sequence[Flag]) -> Iterator[list[Flag]]:
+    """Yield for each name the flags that it sets: the first in the fewest groups, and those in groups beside it."""
     from s2a_bench.options import beside
 
-    return flag.path == other.path or beside(flag.path, other.path)
+    owners = {flag.name: flag for flag in sorted(flags, key=lambda flag: len(flag.path))[::-1]}
+    for owner in flags:
+        if owners[owner.name] is owner:
+            same = (each for each in flags if each.name == owner.name and beside(each.path, owner.path))
+            yield [owner, *(each for each in same if each is not owner)]
 
 
 def _shared(flags: Sequence[Flag]) -> Flag:
     """Return one flag for several: its help begins with their groups and ends with the defaults that differ."""
-    first = flags[0]
-    owners = [flag.prefix.removesuffix(": ") for flag in flags]
-    if len(set(owners)) == 1:
+    abouts = {flag.prefix.removesuffix(": "): flag.about for flag in flags}
+    if len(abouts) == 1:
+        return flags[0]
+    return replace(flags[0], prefix=f"{', '.join(abouts)}: ", about=_with_defaults(abouts))
+
+
+def _with_defaults(abouts: Mapping[str, str]) -> str:
+    """Return the first of several helps, by owner, ending with the defaults of all if they differ."""
+    first = next(iter(abouts.values()))
+    defaults = {owner: default[1] for owner, about in abouts.items() if (default := DEFAULT.search(about))}
+    if len(set(defaults.values())) < 2:  # noqa: PLR2004 - they agree
         return first
-    defaults = {
-        owner: found[1] for owner, flag in zip(owners, flags, strict=True) if (found := DEFAULT.search(flag.about))
-    }
-    about = first.about
-    if len(set(defaults.values())) > 1:
-        listed = ", ".join(f"{owner} {default}" for owner, default in defaults.items())
-        about = DEFAULT.sub(f" [default: {listed}]", about)
-    return replace(first, prefix=f"{', '.join(owners)}: ", about=about)
+    return DEFAULT.sub(f" [default: {', '.join(f'{owner} {default}' for owner, default in defaults.items())}]", first)
 
 
-def build(options: type[Options], given: Mapping[str, Any]) -> Options:
+def build(options: type[Options] | OneOf, given: Mapping[str, Any]) -> Options:
     """Build a configuration from a command's parameters; raises UsageError naming the field."""
     from s2a_bench.options import nested
 
-    flags = [*flags_of(options)]
-    owners = _owners(flags)
-    values = ((flag, owners[flag.name], given.get(owners[flag.name].key)) for flag in flags)
-    return options(
-        **nested((flag.path, value) for flag, owner, value in values if value is not None and _same(flag, owner))
-    )
+    if isinstance(options, OneOf):
+        return options.build(given)
+    typed = (flag for same in _by_name([*flags_of(options)]) for flag in same)
+    return options(**nested((flag.path, given[flag.key]) for flag in typed if given.get(flag.key) is not None))
 
 
 @contextmanager
-def flags_named(*options: type[Options]) -> Iterator[None]:
+def flags_named(*options: type[Options] | OneOf) -> Iterator[None]:
     """Translate the fields in UsageErrors to the flags of ``options``."""
     try:
         yield

@@ -10,7 +10,8 @@ An experiment's ``__init__`` holds its declaration, which imports nothing heavy:
         view="s2a_bench.experiments.boundary.view:show",
     )
 
-Its command, its flags, its chapter on the page, its comparison and its part of the library follow from that. Other
+Its command, its flags, its chapter on the page, its comparison and its part of the library follow from that. An
+experiment that runs in several ways, as `timeline` does computed and live, names each further one as a `RunMode`. Other
 packages offer experiments as entry points of the group ``s2a_bench.experiments``.
 """
 
@@ -190,6 +191,23 @@ def by_name(metrics: Iterable[AnyMetric]) -> dict[str, AnyMetric]:
 
 
 @dataclass(frozen=True, slots=True)
+class RunMode:
+    """One way to run an experiment: the class of its options, and the function that runs it, as in `Experiment`."""
+
+    name: str
+    """``mode`` of the library's function."""
+    config: str
+    run: str
+    flags: Mapping[str, str] = field(default_factory=dict, hash=False)
+    """The flags that pick it, as names of fields -> their help; empty where a flag is an option of the mode."""
+
+    @property
+    def options(self) -> type[Options]:
+        options: type[Options] = resolve_name(self.config)
+        return options
+
+
+@dataclass(frozen=True, slots=True)
 class Experiment:
     """The declaration of one experiment; what it names as ``module:attribute`` is imported when it is needed."""
 
@@ -202,6 +220,9 @@ class Experiment:
     """Function ``(config, output, progress) -> run folder``."""
     view: str
     """Function ``(run, **view options) -> Shown``; it reads the store and measures nothing."""
+    mode: str = ""
+    """The name of this way to run it, if there are other ``modes``."""
+    modes: tuple[RunMode, ...] = ()
     view_options: str = ""
     """Class of the options that change what is shown, not what is measured."""
     compared: str = ""
@@ -211,8 +232,25 @@ class Experiment:
     unit: str = "samples"
     """What progress counts, and what is kept of an interrupted run."""
 
+    @property
+    def every_mode(self) -> tuple[RunMode, ...]:
+        return (RunMode(self.mode, self.config, self.run), *self.modes)
+
+    def refuse_foreign(self, mode: RunMode, names: Iterable[str]) -> None:
+        """Raise UsageError for the name of an option that ``mode`` lacks and another mode has."""
+        from s2a_bench.options import places
+
+        for name in names:
+            owners = [each for each in self.every_mode if name in places(each.options)]
+            if owners and mode not in owners:
+                missing = [f"give `{flag}`" for flag in owners[0].flags if flag not in mode.flags]
+                spare = [f"leave out `{flag}`" for flag in mode.flags if flag not in owners[0].flags]
+                raise UsageError(f"`{name}` is an option of mode {owners[0].name}: {', '.join(missing + spare)}")
+
     def run_with(self, config: Options, output: Path, progress: Progress) -> Path:
-        folder: Path = resolve_name(self.run)(config, output, progress)
+        """Run the mode whose options ``config`` has."""
+        runs = {each.options: each.run for each in self.modes}
+        folder: Path = resolve_name(runs.get(type(config), self.run))(config, output, progress)
         return folder
 
     def show(self, run: StoredRun, **options: Any) -> Shown:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, TypeAlias
 
 from pydantic import create_model
 
-from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.frames import SOURCES
 from s2a_bench.harness import RECORD
-from s2a_bench.inference import STAND_IN, EngineConfig, acting, check_engine
+from s2a_bench.inference import EngineConfig, acting, check_engine, computing
 from s2a_bench.options import Grammar, Names, Options, Size, Square, TextOrFile, group, option
 from s2a_bench.transport import (
     ACTIONS,
@@ -107,12 +106,21 @@ else:  # with the options of everything that may surround a run
     Surrounded = create_model("Surrounded", __base__=(*reversed(SURROUNDING), SentConfig))
 
 
+GROUPED: Final = (
+    *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
+    *("warmup", "timeout_s", "wait_for_server", "deadline_s", "sample_resources_hz", "nonce"),
+)
+"""The flags of requests in experiments of which these are a part, a group of options."""
+
+
 class RequestsConfig(Surrounded):
     PANEL: ClassVar[str] = "Requests"
     QUICK: ClassVar[dict[str, int]] = {"requests": 10, "warmup": 2, "max_tokens": 8}
     """The defaults under ``quick``."""
     COUNTS_TOKENS: ClassVar[str] = "this command counts tokens"
     """Why the command refuses answers of actions; empty: it accepts them."""
+    COMPUTES: ClassVar[str] = ""
+    """Why the command refuses engines that compute nothing; empty: it accepts them."""
     EVERY_VARIANT: ClassVar[bool] = True
     """Whether a transport named without a variant stands for all its default variants; else for its first."""
     OF_ENGINE: ClassVar[tuple[str, ...]] = ()
@@ -222,38 +230,6 @@ class RequestsConfig(Surrounded):
         """Return the first option that names an external server, or nothing."""
         return next(filter(None, (each.options.external for each in self.pipelines)), "")
 
-    def answered(self, say: Callable[[str], None]) -> RequestsConfig:
-        """Choose the engine if none is named, and ``say`` which if it is not llama."""
-        if "name" in self.engine.model_fields_set or not self.serves_engine:
-            return self
-        if self.answer == ACTIONS and not self.engine.of_model:
-            say("the echo engine answers with actions; a model's are those of its own server, see `url`")
-            return self.but(engine=self.engine.but(name=STAND_IN))
-        if self.starts_program and not extras.installed("llama_cpp"):
-            return self._without_our_engine(say)
-        chosen = self.but(engine=self.engine.but(name=self.engine.default_name(say)))
-        if left_out := {each.name for each in self.pipelines} - {each.name for each in chosen.pipelines}:
-            say(f"{', '.join(sorted(left_out))}: left out, as it needs a model")
-        return chosen
-
-    def _without_our_engine(self, say: Callable[[str], None]) -> RequestsConfig:
-        """Keep the cells of external servers, and ``say`` so; raises UsageError if the user named another cell."""
-        kept = [each for each in self.pipelines if each.black_box]
-        missing = f"our own servers have no engine here; {{}}{extras.how_to_install(*self.engine.kind.needs[:1])}"
-        if named := [each.name for each in self.pipelines if each not in kept and self._is_named(each, kept)]:
-            raise UsageError(f"{', '.join(named)}: {missing.format('measure without a model with `engine` echo, or ')}")
-        only = [each.name for each in kept]
-        say(f"only {', '.join(only)}: {missing.format('')}")
-        return self.but(transports=only)
-
-    def _is_named(self, cell: Pipeline, others: Sequence[Pipeline]) -> bool:
-        """Whether the user named a cell, or its transport, of which ``others`` has none."""
-        transport, given = cell.transport.name, "transports" in self.model_fields_set
-        written = {name.partition("?")[0] for name in self.names} if given else set()
-        named = transport in {*written, *self.options.model_fields_set}
-        alone = all(each.transport is not cell.transport for each in others)
-        return cell.name.partition("?")[0] in written or (named and alone)
-
     @property
     def sent_prompt(self) -> str:
         """Return the prompt; the default for policies is a task."""
@@ -271,6 +247,8 @@ class RequestsConfig(Surrounded):
         if not (16 <= width <= LARGEST and 16 <= height <= LARGEST) or width % 2:  # noqa: PLR2004
             raise UsageError(f"`size`: {width}x{height} should be 16x16 to {LARGEST}x{LARGEST}, of even width")
         check_engine(self.engine)
+        if self.COMPUTES and not self.engine.kind.computes:
+            raise UsageError(f"`engine` {self.engine.name} computes nothing; {self.COMPUTES}: use {computing()}")
         self._check_answer()
         self._check_observation()
         if self.record is not None and self.record.exists():

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
 from s2a_bench import extras
+from s2a_bench.errors import UsageError
 from s2a_bench.facts import FRAMES_LOST, FRAMES_PUBLISHED, facts_json
 from s2a_bench.frames import FrameSource, open_source
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.recording import namespace_of
-from s2a_bench.inference import EngineConfig, need_engine
+from s2a_bench.inference import STAND_IN, EngineConfig, need_engine
 from s2a_bench.machine.resources import SPENT
 from s2a_bench.trace import path_of
 from s2a_bench.transport import ACTIONS
@@ -108,11 +109,50 @@ class RunPlan:
         return replace(self, cells=every, request=replace(self.request, stages=stages)).with_manifest(stages=stages)
 
 
-def resolve(config: RequestsConfig) -> RunPlan:
-    """Decide what follows from a configuration; opens and starts nothing.
+def answered(config: RequestsConfig, say: Callable[[str], None]) -> RequestsConfig:
+    """Choose the engine if none is named, and ``say`` which if it is not llama."""
+    engine = config.engine
+    if "name" in engine.model_fields_set or not config.serves_engine:
+        return config
+    if config.answer == ACTIONS and not engine.of_model:
+        say("the echo engine answers with actions; a model's are those of its own server, see `url`")
+        return config.but(engine=engine.but(name=STAND_IN))
+    if config.starts_program and not extras.installed("llama_cpp"):
+        return _without_our_engine(config, say)
+    if config.COMPUTES:
+        return config
+    chosen = config.but(engine=engine.but(name=engine.default_name(say)))
+    if left_out := {each.name for each in config.pipelines} - {each.name for each in chosen.pipelines}:
+        say(f"{', '.join(sorted(left_out))}: left out, as it needs a model")
+    return chosen
+
+
+def _without_our_engine(config: RequestsConfig, say: Callable[[str], None]) -> RequestsConfig:
+    """Keep the cells of external servers, and ``say`` so; raises UsageError if the user named another cell."""
+    kept = [each for each in config.pipelines if each.black_box]
+    missing = f"our own servers have no engine here; {{}}{extras.how_to_install(*config.engine.kind.needs[:1])}"
+    if named := [each.name for each in config.pipelines if each not in kept and _is_named(config, each, kept)]:
+        raise UsageError(f"{', '.join(named)}: {missing.format('measure without a model with `engine` echo, or ')}")
+    only = [each.name for each in kept]
+    say(f"only {', '.join(only)}: {missing.format('')}")
+    return config.but(transports=only)
+
+
+def _is_named(config: RequestsConfig, cell: Pipeline, others: Sequence[Pipeline]) -> bool:
+    """Whether the user named a cell, or its transport, of which ``others`` has none."""
+    transport, given = cell.transport.name, "transports" in config.model_fields_set
+    written = {name.partition("?")[0] for name in config.names} if given else set()
+    named = transport in {*written, *config.options.model_fields_set}
+    alone = all(each.transport is not cell.transport for each in others)
+    return cell.name.partition("?")[0] in written or (named and alone)
+
+
+def resolve(config: RequestsConfig, say: Callable[[str], None]) -> RunPlan:
+    """Decide what follows from a configuration, and ``say`` what is chosen; opens and starts nothing.
 
     Raises MissingExtra if a library that the engine or a server program needs is not installed.
     """
+    config = answered(config, say)
     if config.serves_engine:
         need_engine(config.engine)
     if config.starts_program:

@@ -225,6 +225,10 @@ def acting() -> str:
     return " or ".join(name for name, kind in ENGINES.loaded() if kind.acts)
 
 
+def computing() -> str:
+    return " or ".join(name for name, kind in ENGINES.loaded() if kind.computes)
+
+
 @cache
 def declared_engine(name: str) -> type[Engine]:
     """Return the class of a run's engine; one that is not installed counts as a model's."""

@@ -166,11 +166,11 @@ def load_headers(config: EngineConfig) -> ModelFiles:
     model = read_header(model_path, "`model`")
     if model.is_mmproj:
         raise ModelError(f"`model` {model_path}: this is an mmproj (vision tower); give it as `mmproj`")
+    mmproj_path = mmproj_path or _mmproj_beside(model_path)
     if not (template := chat_template(config) or str(model.fields.get("tokenizer.chat_template", ""))):
         raise ModelError(
             f"`model` {model_path}: has no chat template; give `chat_template`: a FILE, or none for the raw prompt"
         )
-    mmproj_path = mmproj_path or _mmproj_beside(model_path)
     if mmproj_path is None:
         return ModelFiles(model, None, template)
     mmproj = read_header(mmproj_path, "`mmproj`")

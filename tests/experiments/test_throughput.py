@@ -146,7 +146,7 @@ def test_the_reference_computes_with_our_settings_behind_our_prompts_length(tmp_
         kv_type="q8_0",
         flash_attention="on",
     )
-    program, plan = install(tmp_path), resolve(REQUESTS.but(engine=engine))
+    program, plan = install(tmp_path), resolve(REQUESTS.but(engine=engine), print)
     llama_bench(program, launch(plan, writer, 250, 90), Place(0, 1, warmup=True))
     llama_bench(program, launch(plan, writer, 250, 260), Place(1, 0, warmup=False))
     writer.finish("finished")
@@ -190,6 +190,6 @@ def test_a_reference_that_fails_says_so_in_one_line(
     monkeypatch.setenv("S2A_STAND_IN_FAULT", fault)
     program = install(tmp_path)
     with pytest.raises(EngineError) as error:
-        llama_bench(program, launch(resolve(REQUESTS), writer, 0), Place(0, 0, warmup=False))
+        llama_bench(program, launch(resolve(REQUESTS, print), writer, 0), Place(0, 0, warmup=False))
     assert message in str(error.value)
     assert "\n" not in str(error.value)

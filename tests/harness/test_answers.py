@@ -14,7 +14,7 @@ from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.throughput.config import ThroughputConfig
 from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.pixels import fingerprint, together
-from s2a_bench.harness.plan import resolve
+from s2a_bench.harness.plan import answered, resolve
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.trace import Trace
 from s2a_bench.transport import ACTIONS, TOKENS, TRANSPORTS
@@ -38,16 +38,16 @@ def config(transports: str = "http,loopback", **more: Any) -> LatencyConfig:
 def test_all_cells_answer_with_tokens_unless_told() -> None:
     assert config(engine="echo").answer == TOKENS
     assert config(engine="echo", settings={"answer": "actions"}).answer == ACTIONS
-    acting = resolve(config(engine="echo", settings={"answer": "actions", "horizon": 9}))
+    acting = resolve(config(engine="echo", settings={"answer": "actions", "horizon": 9}), print)
     assert acting.request.max_pieces == 9
-    assert resolve(config(engine="echo", max_tokens=5)).request.max_pieces == 5
+    assert resolve(config(engine="echo", max_tokens=5), print).request.max_pieces == 5
 
 
 @pytest.mark.usefixtures("actions_alone")
 def test_one_that_carries_nothing_else_decides_for_all() -> None:
     chosen = config(engine="echo")
     assert chosen.answer == ACTIONS
-    assert resolve(chosen).engine.answer == ACTIONS
+    assert resolve(chosen, print).engine.answer == ACTIONS
     assert chosen.to_manifest()["engine"]["answer"] == ACTIONS
     assert config("loopback", engine="echo").answer == TOKENS
     with pytest.raises(UsageError, match=r"^`answer`: http/as-deployed does not carry tokens; measure it in a run"):
@@ -59,7 +59,7 @@ def test_an_engine_of_tokens_is_refused_in_one_line() -> None:
     with pytest.raises(UsageError, match=r"^`engine` llama answers with tokens, and http/as-deployed carries actions"):
         config(engine="llama")
     lines: list[str] = []
-    assert config().answered(lines.append).engine.name == "echo"
+    assert answered(config(), lines.append).engine.name == "echo"
     assert lines == ["the echo engine answers with actions; a model's are those of its own server, see `url`"]
 
 

@@ -13,6 +13,7 @@ from s2a_bench import extras
 from s2a_bench.errors import MissingExtra, UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.harness.config import RequestsConfig
+from s2a_bench.harness.plan import answered
 from s2a_bench.inference import EngineConfig, need_engine
 from s2a_bench.transport import http
 from s2a_bench.transport.ros.joining import namespace_of
@@ -87,11 +88,11 @@ def test_named_it_is_an_error_where_it_cannot_be(options: dict[str, Any], messag
 @pytest.mark.usefixtures("llama_server_alone")
 def test_without_our_own_engine_its_cell_and_servers_that_run_already_are_measured_alone() -> None:
     lines: list[str] = []
-    assert names(RequestsConfig().answered(lines.append)) == ["http/llama-server"]
+    assert names(answered(RequestsConfig(), lines.append)) == ["http/llama-server"]
     assert lines == ["only http/llama-server: our own servers have no engine here; " + extras.how_to_install("llama")]
     running = RequestsConfig(options={"ros": {"action": "/llama/generate_response"}})
-    assert names(running.answered(lines.append)) == ["http/llama-server", "ros/action"]
-    config = RequestsConfig(engine={"model": Path("m.gguf")}).answered(lines.append)
+    assert names(answered(running, lines.append)) == ["http/llama-server", "ros/action"]
+    config = answered(RequestsConfig(engine={"model": Path("m.gguf")}), lines.append)
     assert (names(config), config.engine.model) == (["http/llama-server"], Path("m.gguf"))
 
 
@@ -110,7 +111,7 @@ def test_without_our_own_engine_what_is_named_is_refused_rather_than_left_out(
     options: dict[str, Any],
 ) -> None:
     with pytest.raises(UsageError, match=r"no engine here.*`engine` echo.*\[llama\]"):
-        RequestsConfig(**options).answered(pytest.fail)
+        answered(RequestsConfig(**options), pytest.fail)
 
 
 def test_of_two_urls_both_are_asked_or_refused() -> None:
@@ -128,7 +129,7 @@ def test_a_model_is_never_answered_for_by_another_engine(
     (field,) = given
     monkeypatch.setattr(extras, "installed", lambda module: module != "llama_cpp")
     with pytest.raises(MissingExtra, match=rf"`{field}`.*\[llama\]"):
-        need_engine(RequestsConfig(engine=given).answered(pytest.fail).engine)
+        need_engine(answered(RequestsConfig(engine=given), pytest.fail).engine)
     with pytest.raises(UsageError, match=f"`{field}`.*leave it out with `engine` echo"):
         RequestsConfig(engine={"name": "echo", **given})
     with pytest.raises(UsageError, match=f"`{field}`.*leave it out with `engine` replay"):
@@ -193,7 +194,7 @@ def test_a_latency_run_sends_the_same_payloads_over_every_transport(options: dic
 )
 def test_a_url_alone_is_asked_over_the_transport_that_its_scheme_names(url: str, cells: list[str]) -> None:
     config = LatencyConfig(url=url)
-    assert names(config.answered(pytest.fail)) == cells
+    assert names(answered(config, pytest.fail)) == cells
 
 
 def test_what_cannot_carry_the_usual_payload_keeps_its_own() -> None:

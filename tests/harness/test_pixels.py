@@ -40,7 +40,7 @@ def measure() -> Iterator[Measure]:
             client = next(connecting)(handler)
             stack.callback(connecting.close)  # type: ignore[attr-defined]  # a generator
             config = LatencyConfig(transports=name, max_tokens=3)
-            session = Session(cell, client, RequestFeed(source, preencoded=False), resolve(config).request)
+            session = Session(cell, client, RequestFeed(source, preencoded=False), resolve(config, print).request)
             return session.measure(Place(0, 0, warmup=False))
 
         yield run

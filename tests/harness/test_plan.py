@@ -13,7 +13,7 @@ from s2a_bench.inference import EngineConfig
 
 
 def facts(**given: Any) -> Any:
-    return resolve(RequestsConfig(**given)).manifest["facts"]
+    return resolve(RequestsConfig(**given), print).manifest["facts"]
 
 
 @pytest.mark.parametrize(("template", "given"), [("", {}), ("openvla-oft", {}), ("", {"prompt": "open the drawer"})])
@@ -23,22 +23,22 @@ def test_a_policy_gets_a_task_not_the_planners_prompt(template: str, given: dict
     http: Any = {"http": {"url": "http://127.0.0.1:8000", "dialect": "openvla", **made}}
     cameras: dict[str, Any] = {"cameras": 3, "state": 14} if template else {}
     config = LatencyConfig(transports=("http/as-deployed",), options=http, **cameras, **given)
-    plan = resolve(config)
+    plan = resolve(config, print)
     assert plan.request.prompt == plan.manifest["configuration"]["prompt"] == given.get("prompt", DEFAULT_TASK)
 
 
 def test_every_run_has_a_nonce_of_its_own_unless_told() -> None:
-    first, second = (resolve(RequestsConfig()) for _ in range(2))
+    first, second = (resolve(RequestsConfig(), print) for _ in range(2))
     assert first.feed.nonce != second.feed.nonce
     assert first.manifest["seeds"]["nonce"] == first.feed.nonce
 
 
 def test_the_stages_are_those_of_the_transports_in_the_order_of_the_path() -> None:
-    assert [*resolve(RequestsConfig(transports=("ros",))).request.stages] == [
+    assert [*resolve(RequestsConfig(transports=("ros",)), print).request.stages] == [
         *("capture", "convert", "resize", "image_encode", "cdr_pack", "connect", "network", "accept", "cdr_parse"),
         *("image_decode", "yuv_decode", "channel_swap", "queue", "preprocess", "inference", "server", "return"),
     ]
-    assert "cdr_pack" not in resolve(RequestsConfig(transports=("http",))).request.stages
+    assert "cdr_pack" not in resolve(RequestsConfig(transports=("http",)), print).request.stages
 
 
 def test_the_facts_are_those_that_transport_dialect_engine_and_harness_may_tell() -> None:

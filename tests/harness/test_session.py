@@ -31,7 +31,7 @@ def session_of(client: Any, cell: Any = "http/as-deployed", **more: Any) -> Sess
     """Return a session of a client whose pictures are made up."""
     cell = one_pipeline(cell) if isinstance(cell, str) else cell
     feed = RequestFeed(open_source("synthetic", 64, 48, fps=30.0, seed=0), preencoded=False)
-    return Session(cell, client, feed, **{"request": resolve(RequestsConfig()).request, **more})
+    return Session(cell, client, feed, **{"request": resolve(RequestsConfig(), print).request, **more})
 
 
 @pytest.mark.parametrize(("retry_after_s", "waited_s"), [(0.0, 0), (1.5, 1.5), (60.0, 60), (3600.0, 60)])
@@ -84,7 +84,7 @@ def test_the_link_to_a_server_of_another_machine_is_unknown(
 ) -> None:
     cell = one_pipeline(transport, **address)
     with ExitStack() as stack:
-        servers = ServerSet(replace(resolve(RequestsConfig()), cells=(cell,)), stack, tmp_path)
+        servers = ServerSet(replace(resolve(RequestsConfig(), print), cells=(cell,)), stack, tmp_path)
         servers.start()
         assert servers.origin(cell).link == link
 

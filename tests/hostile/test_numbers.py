@@ -96,7 +96,7 @@ def test_a_run_with_them_counts_and_warns_once_a_field(tmp_path: Path) -> None:
         config = RequestsConfig(
             transports="http/as-deployed", options={"http": http}, size="64x48", requests=3, warmup=1
         )
-        folder = run_requests(Task("latency"), resolve(config), tmp_path, NullProgress())
+        folder = run_requests(Task("latency"), resolve(config, print), tmp_path, NullProgress())
     run = read_run(folder)
     assert run.samples.error.tolist() == [""] * 4
     assert run.samples.prompt_n.isna().all()

@@ -398,7 +398,7 @@ def test_a_run_gets_the_doctors_warnings_that_concern_it(
     make: Make, tree: dict[str, str], width: int, dds: bool, expected: list[str]
 ) -> None:
     config = RequestsConfig(transports="ros" if dds else "http", size=(width, 480))
-    warnings = before_run(resolve(config).checks, make(tree))
+    warnings = before_run(resolve(config, print).checks, make(tree))
     assert [warning.code for warning in warnings] == expected
     assert all(warning.advice for warning in warnings)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Final
+from typing import ClassVar, Final
 
 from s2a_bench.boards.profile import Profile, load_profile
 from s2a_bench.boards.tokens import NO_JITTER, gaps_of
@@ -19,6 +19,8 @@ MARKS, SHADES = 25, 73
 
 class BoundaryConfig(Options):
     """The plane of tokens per skill and rate."""
+
+    virtual: ClassVar[bool] = True
 
     profiles: Names = option(
         ("rtx-4080", "jetson-agx-orin", "jetson-orin-nano"),
@@ -46,10 +48,6 @@ class BoundaryConfig(Options):
     @cached_property
     def boards(self) -> list[Profile]:
         return [load_profile(name) for name in self.profiles]
-
-    @property
-    def virtual(self) -> bool:
-        return True
 
     @property
     def durations(self) -> dict[str, float]:

@@ -13,7 +13,7 @@ from s2a_bench.progress import Progress
 
 def run_latency(config: LatencyConfig, output: Path, progress: Progress) -> Path:
     """Measure and return the run folder, which keeps the samples so far if S2AError or KeyboardInterrupt is raised."""
-    plan = resolve(config.answered(progress.say))
+    plan = resolve(config, progress.say)
     if config.think_s:
         plan = replace(plan, blocks=replace(plan.blocks, think_s=config.think_s))
         plan = plan.with_manifest(

@@ -46,6 +46,7 @@ class ThroughputEngine(EngineConfig):
 class ThroughputConfig(FirstVariants):
     QUICK: ClassVar[dict[str, int]] = {"requests": 3, "warmup": 1, "max_tokens": 32}
     OF_ENGINE: ClassVar[tuple[str, ...]] = ("flash_attention",)
+    COMPUTES: ClassVar[str] = "this command measures tokens a second"
 
     transports: Names = option(
         (IN_PROCESS,), "in-process, http, ros, as in latency; several with commas", flag="transport"
@@ -100,10 +101,6 @@ class ThroughputConfig(FirstVariants):
         super().check()
         if self.max_tokens < 2:  # noqa: PLR2004 - a rate needs two tokens
             raise UsageError("`max_tokens`: a rate needs 2 tokens or more")
-        if not self.engine.kind.computes:
-            raise UsageError(
-                f"`engine` {self.engine.name} computes nothing; `engine` llama or replay has tokens a second"
-            )
         named = "," in self.engine.flash_attention or any(each.engine for each in self.pipelines)
         if named and not self.engine.kind.needs_model:
             raise UsageError(f"`engine` {self.engine.name} knows no flash attention; leave out `flash_attention`")

@@ -35,7 +35,7 @@ def run_throughput(config: ThroughputConfig, output: Path, progress: Progress) -
         in_blocks(launch, [partial(llama_bench, config.reference, launch)] if config.reference else [])
 
     sampling = "greedy" if config.greedy else "model"
-    plan = resolve(config.but(engine=config.engine.but(sampling=sampling)))
+    plan = resolve(config.but(engine=config.engine.but(sampling=sampling)), progress.say)
     cells = tuple(
         replace(cell, name=cell.name.replace(cell.transport.name, IN_PROCESS, 1)) if cell.transport.in_process else cell
         for cell in plan.cells

@@ -104,7 +104,7 @@ def prepare_requests(config: TimelineConfig, progress: Progress) -> tuple[RunPla
         need_engine(requests.engine)
         requests = requests.but(engine=on_files(requests.engine, progress))
     prompts = plan_prompts(config, requests.engine.model)
-    plan = resolve(requests.but(max_tokens=max(each.max_tokens for each in prompts)))
+    plan = resolve(requests.but(max_tokens=max(each.max_tokens for each in prompts)), progress.say)
     return replace(plan, finds_model=False), prompts
 
 

@@ -222,7 +222,7 @@ class Server:
     """Actions, and the error."""
     places: list[Place] = field(default_factory=list)
     cell: Any = field(default_factory=lambda: SimpleNamespace(name="fake"))
-    request: RequestPlan = field(default_factory=lambda: resolve(RequestsConfig(transports="loopback")).request)
+    request: RequestPlan = field(default_factory=lambda: resolve(RequestsConfig(transports="loopback"), print).request)
 
     def measure(self, place: Place, context: RequestContext) -> Measured:
         self.places.append(place)

@@ -52,7 +52,7 @@ class ElsewhereClient:
 @pytest.fixture
 def elsewhere() -> Iterator[tuple[ElsewhereClient, Session]]:
     source, client = open_source("synthetic", 64, 48, fps=30.0, seed=0), ElsewhereClient()
-    feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig()).request
+    feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig(), print).request
     yield client, Session(one_pipeline("http/as-deployed"), client, feed, plan, clocks={})
     source.close()
 
@@ -106,7 +106,7 @@ def with_wall_clocks(client: ElsewhereClient, monkeypatch: pytest.MonkeyPatch, *
     monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.WALL_CLOCKS", {"chrony": lambda: ours})
     theirs_ms = (ours.offset_ns - client.ahead_ns) / 1e6 + off_ms
     client.facts = {REALTIME_MS: theirs_ms, REALTIME_ERROR_MS: ours.error_ns / 1e6}
-    source, plan = open_source("synthetic", 64, 48, fps=30.0, seed=0), resolve(RequestsConfig()).request
+    source, plan = open_source("synthetic", 64, 48, fps=30.0, seed=0), resolve(RequestsConfig(), print).request
     feed = RequestFeed(source, preencoded=False)
     plan = replace(plan, surroundings=(TwoHosts(system="chrony"),))
     session = Session(one_pipeline("http/as-deployed"), client, feed, plan, clocks={})

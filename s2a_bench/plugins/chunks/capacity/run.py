@@ -58,7 +58,7 @@ def run_capacity(config: CapacityConfig, output: Path, progress: Progress) -> Pa
     """Measure, or predict, and return the run folder, which keeps what was measured if S2AError is raised."""
     if config.virtual:
         return run_predicted(config, output, progress)
-    plan = resolve(config.live_requests.answered(progress.say))
+    plan = resolve(config.live_requests, progress.say)
     settings = {**plan.manifest["configuration"], **config.to_manifest()}
     cadence = {
         "chunks": f"control loops at {config.control_hz:g} Hz",

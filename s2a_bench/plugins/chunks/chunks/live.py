@@ -131,7 +131,7 @@ def write(config: ChunksConfig, writer: RunWriter, live: LiveResult) -> None:
 
 def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
     """Act and return the run folder; raises S2AError."""
-    plan = resolve(config.live_requests.answered(progress.say))
+    plan = resolve(config.live_requests, progress.say)
     several = any(each.several for each in config.control.modes.values())
     settings = {**plan.manifest["configuration"], **config.to_manifest()}
     plan = plan.with_manifest(configuration=settings, cadence=f"a control loop at {config.control_hz:g} Hz")

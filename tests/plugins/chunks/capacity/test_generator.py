@@ -35,7 +35,7 @@ from s2a_bench.types import Token
 from tests.cli.test_provenance import serving
 
 MS = 1_000_000
-REQUEST = resolve(RequestsConfig(transports="loopback")).request
+REQUEST = resolve(RequestsConfig(transports="loopback"), print).request
 
 
 class Over:

@@ -133,7 +133,7 @@ def robots_of(monkeypatch: pytest.MonkeyPatch, *, twin: bool = False, mode: str 
             run_module, kind, lambda plan, kind=kind: SimpleNamespace(kind=kind, plan=plan, close=lambda: None)
         )
     config = CapacityConfig(**options)
-    plan = resolve(config.live_requests)
+    plan = resolve(config.live_requests, print)
     launch: Any = SimpleNamespace(plan=plan, wiring=lambda _: SimpleNamespace(to_json=dict))
     return _Robots(config, None, launch, SimpleNamespace(cell=plan.cells[0], origin=None), mode, twin=twin)  # type: ignore[arg-type]
 
