@@ -5,21 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Final
+from typing import Annotated, Any, ClassVar, Final
+
+from pydantic import BeforeValidator
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.config import FirstVariants
+from s2a_bench.harness.config import GROUPED, FirstVariants
 from s2a_bench.inference import STAND_IN, EngineConfig
 from s2a_bench.options import Names, Options, group, option
 from s2a_bench.plugins.chunks.modes import COMPARED, MODES, ControlSetting, Mode, Rounding, modes
 from s2a_bench.transport import ACTIONS, TRANSPORTS
 
-SHOWN: Final = (
-    *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
-    *("prompt", "warmup", "timeout_s", "wait_for_server", "deadline_s", "sample_resources_hz", "nonce"),
-)
-"""The options of requests that are flags."""
 WITHOUT_PACKAGES: Final = "http/binary"
 """The transport of a control loop, where no transport of actions alone is installed with its packages."""
 
@@ -94,14 +91,29 @@ class LoopRequests(FirstVariants):
         0.0, "readings a second of CPU, memory, GPU and power beside the run; 0: none", flag="sample-resources", ge=0
     )
 
-    def of_robots(self, answer: str, latency: str, control: ControlOptions) -> LoopRequests:
-        """Return the requests for answers of one kind; with a ``latency`` echo takes that; raises UsageError."""
-        engine: dict[str, Any] = {"answer": answer, "horizon": control.horizon}
-        if latency:
-            engine |= {"latency": latency} | ({} if self.engine.model_fields_set else {"name": STAND_IN})
-        return self.but(engine=self.engine.but(**engine), seed=control.seed, requests=1)
+
+class ServedOptions(ControlOptions):
+    """Robots that act on the answers of a server."""
+
+    latency: Annotated[str, BeforeValidator(str, json_schema_input_type=str | float)] = option(
+        "", "how long echo takes to answer: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: no time]", first=True
+    )
+    requests: LoopRequests = group(LoopRequests, only=(*GROUPED, "prompt"), first=("transports",))
+
+    @property
+    def answer(self) -> str:
+        """What the server answers with."""
+        return ACTIONS
+
+    @cached_property
+    def robots_requests(self) -> LoopRequests:
+        """The requests that robots make; with a latency, an engine that is not named is echo."""
+        engine: dict[str, Any] = {"answer": self.answer, "horizon": self.horizon}
+        if self.latency:
+            engine["latency"] = self.latency
+            engine |= {} if self.requests.engine.model_fields_set else {"name": STAND_IN}
+        return self.requests.but(engine=self.requests.engine.but(**engine), seed=self.seed, requests=1)
 
     def check(self) -> None:
-        """Check as other requests do, unless none are configured (virtual time)."""
-        if self.model_fields_set:
-            super().check()
+        super().check()
+        _ = self.robots_requests  # raises UsageError
