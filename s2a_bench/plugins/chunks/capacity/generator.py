@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
     from s2a_bench.frames import FrameSource
-    from s2a_bench.harness.plan import FeedPlan, RequestPlan, RunPlan
+    from s2a_bench.harness.plan import RunPlan
     from s2a_bench.plugins.chunks.capacity.config import RobotLoad
     from s2a_bench.plugins.chunks.modes import Mode
     from s2a_bench.provenance import Provenance
@@ -62,14 +62,12 @@ class FleetPlan:
     cell: str
     wiring: Mapping[str, Any]
     """As `Wiring.to_json`."""
-    feed: FeedPlan
-    request: RequestPlan
-    tuned: bool
+    requests: RunPlan
     load: RobotLoad
     first: int = 0
     """Place in the run before those of its requests."""
-    own: RunPlan | None = None
-    """Of the server that each process starts for its robots alone; None: `wiring` leads to one that all share."""
+    own: Pipeline | None = None
+    """To a server that each process starts for its robots alone; None: `wiring` leads to one that all share."""
     origin: Provenance = UNKNOWN_ORIGIN
 
 
@@ -230,7 +228,7 @@ class Fleet:
         self._threads: list[Thread] = []
         self._loop: ControlLoop | None = None
         self._start_ns = 0
-        self._stack.enter_context(allowed(plan.tuned))
+        self._stack.enter_context(allowed(plan.requests.tuned))
         limit_threads()
         keep_large_blocks()
 
@@ -296,9 +294,9 @@ class Fleet:
 
     @cached_property
     def _wiring(self) -> Wiring[Any]:
-        own = self._plan.own
-        if own is None:
+        if self._plan.own is None:
             return Wiring.from_json(self._plan.wiring)
+        own = replace(self._plan.requests, cells=(self._plan.own,))
         folder = self._stack.enter_context(TemporaryDirectory(prefix="s2a-bench-"))
         servers = ServerSet(own, self._stack, Path(folder))
         servers.start()
@@ -306,18 +304,18 @@ class Fleet:
 
     @cached_property
     def _source(self) -> FrameSource:
-        source = self._plan.feed.open()
+        source = self._plan.requests.feed.open()
         self._stack.callback(source.close)
         return source
 
     def _session(self, robot: int) -> Session:
-        plan, wiring = self._plan, self._wiring
+        plan, wiring, feed_plan = self._plan, self._wiring, self._plan.requests.feed
         cell = Pipeline(plan.cell, TRANSPORTS[wiring.transport], wiring.variant, wiring.options)
         client = open_client(wiring)
-        source = _Shared(self._source, f"{plan.feed.nonce}/{cell.name} {plan.load.name} {robot}", self._reads)
+        source = _Shared(self._source, f"{feed_plan.nonce}/{cell.name} {plan.load.name} {robot}", self._reads)
         preencoded = cell.payload == "jpeg-preencoded"
-        feed = RequestFeed(source, preencoded=preencoded, cameras=plan.feed.cameras, size=plan.feed.resize)
-        session = Session(cell, client, feed, plan.request, origin=plan.origin)
+        feed = RequestFeed(source, preencoded=preencoded, cameras=feed_plan.cameras, size=feed_plan.resize)
+        session = Session(cell, client, feed, plan.requests.request, origin=plan.origin)
         session.answered = True  # its server has answered the warm-up
         self._stack.callback(lambda: None if session.busy else client.close())
         return session

@@ -229,21 +229,12 @@ class _Robots(ExitStack):
         self._load, self._search, self._launch, self.session = load, search, launch, session
         self._number, self._error = 1, ""
         self.name = load.of(session.cell.name)
-        shared = launch.plan
-        plan = FleetPlan(
-            session.cell.name,
-            launch.wiring(session.cell).to_json(),
-            shared.feed,
-            shared.request,
-            shared.tuned,
-            load,
-            first,
-            origin=session.origin,
-        )
         self._fleets: list[Any]
-        in_process, processes, ray = session.cell.transport.in_process, hosts.processes, hosts.ray
-        if twin and (ray is not None or (in_process and processes > 1)):
-            plan = replace(plan, own=replace(shared, cells=(session.cell,)))
+        cell, processes, ray = session.cell, hosts.processes, hosts.ray
+        in_process = cell.transport.in_process
+        own = cell if twin and (ray is not None or (in_process and processes > 1)) else None
+        wiring = launch.wiring(cell).to_json()
+        plan = FleetPlan(cell.name, wiring, launch.plan, load, first, own, session.origin)
         if ray is not None:
             self._fleets = [FleetOnRay(plan, ray) for _ in range(processes)]
         elif processes > 1 and (twin or not in_process):

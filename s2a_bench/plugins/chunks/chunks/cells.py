@@ -19,6 +19,7 @@ from s2a_bench.plugins.chunks.modes.trigger import (
     TriggerRule,
     calibrate,
     follow,
+    greatest_trigger,
     trigger,
 )
 from s2a_bench.policy.parameters import canonical
@@ -81,7 +82,7 @@ class ChunkCell:
         """Return the cell with the triggers that its rule chooses if it learns the judged latencies."""
         if self.begin is None:
             return self
-        most = _most(self.mode, setting)
+        most = greatest_trigger(self.mode, setting)
         return self.chosen(tuple(follow(self.begin(), self.drawn.judged, setting, most).tolist()))
 
 
@@ -107,7 +108,7 @@ def cells(control: ControlPlan, rules: RulesPlan, drawn: LatencyDraw) -> Iterato
         if rule in {"calibrated", "oracle"}:
             known = calibrate(drawn.learnt, rules.epsilon, rules.guarantee) if rule == "calibrated" else None
             limit_ns = known.caution if known else _oracle_ns(drawn.source, rules.epsilon, control.seed)
-            fixed = trigger(limit_ns, setting, _most(mode, setting))
+            fixed = trigger(limit_ns, setting, greatest_trigger(mode, setting))
             yield ChunkCell(mode, name, rule, drawn, (fixed.ticks,), min(fixed.beta, rules.slowest), calibration=known)
         else:
             yield ChunkCell(mode, name, rule, drawn, begin=partial(_learner, rule, drawn, rules.epsilon))
@@ -121,11 +122,6 @@ def changes(setting: ControlSetting, name: str, learnt: Ints, judged: Ints) -> l
 
 def without_trigger(mode: Mode) -> str:
     return canonical(mode.name, mode.varied((0,)))
-
-
-def _most(mode: Mode, setting: ControlSetting) -> int:
-    """Return the greatest trigger."""
-    return max(1, mode.execution_horizon(setting) - 1)
 
 
 def _learner(rule: str, drawn: LatencyDraw, epsilon: float) -> TriggerRule:

@@ -68,13 +68,6 @@ class LiveResult:
     robot: ActionRobot | None
     triggers: tuple[int, ...] = ()
 
-    @property
-    def judged(self) -> ChunkCell:
-        """The cell with the measured latencies of complete answers, to their first action, and the triggers."""
-        latency_ns = self.acted.arrival_ns[: self.acted.whole, 0]
-        cell = replace(self.cell, drawn=replace(self.cell.drawn, judged=latency_ns))
-        return cell.chosen(self.triggers[: latency_ns.size])
-
     def counted(self) -> tuple[Cycles, Ticks]:
         """Return cycles and ticks of the whole run; a missing answer is usable after the last tick."""
         acted, ticks = self.acted, self.acted.chunk.size
@@ -82,8 +75,8 @@ class LiveResult:
         delay = np.where(arrival_ns < 0, ticks, self.setting.delay_ticks(np.maximum(arrival_ns, 0)))
         return gather(acted.request_tick, acted.request_tick + delay, acted.chunk, acted.index, self.setting.horizon)
 
-    def agreement(self) -> float | None:
-        """Return the share of the ticks whose chunk, action and age equal those of `Mode.arrays`; None without them.
+    def agreement(self, done: Ticks) -> float | None:
+        """Return the share of the ticks ``done`` that equal those of `Mode.arrays`; None without these.
 
         The loop runs the mode's stepper, and the arrays do not. Both have the triggers that a rule chose.
         """
@@ -93,7 +86,7 @@ class LiveResult:
         cycles = self.cell.chosen(self.triggers).acting.arrays(arrival_ns, self.setting)
         if cycles is None:
             return None
-        computed, done = lay(cycles), self.counted()[1]
+        computed = lay(cycles)
         length = min(computed.chunk.size, ticks)
         equal = [getattr(computed, each)[:length] == getattr(done, each)[:length] for each in ("chunk", "index", "age")]
         return float(np.all(equal, axis=0).sum()) / ticks
@@ -107,11 +100,10 @@ class LiveResult:
         chunk = self.acted.chunk[first : first + MOST_TICKS]
         return smoothness(motion, actions, chunk)
 
-    def timing(self) -> dict[str, float | None]:
+    def timing(self) -> dict[str, float]:
         acted, period_ns = self.acted, self.setting.period_ns
         late_s, busy_s = acted.late_ns / 1e9, acted.busy_ns / 1e9
         return {
-            "agreement": self.agreement(),
             "jitter_s_p50": float(np.quantile(late_s, 0.5)),
             "jitter_s_p99": float(np.quantile(late_s, 0.99)),
             "jitter_s_max": float(late_s.max()),
@@ -122,19 +114,24 @@ class LiveResult:
         }
 
     def actions(self) -> ActedCell:
-        """Return what the cell did; raises TransportError for fewer than two chunks."""
-        if self.acted.whole < 2:  # noqa: PLR2004 - a boundary lies between two chunks
+        """Return what the cell did, with the latencies of complete answers, to their first action.
+
+        Raises TransportError for fewer than two chunks.
+        """
+        latency_ns = self.acted.arrival_ns[: self.acted.whole, 0]
+        if latency_ns.size < 2:  # noqa: PLR2004 - a boundary lies between two chunks
             seconds = self.acted.chunk.size * self.setting.period_ns / 1e9
-            raise TransportError(f"{self.cell.cell}: {self.acted.whole} chunks in {seconds:g} s; act for longer")
+            raise TransportError(f"{self.cell.cell}: {latency_ns.size} chunks in {seconds:g} s; act for longer")
+        judged = replace(self.cell, drawn=replace(self.cell.drawn, judged=latency_ns))
         cycles, ticks = self.counted()
-        more: dict[str, Any] = self.timing() | self.smooth()
+        more: dict[str, Any] = {"agreement": self.agreement(ticks), **self.timing(), **self.smooth()}
         if ticks.stalled.any() and ticks.stalled[-1]:  # the run ends while it waits at a boundary
             stalls = stalls_of(cycles)
             more |= stall_metrics(stalls["stalled_cycles"] + 1, stalls["boundaries"] + 1)
         if self.cell.mode.streams:  # the closed forms are about a given gap between actions
             more |= dict.fromkeys(("p_stall_closed", "reaction_s_closed", "margin_ticks"))
-        names = self.requester.names
-        return ActedCell(self.judged, self.setting, cycles, ticks, more, self.acted.late_ns, names)
+        judged = judged.chosen(self.triggers[: latency_ns.size])
+        return ActedCell(judged, self.setting, cycles, ticks, more, self.acted.late_ns, self.requester.names)
 
 
 def run_live(config: ChunksLive, output: Path, progress: Progress) -> Path:
@@ -172,25 +169,20 @@ def _drive(plan: ActingPlan, launch: RunningLaunch) -> None:
         robot = plan.robot.open_actions(dims, setting.period_ns) if plan.robot else None
         with nullcontext() if robot is None else closing(robot):
             launch.writer.update(robot={} if robot is None else robot.describe())
-            ticks, streams = max(2, round(plan.seconds * 1e9 / setting.period_ns)), cell.mode.streams
-            acting, requester = _run(
-                cell.acting, setting, sessions, launch, blocks, ticks=ticks, streams=streams, robot=robot
-            )
+            ticks = max(2, round(plan.seconds * 1e9 / setting.period_ns))
+            acting, requester = _run(cell.acting, setting, sessions, launch, blocks, ticks=ticks, robot=robot)
             live = LiveResult(cell, setting, acting.acted(), requester, robot, tuple(acting.stepper.triggers))
             acted = live.actions()
             keep_origin(launch.writer, cell.cell, sessions[0].origin)
             whole = acted.ticks.chunk.size  # what is measured is kept
             for table, rows in cell_rows(acted, whole, plan.rules.epsilon, control.seed).items():
                 launch.writer.append(table, rows)
-        _warn_of_changes(cell, acted.latency_ns, control.setting, launch)
+        learnt, seen = cell.drawn.learnt, acted.latency_ns
+        if cell.rule in PROMISING and (changed := changes(control.setting, cell.cell, learnt, seen)):
+            launch.warnings.extend(changed)
+            if cell.calibration:
+                launch.writer.update(calibrations={cell.drawn.source.name: {"changed": True}})
         launch.progress.advance()
-
-
-def _warn_of_changes(cell: ChunkCell, seen_ns: Ints, setting: ControlSetting, launch: RunningLaunch) -> None:
-    if cell.rule in PROMISING and (changed := changes(setting, cell.cell, cell.drawn.learnt, seen_ns)):
-        launch.warnings.extend(changed)
-        if cell.calibration:
-            launch.writer.update(calibrations={cell.drawn.source.name: {"changed": True}})
 
 
 def _warm_up(
@@ -221,7 +213,6 @@ def _run(
     blocks: Iterator[int],
     *,
     ticks: int = ENDLESS,
-    streams: bool = False,
     robot: ActionRobot | None = None,
     warmup: int = 0,
 ) -> tuple[RobotTicks, ChunkRequester]:
@@ -234,7 +225,7 @@ def _run(
     send: Send = (lambda *_: None) if robot is None else robot.send
     acting = RobotTicks(chosen, setting, send, request_chunk, ticks)
     seed = launch.plan.blocks.seed
-    requester = ChunkRequester(sessions, setting.horizon, seed, streams, acting.arrived, blocks, warmup)
+    requester = ChunkRequester(sessions, setting.horizon, seed, chosen.streams, acting.arrived, blocks, warmup)
     loop = ControlLoop([acting])
     with requester.running():
         try:

@@ -36,7 +36,8 @@ from s2a_bench.types import Token
 from tests.cli.test_provenance import serving
 
 MS = 1_000_000
-REQUEST = resolve(RequestsConfig(transports="loopback"), print).request
+PLAN = resolve(RequestsConfig(transports="loopback"), print)
+REQUEST = PLAN.request
 
 
 class Over:
@@ -129,7 +130,7 @@ def test_a_fleet_acts_on_its_own_clock_and_reports_on_that_of_the_run(monkeypatc
     clock = VirtualClock(10**15)
     monkeypatch.setattr(generator, "now_ns", clock.now_ns)
     load = RobotLoad(ControlSetting(20 * MS, 16), every_ns=10**15)
-    fleet = Fleet(FleetPlan("c", {}, cast("Any", None), REQUEST, False, load))
+    fleet = Fleet(FleetPlan("c", {}, PLAN, load))
     fleet._sessions = {robot: (cast("Session", None), count()) for robot in range(2)}
     fleet.start({0: 0, 1: 7 * MS}, 100 * MS)
     clock.sleep_until_ns(10**15 + 300 * MS)
