@@ -63,6 +63,7 @@ class FleetPlan:
     wiring: Mapping[str, Any]
     """As `Wiring.to_json`."""
     requests: RunPlan
+    """Without its cells."""
     load: RobotLoad
     first: int = 0
     """Place in the run before those of its requests."""

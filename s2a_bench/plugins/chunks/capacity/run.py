@@ -234,7 +234,7 @@ class _Robots(ExitStack):
         in_process = cell.transport.in_process
         own = cell if twin and (ray is not None or (in_process and processes > 1)) else None
         wiring = launch.wiring(cell).to_json()
-        plan = FleetPlan(cell.name, wiring, launch.plan, load, first, own, session.origin)
+        plan = FleetPlan(cell.name, wiring, replace(launch.plan, cells=()), load, first, own, session.origin)
         if ray is not None:
             self._fleets = [FleetOnRay(plan, ray) for _ in range(processes)]
         elif processes > 1 and (twin or not in_process):
