@@ -83,7 +83,7 @@ def _serve(config: Any) -> None:
     limits = Limits(**of_limits | config.limits.given_values())
     pipeline = one_pipeline(config.pipeline, **{**chosen.options.SERVE_DEFAULTS, **of_transport, **flags})
     engine = EngineConfig(**of_engine | config.engine.given_values())
-    address = next(iter(pipeline.options.addresses()))
+    address = next(iter(chosen.addresses(pipeline.options)))
     _run(pipeline.wiring(address, limits=limits), _answering(engine, pipeline))
 
 
@@ -151,7 +151,7 @@ def _run(wiring: Wiring[Any], config: EngineConfig) -> None:
         name = f"{origin.engine}{played} (EMULATED)" if origin.emulated else origin.engine
         typer.echo(f"{transport.ready(replace(wiring, address=server.address))}; engine {name}; Ctrl-C ends it")
 
-    job = ServerJob(wiring, config, tuned=wiring.options.tuned, pixels=False)
+    job = ServerJob(wiring, config, tuned=transport.tuned(wiring.options), pixels=False)
     keep_serving(job, ready, lambda line: typer.echo(line, err=True))
 
 

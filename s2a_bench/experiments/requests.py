@@ -37,7 +37,7 @@ from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import ONE_WAY
 from s2a_bench.store.schema import Count, about, with_fields
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
-from s2a_bench.transport import PAYLOADS, declared_transport
+from s2a_bench.transport import declared_transport, payload_order
 from s2a_bench.transport.pipeline import without
 from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.csv_text import CsvTable
@@ -507,10 +507,9 @@ def stages_present(cells: list[RequestCell]) -> list[str]:
 
 
 def _place(cell: RequestCell) -> tuple[int, float, str, int, str]:
-    payload = PAYLOADS.index(cell.payload) if cell.payload in PAYLOADS else len(PAYLOADS)
     transport, variant = declared_transport(cell.pipeline), cell.about["variant"]
     known = transport.variants.index(variant) if variant in transport.variants else len(transport.variants)
-    return payload, transport.order, cell.pipeline, known, cell.name
+    return payload_order(cell.payload), transport.order, cell.pipeline, known, cell.name
 
 
 def _numbers(column: pd.Series[Any]) -> Floats:

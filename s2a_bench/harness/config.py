@@ -19,6 +19,7 @@ from s2a_bench.transport import (
     EXTERNAL,
     PAYLOADS,
     PROGRAM,
+    RAW,
     SERVER,
     TRANSPORT,
     TRANSPORTS,
@@ -200,7 +201,7 @@ class RequestsConfig(Surrounded):
     @property
     def usual_payloads(self) -> tuple[str, ...]:
         """Return the default payloads, for the pipelines that can carry them."""
-        return ("raw",)
+        return (RAW,)
 
     @cached_property
     def answer(self) -> str:
@@ -213,7 +214,7 @@ class RequestsConfig(Surrounded):
     @property
     def tuned(self) -> bool:
         """Whether this process and the servers keep large blocks of memory for the next picture."""
-        return all(options.tuned for _, options in self.options)
+        return all(TRANSPORTS[name].tuned(options) for name, options in self.options)
 
     @property
     def serves_engine(self) -> bool:
@@ -223,7 +224,7 @@ class RequestsConfig(Surrounded):
     @property
     def starts_program(self) -> bool:
         """Whether an external server program is started on the model's files."""
-        return any(pipeline.options.program for pipeline in self.pipelines)
+        return any(pipeline.transport.program(pipeline.options) for pipeline in self.pipelines)
 
     @property
     def foreign(self) -> str:
@@ -263,8 +264,6 @@ class RequestsConfig(Surrounded):
         _ = self.surroundings  # raises UsageError
 
     def _check(self, pipeline: Pipeline) -> None:
-        if self.resize and pipeline.payload in {"yuyv", "jpeg-preencoded"}:
-            raise UsageError(f"`resize`: {pipeline.payload} is what the camera gave; use `payload` raw, jpeg or png")
         if self.state and not pipeline.capabilities.accepts_state:
             raise UsageError(f"`state`: a request of {pipeline.name} has no place for it; leave one of them out")
         if not (pipeline.transport.serves or pipeline.black_box):
@@ -272,12 +271,10 @@ class RequestsConfig(Surrounded):
             raise UsageError(f"`transport` {pipeline.name} is a client alone: name its `url`, {scheme}://HOST:PORT")
         chosen = Choice(pipeline.options, pipeline.variant, self.mode, self.engine.name, self.cameras, self.state)
         pipeline.transport.require(chosen)
-        require_payload(pipeline)
+        require_payload(pipeline, self.mode, resized=self.resize is not None)
         self.served_engine.but(**dict(pipeline.engine))  # raises UsageError for a value in its name
         if pipeline.engine and pipeline.options.external_address:
             raise UsageError(f"`{pipeline.engine[0][0]}`: the server of {pipeline.name} runs already, as it was set")
-        if self.mode == "stream" and pipeline.payload == "jpeg-preencoded":
-            raise UsageError("`payload` jpeg-preencoded has no meaning in `mode` stream; use jpeg")
 
     def _check_answer(self) -> None:
         if self.answer != ACTIONS:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import product
 from math import ceil
 from pathlib import Path
 from random import Random
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 from s2a_bench import extras
 from s2a_bench.clock import Clock, SystemClock, now_ns
@@ -49,14 +48,6 @@ Slot: TypeAlias = Callable[[Place], None]
 """Measures once and writes the result; called once per block."""
 
 
-class Keep(Protocol):
-    def __call__(self, session: Session, measured: Measured, client: int = 0, clients: int = 1) -> None:
-        """Write a request of one of the ``clients`` of a cell, and raise what makes the next one useless.
-
-        Not thread-safe.
-        """
-
-
 @dataclass(frozen=True, slots=True)
 class RunningLaunch:
     """One running set of servers, and their clients."""
@@ -67,15 +58,36 @@ class RunningLaunch:
     writer: RunWriter
     sessions: Sequence[Session]
     """In the order of the cells, `Task.clients` of each cell one after the other."""
-    keep: Keep
+    servers: ServerSet
     guard: SampleGuard
     progress: Progress
     warnings: list[RunWarning]
     """Warnings of the run besides those about its requests."""
-    wiring: Callable[[Pipeline], Wiring[Any]]
-    """Returns the wiring of further clients of a cell."""
     sampler: ResourceSampler
-    recorder: RunRecorder | None = None
+    recorder: RunRecorder | None
+
+    def wiring(self, cell: Pipeline) -> Wiring[Any]:
+        """Return the wiring of further clients of a cell."""
+        return self.servers.wiring(cell)
+
+    def keep(self, session: Session, measured: Measured, client: int = 0, clients: int = 1) -> None:
+        """Write a request of one of the ``clients`` of a cell, and raise what makes the next one useless.
+
+        Not thread-safe.
+        """
+        name, sample, writer = session.cell.name, measured.sample, self.writer
+        keep_origin(writer, name, session.origin)
+        writer.sample(sample)
+        writer.tokens(measured.tokens)
+        self.sampler.flush(writer)
+        for row in session.frames():
+            writer.frame(row)
+        self.guard.see(sample, measured.fingerprint, measured.odd, client)
+        self.servers.raise_if_over(session.cell, measured, suspect=bool(sample.error) and clients == 1)
+        most = GIVE_UP_AFTER + session.answered * ceil(self.plan.wait_s / LONGEST_PAUSE_S)
+        if sum(failures >= most for failures in self.guard.in_a_row[name].values()) >= clients:
+            raise TransportError(f"{name} failed {most} times in a row, at last with {sample.error}")
+        back_off(name, measured.retry_after_s, SystemClock(), self.progress.stage)
 
 
 def in_blocks(launch: RunningLaunch, others: Sequence[Slot] = ()) -> None:
@@ -128,9 +140,7 @@ def run_requests(task: Task, plan: RunPlan, output: Path, progress: Progress) ->
             writer.update(**each.facts(progress.stage))
         if plan.finds_model and extras.installed("gguf"):  # without gguf no file is read
             plan = replace(plan, engine=on_files(plan.engine, progress))
-        sleeps = {cell.name: sleep for cell in plan.cells if (sleep := cell.transport.sleep)}
-        guard = SampleGuard({cell.name: cell.options.against_loss for cell in plan.cells}, sleeps)
-        run = _Run(task, plan, sources, writer, progress, guard, around)
+        run = _Run(task, plan, sources, writer, progress, SampleGuard(plan.cells), around)
         if plan.record is not None:
             run.recorder = RunRecorder(plan.record, plan.namespace, live=plan.feed.stream)
             stack.enter_context(run.recorder)
@@ -219,18 +229,16 @@ class _Run:
         origins = {session.cell.name: session.origin for session in sessions}
         writer.update(asked=described, provenance=Origins(Provenance.of_engine(model), origins).to_manifest())
         hits = servers.cache_hits()
-        keep = partial(self.keep, servers, sampler)
         try:
             launch = RunningLaunch(
                 number,
                 self.plan,
                 writer,
                 sessions,
-                keep,
+                servers,
                 self.guard,
                 self.progress,
                 self.warnings,
-                servers.wiring,
                 sampler,
                 self.recorder,
             )
@@ -251,8 +259,8 @@ class _Run:
     def _wait_for(self, servers: ServerSet, cell: Pipeline) -> None:
         """Return when the server answers a request that is not measured, be it with an error that the run meets too."""
         plan, request, begun_ns = self.plan.feed, self.plan.request, now_ns()
-        source, preencoded = replace(plan, source="synthetic").open(), cell.payload == "jpeg-preencoded"
-        feed = RequestFeed(source, preencoded=preencoded, cameras=plan.cameras, size=plan.resize)
+        source = replace(plan, source="synthetic").open()
+        feed = RequestFeed(source, preencoded=cell.preencoded, cameras=plan.cameras, size=plan.resize)
         while True:
             trace = Trace()
             feed.get_ready()
@@ -292,34 +300,10 @@ class _Run:
             else:
                 user = f"{cell.name} {place}" if place else cell.name
                 source = self.sources.of(user, user if cell.black_box or place else "")
-                preencoded = cell.payload == "jpeg-preencoded"
-                feed = RequestFeed(source, preencoded=preencoded, cameras=plan.cameras, size=plan.resize)
+                feed = RequestFeed(source, preencoded=cell.preencoded, cameras=plan.cameras, size=plan.resize)
             about = self.plan.request, recorder, sampler, servers.origin(cell), clocks
             made.append(Session(cell, client, feed, *about))
             yield made[0]
-
-    def keep(
-        self,
-        servers: ServerSet,
-        sampler: ResourceSampler,
-        session: Session,
-        measured: Measured,
-        client: int = 0,
-        clients: int = 1,
-    ) -> None:
-        name, sample, writer = session.cell.name, measured.sample, self.writer
-        keep_origin(writer, name, session.origin)
-        writer.sample(sample)
-        writer.tokens(measured.tokens)
-        sampler.flush(writer)
-        for row in session.frames():
-            writer.frame(row)
-        self.guard.see(sample, measured.fingerprint, measured.odd, client)
-        servers.raise_if_over(session.cell, measured, suspect=bool(sample.error) and clients == 1)
-        most = GIVE_UP_AFTER + session.answered * ceil(self.plan.wait_s / LONGEST_PAUSE_S)
-        if sum(failures >= most for failures in self.guard.in_a_row[name].values()) >= clients:
-            raise TransportError(f"{name} failed {most} times in a row, at last with {sample.error}")
-        back_off(name, measured.retry_after_s, SystemClock(), self.progress.stage)
 
 
 def _close_idle(client: Client, sessions: Sequence[Session]) -> None:

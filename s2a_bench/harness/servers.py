@@ -93,7 +93,7 @@ class ServerSet:
         name = (f"{transport.name}-{len(bound) + 1}" if bound else transport.name) + self._suffix
         if address := pipeline.options.external_address:
             return _Running(name, address)
-        for address in pipeline.options.addresses():
+        for address in transport.addresses(pipeline.options):
             if address not in bound:
                 break
         bound.append(address)
@@ -101,7 +101,7 @@ class ServerSet:
         if transport.in_process:
             return _Running(name, self._serve_in_process(self._wiring(pipeline, address), engine))
         log = self._folder / f"server-{name}.log"
-        if program := pipeline.options.program:
+        if program := transport.program(pipeline.options):
             process = start_program(program, engine, log, has_grammar=bool(plan.request.grammar))
         else:
             process = OwnServer(name, ServerJob(self._wiring(pipeline, address), engine, tuned=plan.tuned), log)

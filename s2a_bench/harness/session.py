@@ -204,7 +204,7 @@ class Session:
     def _small(self) -> RequestFeed:
         """The least pictures that a request can carry, as many as the last one had."""
         source = open_source("synthetic", *SMALL, fps=30, seed=0)
-        return RequestFeed(source, preencoded=self.cell.payload == "jpeg-preencoded", cameras=self._pictures)
+        return RequestFeed(source, preencoded=self.cell.preencoded, cameras=self._pictures)
 
     def _exchange(self, system: str) -> Trace:
         """Make a request that our server answers without its engine, with its wall clock by a ``system`` if named."""

@@ -21,6 +21,7 @@ from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import RESIDUAL_LIMIT, budget
 from s2a_bench.transport import Sleep
+from s2a_bench.transport.pipeline import Pipeline
 
 CLOCK_STEP_NS = 50_000_000
 LEVEL: Final = 0.01
@@ -189,21 +190,17 @@ def padded_by(sleep: Sleep) -> Doubt:
 
 
 class SampleGuard:
-    """Checks the samples of a run as they arrive.
+    """Checks the samples of a run's ``cells`` as they arrive."""
 
-    ``against_loss`` is cell -> its transport's advice about loss, ``sleeps`` cell -> how its server may sleep.
-    """
-
-    def __init__(
-        self, against_loss: Mapping[str, str] | None = None, sleeps: Mapping[str, Sleep] | None = None
-    ) -> None:
+    def __init__(self, cells: Iterable[Pipeline] = ()) -> None:
         self.succeeded: Counter[str] = Counter()
         """Samples that count, by cell."""
         self.in_a_row: defaultdict[str, Counter[int]] = defaultdict(Counter)
         """Failures of each client since the last success of any, by cell."""
         self.last_error: dict[str, str] = {}
         """The last error, by cell."""
-        self._against_loss, self._sleeps = against_loss or {}, sleeps or {}
+        self._cells = {cell.name: cell for cell in cells}
+        self._sleeps = {name: sleep for name, cell in self._cells.items() if (sleep := cell.transport.sleep)}
         self._waits = {cell: sleep.fact for cell, sleep in self._sleeps.items()}
         self._counts: dict[Doubt, Counter[str]] = {doubt: Counter() for doubt in DOUBTS}
         self._frames: dict[tuple[str, int], str] = {}
@@ -275,7 +272,8 @@ class SampleGuard:
         return [RunWarning("odd-facts", what, advice)] if where else []
 
     def advice(self, cells: Iterable[str]) -> str:
-        return "; ".join(dict.fromkeys(self._against_loss[cell] for cell in cells if cell in self._against_loss))
+        known = [self._cells[name] for name in cells if name in self._cells]
+        return "; ".join(dict.fromkeys(cell.transport.against_loss(cell.options) for cell in known))
 
     def _correlated(self) -> list[RunWarning]:
         """Check whether neighbouring samples are correlated; intervals over several launches do not depend on it."""

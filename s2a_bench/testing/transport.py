@@ -29,9 +29,12 @@ from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, PROMPT_N
 from s2a_bench.trace import GROUPS, RESIDUAL, STAGES, Trace, budget, path_of
 from s2a_bench.transport import (
     ACTIONS,
+    JPEG,
     LOSSLESS,
+    PNG,
     TOKENS,
     TRANSPORTS,
+    YUYV,
     Client,
     Handler,
     Server,
@@ -49,7 +52,7 @@ Connect = Callable[[Handler], Client]
 """Opens a client of the server that has this handler."""
 
 CODED: Final = frozenset({"image_encode", "image_decode"})
-PICTURE_STAGES: Final = {"yuyv": frozenset({"yuv_decode"}), "jpeg": CODED, "png": CODED}
+PICTURE_STAGES: Final = {YUYV: frozenset({"yuv_decode"}), JPEG: CODED, PNG: CODED}
 """Payload -> the stages of a camera's YUYV frame; of all others `convert`."""
 PATIENCE_S: Final = 20.0
 
@@ -287,7 +290,7 @@ class TransportSuite:
         without, sent = (
             ask(client, Request("a", "plan", tuple(images)))[1].facts[PAYLOAD_BYTES] for images in ([], frames)
         )
-        files = [frame.data if payload == "yuyv" else encoded(frame, payload, Trace())[1] for frame in frames]
+        files = [frame.data if payload == YUYV else encoded(frame, payload, Trace())[1] for frame in frames]
         pictures = sum(file.size for file in files)
         assert pictures <= sent - without <= 4 / 3 * pictures + 400 * len(frames)  # Base64 and fields at most
 

@@ -39,7 +39,7 @@ from s2a_bench import extras
 from s2a_bench import options as base
 from s2a_bench.errors import UsageError
 from s2a_bench.registry import Registry
-from s2a_bench.transport.limits import LIMITS, Limits
+from s2a_bench.transport.limits import LIMITS, Bounds, Limits
 
 if TYPE_CHECKING:
     from s2a_bench.facts import Fact
@@ -47,9 +47,10 @@ if TYPE_CHECKING:
     from s2a_bench.types import Frame, Piece, Request
 
 PAYLOADS: Final = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
-"""Forms of a picture: ``bgr8`` pixels, the camera's YUYV, JPEG, a JPEG encoded before the run, PNG."""
+"""Forms of a picture, in the order of tables: ``bgr8`` pixels, the camera's YUYV, JPEG, JPEG encoded before the run, PNG."""
+RAW, YUYV, JPEG, PREENCODED, PNG = PAYLOADS
 
-LOSSLESS: Final = frozenset({"", "raw", "yuyv", "png"})
+LOSSLESS: Final = frozenset({"", RAW, YUYV, PNG})
 """Payloads that give the engine the camera's exact pixels; "" where no picture is sent."""
 
 TRANSPORT: Final = "Transport"
@@ -64,11 +65,16 @@ EXTERNAL: Final = "external"
 """``side`` of an option that holds the address of a running external server."""
 
 PROGRAM: Final = "program"
-"""``side`` of an option that names an external server for the run to start: see `TransportOptions.program`."""
+"""``side`` of an option that names an external server for the run to start: see `Transport.program`."""
 
 
 Payload = Annotated[str, base.one_of(lambda: ("", *PAYLOADS))]
 Payloads = Annotated[tuple[Payload, ...], base.SEVERAL]
+
+
+def payload_order(payload: str) -> int:
+    """Return the place of a payload in tables; what is none of `PAYLOADS` comes last."""
+    return PAYLOADS.index(payload) if payload in PAYLOADS else len(PAYLOADS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,31 +111,9 @@ class TransportOptions(base.Options):
         return next((getattr(self, name) for name in self.of_sides(EXTERNAL)), "")
 
     @property
-    def program(self) -> Program | None:
-        return None
-
-    @property
     def without_effect(self) -> set[str]:
         """Return the given options that only a server at a `url` reads, where there is none."""
         return set()
-
-    @property
-    def tuned(self) -> bool:
-        """Whether processes are tuned: they keep large blocks of memory for the next picture, for example."""
-        return True
-
-    @property
-    def datagrams(self) -> bool:
-        """Whether requests travel as UDP datagrams rather than over TCP."""
-        return False
-
-    @property
-    def against_loss(self) -> str:
-        return "check the network"
-
-    def addresses(self) -> Iterable[str]:
-        """Return the addresses that a new server tries to bind, in order."""
-        return ("",)
 
 
 O = TypeVar("O", bound=TransportOptions)  # noqa: E741 - the one type variable here
@@ -212,7 +196,7 @@ class Wiring(Generic[O]):
     timeout_s: float = 300.0
     """The longest silence before a request counts as failed."""
     deadline_s: float = 0.0
-    """The longest time for a whole answer; 0: see `deadline_of`."""
+    """The longest time for a whole answer; 0: the longest silence, and `TOKEN_S` for each token."""
     max_tokens: int = 512
     """The most tokens of a request that has no such field."""
     limits: Limits = LIMITS
@@ -227,8 +211,9 @@ class Wiring(Generic[O]):
     def capabilities(self) -> Capabilities[O]:
         return TRANSPORTS[self.transport].capabilities(Choice(self.options, self.variant))
 
-    def deadline_of(self, max_tokens: int) -> float:
-        return self.deadline_s or self.timeout_s + TOKEN_S * max_tokens
+    def bounds(self, server: str, max_tokens: int) -> Bounds:
+        """Return the bounds of an answer that begins now; errors call the server ``server``."""
+        return Bounds(server, self.deadline_s or self.timeout_s + TOKEN_S * max_tokens, max_tokens)
 
     @staticmethod
     def from_json(settings: Mapping[str, Any]) -> Wiring[Any]:
@@ -349,6 +334,26 @@ class Transport(Generic[O]):
     def require(self, choice: Choice[O]) -> None:  # noqa: ARG002 - for those that depend on it
         """Raise UsageError for options that conflict with the rest of a choice, or with this machine."""
         self.check_machine()
+
+    def tuned(self, options: O) -> bool:  # noqa: ARG002 - for those whose options decide, here and below
+        """Return whether processes are tuned: they keep large blocks of memory for the next picture, for example."""
+        return True
+
+    def datagrams(self, options: O) -> bool:  # noqa: ARG002
+        """Return whether requests travel as UDP datagrams rather than over TCP."""
+        return False
+
+    def against_loss(self, options: O) -> str:  # noqa: ARG002
+        """Return what to do where messages are lost."""
+        return "check the network"
+
+    def addresses(self, options: O) -> Iterable[str]:  # noqa: ARG002
+        """Return the addresses that a new server tries to bind, in order."""
+        return ("",)
+
+    def program(self, options: O) -> Program | None:  # noqa: ARG002
+        """Return the external server that a run starts, if the options name one."""
+        return None
 
     def ready(self, wiring: Wiring[O]) -> str:
         """Return the line that `serve` prints once the server is bound at ``wiring.address``."""

@@ -12,7 +12,7 @@ import re
 import socket
 from collections.abc import Collection, Iterable
 from ipaddress import ip_address
-from typing import ClassVar, Final
+from typing import ClassVar, Final, TypeVar
 from urllib.parse import parse_qsl, urlsplit
 
 from pydantic import field_validator
@@ -20,7 +20,7 @@ from pydantic import field_validator
 from s2a_bench.errors import PortInUse, UsageError
 from s2a_bench.options import option
 from s2a_bench.secrets import is_secret, keep
-from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
+from s2a_bench.transport import EXTERNAL, SERVER, SERVING, Transport, TransportOptions
 
 ANY: Final = "127.0.0.1:0"
 VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -61,14 +61,21 @@ class ListeningOptions(UrlOptions):
         if self.no_auth and self.api_key_env:
             raise UsageError("`no_auth` serves every client without the key of `api_key_env`; give one of them")
 
-    def addresses(self) -> Iterable[str]:
-        return f"{self.host}:{self.port}", f"{self.host}:0"
-
     def callers(self, with_key: str) -> str:
         """Return which clients our server serves, for `serve`; ``with_key`` describes those with the key {}."""
         if self.api_key_env:
             return f" for clients that {with_key.format(f'${self.api_key_env}')}"
         return " for every client" if self.no_auth else ""
+
+
+L = TypeVar("L", bound=ListeningOptions)
+
+
+class ListeningTransport(Transport[L]):
+    """Has a server that listens at the host and port of its options."""
+
+    def addresses(self, options: L) -> Iterable[str]:
+        return f"{options.host}:{options.port}", f"{options.host}:0"
 
 
 def split_address(address: str, scheme: str) -> tuple[str, str]:

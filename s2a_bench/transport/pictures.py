@@ -19,7 +19,6 @@ STAGES = {
     **dict.fromkeys(("yuv422_yuy2", "yuv422", "nv12", "nv21"), "yuv_decode"),
 }
 """Encoding -> the stage of its conversion to RGB; of all others `image_decode`."""
-PREENCODED = {"jpeg": "image/jpeg", "png": "image/png"}
 
 
 def bgr_of(frame: Frame, trace: Trace, out: Pixels | None = None) -> Frame:
@@ -48,8 +47,8 @@ def rgb_of(frame: Frame, trace: Trace) -> Frame:
 
 def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
     """Return the media type and the bytes of a picture as ``payload``; marks `convert` and `image_encode`."""
-    if frame.encoding in PREENCODED:
-        return PREENCODED[frame.encoding], frame.data
+    if frame.encoding in {"jpeg", "png"}:
+        return f"image/{frame.encoding}", frame.data
     bgr = bgr_of(frame, trace)
     if payload == "raw":
         return f"{RAW_MIME};encoding=bgr8;width={bgr.width};height={bgr.height}", bgr.data.reshape(-1)

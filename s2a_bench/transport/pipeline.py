@@ -20,11 +20,13 @@ from s2a_bench.text import like
 from s2a_bench.transport import (
     ACTIONS,
     EXTERNAL,
+    PREENCODED,
     PROGRAM,
     SERVER,
     SERVING,
     TOKENS,
     TRANSPORTS,
+    YUYV,
     Capabilities,
     Choice,
     Transport,
@@ -48,6 +50,11 @@ class Pipeline:
     @property
     def payload(self) -> str:
         return self.options.payload if self.transport.payloads else ""
+
+    @property
+    def preencoded(self) -> bool:
+        """Whether pictures are JPEGs before the run, as of a camera that delivers them."""
+        return self.payload == PREENCODED
 
     @property
     def black_box(self) -> bool:
@@ -203,7 +210,12 @@ def _filled(options: O, payload: str) -> O:
     return options if options.payload else options.model_copy(update={"payload": payload})
 
 
-def require_payload(pipeline: Pipeline) -> None:
+def require_payload(pipeline: Pipeline, mode: str, *, resized: bool) -> None:
+    """Raise UsageError for a payload that the pipeline cannot carry, or that cannot be resized or streamed."""
+    if resized and pipeline.payload in {YUYV, PREENCODED}:
+        raise UsageError(f"`resize`: {pipeline.payload} is what the camera gave; use `payload` raw, jpeg or png")
+    if mode == "stream" and pipeline.preencoded:
+        raise UsageError(f"`payload` {PREENCODED} has no meaning in `mode` stream; use jpeg")
     can = pipeline.capabilities.payloads
     if pipeline.payload and pipeline.payload not in can:
         path = pipeline.name.partition("?")[0]

@@ -58,7 +58,7 @@ def test_llama_cpps_own_server_is_a_cell_where_it_has_the_same_to_do(
     config = RequestsConfig(**options)
     assert ("http/llama-server" in names(config)) is there
     for cell in config.pipelines:
-        program = cell.options.program
+        program = cell.transport.program(cell.options)
         assert (program is not None) is (cell.variant == "llama-server")
 
 

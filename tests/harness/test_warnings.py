@@ -13,11 +13,23 @@ from s2a_bench.harness.session import INTERRUPTED
 from s2a_bench.harness.warnings import Counters, SampleGuard
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import Mark
-from s2a_bench.transport import Sleep
+from s2a_bench.transport import Sleep, Transport, TransportOptions
+from s2a_bench.transport.pipeline import Pipeline
 from tests.made_runs import row_of
 
 GOOD: list[Mark] = [("", 0), ("network", 90), ("", 91), ("inference", 500), ("return", 600)]
 LOOSE: list[Mark] = [("", 0), ("network", 90), ("", 191), ("inference", 500), ("return", 600)]
+
+
+class Advising(Transport[TransportOptions]):
+    options = TransportOptions
+    sleep = Sleep(Fact("wait_ms"), 1e3 / 30, "wake it")
+
+    def against_loss(self, options: TransportOptions) -> str:  # noqa: ARG002 - as every transport has it
+        return "export A=1"
+
+
+CELL = Pipeline("ros/topic", Advising(), "topic", TransportOptions())
 
 
 def row(request: str, cell: str = "ros/topic", **fields: Any) -> SampleRow:
@@ -102,7 +114,7 @@ def computed_ms(mean: float, deviation: float) -> list[float]:
     ],
 )
 def test_a_server_that_sleeps_is_known_by_its_earliest_answers(waits_ms: list[float], slept: bool) -> None:
-    guard = SampleGuard(sleeps={"ros/topic": Sleep(Fact("wait_ms"), 1e3 / 30, "wake it")})
+    guard = SampleGuard([CELL])
     for at, wait_ms in enumerate(waits_ms):
         guard.see(row(str(at), facts={"wait_ms": wait_ms}), at)
     assert [(each.code, each.advice) for each in guard.warnings()] == [("padded-answers", "wake it")] * slept
@@ -127,7 +139,7 @@ def test_a_warning_names_cells_and_the_way_out() -> None:
 
 
 def test_what_to_do_against_loss_is_what_the_transport_of_the_cell_says() -> None:
-    guard = SampleGuard({"ros/topic": "export A=1", "http/binary": "no"})
+    guard = SampleGuard([CELL])
     guard.see(row("a", facts={"frames_lost": 2.0}), 1)
     guard.see(row("b", error="MessagesLost: 3"), 2)
     assert [warning.advice for warning in guard.warnings()] == ["export A=1", "export A=1"]

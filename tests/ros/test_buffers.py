@@ -51,8 +51,8 @@ def test_the_advice_against_loss_is_that_of_the_dds_in_use(
     for name, value in environ.items():
         monkeypatch.setenv(name, value)
     pipeline = one_pipeline("ros/topic", middleware=middleware)
-    assert re.search(advice, pipeline.options.against_loss)
-    assert pipeline.options.datagrams == ("Zenoh" not in advice)
+    assert re.search(advice, pipeline.transport.against_loss(pipeline.options))
+    assert pipeline.transport.datagrams(pipeline.options) == ("Zenoh" not in advice)
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def test_cells_share_a_server_unless_it_would_be_told_something_else() -> None:
 
 def test_two_servers_of_one_transport_do_not_collide() -> None:
     http, ros = one_pipeline("http", port=8000), one_pipeline("ros?namespace=/mine")
-    assert list(http.options.addresses()) == ["127.0.0.1:8000", "127.0.0.1:0"]
-    assert list(islice(ros.options.addresses(), 3)) == ["/mine", "/mine_2", "/mine_3"]
+    assert list(http.transport.addresses(http.options)) == ["127.0.0.1:8000", "127.0.0.1:0"]
+    assert list(islice(ros.transport.addresses(ros.options), 3)) == ["/mine", "/mine_2", "/mine_3"]
     unnamed = one_pipeline("ros")
-    assert len({address for _ in range(9) for address in unnamed.options.addresses()}) == 9
+    assert len({address for _ in range(9) for address in unnamed.transport.addresses(unnamed.options)}) == 9

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
 from typing import ClassVar, Final
 
-from s2a_bench.boards.profile import Profile, load_profile
 from s2a_bench.boards.tokens import NO_JITTER, gaps_of
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, Numbers, Options, WholeNumbers, option
@@ -45,29 +42,13 @@ class BoundaryConfig(Options):
     plans: int | None = option(None, f"plans a point [default: 1; with jitter {PLANS}]", ge=1, le=1_000_000)
     seed: int = option(0, "seed of everything that is drawn", ge=0)
 
-    @cached_property
-    def boards(self) -> list[Profile]:
-        return [load_profile(name) for name in self.profiles]
-
-    @property
-    def durations(self) -> dict[str, float]:
-        """The durations of a skill in s: as naive runs it, and the least."""
-        return {"t_nom": self.t_nom_s, "t_min": self.t_min * self.t_nom_s}
-
-    @property
-    def grid(self) -> tuple[Sequence[int], Sequence[float]]:
-        """The values of L and R at whose every pair there is a point."""
-        import numpy as np
-
-        return range(1, self.most_tokens + 1), np.geomspace(self.rates[0], self.rates[1], self.rates_tried).tolist()
-
     @property
     def rates_tried(self) -> int:
-        return self.points if self.points is not None else MARKS if self.jitter == NO_JITTER else SHADES
+        return self.points or (MARKS if self.jitter == NO_JITTER else SHADES)
 
     @property
     def plans_a_point(self) -> int:
-        return self.plans if self.plans is not None else 1 if self.jitter == NO_JITTER else PLANS
+        return self.plans or (1 if self.jitter == NO_JITTER else PLANS)
 
     def check(self) -> None:
         if len(self.rates) != 2 or not 0 < self.rates[0] < self.rates[1] < float("inf"):  # noqa: PLR2004 - from, to

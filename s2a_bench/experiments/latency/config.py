@@ -7,7 +7,7 @@ from typing import ClassVar
 from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.inference import OF_MODEL, EngineConfig
 from s2a_bench.options import group, option
-from s2a_bench.transport import PAYLOADS, Payloads
+from s2a_bench.transport import JPEG, PAYLOADS, RAW, Payloads
 
 
 class LatencyConfig(RequestsConfig):
@@ -35,4 +35,4 @@ class LatencyConfig(RequestsConfig):
     def usual_payloads(self) -> tuple[str, ...]:
         """Raw; and JPEG, unless the run is quick or streams, or a pipeline names its payload."""
         named = any("payload=" in name for name in self.names)
-        return ("raw",) if self.quick or self.mode == "stream" or named else ("raw", "jpeg")
+        return (RAW,) if self.quick or self.mode == "stream" or named else (RAW, JPEG)

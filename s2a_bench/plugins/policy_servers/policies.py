@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar, TypeVar
 
 from s2a_bench.options import option
-from s2a_bench.plugins.policy_servers.observation import DEFAULT, TemplateName, names, template_of
+from s2a_bench.plugins.policy_servers.observation import DEFAULT, Template, TemplateName, names, template_of
 from s2a_bench.transport import ACTIONS, Capabilities, Choice, Transport
 from s2a_bench.transport.defaults import BESIDE
 from s2a_bench.transport.listening import UrlOptions, read_key
@@ -15,17 +15,11 @@ from s2a_bench.transport.listening import UrlOptions, read_key
 class TemplateOptions(UrlOptions):
     """Options of a client that makes its observations from a template."""
 
-    USUAL_TEMPLATE: ClassVar[str] = DEFAULT
-
     template: TemplateName = option(
         "",
         "the observation: a template's name, or a TOML or JSON file [default: that of the transport or dialect]",
         names=names,
     )
-
-    @property
-    def template_name(self) -> str:
-        return self.template or self.USUAL_TEMPLATE
 
 
 P = TypeVar("P", bound=TemplateOptions)
@@ -40,9 +34,14 @@ class PolicyTransport(Transport[P]):
     compared_with = BESIDE
     reads_server: ClassVar[Sequence[str]] = ()
     """The keys of `ExternalServer` by which a template may describe the server."""
+    usual_template: ClassVar[str] = DEFAULT
+
+    def template(self, options: P) -> Template:
+        """Return the template of a client's observations."""
+        return template_of(options.template or self.usual_template)
 
     def capabilities(self, choice: Choice[P]) -> Capabilities[P]:
-        options, template = choice.options, template_of(choice.options.template_name)
+        options, template = choice.options, self.template(choice.options)
         pixels = ("raw", "png", "jpeg")[: 3 if template.server.image_maps else 1] if options.url else self.payloads
         payloads = self.payloads[1:] if template.encoded else pixels
         return Capabilities(options, payloads, self.answer_kinds, template.accepts_state, self.facts)
@@ -50,7 +49,7 @@ class PolicyTransport(Transport[P]):
     def require(self, choice: Choice[P]) -> None:
         """Refuse a template that does not fit the requests or the server; raises MissingExtra too."""
         super().require(choice)
-        template = template_of(choice.options.template_name)
+        template = self.template(choice.options)
         template.check_request(choice.cameras, choice.state)
         template.check_server(self.name, self.reads_server)
         read_key(getattr(choice.options, "api_key_env", ""))

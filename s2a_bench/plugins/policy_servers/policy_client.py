@@ -8,11 +8,11 @@ from typing import Any, Final, Generic
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.convert import to_rgb
-from s2a_bench.plugins.policy_servers.observation import template_of
+from s2a_bench.plugins.policy_servers.observation import Template
 from s2a_bench.plugins.policy_servers.policies import P
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Client, Wiring
+from s2a_bench.transport import TRANSPORTS, Client, Wiring
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Frame, Piece, Pixels, Request
@@ -39,12 +39,13 @@ class PolicyClient(Client, Generic[P]):
     def __init__(self, wiring: Wiring[P], alive: Callable[[], bool]) -> None:
         self._wiring, self._alive = wiring, alive
         self._native = not wiring.black_box
-        self._template = template_of(wiring.options.template_name)
+        declared: Any = TRANSPORTS[wiring.transport]
+        self._template: Template = declared.template(wiring.options)
         self._url = wiring.address
         self._listed: list[str] = []
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        bounds = self._bounds(request.max_tokens)
+        bounds = self._wiring.bounds(self._url, request.max_tokens)
         try:
             for piece in self._answer(request, bounds, trace):
                 bounds.count_piece()
@@ -65,9 +66,6 @@ class PolicyClient(Client, Generic[P]):
 
     def close(self) -> None:
         self._abandon()
-
-    def _bounds(self, max_tokens: int) -> Bounds:
-        return Bounds(self._url, self._wiring.deadline_of(max_tokens), max_tokens)
 
     def _observation(self, request: Request, trace: Trace) -> dict[str, Any]:
         """Fill the template, marking the stages of each picture."""

@@ -16,11 +16,11 @@ from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import need_program
-from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Handler, Server, Transport, Urls, Wiring
+from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Handler, Program, Server, Urls, Wiring
 from s2a_bench.transport.defaults import BESIDE
 from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
 from s2a_bench.transport.http.options import WHEEL, HttpOptions
-from s2a_bench.transport.listening import read_key
+from s2a_bench.transport.listening import ListeningTransport, read_key
 
 VARIANTS = ("as-deployed", "best-effort", "binary", "llama-server")
 BINARY, LLAMA_SERVER = VARIANTS[2:]
@@ -39,7 +39,7 @@ def found_llama_server() -> Path | None:
     return WHEEL if extras.installed(str(WHEEL)) and extras.installed("gguf") else None
 
 
-class Http(Transport[HttpOptions]):
+class Http(ListeningTransport[HttpOptions]):
     name = "http"
     variants = VARIANTS
     payloads = ("jpeg", "jpeg-preencoded", "png", "raw")
@@ -134,6 +134,12 @@ class Http(Transport[HttpOptions]):
             if choice.engine != "llama":
                 raise UsageError(f"`llama_server` runs a model; leave out `engine` {choice.engine}")
         read_key(options.api_key_env)
+
+    def program(self, options: HttpOptions) -> Program | None:
+        if options.llama_server is None:
+            return None
+        kind = "llama-server-wheel" if options.llama_server == WHEEL else LLAMA_SERVER
+        return Program(kind, options.llama_server, options.port)
 
     def ready(self, wiring: Wiring[HttpOptions]) -> str:
         from s2a_bench.transport.http.native import PATHS

@@ -29,7 +29,6 @@ from s2a_bench.transport.http.dialects import NATIVE, Event, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_MODEL
 from s2a_bench.transport.http.dialects.decoder import Decoder, error_in
 from s2a_bench.transport.http.options import HttpOptions, merged, read_patch
-from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
 from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Piece, Request, Token
@@ -69,15 +68,13 @@ class HttpClient(Client):
 
     def _new_client(self) -> BoundedClient | LeanClient:
         """Build the client of the variant; over TLS every variant has httpx, whose TLS context alone takes 20 ms."""
-        bounds, timeout_s, tls = self._bounds(0), self._wiring.timeout_s, self._wiring.address.startswith("https:")
-        if self._wiring.variant in {native.BEST_EFFORT, native.BINARY} and not tls:
+        wiring = self._wiring
+        bounds, timeout_s, tls = wiring.bounds(wiring.address, 0), wiring.timeout_s, wiring.address.startswith("https:")
+        if wiring.variant in {native.BEST_EFFORT, native.BINARY} and not tls:
             return LeanClient(bounds, timeout_s)
         # a connection is kept, however long a turn of the other cells takes; only a cloud's server may need the proxy
         # and the certificates of the environment
         return BoundedClient(bounds, timeout=timeout_s, trust_env=tls, limits=httpx.Limits(keepalive_expiry=None))
-
-    def _bounds(self, max_tokens: int) -> Bounds:
-        return Bounds(self._wiring.address, self._wiring.deadline_of(max_tokens), max_tokens)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Encode and send the request and yield the streamed pieces.
@@ -91,7 +88,7 @@ class HttpClient(Client):
             client = self._new_client()
             trace.mark("connect")
         packed_ns = trace.marks[-1][1]
-        client.bounds = bounds = self._bounds(request.max_tokens)
+        client.bounds = bounds = self._wiring.bounds(self._wiring.address, request.max_tokens)
         try:
             with self._translated(), ExitStack() as stack:
 

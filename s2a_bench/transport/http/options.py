@@ -12,7 +12,7 @@ from pydantic import field_validator
 from s2a_bench.errors import UsageError
 from s2a_bench.options import TextOrFile, one_of, option
 from s2a_bench.secrets import LONG, keep, secrets_in
-from s2a_bench.transport import PROGRAM, SERVING, Program
+from s2a_bench.transport import PROGRAM, SERVING
 from s2a_bench.transport.access import WebOptions
 from s2a_bench.transport.http.dialects import DIALECTS
 
@@ -107,10 +107,3 @@ class HttpOptions(WebOptions):
     @property
     def without_effect(self) -> set[str]:
         return set() if self.url else self.of_dialects
-
-    @property
-    def program(self) -> Program | None:
-        if self.llama_server is None:
-            return None
-        kind = "llama-server-wheel" if self.llama_server == WHEEL else "llama-server"
-        return Program(kind, self.llama_server, self.port)

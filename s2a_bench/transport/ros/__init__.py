@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from itertools import chain, count
 from pkgutil import resolve_name
+from secrets import token_hex
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.facts import CAMERA_FACTS, PAYLOAD_BYTES, Fact
-from s2a_bench.ros import MIDDLEWARES
+from s2a_bench.ros import MIDDLEWARES, loss_advice
 from s2a_bench.ros.config import domain_id
 from s2a_bench.ros.join import PLACES
 from s2a_bench.transport import ACTIONS, TOKENS, Capabilities, Choice, Client, Transport, Urls, Wiring
-from s2a_bench.transport.ros.options import RosOptions
+from s2a_bench.transport.ros.options import NAMESPACE, RosOptions
 
 TOPIC, ACTION = VARIANTS = ("topic", "action")
 UNREADABLE_N = Fact(
@@ -91,6 +93,24 @@ class Ros(Transport[RosOptions]):
                 f"`payload`: a goal carries sensor_msgs/Image, not {options.payload}; say it for this transport alone: "
                 f"ros/{ACTION}?payload=raw"
             )
+
+    def tuned(self, options: RosOptions) -> bool:
+        """Return False for DDS, and processes, as they come."""
+        return options.dds_tuning == "tuned"
+
+    def datagrams(self, options: RosOptions) -> bool:
+        return not loss_advice(options.kind.dds_in(os.environ))
+
+    def against_loss(self, options: RosOptions) -> str:
+        from s2a_bench.transport.ros.buffers import against_loss
+
+        return against_loss(options.kind.dds_in(os.environ), os.environ)
+
+    def addresses(self, options: RosOptions) -> Iterable[str]:
+        """Return the namespace, then it with a number; a new random one without the option."""
+        if not options.namespace:
+            return (f"{NAMESPACE}_{token_hex(4)}",)
+        return chain([options.namespace], (f"{options.namespace}_{number}" for number in count(2)))
 
     def ready(self, wiring: Wiring[RosOptions]) -> str:
         from s2a_bench.ros.llama import GENERATE_RESPONSE

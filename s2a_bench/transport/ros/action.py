@@ -97,7 +97,7 @@ class GenerateClient(RosClient):
 
     def _tokens(self, goal_id: bytes, limit: int, trace: Trace) -> Iterator[Token]:
         """Yield the tokens of a goal; it is cancelled after ``limit``, or when the caller leaves early."""
-        bounds = Bounds(self._name, self._wiring.deadline_of(limit), limit)
+        bounds = self._wiring.bounds(self._name, limit)
         count = 0
         heard: list[str] = []
         ended = False

@@ -23,6 +23,7 @@ from s2a_bench.ros.service import LogOnce, appeared
 from s2a_bench.trace import RESIDUAL, Mark, Trace
 from s2a_bench.transport.limits import LIMITS, Limits, check_pixels
 from s2a_bench.transport.pictures import bgr_of, encoded, rgb_of
+from s2a_bench.transport.ros import ROS
 from s2a_bench.transport.ros.options import RosOptions
 from s2a_bench.types import Frame
 
@@ -199,7 +200,7 @@ class CameraCache:
             return ""
         if self._unused:
             return f"{present}, none of its frames can be used: {self._unused}"
-        buffers = self._options.against_loss.replace("--", "")
+        buffers = ROS.against_loss(self._options).replace("--", "")
         other = "; a best-effort publisher is received with qos sensor_data" * (self._options.qos == "reliable")
         return f"{present}, no frame comes: look at the buffers ({buffers}) and at what is published{other}"
 

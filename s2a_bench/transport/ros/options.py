@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Mapping
-from itertools import count
-from secrets import token_hex
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import create_model, field_validator
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, one_of, option
-from s2a_bench.ros import MIDDLEWARES, MiddlewareKind, chosen, loss_advice
+from s2a_bench.ros import MIDDLEWARES, MiddlewareKind, chosen
 from s2a_bench.ros.join import PLACES
 from s2a_bench.ros.remap import ABSOLUTE
 from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
@@ -142,29 +139,5 @@ class RosOptions(PlaceOptions):
         return self.action or self.url.removeprefix(SCHEME)
 
     @property
-    def tuned(self) -> bool:
-        """Return False for DDS, and processes, as they come."""
-        return self.dds_tuning == "tuned"
-
-    @property
     def kind(self) -> MiddlewareKind:
         return chosen(self.middleware)
-
-    @property
-    def datagrams(self) -> bool:
-        return not loss_advice(self.kind.dds_in(os.environ))
-
-    @property
-    def against_loss(self) -> str:
-        from s2a_bench.transport.ros.buffers import against_loss
-
-        return against_loss(self.kind.dds_in(os.environ), os.environ)
-
-    def addresses(self) -> Iterable[str]:
-        """Yield the namespace, then it with a number; a new random one without the option."""
-        if not self.namespace:
-            yield f"{NAMESPACE}_{token_hex(4)}"
-            return
-        yield self.namespace
-        for number in count(2):
-            yield f"{self.namespace}_{number}"

@@ -64,7 +64,7 @@ class TopicClient(RosClient):
         trace.mark("cdr_pack")
         self._publisher.send(packed)
         trace.facts[PAYLOAD_BYTES] = len(packed)
-        bounds = Bounds("the server", self._wiring.deadline_of(request.max_tokens), request.max_tokens)
+        bounds = self._wiring.bounds("the server", request.max_tokens)
         expected = 0
         while True:
             token = self._next(name, trace, bounds)

@@ -20,9 +20,6 @@ class ShmOptions(TransportOptions):
         "", "path of the Unix socket where shared memory is handed over [default: a new one of this user]", side=SERVER
     )
 
-    def addresses(self) -> Iterable[str]:
-        return self.socket, ""
-
 
 class Shm(Transport[ShmOptions]):
     """Request, picture and tokens lie in shared memory; nothing but their places goes through the kernel."""
@@ -44,6 +41,9 @@ class Shm(Transport[ShmOptions]):
     def check_machine(self) -> None:
         if why := unavailable():
             raise UsageError(f"`transport` shm: {why}; take another")
+
+    def addresses(self, options: ShmOptions) -> Iterable[str]:
+        return options.socket, ""
 
     def ready(self, wiring: Wiring[ShmOptions]) -> str:
         return f"serving shared memory at {wiring.address} for this user alone"

@@ -38,7 +38,7 @@ class ShmClient(Client):
         self._connect(STEP_BYTES)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        bounds = Bounds(self._path, self._wiring.deadline_of(request.max_tokens), request.max_tokens)
+        bounds = self._wiring.bounds(self._path, request.max_tokens)
         link, at, length = self._lay_out(request, trace)
         done = False
         try:

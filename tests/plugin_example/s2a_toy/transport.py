@@ -17,10 +17,6 @@ class ToyOptions(TransportOptions):
 
     toy_port: int = option(0, "port of the toy server; 0: any free one", ge=0, le=65535, side=SERVER)
 
-    def addresses(self) -> Iterable[str]:
-        """Return the address of a new server: the port that was asked for, and any free one."""
-        return f"127.0.0.1:{self.toy_port}", "127.0.0.1:0"
-
 
 class Toy(Transport[ToyOptions]):
     """Length-prefixed messages over TCP: a JSON header, then the picture's pixels."""
@@ -33,6 +29,10 @@ class Toy(Transport[ToyOptions]):
     style: ClassVar[Mapping[str, tuple[str, str]]] = {"": ("#8C564B", "-")}
     client_class = "s2a_toy.wire:ToyClient"
     server_class = "s2a_toy.wire:ToyServer"
+
+    def addresses(self, options: ToyOptions) -> Iterable[str]:
+        """Return the address of a new server: the port that was asked for, and any free one."""
+        return f"127.0.0.1:{options.toy_port}", "127.0.0.1:0"
 
 
 TOY = Toy()

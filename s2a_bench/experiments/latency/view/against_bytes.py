@@ -18,7 +18,7 @@ from s2a_bench.experiments.requests import RequestCell, payloads_of, stand_ins
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.change import FEWEST_LAUNCHES, Blocks, ratio_of_launches
 from s2a_bench.stats.line import Estimate, Line, fit_line
-from s2a_bench.transport import declared_transport
+from s2a_bench.transport import declared_transport, payload_order
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.style import cell_styles
 from s2a_bench.writers.tables import ABSENT, TextTable, interval, number
@@ -90,7 +90,7 @@ def against_bytes(runs: Split) -> list[FittedPipeline]:
                     found.setdefault((name, payload), []).append((place, pixels, cell))
     lines = [_pipeline(name, payload, sized) for (name, payload), sized in found.items()]
     order = sorted(
-        lines, key=lambda each: (each.payload != "raw", each.payload, declared_transport(each.path[0]).order, each.name)
+        lines, key=lambda each: (payload_order(each.payload), declared_transport(each.path[0]).order, each.name)
     )
     return order if any(each.line for each in order) else []
 

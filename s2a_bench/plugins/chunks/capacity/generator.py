@@ -314,8 +314,7 @@ class Fleet:
         cell = Pipeline(plan.cell, TRANSPORTS[wiring.transport], wiring.variant, wiring.options)
         client = open_client(wiring)
         source = _Shared(self._source, f"{feed_plan.nonce}/{cell.name} {plan.load.name} {robot}", self._reads)
-        preencoded = cell.payload == "jpeg-preencoded"
-        feed = RequestFeed(source, preencoded=preencoded, cameras=feed_plan.cameras, size=feed_plan.resize)
+        feed = RequestFeed(source, preencoded=cell.preencoded, cameras=feed_plan.cameras, size=feed_plan.resize)
         session = Session(cell, client, feed, plan.requests.request, origin=plan.origin)
         session.answered = True  # its server has answered the warm-up
         self._stack.callback(lambda: None if session.busy else client.close())

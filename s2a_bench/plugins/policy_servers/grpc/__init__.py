@@ -12,7 +12,6 @@ from s2a_bench.errors import UsageError
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.options import option
 from s2a_bench.plugins.policy_servers.grpc.pickles import observation_of
-from s2a_bench.plugins.policy_servers.observation import template_of
 from s2a_bench.plugins.policy_servers.policies import PolicyTransport, TemplateOptions
 from s2a_bench.transport import Choice, Sleep, Urls
 
@@ -24,7 +23,6 @@ PAYLOAD_DOWN_BYTES = Fact("payload_down_bytes", "bytes", "what the chunk weighs 
 class GrpcOptions(TemplateOptions):
     SCHEMES: ClassVar[tuple[str, ...]] = ("grpc",)
     ENDS_WITH_PORT: ClassVar[bool] = True
-    USUAL_TEMPLATE: ClassVar[str] = LEROBOT
 
     policy_type: str = option("", "the policy that the server loads: act, smolvla, diffusion, pi0, pi05, groot, ...")
     pretrained: str = option("", "its checkpoint: a path on the server's machine, or a name on its hub")
@@ -36,6 +34,7 @@ class Grpc(PolicyTransport[GrpcOptions]):
     name = "grpc"
     options = GrpcOptions
     variants = (LEROBOT,)
+    usual_template = LEROBOT
     serves = False
     payloads = ("raw",)
     stages: ClassVar[dict[str, str]] = {"pickle_pack": "pack", "send": "network", "pickle_parse": "parse"}
@@ -60,7 +59,7 @@ class Grpc(PolicyTransport[GrpcOptions]):
                 "`pretrained`: lerobot's server loads what its client names; give `policy_type` and `pretrained`"
             )
         super().require(choice)
-        template = template_of(options.template_name)
+        template = self.template(options)
         observation_of(template.check_request(choice.cameras, choice.state), template.name)
 
 

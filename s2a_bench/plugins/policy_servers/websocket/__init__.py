@@ -14,6 +14,7 @@ from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS, Fact
 from s2a_bench.plugins.policy_servers.policies import PolicyTransport, TemplateOptions
 from s2a_bench.transport import Urls, Wiring
 from s2a_bench.transport.access import WebOptions
+from s2a_bench.transport.listening import ListeningTransport
 
 VARIANTS = ("openpi", "openpi-stream")
 OPENPI, STREAM = VARIANTS
@@ -32,7 +33,7 @@ class WebsocketOptions(WebOptions, TemplateOptions):
     SERVE_DEFAULTS: ClassVar[Mapping[str, Any]] = {"port": 8000}
 
 
-class Websocket(PolicyTransport[WebsocketOptions]):
+class Websocket(ListeningTransport[WebsocketOptions], PolicyTransport[WebsocketOptions]):
     name = "websocket"
     options = WebsocketOptions
     variants = VARIANTS

@@ -207,7 +207,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         """Return the server and its metadata, for the manifest; connects to a foreign server."""
         if not self._native and self._link is None:
             try:
-                self._connected(self._bounds(1))
+                self._connected(self._wiring.bounds(self._url, 1))
             except Broken as error:
                 raise RequestFailed(str(error), starting=error.starting) from error
         return {**super().describe(), **self._metadata}

@@ -13,9 +13,10 @@ from typing import Any, ClassVar, Literal
 
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.options import option
+from s2a_bench.plugins.policy_servers.observation import Template, template_of
 from s2a_bench.plugins.policy_servers.policies import PolicyTransport, TemplateOptions
 from s2a_bench.transport import SERVER, Urls, Wiring
-from s2a_bench.transport.listening import ListeningOptions
+from s2a_bench.transport.listening import ListeningOptions, ListeningTransport
 
 GR00T = "gr00t"
 PACKAGES = ("msgpack", "zmq")
@@ -33,12 +34,8 @@ class ZmqOptions(ListeningOptions, TemplateOptions):
         side=SERVER,
     )
 
-    @property
-    def template_name(self) -> str:
-        return self.template or ("gr00t-n1.5" if self.layout == "n1.5" else "gr00t-n1.6")
 
-
-class Zmq(PolicyTransport[ZmqOptions]):
+class Zmq(ListeningTransport[ZmqOptions], PolicyTransport[ZmqOptions]):
     name = "zmq"
     options = ZmqOptions
     variants = (GR00T,)
@@ -50,6 +47,10 @@ class Zmq(PolicyTransport[ZmqOptions]):
     order = 22
     style = {GR00T: ("#8C510A", "-")}
     packages = ("msgpack", "pyzmq")
+
+    def template(self, options: ZmqOptions) -> Template:
+        usual = "gr00t-n1.5" if options.layout == "n1.5" else "gr00t-n1.6"
+        return template_of(options.template or usual)
 
     def ready(self, wiring: Wiring[ZmqOptions]) -> str:
         address = wiring.address

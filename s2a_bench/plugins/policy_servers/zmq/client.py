@@ -21,9 +21,9 @@ from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.plugins.policy_servers import observed
-from s2a_bench.plugins.policy_servers.observation import EXTENSION, template_of
+from s2a_bench.plugins.policy_servers.observation import EXTENSION
 from s2a_bench.plugins.policy_servers.policy_client import PolicyClient
-from s2a_bench.plugins.policy_servers.zmq import ZmqOptions, layouts
+from s2a_bench.plugins.policy_servers.zmq import ZMQ, ZmqOptions, layouts
 from s2a_bench.plugins.policy_servers.zmq.npy import PictureFile
 from s2a_bench.plugins.policy_servers.zmq.watch import ConnectionWatch
 from s2a_bench.plugins.policy_servers.zmq.wire import pack, read
@@ -61,12 +61,12 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         if self._layout == layouts.AUTO:
             answer, marks = (None, set()) if self._native else self._configurations()
             self._native, self._layout = self._native or layouts.OURS in marks, layouts.marked(marks)
-            self._template = template_of(wiring.options.but(layout=self._layout).template_name)
+            self._template = ZMQ.template(wiring.options.but(layout=self._layout))
         self._modalities = {} if self._native or wiring.options.template else layouts.modalities_in(answer)
 
     def _configurations(self) -> tuple[Any, set[str]]:
         """Return the server's modality configurations and their marks: its layout, and whether it is ours."""
-        bounds = self._bounds(1)
+        bounds = self._wiring.bounds(self._url, 1)
         with closing(ReqSocket(self._url, self._wiring.timeout_s, self._alive)) as link:
             link.greet(bounds)
             return self._read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))

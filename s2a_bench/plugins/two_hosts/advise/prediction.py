@@ -130,7 +130,8 @@ def _advice(pipeline: FittedPipeline, line: Line, profile: LinkProfile, config: 
     size = (pipeline.wire_share or 0.0) * config.pixels_mb * MB
     jitter_ms = up.jitter_ms + down.jitter_ms  # a uniform share of it each way
     sent_ms = bound_s(link, size * HEADERS) * 1e3 - up.delay_ms - down.delay_ms
-    udp = pipelines([pipeline.name])[0].options.datagrams
+    cell = pipelines([pipeline.name])[0]
+    udp = cell.transport.datagrams(cell.options)
     least_ms, most_ms = (0.0, 0.0) if udp else tcp_adds_ms(size, link, config.period_ms, host_tcp())
     link_ms = sent_ms + up.usual_ms + down.usual_ms + (least_ms + most_ms) / 2
     work_ms = line.at(config.pixels_mb)
