@@ -14,7 +14,7 @@ from functools import cached_property, partial
 from itertools import count
 from multiprocessing import get_context
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from tempfile import TemporaryDirectory
 from threading import Event, Lock, Thread
 from time import monotonic, process_time
@@ -267,11 +267,7 @@ class Fleet:
 
     def measured(self) -> list[Measured]:
         """Return the requests since the last call."""
-        found = []
-        with suppress(Empty):
-            while True:
-                found.append(self._done.get_nowait()[1])
-        return found
+        return [self._done.get()[1] for _ in range(self._done.qsize())]
 
     def stop(self, patience_s: float | None = None) -> None:
         """Stop the robots and wait for the answers under way, at most ``patience_s``; None: as long as they take."""

@@ -129,11 +129,7 @@ def run_predicted(config: CapacityPredicted, output: Path, progress: Progress) -
         progress.say(f"service times: {service.about}")
         for load in config.loads:
             name = load.of(service.source.name)
-            prediction = Prediction(load, search, name, service, progress)
-            found = prediction.run()
-            writer.update(service={name: service.about})
-            writer.append(FLEETS, prediction.rows)
-            writer.append(KNEES, [] if found is None else [found])
+            Prediction(load, search, name, service, progress).write(writer)
         return writer.path
 
 
@@ -148,6 +144,12 @@ class Prediction:
     progress: Progress
     rows: list[Any] = field(default_factory=list)
     """The fleets of the first seed."""
+
+    def write(self, writer: RunWriter) -> None:
+        knee = self.run()
+        writer.update(service={self.cell: self.service.about})
+        writer.append(FLEETS, self.rows)
+        writer.append(KNEES, [] if knee is None else [knee])
 
     def run(self) -> KneeRow | None:
         """Try one robot, then fleets as `search`; return the median knee of `SEEDS` seeds.

@@ -151,16 +151,11 @@ class _Cell:
         """Write what one robot's service times predict of the fleets."""
         if self.service is None:
             return
-        name, writer = self.load.of(self.session.cell.name), self.launch.writer
-        prediction = Prediction(self.load, self.search, name, self.service, self.launch.progress)
+        name, progress = self.load.of(self.session.cell.name), self.launch.progress
         try:
-            predicted = prediction.run()
+            Prediction(self.load, self.search, name, self.service, progress).write(self.launch.writer)
         except UsageError as error:  # what was measured stands without it
-            self.launch.progress.say(f"{name}: no prediction: {error}")
-            return
-        writer.update(service={name: self.service.about})
-        writer.append(FLEETS, prediction.rows)
-        writer.append(KNEES, [predicted] if predicted else [])
+            progress.say(f"{name}: no prediction: {error}")
 
     def _fleet(self, robots: _Robots, number: int, source: Source) -> Tried:
         load, launch, confidence = self.load, self.launch, self.search.confidence

@@ -1,4 +1,4 @@
-"""The rows of a cell: its metrics, its first ticks, its first requests."""
+"""The rows of a cell (metrics, first ticks, first requests), of varied triggers, and of varied mean latencies."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.experiments import COUNT
+from s2a_bench.plugins.chunks.chunks.cells import without_trigger
 from s2a_bench.plugins.chunks.chunks.rows import (
     CHUNKS,
     METRICS,
@@ -18,9 +19,11 @@ from s2a_bench.plugins.chunks.chunks.rows import (
     REQUESTS,
     TICKS,
     ChunkRow,
+    MeanRow,
     ReactionRow,
     RequestRow,
     TickRow,
+    TriggerRow,
 )
 from s2a_bench.plugins.chunks.modes.closed import beta, closed
 from s2a_bench.plugins.chunks.modes.metrics import margin_ticks, measure, reaction_ticks
@@ -28,13 +31,21 @@ from s2a_bench.policy.conformal import upper_bound
 from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.chunks.cells import ChunkCell
-    from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ints, Ticks
+    from s2a_bench.plugins.chunks.chunks.cells import ChunkCell, LatencyDraw
+    from s2a_bench.plugins.chunks.chunks.smooth import TrackingPlant
+    from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ints, Mode, Ticks
+    from s2a_bench.plugins.chunks.options import ControlPlan
     from s2a_bench.policy import Floats
     from s2a_bench.store.schema import Table
 
 EVENTS: Final = 100_000
 """Random events whose reaction times are measured."""
+MOST_POINTS: Final = 64
+"""Triggers that are tried."""
+MEANS_TRIED: Final = 33
+REQUESTS_TRIED: Final = 2000
+"""At each mean."""
+SMOOTH: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal")
 SHARES: Final = np.linspace(0, 1, 401)
 """Quantiles of reaction times that are stored: denser than a figure can show."""
 _SIDE: Final = 0.975
@@ -204,3 +215,48 @@ def _plain(value: float | None, *, whole: bool) -> float | int | None:
     if value is None or math.isnan(value):
         return None
     return int(value) if whole else float(value)
+
+
+def trigger_rows(mode: Mode, setting: ControlSetting, drawn: LatencyDraw) -> Iterator[TriggerRow]:
+    """Yield a row for every trigger of a mode."""
+    length = mode.execution_horizon(setting)
+    for ticks in np.unique(np.linspace(0, length - 1, min(length, MOST_POINTS)).round()).astype(int).tolist():
+        tried = mode.varied((ticks,))
+        cycles = tried.cycles(drawn.judged, setting)
+        found = stalls_of(cycles)
+        del found["stalled_cycles"]
+        if found["boundaries"]:
+            yield TriggerRow(
+                latency=drawn.source.name,
+                mode=without_trigger(mode),
+                execution_horizon=length,
+                trigger=ticks,
+                **found,
+                p_stall_closed=closed(tried, drawn.judged, setting).p_stall,
+                age_ticks_mean=mean_age(cycles),
+            )
+
+
+def mean_rows(control: ControlPlan, drawn: LatencyDraw, follows: TrackingPlant | None) -> Iterator[MeanRow]:
+    """Yield a row for each mode under the source's latencies scaled to means from 0 to H ticks."""
+    setting, judged = control.setting, drawn.judged[:REQUESTS_TRIED]
+    shape = judged / max(float(judged.mean()), 1.0)
+    for mean_ns in np.linspace(0, setting.horizon * setting.period_ns, MEANS_TRIED):
+        latency_ns = np.rint(shape * mean_ns).astype(np.int64)
+        for name, mode in control.modes.items():
+            cycles, ticks = mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)
+            share = measure(mode, cycles, ticks).stall_share
+            smooth = follows.measure(mode, cycles, ticks) if follows else {}
+            yield MeanRow(
+                latency=drawn.source.name,
+                mode=name,
+                latency_s=mean_ns / 1e9,
+                stall_share=None if np.isnan(share) else share,
+                **{each: smooth.get(each) for each in SMOOTH},
+            )
+
+
+def mean_age(cycles: Cycles) -> float:
+    """Return the mean age of the observation in ticks over executed actions; each chunk is executed in one run."""
+    middle = cycles.start_tick - cycles.request_tick + (cycles.executed - 1) / 2
+    return float(np.average(middle, weights=cycles.executed))

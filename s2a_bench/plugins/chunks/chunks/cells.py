@@ -114,9 +114,9 @@ def cells(control: ControlPlan, rules: RulesPlan, drawn: LatencyDraw) -> Iterato
             yield ChunkCell(mode, name, rule, drawn, begin=partial(_learner, rule, drawn, rules.epsilon))
 
 
-def changes(setting: ControlSetting, name: str, learnt: Ints, judged: Ints) -> list[RunWarning]:
-    """Return whether the delays of ``judged`` latencies, in ticks, differ from those that a rule learned from."""
-    learned, seen = (list(setting.delay_ticks(each).astype(float)[:, None]) for each in (learnt, judged))
+def changes(setting: ControlSetting, name: str, drawn: LatencyDraw) -> list[RunWarning]:
+    """Return whether the delays of judged latencies, in ticks, differ from those that a rule learned from."""
+    learned, seen = (list(setting.delay_ticks(each).astype(float)[:, None]) for each in (drawn.learnt, drawn.judged))
     return change_warnings(name, learned, seen, "control ticks", f"calibrate anew, or {FOLLOW}")
 
 

@@ -177,8 +177,7 @@ def _drive(plan: ActingPlan, launch: RunningLaunch) -> None:
             whole = acted.ticks.chunk.size  # what is measured is kept
             for table, rows in cell_rows(acted, whole, plan.rules.epsilon, control.seed).items():
                 launch.writer.append(table, rows)
-        learnt, seen = cell.drawn.learnt, acted.latency_ns
-        if cell.rule in PROMISING and (changed := changes(control.setting, cell.cell, learnt, seen)):
+        if cell.rule in PROMISING and (changed := changes(control.setting, cell.cell, acted.cell.drawn)):
             launch.warnings.extend(changed)
             if cell.calibration:
                 launch.writer.update(calibrations={cell.drawn.source.name: {"changed": True}})

@@ -2,102 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
-from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, stalls_of
-from s2a_bench.plugins.chunks.chunks.cells import (
-    FOLLOW,
-    ChunkCell,
-    LatencyDraw,
-    cells,
-    changes,
-    draw,
-    without_trigger,
-)
+from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, mean_rows, trigger_rows
+from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes, draw
 from s2a_bench.plugins.chunks.chunks.config import PROMISING
-from s2a_bench.plugins.chunks.chunks.rows import (
-    CHUNKS,
-    MEANS,
-    REACTIONS,
-    REQUESTS,
-    TICKS,
-    TRIGGERS,
-    MeanRow,
-    TriggerRow,
-)
+from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
 from s2a_bench.plugins.chunks.chunks.smooth import TrackingPlant, follower
 from s2a_bench.plugins.chunks.latencies import delay_rows, write_delays
-from s2a_bench.plugins.chunks.modes.closed import closed
-from s2a_bench.plugins.chunks.modes.metrics import measure
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
     from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
-    from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Mode
-    from s2a_bench.plugins.chunks.options import ControlPlan
+    from s2a_bench.plugins.chunks.modes import ControlSetting
     from s2a_bench.progress import Progress
 
-MOST_POINTS: Final = 64
 MOST_TICKS: Final = 100_000_000
 """Control ticks of a cell, which are held in memory."""
-MEANS_TRIED: Final = 33
-REQUESTS_TRIED: Final = 2000
-SMOOTH: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal")
-
-
-def trigger_rows(mode: Mode, setting: ControlSetting, drawn: LatencyDraw) -> Iterator[TriggerRow]:
-    """Yield a row for every trigger of a mode."""
-    length = mode.execution_horizon(setting)
-    for ticks in np.unique(np.linspace(0, length - 1, min(length, MOST_POINTS)).round()).astype(int).tolist():
-        tried = mode.varied((ticks,))
-        cycles = tried.cycles(drawn.judged, setting)
-        found = stalls_of(cycles)
-        del found["stalled_cycles"]
-        if found["boundaries"]:
-            yield TriggerRow(
-                latency=drawn.source.name,
-                mode=without_trigger(mode),
-                execution_horizon=length,
-                trigger=ticks,
-                **found,
-                p_stall_closed=closed(tried, drawn.judged, setting).p_stall,
-                age_ticks_mean=mean_age(cycles),
-            )
-
-
-def mean_rows(control: ControlPlan, drawn: LatencyDraw, follows: TrackingPlant | None) -> Iterator[MeanRow]:
-    """Yield a row for each mode under the source's latencies scaled to means from 0 to H ticks."""
-    setting, judged = control.setting, drawn.judged[:REQUESTS_TRIED]
-    shape = judged / max(float(judged.mean()), 1.0)
-    for mean_ns in np.linspace(0, setting.horizon * setting.period_ns, MEANS_TRIED):
-        latency_ns = np.rint(shape * mean_ns).astype(np.int64)
-        for name, mode in control.modes.items():
-            cycles, ticks = mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)
-            share = measure(mode, cycles, ticks).stall_share
-            smooth = follows.measure(mode, cycles, ticks) if follows else {}
-            yield MeanRow(
-                latency=drawn.source.name,
-                mode=name,
-                latency_s=mean_ns / 1e9,
-                stall_share=None if np.isnan(share) else share,
-                **{each: smooth.get(each) for each in SMOOTH},
-            )
-
-
-def mean_age(cycles: Cycles) -> float:
-    """Return the mean age of the observation in ticks over executed actions; each chunk is executed in one run."""
-    middle = cycles.start_tick - cycles.request_tick + (cycles.executed - 1) / 2
-    return float(np.average(middle, weights=cycles.executed))
 
 
 def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path:
@@ -114,7 +42,7 @@ def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path
         warnings = [RunWarning("few-latencies", few, "record more, or raise --eps"), *warnings]
     for each in {cell.drawn.source.name: cell.drawn for cell in tried if cell.rule in PROMISING}.values():
         name, recorded = each.source.name, each.source.recorded_ns is not None
-        if recorded and (changed := changes(setting, name, each.learnt, each.judged)):
+        if recorded and (changed := changes(setting, name, each)):
             warnings += changed
             calibrations.get(name, {})["changed"] = True
     manifest = {
@@ -135,8 +63,8 @@ def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path
         follows = None if plant is None else follower(plant, control)
         for cell in tried:
             acted = _acted(cell, setting.slowed(cell.slower), follows)
-            for table, found in cell_rows(acted, config.shown_ticks, rules.epsilon, config.seed).items():
-                writer.append(table, found)
+            for table, rows in cell_rows(acted, config.shown_ticks, rules.epsilon, config.seed).items():
+                writer.append(table, rows)
             progress.advance()
         if rules.mode is not None:
             for each in drawn:

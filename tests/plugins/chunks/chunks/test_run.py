@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
-from s2a_bench.plugins.chunks.chunks.build_rows import reactions_s
+from s2a_bench.plugins.chunks.chunks.build_rows import mean_age, reactions_s, trigger_rows
 from s2a_bench.plugins.chunks.chunks.cells import cells, draw
 from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, METRICS, REQUESTS, TICKS
-from s2a_bench.plugins.chunks.chunks.run import mean_age, run_virtual, trigger_rows
+from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.plugins.chunks.chunks.view import chunk_sentences, show
 from s2a_bench.plugins.chunks.modes import ControlSetting, mode
 from s2a_bench.plugins.chunks.modes.closed import Closed, closed, mean_reaction_s
