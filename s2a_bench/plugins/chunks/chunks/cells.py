@@ -92,8 +92,8 @@ def draw(source: Source, cycles: int | None, learnt: int, seed: int) -> LatencyD
     if source.recorded_ns is not None:
         judged = source.recorded_ns[count:]
         return LatencyDraw(source, judged[:cycles], source.recorded_ns[:count])
-    judged = source.draw(generator(seed, "chunks", source.name), cycles or CYCLES)
-    return LatencyDraw(source, judged, source.draw(generator(seed, "chunks rules", source.name), count))
+    rng, rules_rng = (generator(seed, key, source.name) for key in ("chunks", "chunks rules"))
+    return LatencyDraw(source, source.draw(rng, cycles or CYCLES), source.draw(rules_rng, count))
 
 
 def cells(control: ControlPlan, rules: RulesPlan, drawn: LatencyDraw) -> Iterator[ChunkCell]:

@@ -44,10 +44,6 @@ class RulesPlan:
     """By how many times a rule may slow actions down."""
 
     @property
-    def learn(self) -> bool:
-        return self.mode is not None and bool(self.tried)
-
-    @property
     def promise(self) -> bool:
         """Whether one of them keeps to ``epsilon``."""
         return self.mode is not None and not {*PROMISING}.isdisjoint(self.tried)
@@ -65,7 +61,7 @@ class ChunksOptions(ControlOptions):
     slowest: float = option(
         1.0, "so many times slower calibrated and oracle may make actions where no trigger is enough", ge=1, le=1000
     )
-    rules: Names = rules_option(())
+    rules: Annotated[Names, one_of(lambda: LIVE_RULES)] = rules_option(())
     epsilon: float = option(0.01, "share of cycles that may stall, for the rules", flag="eps", gt=0, lt=1)
     guarantee: Guarantee = GUARANTEE
     shown_ticks: int = option(
@@ -95,7 +91,7 @@ class ChunksOptions(ControlOptions):
         return self.rules
 
     @cached_property
-    def choosing(self) -> RulesPlan:
+    def rules_plan(self) -> RulesPlan:
         mode = next((each for each in self.control.modes.values() if each.triggered), None)
         return RulesPlan(mode, self.rules_tried, self.epsilon, self.guarantee, self.slowest)
 
@@ -167,7 +163,7 @@ class ChunksVirtual(ChunksOptions):
     @property
     def learnt(self) -> int:
         """The most latencies of a source that rules learn from."""
-        return self.calibration_cycles if self.choosing.learn else 0
+        return self.calibration_cycles if self.rules_plan.mode is not None and self.rules_plan.tried else 0
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
@@ -187,7 +183,7 @@ class ChunksVirtual(ChunksOptions):
                 raise UsageError(
                     f"`latency`: {source.name} has {recorded.size} latencies{kept}; two or more are needed"
                 )
-        if self.choosing.promise and self.too_few:
+        if self.rules_plan.promise and self.too_few:
             others = ",".join(rule for rule in RULES if rule not in PROMISING)
             raise UsageError(f"`rules`: {self.too_few}; raise `epsilon`, or take `rules` {others}")
 
@@ -195,7 +191,6 @@ class ChunksVirtual(ChunksOptions):
 class ChunksLive(ChunksOptions, ServedOptions):
     """Modes and rules in real time, on the answers of a server."""
 
-    rules: Annotated[Names, one_of(lambda: LIVE_RULES)] = rules_option(())
     seconds: float = option(20.0, "how long each mode acts", gt=0, le=86_400)
 
     def check(self) -> None:
@@ -210,7 +205,7 @@ class ChunksLive(ChunksOptions, ServedOptions):
                 f"`seconds`: {self.seconds:g} s at `control_hz` {self.control_hz:g} are over {MOST_LIVE_TICKS:.0e} "
                 "control ticks, which are held in memory; act for a shorter time"
             )
-        if self.choosing.promise and self.requests.warmup < (needed := fewest(self.epsilon)):
+        if self.rules_plan.promise and self.requests.warmup < (needed := fewest(self.epsilon)):
             raise UsageError(
                 f"`warmup`: {self.requests.warmup} requests are too few to learn from for `epsilon` "
                 f"{self.epsilon:g}; take {needed} or more, or other `rules`"

@@ -140,7 +140,7 @@ def run_live(config: ChunksLive, output: Path, progress: Progress) -> Path:
     plan = resolve(config.robots_requests, progress.say)
     settings = {**plan.manifest["configuration"], **config.to_manifest()}
     plan = plan.with_manifest(configuration=settings, cadence=f"a control loop at {config.control_hz:g} Hz")
-    loop = ActingPlan(control, config.choosing, config.seconds, config.latency, config.robot_kind)
+    loop = ActingPlan(control, config.rules_plan, config.seconds, config.latency, config.robot_kind)
     several = any(each.several for each in control.modes.values())
     task = Task("chunks", drive=partial(_drive, loop), clients=CLIENTS if several else 1)
     folder = run_requests(task, plan, output, progress)

@@ -30,14 +30,14 @@ MOST_TICKS: Final = 100_000_000
 
 def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path:
     """Act in virtual time and return the run folder; raises S2AError."""
-    control, rules, setting = config.control, config.choosing, config.setting
+    control, rules, setting = config.control, config.rules_plan, config.setting
     drawn = [draw(source, config.cycles, config.learnt, config.seed) for source in config.sources]
     for each in drawn:
         _check_memory(each, setting)
     tried = [cell.followed(setting) for each in drawn for cell in cells(control, rules, each)]
     calibrations = {cell.drawn.source.name: asdict(cell.calibration) for cell in tried if cell.calibration}
     warnings = exchange_warnings(calibrations, FOLLOW)
-    if rules.learn and (missing := ", ".join(rule for rule in config.rules if rule not in rules.tried)):
+    if config.learnt and (missing := ", ".join(rule for rule in config.rules if rule not in rules.tried)):
         few = f"without the rules {missing}: {config.too_few}"
         warnings = [RunWarning("few-latencies", few, "record more, or raise --eps"), *warnings]
     for each in {cell.drawn.source.name: cell.drawn for cell in tried if cell.rule in PROMISING}.values():

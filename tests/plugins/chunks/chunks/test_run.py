@@ -147,7 +147,7 @@ def test_a_recording_is_played_in_order_and_its_first_half_is_what_rules_learn_f
     drawn = draw(source, config.cycles, config.learnt, config.seed)
     assert (drawn.learnt.size, drawn.judged.size) == (200, 200)
     assert drawn.judged[:3].tolist() == [20_000_000, 21_000_000, 22_000_000]
-    assert {cell.rule for cell in cells(config.control, config.choosing, drawn)} == {"given", *config.rules}
+    assert {cell.rule for cell in cells(config.control, config.rules_plan, drawn)} == {"given", *config.rules}
     without = ChunksVirtual(latency=str(file), rules="", cycles=150)
     assert draw(without.sources[0], without.cycles, without.learnt, 0).judged.size == 150
 
