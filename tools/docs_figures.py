@@ -18,11 +18,11 @@ import numpy as np
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
-from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.ccrb.run import run_ccrb
+from s2a_bench.experiments.ccrb.config import CcrbClosedLoop
+from s2a_bench.experiments.ccrb.run import run_closed_loop
+from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.figures import policy_colours
-from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.policy.arrivals import uniform
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 FOLDER = Path(__file__).parent.parent / "docs" / "figures"
 DPI = 150
-ORIN = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
+ORIN = TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
 
 
 SPREAD = "lognormal:mean_ms=80,cv=0.5"
@@ -60,7 +60,7 @@ class Quiet:
         """Do nothing."""
 
 
-def timelines(config: TimelineConfig) -> Figure:
+def timelines(config: TimelineComputed) -> Figure:
     """Draw a timeline run."""
     return drawn(_run(lambda output: run_timeline(config, output, Quiet())), "timeline")
 
@@ -143,13 +143,11 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     "online": lambda: timelines(
         ORIN.but(policies=("naive", "s2a-clairvoyant", "s2a-mean", "stream-to-act"), jitter="profile")
     ),
-    "timeline": lambda: timelines(TimelineConfig()),
+    "timeline": lambda: timelines(TimelineComputed()),
     "windscreen": windscreen_figure,
     "boundary": lambda: boundary(BoundaryConfig()),
     "boundary-jitter": lambda: boundary(BoundaryConfig(jitter="lognormal:cv=0.2")),
-    "closed-loop": lambda: drawn(
-        _run(lambda output: run_ccrb(CcrbConfig(closed_loop=True), output, Quiet())), "scenario"
-    ),
+    "closed-loop": lambda: drawn(_run(lambda output: run_closed_loop(CcrbClosedLoop(), output, Quiet())), "scenario"),
     "chunks-lanes": lambda: drawn(chunks(SPREAD), "lanes"),
     "chunks-stability": lambda: drawn(chunks(SPREAD), "stability"),
     "chunks-triggers": lambda: drawn(chunks(f"{SPREAD},{SLOW_ONES}"), "triggers"),

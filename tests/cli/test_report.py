@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.experiments.timeline.run import run_timeline
-from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.testing import NullProgress
 from tests.cli.program import called, refused
 
@@ -21,7 +21,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def timeline(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    config = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
+    config = TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
     return run_timeline(config, tmp_path_factory.mktemp("timeline"), NullProgress())
 
 

@@ -14,9 +14,9 @@ WRONG = {
         ("--simulator gazebo", "--simulator: 'gazebo' is none of longitudinal, embedded"),
         ("--simulator 'embedded?port=1'", "--simulator: embedded: 'port' is no parameter; it has no parameters"),
         ("--lane-change", "--lane-change: the longitudinal simulator knows one lane"),
-        ("--pace 4.8", "--pace is about a model that answers; it needs --live"),
-        ("--live --rate 9", "--rate is about tokens that are modelled; leave it out with --live"),
-        ("--live --engine echo", "--engine echo writes no plans"),
+        ("--live --rate 9", "--rate is an option of mode computed: leave out --live"),
+        ("--closed-loop --ttc", "--ttc is an option of mode computed: leave out --closed-loop"),
+        ("--live --engine echo", "--engine echo computes nothing; a plan takes a model's time: use llama or replay"),
     ],
     "chunks": [
         ("--rules calibrated --eps 0.001 --calibration-cycles 100", "or take --rules maximum,mean,oracle"),
@@ -33,9 +33,10 @@ WRONG = {
     ],
     "timeline": [
         ("--policy 'stream-to-act?cauton=2'", "; did you mean caution?"),
-        ("--live --plans 3", "--plans are computed; with --live write --requests 3"),
+        ("--live --plans 3", "--plans is an option of mode computed: leave out --live"),
         ("--jitter fog", "--jitter fog: family: 'fog' is none of"),
-        ("--pace 4.8", "--pace is about a model that answers; it needs --live"),
+        ("--pace 4.8", "--pace is an option of mode live: give --live"),
+        ("--live --real-time", "--live and --real-time exclude each other"),
         ("--live --url http://localhost:1 --pace 3", "--pace needs the package's server"),
     ],
     "boundary": [

@@ -11,7 +11,7 @@ import pytest
 
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.config import CcrbComputed
 from s2a_bench.experiments.ccrb.rows import LOOP, METRICS, ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.ccrb.view.figures import build_phase, build_scenario, region_of
@@ -36,7 +36,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., StoredRun]:
     @cache
     def make(**options: Any) -> StoredRun:
         with RunProgress() as progress:
-            return read_run(run_ccrb(CcrbConfig(**options), tmp_path_factory.mktemp("runs"), progress))
+            return read_run(run_ccrb(CcrbComputed(**options), tmp_path_factory.mktemp("runs"), progress))
 
     return make
 
@@ -119,7 +119,7 @@ def test_random_scenarios_repeat_by_their_seed(tmp_path: Path) -> None:
     again = []
     for seed in (3, 3, 4):
         with RunProgress() as progress:
-            run = read_run(run_ccrb(CcrbConfig(random=10, seed=seed), tmp_path, progress))
+            run = read_run(run_ccrb(CcrbComputed(random=10, seed=seed), tmp_path, progress))
         again.append(run.table(ROLLOUTS).drop(columns="cell").to_csv())
     assert again[0] == again[1] != again[2]
 
@@ -201,4 +201,4 @@ def test_the_run_shows_what_its_options_ask_for(made: Callable[..., StoredRun]) 
 )
 def test_what_makes_no_sense_is_refused(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        CcrbConfig(**options)
+        CcrbComputed(**options)

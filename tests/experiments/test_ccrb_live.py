@@ -11,9 +11,9 @@ import pytest
 
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.experiments.ccrb.config import CcrbConfig, PlanRequest
+from s2a_bench.experiments.ccrb.config import CcrbLive, CcrbLiveLoop, DrivingRequests
+from s2a_bench.experiments.ccrb.live import run_live, run_live_loop
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
-from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.ccrb.view.outcomes import origin_notes, token_times_s
 from s2a_bench.experiments.ccrb.view.tables import ccrb_json
 from s2a_bench.inference import EngineConfig
@@ -29,24 +29,26 @@ from tests.made_runs import SCHEMA
 from tests.scenario.carla_stand_in import RosSimulator
 
 N, L, T_NS = 3, 6, 800_000_000
-REPLAYED = PlanRequest(live=True, transport="loopback", engine=EngineConfig(name="replay"))
 
 
-def drive(plan_request: PlanRequest, folder: Path, profile: str = "jetson-agx-orin") -> StoredRun:
-    config = CcrbConfig(
-        scenario=CcrbOptions(n_skills=N), tokens_per_skill=L, plan_request=plan_request, profile=profile
-    )
+def asked(engine: EngineConfig) -> DrivingRequests:
+    return DrivingRequests(transports="loopback", engine=engine)
+
+
+def replayed(profile: str) -> DrivingRequests:
+    return asked(EngineConfig(name="replay", profile=profile))
+
+
+def drive(requests: DrivingRequests, folder: Path) -> StoredRun:
+    config = CcrbLive(scenario=CcrbOptions(n_skills=N), tokens_per_skill=L, requests=requests)
     with RunProgress() as progress:
-        return read_run(run_ccrb(config, folder, progress))
+        return read_run(run_live(config, folder, progress))
 
 
 @pytest.fixture(scope="module")
 def paced(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     """The tiny dummy model, held back to 40 tokens a second."""
-    return drive(
-        PlanRequest(live=True, transport="loopback", engine=EngineConfig(threads=1, pace=40.0)),
-        tmp_path_factory.mktemp("runs"),
-    )
+    return drive(asked(EngineConfig(threads=1, pace=40.0)), tmp_path_factory.mktemp("runs"))
 
 
 def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: StoredRun) -> None:
@@ -95,7 +97,7 @@ def test_a_text_model_is_live_and_its_tokens_say_that_the_scene_is_not_seen(tmp_
     model = tmp_path / "texts.gguf"
     model.symlink_to(tiny_dummy()[0])
     engine = EngineConfig(model=model, threads=1)
-    run = drive(PlanRequest(live=True, transport="loopback", engine=engine), tmp_path / "runs")
+    run = drive(asked(engine), tmp_path / "runs")
     first = origin_notes(run)[0]
     assert first.startswith("LIVE tokens over loopback, picture not seen; car simulated.")
     assert first.labels == ("picture not seen",)  # type: ignore[attr-defined]
@@ -105,7 +107,7 @@ def test_a_text_model_is_live_and_its_tokens_say_that_the_scene_is_not_seen(tmp_
 
 
 def test_a_replayed_profile_stays_emulated(fast_board: str, tmp_path: Path) -> None:
-    run = drive(REPLAYED, tmp_path / "runs", fast_board)
+    run = drive(replayed(fast_board), tmp_path / "runs")
     assert run.table(ROLLOUTS)["emulated"].all()
     first = origin_notes(run)[0]
     assert first.startswith("EMULATED (replayed) tokens over loopback; car simulated. 1")
@@ -127,7 +129,7 @@ def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
     with pytest.raises(
         TransportError, match=r"loopback: 1 of 3 skills arrived; .*tokens\.csv has what the model wrote"
     ):
-        drive(REPLAYED, tmp_path / "runs", fast_board)
+        drive(replayed(fast_board), tmp_path / "runs")
     (folder,) = (tmp_path / "runs").iterdir()
     assert len(read_run(folder).table(TOKENS)) == 2 * L
 
@@ -139,18 +141,16 @@ def test_the_ego_is_commanded_and_seen_over_ros_while_its_plan_arrives(
     monkeypatch.setitem(SIMULATORS._builtins, "stand-in", "tests.scenario.carla_stand_in:RosSimulator")
     monkeypatch.setattr(RosSimulator, "opened", [])
     ego = "ros?middleware=cyclonedds&wait_s=60"
-    config = CcrbConfig(
+    config = CcrbLiveLoop(
         scenario=CcrbOptions(n_skills=N),
         tokens_per_skill=L,
-        plan_request=REPLAYED,
-        profile=fast_board,
+        requests=replayed(fast_board),
         policies=("naive",),
         simulator="stand-in",
         ego=ego,
-        closed_loop=True,
     )
     with RunProgress() as progress:
-        run = read_run(run_ccrb(config, tmp_path, progress))
+        run = read_run(run_live_loop(config, tmp_path, progress))
     (world,) = RosSimulator.opened
     driven = run.table(ROLLOUTS).query("study == 'point'")
     assert list(driven["simulator"]) == ["stand-in"]
@@ -172,5 +172,5 @@ def test_the_ego_is_commanded_and_seen_over_ros_while_its_plan_arrives(
 )
 def test_an_ego_that_cannot_be_reached_is_refused_before_anything_is_opened(ego: str, says: str) -> None:
     with pytest.raises(UsageError, match=r"^`ego`: ") as error:
-        CcrbConfig(simulator="embedded", ego=ego).check()
+        CcrbLiveLoop(simulator="embedded", ego=ego)
     assert says in str(error.value)

@@ -16,12 +16,14 @@ import pytest
 from s2a_bench.act.events import AbortRequested, Event, Requested, StreamEnded, VirtualInbox
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.clock import SystemClock, VirtualClock
-from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.experiments.ccrb.config import CcrbConfig, PlanRequest
+from s2a_bench.errors import TransportError
+from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbLiveLoop, DrivingRequests
+from s2a_bench.experiments.ccrb.drives import Prepared, TableRows, loop_rows, motion_of
+from s2a_bench.experiments.ccrb.live import run_live_loop
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
+from s2a_bench.experiments.ccrb.plan import resolve
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.ccrb.run import Prepared, keep_loop, prepare, run_ccrb
-from s2a_bench.experiments.ccrb.studies import motion_of
+from s2a_bench.experiments.ccrb.run import prepare
 from s2a_bench.frames import FrameSource
 from s2a_bench.inference import EngineConfig
 from s2a_bench.plan.skillset import GAPS, Gap
@@ -38,10 +40,8 @@ from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Frame, Piece, Request
 
-LIVE = PlanRequest(live=True, transport="loopback", engine=EngineConfig(name="replay"))
 
-
-def scenario(number: int) -> CcrbConfig:
+def scenario(number: int) -> CcrbClosedLoop:
     """Return one of 20 random scenarios."""
     at: dict[str, Any] = {
         name: values[number].item() for name, values in draw(np.random.default_rng(45), 20).numbers.items()
@@ -50,13 +50,13 @@ def scenario(number: int) -> CcrbConfig:
         name: at[name] for name in ("front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s", "n_skills", "t_nom_s")
     }
     options = CcrbOptions(**numbers, speed_kmh=at["speed_mps"] * 3.6, gap=GAPS[number % len(GAPS)])
-    return CcrbConfig(
+    return CcrbClosedLoop(
         rate=at["tokens_per_s"], prompt_s=at["prompt_s"], tokens_per_skill=at["tokens_per_skill"], scenario=options
     )
 
 
-def driven(config: CcrbConfig, ready: Prepared, name: str) -> Driven:
-    return drive(Longitudinal(), config.scenario.cars, config.scenario.driving, ready.schedules[name])
+def driven(ready: Prepared, name: str) -> Driven:
+    return drive(Longitudinal(), ready.scenario.cars, ready.scenario.driving, ready.schedules[name])
 
 
 def differ_m(one: Driven, other: Driven) -> float:
@@ -67,9 +67,9 @@ def differ_m(one: Driven, other: Driven) -> float:
 @pytest.mark.parametrize("number", range(20))
 def test_on_the_same_arrivals_a_loop_ends_as_its_roll_out(number: int) -> None:
     config = scenario(number)
-    ready, name = prepare(config), COMPARED[number % 3]
+    ready, name = prepare(resolve(config)), COMPARED[number % 3]
     looped = replayed(config.scenario, Embedded(), ready.policies[name], ready.plans)
-    expected = driven(config, ready, name)
+    expected = driven(ready, name)
     assert looped.record.outcome == "completed"
     assert looped.driven.outcomes.name(0) == expected.outcomes.name(0)
     assert differ_m(looped.driven, expected) < 0.03
@@ -77,16 +77,16 @@ def test_on_the_same_arrivals_a_loop_ends_as_its_roll_out(number: int) -> None:
 
 
 def test_a_board_of_which_the_first_token_takes_minutes_hits_the_lead_as_in_its_roll_out() -> None:
-    config = CcrbConfig(prompt_s=200.0)
-    ready = prepare(config)
+    config = CcrbClosedLoop(prompt_s=200.0)
+    ready = prepare(resolve(config))
     looped = replayed(config.scenario, Longitudinal(), ready.policies["naive"], ready.plans)
     assert (looped.record.outcome, len(looped.record.ran)) == ("completed", 5)
-    assert looped.driven.outcomes.name(0) == driven(config, ready, "naive").outcomes.name(0) == "front"
+    assert looped.driven.outcomes.name(0) == driven(ready, "naive").outcomes.name(0) == "front"
 
 
 def test_motion_does_not_depend_on_when_the_first_sample_was() -> None:
-    config = CcrbConfig()
-    schedule = prepare(config).schedules["naive"]
+    config = CcrbClosedLoop()
+    schedule = prepare(resolve(config)).schedules["naive"]
     path = drive(Longitudinal(), config.scenario.cars, config.scenario.driving, schedule, record=True).trajectory
     assert path is not None
     assert motion_of(replace(path, time_s=path.time_s + 0.013)) == pytest.approx(motion_of(path))
@@ -95,19 +95,18 @@ def test_motion_does_not_depend_on_when_the_first_sample_was() -> None:
 @pytest.mark.parametrize("number", range(4))
 def test_a_step_as_on_the_clock_changes_gaps_by_decimetres_at_most(number: int) -> None:
     config, world = scenario(number), Longitudinal()
-    ready, world.step_s = prepare(config), 0.02
+    ready, world.step_s = prepare(resolve(config)), 0.02
     for name in COMPARED:
         looped = replayed(config.scenario, world, ready.policies[name], ready.plans)
-        expected = driven(config, ready, name)
+        expected = driven(ready, name)
         assert looped.driven.outcomes.name(0) == expected.outcomes.name(0)
         assert differ_m(looped.driven, expected) < 0.2
 
 
-def run(folder: Path, **options: Any) -> StoredRun:
+def run(folder: Path, profile: str = "jetson-agx-orin", **options: Any) -> StoredRun:
+    requests = DrivingRequests(transports="loopback", engine=EngineConfig(name="replay", profile=profile))
     with RunProgress() as progress:
-        return read_run(
-            run_ccrb(CcrbConfig(**{"closed_loop": True, "plan_request": LIVE, **options}), folder, progress)
-        )
+        return read_run(run_live_loop(CcrbLiveLoop(requests=requests, **options), folder, progress))
 
 
 def by_study(stored: StoredRun, study: str) -> pd.DataFrame:
@@ -234,17 +233,15 @@ def test_an_extended_skill_keeps_the_speed_that_it_has_reached() -> None:
 def test_a_world_that_is_lost_ends_the_run_and_keeps_what_was_driven(
     fast_board: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    keep = keep_loop
-
-    def lose(*given: Any) -> None:
-        keep(*given)
+    def lose(*given: Any) -> Iterator[TableRows]:
+        yield from loop_rows(*given)
 
         def lost(*_: object) -> State:
             raise TransportError("`simulator`: the server is gone")
 
         monkeypatch.setattr(Longitudinal, "step", lost)
 
-    monkeypatch.setattr("s2a_bench.experiments.ccrb.live.keep_loop", lose)
+    monkeypatch.setattr("s2a_bench.experiments.ccrb.live.loop_rows", lose)
     options = CcrbOptions(n_skills=3, speed_kmh=20)
     with pytest.raises(TransportError, match="`simulator`: the server is gone"):
         run(tmp_path, scenario=options, profile=fast_board, policies=("naive", "wait-then-act", "stream-to-act"))
@@ -307,9 +304,3 @@ def test_ctrl_c_while_a_whole_plan_is_driven_does_not_wait_for_its_end(
     monkeypatch.setattr(Future, "result", interrupted)
     ends_interrupted(tmp_path, fast_board)
     assert isinstance(seen[-1], AbortRequested)
-
-
-@pytest.mark.parametrize("given", [{"ttc": True}, {"phase": True}, {"random": 3}])
-def test_what_needs_all_arrivals_is_refused(given: dict[str, Any]) -> None:
-    with pytest.raises(UsageError, match=f"`{next(iter(given))}` needs all arrivals beforehand"):
-        CcrbConfig(**given, closed_loop=True)

@@ -15,15 +15,17 @@ import pytest
 
 from s2a_bench.act.call import SkillMotion
 from s2a_bench.errors import EngineError, ServerDied, SourceError, TransportError, UsageError
+from s2a_bench.experiments.timeline.config import TimelineLive, TimelineRealTime
 from s2a_bench.experiments.timeline.live import run_live
+from s2a_bench.experiments.timeline.plan import prompt_plan
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_real_time
 from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_json, timelines_of
 from s2a_bench.experiments.timeline.view.figures import timeline_figures
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.harness.feed import RequestFeed
-from s2a_bench.harness.timelines.config import TimelineConfig
-from s2a_bench.harness.timelines.link import plan_prompts
+from s2a_bench.harness.timelines.config import PlanRequests
+from s2a_bench.harness.timelines.link import PlanPrompt, write_prompts
 from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
@@ -49,6 +51,9 @@ class Watched:
     def opened(self, folder: Path) -> None:
         self.folder = folder
 
+    def say(self, line: str) -> None:
+        self.lines.append(line)
+
     def stage(self, text: str) -> None:
         self.lines.append(text)
 
@@ -62,20 +67,19 @@ class Watched:
 
 
 @pytest.fixture
-def config(fast_board: str) -> TimelineConfig:
+def config(fast_board: str) -> TimelineLive:
     """Eight household skills of 30 ms each, written by a replay: naive has to wait for every one of them."""
-    return TimelineConfig(
-        live=True,
-        transport="loopback",
-        engine=EngineConfig(name="replay"),
-        profiles=(fast_board,),
-        size=(64, 48),
-        timeout_s=30.0,
-        t_nom_s=(0.03,),
+    requests = PlanRequests(
+        transports="loopback", engine=EngineConfig(name="replay", profile=fast_board), size=(64, 48), timeout_s=30.0
     )
+    return TimelineLive(requests=requests, t_nom_s=(0.03,))
 
 
-def live(config: TimelineConfig, output: Path) -> tuple[StoredRun, Watched]:
+def requesting(config: TimelineLive, **changes: Any) -> TimelineLive:
+    return config.but(requests=config.requests.but(**changes))
+
+
+def live(config: TimelineLive, output: Path) -> tuple[StoredRun, Watched]:
     view = Watched()
     return read_run(run_live(config, output / "runs", view)), view
 
@@ -105,7 +109,7 @@ def check(run: StoredRun, transport: str) -> None:
     jsonschema.validate(timelines_json(run), SCHEMA)
 
 
-def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: TimelineConfig, tmp_path: Path) -> None:
+def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: TimelineLive, tmp_path: Path) -> None:
     run, view = live(config, tmp_path)
     check(run, "loopback")
     assert run.manifest["live"]["emulated"] is True
@@ -119,7 +123,7 @@ def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: Ti
 
 
 def test_plans_of_a_profile_whose_model_sees_no_picture_say_so(
-    config: TimelineConfig, fast_board: str, tmp_path: Path
+    config: TimelineLive, fast_board: str, tmp_path: Path
 ) -> None:
     with Path(fast_board).open("a") as profile:
         profile.write('\n[model]\npictures = "not seen"\n')
@@ -139,7 +143,7 @@ def act(motion: SkillMotion) -> None:
     assert motion.wait()
 
 
-def test_a_function_is_called_with_every_skill(config: TimelineConfig, tmp_path: Path) -> None:
+def test_a_function_is_called_with_every_skill(config: TimelineLive, tmp_path: Path) -> None:
     acted.clear()
     run, _ = live(config.but(robot=f"call?function={__name__}:act", policies=("naive",)), tmp_path)
     (cell,) = timelines_of(run)
@@ -150,13 +154,12 @@ def test_a_function_is_called_with_every_skill(config: TimelineConfig, tmp_path:
 
 @pytest.mark.slow
 def test_a_real_model_is_held_to_its_grammar_and_its_pace(
-    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
     engine = EngineConfig(threads=1, pace=60.0)
-    changed = config.but(
-        engine=engine, profiles=(), transport="http", timeout_s=120.0, t_nom_s=(0.05,), task="Tidy up.", requests=2
-    )
+    changed = requesting(config, engine=engine, transports="http", timeout_s=120.0, requests=2)
+    changed = changed.but(t_nom_s=(0.05,), task="Tidy up.")
     view = Watched()
     run = read_run(run_live(changed, tmp_path / "runs", view))
     outcomes = [found["outcome"] for found in run.manifest["executions"].values()]
@@ -175,7 +178,7 @@ def test_a_real_model_is_held_to_its_grammar_and_its_pace(
 
 @pytest.mark.parametrize("tokens", [0, 1, 5, 6, 7, 20, 47])
 def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
-    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tokens: int
+    config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tokens: int
 ) -> None:
     whole = ReplayEngine.generate
 
@@ -186,7 +189,7 @@ def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
             yield token
 
     monkeypatch.setattr(ReplayEngine, "generate", dies)
-    changed = config.but(warmup=0)
+    changed = requesting(config, warmup=0)
     view = Watched()
     with pytest.raises(TransportError, match="no request of loopback succeeded"):
         run_live(changed, tmp_path / "runs", view)
@@ -203,7 +206,7 @@ def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
     assert len(run.tokens) == tokens
 
 
-def test_prose_is_not_executed(config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prose_is_not_executed(config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def prose(self: ReplayEngine, request: Request) -> Iterator[Token]:
         del self, request
         yield from (
@@ -218,7 +221,7 @@ def test_prose_is_not_executed(config: TimelineConfig, tmp_path: Path, monkeypat
 
 
 def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
-    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = LoopbackClient.request
 
@@ -230,7 +233,7 @@ def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
 
     monkeypatch.setattr(LoopbackClient, "request", dies)
     view = Watched()
-    changed = config.but(warmup=0, t_nom_s=(2.0,))
+    changed = requesting(config, warmup=0).but(t_nom_s=(2.0,))
     with pytest.raises(ServerDied, match="pid 7"):
         run_live(changed, tmp_path / "runs", view)
     run = read_run(view.folder)
@@ -242,7 +245,7 @@ def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
 
 
 def test_a_camera_that_breaks_ends_the_run_and_not_the_executors(
-    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = RequestFeed.capture
     frames = iter(range(9))
@@ -260,7 +263,7 @@ def test_a_camera_that_breaks_ends_the_run_and_not_the_executors(
     assert outcomes == {"stream-error"}
 
 
-def test_an_interruption_aborts_the_robots_and_keeps_what_ran(config: TimelineConfig, tmp_path: Path) -> None:
+def test_an_interruption_aborts_the_robots_and_keeps_what_ran(config: TimelineLive, tmp_path: Path) -> None:
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
@@ -284,8 +287,7 @@ def test_an_interruption_aborts_the_robots_and_keeps_what_ran(config: TimelineCo
 
 
 def test_a_board_is_played_in_real_time(fast_board: str, tmp_path: Path) -> None:
-    played = TimelineConfig(
-        real_time=True,
+    played = TimelineRealTime(
         profiles=(fast_board,),
         tokens_per_skill=(6, 2),
         t_nom_s=(0.03,),
@@ -314,15 +316,19 @@ def test_a_board_is_played_in_real_time(fast_board: str, tmp_path: Path) -> None
     [
         ({"policies": ("s2a-clairvoyant",)}, "s2a-clairvoyant needs to know when every skill will arrive"),
         ({"skills": "juggling"}, "`skills`: 'juggling' is none of"),
-        ({"plans": 0}, "`plans`: 0 should be greater than or equal to 1"),
+        ({"epsilon": 0.05}, "`epsilon`: no policy is calibrated before a live run; it needs `track`"),
+        ({"requests": {"requests": 0}}, "`requests`: 0 should be greater than or equal to 1"),
         ({"robot": "call", "policies": ("naive",)}, "`robot`: call: function = '' should look like module:name"),
         ({"robot": "ros"}, "`robot`: ros follows one policy at a time"),
         ({"tokens_per_skill": (4,)}, "`engine` replay writes plans of the household skills in 6 tokens a skill"),
         ({"skills": "driving"}, "`engine` replay writes plans of the household skills in 6 tokens a skill"),
-        ({"transport": "http,ros"}, "`transport`: 'http,ros' is none of"),
+        (
+            {"requests": {"transports": "http,ros"}},
+            "`transport`: one stream is followed, not http",
+        ),
     ],
 )
-def test_what_makes_no_sense_is_named(config: TimelineConfig, fields: dict[str, Any], message: str) -> None:
+def test_what_makes_no_sense_is_named(config: TimelineLive, fields: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError) as error:
         config.but(**fields)
     assert message in str(error.value)
@@ -350,22 +356,25 @@ def test_a_prior_knows_bursts_that_single_gaps_hide() -> None:
     assert burst.token_cv > 1.9 * even.token_cv  # four blocks of four: 1.2, 1.2, .4, .4 s
 
 
-def test_skills_keep_their_own_durations_unless_they_are_given(config: TimelineConfig) -> None:
-    (own,) = plan_prompts(config.but(t_nom_s=()), None)
+def test_skills_keep_their_own_durations_unless_they_are_given(config: TimelineLive) -> None:
+    def prompt(config: TimelineLive) -> PlanPrompt:
+        (prompt,) = write_prompts(prompt_plan(config), None, exact=True)
+        return prompt
+
+    own = prompt(config.but(t_nom_s=()))
     times = [call.skill.durations.nominal_s for call in own.skills.calls]
-    assert own.t_nom_s == pytest.approx(np.mean(times))
+    assert own.shape.expected.nominal_s == pytest.approx(np.mean(times))
     assert own.shape.expected_cv == pytest.approx(np.std(times) / np.mean(times))
-    (given,) = plan_prompts(config, None)
-    assert (given.t_nom_s, given.shape.expected_cv) == (pytest.approx(0.03), 0.0)
+    given = prompt(config)
+    assert (given.shape.expected.nominal_s, given.shape.expected_cv) == (pytest.approx(0.03), 0.0)
     assert given.shape.expected.most_s == pytest.approx(0.045)
     assert "Output exactly 8 of them." in given.prompt
     assert (bool(given.grammar), given.max_tokens) == (True, 48)
-    (free,) = plan_prompts(config.but(no_grammar=True), None)
-    assert free.grammar == ""
+    assert prompt(config.but(no_grammar=True)).grammar == ""
 
 
 def test_tokens_that_come_slower_than_in_the_warm_ups_are_named(
-    config: TimelineConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     generate = ReplayEngine.generate
     answers = iter(range(10))
@@ -378,7 +387,7 @@ def test_tokens_that_come_slower_than_in_the_warm_ups_are_named(
             yield token
 
     monkeypatch.setattr(ReplayEngine, "generate", paced)
-    run, _ = live(config.but(policies=("naive",), n_skills=(2,), warmup=5, requests=5), tmp_path)
+    run, _ = live(requesting(config, warmup=5, requests=5).but(policies=("naive",), n_skills=(2,)), tmp_path)
     (found,) = [each["message"] for each in run.manifest["warnings"] if each["code"] == "delays-changed"]
     assert found.startswith("loopback: delays changed since the calibration")
 
@@ -398,9 +407,10 @@ def taught(monkeypatch: pytest.MonkeyPatch) -> list[TrackedPolicy]:
 
 
 def test_lambda_is_followed_live_by_each_policy(
-    config: TimelineConfig, taught: list[TrackedPolicy], tmp_path: Path
+    config: TimelineLive, taught: list[TrackedPolicy], tmp_path: Path
 ) -> None:
-    live(config.but(policies=("stream-to-act", "stream-to-act?detect=True", "naive"), track=True, requests=2), tmp_path)
+    policies = ("stream-to-act", "stream-to-act?detect=True", "naive")
+    live(requesting(config, requests=2).but(policies=policies, track=True), tmp_path)
     assert [each.made.detect for each in taught] == [False, True] * 2
     assert taught[:2] == taught[2:]
     for each in taught[:2]:
@@ -408,8 +418,7 @@ def test_lambda_is_followed_live_by_each_policy(
 
 
 def test_lambda_is_followed_in_real_time(fast_board: str, taught: list[TrackedPolicy], tmp_path: Path) -> None:
-    config = TimelineConfig(
-        real_time=True,
+    config = TimelineRealTime(
         profiles=(fast_board,),
         tokens_per_skill=(2,),
         n_skills=(4,),

@@ -18,11 +18,13 @@ from s2a_bench.boards.profile import Profile
 from s2a_bench.boards.tokens import board_of_profile, gaps_of
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
+from s2a_bench.experiments.timeline.config import TimelineComputed
+from s2a_bench.experiments.timeline.plan import recordings
 from s2a_bench.experiments.timeline.rows import TIMELINES
-from s2a_bench.experiments.timeline.run import recordings, run_timeline
+from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.tables import show
-from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, settings
+from s2a_bench.harness.timelines.cases import LearningPlan, PlanSetting
 from s2a_bench.harness.timelines.policies import draw, learn
 from s2a_bench.harness.timelines.rows import KEPT_PLANS
 from s2a_bench.policy import Plans, Schedule
@@ -34,11 +36,11 @@ from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from tests.made_runs import marks_of, row_of
 
-ORIN = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
-JITTERY = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,), jitter="profile", plans=300)
+ORIN = TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))
+JITTERY = TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6,), jitter="profile", plans=300)
 
 
-def ran(config: TimelineConfig, output: Path) -> StoredRun:
+def ran(config: TimelineComputed, output: Path) -> StoredRun:
     return read_run(run_timeline(config, output, NullProgress()))
 
 
@@ -53,7 +55,7 @@ def test_every_policy_meets_the_same_arrivals(tmp_path: Path) -> None:
 def test_a_seed_repeats_a_run_and_another_seed_does_not(tmp_path: Path) -> None:
     texts = []
     for place, seed in enumerate((3, 3, 4)):
-        config = TimelineConfig(
+        config = TimelineComputed(
             rates=(4.8,), profiles=(), tokens_per_skill=(6,), jitter="lognormal:cv=0.2", plans=5, seed=seed
         )
         texts.append((ran(config, tmp_path / str(place)).path / "skills.csv").read_text())
@@ -80,7 +82,7 @@ def test_skills_stalls_and_metrics_of_a_plan_fit_together(tmp_path: Path) -> Non
 
 
 def test_stream_to_act_keeps_its_promise_where_naive_and_the_mean_rule_stall(tmp_path: Path) -> None:
-    config = TimelineConfig(
+    config = TimelineComputed(
         policies=("naive", "s2a-mean", "stream-to-act"),
         profiles=("jetson-agx-orin",),
         tokens_per_skill=(6,),
@@ -107,7 +109,7 @@ def test_stream_to_act_keeps_its_promise_where_naive_and_the_mean_rule_stall(tmp
 def test_online_without_jitter_starts_at_the_safe_start_exactly(
     rate: float, prompt_s: float, tokens: int, skills: int, t_nom_s: float
 ) -> None:
-    config = TimelineConfig(
+    config = TimelineComputed(
         profiles=(),
         rates=(rate,),
         prompt_s=prompt_s,
@@ -115,9 +117,9 @@ def test_online_without_jitter_starts_at_the_safe_start_exactly(
         n_skills=(skills,),
         t_nom_s=(t_nom_s,),
     )
-    ((board, setting),) = settings(config)
-    _, plans = draw(config, board, setting, 1, "plans")
-    schedule = learn(config, board, setting).prepare(StreamToAct()).schedule(plans)
+    (case,) = config.cases
+    _, plans = draw(case, 0, 1, "plans")
+    schedule = learn(case, LearningPlan({"online": StreamToAct()}, 0)).made["online"].schedule(plans)
     safe_s = safe_start(plans.arrival_s, plans.nominal_s)
     assert schedule.start_s[0] == pytest.approx(safe_s, rel=1e-9, abs=1e-9)
     end_s = schedule.start_s[-1] + schedule.duration_s[-1]
@@ -190,13 +192,12 @@ def test_jitter_that_is_wrong_is_named(jitter: str, message: str) -> None:
         ({"seed": -1}, "`seed`: -1"),
         ({"jitter": "lognormal:cv=1", "plans": 10**6}, "`plans`: .* skills are more than"),
         ({"n_skills": (1000,), "tokens_per_skill": (1000,)}, "`n_skills`, `tokens_per_skill`: 1000000 tokens a plan"),
-        ({"engine": {"threads": 2}}, "`threads` is about a model that answers; it needs `live`"),
-        ({"live": True, "prompt_s": 1.0}, "`prompt_s` is about tokens that are modelled; leave it out with `live`"),
+        ({"profiles": ()}, "`profiles`: name at least one"),
     ],
 )
 def test_a_configuration_that_makes_no_sense_is_refused(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        TimelineConfig(**fields)
+        TimelineComputed(**fields)
 
 
 def recorded_run(output: Path, answers: int, tokens: int, slower: int = 0) -> Path:
@@ -229,7 +230,7 @@ def test_answers_of_a_run_are_read_from_the_request(tmp_path: Path) -> None:
 @pytest.mark.parametrize("slower", [0, 100_000])
 def test_recorded_answers_calibrate(tmp_path: Path, slower: int) -> None:
     folder = recorded_run(tmp_path / "recorded", 120, 12, slower)
-    config = TimelineConfig(profiles=(), rates=(5.0,), tokens_per_skill=(3,), n_skills=(4,), calibrate=folder)
+    config = TimelineComputed(profiles=(), rates=(5.0,), tokens_per_skill=(3,), n_skills=(4,), calibrate=folder)
     run = ran(config, tmp_path / "run")
     (found,) = run.manifest["calibrations"].values()
     assert found["plans"] == 120
@@ -243,7 +244,7 @@ def test_recorded_answers_calibrate(tmp_path: Path, slower: int) -> None:
 def test_too_few_or_too_short_answers_are_refused_before_there_is_a_folder(tmp_path: Path) -> None:
     folder = recorded_run(tmp_path / "recorded", 120, 12)
     for skills, answers in ((5, 0), (4, 120)):
-        config = TimelineConfig(
+        config = TimelineComputed(
             profiles=(), rates=(5.0,), tokens_per_skill=(3,), n_skills=(skills,), calibrate=folder, epsilon=0.005
         )
         with pytest.raises(UsageError, match=f"{answers} of 120 answers have the {3 * skills} tokens"):
@@ -274,7 +275,7 @@ def test_lambda_that_nothing_can_promise_is_a_warning(tmp_path: Path, monkeypatc
 
 
 def test_each_setting_is_a_cell_a_policy(tmp_path: Path) -> None:
-    config = TimelineConfig(profiles=("rtx-4080",), tokens_per_skill=(4, 1), n_skills=(2, 3), t_nom_s=(0.5, 2.0))
+    config = TimelineComputed(profiles=("rtx-4080",), tokens_per_skill=(4, 1), n_skills=(2, 3), t_nom_s=(0.5, 2.0))
     rows = ran(config, tmp_path).table(TIMELINES)
     assert Counter(rows["policy"]) == dict.fromkeys(config.policies, 8)
     assert rows["cell"].nunique() == 24
@@ -282,7 +283,7 @@ def test_each_setting_is_a_cell_a_policy(tmp_path: Path) -> None:
 
 
 def test_a_plan_of_hours_has_no_sampled_motion(tmp_path: Path) -> None:
-    config = TimelineConfig(profiles=(), rates=(0.001,), tokens_per_skill=(6,), t_nom_s=(4000.0,))
+    config = TimelineComputed(profiles=(), rates=(0.001,), tokens_per_skill=(6,), t_nom_s=(4000.0,))
     rows = ran(config, tmp_path).table(TIMELINES)
     assert rows[["rms_jerk", "peak_jerk", "sparc"]].isna().all().all()
     assert rows["stalls"].notna().all()
@@ -311,11 +312,11 @@ def test_every_online_rule_is_calibrated_for_itself(tmp_path: Path) -> None:
     early = "stream-to-act-early"
     config = JITTERY.but(policies=("stream-to-act", early, f"{early}?caution=1"), plans=50)
     run = ran(config, tmp_path)
-    (setting,) = (setting for _, setting in settings(config))
+    (case,) = config.cases
     found = run.manifest["calibrations"]
-    assert set(found) == {setting.name, f"{setting.name}/{early}"}
+    assert set(found) == {case.setting.name, f"{case.setting.name}/{early}"}
     cautions = {cell.policy: cell.about("caution") for cell in timelines_of(run)}
-    assert cautions[early] == found[f"{setting.name}/{early}"]["caution"]
+    assert cautions[early] == found[f"{case.setting.name}/{early}"]["caution"]
     assert cautions[f"{early}?caution=1"] == 1
     starts = {cell.policy: cell.mean("start_s") for cell in timelines_of(run)}
     assert starts[early] < starts["stream-to-act"]  # type: ignore[operator]
@@ -340,7 +341,6 @@ def test_a_guarantee_is_kept_with_the_calibration_and_said(tmp_path: Path) -> No
         ({"policies": ("naive",), "track": True}, "`track`: no policy has a lambda to follow"),
         ({"policies": ("stream-to-act?caution=1",), "track": True}, "`track`: no policy has a lambda to follow"),
         ({"jitter": "none", "plans": None, "track": True}, "`track`: without `jitter` or `t_nom_cv`"),
-        ({"live": True, "jitter": "none", "plans": None, "epsilon": 0.05}, "`epsilon`: nothing is calibrated"),
     ],
 )
 def test_what_cannot_be_followed_is_refused(options: dict[str, Any], message: str) -> None:

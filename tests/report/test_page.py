@@ -20,11 +20,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.figures import page_lanes
 from s2a_bench.experiments.timeline.view.tables import execution_table, timeline_csv
-from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import MOST_CHAPTERS, read_chapters
 from s2a_bench.report.page.files import inline, make_report, write_report
@@ -85,7 +85,7 @@ class Page(HTMLParser):
 
 
 def timeline(folder: Path, **settings: Any) -> Path:
-    return run_timeline(TimelineConfig(**settings), folder, NullProgress())
+    return run_timeline(TimelineComputed(**settings), folder, NullProgress())
 
 
 @pytest.fixture(scope="module")

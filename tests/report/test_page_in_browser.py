@@ -9,10 +9,10 @@ import pytest
 
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
-from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.config import CcrbComputed
 from s2a_bench.experiments.ccrb.run import run_ccrb
+from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.experiments.timeline.run import run_timeline
-from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.report.page import ReportConfig
@@ -78,7 +78,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Write a report of a run of each kind, most of them computed, and return its address."""
     folder = tmp_path_factory.mktemp("page")
     done = NullProgress()
-    timeline = TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6, 4), policies=("naive", LONG_POLICY))
+    timeline = TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6, 4), policies=("naive", LONG_POLICY))
     chunks = ChunksVirtual(modes="sync,replace?execute=8", latency="60,100", cycles=100, shown_ticks=60)
     warning = {"code": "load", "message": "busy-" * 60, "advice": "wait"}
     paths = [
@@ -87,7 +87,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
         run_timeline(timeline, folder, done),
         run_virtual(chunks, folder, done),
         run_boundary(BoundaryConfig(), folder, done),
-        run_ccrb(CcrbConfig(), folder, done),
+        run_ccrb(CcrbComputed(), folder, done),
     ]
     output = folder / "page.html"
     report = make_report(read_chapters(paths, against="paper"), against="paper")

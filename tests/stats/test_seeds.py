@@ -11,7 +11,7 @@ import pytest
 from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.boards.latency import read_latency, sequence_ns
 from s2a_bench.frames.synthetic import render_scene
-from s2a_bench.harness.timelines.config import PlanSetting
+from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
 from s2a_bench.policy import PlanShape, Timing

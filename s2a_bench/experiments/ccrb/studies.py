@@ -1,4 +1,4 @@
-"""Roll-outs as rows, and the studies: phase diagram, and random scenarios.
+"""The studies of a CCRB run: phase diagram, and random scenarios.
 
 Tokens arrive evenly, so that stream-to-act starts at S0 (closed form: the online rule does the same with even tokens),
 and the ego is the bare integrator.
@@ -6,121 +6,39 @@ and the ego is the bare integrator.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.experiments.ccrb.rows import (
-    IMPACTS,
-    MARGINS,
-    AboutRollout,
-    RolloutRow,
-    TrajectoryRow,
-)
-from s2a_bench.harness.timelines.rows import to_ns
+from s2a_bench.experiments.ccrb.drives import rollout_rows
+from s2a_bench.experiments.ccrb.rows import AboutRollout
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.policy import COMPARED, TOLERANCE_S, Plans, Schedule, policy
+from s2a_bench.policy import COMPARED, Plans, Schedule, policy
 from s2a_bench.policy.arrivals import uniform
-from s2a_bench.policy.metrics import peak_jerk, rms_jerk, sparc, stalls
-from s2a_bench.scenario import EGO, ROLES
 from s2a_bench.scenario.ccrb.cars import start_deadline
-from s2a_bench.scenario.ccrb.drive import Trajectory
-from s2a_bench.scenario.ccrb.ego import PHASES
-from s2a_bench.scenario.ccrb.outcome import Outcomes
-from s2a_bench.scenario.ccrb.studies import Scenes, draw, drive_along, plane, survived
+from s2a_bench.scenario.ccrb.options import CcrbOptions
+from s2a_bench.scenario.ccrb.studies import Scenes, drive_along, survived
 from s2a_bench.scenario.longitudinal import Longitudinal
-from s2a_bench.stats.seeds import generator
-
-
-def rollout_rows(
-    about: Mapping[str, Any], schedule: Schedule, outcomes: Outcomes, *, motion: Mapping[str, Any] | None = None
-) -> Iterator[AboutRollout]:
-    """Yield the rows of M roll-outs; a value of ``about`` is common to all, or an array of M."""
-    stall_s = stalls(schedule)
-    end_s = schedule.start_s[-1] + schedule.duration_s[-1]
-    shared = {name: value for name, value in about.items() if not isinstance(value, np.ndarray)}
-    each = {name: value for name, value in about.items() if isinstance(value, np.ndarray)}
-    found = {metric.name: getattr(outcomes, metric.name) for metric in (*IMPACTS, *MARGINS)}
-    for place in range(len(outcomes.code)):
-        metrics: dict[str, Any] = {name: float(values[place]) for name, values in found.items()}
-        yield RolloutRow(
-            **shared,
-            **{name: value[place].item() for name, value in each.items()},
-            start_ns=to_ns(schedule.start_s[0, place]),
-            end_ns=to_ns(end_s[place]),
-            stalls=int((stall_s[:, place] > TOLERANCE_S).sum()),
-            stall_ns=to_ns(stall_s[:, place].sum()),
-            outcome=outcomes.name(place),
-            **{name: value if math.isfinite(value) else None for name, value in metrics.items()},
-            **(motion or {}),
-        )
-
-
-def motion_of(path: Trajectory) -> dict[str, float]:
-    """Return jerk and smoothness of the ego in a single roll-out, from the request to rest or impact."""
-    speed = path.speed_mps[:, EGO, 0]
-    if len(speed) < 3:  # noqa: PLR2004 - over at once
-        return {}
-    step_s = float(path.time_s[1] - path.time_s[0])
-    return {"rms_jerk": rms_jerk(speed, step_s), "peak_jerk": peak_jerk(speed, step_s), "sparc": sparc(speed, step_s)}
-
-
-def trajectory_rows(cell: str, path: Trajectory) -> Iterator[TrajectoryRow]:
-    cars: dict[str, Any] = {
-        f"{role}_{what}": getattr(path, what)[:, place, 0].tolist()
-        for what in ("position_m", "speed_mps", "acceleration_mps2")
-        for place, role in enumerate(ROLES)
-    }
-    for step, at_s in enumerate(path.time_s):
-        yield TrajectoryRow(
-            cell=cell,
-            at_ns=to_ns(at_s),
-            phase=PHASES[int(path.phase[step, 0])],
-            skill=int(path.skill[step, 0]),
-            ego_lateral_m=float(path.lateral_m[step, EGO, 0]),
-            **{name: values[step] for name, values in cars.items()},
-        )
-
+from s2a_bench.types import Timing
 
 FORMS: Final = {name: policy(name).foreseeing for name in COMPARED}
 SCENES: Final = 1366
 """Scenarios of a block, driven in lock step: about 8,000 roll-outs."""
 
 
-def studies(config: CcrbConfig) -> Iterator[tuple[str, Scenes]]:
-    """Yield the studies beside the operating point, with their scenarios."""
-    if config.phase:
-        yield (
-            "phase",
-            plane(
-                config.scenario,
-                config.phase_rates,
-                config.phase_gaps_m,
-                config.phase_points,
-                prompt_s=config.timeline.boards[0].prompt_s,
-                tokens_per_skill=config.tokens_per_skill,
-            ),
-        )
-    if config.random:
-        yield "random", draw(generator(config.seed, "ccrb", "random"), config.random)
-
-
-def drive_block(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, list[AboutRollout]]:
+def drive_block(scenario: CcrbOptions, study: str, scenes: Scenes) -> tuple[int, list[AboutRollout]]:
     """Drive every scenario with every gap behaviour and policy; return the number of roll-outs, and the rows.
 
     The check on the car behind is one more roll-out a scenario. A policy that never stalls is driven once, with a row
     for every gap behaviour.
     """
-    scenario = config.scenario
     cases = [(name, gap) for name, form in FORMS.items() for gap in (GAPS if form.stalls else (scenario.gap,))]
     gaps = np.repeat([gap for _, gap in cases], len(scenes))
     every = scenes.times(len(cases))
     cars = every.cars(gaps, scenario)
-    schedule = schedules(config, scenes, [name for name, _ in cases])
+    schedule = schedules(scenario.durations, scenes, [name for name, _ in cases])
     deadline_s = start_deadline(cars, every.numbers["plan_decel_mps2"])
     about: dict[str, Any] = {
         **every.numbers,
@@ -150,8 +68,12 @@ def drive_block(config: CcrbConfig, study: str, scenes: Scenes) -> tuple[int, li
     return len(scenes) + len(rows), rows + again
 
 
-def schedules(config: CcrbConfig, scenes: Scenes, names: Sequence[str]) -> Schedule:
-    """Concatenate the policies' schedules; shorter plans are padded with skills of no length."""
+def schedules(durations: Timing, scenes: Scenes, names: Sequence[str]) -> Schedule:
+    """Concatenate the policies' schedules, with skills in proportion to ``durations``.
+
+    Shorter plans are padded with skills of no length.
+    """
+    t_min, t_max = durations.least_s / durations.nominal_s, durations.most_s / durations.nominal_s
     at, count = scenes.numbers, len(scenes)
     longest = int(at["n_skills"].max())
     start_s = {name: np.empty((longest, count)) for name in FORMS}
@@ -160,7 +82,7 @@ def schedules(config: CcrbConfig, scenes: Scenes, names: Sequence[str]) -> Sched
         mine = at["n_skills"] == length
         arrival_s = uniform(at["prompt_s"][mine], at["tokens_per_skill"][mine], at["tokens_per_s"][mine], length)
         nominal_s = np.broadcast_to(at["t_nom_s"][mine], arrival_s.shape)
-        plans = Plans(arrival_s, nominal_s, config.timeline.t_min * nominal_s, config.timeline.t_max * nominal_s)
+        plans = Plans(arrival_s, nominal_s, t_min * nominal_s, t_max * nominal_s)
         for name, form in FORMS.items():
             found = form.schedule(plans)
             start_s[name][:length, mine], duration_s[name][:length, mine] = found.start_s, found.duration_s

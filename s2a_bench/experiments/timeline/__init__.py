@@ -1,14 +1,23 @@
 """What each policy makes of streamed skills: computed, played in real time, or live."""
 
-from s2a_bench.experiments import Experiment
+from s2a_bench.experiments import Experiment, RunMode
+
+HERE = "s2a_bench.experiments.timeline"
+PLAYED = "play the boards' tokens on the clock and execute while you watch"
+ANSWERED = "execute a model's real answers as they arrive"
 
 EXPERIMENT = Experiment(
     name="timeline",
     about="Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live.",
-    config="s2a_bench.harness.timelines.config:TimelineConfig",
-    run="s2a_bench.experiments.timeline.run:run_timeline",
-    view="s2a_bench.experiments.timeline.view.tables:show",
-    cell="s2a_bench.experiments.timeline.view.cells:TimelineCell",
-    compared="s2a_bench.experiments.timeline.view.cells:COMPARED",
+    config=f"{HERE}.config:TimelineComputed",
+    run=f"{HERE}.run:run_timeline",
+    mode="computed",
+    modes=(
+        RunMode("real-time", f"{HERE}.config:TimelineRealTime", f"{HERE}.run:run_real_time", {"real_time": PLAYED}),
+        RunMode("live", f"{HERE}.config:TimelineLive", f"{HERE}.live:run_live", {"live": ANSWERED}),
+    ),
+    view=f"{HERE}.view.tables:show",
+    cell=f"{HERE}.view.cells:TimelineCell",
+    compared=f"{HERE}.view.cells:COMPARED",
     unit="timelines",
 )

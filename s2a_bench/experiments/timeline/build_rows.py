@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.experiments.timeline.rows import METRICS, PlanRow, TimelineRow
-from s2a_bench.harness.timelines.config import PlanSetting
+from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import KEPT_PLANS
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.conformal import ANY_STALL_S

@@ -13,7 +13,7 @@ from s2a_bench.act.record import Record, executed
 from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
 from s2a_bench.experiments.timeline.rows import TIMELINES
-from s2a_bench.harness.timelines.config import PlanSetting
+from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.policies import finite
 from s2a_bench.harness.timelines.rows import skill_rows
 from s2a_bench.plan import Gap

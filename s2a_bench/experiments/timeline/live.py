@@ -16,52 +16,46 @@ from s2a_bench.act.events import PlanFeed, StreamBroke
 from s2a_bench.act.record import Record
 from s2a_bench.clock import now_ns, quick_switching
 from s2a_bench.errors import S2AError
+from s2a_bench.experiments.timeline.config import TimelineLive
 from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep
+from s2a_bench.experiments.timeline.plan import LivePlan, resolve_live
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
-from s2a_bench.harness.timelines.config import TimelineConfig
-from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt, prepare_requests
+from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt
 from s2a_bench.harness.timelines.policies import Following, prepare
 from s2a_bench.plan import Parser
 from s2a_bench.progress import Progress, watching
 from s2a_bench.store.requests import SKILLS
 
 
-def run_live(config: TimelineConfig, output: Path, progress: Progress) -> Path:
+def run_live(config: TimelineLive, output: Path, progress: Progress) -> Path:
     """Request plans, execute them, and return the run folder; raises S2AError.
 
     The folder keeps the timelines so far; the robots hold before KeyboardInterrupt passes through.
     """
-    plan, asks = prepare_requests(config, progress)
-    seed = plan.request.seed
-    plan = plan.with_manifest(
-        configuration={**config.to_manifest(), "engine": plan.manifest["configuration"]["engine"]},
-        seeds={"sampling": seed, "source": seed, "nonce": plan.feed.nonce},
-    )
-    robot = kind(config.robot, SkillKind)
+    plan = resolve_live(config, progress)
+    robot = kind(plan.robot, SkillKind)
     with ExitStack() as stack:  # first, as a model may take long to load
-        robots = [stack.enter_context(closing(robot.open_skills(config.skill_set))) for _ in config.chosen]
+        robots = [stack.enter_context(closing(robot.open_skills(plan.skills))) for _ in plan.learning.policies]
         stack.enter_context(quick_switching())
-        drive, tables = partial(_drive, config, asks, robots), (TIMELINES, SKILLS)
+        drive, tables = partial(_drive, plan, robots), (TIMELINES, SKILLS)
         task = Task("timeline", drive, tables=tables, source=lambda feed: Stamped(feed.open(), feed.nonce))
-        return run_requests(task, plan, output, progress)
+        return run_requests(task, plan.requests, output, progress)
 
 
-def _drive(
-    config: TimelineConfig, asks: Sequence[PlanPrompt], robots: Sequence[SkillRobot], launch: RunningLaunch
-) -> None:
-    link, records, progress = ModelLink(config, launch, config.robot), list[Record](), launch.progress
-    progress.expect(config.warmup + len(asks) * config.plans_a_cell)
+def _drive(plan: LivePlan, robots: Sequence[SkillRobot], launch: RunningLaunch) -> None:
+    link, records, progress = ModelLink(launch, plan.prompts[0], plan.robot), list[Record](), launch.progress
+    blocks = launch.plan.blocks
+    progress.expect(blocks.warmup + len(plan.prompts) * blocks.requests)
     try:
-        prior = link.warm_up(asks[0])
-        for ask in asks:
-            following = prepare(config, ask.shape, prior)
-            for plan in range(config.plans_a_cell):
-                _execute(link, ask, plan, following, robots, records)
+        prior = link.warm_up()
+        for ask in plan.prompts:
+            following = prepare(plan.learning, ask.shape, prior)
+            for number in range(blocks.requests):
+                _execute(link, ask, number, following, robots, records)
                 progress.advance()
-        link.require_answers()
         link.compare()
     finally:
         launch.writer.update(start_jitter=jitter_facts(records))
@@ -77,9 +71,10 @@ def _execute(
 ) -> None:
     """Request one plan, execute it under every policy as it arrives, and extend ``records``."""
     policies, progress = following.policies(), link.launch.progress
-    span_s = ask.n_skills * (ask.tokens_per_skill / link.rate if link.rate else 0.0) + ask.n_skills * ask.t_nom_s
+    skill_s = (ask.tokens_per_skill / link.rate if link.rate else 0.0) + ask.shape.expected.nominal_s
+    span_s = ask.n_skills * skill_s
     progress.stage(f"{link.cell.name}, L = {ask.tokens_per_skill}: about {span_s:.0f} s")
-    side_by_side = SideBySide(policies, ask.shape, ask.skills.gap, robots, link.config.timeout_s)
+    side_by_side = SideBySide(policies, ask.shape, ask.skills.gap, robots, link.launch.plan.timeout_s)
     feed = PlanFeed(Parser(ask.format), side_by_side.send)
     paced = [f"paced to {link.pace:g} tokens/s"] if link.pace else []
     remarks = [*paced, *(label for label in link.origin.labels if label != "paced")]

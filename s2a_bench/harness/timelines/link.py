@@ -11,15 +11,15 @@ from typing import Final
 import numpy as np
 
 from s2a_bench.act.events import PlanFeed
-from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.errors import UsageError
 from s2a_bench.harness.plan import RunPlan, resolve
 from s2a_bench.harness.rounds import RunningLaunch
 from s2a_bench.harness.servers import on_files
 from s2a_bench.harness.session import Measured, Place, RequestContext
-from s2a_bench.harness.timelines.config import PlanSetting, TimelineConfig, requests_of
+from s2a_bench.harness.timelines.cases import PlanSetting
+from s2a_bench.harness.timelines.config import PlanRequests
 from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.harness.warnings import change_warnings
-from s2a_bench.inference import need_engine
 from s2a_bench.machine.tuning import limit_threads
 from s2a_bench.plan import Format, SkillSet, choose_format, grammar, paper_format, prompt
 from s2a_bench.policy import Floats, PlanShape, Timing
@@ -48,10 +48,6 @@ class PlanPrompt:
     max_tokens: int
 
     @property
-    def t_nom_s(self) -> float:
-        return self.shape.expected.nominal_s
-
-    @property
     def shape(self) -> PlanShape:
         """Return the facts about the plan before its first token: all calls are equally likely."""
         times = [call.skill.durations for call in self.skills.calls]
@@ -63,62 +59,61 @@ class PlanPrompt:
         return PlanShape(self.n_skills, self.tokens_per_skill, timing, float(nominal_s.std()) / mean_s)
 
 
-def plan_prompts(config: TimelineConfig, model: Path | None) -> list[PlanPrompt]:
-    """Write the prompts of all settings for the tokenizer of ``model``; raises UsageError if no format fits."""
+@dataclass(frozen=True, slots=True)
+class PromptPlan:
+    """The plans that a run requests: a prompt for each length, number of skills and skill set."""
+
+    skill_sets: Sequence[SkillSet]
+    """One skill set, a copy for each duration of its skills."""
+    tokens_per_skill: Sequence[int]
+    n_skills: Sequence[int]
+    task: str = ""
+    grammar: bool = True
+    """Whether a grammar holds the answers to their form."""
+
+
+def plan_requests(requests: PlanRequests, plan: PromptPlan, progress: Progress) -> tuple[RunPlan, list[PlanPrompt]]:
+    """Plan requests of sufficient length, find the model's files, and write the prompts; raises S2AError."""
+    limit_threads()
+    run, model = resolve(requests, progress.say), None
+    if run.finds_model:
+        run = replace(run, engine=on_files(run.engine, progress), finds_model=False)
+        model = run.engine.model
+    prompts = write_prompts(plan, model, exact=model is not None or run.engine.kind.plays is not None)
+    request = replace(run.request, max_pieces=max(each.max_tokens for each in prompts))
+    return replace(run, request=request), prompts
+
+
+def write_prompts(plan: PromptPlan, model: Path | None, *, exact: bool) -> list[PlanPrompt]:
+    """Write the prompts for the tokenizer of ``model``, in the paper's format if it is unknown.
+
+    ``exact``: every skill has the planned number of tokens. Raises UsageError if no format fits.
+    """
     tokenize = None
-    if not in_paper_format(config):
+    if model is not None:
         from s2a_bench.inference.tokenizer import Tokenizer
 
         tokenize = Tokenizer(model)
-    found = []
-    for tokens, n_skills, t_nom_s in product(config.lengths, config.n_skills, config.t_nom_s or (None,)):
-        skills = skills_lasting(config, t_nom_s)
+    prompts = []
+    for tokens, n_skills, skills in product(plan.tokens_per_skill, plan.n_skills, plan.skill_sets):
         format_ = paper_format(skills) if tokenize is None else choose_format(skills, tokens, tokenize, n_skills)
-        pinned = None if config.url else tokenize  # only the package's server has the same model files, and token ids
-        rules = grammar(format_, n_skills, pinned) if not config.no_grammar else ""
-        most = n_skills * (tokens if tokenize is not None or config.engine.kind.plays else TOKENS_A_SKILL)
-        text = prompt(format_, n_skills, config.task)
-        found.append(PlanPrompt(skills, format_, tokens, n_skills, text, rules, most))
-    return found
-
-
-def in_paper_format(config: TimelineConfig) -> bool:
-    """Return True if plans have the paper's format, as no tokenizer is known."""
-    return not config.engine.kind.needs_model or bool(config.url)
-
-
-def skills_lasting(config: TimelineConfig, t_nom_s: float | None) -> SkillSet:
-    """Return the skill set; ``t_nom_s`` replaces the duration of every skill."""
-    if t_nom_s is None:
-        return config.skill_set
-    times = Timing(t_nom_s, config.t_min * t_nom_s, config.t_max * t_nom_s)
-    skills = tuple(replace(skill, durations=times) for skill in config.skill_set.skills)
-    return replace(config.skill_set, skills=skills)
-
-
-def prepare_requests(config: TimelineConfig, progress: Progress) -> tuple[RunPlan, list[PlanPrompt]]:
-    """Find the model's files, write the prompts, and plan requests of sufficient length; raises S2AError."""
-    limit_threads()
-    requests = requests_of(config)
-    if not in_paper_format(config):
-        need_engine(requests.engine)
-        requests = requests.but(engine=on_files(requests.engine, progress))
-    prompts = plan_prompts(config, requests.engine.model)
-    plan = resolve(requests.but(max_tokens=max(each.max_tokens for each in prompts)), progress.say)
-    return replace(plan, finds_model=False), prompts
+        rules = grammar(format_, n_skills, tokenize) if plan.grammar else ""
+        most = n_skills * (tokens if exact else TOKENS_A_SKILL)
+        text = prompt(format_, n_skills, plan.task)
+        prompts.append(PlanPrompt(skills, format_, tokens, n_skills, text, rules, most))
+    return prompts
 
 
 @dataclass
 class ModelLink:
     """The requests of one run to one model."""
 
-    config: TimelineConfig
     launch: RunningLaunch
+    first: PlanPrompt
+    """The prompt of the warm-up requests."""
     robot: str
     """For the manifest."""
     blocks: Iterator[int] = field(default_factory=count)
-    answers: int = 0
-    """Plans without an error."""
     learned_ms: list[Floats] = field(default_factory=list)
     """Gaps between tokens of each warm-up, from which policies learn."""
     seen_ms: list[Floats] = field(default_factory=list)
@@ -134,8 +129,8 @@ class ModelLink:
             live={
                 "transport": self.cell.name,
                 **({"paced_tokens_per_s": self.pace} if self.pace else {}),
-                "grammar": not self.config.no_grammar,
-                "skills": self.config.skill_set.name,
+                "grammar": bool(self.first.grammar),
+                "skills": self.first.skills.name,
                 "robot": self.robot,
             },
         )
@@ -148,13 +143,13 @@ class ModelLink:
             provenance=Origins(self.origin).to_manifest(), live=live if dummy is None else {**live, "dummy": dummy}
         )
 
-    def warm_up(self, of: PlanPrompt) -> GapPrior | None:
+    def warm_up(self) -> GapPrior | None:
         """Make the warm-up requests and return the prior that policies learn from them."""
         warmups, progress = self.launch.plan.blocks.warmup, self.launch.progress
         arrivals_ns = []
         for _ in range(warmups):
             progress.stage("warming up")
-            measured = self.request(of, 0, None)
+            measured = self.request(self.first, 0, None)
             arrivals_ns.append([token.client_ns for token in measured.tokens])
             progress.advance()
         self.learned_ms += filter(np.size, (np.diff(times) / 1e6 for times in arrivals_ns))
@@ -173,7 +168,6 @@ class ModelLink:
         measured = self.session.measure(place, RequestContext(plan=feed, request=request))
         if self.session.origin != self.origin:
             self._write_origin()
-        self.answers += feed is not None and not measured.sample.error
         try:
             self.launch.keep(self.session, measured)
         except UsageError as error:
@@ -190,7 +184,7 @@ class ModelLink:
             prompt_s=None,
             tokens_per_skill=of.tokens_per_skill,
             n_skills=of.n_skills,
-            t_nom_s=of.t_nom_s,
+            t_nom_s=of.shape.expected.nominal_s,
             mode=MODE,
             emulated=self.origin.emulated,
         )
@@ -213,9 +207,3 @@ class ModelLink:
         self.launch.warnings.extend(
             change_warnings(self.cell.name, self.learned_ms, self.seen_ms, "ms a token", advice)
         )
-
-    def require_answers(self) -> None:
-        if not self.answers:
-            raise TransportError(
-                f"no request of {self.cell.name} succeeded; {self.writer.path / 'samples.csv'} says why"
-            )

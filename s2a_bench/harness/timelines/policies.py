@@ -12,115 +12,29 @@ import numpy as np
 from s2a_bench.act.record import Record, observed
 from s2a_bench.boards.tokens import Board
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.timelines.config import MOST_CV, PlanSetting, TimelineConfig
+from s2a_bench.harness.timelines.cases import MOST_CV, LearningPlan, PlanCase, PlanSetting
 from s2a_bench.policy import CAUTION, ONLINE, TOLERANCE_S, Floats, Plans, PlanShape, Policy
 from s2a_bench.policy.arrivals import recorded_plans, with_skills
-from s2a_bench.policy.conformal import PLANS, Calibration, Guarantee, Tracker, choose, scores
+from s2a_bench.policy.conformal import PLANS, Calibration, Tracker, choose, scores
 from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
-from s2a_bench.policy.parameters import canonical
 from s2a_bench.policy.tracking import TrackedPolicy
 from s2a_bench.stats.seeds import generator
 
 
 @dataclass(slots=True)
-class Knowledge:
-    """Knowledge about one setting before its plans."""
-
-    prior: GapPrior
-    plans: Plans | None
-    """The plans for calibrating lambda; None if nothing is random."""
-    epsilon: float
-    guarantee: Guarantee
-    calibrations: dict[Policy, Calibration] = field(default_factory=dict)
-    """Of each online policy."""
-    scores: dict[Policy, Floats] = field(default_factory=dict)
-
-    def prepare(self, policy: Policy) -> Policy:
-        """Give a policy the prior, and lambda if it is not set."""
-        return policy.informed(self.prior, self._caution(policy) if _open(policy) else None)
-
-    def tracked(self, policy: Policy) -> TrackedPolicy | None:
-        """Return the tracker of a policy's lambda; None if it has none, or a set one."""
-        if not _open(policy) or self.plans is None:
-            return None
-        self._caution(policy)
-        return TrackedPolicy(policy.informed(self.prior), Tracker(self.scores[policy], self.epsilon))
-
-    def _caution(self, policy: Policy) -> float:
-        if self.plans is None:
-            return CAUTION
-        if policy not in self.calibrations:
-            self.scores[policy] = scores(policy.informed(self.prior), self.plans)
-            last_s = self.plans.arrival_s[-1]
-            self.calibrations[policy] = choose(self.scores[policy], self.epsilon, self.guarantee, last_s)
-        return self.calibrations[policy].caution
-
-    def facts(self, setting: PlanSetting) -> dict[str, Any]:
-        """Return the calibrations as plain data, stream-to-act's by the setting's name, others by the cell's."""
-        named = {canonical(policy.name, policy): found for policy, found in self.calibrations.items()}
-        return {
-            setting.name if name == ONLINE else f"{setting.name}/{name}": asdict(found)
-            | {"caution": finite(found.caution)}
-            for name, found in named.items()
-        }
-
-
-def _open(policy: Policy) -> bool:
-    return policy.learns and policy.caution is None
-
-
-def finite(caution: float | None) -> float | None:
-    """Return lambda, or None if it is infinite: JSON has no infinity."""
-    return None if caution is None or caution == float("inf") else caution
-
-
-def learn(config: TimelineConfig, board: Board, setting: PlanSetting, answers: Sequence[Floats] = ()) -> Knowledge:
-    """Learn a prior, and get plans for calibration, from drawn plans of the same kind or recorded ``answers``.
-
-    If nothing is random the prior is as certain as the arrivals, and the online rule starts at S0.
-    """
-    plans = None
-    if answers:
-        plans = plans_of(config, setting, answers)
-        prior = GapPrior.fit(plans.token_s)  # type: ignore[arg-type]  # recorded plans have tokens
-    elif config.random and any(policy.learns for policy in config.chosen.values()):
-        count = max(setting.n_skills * setting.tokens_per_skill, 3)  # a spread needs two gaps
-        rng = generator(config.seed, "timeline", "prior", setting.key)
-        prior = GapPrior.fit(board.tokens(count, rng, config.calibration_plans))
-        _, plans = draw(config, board, setting, config.calibration_plans, "calibration")
-    else:
-        prior = GapPrior(1 / board.tokens_per_s, LEAST_CV, LEAST_CV)
-    return Knowledge(prior, plans, config.epsilon, config.guarantee)
-
-
-def plans_of(config: TimelineConfig, setting: PlanSetting, answers: Sequence[Floats]) -> Plans:
-    """Make plans of recorded answers; raises UsageError if too few are long enough."""
-    rng = generator(config.seed, "timeline", "calibration", setting.key)
-    plans = recorded_plans(answers, config.shape(setting), rng)
-    count, tokens = plans.arrival_s.shape[1], setting.n_skills * setting.tokens_per_skill
-    if (count + 1) * config.epsilon < 1:
-        raise UsageError(
-            f"`calibrate`: {count} of {len(answers)} answers have the {tokens} tokens of {setting.name}; "
-            f"`epsilon` {config.epsilon:g} needs {math.ceil(1 / config.epsilon) - 1}"
-        )
-    return plans
-
-
-def draw(config: TimelineConfig, board: Board, setting: PlanSetting, plans: int, purpose: str) -> tuple[Floats, Plans]:
-    """Draw the arrivals of tokens, and the plans in them; each purpose has separate random numbers."""
-    rng = generator(config.seed, "timeline", purpose, setting.key)
-    shape = config.shape(setting)
-    token_s = board.tokens(setting.n_skills * setting.tokens_per_skill, rng, plans)
-    return token_s, with_skills(token_s, shape, rng)
-
-
-@dataclass(slots=True)
 class Following:
-    """The policies of one setting by name, and the trackers of their lambda."""
+    """The policies of one case by name, prepared for its plans."""
 
     shape: PlanShape
-    made: Mapping[str, Policy]
+    made: dict[str, Policy]
     tracked: dict[str, TrackedPolicy] = field(default_factory=dict)
+    """The trackers of lambda."""
+    calibrations: dict[str, Calibration] = field(default_factory=dict)
+
+    @property
+    def unset(self) -> dict[str, Policy]:
+        """Return the policies whose lambda is not set."""
+        return {name: policy for name, policy in self.made.items() if policy.learns and policy.caution is None}
 
     def policies(self) -> dict[str, Policy]:
         return {name: self.tracked[name].policy if name in self.tracked else each for name, each in self.made.items()}
@@ -133,18 +47,80 @@ class Following:
                 stalled = any(stall_ns > TOLERANCE_S * 1e9 for stall_ns in record.stalls_ns)
                 self.tracked[record.policy].learn(plan, stalled=stalled)
 
+    def facts(self, setting: PlanSetting) -> dict[str, Any]:
+        """Return the calibrations as plain data, stream-to-act's by the setting's name, others by the cell's."""
+        return {
+            setting.name if name == ONLINE else f"{setting.name}/{name}": asdict(calibration)
+            | {"caution": finite(calibration.caution)}
+            for name, calibration in self.calibrations.items()
+        }
 
-def prepare(config: TimelineConfig, shape: PlanShape, prior: GapPrior | None) -> Following:
-    """Give online policies the prior, and a lambda that is tracked, not calibrated, unless it is set."""
-    made, tracked = dict(config.chosen), {}
-    for name, policy in config.chosen.items():
-        made[name] = policy.informed(prior)
-        if _open(policy) and config.track:
-            plans = drawn(made[name].prior, shape, generator(config.seed, "tracking", shape.key), PLANS)
-            tracked[name] = TrackedPolicy.begin(made[name], plans, config.epsilon)
-        elif _open(policy):
-            made[name] = policy.informed(prior, CAUTION)
-    return Following(shape, made, tracked)
+
+def finite(caution: float | None) -> float | None:
+    """Return lambda, or None if it is infinite: JSON has no infinity."""
+    return None if caution is None or caution == float("inf") else caution
+
+
+def learn(case: PlanCase, plan: LearningPlan) -> Following:
+    """Give policies a prior, and calibrate lambda, from drawn plans of the same kind or recorded answers."""
+    if plan.answers:
+        plans = plans_of(case, plan)
+        prior = GapPrior.fit(plans.token_s)  # type: ignore[arg-type]  # recorded plans have tokens
+    elif plan.random and any(policy.learns for policy in plan.policies.values()):
+        count = max(case.tokens, 3)  # a spread needs two gaps
+        rng = generator(plan.seed, "timeline", "prior", case.setting.key)
+        prior = GapPrior.fit(case.board.tokens(count, rng, plan.calibration_plans))
+        _, plans = draw(case, plan.seed, plan.calibration_plans, "calibration")
+    else:
+        return Following(case.shape, certain(plan.policies, case.board))
+    following = Following(case.shape, {name: policy.informed(prior) for name, policy in plan.policies.items()})
+    for name, policy in following.unset.items():
+        score = scores(policy, plans)
+        chosen = choose(score, plan.epsilon, plan.guarantee, plans.arrival_s[-1])
+        following.calibrations[name], following.made[name] = chosen, policy.informed(caution=chosen.caution)
+        if plan.track:
+            following.tracked[name] = TrackedPolicy(policy, Tracker(score, plan.epsilon))
+    return following
+
+
+def certain(policies: Mapping[str, Policy], board: Board) -> dict[str, Policy]:
+    """Give policies a prior as certain as even arrivals are: the online rule starts at S0."""
+    prior = GapPrior(1 / board.tokens_per_s, LEAST_CV, LEAST_CV)
+    return {
+        name: policy.informed(prior, CAUTION if policy.caution is None else None) for name, policy in policies.items()
+    }
+
+
+def prepare(plan: LearningPlan, shape: PlanShape, prior: GapPrior | None) -> Following:
+    """Give policies the prior of a model's answers, and a lambda that is tracked, not calibrated."""
+    following = Following(shape, {name: policy.informed(prior) for name, policy in plan.policies.items()})
+    for name, policy in following.unset.items():
+        if plan.track:
+            plans = drawn(policy.prior, shape, generator(plan.seed, "tracking", shape.key), PLANS)
+            following.tracked[name] = TrackedPolicy.begin(policy, plans, plan.epsilon)
+        else:
+            following.made[name] = policy.informed(caution=CAUTION)
+    return following
+
+
+def plans_of(case: PlanCase, plan: LearningPlan) -> Plans:
+    """Make plans of recorded answers; raises UsageError if too few are long enough."""
+    rng = generator(plan.seed, "timeline", "calibration", case.setting.key)
+    plans = recorded_plans(plan.answers, case.shape, rng)
+    count = plans.arrival_s.shape[1]
+    if (count + 1) * plan.epsilon < 1:
+        raise UsageError(
+            f"`calibrate`: {count} of {len(plan.answers)} answers have the {case.tokens} tokens of "
+            f"{case.setting.name}; `epsilon` {plan.epsilon:g} needs {math.ceil(1 / plan.epsilon) - 1}"
+        )
+    return plans
+
+
+def draw(case: PlanCase, seed: int, plans: int, purpose: str) -> tuple[Floats, Plans]:
+    """Draw the arrivals of tokens, and the plans in them; each purpose has separate random numbers."""
+    rng = generator(seed, "timeline", purpose, case.setting.key)
+    token_s = case.board.tokens(case.tokens, rng, plans)
+    return token_s, with_skills(token_s, case.shape, rng)
 
 
 def drawn(prior: GapPrior, shape: PlanShape, rng: np.random.Generator, plans: int) -> Plans:

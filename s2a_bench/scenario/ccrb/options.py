@@ -33,7 +33,7 @@ class CcrbOptions(Options):
 
     n_skills: int = option(5, "N, speed set-points down to rest", flag="skills", ge=1, le=100)
     t_nom_s: float | None = option(
-        None, "seconds a set-point takes [default: the skill set's 0.8]", flag="t-nom", gt=0, le=60
+        None, "seconds a set-point takes [default: the skill set's 0.8]", flag="t-nom", ge=1e-6, le=60
     )
     speed_kmh: float = option(50.0, "of all three cars in the beginning, km/h", flag="speed", gt=0, le=200)
     plan_decel_mps2: float | None = option(

@@ -13,15 +13,16 @@ from rosbags.highlevel import AnyReader
 
 from s2a_bench.boards.profile import to_toml
 from s2a_bench.cli.progress import RunProgress
-from s2a_bench.errors import StoreError, UsageError
-from s2a_bench.experiments.ccrb.config import CcrbConfig, PlanRequest
+from s2a_bench.errors import UsageError
+from s2a_bench.experiments import EXPERIMENTS
+from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbComputed, CcrbLiveLoop, DrivingRequests
 from s2a_bench.experiments.ccrb.loop import ClosedLoop
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.ccrb.view.figures import build_scenario
 from s2a_bench.experiments.ccrb.view.outcomes import token_times_s
 from s2a_bench.experiments.ccrb.view.tables import ccrb_json, show
 from s2a_bench.inference import EngineConfig
+from s2a_bench.options import Options
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
@@ -32,14 +33,14 @@ POLICIES = ("naive", "wait-then-act", "stream-to-act")
 TOPICS = {policy: f"/s2a_bench/{policy.replace('-', '_')}" for policy in POLICIES}
 
 
-def run(folder: Path, **options: Any) -> StoredRun:
+def run(folder: Path, config: Options) -> StoredRun:
     with RunProgress() as progress:
-        return read_run(run_ccrb(CcrbConfig(**options), folder, progress))
+        return read_run(EXPERIMENTS["ccrb"].run_with(config, folder, progress))
 
 
 @pytest.fixture(scope="module")
 def virtual(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
-    return run(tmp_path_factory.mktemp("runs"), closed_loop=True)
+    return run(tmp_path_factory.mktemp("runs"), CcrbClosedLoop())
 
 
 class Live(NamedTuple):
@@ -53,12 +54,9 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Live:
     folder = tmp_path_factory.mktemp("runs")
     facts = {"title": "A board", "origin": "measured", "tokens_per_s": 120.0, "prompt_s": 0.05}
     (folder / "fast.toml").write_text(to_toml({**facts, "gaps": {"family": "constant"}}))
-    asked = PlanRequest(
-        live=True, transport="http/binary", engine=EngineConfig(name="replay"), record=folder / "run.mcap"
-    )
-    scenario = CcrbOptions(n_skills=3, speed_kmh=20)
-    profile = str(folder / "fast.toml")
-    made = run(folder, closed_loop=True, plan_request=asked, scenario=scenario, profile=profile)
+    engine = EngineConfig(name="replay", profile=str(folder / "fast.toml"))
+    requests = DrivingRequests(transports="http/binary", engine=engine, record=folder / "run.mcap")
+    made = run(folder, CcrbLiveLoop(requests=requests, scenario=CcrbOptions(n_skills=3, speed_kmh=20)))
     return Live(made, folder / "run.mcap")
 
 
@@ -100,7 +98,7 @@ def test_a_closed_loop_is_followed_by_its_roll_out(virtual: StoredRun) -> None:
 
 
 def test_a_run_without_closed_loops_has_no_roll_outs_beside_it(tmp_path: Path) -> None:
-    made = run(tmp_path)
+    made = run(tmp_path, CcrbComputed())
     table = show(made).tables["outcomes"]
     assert [row[0] for row in table.rows] == list(POLICIES)
     assert "real-time factor" not in table.header
@@ -129,7 +127,7 @@ def test_a_world_slower_than_the_clock_is_told_with_its_factor(
     factor: float, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ClosedLoop, "real_time_factor", factor)
-    made = run(tmp_path, closed_loop=True, policies=POLICIES[:2])
+    made = run(tmp_path, CcrbClosedLoop(policies=POLICIES[:2]))
     slow = [note for note in show(made).tables["outcomes"].notes if "slower than the clock" in note]
     assert [told in note for note in slow] == [True] * bool(told)
     assert [note.labels for note in slow] == [("world slower than the clock",)] * bool(told)  # type: ignore[attr-defined]
@@ -180,7 +178,7 @@ def test_no_skill_is_drawn_beyond_what_was_driven(virtual: StoredRun) -> None:
 @pytest.fixture(scope="module")
 def slow(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     """A board that is still writing its first skill when the lead is hit."""
-    return run(tmp_path_factory.mktemp("runs"), closed_loop=True, rate=0.3, policies=("naive",))
+    return run(tmp_path_factory.mktemp("runs"), CcrbClosedLoop(rate=0.3, policies=("naive",)))
 
 
 def test_tokens_that_come_after_the_crash_are_not_drawn(slow: StoredRun) -> None:
@@ -245,11 +243,7 @@ def test_a_recording_has_the_egos_view_and_the_requests_with_their_pictures(
     assert len(recorded["/s2a_bench/http/binary/token"]) == 4 * 18
 
 
-def test_a_recording_is_not_overwritten_and_is_of_a_model_that_answers(tmp_path: Path) -> None:
+def test_a_recording_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "run.mcap").touch()
-    engine = EngineConfig(name="replay")
-    asked = PlanRequest(live=True, transport="loopback", engine=engine, record=tmp_path / "run.mcap")
-    with pytest.raises(StoreError, match=r"`record`: .*run\.mcap exists already and is not overwritten"):
-        run(tmp_path, closed_loop=True, plan_request=asked)
-    with pytest.raises(UsageError, match="`record` is about a model that answers; it needs `live`"):
-        PlanRequest(record=tmp_path / "other.mcap")
+    with pytest.raises(UsageError, match=r"`record`: .*run\.mcap exists already and is not overwritten"):
+        DrivingRequests(transports="loopback", engine=EngineConfig(name="replay"), record=tmp_path / "run.mcap")

@@ -10,8 +10,8 @@ from matplotlib.text import Text
 
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.boundary.config import BoundaryConfig
-from s2a_bench.experiments.ccrb.config import CcrbConfig
-from s2a_bench.harness.timelines.config import TimelineConfig
+from s2a_bench.experiments.ccrb.config import CcrbComputed
+from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.plugins.chunks.capacity.config import CapacityPredicted
 from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.provenance import Origins, Provenance
@@ -48,11 +48,11 @@ def measured(name: str, _: Path, make_run: Any) -> StoredRun:
 RUNS: dict[str, Make] = {
     "boundary": partial(computed, "boundary", BoundaryConfig(points=5, most_tokens=3)),
     "capacity": partial(computed, "capacity", CapacityPredicted(predict="40", robots="1..2", seconds=1)),
-    "ccrb": partial(computed, "ccrb", CcrbConfig(phase=True, phase_points=(3, 2))),
+    "ccrb": partial(computed, "ccrb", CcrbComputed(phase=True, phase_points=(3, 2))),
     "chunks": partial(computed, "chunks", ChunksVirtual(cycles=50)),
     "latency": partial(measured, "latency"),
     "throughput": partial(measured, "throughput"),
-    "timeline": partial(computed, "timeline", TimelineConfig(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))),
+    "timeline": partial(computed, "timeline", TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))),
 }
 EMULATED, DUMMY = "no engine, tokens EMULATED, virtual time", "llama (DUMMY WEIGHTS), tokens PACED"
 

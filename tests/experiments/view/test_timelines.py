@@ -20,7 +20,7 @@ from s2a_bench.experiments.timeline.view.tables import (
     skill_table,
     timeline_csv,
 )
-from s2a_bench.harness.timelines.config import PlanSetting
+from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import skill_rows, token_rows
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform

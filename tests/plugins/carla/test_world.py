@@ -151,10 +151,10 @@ def test_the_operating_point_has_the_outcomes_of_the_other_simulators(
     assert np.nan_to_num(found.front_impact_mps[0]) == pytest.approx(np.nan_to_num(exact.front_impact_mps[0]), abs=1.0)
 
 
-@pytest.mark.parametrize("closed_loop", [False, True])
-def test_the_experiment_drives_it(closed_loop: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+@pytest.mark.parametrize("mode", ["computed", "closed-loop"])
+def test_the_experiment_drives_it(mode: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setitem(sys.modules, "carla", fresh())
-    found = s2a.ccrb(simulator="carla?port=2042", policy="stream-to-act", closed_loop=closed_loop, output=tmp_path)
+    found = s2a.ccrb(simulator="carla?port=2042", policy="stream-to-act", mode=mode, output=tmp_path)
     cell, *_ = found.json()["cells"]
     assert (cell["simulator"], cell["outcome"]) == ("carla", "none")
     assert found.manifest["configuration"]["simulator"] == "carla?port=2042"

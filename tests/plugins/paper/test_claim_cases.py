@@ -18,11 +18,11 @@ import pytest
 
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
-from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.config import CcrbComputed
 from s2a_bench.experiments.ccrb.run import run_ccrb
+from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_timeline
-from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.plugins.paper.claims import CONTRADICTED, SUPPORTED, UNDECIDED
 from s2a_bench.plugins.paper.claims.plans import after, timelines
 from s2a_bench.plugins.paper.claims.requests import change
@@ -54,7 +54,7 @@ class Kit:
 
     def timeline(self, **settings: Any) -> StoredRun:
         """Compute a timeline run."""
-        return read_run(run_timeline(TimelineConfig(**settings), self.root, NullProgress()))
+        return read_run(run_timeline(TimelineComputed(**settings), self.root, NullProgress()))
 
     def live(self, provenance: Provenance, rate: float, **facts: Any) -> StoredRun:
         """Make a live run of the four L, with timings as one at that rate has them."""
@@ -113,7 +113,7 @@ class Kit:
 
     def ccrb(self, **settings: Any) -> StoredRun:
         """Drive a CCRB run."""
-        return read_run(run_ccrb(CcrbConfig(**settings), self.root, NullProgress()))
+        return read_run(run_ccrb(CcrbComputed(**settings), self.root, NullProgress()))
 
 
 @pytest.fixture

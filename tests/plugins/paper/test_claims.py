@@ -16,13 +16,13 @@ import pytest
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.run import run_boundary
-from s2a_bench.experiments.ccrb.config import CcrbConfig
+from s2a_bench.experiments.ccrb.config import CcrbComputed
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.references import REFERENCES
+from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_timeline
-from s2a_bench.harness.timelines.config import TimelineConfig
 from s2a_bench.plugins.paper.claims import (
     CONTRADICTED,
     IDENTITY,
@@ -69,12 +69,12 @@ def changed(run: StoredRun, **tables: pd.DataFrame) -> StoredRun:
 
 @pytest.fixture(scope="module")
 def timelines(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
-    return read_run(run_timeline(TimelineConfig(), tmp_path_factory.mktemp("timeline"), NullProgress()))
+    return read_run(run_timeline(TimelineComputed(), tmp_path_factory.mktemp("timeline"), NullProgress()))
 
 
 @pytest.fixture(scope="module")
 def ccrb(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
-    config = CcrbConfig(phase=True, phase_points=(7, 5))
+    config = CcrbComputed(phase=True, phase_points=(7, 5))
     return read_run(run_ccrb(config, tmp_path_factory.mktemp("ccrb"), NullProgress()))
 
 
@@ -259,7 +259,7 @@ def test_an_end_within_one_per_cent_of_naives_is_no_penalty(timelines: StoredRun
 
 @pytest.mark.parametrize(("factor", "verdict"), [(1.0, SUPPORTED), (1.05, CONTRADICTED)])
 def test_a_later_end_contradicts_where_s0_is_estimated(tmp_path: Path, factor: float, verdict: str) -> None:
-    config = TimelineConfig(profiles=("jetson-agx-orin",), jitter="lognormal:cv=0.2", plans=200)
+    config = TimelineComputed(profiles=("jetson-agx-orin",), jitter="lognormal:cv=0.2", plans=200)
     run = read_run(run_timeline(config, tmp_path, NullProgress()))
     rows = run.table(TIMELINES).copy()
     ours = rows["policy"] == "stream-to-act"
@@ -268,7 +268,7 @@ def test_a_later_end_contradicts_where_s0_is_estimated(tmp_path: Path, factor: f
 
 
 def test_an_increase_that_may_be_none_decides_nothing(tmp_path: Path) -> None:
-    config = TimelineConfig(
+    config = TimelineComputed(
         profiles=("jetson-agx-orin",), policies=("naive",), tokens_per_skill=(4, 6), jitter="lognormal:cv=0.2", plans=40
     )
     run = read_run(run_timeline(config, tmp_path, NullProgress()))
@@ -286,7 +286,7 @@ def test_what_ends_with_stream_to_act_or_before_it_does_not_end_later(timelines:
 
 
 def test_where_nothing_can_be_stretched_only_fixed_durations_are_judged(tmp_path: Path) -> None:
-    run = read_run(run_timeline(TimelineConfig(t_max=1.0), tmp_path, NullProgress()))
+    run = read_run(run_timeline(TimelineComputed(t_max=1.0), tmp_path, NullProgress()))
     assert claim_of("with fixed durations", run).verdict == IDENTITY
     assert not claim_of("up to T_max", run).tested
 
@@ -312,7 +312,7 @@ def test_at_another_t_min_than_the_chosen_the_papers_line_is_tried_without_a_ver
 
 def test_the_chosen_settings_are_the_defaults_of_the_commands() -> None:
     point, plans, plane = (
-        json.loads(json.dumps(kind().to_manifest())) for kind in (CcrbConfig, TimelineConfig, BoundaryConfig)
+        json.loads(json.dumps(kind().to_manifest())) for kind in (CcrbComputed, TimelineComputed, BoundaryConfig)
     )
     several = {"n_skills": [PLANS["n_skills"]], "t_nom_s": [PLANS["t_nom_s"]]}
     assert {name: point[name] for name in CHOSEN} == CHOSEN
