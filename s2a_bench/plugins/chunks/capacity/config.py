@@ -55,12 +55,6 @@ class Limit:
         value_ns = float(match[5]) * (1e9 if match[6] == "s" else 1e6)
         return Limit(f"{match[3]}_ns", value_ns, 1 - int(match[4]) / 100)
 
-    @property
-    def text(self) -> str:
-        if self.column == "stalled":
-            return f"at most {self.share * 100:g} % stalled"
-        return f"{self.column.removesuffix('_ns').replace('_', ' ')} of at most {self.value / 1e6:g} ms"
-
 
 @dataclass(frozen=True, slots=True)
 class RobotLoad:
@@ -98,9 +92,9 @@ class RobotLoad:
     def limit_text(self, limit: Limit) -> str:
         """Return a limit in words."""
         if limit.column != "stalled":
-            return limit.text
+            return f"{limit.column.removesuffix('_ns').replace('_', ' ')} of at most {limit.value / 1e6:g} ms"
         beyond = " beyond those of one robot alone" if self.beyond_alone(limit) else ""
-        return f"{limit.text} {'plans' if self.mode is None else 'ticks'}{beyond}"
+        return f"at most {limit.share * 100:g} % stalled {'plans' if self.mode is None else 'ticks'}{beyond}"
 
 
 @dataclass(frozen=True, slots=True)
