@@ -17,12 +17,13 @@ from typing import Final
 import numpy as np
 from scipy import stats
 
-from s2a_bench.plugins.chunks.capacity.config import CapacityConfig
+from s2a_bench.plugins.chunks.capacity.config import CapacityPredicted, RobotLoad
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace, measures
 from s2a_bench.plugins.chunks.capacity.search import Judge, Tried, knee, search
-from s2a_bench.plugins.chunks.capacity.simulate import UNKNOWN, ServiceTime, VirtualFleet, simulate
+from s2a_bench.plugins.chunks.capacity.simulate import UNKNOWN, ServiceTime, simulate
 
-CONFIG: Final = CapacityConfig(predict="20")
+CONFIG: Final = CapacityPredicted(predict="20")
+SEARCH: Final = CONFIG.search
 """The defaults of the command: 10 s a look, 4 looks, at most 1 % stalled."""
 MEAN_MS: Final = 20.0
 SIGMA: Final = float(np.sqrt(np.log1p(0.3**2)))
@@ -51,10 +52,10 @@ def traces(service: str, mode: str, robots: int, seconds: float, seed: int) -> l
 
 
 def _fleet(mode: str, robots: int, seconds: float, times_ns: Iterator[int], seed: int) -> list[RobotTrace]:
-    made = CONFIG.but(modes=(mode,)).made[mode]
-    fleet = VirtualFleet(CONFIG.setting, round(seconds * 1e9) + CONFIG.settle_ns, made)
+    made = CONFIG.but(modes=(mode,)).control.modes[mode]
+    span_ns = round(seconds * 1e9) + CONFIG.settle_ns
     times = (ServiceTime(UNKNOWN, each) for each in times_ns)
-    return simulate(fleet, robots, times, np.random.default_rng([seed, 1]), 1, (1.0,))
+    return simulate(RobotLoad(CONFIG.setting, made), span_ns, robots, times, np.random.default_rng([seed, 1]))
 
 
 def _stalled(found: list[RobotTrace]) -> float:
@@ -78,21 +79,21 @@ def interval(service: str, mode: str, robots: int, seconds: float, seed: int) ->
 
 def wrong(service: str, shares: Mapping[int, float], seed: int) -> bool:
     """Return whether a search decides any fleet against the truth; every fleet is looked at as the command does."""
-    assert CONFIG.limited is not None  # noqa: S101 - the default limit
-    limit, errors = CONFIG.limited, []
+    assert SEARCH.limit is not None  # noqa: S101 - the default limit
+    limit, errors = SEARCH.limit, []
 
     def attempt(robots: int) -> Tried:
-        judge = Judge(limit, beyond=False, settle_ns=CONFIG.settle_ns, confidence=CONFIG.confidence)
+        judge = Judge(limit, beyond=False, settle_ns=CONFIG.settle_ns, confidence=SEARCH.confidence)
         for look in range(1, CONFIG.looks + 1):
             found = traces(service, "queue?trigger=8", robots, look * CONFIG.seconds, seed)
-            row = measures(found, CONFIG.setting, CONFIG.settle_ns, confidence=CONFIG.confidence)
+            row = measures(found, CONFIG.setting, CONFIG.settle_ns, confidence=SEARCH.confidence)
             verdict, within = judge(row, found)
             if verdict != "undecided":
                 errors.append((verdict == "below") != (shares.get(robots, robots > max(shares)) <= limit.share))
                 break
         return Tried(robots, verdict, within)
 
-    search(CONFIG.numbers, attempt, {}, bisects=True)
+    search(SEARCH.numbers, attempt, {}, bisects=True)
     return any(errors)
 
 
@@ -119,14 +120,14 @@ def _drawn(service: str, seed: int | list[int] = 3) -> Iterator[int]:
 
 
 def _knee(times_ns: Callable[[], Iterator[int]], seed: int, seconds: float = CONFIG.seconds) -> int:
-    assert CONFIG.limited is not None  # noqa: S101 - the default limit
-    share, tried = CONFIG.limited.share, dict[int, Tried]()
+    assert SEARCH.limit is not None  # noqa: S101 - the default limit
+    share, tried = SEARCH.limit.share, dict[int, Tried]()
 
     def attempt(robots: int) -> Tried:
         within = _stalled(_fleet("queue?trigger=8", robots, seconds, times_ns(), seed)) <= share
         return Tried(robots, "below" if within else "above", within)
 
-    search(CONFIG.numbers, attempt, tried, bisects=True)
+    search(SEARCH.numbers, attempt, tried, bisects=True)
     found = knee(tried.values())
     return found.robots if found else 0
 

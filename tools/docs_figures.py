@@ -23,8 +23,8 @@ from s2a_bench.experiments.ccrb.run import run_closed_loop
 from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.experiments.timeline.run import run_timeline
 from s2a_bench.experiments.timeline.view.figures import policy_colours
-from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
-from s2a_bench.plugins.chunks.chunks.run import run_chunks
+from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
+from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
 from s2a_bench.scenario import SIMULATORS, DriveCommand
@@ -72,7 +72,7 @@ def boundary(config: BoundaryConfig) -> Figure:
 
 def chunks(latency: str) -> StoredRun:
     """Make a run of chunks, four modes and the rules."""
-    return _run(lambda output: run_chunks(ChunksConfig(latency=latency, shown_ticks=90), output, Quiet()))
+    return _run(lambda output: run_virtual(ChunksVirtual(latency=latency, shown_ticks=90), output, Quiet()))
 
 
 def safe_start_figure() -> Figure:

@@ -28,7 +28,7 @@ from s2a_bench.transport import (
     named_by,
     paths,
 )
-from s2a_bench.transport.defaults import COMPARED, acting_over
+from s2a_bench.transport.defaults import COMPARED
 from s2a_bench.transport.pipeline import Pipeline, answer_over, carries_alone, pipelines, require_payload
 from s2a_bench.transport.surroundings import SURROUNDINGS, Surroundings
 
@@ -346,25 +346,3 @@ class FirstVariants(RequestsConfig):
     """The settings of a run in which a transport named without a variant stands for its first variant."""
 
     EVERY_VARIANT: ClassVar[bool] = False
-
-
-class LiveRequests(FirstVariants):
-    """The requests of control loops."""
-
-    COUNTS_TOKENS: ClassVar[str] = ""
-
-    transports: Names = option(
-        (acting_over()[0],),
-        f"transports as in latency; several with commas, each with every mode [default: {acting_over()[1]}]",
-        flag="transport",
-    )
-    engine: EngineConfig = group(EngineConfig, only=("name", "profile", "gaps", "action_dim"))
-    warmup: int = option(5, "requests before a cell's loop starts, kept and marked", ge=1, le=10**6)
-    sample_resources_hz: float = option(
-        0.0, "readings a second of CPU, memory, GPU and power beside the run; 0: none", flag="sample-resources", ge=0
-    )
-
-    def check(self) -> None:
-        """Check as other requests do, unless none are configured (virtual time)."""
-        if self.model_fields_set:
-            super().check()

@@ -48,7 +48,7 @@ def test_help_is_code_zero_and_names_every_flag(path: tuple[str, ...]) -> None:
         ("latency", ["Transport", "Pictures", "Model", "Requests", "Options"]),
         ("throughput", ["Transport", "Pictures", "Model", "Requests", "Options"]),
         ("timeline", ["Plans", "Tokens that are modelled", "A model that answers", "Options"]),
-        ("chunks", ["Control loop", "Transport", "Options"]),
+        ("chunks", ["Modes", "Control loop", "Transport (with --live)", "Options"]),
         ("ccrb", ["Drives", "Scenario", "A model that answers", "Options"]),
         ("serve", ["Arguments", "Model", "Transport", "ROS 2", "Options"]),
     ],

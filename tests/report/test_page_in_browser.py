@@ -13,8 +13,8 @@ from s2a_bench.experiments.ccrb.config import CcrbComputed
 from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.experiments.timeline.run import run_timeline
-from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
-from s2a_bench.plugins.chunks.chunks.run import run_chunks
+from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
+from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import read_chapters
 from s2a_bench.report.page.files import make_report, write_report
@@ -79,13 +79,13 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("page")
     done = NullProgress()
     timeline = TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6, 4), policies=("naive", LONG_POLICY))
-    chunks = ChunksConfig(modes="sync,replace?execute=8", latency="60,100", cycles=100, shown_ticks=60)
+    chunks = ChunksVirtual(modes="sync,replace?execute=8", latency="60,100", cycles=100, shown_ticks=60)
     warning = {"code": "load", "message": "busy-" * 60, "advice": "wait"}
     paths = [
         made_run(folder, EIGHT, manifest={"warnings": [warning], "environment": {"cpu": "c" * 300}}).path,
         spoken_run(folder, 34.2, host="h" * 60).path,
         run_timeline(timeline, folder, done),
-        run_chunks(chunks, folder, done),
+        run_virtual(chunks, folder, done),
         run_boundary(BoundaryConfig(), folder, done),
         run_ccrb(CcrbComputed(), folder, done),
     ]

@@ -49,6 +49,10 @@ class Source:
     def provenance(self) -> Provenance:
         return replace(self.origin, profile=self.name)
 
+    def learnable(self, most: int) -> int:
+        """Return how many latencies rules learn from: at most ``most``, and the first half of a recording."""
+        return most if self.recorded_ns is None else min(most, self.recorded_ns.size // 2)
+
     def draw(self, rng: np.random.Generator, count: int) -> Ints:
         """Draw latencies of shape (count,), in ns; raises TypeError for a recording."""
         if self.profile:

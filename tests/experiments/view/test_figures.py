@@ -12,8 +12,8 @@ from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.ccrb.config import CcrbComputed
 from s2a_bench.experiments.timeline.config import TimelineComputed
-from s2a_bench.plugins.chunks.capacity.config import CapacityConfig
-from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
+from s2a_bench.plugins.chunks.capacity.config import CapacityPredicted
+from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
@@ -47,9 +47,9 @@ def measured(name: str, _: Path, make_run: Any) -> StoredRun:
 
 RUNS: dict[str, Make] = {
     "boundary": partial(computed, "boundary", BoundaryConfig(points=5, most_tokens=3)),
-    "capacity": partial(computed, "capacity", CapacityConfig(predict="40", robots="1..2", seconds=1)),
+    "capacity": partial(computed, "capacity", CapacityPredicted(predict="40", robots="1..2", seconds=1)),
     "ccrb": partial(computed, "ccrb", CcrbComputed(phase=True, phase_points=(3, 2))),
-    "chunks": partial(computed, "chunks", ChunksConfig(cycles=50)),
+    "chunks": partial(computed, "chunks", ChunksVirtual(cycles=50)),
     "latency": partial(measured, "latency"),
     "throughput": partial(measured, "throughput"),
     "timeline": partial(computed, "timeline", TimelineComputed(profiles=("jetson-agx-orin",), tokens_per_skill=(6,))),

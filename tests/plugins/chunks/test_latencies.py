@@ -11,9 +11,9 @@ import pytest
 
 from s2a_bench.boards.latency import read_delays
 from s2a_bench.errors import StoreError, UsageError
-from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
+from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.rows import REQUESTS
-from s2a_bench.plugins.chunks.chunks.run import run_chunks
+from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.plugins.chunks.latencies import COLUMNS, Source, sources, split, write_delays
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
@@ -86,7 +86,7 @@ def test_what_is_no_source_is_one_line_that_names_it(written: str, message: str)
 
 def exported(folder: Path, **options: Any) -> list[dict[str, str]]:
     file = folder / "delays.csv"
-    run_chunks(ChunksConfig(export_delays=file, **options), folder / "runs", NullProgress())
+    run_virtual(ChunksVirtual(export_delays=file, **options), folder / "runs", NullProgress())
     with file.open(newline="") as text:
         return list(csv.DictReader(text))
 
@@ -108,8 +108,8 @@ def test_drawn_latencies_are_written_with_their_d_and_read_back(rounding: str, t
 
 def test_what_is_replayed_is_what_was_exported(tmp_path: Path) -> None:
     first = {"modes": "queue?trigger=4", "rules": "", "cycles": 200}
-    one = read_run(run_chunks(ChunksConfig(export_delays=tmp_path / "d.csv", **first), tmp_path, NullProgress()))
-    again = read_run(run_chunks(ChunksConfig(latency=str(tmp_path / "d.csv"), **first), tmp_path, NullProgress()))
+    one = read_run(run_virtual(ChunksVirtual(export_delays=tmp_path / "d.csv", **first), tmp_path, NullProgress()))
+    again = read_run(run_virtual(ChunksVirtual(latency=str(tmp_path / "d.csv"), **first), tmp_path, NullProgress()))
     columns = [name for name in one.table(REQUESTS).columns if name != "cell"]
     assert len(one.table(REQUESTS))
     assert one.table(REQUESTS)[columns].equals(again.table(REQUESTS)[columns])
@@ -138,7 +138,7 @@ def test_a_run_has_to_be_told_which_of_its_cells(make_run: MakeRun, tmp_path: Pa
 def test_a_place_that_is_none_is_refused_before_anything_is_computed(tmp_path: Path) -> None:
     for file in (tmp_path / "none" / "d.csv", tmp_path / "d.txt"):
         with pytest.raises(UsageError, match=r"`export_delays`: .* should be a \.csv file in a folder that there is"):
-            ChunksConfig(export_delays=file)
+            ChunksVirtual(export_delays=file)
     (tmp_path / "d.csv").mkdir()
     with pytest.raises(StoreError, match="`export_delays`: cannot write"):
         write_delays(tmp_path / "d.csv", [])

@@ -1,14 +1,17 @@
 """How many robots one server carries: measured with N control loops, or predicted from the service times of one."""
 
-from s2a_bench.experiments import Experiment
+from s2a_bench.experiments import Experiment, RunMode
 
+HERE = "s2a_bench.plugins.chunks.capacity"
 EXPERIMENT = Experiment(
     name="capacity",
     about="Find how many robots one server carries, each with its control clock: measured, or predicted.",
-    config="s2a_bench.plugins.chunks.capacity.config:CapacityConfig",
-    run="s2a_bench.plugins.chunks.capacity.run:run_capacity",
-    view="s2a_bench.plugins.chunks.capacity.view:show",
-    cell="s2a_bench.plugins.chunks.capacity.view:CapacityCell",
-    compared="s2a_bench.plugins.chunks.capacity.view:COMPARED",
+    config=f"{HERE}.config:CapacityMeasured",
+    run=f"{HERE}.run:run_measured",
+    mode="measured",
+    modes=(RunMode("predicted", f"{HERE}.config:CapacityPredicted", f"{HERE}.predict:run_predicted", {"predict": ""}),),
+    view=f"{HERE}.view:show",
+    cell=f"{HERE}.view:CapacityCell",
+    compared=f"{HERE}.view:COMPARED",
     unit="fleets",
 )

@@ -1,11 +1,11 @@
-"""The options of a capacity run: the robots, the limit, the search, and the requests of a measured run."""
+"""The options of a capacity run: the robots, the limit and the search; measured, the requests, or predicted."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal
@@ -13,20 +13,13 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 from pydantic import BeforeValidator
 
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.config import LiveRequests
-from s2a_bench.inference import STAND_IN, EngineConfig
-from s2a_bench.options import Names, Options, group, option
-from s2a_bench.plugins.chunks.modes import MODES, ControlSetting, Mode, Rounding, modes
+from s2a_bench.harness.config import GROUPED
+from s2a_bench.inference import EngineConfig
+from s2a_bench.options import Names, group, option
+from s2a_bench.plugins.chunks.modes import ControlSetting, Mode
+from s2a_bench.plugins.chunks.options import ControlOptions, LoopRequests, ServedOptions, acting_modes
 from s2a_bench.transport import ACTIONS, TOKENS
 
-SHOWN: Final = (
-    *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
-    *("prompt", "max_tokens", "warmup", "timeout_s", "wait_for_server", "deadline_s", "sample_resources_hz", "nonce"),
-)
-"""The options of requests that are flags of `capacity`."""
-MOST_ROBOTS: Final = 10_000
-MOST_CONNECTIONS: Final = 1_000
-"""Robots of a measured run, each with a connection and a thread."""
 PLAN_EVERY_S: Final = 2.0
 FEWEST_PLANS: Final = 3
 """Of a robot, in the time that counts."""
@@ -51,49 +44,104 @@ class Limit:
     @staticmethod
     def read(written: str) -> Limit:
         """Read ``METRIC=VALUE``; raises ValueError."""
-        found = _LIMIT.fullmatch(written)
-        if found is None:
+        match = _LIMIT.fullmatch(written)
+        if match is None:
             raise ValueError(f"'{written}' should be one of {LIMITS}")
-        if found[1]:
-            share = float(found[2]) / (100 if written.endswith("%") else 1)
+        if match[1]:
+            share = float(match[2]) / (100 if written.endswith("%") else 1)
             if share >= 1:
                 raise ValueError(f"'{written}' allows every tick to stall; write 1% or 0.01")
             return Limit("stalled", share, share)
-        value_ns = float(found[5]) * (1e9 if found[6] == "s" else 1e6)
-        return Limit(f"{found[3]}_ns", value_ns, 1 - int(found[4]) / 100)
+        value_ns = float(match[5]) * (1e9 if match[6] == "s" else 1e6)
+        return Limit(f"{match[3]}_ns", value_ns, 1 - int(match[4]) / 100)
+
+
+@dataclass(frozen=True, slots=True)
+class RobotLoad:
+    """What each robot of a fleet does: act on chunks in a mode, request a plan every so often, or a closed loop."""
+
+    setting: ControlSetting
+    mode: Mode | None = None
+    """None: robots without a control clock."""
+    name: str = ""
+    """The canonical name of the mode."""
+    seed: int = 0
+    every_ns: int = 0
+    """Between the plans of a robot; 0 and no mode: closed loop."""
+    think_ns: int = 0
+    """Closed loop: from an answer to the next request."""
+    episode_ns: int = 0
+    """The robots start together every so often; 0: once, at random moments of their first cycle."""
+    settle_ns: int = 0
+    """After a start, left out of what is measured."""
 
     @property
-    def text(self) -> str:
-        if self.column == "stalled":
-            return f"at most {self.share * 100:g} % stalled"
-        return f"{self.column.removesuffix('_ns').replace('_', ' ')} of at most {self.value / 1e6:g} ms"
+    def cycle_ns(self) -> int:
+        if self.mode is not None:
+            return self.mode.execution_horizon(self.setting) * self.setting.period_ns
+        return self.every_ns or self.think_ns
+
+    def of(self, server: str) -> str:
+        """Return the name of the cell of these robots and a server."""
+        return f"{server}, {self.name}" if self.name else server
+
+    def beyond_alone(self, limit: Limit | None) -> bool:
+        """Return True if only stalls beyond those of one robot alone count, as in a mode that blocks."""
+        return self.mode is not None and self.mode.blocks and limit is not None and limit.column == "stalled"
+
+    def limit_text(self, limit: Limit) -> str:
+        """Return a limit in words."""
+        if limit.column != "stalled":
+            return f"{limit.column.removesuffix('_ns').replace('_', ' ')} of at most {limit.value / 1e6:g} ms"
+        beyond = " beyond those of one robot alone" if self.beyond_alone(limit) else ""
+        return f"at most {limit.share * 100:g} % stalled {'plans' if self.mode is None else 'ticks'}{beyond}"
 
 
-class CapacityRequests(LiveRequests):
-    engine: EngineConfig = group(EngineConfig, only=set(EngineConfig.model_fields) - {"answer", "horizon", "latency"})
+@dataclass(frozen=True, slots=True)
+class SearchPlan:
+    """Which fleets are tried, for how long, and what they may not exceed."""
+
+    numbers: Sequence[int]
+    """Of robots, ascending."""
+    bisects: bool
+    """Whether the search ends at the first fleet beyond the limit, and bisects from there."""
+    limit: Limit | None
+    look_ns: int
+    """The shortest time for which a fleet acts, and the time between looks at it."""
+    looks: int
+
+    @property
+    def most_fleets(self) -> int:
+        """Return the most fleets of a search, one robot alone included."""
+        bisected = math.ceil(math.log2(self.numbers[-1] / self.numbers[0])) if self.bisects else 0
+        return len({1, *self.numbers}) + bisected
+
+    @property
+    def confidence(self) -> float:
+        """Return the confidence of one look, so that all looks of a search are right with 95 % (Bonferroni)."""
+        return 1 - 0.05 / (self.most_fleets * self.looks)
+
+
+class CapacityRequests(LoopRequests):
+    engine: EngineConfig = group(
+        EngineConfig, only=set(EngineConfig.model_fields) - {"answer", "horizon", "latency", "batch"}
+    )
     sample_resources_hz: float = option(
         2.0, "readings a second of CPU, memory, GPU and power beside the run; 0: none", flag="sample-resources", ge=0
     )
 
 
-class CapacityConfig(Options):
+class CapacityOptions(ControlOptions):
     """A fleet of robots, and what it may not exceed."""
 
     PANEL: ClassVar[str] = "Fleet"
+    MOST_ROBOTS: ClassVar[int]
 
-    modes: Names = option(
-        ("queue?trigger=8",),
-        f"{', '.join(MODES)}, each with ?parameter=value&...; several with commas",
-        first=True,
-        names=lambda: MODES,
-    )
+    modes: Names = acting_modes(("queue?trigger=8",))
     robots: Annotated[str, BeforeValidator(str, json_schema_input_type=str | int)] = option(
         "1..64", "FROM..TO is searched, doubling, then by bisection; a number or a list is tried", first=True
     )
     limit: str = option("stalled=1%", f"{LIMITS}; empty text: none, every number of robots is tried", first=True)
-    control_hz: float = option(50.0, "control ticks a second", ge=1e-3, le=10_000, allow_inf_nan=False, first=True)
-    horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096, first=True)
-    rounding: Rounding = option("floor", "d is the floor or ceil of latency over control tick")
     seconds: float = option(10.0, "the shortest time for which a fleet acts, and the time between looks", gt=0, le=3600)
     looks: int = option(4, "the most looks at a fleet before it counts as undecided", ge=1, le=100)
     settle_s: float | None = option(
@@ -115,150 +163,76 @@ class CapacityConfig(Options):
         gt=0,
         le=3600,
     )
-    processes: int = option(1, "processes over which the robots are spread", ge=1, le=256)
-    ray: str = option("", "spread the processes over a Ray cluster: its ADDRESS, auto, or local; needs --url")
-    latency: Annotated[str, BeforeValidator(str, json_schema_input_type=str | float)] = option(
-        "", "how long echo takes to answer: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: no time]", first=True
-    )
-    predict: str = option(
-        "",
-        "predict, in virtual time: the run folder of one robot, or service times as in --latency",
-        first=True,
-    )
-    servers: int = option(1, "--predict: servers that share one queue", ge=1, le=1000)
-    batch: Path | None = option(
-        None, "--predict: CSV of a batching server, columns batch and latency_ms, that of so many requests together"
-    )
-    seed: int = option(0, "seed of everything that is drawn", ge=0)
-    requests: CapacityRequests = group(CapacityRequests, only=SHOWN, first=("transports", "url"))
 
     @property
-    def virtual(self) -> bool:
-        return bool(self.predict)
-
-    @cached_property
     def numbers(self) -> Sequence[int]:
         """The numbers of robots to try, ascending; of FROM..TO the powers of two times FROM, then TO."""
         low, _, high = self.robots.partition("..")
         try:
-            found = sorted({int(each) for each in (*low.split(","), *high.split(",")) if each.strip()})
+            named = sorted({int(each) for each in (*low.split(","), *high.split(",")) if each.strip()})
         except ValueError:
-            found = []
-        if not found or found[0] < 1:
+            named = []
+        if not named or named[0] < 1:
             raise UsageError(f"`robots`: '{self.robots}' should be 1 or more: a number, a list, or FROM..TO")
         if not high:
-            return tuple(found)
-        first, last = found[0], found[-1]
+            return tuple(named)
+        first, last = named[0], named[-1]
         return (*(first << step for step in range((last // first).bit_length()) if first << step < last), last)
 
-    @property
-    def searches(self) -> bool:
-        return ".." in self.robots and self.limited is not None
-
-    @property
-    def most_fleets(self) -> int:
-        """Return the most fleets of a search, one robot alone included."""
-        bisected = math.ceil(math.log2(self.numbers[-1] / self.numbers[0])) if self.searches else 0
-        return len({1, *self.numbers}) + bisected
-
-    @property
-    def confidence(self) -> float:
-        """Return the confidence of one look, so that all looks of a search are right with 95 % (Bonferroni)."""
-        return 1 - 0.05 / (self.most_fleets * self.looks)
-
     @cached_property
-    def limited(self) -> Limit | None:
-        """The limit; by default none for clients without a clock."""
-        if not self.limit or (self.closed_loop and "limit" not in self.model_fields_set):
-            return None
-        try:
-            return Limit.read(self.limit)
-        except ValueError as error:
-            raise UsageError(f"`limit`: {error}") from error
-
-    def limit_text(self, mode: str) -> str:
-        """Return the limit in words, as it is for a mode, or for "" for robots without one."""
-        if self.limited is None or self.limited.column != "stalled":
-            return "" if self.limited is None else self.limited.text
-        beyond = " beyond those of one robot alone" if self.beyond_alone(mode) else ""
-        return f"{self.limited.text} {'ticks' if self.load == 'chunks' else 'plans'}{beyond}"
-
-    def beyond_alone(self, mode: str) -> bool:
-        """Return True if only stalls beyond those of one robot alone count, as in a mode that blocks."""
-        return bool(mode) and self.made[mode].blocks and self.limited is not None and self.limited.column == "stalled"
+    def search(self) -> SearchPlan:
+        """The search; by default without a limit for clients without a clock."""
+        limit = None
+        if self.limit and ("limit" in self.model_fields_set or not self.closed_loop):
+            try:
+                limit = Limit.read(self.limit)
+            except ValueError as error:
+                raise UsageError(f"`limit`: {error}") from error
+        bisects = ".." in self.robots and limit is not None
+        return SearchPlan(self.numbers, bisects, limit, round(self.seconds * 1e9), self.looks)
 
     @property
-    def setting(self) -> ControlSetting:
-        return ControlSetting(round(1e9 / self.control_hz), self.horizon, self.rounding)
+    def loads(self) -> Sequence[RobotLoad]:
+        """What the robots do: act in each mode, or the one thing that they do without chunks."""
+        episode_ns = round(self.episodes_s * 1e9)
+        load = RobotLoad(self.setting, seed=self.seed, episode_ns=episode_ns, settle_ns=self.settle_ns)
+        if self.load == "chunks":
+            return [replace(load, mode=mode, name=name) for name, mode in self.control.modes.items()]
+        if self.load == "plans":
+            return [replace(load, every_ns=self.plan_ns)]
+        return [replace(load, think_ns=round(self.think_s * 1e9))]
 
     @property
     def settle_ns(self) -> int:
         settle_s = self.settle_s if self.settle_s is not None else 0.0 if self.episodes_s else SETTLE_S
         return round(settle_s * 1e9)
 
-    @cached_property
-    def made(self) -> dict[str, Mode]:
-        """Mode by its canonical name."""
-        return modes(self.modes, self.setting)
+    @property
+    def answer(self) -> str:
+        """What the server answers with."""
+        return ACTIONS if self.plan_every_s is None else TOKENS
 
     @cached_property
     def load(self) -> Literal["chunks", "plans", "closed"]:
-        """What the robots do; those of a transport that carries no actions ask for plans."""
+        """What the robots do; those of a server without actions ask for plans."""
         if self.closed_loop:
             return "closed"
-        return "plans" if self.plan_every_s is not None or (not self.predict and self._answer == TOKENS) else "chunks"
+        return "chunks" if self.answer == ACTIONS else "plans"
 
     @property
     def plan_ns(self) -> int:
         return round((self.plan_every_s or PLAN_EVERY_S) * 1e9)
 
-    @property
-    def _answer(self) -> str:
-        able = all(ACTIONS in each.capabilities.answer_kinds for each in self.requests.pipelines)
-        return ACTIONS if able and self.plan_every_s is None else TOKENS
-
-    @cached_property
-    def live_requests(self) -> LiveRequests:
-        """The requests of a measured run; raises UsageError naming the field."""
-        engine: dict[str, Any] = {"answer": self._answer, "horizon": self.horizon}
-        if self.latency:
-            engine |= {"latency": self.latency} | ({} if self.requests.engine.model_fields_set else {"name": STAND_IN})
-        return self.requests.but(engine=self.requests.engine.but(**engine), seed=self.seed, requests=1)
-
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
-        if not self.modes:
-            raise UsageError("`modes`: name at least one")
-        most = MOST_ROBOTS if self.predict else MOST_CONNECTIONS
-        if self.numbers[-1] > most:
-            raise UsageError(f"`robots`: {self.numbers[-1]} are more than {most}")
+        super().check()
+        if self.numbers[-1] > self.MOST_ROBOTS:
+            raise UsageError(f"`robots`: {self.numbers[-1]} are more than {self.MOST_ROBOTS}")
         if self.episodes_s and (self.closed_loop or self.episodes_s * self.control_hz < 2):  # noqa: PLR2004
             raise UsageError(f"`episodes`: {self.episodes_s:g} s need a control clock, and two of its ticks")
         if self.episodes_s and self.settle_ns >= self.episodes_s * 1e9:
             raise UsageError(f"`settle`: {self.settle_s:g} s leave nothing of an episode of {self.episodes_s:g} s")
-        _ = self.made
-        if self.predict:
-            given = {"processes", "ray", "latency"} & self.model_fields_set
-            if alone := next(iter((*sorted(given), *self.requests.given())), ""):
-                raise UsageError(f"`{alone}` is for a measured run; leave it out with `predict`")
-        else:
-            self._check_measured()
-        self._check_load()
-
-    def _check_measured(self) -> None:
-        for name in ("servers", "batch"):
-            if name in self.model_fields_set:
-                raise UsageError(f"`{name}` needs `predict`")
-        _ = self.live_requests
-        if several := [name for name, each in self.made.items() if each.several]:
-            raise UsageError(
-                f"`modes`: {several[0]} has several requests under way, a robot one connection; `predict` it instead"
-            )
-        if self.ray and not all(each.options.external_address for each in self.requests.pipelines):
-            raise UsageError("`ray`: robots on other hosts need a server that they reach; name it with `url`")
-
-    def _check_load(self) -> None:
-        limit, given = self.limited, self.model_fields_set
+        limit, given = self.search.limit, self.model_fields_set
         if "think_s" in given and not self.closed_loop:
             raise UsageError("`think` needs `closed_loop`")
         if "modes" in given and self.load != "chunks":
@@ -275,17 +249,52 @@ class CapacityConfig(Options):
         if limit.column == "stalled" and self.load == "closed":
             raise UsageError("`limit`: a client without a clock never stalls; take latency_p99=300ms or ttft_p99=300ms")
 
-    def risks(self) -> Iterator[tuple[str, str, str]]:
-        yield from super().risks()
-        if not self.predict:
-            yield from self.live_requests.risks()
-
     def to_manifest(self) -> dict[str, Any]:
         return {
-            **self.model_dump(mode="json", exclude={"requests"}),
-            "modes": list(self.made),
+            **super().to_manifest(),
             "load": self.load,
             **({"plan_every_s": self.plan_ns / 1e9} if self.load == "plans" else {}),
-            "period_ns": self.setting.period_ns,
             "settle_ns": self.settle_ns,
         }
+
+
+class CapacityMeasured(CapacityOptions, ServedOptions):
+    """A fleet of robots at a server."""
+
+    MOST_ROBOTS: ClassVar[int] = 1_000
+    """Each has a connection and a thread."""
+
+    processes: int = option(1, "processes over which the robots are spread", ge=1, le=256)
+    ray: str = option("", "spread the processes over a Ray cluster: its ADDRESS, auto, or local; needs --url")
+    requests: CapacityRequests = group(
+        CapacityRequests, only=(*GROUPED, "prompt", "max_tokens"), first=("transports", "url")
+    )
+
+    @property
+    def answer(self) -> str:
+        able = all(ACTIONS in each.capabilities.answer_kinds for each in self.requests.pipelines)
+        return ACTIONS if able and self.plan_every_s is None else TOKENS
+
+    def check(self) -> None:
+        super().check()
+        if several := [name for name, each in self.control.modes.items() if each.several]:
+            raise UsageError(
+                f"`modes`: {several[0]} has several requests under way, a robot one connection; `predict` it instead"
+            )
+        if self.ray and not all(each.options.external_address for each in self.requests.pipelines):
+            raise UsageError("`ray`: robots on other hosts need a server that they reach; name it with `url`")
+
+
+class CapacityPredicted(CapacityOptions):
+    """A fleet of robots in virtual time."""
+
+    virtual: ClassVar[bool] = True
+    MOST_ROBOTS: ClassVar[int] = 10_000
+
+    predict: str = option(
+        ..., "predict, in virtual time: the run folder of one robot, or service times as in --latency", first=True
+    )
+    servers: int = option(1, "servers that share one queue", ge=1, le=1000)
+    batch: Path | None = option(
+        None, "CSV of a batching server, columns batch and latency_ms, that of so many requests together"
+    )

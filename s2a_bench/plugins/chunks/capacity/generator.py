@@ -14,7 +14,7 @@ from functools import cached_property, partial
 from itertools import count
 from multiprocessing import get_context
 from pathlib import Path
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from tempfile import TemporaryDirectory
 from threading import Event, Lock, Thread
 from time import monotonic, process_time
@@ -32,7 +32,6 @@ from s2a_bench.machine import environment
 from s2a_bench.machine.tuning import allowed, end_with_parent, keep_large_blocks, limit_threads
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
 from s2a_bench.plugins.chunks.control import ENDLESS, ControlLoop, RobotTicks
-from s2a_bench.plugins.chunks.modes import ControlSetting, mode
 from s2a_bench.plugins.chunks.modes.cycles import gather
 from s2a_bench.plugins.chunks.requester import SEEDS, ChunkRequester, Job, wait_s
 from s2a_bench.transport import TRANSPORTS, Wiring, open_client
@@ -42,7 +41,9 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
     from s2a_bench.frames import FrameSource
-    from s2a_bench.harness.plan import FeedPlan, RequestPlan, RunPlan
+    from s2a_bench.harness.plan import RunPlan
+    from s2a_bench.plugins.chunks.capacity.config import RobotLoad
+    from s2a_bench.plugins.chunks.modes import Mode
     from s2a_bench.provenance import Provenance
     from s2a_bench.types import Frame, Piece
 
@@ -61,32 +62,27 @@ class FleetPlan:
     cell: str
     wiring: Mapping[str, Any]
     """As `Wiring.to_json`."""
-    feed: FeedPlan
-    request: RequestPlan
-    tuned: bool
-    setting: ControlSetting
-    mode: str
-    """How chunks are acted on; empty: robots without a control clock."""
-    seed: int
-    every_ns: int = 0
-    """Between the plans of a robot; 0 and no mode: closed loop."""
-    think_ns: int = 0
+    requests: RunPlan
+    """Without its cells."""
+    load: RobotLoad
     first: int = 0
     """Place in the run before those of its requests."""
-    own: RunPlan | None = None
-    """Of the server that each process starts for its robots alone; None: `wiring` leads to one that all share."""
+    own: Pipeline | None = None
+    """To a server that each process starts for its robots alone; None: `wiring` leads to one that all share."""
     origin: Provenance = UNKNOWN_ORIGIN
 
 
 class ChunkRobot:
     """A robot with a control clock that acts on chunks; a chunk that fails is requested again."""
 
-    def __init__(self, plan: FleetPlan, session: Session, blocks: count[int], phase_ns: int, done: Any) -> None:
-        self._session, self._setting = session, plan.setting
-        chosen = mode(plan.mode)
-        self.ticks = RobotTicks(chosen, plan.setting, lambda *_: None, self._request, ENDLESS, phase_ns)
+    def __init__(
+        self, mode: Mode, load: RobotLoad, session: Session, blocks: count[int], phase_ns: int, done: Any
+    ) -> None:
+        setting = load.setting
+        self._session, self._setting = session, setting
+        self.ticks = RobotTicks(mode, setting, lambda *_: None, self._request, ENDLESS, phase_ns)
         self._requester = ChunkRequester(
-            [session], plan.setting.horizon, plan.seed, chosen.streams, self.ticks.arrived, blocks, done=done
+            [session], setting.horizon, load.seed, mode.streams, self.ticks.arrived, blocks, done=done
         )
         self.over = self._requester.over
 
@@ -143,21 +139,21 @@ class PlainRobot:
     later than that.
     """
 
-    def __init__(self, plan: FleetPlan, session: Session, blocks: count[int], begin_ns: int, done: Any) -> None:
-        self._plan, self._session, self._blocks, self._begin_ns, self._done = plan, session, blocks, begin_ns, done
+    def __init__(self, load: RobotLoad, session: Session, blocks: count[int], begin_ns: int, done: Any) -> None:
+        self._load, self._session, self._blocks, self._begin_ns, self._done = load, session, blocks, begin_ns, done
         self._timed: list[Timed] = []
         self._failure: BaseException | None = None
         self.over = Event()
 
     def work(self) -> None:
-        every_ns, intended_ns, free_ns = self._plan.every_ns, self._begin_ns, 0
+        every_ns, intended_ns, free_ns = self._load.every_ns, self._begin_ns, 0
         try:
             while not self.over.wait(max(0, intended_ns - now_ns()) / 1e9):
                 timed = Timed(intended_ns, now_ns() - max(intended_ns, free_ns))
                 self._timed.append(timed)
                 self._request(timed)
                 free_ns = now_ns()
-                intended_ns = intended_ns + every_ns if every_ns else free_ns + self._plan.think_ns
+                intended_ns = intended_ns + every_ns if every_ns else free_ns + self._load.think_ns
         except BaseException as error:  # noqa: BLE001 - raised again by `trace`
             self._failure = error
 
@@ -167,7 +163,7 @@ class PlainRobot:
     def trace(self, robot: int, end_ns: int) -> RobotTrace:
         if self._failure is not None:
             raise self._failure
-        timed, every_ns = self._timed[:], self._plan.every_ns
+        timed, every_ns = self._timed[:], self._load.every_ns
         if every_ns:  # plans that are due wait for the answers before them
             due_ns = timed[-1].intended_ns + every_ns if timed else self._begin_ns
             timed += [Timed(each, -1) for each in range(due_ns, end_ns, every_ns)]
@@ -186,16 +182,16 @@ class PlainRobot:
     def _stalls(self, timed: Timed) -> bool:
         if timed.whole_ns < 0:
             return True
-        each_ns = self._plan.every_ns / max(1, len(timed.at_ns))
+        each_ns = self._load.every_ns / max(1, len(timed.at_ns))
         start_ns = max((at - place * each_ns for place, at in enumerate(timed.at_ns)), default=0)
-        return start_ns - timed.intended_ns > self._plan.every_ns
+        return start_ns - timed.intended_ns > self._load.every_ns
 
     def _request(self, timed: Timed) -> None:
         def on_piece(_piece: Piece, at_ns: int) -> None:
             timed.at_ns.append(at_ns)
 
         number = next(self._blocks)
-        request = replace(self._session.request, seed=(self._plan.seed + number) % SEEDS)
+        request = replace(self._session.request, seed=(self._load.seed + number) % SEEDS)
         measured = self._session.measure(
             Place(number, 0, warmup=False), RequestContext(None, on_piece, request=request)
         )
@@ -233,7 +229,7 @@ class Fleet:
         self._threads: list[Thread] = []
         self._loop: ControlLoop | None = None
         self._start_ns = 0
-        self._stack.enter_context(allowed(plan.tuned))
+        self._stack.enter_context(allowed(plan.requests.tuned))
         limit_threads()
         keep_large_blocks()
 
@@ -249,12 +245,7 @@ class Fleet:
     def start(self, phases_ns: Mapping[int, int], in_ns: int) -> None:
         """Start connected robots in ``in_ns``, each its phase later."""
         self._start_ns = start_ns = now_ns() + in_ns
-        made: type[ChunkRobot | PlainRobot] = ChunkRobot if self._plan.mode else PlainRobot
-        begin_ns = 0 if self._plan.mode else start_ns
-        self._robots = {
-            robot: made(self._plan, *self._sessions[robot], begin_ns + phase_ns, self._done)
-            for robot, phase_ns in phases_ns.items()
-        }
+        self._robots = {robot: self._robot(robot, phase_ns) for robot, phase_ns in phases_ns.items()}
         self._threads = [Thread(target=robot.work, name="robot", daemon=True) for robot in self._robots.values()]
         for thread in self._threads:
             thread.start()
@@ -263,6 +254,12 @@ class Fleet:
         if self._loop is not None:
             self._loop.start(start_ns)
 
+    def _robot(self, robot: int, phase_ns: int) -> ChunkRobot | PlainRobot:
+        load, (session, blocks) = self._plan.load, self._sessions[robot]
+        if load.mode is None:
+            return PlainRobot(load, session, blocks, self._start_ns + phase_ns, self._done)
+        return ChunkRobot(load.mode, load, session, blocks, phase_ns, self._done)
+
     def traces(self, start_ns: int) -> list[RobotTrace]:
         """Return what each robot did so far, as if it had started at ``start_ns``; raises what ended one."""
         end_ns, by_ns = now_ns(), start_ns - self._start_ns
@@ -270,11 +267,7 @@ class Fleet:
 
     def measured(self) -> list[Measured]:
         """Return the requests since the last call."""
-        found = []
-        with suppress(Empty):
-            while True:
-                found.append(self._done.get_nowait()[1])
-        return found
+        return [self._done.get()[1] for _ in range(self._done.qsize())]
 
     def stop(self, patience_s: float | None = None) -> None:
         """Stop the robots and wait for the answers under way, at most ``patience_s``; None: as long as they take."""
@@ -298,9 +291,9 @@ class Fleet:
 
     @cached_property
     def _wiring(self) -> Wiring[Any]:
-        own = self._plan.own
-        if own is None:
+        if self._plan.own is None:
             return Wiring.from_json(self._plan.wiring)
+        own = replace(self._plan.requests, cells=(self._plan.own,))
         folder = self._stack.enter_context(TemporaryDirectory(prefix="s2a-bench-"))
         servers = ServerSet(own, self._stack, Path(folder))
         servers.start()
@@ -308,17 +301,17 @@ class Fleet:
 
     @cached_property
     def _source(self) -> FrameSource:
-        source = self._plan.feed.open()
+        source = self._plan.requests.feed.open()
         self._stack.callback(source.close)
         return source
 
     def _session(self, robot: int) -> Session:
-        plan, wiring = self._plan, self._wiring
+        plan, wiring, feed_plan = self._plan, self._wiring, self._plan.requests.feed
         cell = Pipeline(plan.cell, TRANSPORTS[wiring.transport], wiring.variant, wiring.options)
         client = open_client(wiring)
-        source = _Shared(self._source, f"{plan.feed.nonce}/{cell.name} {plan.mode} {robot}", self._reads)
-        feed = RequestFeed(source, preencoded=cell.preencoded, cameras=plan.feed.cameras, size=plan.feed.resize)
-        session = Session(cell, client, feed, plan.request, origin=plan.origin)
+        source = _Shared(self._source, f"{feed_plan.nonce}/{cell.name} {plan.load.name} {robot}", self._reads)
+        feed = RequestFeed(source, preencoded=cell.preencoded, cameras=feed_plan.cameras, size=feed_plan.resize)
+        session = Session(cell, client, feed, plan.requests.request, origin=plan.origin)
         session.answered = True  # its server has answered the warm-up
         self._stack.callback(lambda: None if session.busy else client.close())
         return session

@@ -17,17 +17,18 @@ import numpy as np
 from s2a_bench.boards.latency import STRETCH, read_delays
 from s2a_bench.errors import UsageError
 from s2a_bench.machine import environment
+from s2a_bench.plugins.chunks.capacity.config import RobotLoad, SearchPlan
 from s2a_bench.plugins.chunks.capacity.metrics import measures
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, KNEES, FleetRow, KneeRow
 from s2a_bench.plugins.chunks.capacity.search import Judge, Tried, knee, search
-from s2a_bench.plugins.chunks.capacity.simulate import UNKNOWN, ServiceTime, VirtualFleet, simulate
+from s2a_bench.plugins.chunks.capacity.simulate import UNKNOWN, ServiceTime, simulate
 from s2a_bench.plugins.chunks.latencies import Source, sources
 from s2a_bench.provenance import Origins
 from s2a_bench.stats.seeds import generator
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.capacity.config import CapacityConfig
+    from s2a_bench.plugins.chunks.capacity.config import CapacityPredicted
     from s2a_bench.plugins.chunks.modes import Ints
     from s2a_bench.progress import Progress
 
@@ -49,10 +50,14 @@ class Service:
     source: Source
     recorded_ns: Ints | None
     mean_ns: float
+    servers: int = 1
+    """They share one queue."""
+    slower: Sequence[float] = (1.0,)
+    """As in `simulate.serve`."""
 
     @staticmethod
-    def read(written: str) -> Service:
-        """Read one source as users write it; raises S2AError naming the field.
+    def read(written: str, servers: int = 1, batch: Path | None = None) -> Service:
+        """Read one source, and a file of batches, as users write them; raises S2AError naming the field.
 
         Of measured requests it takes the engine's times; service times that are given have no first piece.
         """
@@ -69,7 +74,8 @@ class Service:
         drawn_ns = source.draw(np.random.default_rng(0), STRETCH) if recorded_ns is None else recorded_ns[:, 1]
         if not drawn_ns.any():
             raise UsageError(f"`predict`: {source.name} takes no time; it would carry any number of robots")
-        return Service(source, recorded_ns, float(drawn_ns.mean()))
+        slower = read_batches(batch) if batch is not None else (1.0,)
+        return Service(source, recorded_ns, float(drawn_ns.mean()), servers, slower)
 
     @property
     def about(self) -> str:
@@ -105,14 +111,13 @@ def read_batches(path: Path) -> Sequence[float]:
     return found
 
 
-def run_predicted(config: CapacityConfig, output: Path, progress: Progress) -> Path:
+def run_predicted(config: CapacityPredicted, output: Path, progress: Progress) -> Path:
     """Predict every mode and return the run folder; raises S2AError."""
-    service = Service.read(config.predict)
-    if config.limited is not None and config.limited.column.startswith("ttft") and not service.source.requests:
+    service, search = Service.read(config.predict, config.servers, config.batch), config.search
+    if search.limit is not None and search.limit.column.startswith("ttft") and not service.source.requests:
         raise UsageError(
             "`limit`: service times that are given have no first piece; take latency_p99, or `predict` a run"
         )
-    slower = read_batches(config.batch) if config.batch is not None else (1.0,)
     manifest = {
         "configuration": config.to_manifest(),
         "environment": environment.collect(),
@@ -122,13 +127,9 @@ def run_predicted(config: CapacityConfig, output: Path, progress: Progress) -> P
     with RunWriter.create(output, "capacity", manifest, (FLEETS, KNEES)) as writer:
         progress.opened(writer.path)
         progress.say(f"service times: {service.about}")
-        for mode in config.made if config.load == "chunks" else ("",):
-            name = f"{service.source.name}, {mode}" if mode else service.source.name
-            prediction = Prediction(config, name, mode, service, slower, progress)
-            knee = prediction.run(config.numbers, bisects=config.searches)
-            writer.update(service={name: service.about})
-            writer.append(FLEETS, prediction.rows)
-            writer.append(KNEES, [] if knee is None else [knee])
+        for load in config.loads:
+            name = load.of(service.source.name)
+            Prediction(load, search, name, service, progress).write(writer)
         return writer.path
 
 
@@ -136,68 +137,64 @@ def run_predicted(config: CapacityConfig, output: Path, progress: Progress) -> P
 class Prediction:
     """The fleets of one cell in virtual time; a seed draws their phases, and the order of the service times."""
 
-    config: CapacityConfig
+    load: RobotLoad
+    search: SearchPlan
     cell: str
-    mode: str
-    """Empty: robots without a control clock."""
     service: Service
-    slower: Sequence[float]
-    """As in `simulate.serve`."""
     progress: Progress
     rows: list[Any] = field(default_factory=list)
     """The fleets of the first seed."""
 
-    def run(self, numbers: Sequence[int], *, bisects: bool) -> KneeRow | None:
+    def write(self, writer: RunWriter) -> None:
+        knee = self.run()
+        writer.update(service={self.cell: self.service.about})
+        writer.append(FLEETS, self.rows)
+        writer.append(KNEES, [] if knee is None else [knee])
+
+    def run(self) -> KneeRow | None:
         """Try one robot, then fleets as `search`; return the median knee of `SEEDS` seeds.
 
         It has no interval: how rare service times are is not seen in those of one robot.
         """
-        first, found = self.config.seed, []
-        for seed in range(first, first + (1 if self.config.limited is None else SEEDS)):
+        plan, limit, first, knees = self.search, self.search.limit, self.load.seed, []
+        for seed in range(first, first + (1 if limit is None else SEEDS)):
             self.progress.stage(f"{self.cell}: in virtual time, seed {seed}")
             tried: dict[int, Tried] = {}
-            judge = Judge(self.config.limited, self.config.beyond_alone(self.mode), self.config.settle_ns, LEVEL)
-            search(numbers, partial(self._attempt, judge, seed), tried, bisects=bisects)
-            found += [each for each in (knee(tried.values()),) if each]
-        if self.config.limited is None:
+            judge = Judge(limit, self.load.beyond_alone(limit), self.load.settle_ns, LEVEL)
+            search(plan.numbers, partial(self._attempt, judge, seed), tried, bisects=plan.bisects)
+            knees += [each for each in (knee(tried.values()),) if each]
+        if limit is None:
             return None
-        median = sorted(found, key=lambda each: each.robots)[len(found) // 2]
-        text = self.config.limit_text(self.mode)
+        median = sorted(knees, key=lambda each: each.robots)[len(knees) // 2]
+        text = self.load.limit_text(limit)
         return KneeRow(self.cell, "predicted", text, median.robots, median.robots, median.high, None)
 
     def _attempt(self, judge: Judge, seed: int, robots: int) -> Tried:
-        config, mode = self.config, self.config.made.get(self.mode)
-        closed = mode is None and config.load == "closed"
-        fleet = VirtualFleet(
-            config.setting,
-            round(config.seconds * 1e9) + (0 if config.episodes_s else config.settle_ns),
-            mode,
-            every_ns=0 if closed or mode is not None else config.plan_ns,
-            think_ns=round(config.think_s * 1e9),
-            episode_ns=round(config.episodes_s * 1e9),
-        )
-        self._check(fleet, robots)
-        rng = generator(seed, "capacity service", str(robots))
-        times = self.service.times(rng)
-        traces = simulate(fleet, robots, times, generator(seed, "capacity phases"), config.servers, self.slower)
-        row = measures(traces, config.setting, config.settle_ns)
+        load, service, look_ns = self.load, self.service, self.search.look_ns
+        span_ns = look_ns + (0 if load.episode_ns else load.settle_ns)
+        self._check(robots, span_ns)
+        times = service.times(generator(seed, "capacity service", str(robots)))
+        rng = generator(seed, "capacity phases")
+        traces = simulate(load, span_ns, robots, times, rng, service.servers, service.slower)
+        row = measures(traces, load.setting, load.settle_ns)
         verdict, within = judge(row, traces, first=robots == 1)
-        if seed == config.seed:
-            about = {"cell": self.cell, "source": "predicted", "robots": robots, "seconds": config.seconds}
+        if seed == load.seed:
+            about = {"cell": self.cell, "source": "predicted", "robots": robots, "seconds": look_ns / 1e9}
             self.rows.append(FleetRow(**about, looks=1, verdict=verdict, within=within, clean=True, **row))
         if judge.limit and row[judge.limit.column] is not None:  # what is computed is taken as sure
             verdict = "below" if within else "above"
         return Tried(robots, verdict, within)
 
-    def _check(self, fleet: VirtualFleet, robots: int) -> None:
+    def _check(self, robots: int, span_ns: int) -> None:
         """Raise UsageError for more ticks or requests than are kept in memory."""
-        if fleet.mode is None:
-            rate = self.config.servers * len(self.slower) / self.slower[-1] / self.service.mean_ns
+        service = self.service
+        if self.load.mode is None:
+            rate = service.servers * len(service.slower) / service.slower[-1] / service.mean_ns
         else:
-            rate = robots / fleet.setting.period_ns
-        if rate * fleet.span_ns > MOST:
+            rate = robots / self.load.setting.period_ns
+        if rate * span_ns > MOST:
             raise UsageError(
-                f"`seconds`: {robots} robots for {fleet.span_ns / 1e9:g} s are over {MOST:.0e} ticks or requests, "
+                f"`seconds`: {robots} robots for {span_ns / 1e9:g} s are over {MOST:.0e} ticks or requests, "
                 "which are held in memory; take fewer"
             )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,9 +18,10 @@ from s2a_bench.harness.session import Place, Session
 from s2a_bench.inference import STAND_IN
 from s2a_bench.machine.cluster import connect
 from s2a_bench.machine.resources import POWER_W
+from s2a_bench.plugins.chunks.capacity.config import RobotLoad, SearchPlan
 from s2a_bench.plugins.chunks.capacity.generator import STRIDE, Fleet, FleetOnRay, FleetPlan, FleetProcess
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace, measures
-from s2a_bench.plugins.chunks.capacity.predict import Prediction, Service, run_predicted
+from s2a_bench.plugins.chunks.capacity.predict import Prediction, Service
 from s2a_bench.plugins.chunks.capacity.rows import (
     FLEETS,
     KNEES,
@@ -41,24 +42,31 @@ from s2a_bench.transport.defaults import LOOPBACK
 from s2a_bench.transport.pipeline import Pipeline, pipelines
 
 if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.capacity.config import CapacityConfig
+    from s2a_bench.plugins.chunks.capacity.config import CapacityMeasured
     from s2a_bench.progress import Progress
     from s2a_bench.store.run import RunWriter
 
+ECHO: Final = (("name", STAND_IN), ("latency", ""), ("pace", None), ("profile", ""), ("gaps", ""))
+ECHO_OF_MODEL: Final = (("model", None), ("mmproj", None), ("chat_template", ""), ("gpu_layers", 0))
 KEEP_S: Final = 0.2
 """Period in which requests are written while the robots act."""
 HEAD_START_S: Final = 0.2
 LATEST: Final = 0.05
 """Lateness of the generator's ticks at p99, as a share of a tick, above which a fleet is no measurement."""
-ECHO: Final = (("name", STAND_IN), ("latency", ""), ("pace", None), ("profile", ""), ("gaps", ""))
-ECHO_OF_MODEL: Final = (("model", None), ("mmproj", None), ("chat_template", ""), ("gpu_layers", 0))
 
 
-def run_capacity(config: CapacityConfig, output: Path, progress: Progress) -> Path:
-    """Measure, or predict, and return the run folder, which keeps what was measured if S2AError is raised."""
-    if config.virtual:
-        return run_predicted(config, output, progress)
-    plan = resolve(config.live_requests, progress.say)
+@dataclass(frozen=True, slots=True)
+class Hosts:
+    """Where the robots are: in so many processes of this host, or of a cluster."""
+
+    processes: int
+    ray: Any = None
+    """None: on this host."""
+
+
+def run_measured(config: CapacityMeasured, output: Path, progress: Progress) -> Path:
+    """Measure and return the run folder, which keeps what was measured if S2AError is raised."""
+    plan = resolve(config.robots_requests, progress.say)
     settings = {**plan.manifest["configuration"], **config.to_manifest()}
     cadence = {
         "chunks": f"control loops at {config.control_hz:g} Hz",
@@ -72,7 +80,8 @@ def run_capacity(config: CapacityConfig, output: Path, progress: Progress) -> Pa
         ray = connect(config.ray, config.processes) if config.ray else None
         if ray is not None:
             stack.callback(ray.shutdown)
-        task = Task("capacity", drive=partial(_drive, config, ray), tables=(FLEETS, KNEES))
+        hosts = Hosts(config.processes, ray)
+        task = Task("capacity", drive=partial(_drive, config.loads, config.search, hosts), tables=(FLEETS, KNEES))
         return run_requests(task, plan, output, progress)
 
 
@@ -88,23 +97,20 @@ def twin(cell: Pipeline) -> Pipeline:
     return replace(own, name=cell.name + TWIN, engine=(*ECHO, *ECHO_OF_MODEL))  # type: ignore[arg-type]
 
 
-def cell_name(session: Session, mode: str) -> str:
-    return f"{session.cell.name}, {mode}" if mode else session.cell.name
-
-
-def _drive(config: CapacityConfig, ray: Any, launch: RunningLaunch) -> None:
-    count = len(config.requests.pipelines)
+def _drive(loads: Sequence[RobotLoad], plan: SearchPlan, hosts: Hosts, launch: RunningLaunch) -> None:
+    sessions = [session for session in launch.sessions if not session.cell.name.endswith(TWIN)]
+    twins = launch.sessions[len(sessions) :]
     for position, session in enumerate(launch.sessions):
         launch.progress.stage(f"warming up: {session.cell.name}")
         for block in range(max(1, launch.plan.blocks.warmup)):
-            launch.keep(session, session.measure(Place(block, position, warmup=position < count)))
-    modes = [*config.made] if config.load == "chunks" else [""]
-    launch.progress.expect(count * len(modes) * config.most_fleets)
-    for session, instant in zip_longest(launch.sessions[:count], launch.sessions[count:]):
+            launch.keep(session, session.measure(Place(block, position, warmup=position < len(sessions))))
+    launch.progress.expect(len(sessions) * len(loads) * plan.most_fleets)
+    for session, instant in zip_longest(sessions, twins):
         service: Service | None = None
-        for mode in modes:
-            judge = Judge(config.limited, config.beyond_alone(mode), config.settle_ns, config.confidence)
-            cell = _Cell(config, ray, launch, session, instant, mode, judge, service)
+        for place, load in enumerate(loads):
+            robots = partial(_Robots, load, plan, hosts, launch, place * STRIDE * STRIDE)
+            judge = Judge(plan.limit, load.beyond_alone(plan.limit), load.settle_ns, plan.confidence)
+            cell = _Cell(load, plan, judge, launch, robots, session, instant, service)
             cell.run()
             service = cell.service
 
@@ -113,27 +119,26 @@ def _drive(config: CapacityConfig, ray: Any, launch: RunningLaunch) -> None:
 class _Cell:
     """The fleets of one pipeline and mode."""
 
-    config: CapacityConfig
-    ray: Any
-    """None: the robots are on this host."""
+    load: RobotLoad
+    search: SearchPlan
+    judge: Judge
     launch: RunningLaunch
+    robots: Callable[..., _Robots]
+    """Opens the robots of a session."""
     session: Session
     instant: Session | None
     """Of a server that takes no time, with which the generator is checked."""
-    mode: str
-    judge: Judge
     service: Service | None = None
     """Of the requests of one robot alone, before any other fleet."""
     tried: dict[int, Tried] = field(default_factory=dict)
 
     def run(self) -> None:
-        config = self.config
         try:
-            with _Robots(config, self.ray, self.launch, self.session, self.mode) as robots:
+            with self.robots(self.session) as robots:
                 attempt = partial(self._fleet, robots, source="measured")
-                search(config.numbers, attempt, self.tried, bisects=config.searches)
+                search(self.search.numbers, attempt, self.tried, bisects=self.search.bisects)
             if self.instant is not None:
-                with _Robots(config, self.ray, self.launch, self.instant, self.mode, twin=True) as robots:
+                with self.robots(self.instant, twin=True) as robots:
                     for number in sorted(self.tried, reverse=True):
                         if self.tried[number].clean and self._fleet(robots, number, "twin").within:
                             break
@@ -146,32 +151,27 @@ class _Cell:
         """Write what one robot's service times predict of the fleets."""
         if self.service is None:
             return
-        config, name, writer = self.config, cell_name(self.session, self.mode), self.launch.writer
-        prediction = Prediction(config, name, self.mode, self.service, (1.0,), self.launch.progress)
+        name, progress = self.load.of(self.session.cell.name), self.launch.progress
         try:
-            found = prediction.run(config.numbers, bisects=config.searches)
+            Prediction(self.load, self.search, name, self.service, progress).write(self.launch.writer)
         except UsageError as error:  # what was measured stands without it
-            self.launch.progress.say(f"{name}: no prediction: {error}")
-            return
-        writer.update(service={name: self.service.about})
-        writer.append(FLEETS, prediction.rows)
-        writer.append(KNEES, [found] if found else [])
+            progress.say(f"{name}: no prediction: {error}")
 
     def _fleet(self, robots: _Robots, number: int, source: Source) -> Tried:
-        config, launch = self.config, self.launch
+        load, launch, confidence = self.load, self.launch, self.search.confidence
         launch.progress.stage(f"{robots.name}: {number} robot{'s' * (number > 1)}")
         first = source == "measured" and number == 1
         for looks, (traces, used) in enumerate(robots.looks(number), 1):  # noqa: B007 - their number is kept
-            row = measures(traces, config.setting, config.settle_ns, confidence=config.confidence) | used
+            row = measures(traces, load.setting, load.settle_ns, confidence=confidence) | used
             verdict, within = self.judge(row, traces, first=first)
             if source == "twin" or (verdict != "undecided" and not (first and self.judge.beyond)):
                 break  # one robot alone has all looks where the others are judged by it
         robots.stop()
         if first and not self.service and row["latency_p50_ns"] and not self.tried:
             self.service = Service.read(f"{launch.writer.path}#{self.session.cell.name}")
-        tick_ns = config.setting.period_ns if self.mode else row["latency_p50_ns"]
+        tick_ns = row["latency_p50_ns"] if load.mode is None else load.setting.period_ns
         clean = source == "twin" or tick_ns is None or (row["late_p99_ns"] or 0) <= LATEST * tick_ns
-        seconds = sum(max(0, each.end_ns - each.start_ns - config.settle_ns) for each in traces) / number / 1e9
+        seconds = sum(max(0, each.end_ns - each.start_ns - load.settle_ns) for each in traces) / number / 1e9
         about = {"cell": robots.name, "source": source, "robots": number}
         fleet = FleetRow(**about, seconds=seconds, looks=looks, verdict=verdict, within=within, clean=clean, **row)
         keep_origin(launch.writer, robots.name, robots.session.origin)
@@ -184,8 +184,8 @@ class _Cell:
 
     def _write(self, writer: RunWriter, about: Mapping[str, Any], trace: RobotTrace) -> None:
         """Write what one robot did, in one episode."""
-        settle_ns = self.config.settle_ns
-        writer.append(ROBOTS, [RobotRow(**about, **measures([trace], self.config.setting, settle_ns))])
+        settle_ns = self.load.settle_ns
+        writer.append(ROBOTS, [RobotRow(**about, **measures([trace], self.load.setting, settle_ns))])
         since_ns = (trace.request_ns - trace.start_ns).tolist()
         latency_ns = [each if each >= 0 else None for each in trace.arrival_ns.tolist()]
         times = zip(since_ns, latency_ns, strict=True)
@@ -194,10 +194,10 @@ class _Cell:
 
     def _conclude(self) -> None:
         """Write the knee of the fleets so far, and a warning about those that the generator did not drive."""
-        tried, name, limit = self.tried.values(), cell_name(self.session, self.mode), self.config.limit_text(self.mode)
+        tried, name, limit = self.tried.values(), self.load.of(self.session.cell.name), self.search.limit
         driven = max((each.robots for each in tried if each.clean), default=0)
-        if limit and (found := knee(tried)) is not None:
-            row = KneeRow(name, "measured", limit, found.robots, found.low, found.high, driven)
+        if limit is not None and (found := knee(tried)) is not None:
+            row = KneeRow(name, "measured", self.load.limit_text(limit), found.robots, found.low, found.high, driven)
             self.launch.writer.append(KNEES, [row])
         if late := sorted(each.robots for each in tried if not each.clean):
             what = f"{name}: {', '.join(map(str, late))} robots are no measurement: the generator was late or too slow"
@@ -210,40 +210,30 @@ class _Robots(ExitStack):
 
     def __init__(
         self,
-        config: CapacityConfig,
-        ray: Any,
+        load: RobotLoad,
+        search: SearchPlan,
+        hosts: Hosts,
         launch: RunningLaunch,
+        first: int,
         session: Session,
-        mode: str,
         *,
         twin: bool = False,
     ) -> None:
+        """Start them; their requests are numbered from ``first`` on."""
         super().__init__()
-        self._config, self._launch, self.session = config, launch, session
+        self._load, self._search, self._launch, self.session = load, search, launch, session
         self._number, self._error = 1, ""
-        self.name = cell_name(session, mode)
-        plan = self._plan = FleetPlan(
-            session.cell.name,
-            launch.wiring(session.cell).to_json(),
-            launch.plan.feed,
-            launch.plan.request,
-            launch.plan.tuned,
-            config.setting,
-            mode,
-            config.seed,
-            first=STRIDE * STRIDE * [*config.made].index(mode) if mode else 0,
-            every_ns=config.plan_ns if config.load == "plans" else 0,
-            think_ns=round(config.think_s * 1e9),
-            origin=session.origin,
-        )
+        self.name = load.of(session.cell.name)
         self._fleets: list[Any]
-        in_process = session.cell.transport.in_process
-        if twin and (ray is not None or (in_process and config.processes > 1)):
-            plan = replace(plan, own=replace(launch.plan, cells=(session.cell,)))
+        cell, processes, ray = session.cell, hosts.processes, hosts.ray
+        in_process = cell.transport.in_process
+        own = cell if twin and (ray is not None or (in_process and processes > 1)) else None
+        wiring = launch.wiring(cell).to_json()
+        plan = FleetPlan(cell.name, wiring, replace(launch.plan, cells=()), load, first, own, session.origin)
         if ray is not None:
-            self._fleets = [FleetOnRay(plan, ray) for _ in range(config.processes)]
-        elif config.processes > 1 and (twin or not in_process):
-            self._fleets = [FleetProcess(plan) for _ in range(config.processes)]
+            self._fleets = [FleetOnRay(plan, ray) for _ in range(processes)]
+        elif processes > 1 and (twin or not in_process):
+            self._fleets = [FleetProcess(plan) for _ in range(processes)]
         else:
             self._fleets = [Fleet(plan)]
         for fleet in self._fleets:
@@ -257,35 +247,29 @@ class _Robots(ExitStack):
 
         They act on until `stop`.
         """
-        config = self._config
+        load, look_ns, looks = self._load, self._search.look_ns, self._search.looks
         self._number = number
         self._launch.guard.in_a_row.clear()
-        seconds_ns = round(config.seconds * 1e9)
-        if not config.episodes_s:
+        if not load.episode_ns:
             start_ns = self._start(self._phases(number))
-            self._wait(start_ns + config.settle_ns)
+            self._wait(start_ns + load.settle_ns)
             since = self._clocks()
-            for look in range(1, config.looks + 1):
-                yield self._until(start_ns, config.settle_ns + look * seconds_ns, since)
+            for look in range(1, looks + 1):
+                yield self._until(start_ns, load.settle_ns + look * look_ns, since)
             return
         done: list[RobotTrace] = []
         since = self._clocks()
-        episode_ns = round(config.episodes_s * 1e9)
-        for _ in range(config.looks):
-            for _ in range(max(1, -(-seconds_ns // episode_ns))):
+        for _ in range(looks):
+            for _ in range(max(1, -(-look_ns // load.episode_ns))):
                 start_ns = self._start(dict.fromkeys(range(number), 0))
-                traces, used = self._until(start_ns, episode_ns, since)
+                traces, used = self._until(start_ns, load.episode_ns, since)
                 self.stop()
                 done += traces
             yield done, used
 
     def _phases(self, number: int) -> dict[int, int]:
         """Return random moments of a cycle, in ns, by robot."""
-        config, plan = self._config, self._plan
-        cycle_ns = plan.every_ns or plan.think_ns
-        if plan.mode:
-            cycle_ns = config.made[plan.mode].execution_horizon(config.setting) * config.setting.period_ns
-        phases_ns = generator(config.seed, "capacity phases").integers(0, cycle_ns + 1, number)
+        phases_ns = generator(self._load.seed, "capacity phases").integers(0, self._load.cycle_ns + 1, number)
         return dict(enumerate(phases_ns.tolist()))
 
     def _start(self, phases_ns: dict[int, int]) -> int:

@@ -10,14 +10,16 @@ from __future__ import annotations
 import heapq
 from collections import deque
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
 from s2a_bench.plugins.chunks.modes import ControlSetting, Mode, Pace, Ticks
 from s2a_bench.plugins.chunks.modes.cycles import drive
+
+if TYPE_CHECKING:
+    from s2a_bench.plugins.chunks.capacity.config import RobotLoad
 
 UNKNOWN: Final = -1
 
@@ -44,50 +46,25 @@ Robot: TypeAlias = "Generator[int, Answer, RobotTrace]"
 """Yields the time at which each request leaves, to be sent its answer."""
 
 
-@dataclass(frozen=True, slots=True)
-class VirtualFleet:
-    """What the robots of a fleet have in common: a mode of acting, a plan every ``every_ns``, or a closed loop."""
-
-    setting: ControlSetting
-    span_ns: int
-    """For how long each robot acts."""
-    mode: Mode | None = None
-    every_ns: int = 0
-    think_ns: int = 0
-    """Closed loop: from an answer to the next request."""
-    episode_ns: int = 0
-    """The robots start together every so often; 0: once, at random moments of their first cycle."""
-
-    @property
-    def cycle_ns(self) -> int:
-        if self.mode is not None:
-            return self.mode.execution_horizon(self.setting) * self.setting.period_ns
-        return self.every_ns or self.think_ns
-
-    def robot(self, number: int, start_ns: int, span_ns: int) -> Robot:
-        if self.mode is not None:
-            return _acting(number, self.mode, self.setting, start_ns, max(1, span_ns // self.setting.period_ns))
-        return _requesting(number, self.every_ns, self.think_ns, start_ns, start_ns + span_ns)
-
-
 def simulate(
-    fleet: VirtualFleet,
+    load: RobotLoad,
+    span_ns: int,
     robots: int,
     times: Iterator[ServiceTime],
     rng: np.random.Generator,
-    servers: int,
-    slower: Sequence[float],
+    servers: int = 1,
+    slower: Sequence[float] = (1.0,),
 ) -> list[RobotTrace]:
-    """Return the traces of ``robots`` robots, in each episode; see `serve` for the server."""
-    if not fleet.episode_ns:
-        starts = rng.integers(0, fleet.cycle_ns + 1, robots).tolist()
-        return serve([fleet.robot(*each, fleet.span_ns) for each in enumerate(starts)], times, servers, slower)
-    found = []
-    for start_ns in range(0, fleet.span_ns, fleet.episode_ns):
-        span_ns = min(fleet.episode_ns, fleet.span_ns - start_ns)
+    """Return the traces of ``robots`` robots that act for ``span_ns``, in each episode; `serve` is the server."""
+    if not load.episode_ns:
+        starts = rng.integers(0, load.cycle_ns + 1, robots).tolist()
+        return serve([robot_of(load, *each, span_ns) for each in enumerate(starts)], times, servers, slower)
+    traces = []
+    for start_ns in range(0, span_ns, load.episode_ns):
+        episode_ns = min(load.episode_ns, span_ns - start_ns)
         order = rng.permutation(robots).tolist()
-        found += serve([fleet.robot(each, start_ns, span_ns) for each in order], times, servers, slower)
-    return found
+        traces += serve([robot_of(load, each, start_ns, episode_ns) for each in order], times, servers, slower)
+    return traces
 
 
 def serve(
@@ -121,6 +98,12 @@ def serve(
             except StopIteration as end:
                 traces[place] = end.value
     return [traces[place] for place in range(len(robots))]
+
+
+def robot_of(load: RobotLoad, number: int, start_ns: int, span_ns: int) -> Robot:
+    if load.mode is not None:
+        return _acting(number, load.mode, load.setting, start_ns, max(1, span_ns // load.setting.period_ns))
+    return _requesting(number, load.every_ns, load.think_ns, start_ns, start_ns + span_ns)
 
 
 def _acting(robot: int, mode: Mode, setting: ControlSetting, start_ns: int, most: int) -> Robot:

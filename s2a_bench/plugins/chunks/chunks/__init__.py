@@ -1,13 +1,17 @@
 """When to act on actions in chunks: modes and triggers under given latencies, in virtual time, or live."""
 
-from s2a_bench.experiments import Experiment
+from s2a_bench.experiments import Experiment, RunMode
 
+HERE = "s2a_bench.plugins.chunks.chunks"
+LIVE = {"live": "act in real time on what a server answers; with --engine echo, --latency is how long that takes"}
 EXPERIMENT = Experiment(
     name="chunks",
     about="Act on chunks of actions, computed or live: how often each mode and trigger stalls, on how old a picture.",
-    config="s2a_bench.plugins.chunks.chunks.config:ChunksConfig",
-    run="s2a_bench.plugins.chunks.chunks.run:run_chunks",
-    view="s2a_bench.plugins.chunks.chunks.view:show",
-    cell="s2a_bench.plugins.chunks.chunks.view.tables:ChunkCell",
+    config=f"{HERE}.config:ChunksVirtual",
+    run=f"{HERE}.run:run_virtual",
+    mode="virtual",
+    modes=(RunMode("live", f"{HERE}.config:ChunksLive", f"{HERE}.live:run_live", LIVE),),
+    view=f"{HERE}.view:show",
+    cell=f"{HERE}.view.tables:ChunkCell",
     unit="cells",
 )

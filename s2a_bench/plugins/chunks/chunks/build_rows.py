@@ -1,15 +1,17 @@
-"""The rows of a cell: its metrics, its first ticks, its first requests."""
+"""The rows of a cell (metrics, first ticks, first requests), of varied triggers, and of varied mean latencies."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, fields
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields
+from itertools import repeat
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from s2a_bench.experiments import COUNT
+from s2a_bench.plugins.chunks.chunks.cells import without_trigger
 from s2a_bench.plugins.chunks.chunks.rows import (
     CHUNKS,
     METRICS,
@@ -17,9 +19,11 @@ from s2a_bench.plugins.chunks.chunks.rows import (
     REQUESTS,
     TICKS,
     ChunkRow,
+    MeanRow,
     ReactionRow,
     RequestRow,
     TickRow,
+    TriggerRow,
 )
 from s2a_bench.plugins.chunks.modes.closed import beta, closed
 from s2a_bench.plugins.chunks.modes.metrics import margin_ticks, measure, reaction_ticks
@@ -27,42 +31,54 @@ from s2a_bench.policy.conformal import upper_bound
 from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.chunks.cells import ChunkCell
-    from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
-    from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ints, Ticks
+    from s2a_bench.plugins.chunks.chunks.cells import ChunkCell, LatencyDraw
+    from s2a_bench.plugins.chunks.chunks.smooth import TrackingPlant
+    from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ints, Mode, Ticks
+    from s2a_bench.plugins.chunks.options import ControlPlan
     from s2a_bench.policy import Floats
-    from s2a_bench.store.run import RunWriter
+    from s2a_bench.store.schema import Table
 
 EVENTS: Final = 100_000
 """Random events whose reaction times are measured."""
+MOST_POINTS: Final = 64
+"""Triggers that are tried."""
+MEANS_TRIED: Final = 33
+REQUESTS_TRIED: Final = 2000
+"""At each mean."""
+SMOOTH: Final = ("tracking_rms", "tracking_rms_ideal", "jerk_rms", "jerk_rms_ideal")
 SHARES: Final = np.linspace(0, 1, 401)
 """Quantiles of reaction times that are stored: denser than a figure can show."""
-NO_NAMES: Final[Mapping[int, str]] = {}
 _SIDE: Final = 0.975
 """Confidence of each end of a two-sided 95 % interval."""
 
 
-def write_cell(
-    config: ChunksConfig,
-    writer: RunWriter,
-    cell: ChunkCell,
-    cycles: Cycles,
-    ticks: Ticks,
-    most: int,
-    *,
-    more: Mapping[str, Any],
-    late_ns: Ints | None = None,
-    names: Mapping[int, str] = NO_NAMES,
-) -> None:
-    """Write the rows of a cell, its ticks and requests within the first ``most`` ticks.
+@dataclass(frozen=True, slots=True, eq=False)
+class ActedCell:
+    """What a cell did: by its cycles and by its ticks."""
 
-    ``more`` adds metrics or overrides computed ones; ``late_ns`` is each action's delay after its due time, ``names``
-    are the ids of the requests' samples.
-    """
-    setting, latency_ns = config.setting.slowed(cell.slower), cell.drawn.judged
-    reaction_s = reactions_s(cycles, ticks, setting, generator(config.seed, "chunks events"))
-    values = metrics_of(cell, setting, cycles, ticks, reaction_s)
-    values |= {"slow_down": beta(cell.mode, latency_ns, setting, config.epsilon), "slower": cell.slower, **more}
+    cell: ChunkCell
+    setting: ControlSetting
+    """With actions as slow as the cell's."""
+    cycles: Cycles
+    ticks: Ticks
+    more: Mapping[str, Any]
+    """Metrics that are measured, or override computed ones."""
+    late_ns: Ints | None = None
+    """Delay of each action after its due time; None in virtual time."""
+    names: Mapping[int, str] = field(default_factory=dict)
+    """Request -> the id of its sample."""
+
+    @property
+    def latency_ns(self) -> Ints:
+        return self.cell.drawn.judged
+
+
+def cell_rows(acted: ActedCell, shown: int, epsilon: float, seed: int) -> dict[Table[Any], Iterable[Any]]:
+    """Return the rows of a cell by their table; ticks and requests are those within the first ``shown`` ticks."""
+    cell, setting, latency_ns = acted.cell, acted.setting, acted.latency_ns
+    reaction_s = reactions_s(acted.cycles, acted.ticks, setting, generator(seed, "chunks events"))
+    values = metrics_of(acted, reaction_s)
+    values |= {"slow_down": beta(cell.mode, latency_ns, setting, epsilon), "slower": cell.slower, **acted.more}
     row = ChunkRow(
         cell=cell.cell,
         mode=cell.name,
@@ -78,18 +94,19 @@ def write_cell(
         trigger=_mean(cell.triggers, cell.mode.trigger),
         **{name: _plain(values.get(name), whole=metric.kind == COUNT) for name, metric in METRICS.items()},
     )
-    writer.append(CHUNKS, [row])
-    writer.append(REACTIONS, _reaction_rows(cell, latency_ns, setting, reaction_s))
-    writer.append(TICKS, _tick_rows(cell.cell, ticks, most, late_ns))
-    writer.append(REQUESTS, _request_rows(cell.cell, latency_ns, cycles, most, names))
+    return {
+        CHUNKS: [row],
+        REACTIONS: _reaction_rows(acted, reaction_s),
+        TICKS: _tick_rows(acted, shown),
+        REQUESTS: _request_rows(acted, shown),
+    }
 
 
-def metrics_of(
-    cell: ChunkCell, setting: ControlSetting, cycles: Cycles, ticks: Ticks, reaction_s: Floats
-) -> dict[str, float | None]:
+def metrics_of(acted: ActedCell, reaction_s: Floats) -> dict[str, float | None]:
     """Return the value of every computed metric; NaN or None if it has none."""
-    period_s, latency_ns = setting.period_ns / 1e9, cell.drawn.judged
-    found: dict[str, Any] = asdict(measure(cell.mode, cycles, ticks))
+    cell, setting, cycles, latency_ns = acted.cell, acted.setting, acted.cycles, acted.latency_ns
+    period_s = setting.period_ns / 1e9
+    found: dict[str, Any] = asdict(measure(cell.mode, cycles, acted.ticks))
     expected = closed(cell.acting, latency_ns, setting)
     mean_reaction = expected.mean_reaction_ticks
     delay = cycles.delay_ticks[: latency_ns.size]  # a live run may end before an answer
@@ -139,39 +156,37 @@ def reactions_s(cycles: Cycles, ticks: Ticks, setting: ControlSetting, rng: np.r
     return found[~np.isnan(found)]
 
 
-def _reaction_rows(
-    cell: ChunkCell, latency_ns: Ints, setting: ControlSetting, reaction_s: Floats
-) -> Iterator[ReactionRow]:
+def _reaction_rows(acted: ActedCell, reaction_s: Floats) -> Iterator[ReactionRow]:
     if not reaction_s.size:
         return
-    period_s = setting.period_ns / 1e9
-    form = closed(cell.acting, latency_ns, setting).reaction_ticks(SHARES)
+    cell, period_s = acted.cell, acted.setting.period_ns / 1e9
+    form = closed(cell.acting, acted.latency_ns, acted.setting).reaction_ticks(SHARES)
     found = np.quantile(reaction_s, SHARES).tolist()
     closed_s = [None] * SHARES.size if form is None else (form * period_s).tolist()
     for share, simulated_s, expected_s in zip(SHARES.tolist(), found, closed_s, strict=True):
         yield ReactionRow(cell.cell, share, simulated_s, expected_s)
 
 
-def _tick_rows(cell: str, ticks: Ticks, most: int, late_ns: Ints | None) -> Iterator[TickRow]:
-    late = [None] * most if late_ns is None else late_ns.tolist()
-    columns = (ticks.chunk, ticks.index, ticks.age, ticks.stalled)
-    for tick, (chunk, index, age, stalled) in enumerate(zip(*(each[:most].tolist() for each in columns), strict=True)):
-        none = chunk < 0
+def _tick_rows(acted: ActedCell, shown: int) -> Iterator[TickRow]:
+    ticks = acted.ticks
+    late: Iterable[int | None] = repeat(None) if acted.late_ns is None else acted.late_ns.tolist()
+    columns = (each[:shown].tolist() for each in (ticks.chunk, ticks.index, ticks.age, ticks.stalled))
+    for tick, (chunk, index, age, stalled, late_ns) in enumerate(zip(*columns, late, strict=False)):
+        known = chunk >= 0
         yield TickRow(
-            cell=cell,
+            cell=acted.cell.cell,
             tick=tick,
-            chunk=None if none else chunk,
-            index=None if none else index,
-            age_ticks=None if none else age,
-            stalled=bool(stalled),
-            late_ns=late[tick],
+            chunk=chunk if known else None,
+            index=index if known else None,
+            age_ticks=age if known else None,
+            stalled=stalled,
+            late_ns=late_ns,
         )
 
 
-def _request_rows(
-    cell: str, latency_ns: Ints, cycles: Cycles, most: int, names: Mapping[int, str]
-) -> Iterator[RequestRow]:
-    count = min(latency_ns.size, int(np.searchsorted(cycles.request_tick, most)))
+def _request_rows(acted: ActedCell, shown: int) -> Iterator[RequestRow]:
+    cycles, latency_ns = acted.cycles, acted.latency_ns
+    count = min(latency_ns.size, int(np.searchsorted(cycles.request_tick, shown)))
     kept = [each.name for each in fields(RequestRow)]
     columns = {name: getattr(cycles, name)[:count].tolist() for name in kept if hasattr(cycles, name)}
     for request in range(count):
@@ -179,10 +194,10 @@ def _request_rows(
         if not row["executed"]:
             row |= dict.fromkeys(("start_tick", "first_index", "jump"))
         yield RequestRow(
-            cell=cell,
+            cell=acted.cell.cell,
             request=request,
             latency_ns=int(latency_ns[request]),
-            request_id=names.get(request),
+            request_id=acted.names.get(request),
             **row,
         )
 
@@ -200,3 +215,48 @@ def _plain(value: float | None, *, whole: bool) -> float | int | None:
     if value is None or math.isnan(value):
         return None
     return int(value) if whole else float(value)
+
+
+def trigger_rows(mode: Mode, setting: ControlSetting, drawn: LatencyDraw) -> Iterator[TriggerRow]:
+    """Yield a row for every trigger of a mode."""
+    length = mode.execution_horizon(setting)
+    for ticks in np.unique(np.linspace(0, length - 1, min(length, MOST_POINTS)).round()).astype(int).tolist():
+        tried = mode.varied((ticks,))
+        cycles = tried.cycles(drawn.judged, setting)
+        found = stalls_of(cycles)
+        del found["stalled_cycles"]
+        if found["boundaries"]:
+            yield TriggerRow(
+                latency=drawn.source.name,
+                mode=without_trigger(mode),
+                execution_horizon=length,
+                trigger=ticks,
+                **found,
+                p_stall_closed=closed(tried, drawn.judged, setting).p_stall,
+                age_ticks_mean=mean_age(cycles),
+            )
+
+
+def mean_rows(control: ControlPlan, drawn: LatencyDraw, follows: TrackingPlant | None) -> Iterator[MeanRow]:
+    """Yield a row for each mode under the source's latencies scaled to means from 0 to H ticks."""
+    setting, judged = control.setting, drawn.judged[:REQUESTS_TRIED]
+    shape = judged / max(float(judged.mean()), 1.0)
+    for mean_ns in np.linspace(0, setting.horizon * setting.period_ns, MEANS_TRIED):
+        latency_ns = np.rint(shape * mean_ns).astype(np.int64)
+        for name, mode in control.modes.items():
+            cycles, ticks = mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)
+            share = measure(mode, cycles, ticks).stall_share
+            smooth = follows.measure(mode, cycles, ticks) if follows else {}
+            yield MeanRow(
+                latency=drawn.source.name,
+                mode=name,
+                latency_s=mean_ns / 1e9,
+                stall_share=None if np.isnan(share) else share,
+                **{each: smooth.get(each) for each in SMOOTH},
+            )
+
+
+def mean_age(cycles: Cycles) -> float:
+    """Return the mean age of the observation in ticks over executed actions; each chunk is executed in one run."""
+    middle = cycles.start_tick - cycles.request_tick + (cycles.executed - 1) / 2
+    return float(np.average(middle, weights=cycles.executed))

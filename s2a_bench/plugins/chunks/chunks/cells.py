@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from s2a_bench.harness.warnings import change_warnings
-from s2a_bench.plugins.chunks.chunks.config import CYCLES, ChunksConfig
+from s2a_bench.plugins.chunks.chunks.config import CYCLES, RulesPlan
 from s2a_bench.plugins.chunks.modes.trigger import (
     Learning,
     Maximum,
@@ -19,6 +19,7 @@ from s2a_bench.plugins.chunks.modes.trigger import (
     TriggerRule,
     calibrate,
     follow,
+    greatest_trigger,
     trigger,
 )
 from s2a_bench.policy.parameters import canonical
@@ -26,12 +27,11 @@ from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
     from s2a_bench.plugins.chunks.latencies import Source
-    from s2a_bench.plugins.chunks.modes import Ints, Mode
+    from s2a_bench.plugins.chunks.modes import ControlSetting, Ints, Mode
+    from s2a_bench.plugins.chunks.options import ControlPlan
     from s2a_bench.policy.conformal import Calibration
     from s2a_bench.store.manifest import RunWarning
 
-FIXED: Final = ("calibrated", "oracle")
-"""Rules that choose one trigger for all requests, and may slow actions down."""
 GIVEN: Final = "given"
 FOLLOW: Final = "take --rules tracked, whose trigger follows the delays"
 _ORACLE_DRAWS: Final = 1_000_000
@@ -59,7 +59,7 @@ class ChunkCell:
     slower: float = 1.0
     """By how many times slower its actions are executed (time-scaling)."""
     begin: Callable[[], TriggerRule] | None = None
-    """Creates the rule that chooses triggers in a live run."""
+    """Creates the rule that chooses a trigger after the other; None once all are chosen."""
     calibration: Calibration | None = None
     """What the rule `calibrated` learned."""
 
@@ -74,42 +74,49 @@ class ChunkCell:
         rule = "" if self.rule == GIVEN else f", {self.rule}"
         return f"{self.name}{rule} @ {self.drawn.source.name}"
 
+    def chosen(self, triggers: tuple[int, ...]) -> ChunkCell:
+        """Return the cell with the triggers that its rule chose; none: as it is."""
+        return replace(self, triggers=triggers, begin=None) if triggers else self
 
-def draw(config: ChunksConfig, source: Source) -> LatencyDraw:
-    """Draw the latencies of a source; a recording keeps its order, its first half for the rules if any."""
-    count = config.learnt(source)
+    def followed(self, setting: ControlSetting) -> ChunkCell:
+        """Return the cell with the triggers that its rule chooses if it learns the judged latencies."""
+        if self.begin is None:
+            return self
+        most = greatest_trigger(self.mode, setting)
+        return self.chosen(tuple(follow(self.begin(), self.drawn.judged, setting, most).tolist()))
+
+
+def draw(source: Source, cycles: int | None, learnt: int, seed: int) -> LatencyDraw:
+    """Draw the latencies of a source, at most ``learnt`` for the rules; a recording keeps its order, and may end."""
+    count = source.learnable(learnt)
     if source.recorded_ns is not None:
         judged = source.recorded_ns[count:]
-        return LatencyDraw(source, judged[: config.cycles], source.recorded_ns[:count])
-    judged = source.draw(generator(config.seed, "chunks", source.name), config.cycles or CYCLES)
-    return LatencyDraw(source, judged, source.draw(generator(config.seed, "chunks rules", source.name), count))
+        return LatencyDraw(source, judged[:cycles], source.recorded_ns[:count])
+    rng, rules_rng = (generator(seed, key, source.name) for key in ("chunks", "chunks rules"))
+    return LatencyDraw(source, source.draw(rng, cycles or CYCLES), source.draw(rules_rng, count))
 
 
-def cells(config: ChunksConfig, drawn: LatencyDraw) -> Iterator[ChunkCell]:
+def cells(control: ControlPlan, rules: RulesPlan, drawn: LatencyDraw) -> Iterator[ChunkCell]:
     """Yield the cells of one source; a live one has no judged latencies yet."""
-    for name, given in config.made.items():
+    for name, given in control.modes.items():
         yield ChunkCell(given, name, GIVEN, drawn)
-    mode = config.triggered
+    mode, setting = rules.mode, control.setting
     if mode is None:
         return
     name = without_trigger(mode)
-    for rule in config.rules_tried:
-        most = max(1, mode.execution_horizon(config.setting) - 1)
-        if rule in FIXED:
-            known = calibrate(drawn.learnt, config.epsilon, config.guarantee) if rule == "calibrated" else None
-            chosen = trigger(known.caution if known else _oracle_ns(config, drawn), config.setting, most)
-            slower = min(chosen.beta, config.slowest)
-            yield ChunkCell(mode, name, rule, drawn, (chosen.ticks,), slower, calibration=known)
-        elif config.live:
-            yield ChunkCell(mode, name, rule, drawn, begin=partial(_learner, config, rule, drawn))
+    for rule in rules.tried:
+        if rule in {"calibrated", "oracle"}:
+            known = calibrate(drawn.learnt, rules.epsilon, rules.guarantee) if rule == "calibrated" else None
+            limit_ns = known.caution if known else _oracle_ns(drawn.source, rules.epsilon, control.seed)
+            fixed = trigger(limit_ns, setting, greatest_trigger(mode, setting))
+            yield ChunkCell(mode, name, rule, drawn, (fixed.ticks,), min(fixed.beta, rules.slowest), calibration=known)
         else:
-            triggers = tuple(follow(_learner(config, rule, drawn), drawn.judged, config.setting, most).tolist())
-            yield ChunkCell(mode, name, rule, drawn, triggers)
+            yield ChunkCell(mode, name, rule, drawn, begin=partial(_learner, rule, drawn, rules.epsilon))
 
 
-def changes(config: ChunksConfig, name: str, learnt: Ints, judged: Ints) -> list[RunWarning]:
-    """Return whether the delays of ``judged`` latencies, in ticks, differ from those that a rule learned from."""
-    learned, seen = (list(config.setting.delay_ticks(each).astype(float)[:, None]) for each in (learnt, judged))
+def changes(setting: ControlSetting, name: str, drawn: LatencyDraw) -> list[RunWarning]:
+    """Return whether the delays of judged latencies, in ticks, differ from those that a rule learned from."""
+    learned, seen = (list(setting.delay_ticks(each).astype(float)[:, None]) for each in (drawn.learnt, drawn.judged))
     return change_warnings(name, learned, seen, "control ticks", f"calibrate anew, or {FOLLOW}")
 
 
@@ -117,19 +124,18 @@ def without_trigger(mode: Mode) -> str:
     return canonical(mode.name, mode.varied((0,)))
 
 
-def _learner(config: ChunksConfig, rule: str, drawn: LatencyDraw) -> TriggerRule:
+def _learner(rule: str, drawn: LatencyDraw, epsilon: float) -> TriggerRule:
     if rule == "tracked":
-        return TrackedLatency.begin(drawn.learnt.tolist(), config.epsilon)
+        return TrackedLatency.begin(drawn.learnt.tolist(), epsilon)
     learner: TriggerRule = Maximum() if rule == "maximum" else Mean()
     for latency_ns in drawn.learnt.tolist():
         learner.learn(latency_ns, stalled=False)
     return learner
 
 
-def _oracle_ns(config: ChunksConfig, drawn: LatencyDraw) -> int:
+def _oracle_ns(source: Source, epsilon: float, seed: int) -> int:
     """Return the latency that at most a share epsilon exceeds of a million other draws, or of the whole recording."""
-    source = drawn.source
     latency_ns = source.recorded_ns
     if latency_ns is None:
-        latency_ns = source.draw(generator(config.seed, "chunks oracle", source.name), _ORACLE_DRAWS)
-    return int(np.sort(latency_ns)[-1 - int(config.epsilon * latency_ns.size)])
+        latency_ns = source.draw(generator(seed, "chunks oracle", source.name), _ORACLE_DRAWS)
+    return int(np.sort(latency_ns)[-1 - int(epsilon * latency_ns.size)])

@@ -1,10 +1,10 @@
-"""The options of a run of chunks: modes, rules and latencies; live, its requests."""
+"""The options of a run of chunks: modes and rules under given latencies, or live on the answers of a server."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final
 
@@ -14,73 +14,56 @@ from s2a_bench.act import ROBOTS, ActionKind, kind
 from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.config import LiveRequests
-from s2a_bench.inference import STAND_IN
-from s2a_bench.options import Names, Options, group, one_of, option
+from s2a_bench.options import Names, one_of, option
 from s2a_bench.plugins.chunks.latencies import Source, sources, split
-from s2a_bench.plugins.chunks.modes import COMPARED, MODES, ControlSetting, Mode, Rounding, modes
+from s2a_bench.plugins.chunks.modes import ControlSetting, Mode
+from s2a_bench.plugins.chunks.options import ControlOptions, ServedOptions
 from s2a_bench.policy.conformal import GUARANTEE, Guarantee, fewest
 
-SHOWN: Final = (
-    *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
-    *("prompt", "warmup", "timeout_s", "wait_for_server", "deadline_s", "sample_resources_hz", "nonce"),
-)
-"""The options that are flags of `chunks`."""
-
-
-RULES: Final = ("calibrated", "tracked", "maximum", "mean", "oracle")
+LIVE_RULES: Final = ("calibrated", "tracked", "maximum", "mean")
+RULES: Final = (*LIVE_RULES, "oracle")
 PROMISING: Final = ("calibrated", "tracked")
 """Rules that keep to `epsilon`, given enough latencies."""
 CYCLES: Final = 10_000
 CALIBRATION: Final = 8_000
-VIRTUAL: Final = ("cycles", "calibration_cycles", "tokens_per_action")
-FASTEST_LIVE_HZ: Final = 10_000.0
 MOST_LIVE_TICKS: Final = 1_000_000
 
 Sources = Annotated[tuple[str, ...], BeforeValidator(split, json_schema_input_type=tuple[str | float, ...])]
 """Sources of latencies; as text they are separated by commas, and so are the parameters of a family."""
 
 
-class ChunksConfig(Options):
-    """Modes and rules under latencies."""
+@dataclass(frozen=True, slots=True)
+class RulesPlan:
+    """The rules that choose the trigger of ``mode``, each in a cell; None: no mode has a trigger."""
 
-    PANEL: ClassVar[str] = "Control loop"
+    mode: Mode | None
+    tried: Sequence[str]
+    epsilon: float
+    guarantee: Guarantee
+    slowest: float
+    """By how many times a rule may slow actions down."""
 
-    modes: Names = option(
-        COMPARED,
-        f"{', '.join(MODES)}, each with ?parameter=value&...; several with commas",
-        first=True,
-        names=lambda: MODES,
-    )
-    latency: Sources = option(
-        (EXAMPLE,),
-        "observation to usable chunk (with streamed: to its first action): ms, FAMILY:mean_ms=...,key=value, FILE.csv, "
-        "a run folder, or a profile; several with commas",
-        first=True,
-        names=profile_files,
-    )
+    @property
+    def promise(self) -> bool:
+        """Whether one of them keeps to ``epsilon``."""
+        return self.mode is not None and not {*PROMISING}.isdisjoint(self.tried)
+
+
+def rules_option(default: tuple[str, ...]) -> Any:
+    about = "further rows for the first queue, its trigger chosen by each; empty text for none"
+    return option(default, about, first=True)
+
+
+class ChunksOptions(ControlOptions):
+    """Modes of acting on chunks, and rules for their triggers."""
+
     slow_down: float = option(1.0, "all actions so many times slower (time-scaling)", ge=1, le=1000)
     slowest: float = option(
         1.0, "so many times slower calibrated and oracle may make actions where no trigger is enough", ge=1, le=1000
     )
-    control_hz: float = option(50.0, "control ticks a second", ge=1e-3, le=1e6, allow_inf_nan=False, first=True)
-    horizon: int = option(16, "H, actions of a chunk", ge=1, le=4096, first=True)
-    rounding: Rounding = option("floor", "d is the floor or ceil of latency over control tick")
-    rules: Annotated[Names, one_of(lambda: RULES)] = option(
-        RULES,
-        "further rows for the first queue, its trigger chosen by each; empty text for none "
-        f"[default: {','.join(RULES)}; --live: none]",
-        first=True,
-    )
+    rules: Annotated[Names, one_of(lambda: LIVE_RULES)] = rules_option(())
     epsilon: float = option(0.01, "share of cycles that may stall, for the rules", flag="eps", gt=0, lt=1)
     guarantee: Guarantee = GUARANTEE
-    cycles: int | None = option(
-        None, f"requests of each row [default: {CYCLES}; replayed: as many as there are]", ge=2, le=1_000_000
-    )
-    calibration_cycles: int = option(
-        CALIBRATION, "further requests that the rules learn from; of a recording its first half at most", ge=1
-    )
-    tokens_per_action: int = option(7, "tokens of an action, where a profile answers", ge=1, le=1000)
     shown_ticks: int = option(
         120, "control ticks of each row that are drawn, and in virtual time kept", ge=0, le=100_000
     )
@@ -94,45 +77,61 @@ class ChunksConfig(Options):
     export_delays: Path | None = option(
         None, "also write each request's times, L and d as CSV, for other simulators; of one source of latencies"
     )
-    seed: int = option(0, "seed of everything that is drawn", ge=0)
-
-    live: bool = option(
-        False,
-        "act in real time on what a server answers; with `engine` echo, `latency` is how long its answers take",
-        first=True,
-    )
-    seconds: float = option(20.0, "--live: how long each mode acts", gt=0, le=86_400)
-    requests: LiveRequests = group(LiveRequests, only=SHOWN, about="--live: ", first=("transports",))
-
-    @property
-    def virtual(self) -> bool:
-        return not self.live
-
-    @cached_property
-    def live_requests(self) -> LiveRequests:
-        """The requests of a live control loop; raises UsageError naming the field."""
-        engine_settings: dict[str, Any] = {"answer": "actions", "horizon": self.horizon}
-        if self.known:
-            engine_settings |= {"latency": self.known} | (
-                {"name": STAND_IN} if not self.requests.engine.model_fields_set else {}
-            )
-        return self.requests.but(engine=self.requests.engine.but(**engine_settings), seed=self.seed, requests=1)
-
-    @property
-    def known(self) -> str:
-        """The latencies that our live server keeps; empty if it answers as fast as it can."""
-        return self.latency[0] if "latency" in self.model_fields_set else ""
-
-    def named(self, pipeline: str) -> str:
-        return f"{pipeline}, {self.known}" if self.known else pipeline
 
     @property
     def setting(self) -> ControlSetting:
-        return ControlSetting(round(1e9 / self.control_hz), self.horizon, self.rounding).slowed(self.slow_down)
+        return super().setting.slowed(self.slow_down)
 
     @cached_property
-    def made(self) -> dict[str, Mode]:
-        return modes(self.modes, self.setting)
+    def robot_kind(self) -> ActionKind | None:
+        return kind(self.robot, ActionKind) if self.robot else None
+
+    @property
+    def rules_tried(self) -> Sequence[str]:
+        return self.rules
+
+    @cached_property
+    def rules_plan(self) -> RulesPlan:
+        mode = next((each for each in self.control.modes.values() if each.triggered), None)
+        return RulesPlan(mode, self.rules_tried, self.epsilon, self.guarantee, self.slowest)
+
+    def check(self) -> None:
+        super().check()
+        _ = self.robot_kind  # raises UsageError
+        file = self.export_delays
+        if file is not None and (file.suffix != ".csv" or not file.parent.is_dir()):
+            raise UsageError(f"`export_delays`: {file} should be a .csv file in a folder that there is")
+
+    def risks(self) -> Iterator[tuple[str, str, str]]:
+        yield from super().risks()
+        if self.robot_kind is not None and (risk := self.robot_kind.risk):
+            yield "robot", risk, self.robot
+
+    def to_manifest(self) -> dict[str, Any]:
+        return {**super().to_manifest(), "live": not self.virtual}
+
+
+class ChunksVirtual(ChunksOptions):
+    """Modes and rules under given latencies."""
+
+    virtual: ClassVar[bool] = True
+
+    control_hz: float = option(50.0, "control ticks a second", ge=1e-3, le=1e6, allow_inf_nan=False)
+    latency: Sources = option(
+        (EXAMPLE,),
+        "observation to usable chunk (with streamed: to its first action): ms, FAMILY:mean_ms=...,key=value, FILE.csv, "
+        "a run folder, or a profile; several with commas; live: how long echo takes to answer, ms, FAMILY, FILE.csv",
+        first=True,
+        names=profile_files,
+    )
+    rules: Annotated[Names, one_of(lambda: RULES)] = rules_option(RULES)
+    cycles: int | None = option(
+        None, f"requests of each row [default: {CYCLES}; replayed: as many as there are]", ge=2, le=1_000_000
+    )
+    calibration_cycles: int = option(
+        CALIBRATION, "further requests that the rules learn from; of a recording its first half at most", ge=1
+    )
+    tokens_per_action: int = option(7, "tokens of an action, where a profile answers", ge=1, le=1000)
 
     @cached_property
     def sources(self) -> tuple[Source, ...]:
@@ -140,22 +139,12 @@ class ChunksConfig(Options):
             each for written in self.latency for each in sources(written, self.horizon * self.tokens_per_action)
         )
 
-    @cached_property
-    def plant(self) -> ActionKind | None:
-        if not self.robot:
-            return None
-        found = kind(self.robot, ActionKind)
-        if not found.simulated:
-            name = self.robot.partition("?")[0]
-            raise UsageError(f"`robot`: {name}: virtual time has no actions to send; name a plant, or nothing")
-        return found
-
-    @cached_property
+    @property
     def rules_tried(self) -> Sequence[str]:
-        """The rules; by default none live, and none with too few latencies to learn from."""
+        """The rules; by default none with too few latencies to learn from."""
         if "rules" in self.model_fields_set:
             return self.rules
-        return () if self.live else tuple(rule for rule in self.rules if rule not in PROMISING or not self.too_few)
+        return tuple(rule for rule in self.rules if rule not in PROMISING or not self.too_few)
 
     @cached_property
     def too_few(self) -> str:
@@ -163,111 +152,63 @@ class ChunksConfig(Options):
         needed = fewest(self.epsilon)
         return next(
             (
-                f"{each.name} has {self._learnable(each)} latencies to learn from (of a recording the first half); "
+                f"{each.name} has {count} latencies to learn from (of a recording the first half); "
                 f"a stall in {self.epsilon:.2%} of the cycles takes {needed}"
                 for each in self.sources
-                if self._learnable(each) < needed
+                if (count := each.learnable(self.calibration_cycles)) < needed
             ),
             "",
         )
 
-    def _learnable(self, source: Source) -> int:
-        recorded = source.recorded_ns
-        return self.calibration_cycles if recorded is None else min(self.calibration_cycles, recorded.size // 2)
-
-    def learnt(self, source: Source) -> int:
-        return self._learnable(source) if self.with_rules else 0
-
-    @cached_property
-    def triggered(self) -> Mode | None:
-        return next((each for each in self.made.values() if each.triggered), None)
-
     @property
-    def with_rules(self) -> bool:
-        return bool(self.rules_tried) and self.triggered is not None
+    def learnt(self) -> int:
+        """The most latencies of a source that rules learn from."""
+        return self.calibration_cycles if self.rules_plan.mode is not None and self.rules_plan.tried else 0
 
     def check(self) -> None:
         """Refuse what makes no sense together; raises UsageError naming the fields."""
-        for field in ("modes", "latency"):
-            if not getattr(self, field):
-                raise UsageError(f"`{field}`: name at least one")
-        if self.live:
-            self._check_live()
-            return
-        if alone := next(chain(self.requests.given(), {"seconds"} & self.model_fields_set), ""):
-            raise UsageError(f"`{alone}` is for a control loop that runs; it needs `live`")
-        self._check_export()
-        _ = self.plant
+        super().check()
+        if not self.latency:
+            raise UsageError("`latency`: name at least one")
+        if self.export_delays is not None and len(self.sources) != 1:
+            names = ", ".join(source.name for source in self.sources)
+            raise UsageError(f"`export_delays`: {len(self.sources)} sources of `latency`, {names}; name one of them")
+        if self.robot_kind is not None and not self.robot_kind.simulated:
+            name = self.robot.partition("?")[0]
+            raise UsageError(f"`robot`: {name}: virtual time has no actions to send; name a plant, or nothing")
         for source in self.sources:
-            recorded = source.recorded_ns
-            if recorded is not None and recorded.size - self.learnt(source) < 2:  # noqa: PLR2004 - a boundary
-                kept = f", and `rules` set {self.learnt(source)} aside" if self.learnt(source) else ""
+            recorded, learnt = source.recorded_ns, source.learnable(self.learnt)
+            if recorded is not None and recorded.size - learnt < 2:  # noqa: PLR2004 - a boundary
+                kept = f", and `rules` set {learnt} aside" if learnt else ""
                 raise UsageError(
                     f"`latency`: {source.name} has {recorded.size} latencies{kept}; two or more are needed"
                 )
-        if self.with_rules and self.too_few and {*PROMISING} & {*self.rules_tried}:
+        if self.rules_plan.promise and self.too_few:
             others = ",".join(rule for rule in RULES if rule not in PROMISING)
             raise UsageError(f"`rules`: {self.too_few}; raise `epsilon`, or take `rules` {others}")
 
-    def _check_live(self) -> None:
-        if self.robot:
-            kind(self.robot, ActionKind)
-        given = self.model_fields_set
-        if alone := next((field for field in VIRTUAL if field in given), ""):
-            raise UsageError(f"`{alone}` is for virtual time; live there are `seconds` and `warmup`")
-        self._check_ticks()
-        self._check_learning()
-        if self.known and len(self.latency) > 1:
-            raise UsageError(f"`latency`: live a server keeps one, not {len(self.latency)}; run once for each")
-        if len(self.live_requests.pipelines) > 1 and self.export_delays is not None:
-            raise UsageError("`export_delays`: of one `transport` at a time")
-        self._check_file()
 
-    def _check_ticks(self) -> None:
+class ChunksLive(ChunksOptions, ServedOptions):
+    """Modes and rules in real time, on the answers of a server."""
+
+    seconds: float = option(20.0, "how long each mode acts", gt=0, le=86_400)
+
+    def check(self) -> None:
+        """Refuse what makes no sense together; raises UsageError naming the fields."""
+        super().check()
         if self.seconds * 1e9 < 2 * self.setting.period_ns:
             raise UsageError(
                 f"`seconds`: {self.seconds:g} s are less than two ticks at `control_hz` {self.control_hz:g}"
-            )
-        if self.control_hz > FASTEST_LIVE_HZ:
-            raise UsageError(
-                f"`control_hz`: {self.control_hz:g}: a live loop keeps up with at most {FASTEST_LIVE_HZ:g} Hz; lower it"
             )
         if self.seconds * self.control_hz > MOST_LIVE_TICKS:
             raise UsageError(
                 f"`seconds`: {self.seconds:g} s at `control_hz` {self.control_hz:g} are over {MOST_LIVE_TICKS:.0e} "
                 "control ticks, which are held in memory; act for a shorter time"
             )
-
-    def _check_learning(self) -> None:
-        if "oracle" in self.rules_tried:
-            raise UsageError("`rules`: a live run has no oracle; take calibrated, tracked, maximum or mean")
-        if {*PROMISING} & {*self.rules_tried} and self.with_rules:
-            needed = fewest(self.epsilon)
-            if self.requests.warmup < needed:
-                raise UsageError(
-                    f"`warmup`: {self.requests.warmup} requests are too few to learn from for `epsilon` "
-                    f"{self.epsilon:g}; take {needed} or more, or other `rules`"
-                )
-
-    def _check_export(self) -> None:
-        if self.export_delays is None:
-            return
-        if len(self.sources) != 1:
-            names = ", ".join(source.name for source in self.sources)
-            raise UsageError(f"`export_delays`: {len(self.sources)} sources of `latency`, {names}; name one of them")
-        self._check_file()
-
-    def _check_file(self) -> None:
-        file = self.export_delays
-        if file is not None and (file.suffix != ".csv" or not file.parent.is_dir()):
-            raise UsageError(f"`export_delays`: {file} should be a .csv file in a folder that there is")
-
-    def risks(self) -> Iterator[tuple[str, str, str]]:
-        yield from super().risks()
-        if self.robot and (risk := kind(self.robot, ActionKind).risk):
-            yield "robot", risk, self.robot
-
-    def to_manifest(self) -> dict[str, Any]:
-        file = None if self.export_delays is None else str(self.export_delays)
-        more = {"modes": list(self.made), "period_ns": self.setting.period_ns, "export_delays": file}
-        return {**self.model_dump(exclude={"requests"}), **more}
+        if self.rules_plan.promise and self.requests.warmup < (needed := fewest(self.epsilon)):
+            raise UsageError(
+                f"`warmup`: {self.requests.warmup} requests are too few to learn from for `epsilon` "
+                f"{self.epsilon:g}; take {needed} or more, or other `rules`"
+            )
+        if self.export_delays is not None and len(self.robots_requests.pipelines) > 1:
+            raise UsageError("`export_delays`: of one `transport` at a time")

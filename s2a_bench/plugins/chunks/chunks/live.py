@@ -16,15 +16,14 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.act import ActionRobot, open_robot
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Session
 from s2a_bench.harness.warnings import exchange_warnings
-from s2a_bench.plugins.chunks.chunks.build_rows import stall_metrics, stalls_of, write_cell
+from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, stall_metrics, stalls_of
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes
-from s2a_bench.plugins.chunks.chunks.config import PROMISING, ChunksConfig
+from s2a_bench.plugins.chunks.chunks.config import PROMISING
 from s2a_bench.plugins.chunks.chunks.smooth import MOST_TICKS, smoothness
 from s2a_bench.plugins.chunks.control import ENDLESS, Acted, ControlLoop, RobotTicks, Send
 from s2a_bench.plugins.chunks.latencies import Source, delay_rows, measured, write_delays
@@ -33,8 +32,11 @@ from s2a_bench.plugins.chunks.modes.cycles import gather, lay
 from s2a_bench.plugins.chunks.requester import ChunkRequester, Job
 
 if TYPE_CHECKING:
+    from s2a_bench.act import ActionKind, ActionRobot
+    from s2a_bench.plugins.chunks.chunks.config import ChunksLive, RulesPlan
+    from s2a_bench.plugins.chunks.options import ControlPlan
     from s2a_bench.progress import Progress
-    from s2a_bench.store.run import RunWriter
+
 CLIENTS: Final = 4
 """Of a cell, for modes with several concurrent requests."""
 KEEP_S: Final = 0.05
@@ -43,25 +45,28 @@ WARM_UP_TICK_NS: Final = 20_000_000
 """The longest tick of the loop that warms up."""
 
 
+@dataclass(frozen=True, slots=True)
+class ActingPlan:
+    """How every cell acts."""
+
+    control: ControlPlan
+    rules: RulesPlan
+    seconds: float
+    latency: str
+    """Given to the server; empty: it answers as fast as it can."""
+    robot: ActionKind | None
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class LiveResult:
     """The actions of a mode over a pipeline; ``triggers`` are those that its rule chose."""
 
     cell: ChunkCell
     setting: ControlSetting
-    session: Session
     acted: Acted
     requester: ChunkRequester
     robot: ActionRobot | None
     triggers: tuple[int, ...] = ()
-
-    @property
-    def judged(self) -> ChunkCell:
-        """The cell with the measured latencies of complete answers, to their first action, and the triggers."""
-        latency_ns = self.acted.arrival_ns[: self.acted.whole, 0]
-        cell = replace(self.cell, drawn=replace(self.cell.drawn, judged=latency_ns))
-        triggers = self.triggers[: latency_ns.size]
-        return replace(cell, triggers=triggers, begin=None) if triggers else cell
 
     def counted(self) -> tuple[Cycles, Ticks]:
         """Return cycles and ticks of the whole run; a missing answer is usable after the last tick."""
@@ -70,19 +75,18 @@ class LiveResult:
         delay = np.where(arrival_ns < 0, ticks, self.setting.delay_ticks(np.maximum(arrival_ns, 0)))
         return gather(acted.request_tick, acted.request_tick + delay, acted.chunk, acted.index, self.setting.horizon)
 
-    def agreement(self) -> float | None:
-        """Return the share of the ticks whose chunk, action and age equal those of `Mode.arrays`; None without them.
+    def agreement(self, done: Ticks) -> float | None:
+        """Return the share of the ticks ``done`` that equal those of `Mode.arrays`; None without these.
 
         The loop runs the mode's stepper, and the arrays do not. Both have the triggers that a rule chose.
         """
         arrival_ns, ticks = self.acted.arrival_ns, self.acted.chunk.size
         end_ns = ticks * self.setting.period_ns
         arrival_ns = np.where((arrival_ns < 0) | (arrival_ns > end_ns), end_ns, arrival_ns)
-        cell = replace(self.cell, triggers=self.triggers, begin=None) if self.triggers else self.cell
-        cycles = cell.acting.arrays(arrival_ns, self.setting)
+        cycles = self.cell.chosen(self.triggers).acting.arrays(arrival_ns, self.setting)
         if cycles is None:
             return None
-        computed, done = lay(cycles), self.counted()[1]
+        computed = lay(cycles)
         length = min(computed.chunk.size, ticks)
         equal = [getattr(computed, each)[:length] == getattr(done, each)[:length] for each in ("chunk", "index", "age")]
         return float(np.all(equal, axis=0).sum()) / ticks
@@ -96,11 +100,10 @@ class LiveResult:
         chunk = self.acted.chunk[first : first + MOST_TICKS]
         return smoothness(motion, actions, chunk)
 
-    def timing(self) -> dict[str, float | None]:
+    def timing(self) -> dict[str, float]:
         acted, period_ns = self.acted, self.setting.period_ns
         late_s, busy_s = acted.late_ns / 1e9, acted.busy_ns / 1e9
         return {
-            "agreement": self.agreement(),
             "jitter_s_p50": float(np.quantile(late_s, 0.5)),
             "jitter_s_p99": float(np.quantile(late_s, 0.99)),
             "jitter_s_max": float(late_s.max()),
@@ -110,86 +113,89 @@ class LiveResult:
             "bytes_up_per_s": self.requester.sent_bytes / (acted.chunk.size * period_ns / 1e9),
         }
 
+    def actions(self) -> ActedCell:
+        """Return what the cell did, with the latencies of complete answers, to their first action.
 
-def write(config: ChunksConfig, writer: RunWriter, live: LiveResult) -> None:
-    """Write the rows of one mode over one pipeline; raises TransportError for fewer than two chunks."""
-    if live.acted.whole < 2:  # noqa: PLR2004 - a boundary lies between two chunks
-        raise TransportError(f"{live.cell.cell}: {live.acted.whole} chunks in {config.seconds:g} s; act for longer")
-    cell = live.judged
-    keep_origin(writer, cell.cell, live.session.origin)
-    cycles, ticks = live.counted()
-    more: dict[str, Any] = live.timing() | live.smooth()
-    if ticks.stalled.any() and ticks.stalled[-1]:  # the run ends while it waits at a boundary
-        found = stalls_of(cycles)
-        more |= stall_metrics(found["stalled_cycles"] + 1, found["boundaries"] + 1)
-    if cell.mode.streams:  # the closed forms are about a given gap between actions
-        more |= dict.fromkeys(("p_stall_closed", "reaction_s_closed", "margin_ticks"))
-    whole = ticks.chunk.size  # what is measured is kept
-    late_ns, names = live.acted.late_ns, live.requester.names
-    write_cell(config, writer, cell, cycles, ticks, whole, more=more, late_ns=late_ns, names=names)
+        Raises TransportError for fewer than two chunks.
+        """
+        latency_ns = self.acted.arrival_ns[: self.acted.whole, 0]
+        if latency_ns.size < 2:  # noqa: PLR2004 - a boundary lies between two chunks
+            seconds = self.acted.chunk.size * self.setting.period_ns / 1e9
+            raise TransportError(f"{self.cell.cell}: {latency_ns.size} chunks in {seconds:g} s; act for longer")
+        judged = replace(self.cell, drawn=replace(self.cell.drawn, judged=latency_ns))
+        cycles, ticks = self.counted()
+        more: dict[str, Any] = {"agreement": self.agreement(ticks), **self.timing(), **self.smooth()}
+        if ticks.stalled.any() and ticks.stalled[-1]:  # the run ends while it waits at a boundary
+            stalls = stalls_of(cycles)
+            more |= stall_metrics(stalls["stalled_cycles"] + 1, stalls["boundaries"] + 1)
+        if self.cell.mode.streams:  # the closed forms are about a given gap between actions
+            more |= dict.fromkeys(("p_stall_closed", "reaction_s_closed", "margin_ticks"))
+        judged = judged.chosen(self.triggers[: latency_ns.size])
+        return ActedCell(judged, self.setting, cycles, ticks, more, self.acted.late_ns, self.requester.names)
 
 
-def run_live(config: ChunksConfig, output: Path, progress: Progress) -> Path:
+def run_live(config: ChunksLive, output: Path, progress: Progress) -> Path:
     """Act and return the run folder; raises S2AError."""
-    plan = resolve(config.live_requests, progress.say)
-    several = any(each.several for each in config.made.values())
+    control, mode = config.control, next(iter(config.control.modes.values()))
+    plan = resolve(config.robots_requests, progress.say)
     settings = {**plan.manifest["configuration"], **config.to_manifest()}
     plan = plan.with_manifest(configuration=settings, cadence=f"a control loop at {config.control_hz:g} Hz")
-    task = Task("chunks", drive=partial(_drive, config), clients=CLIENTS if several else 1)
+    loop = ActingPlan(control, config.rules_plan, config.seconds, config.latency, config.robot_kind)
+    several = any(each.several for each in control.modes.values())
+    task = Task("chunks", drive=partial(_drive, loop), clients=CLIENTS if several else 1)
     folder = run_requests(task, plan, output, progress)
     if config.export_delays is not None:
-        source = next(measured(folder))
-        rows = delay_rows(source, np.empty(0, np.int64), next(iter(config.made.values())), config.setting)
+        rows = delay_rows(next(measured(folder)), np.empty(0, np.int64), mode, config.setting)
         write_delays(config.export_delays, rows)
     return folder
 
 
-def _drive(config: ChunksConfig, launch: RunningLaunch) -> None:
-    blocks = count()
+def _drive(plan: ActingPlan, launch: RunningLaunch) -> None:
+    blocks, control = count(), plan.control
     tried: list[tuple[ChunkCell, list[Session], int]] = []
     launch.progress.stage("warming up")
-    for _, of_cell in groupby(launch.sessions, lambda session: session.cell.name):
+    for name, of_cell in groupby(launch.sessions, lambda session: session.cell.name):
         sessions = list(of_cell)
-        learnt, dims = _warm_up(config, launch, sessions, blocks)
-        source = Source(config.named(sessions[0].cell.name))
-        tried += [(cell, sessions, dims) for cell in cells(config, LatencyDraw(source, learnt[:0], learnt))]
-    found = {cell.drawn.source.name: asdict(cell.calibration) for cell, *_ in tried if cell.calibration}
-    launch.writer.update(calibrations=found)
-    launch.warnings.extend(exchange_warnings(found, FOLLOW))
+        learnt, dims = _warm_up(control.setting, launch, sessions, blocks)
+        drawn = LatencyDraw(Source(f"{name}, {plan.latency}" if plan.latency else name), learnt[:0], learnt)
+        tried += [(cell, sessions, dims) for cell in cells(control, plan.rules, drawn)]
+    calibrations = {cell.drawn.source.name: asdict(cell.calibration) for cell, *_ in tried if cell.calibration}
+    launch.writer.update(calibrations=calibrations)
+    launch.warnings.extend(exchange_warnings(calibrations, FOLLOW))
     launch.progress.expect(len(tried))
-    for cell, sessions, dims in Random(config.seed).sample(tried, len(tried)):  # noqa: S311 - an order, not a secret
-        launch.progress.stage(f"acting for {config.seconds:g} s: {cell.cell}")
-        setting = config.setting.slowed(cell.slower)
-        ticks, streams = max(2, round(config.seconds * 1e9 / setting.period_ns)), cell.mode.streams
-        robot = open_robot(config.robot, dims, setting.period_ns) if config.robot else None
+    for cell, sessions, dims in Random(control.seed).sample(tried, len(tried)):  # noqa: S311 - an order, not a secret
+        launch.progress.stage(f"acting for {plan.seconds:g} s: {cell.cell}")
+        setting = control.setting.slowed(cell.slower)
+        robot = plan.robot.open_actions(dims, setting.period_ns) if plan.robot else None
         with nullcontext() if robot is None else closing(robot):
             launch.writer.update(robot={} if robot is None else robot.describe())
-            acting, requester = _run(
-                config, cell.acting, setting, sessions, launch, blocks, ticks=ticks, streams=streams, robot=robot
-            )
-            triggers = tuple(acting.stepper.triggers)
-            live = LiveResult(cell, setting, sessions[0], acting.acted(), requester, robot, triggers)
-            write(config, launch.writer, live)
-            seen_ns = live.judged.drawn.judged
-            if cell.rule in PROMISING and (changed := changes(config, cell.cell, cell.drawn.learnt, seen_ns)):
-                launch.warnings.extend(changed)
-                if cell.calibration:
-                    launch.writer.update(calibrations={cell.drawn.source.name: {"changed": True}})
+            ticks = max(2, round(plan.seconds * 1e9 / setting.period_ns))
+            acting, requester = _run(cell.acting, setting, sessions, launch, blocks, ticks=ticks, robot=robot)
+            live = LiveResult(cell, setting, acting.acted(), requester, robot, tuple(acting.stepper.triggers))
+            acted = live.actions()
+            keep_origin(launch.writer, cell.cell, sessions[0].origin)
+            whole = acted.ticks.chunk.size  # what is measured is kept
+            for table, rows in cell_rows(acted, whole, plan.rules.epsilon, control.seed).items():
+                launch.writer.append(table, rows)
+        if cell.rule in PROMISING and (changed := changes(control.setting, cell.cell, acted.cell.drawn)):
+            launch.warnings.extend(changed)
+            if cell.calibration:
+                launch.writer.update(calibrations={cell.drawn.source.name: {"changed": True}})
         launch.progress.advance()
 
 
 def _warm_up(
-    config: ChunksConfig, launch: RunningLaunch, sessions: Sequence[Session], blocks: Iterator[int]
+    setting: ControlSetting, launch: RunningLaunch, sessions: Sequence[Session], blocks: Iterator[int]
 ) -> tuple[Ints, int]:
     """Return the latencies of warm-up requests in ns, and the size of an action.
 
     A loop requests them: their latencies include the hand-over between threads, as those of the run do.
     """
-    setting = ControlSetting(min(config.setting.period_ns, WARM_UP_TICK_NS), config.horizon)
+    setting = ControlSetting(min(setting.period_ns, WARM_UP_TICK_NS), setting.horizon)
     latency_ns, dims = [np.empty(0, np.int64)], 0
     for session in sessions:
         warmup = launch.plan.blocks.warmup
-        acting, requester = _run(config, mode(ONE_BY_ONE), setting, [session], launch, blocks, warmup=warmup)
+        acting, requester = _run(mode(ONE_BY_ONE), setting, [session], launch, blocks, warmup=warmup)
         arrival_ns, dims = acting.acted().arrival_ns[:, 0], dims or requester.dims
         latency_ns.append(arrival_ns[arrival_ns >= 0])
         error = requester.error
@@ -199,7 +205,6 @@ def _warm_up(
 
 
 def _run(
-    config: ChunksConfig,
     chosen: Mode,
     setting: ControlSetting,
     sessions: Sequence[Session],
@@ -207,19 +212,19 @@ def _run(
     blocks: Iterator[int],
     *,
     ticks: int = ENDLESS,
-    streams: bool = False,
     robot: ActionRobot | None = None,
     warmup: int = 0,
 ) -> tuple[RobotTicks, ChunkRequester]:
     """Act for ``ticks``, or until ``warmup`` requests have been made; write the requests."""
-    sends_state = robot is not None and _accepts_state(config, sessions[0], robot)
+    sends_state = robot is not None and _accepts_state(sessions[0], robot)
 
     def request_chunk(request: int, tick: int) -> None:
         requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else ()))
 
     send: Send = (lambda *_: None) if robot is None else robot.send
     acting = RobotTicks(chosen, setting, send, request_chunk, ticks)
-    requester = ChunkRequester(sessions, config.horizon, config.seed, streams, acting.arrived, blocks, warmup)
+    seed = launch.plan.blocks.seed
+    requester = ChunkRequester(sessions, setting.horizon, seed, chosen.streams, acting.arrived, blocks, warmup)
     loop = ControlLoop([acting])
     with requester.running():
         try:
@@ -235,12 +240,13 @@ def _run(
     return acting, requester
 
 
-def _accepts_state(config: ChunksConfig, session: Session, robot: ActionRobot) -> bool:
+def _accepts_state(session: Session, robot: ActionRobot) -> bool:
     """Return whether requests carry the robot's state; raises UsageError where its size contradicts `state`."""
-    cell, numbers, wanted = session.cell, len(robot.state()), config.requests.state
+    numbers, wanted = len(robot.state()), session.request.state
     if numbers and wanted and numbers != wanted:
-        raise UsageError(f"`state`: `robot` {config.robot} has {numbers} numbers, not {wanted}; leave it out")
-    return bool(numbers) and cell.capabilities.accepts_state
+        name = robot.describe()["robot"]
+        raise UsageError(f"`state`: `robot` {name} has {numbers} numbers, not {wanted}; leave it out")
+    return bool(numbers) and session.cell.capabilities.accepts_state
 
 
 def _keep(requester: ChunkRequester, launch: RunningLaunch) -> None:

@@ -18,8 +18,8 @@ from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
     from s2a_bench.act import ActionKind, Motion
-    from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
     from s2a_bench.plugins.chunks.modes import Cycles, Ints, Mode, Ticks
+    from s2a_bench.plugins.chunks.options import ControlPlan
     from s2a_bench.policy import Floats
 
 RATE: Final = 3.0
@@ -89,12 +89,10 @@ class TrackingPlant:
         return {**found, **{f"{name}_ideal": ideal[name] for name in ("tracking_rms", "jerk_rms")}}
 
 
-def follower(config: ChunksConfig) -> TrackingPlant | None:
-    """Return plant and target, which all cells of a seed share; None without a robot, or with actions slowed down."""
-    if config.plant is None or config.slow_down > 1:
-        return None
-    rng = generator(config.seed, "chunks target")
-    return TrackingPlant(config.plant, draw_target(rng, MOST_TICKS, config.setting.period_ns / 1e9))
+def follower(plant: ActionKind, control: ControlPlan) -> TrackingPlant:
+    """Return a plant and its target, which all cells of a seed share."""
+    rng = generator(control.seed, "chunks target")
+    return TrackingPlant(plant, draw_target(rng, MOST_TICKS, control.setting.period_ns / 1e9))
 
 
 def executed(mode: Mode, cycles: Cycles, ticks: Ticks, target: TargetPath) -> Floats:

@@ -55,6 +55,11 @@ def trigger(latency_ns: float, setting: ControlSetting, most: int) -> Trigger:
     return Trigger(most, slow_down(latency_ns / 1e9, most, setting.period_ns / 1e9))
 
 
+def greatest_trigger(mode: Mode, setting: ControlSetting) -> int:
+    """Return the trigger above which none helps queue."""
+    return max(1, mode.execution_horizon(setting) - 1)
+
+
 def calibrate(latency_ns: Ints, epsilon: float = EPSILON, guarantee: Guarantee = "high-confidence") -> Calibration:
     """Find the latency limit, ``caution`` in ns, from latencies of shape (n,); raises UsageError for too few."""
     return choose(latency_ns.astype(float), epsilon, guarantee, latency_ns.astype(float))
@@ -140,6 +145,10 @@ class Chosen(Mode):
         return self.mode.name
 
     @property
+    def streams(self) -> bool:  # type: ignore[override]
+        return self.mode.streams
+
+    @property
     def gap_ns(self) -> int:
         return self.mode.gap_ns
 
@@ -198,10 +207,11 @@ class Learning(Chosen):
     begin: Callable[[], TriggerRule]
 
     def stepper(self, setting: ControlSetting) -> LearningStepper:
-        rule, length = self.begin(), self.mode.execution_horizon(setting)
+        rule, most = self.begin(), greatest_trigger(self.mode, setting)
+        length = self.mode.execution_horizon(setting)
 
         def choose() -> int:
-            return trigger(rule.latency_ns, setting, max(1, length - 1)).ticks
+            return trigger(rule.latency_ns, setting, most).ticks
 
         return LearningStepper(self.mode.stepper(setting), choose, rule=rule, setting=setting, length=length)
 

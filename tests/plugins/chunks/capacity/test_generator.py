@@ -19,22 +19,25 @@ import pytest
 import s2a_bench as s2a
 from s2a_bench.clock import VirtualClock
 from s2a_bench.errors import ServerDied
-from s2a_bench.harness.config import LiveRequests, RequestsConfig
+from s2a_bench.harness.config import RequestsConfig
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.session import Measured, Place, RequestContext, Session
 from s2a_bench.plugins.chunks.capacity import generator
 from s2a_bench.plugins.chunks.capacity import run as run_module
+from s2a_bench.plugins.chunks.capacity.config import RobotLoad
 from s2a_bench.plugins.chunks.capacity.generator import Fleet, FleetPlan, PlainRobot
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, KNEES, REQUESTS, ROBOTS
 from s2a_bench.plugins.chunks.capacity.run import twin
 from s2a_bench.plugins.chunks.modes import ControlSetting
+from s2a_bench.plugins.chunks.options import LoopRequests
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.types import Token
 from tests.cli.test_provenance import serving
 
 MS = 1_000_000
-REQUEST = resolve(RequestsConfig(transports="loopback"), print).request
+PLAN = resolve(RequestsConfig(transports="loopback"), print)
+REQUEST = PLAN.request
 
 
 class Over:
@@ -71,8 +74,8 @@ def robot_of(
         return Measured(sample, [], 0, fatal=ServerDied("gone") if error == "fatal" else None)
 
     session: Any = SimpleNamespace(measure=measure, request=REQUEST)
-    plan = FleetPlan("c", {}, cast("Any", None), REQUEST, False, ControlSetting(20 * MS, 16), "", 0, every_ns, think_ns)
-    robot = PlainRobot(plan, cast("Session", session), count(), 1000 * MS, SimpleQueue())
+    load = RobotLoad(ControlSetting(20 * MS, 16), every_ns=every_ns, think_ns=think_ns)
+    robot = PlainRobot(load, cast("Session", session), count(), 1000 * MS, SimpleQueue())
     robot.over = cast("Any", Over(clock))
     robot.work()
     return robot.trace(0, 10_000 * MS)
@@ -126,7 +129,8 @@ def test_a_robot_goes_on_after_an_answer_that_breaks_and_ends_with_its_server(mo
 def test_a_fleet_acts_on_its_own_clock_and_reports_on_that_of_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = VirtualClock(10**15)
     monkeypatch.setattr(generator, "now_ns", clock.now_ns)
-    fleet = Fleet(FleetPlan("c", {}, cast("Any", None), REQUEST, False, ControlSetting(20 * MS, 16), "", 0, 10**15))
+    load = RobotLoad(ControlSetting(20 * MS, 16), every_ns=10**15)
+    fleet = Fleet(FleetPlan("c", {}, PLAN, load))
     fleet._sessions = {robot: (cast("Session", None), count()) for robot in range(2)}
     fleet.start({0: 0, 1: 7 * MS}, 100 * MS)
     clock.sleep_until_ns(10**15 + 300 * MS)
@@ -144,7 +148,7 @@ def test_a_fleet_acts_on_its_own_clock_and_reports_on_that_of_the_run(monkeypatc
     ],
 )
 def test_the_twin_is_an_instant_server_of_ours_on_the_same_wire(written: str, options: Any, same: str) -> None:
-    cell = LiveRequests(transports=written, options=options).pipelines[0]
+    cell = LoopRequests(transports=written, options=options).pipelines[0]
     found = twin(cell)
     assert found.name == f"{cell.name}, instant"
     assert "/".join(filter(None, (found.transport.name, found.variant))) == same

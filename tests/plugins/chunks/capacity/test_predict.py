@@ -25,7 +25,7 @@ def first(service: Service, count: int = 3, seed: int = 0) -> list[tuple[int, ..
 
 
 def predicted(tmp_path: Path, **options: Any) -> StoredRun:
-    return read_run(s2a.capacity(output=tmp_path, seconds=5, settle_s=3, **options).path)
+    return read_run(s2a.capacity(mode="predicted", output=tmp_path, seconds=5, settle_s=3, **options).path)
 
 
 def test_the_engine_s_time_of_a_run_is_the_service_and_the_queue_is_no_part_of_it(make_run: MakeRun) -> None:
@@ -82,7 +82,7 @@ def test_batches_that_make_no_sense_are_one_line(tmp_path: Path, text: str) -> N
 )
 def test_what_cannot_be_predicted_is_one_line(tmp_path: Path, options: dict[str, Any], message: str) -> None:
     with pytest.raises(S2AError, match=message):
-        s2a.capacity(output=tmp_path, **options)
+        s2a.capacity(mode="predicted", output=tmp_path, **options)
 
 
 def test_the_knee_of_a_queue_is_exact(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import nullcontext
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 
 from s2a_bench.harness.plan import resolve
 from s2a_bench.plugins.chunks.capacity import run as run_module
-from s2a_bench.plugins.chunks.capacity.config import CapacityConfig
+from s2a_bench.plugins.chunks.capacity.config import CapacityMeasured, CapacityPredicted
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, REQUESTS, ROBOTS
 from s2a_bench.plugins.chunks.capacity.run import _Robots
@@ -21,7 +22,9 @@ from s2a_bench.plugins.chunks.modes import Ticks
 from s2a_bench.testing import NullProgress
 
 MS = 1_000_000
-CONFIG = CapacityConfig(predict="20", modes="sync", settle_s=0, control_hz=50, looks=4)
+CONFIG = CapacityPredicted(predict="20", modes="sync", settle_s=0, control_hz=50, looks=4)
+SEARCH = CONFIG.search
+(LOAD,) = CONFIG.loads
 
 
 def trace(late_ms: float = 0, *, stalled: int = 0, ticks: bool = True) -> RobotTrace:
@@ -55,8 +58,10 @@ def fleet(robots: Looks, source: Any = "measured", number: int = 2, mode: str = 
         manifest={"provenance": {"cells": {"c": {}}}}, append=lambda table, found: rows[table.name].extend(found)
     )
     launch: Any = SimpleNamespace(writer=writer, progress=NullProgress())
-    judges = Judge(CONFIG.limited, beyond=judge.get("beyond", False), settle_ns=0, confidence=0.95)
-    cell = run_module._Cell(CONFIG, None, launch, robots.session, None, mode, judges, service=object())  # type: ignore[arg-type]
+    judges = Judge(SEARCH.limit, beyond=judge.get("beyond", False), settle_ns=0, confidence=0.95)
+    load = LOAD if mode else replace(LOAD, mode=None, name="")
+    nothing: Any = object()
+    cell = run_module._Cell(load, SEARCH, judges, launch, nothing, robots.session, None, service=nothing)
     found = cell._fleet(robots, number, source)  # type: ignore[arg-type]
     assert robots.stopped
     return found, rows
@@ -115,27 +120,27 @@ def test_a_fleet_is_withdrawn_for_a_twin_that_exceeds_the_limit_and_not_for_one_
         twin = source == "twin"
         return Tried(number, "below", within=number < 4 or (twin and within), clean=not twin)
 
-    monkeypatch.setattr(run_module, "_Robots", lambda *_, **__: nullcontext())
     monkeypatch.setattr(run_module._Cell, "_fleet", found)
     monkeypatch.setattr(run_module._Cell, "_conclude", lambda _: None)
-    config = CONFIG.but(robots="1..4")
+    search = CONFIG.but(robots="1..4").search
     nothing: Any = SimpleNamespace()
-    judge = Judge(config.limited, beyond=False, settle_ns=0, confidence=0.95)
-    cell = run_module._Cell(config, None, nothing, nothing, nothing, "sync", judge)
+    judge = Judge(search.limit, beyond=False, settle_ns=0, confidence=0.95)
+    cell = run_module._Cell(LOAD, search, judge, nothing, lambda *_, **__: nullcontext(), nothing, nothing)  # type: ignore[arg-type, return-value]
     cell.run()
     assert {number: each.clean for number, each in cell.tried.items()} == {1: True, 2: True, 3: True, 4: within}
 
 
-def robots_of(monkeypatch: pytest.MonkeyPatch, *, twin: bool = False, mode: str = "sync", **options: Any) -> _Robots:
+def robots_of(monkeypatch: pytest.MonkeyPatch, *, twin: bool = False, **options: Any) -> _Robots:
     """Return robots whose fleets are `(kind, plan)`."""
     for kind in ("Fleet", "FleetProcess"):
         monkeypatch.setattr(
             run_module, kind, lambda plan, kind=kind: SimpleNamespace(kind=kind, plan=plan, close=lambda: None)
         )
-    config = CapacityConfig(**options)
-    plan = resolve(config.live_requests, print)
+    config = CapacityMeasured(**options)
+    plan, hosts = resolve(config.robots_requests, print), run_module.Hosts(config.processes)
     launch: Any = SimpleNamespace(plan=plan, wiring=lambda _: SimpleNamespace(to_json=dict))
-    return _Robots(config, None, launch, SimpleNamespace(cell=plan.cells[0], origin=None), mode, twin=twin)  # type: ignore[arg-type]
+    session: Any = SimpleNamespace(cell=plan.cells[0], origin=None)
+    return _Robots(config.loads[0], config.search, hosts, launch, 0, session, twin=twin)
 
 
 @pytest.mark.parametrize(
@@ -159,18 +164,18 @@ def test_robots_are_in_as_many_processes_as_their_server_lets_them(
 
 
 @pytest.mark.parametrize(
-    ("mode", "options", "cycle_ms"),
+    ("options", "cycle_ms"),
     [
-        ("sync", {"modes": "sync"}, 16 * 20),
-        ("queue?trigger=8", {"modes": "queue?trigger=8", "control_hz": 100}, 16 * 10),
-        ("", {"plan_every_s": 2, "limit": "stalled=50%"}, 2000),
-        ("", {"closed_loop": True, "think_s": 0.5}, 500),
+        ({"modes": "sync"}, 16 * 20),
+        ({"modes": "queue?trigger=8", "control_hz": 100}, 16 * 10),
+        ({"plan_every_s": 2, "limit": "stalled=50%"}, 2000),
+        ({"closed_loop": True, "think_s": 0.5}, 500),
     ],
 )
 def test_robots_start_at_random_moments_of_a_cycle(
-    monkeypatch: pytest.MonkeyPatch, mode: str, options: Any, cycle_ms: float
+    monkeypatch: pytest.MonkeyPatch, options: Any, cycle_ms: float
 ) -> None:
-    robots, cycle_ns = robots_of(monkeypatch, mode=mode, requests={"transports": "loopback"}, **options), cycle_ms * MS
+    robots, cycle_ns = robots_of(monkeypatch, requests={"transports": "loopback"}, **options), cycle_ms * MS
     phases_ns = np.array([*robots._phases(2000).values()])
     assert 0 <= phases_ns.min() < 0.01 * cycle_ns
     assert 0.99 * cycle_ns < phases_ns.max() <= cycle_ns

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import UsageError
-from s2a_bench.plugins.chunks.capacity.config import CapacityConfig, Limit
+from s2a_bench.plugins.chunks.capacity.config import CapacityMeasured, CapacityPredicted, Limit
 from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace, measures
 from s2a_bench.plugins.chunks.capacity.search import Judge, Knee, Tried, above_limit, knee, search
 from s2a_bench.plugins.chunks.modes import ControlSetting, Ticks
@@ -19,7 +19,7 @@ SETTING = ControlSetting(20 * MS, 16)
 
 @pytest.mark.parametrize("robots", ["1..64", "3..50", "1..1"])
 def test_the_search_finds_every_knee_in_as_many_fleets_as_it_says(robots: str) -> None:
-    config = CapacityConfig(robots=robots)
+    plan = CapacityPredicted(predict="20", robots=robots).search
     for largest in range(70):
         attempts: list[int] = []
 
@@ -28,13 +28,13 @@ def test_the_search_finds_every_knee_in_as_many_fleets_as_it_says(robots: str) -
             return Tried(number, "below" if number <= largest else "above", number <= largest)
 
         tried: dict[int, Tried] = {}
-        search(config.numbers, attempt, tried, bisects=True)
-        first, last = config.numbers[0], config.numbers[-1]
+        search(plan.numbers, attempt, tried, bisects=True)
+        first, last = plan.numbers[0], plan.numbers[-1]
         found = min(1, largest) if largest < first else min(largest, last)
         high = None if largest >= last else first - 1 if found == 1 < first else found
         assert knee(tried.values()) == Knee(found, found, high)
         assert attempts == [*tried]
-        assert len(attempts) <= config.most_fleets
+        assert len(attempts) <= plan.most_fleets
 
 
 def test_a_list_is_tried_to_its_end_after_one_robot_alone() -> None:
@@ -156,7 +156,7 @@ def test_without_values_nothing_is_decided() -> None:
     [("1..64", (1, 2, 4, 8, 16, 32, 64)), ("3..20", (3, 6, 12, 20)), ("5", (5,)), ("4,1,2", (1, 2, 4)), (7, (7,))],
 )
 def test_robots_are_a_range_a_list_or_a_number(written: Any, numbers: tuple[int, ...]) -> None:
-    assert CapacityConfig(robots=written).numbers == numbers
+    assert CapacityPredicted(predict="20", robots=written).search.numbers == numbers
 
 
 @pytest.mark.parametrize(
@@ -169,7 +169,7 @@ def test_robots_are_a_range_a_list_or_a_number(written: Any, numbers: tuple[int,
     ],
 )
 def test_a_limit_is_a_share_of_values_that_may_be_above_it(written: str, limit: Limit) -> None:
-    assert CapacityConfig(limit=written, plan_every_s=1, requests={"transports": "loopback"}).limited == limit
+    assert CapacityPredicted(predict="20", limit=written, plan_every_s=1).search.limit == limit
 
 
 @pytest.mark.parametrize(
@@ -196,17 +196,15 @@ def test_a_limit_is_a_share_of_values_that_may_be_above_it(written: str, limit: 
             {"predict": "20", "plan_every_s": 2, "episodes_s": 7, "settle_s": 5},
             "`episodes`: 2 s are too short for one plan every 2 s",
         ),
-        ({"predict": "20", "latency": "5"}, "`latency` is for a measured run"),
-        ({"servers": 2}, "`servers` needs `predict`"),
-        ({"predict": "20", "ray": "auto"}, "`ray` is for a measured run"),
+        ({"servers": 2}, "`servers` is none of the options"),
         ({"ray": "auto"}, "`ray`: robots on other hosts need a server that they reach; name it with `url`"),
         ({"modes": "replace?under_way=many"}, "`modes`: replace?under_way=many has several requests under way"),
-        ({"predict": "20", "requests": {"timeout_s": 3}}, "`timeout_s` is for a measured run"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_a_line(given: dict[str, Any], message: str) -> None:
+    options = CapacityPredicted if "predict" in given else CapacityMeasured
     with pytest.raises(UsageError) as error:
-        CapacityConfig(**given)
+        options(**given)
     assert message in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -222,7 +220,9 @@ def test_what_makes_no_sense_is_refused_in_a_line(given: dict[str, Any], message
     ],
 )
 def test_a_limit_in_words_names_what_stalls(given: dict[str, Any], mode: str, text: str) -> None:
-    assert CapacityConfig(predict="20", **given).limit_text(mode) == text
+    config = CapacityPredicted(predict="20", **given)
+    (load,), limit = config.loads, config.search.limit
+    assert (load.name, load.limit_text(limit) if limit else "") == (mode, text)
 
 
 @pytest.mark.parametrize(
@@ -236,14 +236,15 @@ def test_a_limit_in_words_names_what_stalls(given: dict[str, Any], mode: str, te
     ],
 )
 def test_what_robots_do_follows_from_what_the_server_answers(given: dict[str, Any], load: str) -> None:
-    config = CapacityConfig(**given)
+    config = CapacityMeasured(**given)
     assert config.load == load
-    assert (config.live_requests.engine.answer == "tokens") == (load == "plans")
+    assert (config.robots_requests.engine.answer == "tokens") == (load == "plans")
 
 
 def test_all_looks_at_all_fleets_of_a_search_are_right_with_95_percent() -> None:
     """One of 1 to 64 robots: seven fleets that double, six of the bisection, four looks each."""
-    search, alone = CapacityConfig(robots="1..64", looks=4), CapacityConfig(robots="1", looks=1)
+    many, one = ({"robots": "1..64", "looks": 4}, {"robots": "1", "looks": 1})
+    search, alone = (CapacityPredicted(predict="20", **given).search for given in (many, one))
     assert (search.most_fleets, alone.most_fleets) == (13, 1)
     assert 1 - search.confidence == pytest.approx(0.05 / (13 * 4))
     assert alone.confidence == pytest.approx(0.95)

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from s2a_bench.plugins.chunks.capacity.config import RobotLoad
 from s2a_bench.plugins.chunks.capacity.metrics import measures
-from s2a_bench.plugins.chunks.capacity.simulate import ServiceTime, VirtualFleet, serve, simulate
+from s2a_bench.plugins.chunks.capacity.simulate import ServiceTime, robot_of, serve, simulate
 from s2a_bench.plugins.chunks.modes import ControlSetting, Mode, mode
 
 MS = 1_000_000
@@ -30,21 +31,22 @@ def exponential(mean_ns: float, seed: int = 0) -> Iterator[ServiceTime]:
 
 def fleet(
     written: str = "", seconds: float = 60, horizon: int = 16, rounding: Any = "floor", **given: Any
-) -> VirtualFleet:
+) -> tuple[RobotLoad, int]:
+    """Return what each robot does, and for how long."""
     setting = ControlSetting(given.pop("period_ns", DT), horizon, rounding)
-    return VirtualFleet(setting, round(seconds * 1e9), mode(written) if written else None, **given)
+    return RobotLoad(setting, mode(written) if written else None, **given), round(seconds * 1e9)
 
 
 def measured(
-    fleet: VirtualFleet,
+    fleet: tuple[RobotLoad, int],
     robots: int,
     times: Iterator[ServiceTime],
     settle_s: float = 30,
     servers: int = 1,
     batch: Any = PLAIN,
 ) -> dict[str, Any]:
-    traces = simulate(fleet, robots, times, np.random.default_rng(1), servers, batch)
-    return measures(traces, fleet.setting, round(settle_s * 1e9))
+    traces = simulate(*fleet, robots, times, np.random.default_rng(1), servers, batch)
+    return measures(traces, fleet[0].setting, round(settle_s * 1e9))
 
 
 class TickByTick:
@@ -114,7 +116,7 @@ def test_a_fleet_does_what_its_steppers_do_tick_by_tick(
         rng = np.random.default_rng(seed)
         starts = [0, 0, *rng.integers(0, 12 * DT, 4).tolist()]
         drawn = [ServiceTime(each, each) for each in rng.integers(1, 4 * DT, 2000).tolist()]
-        robots = [VirtualFleet(setting, most * DT, made).robot(*each, most * DT) for each in enumerate(starts)]
+        robots = [robot_of(RobotLoad(setting, made), *each, most * DT) for each in enumerate(starts)]
         traces = serve(robots, iter(drawn), servers, slower)
         plainly = TickByTick(made, setting, starts, iter(drawn), slower)
         plainly.run(servers, most)
@@ -144,7 +146,7 @@ def test_the_clients_of_vllm_omni_6567() -> None:
 def test_of_robots_that_start_together_the_last_one_waits_for_all_others_in_every_episode() -> None:
     service_ns = 7 * MS
     traces = simulate(
-        fleet("queue?trigger=8", 3, episode_ns=10**9), 12, constant(service_ns), np.random.default_rng(0), 1, PLAIN
+        *fleet("queue?trigger=8", 3, episode_ns=10**9), 12, constant(service_ns), np.random.default_rng(0), 1, PLAIN
     )
     starts = {trace.start_ns for trace in traces}
     assert starts == {0, 10**9, 2 * 10**9}
@@ -196,14 +198,15 @@ def test_other_modes_stall_no_less_than_the_server_s_time_and_one_robot_alone(wr
 def test_near_the_knee_requests_wait_for_ticks(
     written: str, service_ms: int, robots: int, stalled: float, alone: float
 ) -> None:
-    made = fleet(written, rounding="ceil")
+    load, span_ns = fleet(written, rounding="ceil")
     shares = []
     for seed in range(5):
         starts = np.random.default_rng(seed).integers(0, DT, robots).tolist()  # all within one tick
-        traces = serve([made.robot(*each, made.span_ns) for each in enumerate(starts)], constant(service_ms * MS))
-        shares.append(measures(traces, made.setting, 30 * 10**9)["stalled"])
+        clients = [robot_of(load, *each, span_ns) for each in enumerate(starts)]
+        traces = serve(clients, constant(service_ms * MS))
+        shares.append(measures(traces, load.setting, 30 * 10**9)["stalled"])
     assert np.mean(shares) == pytest.approx(stalled, abs=2e-3)
-    assert measured(made, 1, constant(service_ms * MS))["stalled"] == pytest.approx(alone, abs=1e-3)
+    assert measured((load, span_ns), 1, constant(service_ms * MS))["stalled"] == pytest.approx(alone, abs=1e-3)
 
 
 def mean_value_analysis(robots: int, service_s: float, think_s: float) -> tuple[float, float]:
@@ -231,12 +234,12 @@ def test_exponential_service_times_have_their_mean_value_analysis(robots: int, a
 
 def test_a_batching_server_reaches_its_rate_with_a_full_batch_waiting() -> None:
     slower = np.interp(np.arange(1, 17), (1, 4, 8, 16), np.array((58.5, 100, 171.7, 324.5)) / 58.5).tolist()
-    made = fleet()
+    load, span_ns = fleet()
     rates = {}
     for robots in (1, 4, 8, 16, 32):
-        clients = [made.robot(number, number * MS, made.span_ns) for number in range(robots)]
+        clients = [robot_of(load, number, number * MS, span_ns) for number in range(robots)]
         traces = serve(clients, constant(58_500_000), 1, slower)
-        rates[robots] = measures(traces, made.setting, 30 * 10**9)["requests_per_s"]
+        rates[robots] = measures(traces, load.setting, 30 * 10**9)["requests_per_s"]
     assert rates[1] == pytest.approx(17.1, rel=0.01)
     for robots in (4, 8, 16):  # one is served while the others wait, and they while it waits
         expected = robots / (0.0585 * (1 + slower[robots - 2]))

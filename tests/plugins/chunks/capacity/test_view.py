@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from s2a_bench.plugins.chunks.capacity import EXPERIMENT
-from s2a_bench.plugins.chunks.capacity.config import CapacityConfig
+from s2a_bench.plugins.chunks.capacity.config import CapacityPredicted
 from s2a_bench.plugins.chunks.capacity.predict import run_predicted
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, KNEES, ROBOTS
 from s2a_bench.report.compare.comparison import compare, metrics_of, open_comparison
@@ -21,7 +21,7 @@ STALLED = "at most 1 % stalled ticks"
 
 
 def predicted(tmp_path: Path, service_ms: int, **options: Any) -> StoredRun:
-    config = CapacityConfig(predict=str(service_ms), robots="1..64", seconds=10, **options)
+    config = CapacityPredicted(predict=str(service_ms), robots="1..64", seconds=10, **options)
     return read_run(run_predicted(config, tmp_path, NullProgress()))
 
 

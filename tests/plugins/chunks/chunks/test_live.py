@@ -15,9 +15,9 @@ from s2a_bench.errors import EngineError, RequestFailed, RobotError, S2AError, U
 from s2a_bench.harness.session import PLAIN, Measured, Place, RequestContext, Session
 from s2a_bench.inference import EngineConfig, chunk
 from s2a_bench.library import Run
-from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
+from s2a_bench.plugins.chunks.chunks.config import ChunksLive, ChunksVirtual
+from s2a_bench.plugins.chunks.chunks.live import run_live
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS
-from s2a_bench.plugins.chunks.chunks.run import run_chunks
 from s2a_bench.plugins.chunks.chunks.view import show
 from s2a_bench.plugins.chunks.modes.append import QueueStepper, Sync
 from s2a_bench.store.run import read_run
@@ -31,8 +31,8 @@ TRIES = 5
 def act(tmp_path: Path, *, transport: str = "loopback", warmup: int = 1, **options: object) -> pd.DataFrame:
     """Act for a moment and return a row a mode."""
     requests = {"transports": transport, "engine": {"name": "echo"}, "size": "64x48", "warmup": warmup}
-    config = ChunksConfig(**{"live": True, "seconds": 1.5, "requests": requests, **options})
-    folder = run_chunks(config, tmp_path, NullProgress())
+    config = ChunksLive(**{"seconds": 1.5, "requests": requests, **options})
+    folder = run_live(config, tmp_path, NullProgress())
     return pd.read_csv(folder / "chunks.csv")
 
 
@@ -119,7 +119,7 @@ def test_a_live_run_is_shown_and_its_latencies_are_a_source(tmp_path: Path, monk
     assert "that the modes' arrays give for the measured delays" in " ".join(shown.sentences)
     assert "not checked, as arrays do not cover its arrivals: sync;" in " ".join(shown.sentences)
     assert Run(folder).table("loop").shape[0] == 2
-    again = ChunksConfig(latency=f"{folder}#loopback", modes="queue?trigger=3", rules="")
+    again = ChunksVirtual(latency=f"{folder}#loopback", modes="queue?trigger=3", rules="")
     assert again.sources[0].recorded_ns is not None
 
 
@@ -301,41 +301,36 @@ def test_answers_that_no_robot_can_act_on_are_one_line(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"live": True, "rules": "mean,oracle"}, "`rules`: a live run has no oracle"),
+        ({"rules": "mean,oracle"}, "`rules`: 'oracle' is none of calibrated, tracked, maximum, mean"),
         (
-            {"live": True, "rules": "tracked"},
+            {"rules": "tracked"},
             "`warmup`: 5 requests are too few to learn from for `epsilon` 0.01; take 99",
         ),
         (
-            {"live": True, "seconds": 80_000, "control_hz": 1000},
+            {"seconds": 80_000, "control_hz": 1000},
             "`seconds`: 80000 s at `control_hz` 1000 are over",
         ),
-        (
-            {"live": True, "control_hz": 1e6},
-            "`control_hz`: 1e[+]06: a live loop keeps up with at most 10000 Hz",
-        ),
-        ({"live": True, "control_hz": 0.1, "seconds": 1}, "`seconds`: 1 s are less than two ticks at `control_hz` 0.1"),
-        ({"live": True, "cycles": 5}, "`cycles` is for virtual time"),
-        ({"seconds": 5}, "`seconds` is for a control loop"),
+        ({"control_hz": 1e6}, "`control_hz`: 1000000.0 should be less than or equal to 10000"),
+        ({"control_hz": 0.1, "seconds": 1}, "`seconds`: 1 s are less than two ticks at `control_hz` 0.1"),
+        ({"cycles": 5}, "`cycles` is none of the options"),
         ({"control_hz": 1e-300}, "`control_hz`"),
-        ({"requests": {"transports": "http"}}, "`transports` is for a control loop"),
-        ({"live": True, "requests": {"transports": "nothing"}}, "nothing"),
-        ({"live": True, "requests": {"engine": {"name": "llama"}}}, "echo or replay"),
-        ({"live": True, "export_delays": "delays.txt"}, "`export_delays`: delays.txt should be"),
-        ({"live": True, "export_delays": "d.csv", "requests": {"transports": "http,ros"}}, "one `transport` at a time"),
+        ({"requests": {"transports": "nothing"}}, "nothing"),
+        ({"requests": {"engine": {"name": "llama"}}}, "echo or replay"),
+        ({"export_delays": "delays.txt"}, "`export_delays`: delays.txt should be"),
+        ({"export_delays": "d.csv", "requests": {"transports": "http,ros"}}, "one `transport` at a time"),
     ],
 )
 def test_what_makes_no_sense_is_refused(options: dict[str, object], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        ChunksConfig(**options)
+        ChunksLive(**options)
 
 
 def test_without_websockets_packages_it_goes_over_http() -> None:
     program = """
 import sys
 sys.modules["websockets"] = None
-from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
-print(*ChunksConfig(live=True).live_requests.transports)
+from s2a_bench.plugins.chunks.chunks.config import ChunksLive
+print(*ChunksLive().requests.transports)
 """
     program_run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert program_run.stdout.split() == ["http/binary"]
@@ -344,10 +339,8 @@ print(*ChunksConfig(live=True).live_requests.transports)
 def test_a_policy_server_of_somebody_elses_moves_the_loop(tmp_path: Path) -> None:
     requests = {"transports": "websocket", "size": "64x48", "state": 3, "warmup": 1}
     with policy_server() as url:
-        config = ChunksConfig(
-            live=True, seconds=2, horizon=10, modes="queue?trigger=4,sync", requests={**requests, "url": url}
-        )
-        run = read_run(run_chunks(config, tmp_path, NullProgress()))
+        config = ChunksLive(seconds=2, horizon=10, modes="queue?trigger=4,sync", requests={**requests, "url": url})
+        run = read_run(run_live(config, tmp_path, NullProgress()))
     table = run.table(CHUNKS)
     assert table["agreement"].notna().all()
     assert (table["latency_s"] >= 0.05).all()

@@ -14,11 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
-from s2a_bench.plugins.chunks.chunks.build_rows import reactions_s
+from s2a_bench.plugins.chunks.chunks.build_rows import mean_age, reactions_s, trigger_rows
 from s2a_bench.plugins.chunks.chunks.cells import cells, draw
-from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
+from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, METRICS, REQUESTS, TICKS
-from s2a_bench.plugins.chunks.chunks.run import mean_age, run_chunks, trigger_rows
+from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.plugins.chunks.chunks.view import chunk_sentences, show
 from s2a_bench.plugins.chunks.modes import ControlSetting, mode
 from s2a_bench.plugins.chunks.modes.closed import Closed, closed, mean_reaction_s
@@ -30,7 +30,7 @@ LATENCIES = "40,lognormal:mean_ms=80,cv=.5"
 
 
 def ran(folder: Path, **options: Any) -> StoredRun:
-    return read_run(run_chunks(ChunksConfig(**options), folder, NullProgress()))
+    return read_run(run_virtual(ChunksVirtual(**options), folder, NullProgress()))
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +100,7 @@ def test_blended_actions_are_older_than_the_newest_observation_in_them(tmp_path:
 
 
 def test_rules_choose_between_the_mean_that_stalls_and_the_maximum_that_is_old(run: StoredRun) -> None:
-    found = {rule: row(run, "queue", "lognormal:mean_ms=80,cv=.5", rule) for rule in ChunksConfig().rules}
+    found = {rule: row(run, "queue", "lognormal:mean_ms=80,cv=.5", rule) for rule in ChunksVirtual().rules}
     assert found["mean"]["p_stall_cycle"] > 0.2
     assert found["calibrated"]["p_stall_cycle"] <= 0.015
     assert found["tracked"]["p_stall_cycle"] <= 0.015
@@ -142,14 +142,14 @@ def test_a_mode_has_the_same_row_whatever_else_is_tried(tmp_path: Path) -> None:
 def test_a_recording_is_played_in_order_and_its_first_half_is_what_rules_learn_from(tmp_path: Path) -> None:
     file = tmp_path / "delays.csv"
     file.write_text("latency_ms\n" + "".join(f"{20 + place % 40}\n" for place in range(400)))
-    config = ChunksConfig(latency=str(file), epsilon=0.05)
+    config = ChunksVirtual(latency=str(file), epsilon=0.05)
     (source,) = config.sources
-    drawn = draw(config, source)
+    drawn = draw(source, config.cycles, config.learnt, config.seed)
     assert (drawn.learnt.size, drawn.judged.size) == (200, 200)
     assert drawn.judged[:3].tolist() == [20_000_000, 21_000_000, 22_000_000]
-    assert {cell.rule for cell in cells(config, drawn)} == {"given", *config.rules}
-    without = ChunksConfig(latency=str(file), rules="", cycles=150)
-    assert draw(without, without.sources[0]).judged.size == 150
+    assert {cell.rule for cell in cells(config.control, config.rules_plan, drawn)} == {"given", *config.rules}
+    without = ChunksVirtual(latency=str(file), rules="", cycles=150)
+    assert draw(without.sources[0], without.cycles, without.learnt, 0).judged.size == 150
 
 
 @pytest.mark.parametrize(
@@ -201,9 +201,10 @@ def test_a_short_recording_has_no_rule_that_promises(tmp_path: Path) -> None:
     others = "maximum,mean,oracle"
     assert {*run.table(CHUNKS)["rule"]} == {"given", *others.split(",")}
     with pytest.raises(UsageError, match=re.escape(f"{few}; raise `epsilon`, or take `rules` {others}")):
-        ChunksConfig(latency=str(file), rules="tracked")
+        ChunksVirtual(latency=str(file), rules="tracked")
     for way_out in ({"epsilon": 0.04}, {"rules": others}):
-        assert ChunksConfig(latency=str(file), **way_out).learnt(ChunksConfig(latency=str(file)).sources[0]) == 25
+        config = ChunksVirtual(latency=str(file), **way_out)
+        assert config.sources[0].learnable(config.learnt) == 25
 
 
 def test_a_mode_that_never_acts_has_no_numbers_instead_of_wrong_ones(tmp_path: Path) -> None:
@@ -222,13 +223,13 @@ def test_a_mode_that_never_acts_has_no_numbers_instead_of_wrong_ones(tmp_path: P
 )
 def test_what_makes_no_sense_is_refused_by_its_field(options: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError) as error:
-        ChunksConfig(**options)
+        ChunksVirtual(**options)
     assert message in str(error.value)
 
 
 def test_what_would_not_fit_into_memory_is_refused_before_a_folder_is_made(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"`cycles`: 1000000 chunks @ 3\.6e6 make"):
-        run_chunks(ChunksConfig(latency="3.6e6", cycles=1_000_000, rules=""), tmp_path / "none", NullProgress())
+        run_virtual(ChunksVirtual(latency="3.6e6", cycles=1_000_000, rules=""), tmp_path / "none", NullProgress())
     assert not (tmp_path / "none").exists()
 
 
@@ -307,10 +308,10 @@ def test_the_mean_age_of_cycles_is_that_of_ticks(written: str) -> None:
 
 
 def test_a_greater_trigger_stalls_less_and_acts_on_older_observations() -> None:
-    config = ChunksConfig(cycles=3000)
-    found = list(trigger_rows(config, draw(config, config.sources[0])))
+    config = ChunksVirtual(cycles=3000)
+    drawn = draw(config.sources[0], config.cycles, 0, 0)
+    found = list(trigger_rows(mode("queue"), config.setting, drawn))
     assert [row.trigger for row in found] == list(range(16))
     assert (np.diff([row.p_stall_cycle for row in found]) <= 0).all()
     assert (np.diff([row.age_ticks_mean for row in found]) > 0).all()
     assert all(row.p_stall_closed in {None, row.p_stall_cycle} for row in found)
-    assert not list(trigger_rows(ChunksConfig(modes="sync"), draw(config, config.sources[0])))

@@ -11,7 +11,7 @@ from scipy.special import gammainc
 
 from s2a_bench.act import Motion
 from s2a_bench.errors import UsageError
-from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
+from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, METRICS
 from s2a_bench.plugins.chunks.chunks.smooth import (
     RATE,
@@ -19,7 +19,6 @@ from s2a_bench.plugins.chunks.chunks.smooth import (
     TrackingPlant,
     draw_target,
     executed,
-    follower,
     smoothness,
 )
 from s2a_bench.plugins.chunks.modes import ControlSetting, Ticks, mode
@@ -182,7 +181,8 @@ class TestRuns:
         assert run.table(MEANS)["tracking_rms"].isna().all()
 
     def test_no_target_waits_for_actions_that_are_slowed_down(self, tmp_path: Path) -> None:
-        assert follower(ChunksConfig(slow_down=2)) is None
+        slowed = ran(tmp_path / "slowed", slow_down=2, cycles=50).table(CHUNKS)
+        assert slowed[NAMES].isna().all().all()
         run = ran(tmp_path, latency="400", modes="queue", rules="calibrated", slowest=4.0, cycles=100)
         table = run.table(CHUNKS).set_index("rule")
         assert table.loc["given", NAMES].notna().all()
@@ -198,7 +198,7 @@ class TestRuns:
     )
     def test_a_robot_that_cannot_be_is_refused(self, robot: str, message: str) -> None:
         with pytest.raises(UsageError) as error:
-            ChunksConfig(robot=robot)
+            ChunksVirtual(robot=robot)
         assert message in str(error.value)
 
 

@@ -9,8 +9,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from s2a_bench.plugins.chunks.chunks import EXPERIMENT
-from s2a_bench.plugins.chunks.chunks.config import ChunksConfig
-from s2a_bench.plugins.chunks.chunks.run import run_chunks
+from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
+from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.plugins.chunks.chunks.view import chunk_sentences, page_lanes, show
 from s2a_bench.plugins.chunks.chunks.view.figures import (
     COLOURS,
@@ -29,8 +29,8 @@ from s2a_bench.writers.style import paper_column
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
-    config = ChunksConfig(latency="60,lognormal:mean_ms=80,cv=.5", cycles=1500)
-    return read_run(run_chunks(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
+    config = ChunksVirtual(latency="60,lognormal:mean_ms=80,cv=.5", cycles=1500)
+    return read_run(run_virtual(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
 
 
 def drawn(run: StoredRun, build: object) -> Figure:
@@ -72,12 +72,12 @@ def test_csv_has_every_row_with_its_provenance(run: StoredRun) -> None:
 
 
 def test_lanes_show_the_modes_and_the_calibrated_trigger(run: StoredRun) -> None:
-    assert [(lane.name, lane.rule) for lane in lanes_of(run)[:5]] == [
-        ("sync", "given"),
-        ("queue?trigger=6", "given"),
-        ("replace", "given"),
-        ("aggregate?trigger=6", "given"),
-        ("queue", "calibrated"),
+    assert [lane.title for lane in lanes_of(run)[:5]] == [
+        "sync",
+        "queue?trigger=6",
+        "replace",
+        "aggregate?trigger=6",
+        "queue, calibrated",
     ]
     axes = drawn(run, build_lanes).axes[0]
     (ages,) = axes.child_axes
@@ -118,23 +118,25 @@ def test_smoothness_stands_beside_the_ideal(run: StoredRun) -> None:
 
 def test_what_a_run_has_no_rows_for_is_not_drawn(run: StoredRun, tmp_path: Path) -> None:
     assert list(EXPERIMENT.show(run).figures) == ["lanes", "stability", "triggers", "reactions", "smoothness"]
-    config = ChunksConfig(modes="sync", cycles=20, shown_ticks=0, robot="")
-    run = read_run(run_chunks(config, tmp_path, NullProgress()))
+    config = ChunksVirtual(modes="sync", cycles=20, shown_ticks=0, robot="")
+    run = read_run(run_virtual(config, tmp_path, NullProgress()))
     assert list(EXPERIMENT.show(run).figures) == ["stability", "reactions"]
     assert "smoothness" not in EXPERIMENT.show(run).tables
 
 
 @pytest.mark.parametrize("modes", ["sync", "sync,replace"])
 def test_few_lanes_have_room_for_their_labels(tmp_path: Path, modes: str) -> None:
-    few = read_run(run_chunks(ChunksConfig(latency="60", modes=modes, rules="", cycles=100), tmp_path, NullProgress()))
+    few = read_run(
+        run_virtual(ChunksVirtual(latency="60", modes=modes, rules="", cycles=100), tmp_path, NullProgress())
+    )
     assert len(lanes_of(few)) == modes.count(",") + 1
     drawn(few, build_lanes).savefig(tmp_path / "lanes.png")  # a warning where they have none
 
 
 @pytest.fixture(scope="module")
 def lanes_run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
-    config = ChunksConfig(modes="sync,replace?execute=8", latency="60,100", cycles=100, shown_ticks=60)
-    return read_run(run_chunks(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
+    config = ChunksVirtual(modes="sync,replace?execute=8", latency="60,100", cycles=100, shown_ticks=60)
+    return read_run(run_virtual(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
 
 
 def test_a_panel_is_a_source_and_a_bar_a_chunk_or_a_stall(lanes_run: StoredRun) -> None:

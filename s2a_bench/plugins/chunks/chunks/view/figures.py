@@ -41,16 +41,11 @@ _BULK: Final = 0.9975
 class CellTicks:
     """The first ticks of one cell, and their requests."""
 
-    name: str
-    rule: str
+    title: str
     source: str
     ticks: pd.DataFrame
     requests: pd.DataFrame
     period_s: float
-
-    @property
-    def title(self) -> str:
-        return self.name if self.rule == "given" else f"{self.name}, {self.rule}"
 
 
 def lanes_of(run: StoredRun) -> list[CellTicks]:
@@ -63,7 +58,7 @@ def lanes_of(run: StoredRun) -> list[CellTicks]:
         mine = ticks[ticks["cell"] == row["cell"]]
         if len(mine) and _drawn(row):
             sent = requests[requests["cell"] == row["cell"]]
-            found.append(CellTicks(row["mode"], row["rule"], row["latency"], mine, sent, row["delta_t_s"]))
+            found.append(CellTicks(_line_name(row), row["latency"], mine, sent, row["delta_t_s"]))
     return found[:MOST_LANES]
 
 

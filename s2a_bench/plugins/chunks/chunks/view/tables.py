@@ -109,17 +109,18 @@ def chunk_tables(run: StoredRun) -> Tables:
 
 def delay_table(run: StoredRun) -> TextTable:
     """Return the table of the delays of each source; in a live run, of each mode with the d that it assumes."""
+    of_modes = live(run)
+    left = ("mode",) if of_modes else ("latency", "requests")
     names = ["delay_ticks_mean", "delay_ticks_p99", "delay_ticks_max"]
-    names += ["delay_assumed_ticks", "p_delay_above"] if live(run) else []
+    names += ["delay_assumed_ticks", "p_delay_above"] if of_modes else []
     rows, cells = [], []
-    for place, (name, group) in enumerate(sources_of(rows_of(run)), 1):
-        for one in group if live(run) else group[:1]:
+    for place, (_, group) in enumerate(sources_of(rows_of(run)), 1):
+        for one in group if of_modes else group[:1]:
             latency = (number(one[column] * 1e3) for column in ("latency_s", "latency_s_p99"))
+            about = (str(one[column]) for column in left)
             cells.append(one["cell"])
-            left = (one["mode"],) if live(run) else (name, str(one["requests"]))
-            rows.append((str(place), *left, *latency, *(_cell(one, name) for name in names)))
-    names_left = ("L", "mode") if live(run) else ("L", "latency", "requests")
-    header = (*names_left, "ms", "p99", *(_TITLES[name] for name in names))
+            rows.append((str(place), *about, *latency, *(_cell(one, name) for name in names)))
+    header = ("L", *left, "ms", "p99", *(_TITLES[name] for name in names))
     title = f"Delays, d = {run.manifest['configuration']['rounding']} of L over Delta t"
     notes = (_convention(run), "L and d of streamed: to the first action.")
     return TextTable(title, header, rows, 2, notes=notes, cells=tuple(cells))
