@@ -109,7 +109,7 @@ class OneOf:
         if mode is None:
             raise UsageError(f"{' and '.join(f'`{flag}`' for flag in sorted(picking))} exclude each other")
         names = [flag.key for flag in self.flags() if given.get(flag.key) is not None]
-        self.experiment.refuse_foreign(mode, names)
+        self.experiment.refuse_foreign(mode, names, lambda options: {flag.key for flag in flags_of(options)})
         return build(mode.options, given)
 
 

@@ -17,7 +17,7 @@ packages offer experiments as entry points of the group ``s2a_bench.experiments`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -236,12 +236,12 @@ class Experiment:
     def every_mode(self) -> tuple[RunMode, ...]:
         return (RunMode(self.mode, self.config, self.run), *self.modes)
 
-    def refuse_foreign(self, mode: RunMode, names: Iterable[str]) -> None:
-        """Raise UsageError for the name of an option that ``mode`` lacks and another mode has."""
-        from s2a_bench.options import places
-
+    def refuse_foreign(
+        self, mode: RunMode, names: Iterable[str], known: Callable[[type[Options]], Container[str]]
+    ) -> None:
+        """Raise UsageError for a name that ``mode`` lacks and another mode has; ``known`` returns a class's names."""
         for name in names:
-            owners = [each for each in self.every_mode if name in places(each.options)]
+            owners = [each for each in self.every_mode if name in known(each.options)]
             if owners and mode not in owners:
                 missing = [f"give `{flag}`" for flag in owners[0].flags if flag not in mode.flags]
                 spare = [f"leave out `{flag}`" for flag in mode.flags if flag not in owners[0].flags]

@@ -33,7 +33,7 @@ class Requests(Options):
     PANEL: ClassVar[str] = "Requests"
 
     url: str = option("", "a server")
-    hidden_url: str = option("", "no flag of this command")
+    plans: str = option("", "no flag of this command")
 
 
 class Live(Shared):
