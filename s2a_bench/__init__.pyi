@@ -3,7 +3,7 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal, TypeAlias, TypedDict, TypeVar
+from typing import Literal, TypeAlias, TypedDict, TypeVar, overload
 
 from typing_extensions import Unpack
 
@@ -23,7 +23,7 @@ class _Run(TypedDict, total=False):
     progress: Progress | None
     tune: bool
 
-class _CapacityChunksLatencyThroughput(TypedDict, total=False):
+class _Shared1(TypedDict, total=False):
     action: str
     actions_per_chunk: int
     api_key_env: str
@@ -33,19 +33,20 @@ class _CapacityChunksLatencyThroughput(TypedDict, total=False):
     deadline: float
     deadline_s: float
     device: str
+    dialect: str
     domain_id: int | None
+    engine: str
     extra_body: str
-    gaps: str
     layout: Literal["auto", "n1.7", "n1.6", "n1.5"]
     llama_server: str | Path | None
     max_frame_age: float
     middleware: str
     namespace: str
+    nonce: str
     payload: _Several[str]
     policy_type: str
     port: int
     pretrained: str
-    prompt: str
     qos: Literal["reliable", "sensor_data"]
     resize: str | tuple[int, int] | None
     result_timeout: float
@@ -53,22 +54,53 @@ class _CapacityChunksLatencyThroughput(TypedDict, total=False):
     sample_resources: float
     sample_resources_hz: float
     served_model: str
+    size: str | tuple[int, int]
     socket: str
     state: int
     template: str
-    transport: _Several[str]
-    transports: _Several[str]
-
-class _CapacityChunksLatencyThroughputTimeline(TypedDict, total=False):
-    dialect: str
-    nonce: str
-    size: str | tuple[int, int]
-    source: str
     timeout: float
     timeout_s: float
+    transport: _Several[str]
+    transports: _Several[str]
     url: str
     wait_for_server: float
     warmup: int
+
+class _Shared2(TypedDict, total=False):
+    closed_loop: bool
+    episodes: float
+    episodes_s: float
+    limit: str
+    looks: int
+    plan_every: float | None
+    plan_every_s: float | None
+    robots: str | int
+    settle: float | None
+    settle_s: float | None
+
+class _Shared3(TypedDict, total=False):
+    follower: str
+    front_gap: float
+    front_gap_m: float
+    gap: Literal["stop", "coast", "hold", "cruise"]
+    gap_behaviour: Literal["stop", "coast", "hold", "cruise"]
+    lane_change: bool
+    lead_decel: float
+    lead_decel_mps2: float
+    plan_decel: float | None
+    plan_decel_mps2: float | None
+    reaction: float
+    reaction_s: float
+    rear_gap: float
+    rear_gap_m: float
+    reflex: bool
+    simulator: str
+    skills: int
+    speed: float
+    speed_kmh: float
+    t_nom: float | None
+    t_nom_s: float | None
+    tokens_per_skill: int
 
 class _Boundary(_Run, total=False):
     jitter: str
@@ -85,70 +117,54 @@ class _Boundary(_Run, total=False):
     t_nom_s: float
     tokens_per_skill: _Several[int]
 
-class _Capacity(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
+class _CapacityMeasured(_Run, _Shared1, _Shared2, total=False):
     action_dim: int
-    batch: str | Path | None
     chat_template: str
-    closed_loop: bool
     context: int
     control_hz: float
-    engine: str
-    episodes: float
-    episodes_s: float
     flash_attention: str
+    gaps: str
     gpu_layers: int
     horizon: int
     kv_type: str
     latency: str | float
-    limit: str
-    looks: int
     max_tokens: int
     mmproj: str | Path | None
     model: str | Path | None
     modes: _Several[str]
     pace: float | None
-    plan_every: float | None
-    plan_every_s: float | None
-    predict: str
     processes: int
     profile: str
+    prompt: str
     ray: str
-    robots: str | int
     rounding: Literal["floor", "ceil"]
     sampling: str
     seconds: float
     seed: int
-    servers: int
-    settle: float | None
-    settle_s: float | None
+    source: str
     think: float
     think_s: float
     threads: int
 
-class _Ccrb(_Run, total=False):
-    chat_template: str
-    closed_loop: bool
-    ego: str
-    engine: str
-    follower: str
-    front_gap: float
-    front_gap_m: float
-    gap: Literal["stop", "coast", "hold", "cruise"]
-    gap_behaviour: Literal["stop", "coast", "hold", "cruise"]
-    lane_change: bool
-    lead_decel: float
-    lead_decel_mps2: float
-    live: bool
-    mmproj: str | Path | None
-    model: str | Path | None
+class _CapacityPredicted(_Run, _Shared2, total=False):
+    batch: str | Path | None
+    control_hz: float
+    horizon: int
+    modes: _Several[str]
+    predict: str
+    rounding: Literal["floor", "ceil"]
+    seconds: float
+    seed: int
+    servers: int
+    think: float
+    think_s: float
+
+class _CcrbComputed(_Run, _Shared3, total=False):
     n_skills: int
-    pace: float | None
     phase: bool
     phase_gaps: _Several[float]
     phase_gaps_m: _Several[float]
     phase_rates: _Several[float]
-    plan_decel: float | None
-    plan_decel_mps2: float | None
     policies: _Several[str]
     policy: _Several[str]
     profile: str
@@ -156,39 +172,82 @@ class _Ccrb(_Run, total=False):
     prompt_time: float | None
     random: int
     rate: float | None
-    reaction: float
-    reaction_s: float
-    rear_gap: float
-    rear_gap_m: float
-    record: str | Path | None
-    reflex: bool
     seed: int
-    simulator: str
-    skills: int
-    speed: float
-    speed_kmh: float
-    t_nom: float | None
-    t_nom_s: float | None
-    threads: int
-    tokens_per_skill: int
-    transport: str
     ttc: bool
 
-class _Chunks(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
-    action_dim: int
+class _CcrbLive(_Run, _Shared1, _Shared3, total=False):
+    chat_template: str
+    gpu_layers: int
+    mmproj: str | Path | None
+    model: str | Path | None
+    n_skills: int
+    pace: float | None
+    policies: _Several[str]
+    policy: _Several[str]
+    profile: str
+    record: str | Path | None
+    seed: int
+    threads: int
+    ttc: bool
+
+class _CcrbClosedLoop(_Run, _Shared3, total=False):
+    n_skills: int
+    policies: _Several[str]
+    policy: _Several[str]
+    profile: str
+    prompt_s: float | None
+    prompt_time: float | None
+    rate: float | None
+    seed: int
+
+class _CcrbLiveLoop(_Run, _Shared1, _Shared3, total=False):
+    chat_template: str
+    ego: str
+    gpu_layers: int
+    mmproj: str | Path | None
+    model: str | Path | None
+    n_skills: int
+    pace: float | None
+    policies: _Several[str]
+    policy: _Several[str]
+    profile: str
+    record: str | Path | None
+    seed: int
+    threads: int
+
+class _ChunksVirtual(_Run, total=False):
     calibration_cycles: int
     control_hz: float
     cycles: int | None
-    engine: str
     eps: float
     epsilon: float
     export_delays: str | Path | None
     guarantee: Literal["high-confidence", "expected"]
     horizon: int
     latency: _Several[str | float]
-    live: bool
+    modes: _Several[str]
+    robot: str
+    rounding: Literal["floor", "ceil"]
+    rules: _Several[str]
+    seed: int
+    shown_ticks: int
+    slow_down: float
+    slowest: float
+    tokens_per_action: int
+
+class _ChunksLive(_Run, _Shared1, total=False):
+    action_dim: int
+    control_hz: float
+    eps: float
+    epsilon: float
+    export_delays: str | Path | None
+    gaps: str
+    guarantee: Literal["high-confidence", "expected"]
+    horizon: int
+    latency: str | float
     modes: _Several[str]
     profile: str
+    prompt: str
     robot: str
     rounding: Literal["floor", "ceil"]
     rules: _Several[str]
@@ -197,17 +256,17 @@ class _Chunks(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThro
     shown_ticks: int
     slow_down: float
     slowest: float
-    tokens_per_action: int
+    source: str
 
-class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
+class _Latency(_Run, _Shared1, total=False):
     action_dim: int
     answer: Literal["auto", "tokens", "actions"]
     chat_template: str
     clock: str
     context: int
-    engine: str
     flash_attention: str
     fps: float
+    gaps: str
     gpu_layers: int
     grammar: str
     horizon: int
@@ -219,22 +278,24 @@ class _Latency(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThr
     mode: Literal["request", "stream"]
     model: str | Path | None
     profile: str
+    prompt: str
     quick: bool
     record: str | Path | None
     requests: int
     seed: int
+    source: str
     think: float
     think_s: float
     threads: int
 
-class _Throughput(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatencyThroughputTimeline, total=False):
+class _Throughput(_Run, _Shared1, total=False):
     batch: int
     chat_template: str
     clock: str
     context: int
-    engine: str
     flash_attention: str
     fps: float
+    gaps: str
     gpu_layers: int
     grammar: str
     kv_type: str
@@ -245,29 +306,23 @@ class _Throughput(_Run, _CapacityChunksLatencyThroughput, _CapacityChunksLatency
     mode: Literal["request", "stream"]
     model: str | Path | None
     profile: str
+    prompt: str
     quick: bool
     record: str | Path | None
     reference: str | Path | None
     requests: int
     sampling: str
     seed: int
+    source: str
     threads: int
 
-class _Timeline(_Run, _CapacityChunksLatencyThroughputTimeline, total=False):
+class _TimelineComputed(_Run, total=False):
     calibrate: str | Path | None
     calibration_plans: int
-    chat_template: str
-    engine: str
     epsilon: float
-    gpu_layers: int
     guarantee: Literal["high-confidence", "expected"]
     jitter: str
-    live: bool
-    mmproj: str | Path | None
-    model: str | Path | None
     n_skills: _Several[int]
-    no_grammar: bool
-    pace: float | None
     plans: int | None
     policies: _Several[str]
     policy: _Several[str]
@@ -277,32 +332,94 @@ class _Timeline(_Run, _CapacityChunksLatencyThroughputTimeline, total=False):
     prompt_time: float | None
     rate: _Several[float]
     rates: _Several[float]
-    real_time: bool
-    requests: int
-    robot: str
     seed: int
-    skills: str
     t_max: float
     t_min: float
     t_nom: _Several[float]
     t_nom_cv: float
     t_nom_s: _Several[float]
+    tokens_per_skill: _Several[int]
+    track: bool
+
+class _TimelineRealTime(_Run, total=False):
+    calibrate: str | Path | None
+    calibration_plans: int
+    epsilon: float
+    guarantee: Literal["high-confidence", "expected"]
+    jitter: str
+    n_skills: _Several[int]
+    plans: int | None
+    policies: _Several[str]
+    policy: _Several[str]
+    profile: _Several[str]
+    profiles: _Several[str]
+    prompt_s: float | None
+    prompt_time: float | None
+    rate: _Several[float]
+    rates: _Several[float]
+    seed: int
+    t_max: float
+    t_min: float
+    t_nom: _Several[float]
+    t_nom_cv: float
+    t_nom_s: _Several[float]
+    tokens_per_skill: _Several[int]
+    track: bool
+
+class _TimelineLive(_Run, _Shared1, total=False):
+    chat_template: str
+    epsilon: float
+    gpu_layers: int
+    mmproj: str | Path | None
+    model: str | Path | None
+    n_skills: _Several[int]
+    no_grammar: bool
+    pace: float | None
+    policies: _Several[str]
+    policy: _Several[str]
+    profile: str
+    requests: int
+    robot: str
+    seed: int
+    skills: str
+    source: str
+    t_max: float
+    t_min: float
+    t_nom: _Several[float]
+    t_nom_s: _Several[float]
     task: str
     threads: int
     tokens_per_skill: _Several[int]
     track: bool
-    transport: str
 
 def boundary(**options: Unpack[_Boundary]) -> Run:
     """Show at which rates and granularities naive execution never stalls: by formula, and by trying every point."""
 
-def capacity(**options: Unpack[_Capacity]) -> Run:
+@overload
+def capacity(*, mode: Literal["measured"] = ..., **options: Unpack[_CapacityMeasured]) -> Run:
+    """Find how many robots one server carries, each with its control clock: measured, or predicted."""
+@overload
+def capacity(*, mode: Literal["predicted"], **options: Unpack[_CapacityPredicted]) -> Run:
     """Find how many robots one server carries, each with its control clock: measured, or predicted."""
 
-def ccrb(**options: Unpack[_Ccrb]) -> Run:
+@overload
+def ccrb(*, mode: Literal["computed"] = ..., **options: Unpack[_CcrbComputed]) -> Run:
+    """Drive car-to-car rear braking with a car behind, under each policy: who hits whom, and when."""
+@overload
+def ccrb(*, mode: Literal["live"], **options: Unpack[_CcrbLive]) -> Run:
+    """Drive car-to-car rear braking with a car behind, under each policy: who hits whom, and when."""
+@overload
+def ccrb(*, mode: Literal["closed-loop"], **options: Unpack[_CcrbClosedLoop]) -> Run:
+    """Drive car-to-car rear braking with a car behind, under each policy: who hits whom, and when."""
+@overload
+def ccrb(*, mode: Literal["live-loop"], **options: Unpack[_CcrbLiveLoop]) -> Run:
     """Drive car-to-car rear braking with a car behind, under each policy: who hits whom, and when."""
 
-def chunks(**options: Unpack[_Chunks]) -> Run:
+@overload
+def chunks(*, mode: Literal["virtual"] = ..., **options: Unpack[_ChunksVirtual]) -> Run:
+    """Act on chunks of actions, computed or live: how often each mode and trigger stalls, on how old a picture."""
+@overload
+def chunks(*, mode: Literal["live"], **options: Unpack[_ChunksLive]) -> Run:
     """Act on chunks of actions, computed or live: how often each mode and trigger stalls, on how old a picture."""
 
 def latency(**options: Unpack[_Latency]) -> Run:
@@ -311,5 +428,12 @@ def latency(**options: Unpack[_Latency]) -> Run:
 def throughput(**options: Unpack[_Throughput]) -> Run:
     """Measure tokens a second: prefill, time to first token, every gap between tokens, decode rate by position."""
 
-def timeline(**options: Unpack[_Timeline]) -> Run:
+@overload
+def timeline(*, mode: Literal["computed"] = ..., **options: Unpack[_TimelineComputed]) -> Run:
+    """Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live."""
+@overload
+def timeline(*, mode: Literal["real-time"], **options: Unpack[_TimelineRealTime]) -> Run:
+    """Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live."""
+@overload
+def timeline(*, mode: Literal["live"], **options: Unpack[_TimelineLive]) -> Run:
     """Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live."""
