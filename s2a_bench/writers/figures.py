@@ -21,7 +21,9 @@ from s2a_bench.writers.tables import markdown_text, number, required
 
 if TYPE_CHECKING:
     import numpy as np
+    import pandas as pd
     from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
@@ -86,6 +88,13 @@ def logarithmic(axes: Axes, spread: float) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if spread < WIDE_SPREAD**2 else (1,)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _place: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def shade_plane(axes: Axes, points: pd.DataFrame, x: str, y: str, value: str, **style: Any) -> QuadMesh:
+    """Shade the plane of two columns by a third, a rectangle around each point."""
+    table = points.pivot_table(index=y, columns=x, values=value)
+    xs, ys, values = (each.to_numpy(dtype="float64") for each in (table.columns, table.index, table))
+    return axes.pcolormesh(xs, ys, values, shading="nearest", rasterized=True, **style)
 
 
 @dataclass(frozen=True, slots=True)
