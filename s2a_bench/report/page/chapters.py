@@ -132,9 +132,8 @@ def _sweep(sweep: Sweep, against: str) -> Iterator[Chapter]:
 
 def _named(chapter: Chapter, place: int, chapters: Sequence[Chapter]) -> Chapter:
     """Append a number to the second and later of equal names."""
-    same = [other for other in chapters if other.name == chapter.name]
     number = sum(other.name == chapter.name for other in chapters[: place + 1])
-    return chapter if len(same) == 1 or number == 1 else replace(chapter, name=f"{chapter.name}-{number}")
+    return chapter if number == 1 else replace(chapter, name=f"{chapter.name}-{number}")
 
 
 def content_of(run: StoredRun, against: str) -> Shown:
