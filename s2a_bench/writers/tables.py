@@ -114,6 +114,12 @@ def entries(values: NDArray[np.float64], *statistics: str) -> list[str]:
     return [mean_sd(found) if name == MEAN_SD else number(getattr(found, name)) for name in statistics]
 
 
+def median_mean(values: NDArray[np.float64]) -> str:
+    """Format the median, and mean ± standard deviation in brackets."""
+    median, mean = entries(values, "median", MEAN_SD)
+    return f"{median} ({mean})" if values.size else ABSENT
+
+
 def ends_entries(ends: tuple[NDArray[np.float64], NDArray[np.float64]], *statistics: str) -> list[str]:
     """Format statistics of both ends of intervals."""
     return [f"[{lo}, {hi}]" for lo, hi in zip(*(entries(values, *statistics) for values in ends), strict=True)]

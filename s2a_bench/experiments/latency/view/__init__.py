@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.experiments import Shown, Tables
+from s2a_bench.experiments import Shown
 from s2a_bench.experiments.latency.metrics import AROUND, METRICS, latency_csv, latency_json
 from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.requests import (
@@ -33,7 +33,7 @@ from s2a_bench.experiments.requests import (
 from s2a_bench.stats import summary_of
 from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport
-from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, ends_entries, entries, interval, number
+from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, ends_entries, entries, interval, median_mean, number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -48,9 +48,18 @@ _MOST = 6
 
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
+    modelled = any(cell.values_ms("e2e_without_model").size for cell in cells_of(run))
     return Shown.build(
         sentences=lambda: _latency_sentences(run),
-        tables=latency_tables(run),
+        tables={
+            "stages": lambda: stage_table(run),
+            "summary": lambda: summary_table(run),
+            "summary-e2e": lambda: summary_table(run, "e2e"),
+            "summary-model": lambda: summary_table(run, "e2e_without_model") if modelled else None,
+            "tokens": lambda: _token_table(run),
+            "frames": lambda: _frame_table(run),
+            "facts": lambda: fact_table(run),
+        },
         main=["stages", "summary", "summary-model"],
         csvs=lambda: latency_csv(run),
         figures=lambda: latency_figures(run, against),
@@ -233,8 +242,7 @@ def _statistics(cell: RequestCell, metric: RequestMetric) -> list[str]:
 def _entry(values: Floats, ends: Ends | None = None, *, full: bool = False) -> str:
     if ends and ends.lo.size:
         return ends_entries(ends, "median")[0]
-    (middle,) = entries(values, "median")
-    return f"{middle} ({entries(values, MEAN_SD)[0]})" if full and values.size else middle
+    return median_mean(values) if full else entries(values, "median")[0]
 
 
 def _notes(run: StoredRun, cells: list[RequestCell]) -> tuple[str, ...]:
@@ -293,16 +301,3 @@ def _frame_entry(frames: pd.DataFrame, column: str) -> str:
     none = frames["path_ns"].iloc[:0]
     exact, lo, hi = (numbers_ms(frames.get(f"{column}{end}_ns", none)) for end in ("", "_lo", "_hi"))
     return _entry(exact, Ends(lo, hi))
-
-
-def latency_tables(run: StoredRun) -> Tables:
-    modelled = any(cell.values_ms("e2e_without_model").size for cell in cells_of(run))
-    return {
-        "stages": lambda: stage_table(run),
-        "summary": lambda: summary_table(run),
-        "summary-e2e": lambda: summary_table(run, "e2e"),
-        "summary-model": lambda: summary_table(run, "e2e_without_model") if modelled else None,
-        "tokens": lambda: _token_table(run),
-        "frames": lambda: _frame_table(run),
-        "facts": lambda: fact_table(run),
-    }
