@@ -6,7 +6,7 @@ Measured cells stay separate runs, since machines and moments differ.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -72,8 +72,13 @@ def cell_table(sweep: Sweep) -> TextTable:
 
 def measured_table(settings: Sequence[Mapping[str, Any]], runs: Split) -> TextTable | None:
     """Make a table of the numbers of latency and throughput cells; None if there are none."""
-    pairs = zip(settings, runs, strict=True)
-    rows = [row for each, (run, cells) in pairs for row in _measured(settings_text(each), run, cells)]
+    rows: list[tuple[str, ...]] = []
+    for setting, (run, cells) in zip(settings, runs, strict=True):
+        for cell in cells:
+            what, values = _quantity(cell, run)
+            numbers = entries(values, MEAN_SD, "median", "p99")
+            host = str(run.manifest.get("host", ""))
+            rows.append((settings_text(setting), cell.name, what, host, str(cell.n), str(cell.errors), *numbers))
     if not rows:
         return None
     header = ("settings", "cell", "what", "host", "n", "errors", "mean ± sd", "median", "p99")
@@ -124,16 +129,6 @@ def _joined(sweep: Sweep, runs: Sequence[StoredRun]) -> StoredRun:
     cells = {name: origin for run in runs for name, origin in run.origins.cells.items()}
     manifest["provenance"] = Origins(runs[0].origins.run, cells).to_manifest()
     return StoredRun(sweep.path, manifest, tables)
-
-
-def _measured(setting: str, run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[str, ...]]:
-    if run.samples.empty:
-        return
-    for cell in cells:
-        what, values = _quantity(cell, run)
-        numbers = entries(values, MEAN_SD, "median", "p99")
-        host = str(run.manifest.get("host", ""))
-        yield setting, cell.name, what, host, str(cell.n), str(cell.errors), *numbers
 
 
 def _quantity(cell: RequestCell, run: StoredRun) -> tuple[str, Floats]:
