@@ -15,7 +15,7 @@ from functools import cached_property
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
-from s2a_bench.experiments import Comparable, Metric, Subject, by_name
+from s2a_bench.experiments import Comparable, Metric, Rows, Subject, by_name
 from s2a_bench.facts import (
     END_N,
     FIRST_DECODE_MS,
@@ -49,13 +49,11 @@ if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
 
-    from s2a_bench.experiments import Rows
     from s2a_bench.store.run import StoredRun
 
-    Floats: TypeAlias = NDArray[np.float64]
-    Of: TypeAlias = Callable[["RequestCell"], pd.Series[Any]]
-    Split: TypeAlias = Sequence[tuple[StoredRun, list["RequestCell"]]]
-
+Floats: TypeAlias = "NDArray[np.float64]"
+Of: TypeAlias = "Callable[[RequestCell], pd.Series[Any]]"
+Split: TypeAlias = "Sequence[tuple[StoredRun, list[RequestCell]]]"
 RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
 """What cells are compared by: columns of the samples without their unit."""
 ABOUT = ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from s2a_bench.stats import summary_of
+from s2a_bench.stats import Ratio, Summary, summary_of
 from s2a_bench.text import one_line, visible
 
 if TYPE_CHECKING:
@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rich.console import RenderableType
     from typing_extensions import Self
-
-    from s2a_bench.stats import Ratio, Summary
 
 ABSENT = "\N{EN DASH}"
 """The entry of an absent stage or ratio."""

@@ -11,6 +11,7 @@ from s2a_bench.experiments import Shown
 from s2a_bench.experiments.references import bars_of
 from s2a_bench.experiments.requests import (
     OF_ANSWERS,
+    RequestCell,
     caption_for,
     engine_notes,
     failure_notes,
@@ -39,7 +40,6 @@ from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, entries, interv
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.requests import RequestCell
     from s2a_bench.store.run import StoredRun
 
 _REFERENCE_FILL: Final = "#FFFFFF"

@@ -9,11 +9,11 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 from s2a_bench.experiments import Shown, Tables
 from s2a_bench.experiments.latency.view import against_bytes
-from s2a_bench.experiments.requests import RequestCell, metric_phrase, split, stand_ins
+from s2a_bench.experiments.requests import RequestCell, Split, metric_phrase, split, stand_ins
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.policy import Floats
 from s2a_bench.provenance import Origins
@@ -23,9 +23,6 @@ from s2a_bench.store.sweep import Sweep
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import marked
 from s2a_bench.writers.tables import MEAN_SD, TextTable, entries
-
-if TYPE_CHECKING:
-    from s2a_bench.experiments.requests import Split
 
 Runs = Sequence[tuple[dict[str, Any], StoredRun]]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from s2a_bench.experiments import TIME, Shown, requests
+from s2a_bench.experiments import TIME, Metric, Shown, requests
 from s2a_bench.experiments.ccrb.rows import IMPACTS, LOOP, MARGINS, METRICS, MOTION, TIMES, RolloutRow
 from s2a_bench.experiments.ccrb.view.figures import ccrb_figures
 from s2a_bench.experiments.ccrb.view.outcomes import (
@@ -31,7 +31,6 @@ from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, entries, n
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from s2a_bench.experiments import Metric
     from s2a_bench.store.run import StoredRun
 
 

@@ -12,7 +12,9 @@ from s2a_bench.experiments.latency.metrics import AROUND, METRICS, latency_csv, 
 from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.requests import (
     Ends,
+    Floats,
     RequestCell,
+    RequestMetric,
     action_shape,
     answer_kind,
     cells_of,
@@ -30,7 +32,7 @@ from s2a_bench.experiments.requests import (
     stages_present,
     titles,
 )
-from s2a_bench.stats import summary_of
+from s2a_bench.stats import Ratio, summary_of
 from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport
 from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, ends_entries, entries, interval, median_mean, number
@@ -38,8 +40,6 @@ from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, ends_entries, e
 if TYPE_CHECKING:
     import pandas as pd
 
-    from s2a_bench.experiments.requests import Floats, RequestMetric
-    from s2a_bench.stats import Ratio
     from s2a_bench.store.run import StoredRun
 
 _STAGE_CELLS = 5

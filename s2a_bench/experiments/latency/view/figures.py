@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.references import bars_of
 from s2a_bench.experiments.requests import (
+    Floats,
     RequestCell,
     action_shape,
     caption_for,
@@ -36,7 +37,6 @@ from s2a_bench.writers.tables import number
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.requests import Floats
     from s2a_bench.store.run import StoredRun
 
 
