@@ -7,6 +7,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Shown
+from s2a_bench.experiments.requests import span_of
 from s2a_bench.experiments.timeline.rows import METRICS, TimelineMetric
 from s2a_bench.experiments.timeline.view.cells import (
     Timelines,
@@ -52,8 +53,7 @@ def _timeline_sentences(cells: Sequence[Timelines]) -> list[str]:
     for cell in cells:
         by_policy.setdefault(cell.policy, []).append(cell)
     settings = len({cell.setting for cell in cells})
-    counts = sorted({cell.n for cell in cells})
-    plans = f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} plan{'s' * (counts[-1] != 1)}"
+    plans = span_of((cell.n for cell in cells), "plan")
     sentences = [f"{settings} setting{'s' * (settings != 1)} of board and granularity, {plans} a policy in each."]
     return sentences + [_policy_sentence(policy, mine) for policy, mine in by_policy.items()]
 
