@@ -267,12 +267,12 @@ def _delay_ends(cell: RequestCell) -> Ends:
     return Ends(lo, hi)
 
 
-def _fact(name: Fact) -> Of:
-    return lambda cell: cell.fact(name)
-
-
 def in_ms(name: str, title: str = "", about: str = "", of: Of | None = None, **more: Any) -> RequestMetric:
     return RequestMetric(name, "ms", title=title, about=about, of=of, **more)
+
+
+def _of_fact(fact: Fact, title: str, about: str) -> RequestMetric:
+    return in_ms(str(fact), title, about, lambda cell: cell.fact(fact))
 
 
 def _rate(name: str, unit: str, title: str, about: str, of: Of) -> RequestMetric:
@@ -291,27 +291,19 @@ ANSWER_METRICS: Final = (
         decode_rate,
     ),
     in_ms("ttft_ms", "TTFT", "From the prompt: e2e without capture."),
-    in_ms("prompt_ms", "all", "Picture and prompt in the engine, up to the first token's logits.", _fact(PROMPT_MS)),
-    in_ms(
-        *("preprocess_ms", "preprocess"),
-        "The part of prompt_ms before the model: template, slicing, resizing, tokenising.",
-        _fact(PREPROCESS_MS),
+    _of_fact(PROMPT_MS, "all", "Picture and prompt in the engine, up to the first token's logits."),
+    _of_fact(
+        PREPROCESS_MS, "preprocess", "The part of prompt_ms before the model: template, slicing, resizing, tokenising."
     ),
-    in_ms(
-        *("vision_encode_ms", "vision encode"),
-        "The vision tower's part of prompt_ms, over all slices.",
-        _fact(VISION_ENCODE_MS),
-    ),
+    _of_fact(VISION_ENCODE_MS, "vision encode", "The vision tower's part of prompt_ms, over all slices."),
     in_ms(
         *("image_ms", ""),
         "The part of prompt_ms outside the language model: slicing, vision tower, tokenising.",
         lambda cell: cell.fact(PROMPT_MS) - cell.fact(PROMPT_EVAL_MS),
     ),
-    in_ms("prompt_eval_ms", "prefill", "The language model's part of prompt_ms.", _fact(PROMPT_EVAL_MS)),
-    in_ms(
-        *("first_decode_ms", "1st decode"),
-        "The first token to the second in the engine: the first step after the prompt.",
-        _fact(FIRST_DECODE_MS),
+    _of_fact(PROMPT_EVAL_MS, "prefill", "The language model's part of prompt_ms."),
+    _of_fact(
+        FIRST_DECODE_MS, "1st decode", "The first token to the second in the engine: the first step after the prompt."
     ),
     RequestMetric(
         *("prompt_tokens", "tokens", "neither", "tokens"),
@@ -560,18 +552,15 @@ def cell_json(
 ) -> dict[str, Any]:
     """Return one cell as JSON; a metric that no sample has is absent, and so is an unknown ``dummy``."""
     origin = run.origins.of(cell.name)
-    described: dict[str, Any] = {
-        "cell": cell.name,
-        **cell.about,
-        "observation": observation_of(run, [cell]),
-        "answer": answer_kind(run),
-        "profile": origin.profile or None,
-        "dummy": {"real": False, "dummy": True, NONE: not declared_engine(origin.engine).plays}.get(origin.weights),
-        **{name: getattr(cell, name) for name in ("emulated", "n", "errors", "warmups")},
-    }
     return present(
         cls(
-            **described,
+            cell=cell.name,
+            **cell.about,
+            observation=observation_of(run, [cell]),
+            answer=answer_kind(run),
+            profile=origin.profile or None,
+            dummy={"real": False, "dummy": True, NONE: not declared_engine(origin.engine).plays}.get(origin.weights),
+            **{name: getattr(cell, name) for name in ("emulated", "n", "errors", "warmups")},
             **fields,
             **summaries((each.key, cell.values(each)) for each in metrics),
             **summaries_of_ends((each.key, cell.ends(each)) for each in metrics),
