@@ -32,7 +32,7 @@ from s2a_bench.facts import (
 from s2a_bench.inference import declared_engine
 from s2a_bench.machine.resources import ENERGY_J
 from s2a_bench.provenance import NONE, NOT_SENT, UNKNOWN
-from s2a_bench.stats import Ratio, Summary, SummaryEnds, summary_of
+from s2a_bench.stats import Floats, Ratio, Summary, SummaryEnds, summary_of
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import ONE_WAY
 from s2a_bench.store.schema import Count, about, with_fields
@@ -45,13 +45,10 @@ from s2a_bench.writers.json import summaries, summaries_of_ends
 from s2a_bench.writers.tables import DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
-    from numpy.typing import NDArray
 
     from s2a_bench.store.run import StoredRun
 
-Floats: TypeAlias = "NDArray[np.float64]"
 Of: TypeAlias = "Callable[[RequestCell], pd.Series[Any]]"
 Split: TypeAlias = "Sequence[tuple[StoredRun, list[RequestCell]]]"
 RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from s2a_bench.experiments.requests import (
     ANSWER_METRICS,
     TOKEN_METRICS,
-    Floats,
     RequestCell,
     by_launch,
     cell_class,
@@ -19,7 +18,7 @@ from s2a_bench.experiments.requests import (
     ratio_table,
     summarised,
 )
-from s2a_bench.stats import Ratio, Summary, summarise
+from s2a_bench.stats import Floats, Ratio, Summary, summarise
 from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import Count, Table, about

@@ -13,7 +13,6 @@ from s2a_bench.experiments.latency.metrics import AROUND, METRICS, latency_csv, 
 from s2a_bench.experiments.references import bars_of
 from s2a_bench.experiments.requests import (
     Ends,
-    Floats,
     RequestCell,
     RequestMetric,
     action_shape,
@@ -34,7 +33,7 @@ from s2a_bench.experiments.requests import (
     stages_present,
     titles,
 )
-from s2a_bench.stats import Ratio, summary_of
+from s2a_bench.stats import Floats, Ratio, summary_of
 from s2a_bench.trace import RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport
 from s2a_bench.transport.surroundings import shown
