@@ -68,7 +68,12 @@ def read_chapters(paths: Sequence[Path], *, against: str = "") -> list[Chapter]:
             found += _sweep(read_sweep(path), against)
         else:
             found.append(_chapter(run, title_of(run.manifest), against))
-    return [_named(chapter, place, found) for place, chapter in enumerate(found)]
+    names = [chapter.name for chapter in found]
+    numbers = [names[:place].count(name) + 1 for place, name in enumerate(names)]
+    return [
+        replace(chapter, name=f"{chapter.name}-{number}") if number > 1 else chapter
+        for chapter, number in zip(found, numbers, strict=True)
+    ]
 
 
 def title_of(manifest: Mapping[str, Any]) -> str:
@@ -105,11 +110,10 @@ def differences_of(chapters: Sequence[Chapter]) -> list[str]:
 
 def _chapter(run: StoredRun, title: str, against: str, command: str = "") -> Chapter:
     """Make the chapter of a run; an unfinished one may lack the rows of its tables."""
-    manifest = run.manifest
-    caveats = list(_unfinished(manifest))
     with fits(run):
         content = content_of(run, against)
-    return Chapter(_slug(run.path.name), title, run, content, command or repeat_command(manifest), caveats)
+    caveats = list(_unfinished(run.manifest))
+    return Chapter(_slug(run.path.name), title, run, content, command or repeat_command(run.manifest), caveats)
 
 
 def _slug(name: str) -> str:
@@ -146,12 +150,6 @@ def _sweep(sweep: Sweep, against: str) -> Iterator[Chapter]:
         yield _chapter(run, what, against, command=command)
     for settings, run in single[:MOST_CHAPTERS]:
         yield _chapter(run, f"{run.manifest['command']}: {settings_text(settings)}", against)
-
-
-def _named(chapter: Chapter, place: int, chapters: Sequence[Chapter]) -> Chapter:
-    """Append a number to the second and later of equal names."""
-    number = sum(other.name == chapter.name for other in chapters[: place + 1])
-    return chapter if number == 1 else replace(chapter, name=f"{chapter.name}-{number}")
 
 
 def content_of(run: StoredRun, against: str) -> Shown:

@@ -303,13 +303,8 @@ def _frame_table(run: StoredRun) -> TextTable | None:
     rows += [("", name, *(_frame_entry(frames, column) for frames in used)) for column, name in _FRAME_FOOT.items()]
     ages = ((cell.values_ms("frame_age"), cell.ends("frame_age")) for cell in cells)
     rows.append(("", "age when inference starts", *(_entry(*age) for age in ages)))
-    return TextTable(
-        "Frame path in ms: medians over the frames that a prompt was about",
-        ("group", "stage", *titles(cells)),
-        rows,
-        2,
-        frozenset({rule + 1}),
-    )
+    title = "Frame path in ms: medians over the frames that a prompt was about"
+    return TextTable(title, ("group", "stage", *titles(cells)), rows, 2, frozenset({rule + 1}))
 
 
 def _frame_entry(frames: pd.DataFrame, column: str) -> str:
