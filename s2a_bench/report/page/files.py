@@ -234,12 +234,10 @@ def _view(chapter: Chapter) -> dict[str, Any]:
 
 
 def _facts(facts: Any, prefix: str = "") -> list[tuple[str, str]]:
-    if isinstance(facts, dict):
-        return [
-            line for name, value in facts.items() for line in _facts(value, f"{prefix}.{name}" if prefix else str(name))
-        ]
     if isinstance(facts, list) and any(isinstance(each, dict) for each in facts):
-        return [line for place, value in enumerate(facts) for line in _facts(value, f"{prefix}.{place}")]
+        facts = dict(enumerate(facts))
+    if isinstance(facts, dict):
+        return [line for name, value in facts.items() for line in _facts(value, f"{prefix}.{name}".removeprefix("."))]
     if facts is None or facts in ("", []):
         return []
     text = ", ".join(map(str, facts)) if isinstance(facts, list) else str(facts)
