@@ -34,36 +34,24 @@ COMMANDS: Final[Registry[tuple[str, str]]] = Registry("commands", "command", {})
 """Commands of installed packages, declared as in `Commands.lazy`: declarations import nothing."""
 
 
+_OURS: Final = {
+    "compare": ("report:compare", "Compare run B with run A: effect sizes with intervals, one test, gates for CI."),
+    "doctor": ("doctor:doctor", "Check this machine: a line for each finding, warnings with their fix."),
+    "model": ("model:app", "Fetch, make and inspect model files."),
+    "profile": ("profile:app", "Measure this machine as a hardware profile, and show profiles."),
+    "report": ("report:report", "Make one page of runs, and their tables and figures for a paper. Measures nothing."),
+    "serve": ("serve:serve", "Serve a model until interrupted: over HTTP, ROS 2 or another transport."),
+    "sweep": ("sweep:sweep", "Run a command for every cell of a grid; an interrupted sweep can be resumed."),
+}
+
+
 class TopCommands(Commands):
     """All commands: those listed below, the experiments, and those of other packages with a name of their own."""
 
     experiments = EXPERIMENTS
     lazy: ClassVar[Mapping[str, tuple[str, str]]] = {
         name: offered for name, offered in COMMANDS.loaded() if name not in EXPERIMENTS
-    } | {
-        name: (f"s2a_bench.cli.{where}", about)
-        for name, where, about in (
-            (
-                "compare",
-                "report:compare",
-                "Compare run B with run A: effect sizes with intervals, one test, gates for CI.",
-            ),
-            ("doctor", "doctor:doctor", "Check this machine: a line for each finding, warnings with their fix."),
-            ("model", "model:app", "Fetch, make and inspect model files."),
-            ("profile", "profile:app", "Measure this machine as a hardware profile, and show profiles."),
-            (
-                "report",
-                "report:report",
-                "Make one page of runs, and their tables and figures for a paper. Measures nothing.",
-            ),
-            (
-                "serve",
-                "serve:serve",
-                "Serve a model until interrupted: over HTTP, ROS 2 or another transport.",
-            ),
-            ("sweep", "sweep:sweep", "Run a command for every cell of a grid; an interrupted sweep can be resumed."),
-        )
-    }
+    } | {name: (f"s2a_bench.cli.{where}", about) for name, (where, about) in _OURS.items()}
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find a command; raises UsageError for that of a package that does not load."""
@@ -116,11 +104,9 @@ def main() -> None:
             code = app(args=folded(sys.argv[1:]), prog_name=app.info.name, standalone_mode=False)
         if code == INTERRUPTED:  # newer typer turns Ctrl-C into this code itself
             print_error("interrupted")
-    except NotPermitted as error:
-        _enter_user_namespace()
-        print_error(f"error: {with_flags(str(error))}")
-        code = error.exit_code
     except S2AError as error:
+        if isinstance(error, NotPermitted):
+            _enter_user_namespace()
         print_error(f"error: {with_flags(str(error))}")
         code = error.exit_code
     except ParseError as error:

@@ -2,13 +2,40 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import typer
 
 from s2a_bench.cli.adapter import command
 from s2a_bench.cli.output import Json, print_error, print_failures, print_json, print_line, print_table
-from s2a_bench.errors import TRIPPED, UNDECIDED
-from s2a_bench.report.compare import CompareConfig
+from s2a_bench.errors import TRIPPED, UNDECIDED, UsageError
+from s2a_bench.options import Options, listed, option
 from s2a_bench.report.page import ReportConfig
+
+
+class CompareConfig(Options):
+    """Two sides, each a run folder or repeated launches with commas between them."""
+
+    baseline: str = option(..., "run folder; repeated launches with commas", flag="a", argument=True)
+    other: str = option(..., "compared with A: one folder, or several as above", flag="b", argument=True)
+    metric: list[str] = option(
+        [], "METRIC or METRIC.STATISTIC (median, mean, p90, p99), with commas; or all [default: a few]"
+    )
+    fail_if: list[str] = option(
+        [], "gate, e.g. e2e.median>5%, tokens_per_s<-5%, ros/topic:e2e.p99>10%; may be repeated"
+    )
+    strict: bool = option(False, "gates trip on any change beyond the limit, significant or not")
+    one_launch: bool = option(
+        False, "gates also judge fewer than 3 launches a side: they trip on differences between launches"
+    )
+    min_effect: float = option(5.0, "the smallest relevant change, in per cent", ge=0)
+    unlike: bool = option(False, "also compare runs of different machines, models or settings")
+    output: Path | None = option(None, "folder for table, figure and JSON")
+
+    def check(self) -> None:
+        for name in ("strict", "one_launch"):
+            if getattr(self, name) and not self.fail_if:
+                raise UsageError(f"`{name}`: there is no gate; add `fail_if`")
 
 
 def _compare(config: CompareConfig, *, json_: Json = False) -> None:
@@ -17,7 +44,7 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
     conditions = [gates.read_gate(text) for text in config.fail_if]
     sides = comparison.read_side(config.baseline, "A"), comparison.read_side(config.other, "B")
     compared = comparison.open_comparison(*sides, unlike=config.unlike, least=config.min_effect / 100)
-    wanted = comparison.metrics_of(compared, config.metrics)
+    wanted = comparison.metrics_of(compared, [name for text in config.metric for name in listed(text)])
     compared = comparison.compare(compared, [*wanted, *gates.concerned(compared, conditions)])
     judgements = gates.judge(compared, conditions, strict=config.strict, one_launch=config.one_launch)
     found = comparison.warnings_of(compared)

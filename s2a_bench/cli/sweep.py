@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from pkgutil import resolve_name
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -22,9 +21,10 @@ from s2a_bench.machine.environment import collect
 from s2a_bench.secrets import struck
 from s2a_bench.store.run import RunWriter
 from s2a_bench.store.sweep import CELLS, Sweep, read_sweep
-from s2a_bench.sweep import WORKERS, CellWorkers, SweepCell, SweepCommand, SweepConfig
+from s2a_bench.sweep import CellWorkers, SweepCell, SweepCommand, SweepConfig
 from s2a_bench.sweep.file import read_sweep_file
 from s2a_bench.sweep.json import plan_json, sweep_json
+from s2a_bench.sweep.perform import LocalWorkers
 from s2a_bench.sweep.plan import SweepPlan, plan_sweep
 from s2a_bench.sweep.run import SweepRun, check_resume, only_one, pending, start_sweep
 from s2a_bench.text import none_of, visible
@@ -48,9 +48,12 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
     if missing:
         raise MissingExtra(_lacking(source, missing))
     with RunProgress("cells") as progress, ExitStack() as stack:
-        workers: CellWorkers = resolve_name(WORKERS["ray" if config.ray else "local"])(
-            ENTRY, config.ray, plan, config.width
-        )
+        if config.ray:
+            from s2a_bench.sweep.on_ray import RayWorkers
+
+            workers: CellWorkers = RayWorkers(ENTRY, config.ray, plan, config.width)
+        else:
+            workers = LocalWorkers(ENTRY, config.width)
         if resume is None:
             writer = start_sweep(plan, source, config.output, boards)
             stack.enter_context(only_one(writer.path))

@@ -15,7 +15,7 @@ from functools import cached_property
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
-from s2a_bench.experiments import Comparable, Metric, Subject, by_name
+from s2a_bench.experiments import Comparable, Metric, Rows, Subject, by_name
 from s2a_bench.facts import (
     END_N,
     FIRST_DECODE_MS,
@@ -32,7 +32,7 @@ from s2a_bench.facts import (
 from s2a_bench.inference import declared_engine
 from s2a_bench.machine.resources import ENERGY_J
 from s2a_bench.provenance import NONE, NOT_SENT, UNKNOWN
-from s2a_bench.stats import Ratio, Summary, SummaryEnds, summary_of
+from s2a_bench.stats import Floats, Ratio, Summary, SummaryEnds, summary_of
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import ONE_WAY
 from s2a_bench.store.schema import Count, about, with_fields
@@ -45,17 +45,12 @@ from s2a_bench.writers.json import summaries, summaries_of_ends
 from s2a_bench.writers.tables import DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
-    from numpy.typing import NDArray
 
-    from s2a_bench.experiments import Rows
     from s2a_bench.store.run import StoredRun
 
-    Floats: TypeAlias = NDArray[np.float64]
-    Of: TypeAlias = Callable[["RequestCell"], pd.Series[Any]]
-    Split: TypeAlias = Sequence[tuple[StoredRun, list["RequestCell"]]]
-
+Of: TypeAlias = "Callable[[RequestCell], pd.Series[Any]]"
+Split: TypeAlias = "Sequence[tuple[StoredRun, list[RequestCell]]]"
 RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
 """What cells are compared by: columns of the samples without their unit."""
 ABOUT = ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")
@@ -269,12 +264,12 @@ def _delay_ends(cell: RequestCell) -> Ends:
     return Ends(lo, hi)
 
 
-def _fact(name: Fact) -> Of:
-    return lambda cell: cell.fact(name)
-
-
 def in_ms(name: str, title: str = "", about: str = "", of: Of | None = None, **more: Any) -> RequestMetric:
     return RequestMetric(name, "ms", title=title, about=about, of=of, **more)
+
+
+def _of_fact(fact: Fact, title: str, about: str) -> RequestMetric:
+    return in_ms(str(fact), title, about, lambda cell: cell.fact(fact))
 
 
 def _rate(name: str, unit: str, title: str, about: str, of: Of) -> RequestMetric:
@@ -293,27 +288,19 @@ ANSWER_METRICS: Final = (
         decode_rate,
     ),
     in_ms("ttft_ms", "TTFT", "From the prompt: e2e without capture."),
-    in_ms("prompt_ms", "all", "Picture and prompt in the engine, up to the first token's logits.", _fact(PROMPT_MS)),
-    in_ms(
-        *("preprocess_ms", "preprocess"),
-        "The part of prompt_ms before the model: template, slicing, resizing, tokenising.",
-        _fact(PREPROCESS_MS),
+    _of_fact(PROMPT_MS, "all", "Picture and prompt in the engine, up to the first token's logits."),
+    _of_fact(
+        PREPROCESS_MS, "preprocess", "The part of prompt_ms before the model: template, slicing, resizing, tokenising."
     ),
-    in_ms(
-        *("vision_encode_ms", "vision encode"),
-        "The vision tower's part of prompt_ms, over all slices.",
-        _fact(VISION_ENCODE_MS),
-    ),
+    _of_fact(VISION_ENCODE_MS, "vision encode", "The vision tower's part of prompt_ms, over all slices."),
     in_ms(
         *("image_ms", ""),
         "The part of prompt_ms outside the language model: slicing, vision tower, tokenising.",
         lambda cell: cell.fact(PROMPT_MS) - cell.fact(PROMPT_EVAL_MS),
     ),
-    in_ms("prompt_eval_ms", "prefill", "The language model's part of prompt_ms.", _fact(PROMPT_EVAL_MS)),
-    in_ms(
-        *("first_decode_ms", "1st decode"),
-        "The first token to the second in the engine: the first step after the prompt.",
-        _fact(FIRST_DECODE_MS),
+    _of_fact(PROMPT_EVAL_MS, "prefill", "The language model's part of prompt_ms."),
+    _of_fact(
+        FIRST_DECODE_MS, "1st decode", "The first token to the second in the engine: the first step after the prompt."
     ),
     RequestMetric(
         *("prompt_tokens", "tokens", "neither", "tokens"),
@@ -561,18 +548,15 @@ def cell_json(
 ) -> dict[str, Any]:
     """Return one cell as JSON; a metric that no sample has is absent, and so is an unknown ``dummy``."""
     origin = run.origins.of(cell.name)
-    described: dict[str, Any] = {
-        "cell": cell.name,
-        **cell.about,
-        "observation": observation_of(run, [cell]),
-        "answer": answer_kind(run),
-        "profile": origin.profile or None,
-        "dummy": {"real": False, "dummy": True, NONE: not declared_engine(origin.engine).plays}.get(origin.weights),
-        **{name: getattr(cell, name) for name in ("emulated", "n", "errors", "warmups")},
-    }
     return present(
         cls(
-            **described,
+            cell=cell.name,
+            **cell.about,
+            observation=observation_of(run, [cell]),
+            answer=answer_kind(run),
+            profile=origin.profile or None,
+            dummy={"real": False, "dummy": True, NONE: not declared_engine(origin.engine).plays}.get(origin.weights),
+            **{name: getattr(cell, name) for name in ("emulated", "n", "errors", "warmups")},
             **fields,
             **summaries((each.key, cell.values(each)) for each in metrics),
             **summaries_of_ends((each.key, cell.ends(each)) for each in metrics),

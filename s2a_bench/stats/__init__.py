@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeAlias
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+Floats: TypeAlias = "NDArray[np.float64]"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +67,6 @@ def summarise(values: Iterable[float]) -> Summary:
     return Summary(array.size, float(median), float(array.mean()), sd, float(p90), float(p99))
 
 
-def summary_of(values: NDArray[np.float64]) -> Summary | None:
+def summary_of(values: Floats) -> Summary | None:
     """Summarise values; None for no values."""
     return summarise(values) if values.size else None

@@ -10,7 +10,8 @@ from typing import Final, TypeAlias, final
 import numpy as np
 from numpy.typing import NDArray
 
-Floats: TypeAlias = NDArray[np.float64]
+from s2a_bench.stats import Floats
+
 Rows: TypeAlias = Sequence[Floats]
 """The values of one launch in order of time: one array per request (its value, or the gaps of its tokens)."""
 

@@ -10,8 +10,8 @@ from typing import Final, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from s2a_bench.stats import Ratio
-from s2a_bench.stats.batches import FEWEST_ROWS, Floats, LaunchValues, RowCorrelation, Rows
+from s2a_bench.stats import Floats, Ratio
+from s2a_bench.stats.batches import FEWEST_ROWS, LaunchValues, RowCorrelation, Rows
 
 Middle: TypeAlias = Literal["median", "mean"]
 

@@ -18,18 +18,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, final
 
 from s2a_bench.errors import MissingExtra, StoreError
 from s2a_bench.provenance import Origins
+from s2a_bench.store import files
 from s2a_bench.store import manifest as manifests
-from s2a_bench.store.files import (
-    CsvFile,
-    count_rows,
-    read_csv,
-    read_parquet,
-    release,
-    reserve,
-    to_pandas,
-    why,
-    write_parquet,
-)
 from s2a_bench.store.requests import TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
 from s2a_bench.store.schema import PROVENANCE, SCHEMA, Row, Table
 
@@ -57,12 +47,12 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         self._rows = 0
         self._codes: dict[str, str] = {}
         try:
-            reserve(path)
+            files.reserve(path)
         except OSError as error:
-            release(path)
-            raise StoreError(f"cannot write into {path}: {why(error, path)}") from error
+            files.release(path)
+            raise StoreError(f"cannot write into {path}: {files.why(error, path)}") from error
         manifests.write(path, manifest)
-        self._files: dict[str, tuple[Table[Any], CsvFile]] = {}
+        self._files: dict[str, tuple[Table[Any], files.CsvFile]] = {}
         stages = manifest.get("stages", {})
         self._samples, self._frames = samples_table(stages), frames_table(stages)
 
@@ -84,7 +74,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         except (FileExistsError, NotADirectoryError) as error:
             raise StoreError(f"`output` {root}: {error.filename} is not a folder; name another one") from error
         except OSError as error:
-            raise StoreError(f"`output` {root}: cannot create a folder there: {why(error, root)}") from error
+            raise StoreError(f"`output` {root}: cannot create a folder there: {files.why(error, root)}") from error
         whole: dict[str, Any] = {
             "schema": SCHEMA,
             "command": command,
@@ -117,7 +107,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         for table in tables:
             (path / f"{table.name}.parquet").unlink(missing_ok=True)
             if (path / f"{table.name}.csv").exists():
-                run._files[table.name] = table, CsvFile(path / f"{table.name}.csv", table.columns, reopen=True)
+                run._files[table.name] = table, files.CsvFile(path / f"{table.name}.csv", table.columns, reopen=True)
         return run
 
     @property
@@ -128,7 +118,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
     def append(self, table: Table[Row], rows: Iterable[Row]) -> None:
         """Append rows to a table in one write; the first call creates the file."""
         if table.name not in self._files:
-            self._files[table.name] = table, CsvFile(self.path / f"{table.name}.csv", table.columns)
+            self._files[table.name] = table, files.CsvFile(self.path / f"{table.name}.csv", table.columns)
         kept = [*rows]
         self._files[table.name][1].append(table, kept, self._provenance)
         self._rows += len(kept)
@@ -158,7 +148,7 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         try:
             manifests.write(self.path, self._manifest)
         except StoreError:
-            if not release(self.path):
+            if not files.release(self.path):
                 raise
             manifests.write(self.path, self._manifest)
 
@@ -172,10 +162,10 @@ class RunWriter(AbstractContextManager["RunWriter"]):
         self._finished = True
         for _, file in self._files.values():
             file.close()
-        release(self.path)
+        files.release(self.path)
         try:
             for table, file in self._files.values():
-                write_parquet(self.path / f"{table.name}.parquet", read_csv(file.path, table.columns))
+                files.write_parquet(self.path / f"{table.name}.parquet", files.read_csv(file.path, table.columns))
         except MissingExtra:
             pass  # the CSV files are complete, and reading them raises it again
         except StoreError as full:
@@ -231,9 +221,10 @@ class StoredRun:
     def table(self, table: Table[Any]) -> pd.DataFrame:
         """Return a table with all its columns, empty if the run has none; raises StoreError for a damaged file."""
         if table.name not in self.tables:
-            parquet = self.path / f"{table.name}.parquet"  # of a run that has ended
-            read, path = (read_parquet, parquet) if parquet.exists() else (read_csv, parquet.with_suffix(".csv"))
-            self.tables[table.name] = to_pandas(read(path, table.columns))
+            csv = self.path / f"{table.name}.csv"
+            parquet = csv.with_suffix(".parquet")  # of a run that has ended
+            read, path = (files.read_parquet, parquet) if parquet.exists() else (files.read_csv, csv)
+            self.tables[table.name] = files.to_pandas(read(path, table.columns))
             self.tables[table.name].attrs[PROVENANCE] = self.origins.line
         return self.tables[table.name]
 
@@ -249,7 +240,7 @@ class StoredRun:
         counts = {name: len(table) for name, table in self.tables.items()}
         for file in sorted([*self.path.glob("*.parquet"), *self.path.glob("*.csv")]):
             if file.stem not in counts:
-                counts[file.stem] = count_rows(file)
+                counts[file.stem] = files.count_rows(file)
         return {name: count for name, count in counts.items() if count}
 
     @property

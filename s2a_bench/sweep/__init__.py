@@ -80,10 +80,6 @@ class CellWorkers(AbstractContextManager["CellWorkers"], Protocol):
         """Return the outcome of a finished future; the run folder of its cell is then below ``folder``."""
 
 
-WORKERS: dict[str, str] = {
-    "local": "s2a_bench.sweep.perform:LocalWorkers",
-    "ray": "s2a_bench.sweep.on_ray:RayWorkers",
-}
 COPY: Final = "sweep.toml"
 
 

@@ -71,7 +71,8 @@ class RayWorkers(CellWorkers):
 
 
 def _check(plan: SweepPlan, resources: Mapping[str, float]) -> None:
-    missing = [board for board in plan.boards if not resources.get(resource(board))]
+    boards = dict.fromkeys(cell.board for cell in plan.cells if cell.board)
+    missing = [board for board in boards if not resources.get(resource(board))]
     if missing:
         offered = ", ".join(name.partition(":")[2] for name in resources if name.startswith("board:"))
         raise UsageError(

@@ -22,7 +22,6 @@ from s2a_bench.machine.tuning import end_with_parent
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.manifest import utc_now
 from s2a_bench.sweep import CellWorkers, Outcome, SweepCell
-from s2a_bench.sweep.plan import SweepPlan
 
 
 def perform(cell: SweepCell, folder: Path, entry: str) -> Outcome:
@@ -86,7 +85,7 @@ def _outside(argv: list[str], log: Path) -> str:
 class LocalWorkers(CellWorkers):
     """Two pools of processes: a cell that crashes or exhausts memory does not end the sweep."""
 
-    def __init__(self, entry: str, _address: str, _plan: SweepPlan, jobs: int) -> None:
+    def __init__(self, entry: str, jobs: int) -> None:
         self.width = jobs
         self._entry = entry
         self._others = set(active_children())

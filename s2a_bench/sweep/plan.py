@@ -33,10 +33,6 @@ class SweepPlan:
         """Identify the sweep: a changed value, axis, order or profile changes the hash."""
         return _hash([self.command, self.rest_s, self.seed, [[*cell.key, cell.config_hash] for cell in self.cells]])
 
-    @property
-    def boards(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(cell.board for cell in self.cells if cell.board))
-
 
 def plan_sweep(file: SweepFile, command: SweepCommand, boards: Collection[str] | None = None) -> SweepPlan:
     """Make the cells for ``boards`` and those that need no board; None makes all.

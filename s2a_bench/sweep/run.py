@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fcntl
-import json
 import shutil
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -187,7 +186,7 @@ class SweepRun:
         kind = facts_of(outcome.machine, KIND)
         boards = self._writer.manifest["boards"]
         if cell.board not in boards:
-            self._writer.update(boards={cell.board: json.loads(json.dumps(kind))})
+            self._writer.update(boards={cell.board: kind})
         other = difference(kind, boards[cell.board])
         return f"{cell.board} is another machine than before: {other}" if other else ""
 

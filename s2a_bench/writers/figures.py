@@ -14,16 +14,17 @@ from typing import TYPE_CHECKING, Any
 
 from s2a_bench.errors import StoreError
 from s2a_bench.provenance import joined
+from s2a_bench.stats import Floats
 from s2a_bench.store.files import why
 from s2a_bench.text import one_line
 from s2a_bench.writers.style import GREY, WIDTH_IN, paper_column
 from s2a_bench.writers.tables import markdown_text, number, required
 
 if TYPE_CHECKING:
-    import numpy as np
+    import pandas as pd
     from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
     from s2a_bench.store.run import StoredRun
 
@@ -88,6 +89,13 @@ def logarithmic(axes: Axes, spread: float) -> None:
     axes.xaxis.set_minor_formatter(NullFormatter())
 
 
+def shade_plane(axes: Axes, points: pd.DataFrame, x: str, y: str, value: str, **style: Any) -> QuadMesh:
+    """Shade the plane of two columns by a third, a rectangle around each point."""
+    table = points.pivot_table(index=y, columns=x, values=value)
+    xs, ys, values = (each.to_numpy(dtype="float64") for each in (table.columns, table.index, table))
+    return axes.pcolormesh(xs, ys, values, shading="nearest", rasterized=True, **style)
+
+
 @dataclass(frozen=True, slots=True)
 class Bar:
     """One row of `build_bars`; ``whisker`` has both ends, None if they are unknown."""
@@ -99,7 +107,7 @@ class Bar:
     colour: str = GREY
 
     @classmethod
-    def of(cls, name: str, values: NDArray[np.float64], colour: str) -> Bar:
+    def of(cls, name: str, values: Floats, colour: str) -> Bar:
         import numpy as np
 
         low, median, high = np.percentile(values, (10, 50, 90)).tolist()
@@ -145,7 +153,7 @@ def build_bars(
 
 def build_distribution(
     caption: Iterable[str],
-    lines: Mapping[str, tuple[NDArray[np.float64], tuple[str, str]]],
+    lines: Mapping[str, tuple[Floats, tuple[str, str]]],
     of: str,
     label: str,
     columns: int = 2,

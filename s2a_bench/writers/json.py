@@ -4,20 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
-from s2a_bench.stats import Ratio, SummaryEnds, summarise, summary_of
+from s2a_bench.stats import Floats, Ratio, SummaryEnds, summarise, summary_of
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import SCHEMA, with_fields
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from s2a_bench.store.run import StoredRun
     from s2a_bench.store.sweep import Sweep
-
-    Ends: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +63,12 @@ def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
     return present(RatioJson(metric, of, to, ratio.value, ratio.ci95, ratio.launches, ratio.launch_sd))
 
 
-def summaries_of_ends(metrics: Iterable[tuple[str, Ends]]) -> dict[str, Any]:
+def summaries_of_ends(metrics: Iterable[tuple[str, tuple[Floats, Floats]]]) -> dict[str, Any]:
     """Summarise both ends of the metrics that are intervals."""
     return {name: asdict(SummaryEnds(*map(summarise, ends))) for name, ends in metrics if ends[0].size}
 
 
-def summaries(metrics: Iterable[tuple[str, NDArray[np.float64]]]) -> dict[str, Any]:
+def summaries(metrics: Iterable[tuple[str, Floats]]) -> dict[str, Any]:
     """Summarise the metrics that have values; ``n`` is smaller if only some samples have a stage."""
     found = ((name, summary_of(values)) for name, values in metrics)
     return {name: asdict(summary) for name, summary in found if summary}

@@ -7,16 +7,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from s2a_bench.stats import summary_of
+from s2a_bench.stats import Floats, Ratio, Summary, summary_of
 from s2a_bench.text import one_line, visible
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
     from rich.console import RenderableType
     from typing_extensions import Self
-
-    from s2a_bench.stats import Ratio, Summary
 
 ABSENT = "\N{EN DASH}"
 """The entry of an absent stage or ratio."""
@@ -106,7 +102,7 @@ def mean_sd(summary: Summary) -> str:
     return f"{summary.mean:.{places}f}" + ("" if summary.sd is None else f" ± {summary.sd:.{places}f}")
 
 
-def entries(values: NDArray[np.float64], *statistics: str) -> list[str]:
+def entries(values: Floats, *statistics: str) -> list[str]:
     """Format statistics of values, fields of `Summary` or `MEAN_SD`; `ABSENT` if there are no values."""
     found = summary_of(values)
     if found is None:
@@ -114,7 +110,13 @@ def entries(values: NDArray[np.float64], *statistics: str) -> list[str]:
     return [mean_sd(found) if name == MEAN_SD else number(getattr(found, name)) for name in statistics]
 
 
-def ends_entries(ends: tuple[NDArray[np.float64], NDArray[np.float64]], *statistics: str) -> list[str]:
+def median_mean(values: Floats) -> str:
+    """Format the median, and mean ± standard deviation in brackets."""
+    median, mean = entries(values, "median", MEAN_SD)
+    return f"{median} ({mean})" if values.size else ABSENT
+
+
+def ends_entries(ends: tuple[Floats, Floats], *statistics: str) -> list[str]:
     """Format statistics of both ends of intervals."""
     return [f"[{lo}, {hi}]" for lo, hi in zip(*(entries(values, *statistics) for values in ends), strict=True)]
 

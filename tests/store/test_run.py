@@ -254,7 +254,7 @@ def test_a_disk_without_room_for_the_reserve_ends_the_run_before_it_begins(
         (folder / RESERVE).touch()
         raise OSError(errno.EIO, "Input/output error")
 
-    monkeypatch.setattr("s2a_bench.store.run.reserve", full)
+    monkeypatch.setattr("s2a_bench.store.run.files.reserve", full)
     with pytest.raises(StoreError, match=f"cannot write into {tmp_path}: Input/output error"):
         RunWriter(tmp_path, {})
     assert not list(tmp_path.iterdir())
@@ -530,7 +530,7 @@ def test_a_run_whose_parquet_files_cannot_be_written_has_failed_of_what_went_wro
     def refuse(path: Path, _table: object) -> None:
         raise StoreError(f"cannot write {path}")
 
-    monkeypatch.setattr("s2a_bench.store.run.write_parquet", refuse)
+    monkeypatch.setattr("s2a_bench.store.run.files.write_parquet", refuse)
     run = RunWriter.create(tmp_path, "latency", {"stages": STAGES})
     message = str(first or f"cannot write {run.path / 'samples.parquet'}")
     with pytest.raises(type(first or StoreError("")), match=re.escape(message)), run:  # noqa: PT012 - the block is tested

@@ -13,7 +13,7 @@ from s2a_bench.experiments import Shown, plain_rows
 from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
 from s2a_bench.store.schema import PROVENANCE, Positive, about
 from s2a_bench.writers.csv_text import CsvTable
-from s2a_bench.writers.figures import new_figure, write_beside
+from s2a_bench.writers.figures import new_figure, shade_plane, write_beside
 from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, EMULATED, PAPERS, Note, TextTable, number
 
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.run import StoredRun
 
+_CSV = ("duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall")
 DURATIONS = ("t_nom", "t_min")
 _FREE, _BETWEEN, _STALLS = "#009E73", "#F0E442", "#D55E00"
 _SHADE: Final = 0.3
@@ -39,7 +40,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
         sentences=partial(_boundary_sentences, run),
         tables={"boundary": partial(line_table, run), "boards": partial(board_table, run)},
         main=["boards"],
-        csvs=partial(boundary_csv, run),
+        csvs=lambda: {"boundary.csv": CsvTable.of_frame(run.table(BOUNDARY)[[*_CSV, PROVENANCE]])},
         figures=lambda: {"boundary": partial(build_boundary, run)},
         json=lambda: frame(run, list(_cells(run)), []),
     )
@@ -109,11 +110,6 @@ def line_table(run: StoredRun) -> TextTable:
     return TextTable("Slowest rate without stalls under naive, in tokens/s", header, rows, 1)
 
 
-def boundary_csv(run: StoredRun) -> dict[str, CsvTable]:
-    names = ["duration", "duration_s", "tokens_per_skill", "tokens_per_s", "board", "stall_free", "plans", "p_stall"]
-    return {"boundary.csv": CsvTable.of_frame(run.table(BOUNDARY)[[*names, PROVENANCE]])}
-
-
 def _boundary_sentences(run: StoredRun) -> list[str]:
     points = len(run.table(BOUNDARY))
     sentences = [f"Naive execution was tried at {points} points of rate and tokens per skill."]
@@ -179,7 +175,8 @@ def build_boundary(run: StoredRun) -> Figure:
     lines = {name: float(grid_of(run, name)["duration_s"].iloc[0]) for name in ("t_nom", "t_min")}
     tokens = np.linspace(0.5, most + 0.5, 200)
     if is_random(run):
-        _shade_shares(figure, axes, run)
+        mesh = shade_plane(axes, nominal, "tokens_per_skill", "tokens_per_s", "p_stall", cmap="Oranges", vmin=0, vmax=1)
+        figure.colorbar(mesh, ax=axes, location="top", label="P(a plan stalls), naive at $T_\\mathrm{nom}$", pad=0.02)
     else:
         _shade_regions(axes, tokens, lines, low, high)
         _mark_trials(axes, run)
@@ -214,21 +211,6 @@ def _mark_trials(axes: Axes, run: StoredRun) -> None:
     free = points["p_stall"] == 0
     for chosen, (label, style) in zip((points[free], points[~free]), _TRIALS.items(), strict=True):
         axes.scatter(chosen["tokens_per_skill"], chosen["tokens_per_s"], 7, linewidths=0.5, label=label, **style)
-
-
-def _shade_shares(figure: Figure, axes: Axes, run: StoredRun) -> None:
-    table = grid_of(run, "t_nom").pivot_table(index="tokens_per_s", columns="tokens_per_skill", values="p_stall")
-    mesh = axes.pcolormesh(
-        table.columns.to_numpy(dtype="float64"),
-        table.index.to_numpy(dtype="float64"),
-        table.to_numpy(dtype="float64"),
-        cmap="Oranges",
-        vmin=0,
-        vmax=1,
-        shading="nearest",
-        rasterized=True,
-    )
-    figure.colorbar(mesh, ax=axes, location="top", label="P(a plan stalls), naive at $T_\\mathrm{nom}$", pad=0.02)
 
 
 def _mark_boards(axes: Axes, run: StoredRun) -> None:

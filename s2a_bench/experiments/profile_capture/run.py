@@ -23,7 +23,7 @@ from s2a_bench.frames import open_source
 from s2a_bench.frames.convert import bgr_to_rgb, to_bgr
 from s2a_bench.frames.stamp import Stamped
 from s2a_bench.harness.warnings import Counters, before_run
-from s2a_bench.inference import Engine, EngineConfig, need_engine
+from s2a_bench.inference import Engine, need_engine
 from s2a_bench.inference.models import resolve
 from s2a_bench.machine import environment
 from s2a_bench.machine.environment import board_facts
@@ -75,13 +75,6 @@ def answers(engine: Engine, config: CaptureConfig) -> Iterator[TimedAnswer]:
             yield TimedAnswer(times[0] - started, [after - before for before, after in pairwise(times)])
 
 
-def open_model(config: EngineConfig) -> Engine:
-    """Open llama.cpp on this thread: another thread would hand tokens over late, and several at once."""
-    from s2a_bench.inference.llama_cpp import LlamaCppEngine
-
-    return LlamaCppEngine(config)
-
-
 def capture(config: CaptureConfig, progress: Progress) -> dict[str, Any]:
     """Measure, and return the profile as the tables of its file; raises EngineError for short answers."""
     need_engine(config.engine)
@@ -89,9 +82,12 @@ def capture(config: CaptureConfig, progress: Progress) -> dict[str, Any]:
     progress.expect(config.warmup + config.requests)
     warnings = before_run()
     with ExitStack() as stack:
+        from s2a_bench.inference.llama_cpp import LlamaCppEngine
+
         model, mmproj = resolve(config.engine)
         progress.stage("loading the model")
-        engine = open_model(config.engine.but(model=model, mmproj=mmproj))
+        # on this thread: another one would hand tokens over late, and several at once
+        engine = LlamaCppEngine(config.engine.but(model=model, mmproj=mmproj))
         stack.callback(engine.close)
         before = Counters.read(watches_udp=False)
         timed = answers(engine, config)

@@ -18,7 +18,7 @@ from s2a_bench.experiments.requests import (
     ratio_table,
     summarised,
 )
-from s2a_bench.stats import Summary, summarise
+from s2a_bench.stats import Floats, Ratio, Summary, summarise
 from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import Count, Table, about
@@ -27,8 +27,6 @@ from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 from s2a_bench.writers.json import frame, ratio_entry
 
 if TYPE_CHECKING:
-    from s2a_bench.experiments.requests import Floats
-    from s2a_bench.stats import Ratio
     from s2a_bench.store.run import StoredRun
 
 

@@ -11,6 +11,7 @@ from s2a_bench.experiments import Shown
 from s2a_bench.experiments.references import bars_of
 from s2a_bench.experiments.requests import (
     OF_ANSWERS,
+    RequestCell,
     caption_for,
     engine_notes,
     failure_notes,
@@ -34,12 +35,11 @@ from s2a_bench.experiments.throughput.metrics import (
 from s2a_bench.stats import summary_of
 from s2a_bench.writers.figures import WHISKERS, Bar, build_bars, build_distribution, new_figure
 from s2a_bench.writers.style import cell_styles
-from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, entries, interval, mean_sd, number
+from s2a_bench.writers.tables import ABSENT, MEAN_SD, TextTable, entries, interval, mean_sd, median_mean, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.requests import Floats, RequestCell
     from s2a_bench.store.run import StoredRun
 
 _REFERENCE_FILL: Final = "#FFFFFF"
@@ -86,13 +86,13 @@ def speed_table(run: StoredRun) -> TextTable:
     rows: list[tuple[str, ...]] = [
         (
             *(cell.name, str(cell.n), str(cell.errors)),
-            *(_median_mean(cell.values(metric)) for metric in metrics),
+            *(median_mean(cell.values(metric)) for metric in metrics),
             *("1" if cell.name == base else interval(ratios.get((cell.name, base))) for base in bases),
         )
         for cell in cells
     ]
     if reference:
-        rates = (ABSENT, _median_mean(np.array(reference)), ABSENT)[: len(metrics)]
+        rates = (ABSENT, median_mean(np.array(reference)), ABSENT)[: len(metrics)]
         over = ("1" if base == LLAMA_BENCH else ABSENT for base in bases)
         rows.append((LLAMA_BENCH, str(len(reference)), "0", *rates, *over))
     return TextTable(
@@ -103,11 +103,6 @@ def speed_table(run: StoredRun) -> TextTable:
         frozenset({len(cells)}) if reference else frozenset(),
         (*_notes(run, cells, launches_note(ratios.values())), *failure_notes(cells, "requests")),
     )
-
-
-def _median_mean(values: Floats) -> str:
-    median, mean = entries(values, "median", MEAN_SD)
-    return f"{median} ({mean})" if values.size else median
 
 
 def _prompt_table(run: StoredRun) -> TextTable:

@@ -6,19 +6,16 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from s2a_bench.errors import UnlikeRuns, UsageError
-from s2a_bench.experiments import EXPERIMENTS, Comparable, Metric, Subject, by_name, experiment_of
+from s2a_bench.experiments import EXPERIMENTS, Comparable, Metric, Rows, Subject, by_name, experiment_of
 from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.compare.agreement import Difference, as_line, differences
 from s2a_bench.stats.batches import STATISTICS
 from s2a_bench.stats.change import Change, change_between, holm
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import StoredRun, fits, read_run
-
-if TYPE_CHECKING:
-    from s2a_bench.experiments import Rows
 
 LEVEL: Final = 0.05
 """The probability of any false difference, over all comparisons together."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments import Better
 from s2a_bench.report.compare.agreement import Difference
-from s2a_bench.report.compare.comparison import LEVEL, SAME, TOO_FEW, UNCLEAR
+from s2a_bench.report.compare.comparison import LEVEL, SAME, TOO_FEW, UNCLEAR, CellComparison, ComparedRuns
 from s2a_bench.stats.batches import BATCHES
 from s2a_bench.stats.change import POWER
 from s2a_bench.store.manifest import RunWarning, plain
@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.report.compare.comparison import CellComparison, ComparedRuns
     from s2a_bench.report.compare.gates import Judgement
 
 _HEADER = ("cell", "n", "A", "B", "change [95 %]", "P(B > A)", "p", "sees", "verdict")

@@ -9,20 +9,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from s2a_bench import __version__
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments import Shown
 from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.page import GENERATOR, ReportConfig
-from s2a_bench.report.page.chapters import Chapter, differences_of
-from s2a_bench.report.page.page import render
+from s2a_bench.report.page.chapters import Chapter, differences_of, when
 from s2a_bench.report.verdicts import Verdicts, judge
+from s2a_bench.store.manifest import utc_now
 from s2a_bench.store.run import fits
+from s2a_bench.store.sweep import is_sweep
 from s2a_bench.text import visible
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.latex import document, escape, to_siunitx
 from s2a_bench.writers.style import WIDTH_IN, paper_column
-from s2a_bench.writers.tables import markdown_text, to_markdown
+from s2a_bench.writers.tables import Note, markdown_text, to_markdown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -114,7 +116,7 @@ def write_report(report: Report, config: ReportConfig) -> list[Path]:
     texts: dict[Path, str | bytes] = {}
     if config.page:
         with fits(*(chapter.run for chapter in report.chapters)):
-            texts[config.page] = render(report.chapters, drawn, report.judged, report.caveats)
+            texts[config.page] = _page(report, drawn)
     if config.latex:
         texts |= {config.latex / name: text for name, text in _latex(report, drawn)}
     if config.csv:
@@ -173,3 +175,70 @@ def _markdown(report: Report) -> str:
         blocks.append(f"```sh\n{visible(chapter.command)}\n```")
         blocks += [to_markdown(table) for table in chapter.content.tables.values()]
     return "\n\n".join(filter(None, blocks)) + "\n"
+
+
+def _page(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> str:
+    """Return the page, one HTML file that fetches nothing; every text of a run is escaped."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    loader = PackageLoader("s2a_bench.report.page", "templates")
+    world = Environment(
+        loader=loader,
+        autoescape=True,
+        finalize=lambda value: visible(value) if type(value) is str else value,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    world.filters["parts"] = re.compile(r" (?=[(\[])").split  # a number, and its spread or interval
+    world.filters["short"] = lambda value: f"{value:.6g}"
+    return world.get_template("page.html").render(
+        generator=GENERATOR,
+        version=__version__,
+        made=utc_now().replace("T", " ").replace("+00:00", " UTC"),
+        style=loader.get_source(world, "page.css")[0],
+        script=loader.get_source(world, "page.js")[0],
+        title=title_of_page(report.chapters),
+        chapters=[(chapter, _view(chapter), drawn.get(chapter.name, {})) for chapter in report.chapters],
+        judged=report.judged,
+        caveats=report.caveats,
+    )
+
+
+def title_of_page(chapters: Sequence[Chapter]) -> str:
+    """Return the title of the only folder, or the number of folders; a sweep's chapters count as one."""
+    sweeps = {chapter.run.path for chapter in chapters if is_sweep(chapter.manifest)}
+    folders = [chapter for chapter in chapters if sweeps.isdisjoint(chapter.run.path.parents)]
+    names = {chapter.run.path: chapter.title for chapter in reversed(folders)}
+    return next(iter(names.values())) if len(names) == 1 else f"{len(names)} runs, side by side"
+
+
+def _view(chapter: Chapter) -> dict[str, Any]:
+    """Return what the page shows of a chapter besides its fields."""
+    content, manifest = chapter.content, chapter.manifest
+    notes = [note for table in content.tables.values() for note in table.notes if isinstance(note, Note)]
+    labels = [label for note in notes for label in note.labels]
+    return {
+        "id": "run-" + re.sub(r"[^A-Za-z0-9_-]", "-", chapter.name),
+        "started": when(manifest),
+        "labels": list(dict.fromkeys((*chapter.run.origins.labels, *labels))),
+        "more": [table for name, table in content.tables.items() if name not in content.main],
+        "facts": {
+            "Environment": _facts(manifest.get("environment", {})),
+            "Model": _facts(manifest.get("model") or {}),
+            "Configuration": _facts(manifest.get("configuration", {})),
+            "Seeds": _facts(manifest.get("seeds", {})),
+            "Facts of a request": [(name, fact["about"]) for name, fact in chapter.run.facts.items()],
+        },
+    }
+
+
+def _facts(facts: Any, prefix: str = "") -> list[tuple[str, str]]:
+    if isinstance(facts, list) and any(isinstance(each, dict) for each in facts):
+        facts = dict(enumerate(facts))
+    if isinstance(facts, dict):
+        return [line for name, value in facts.items() for line in _facts(value, f"{prefix}.{name}".removeprefix("."))]
+    if facts is None or facts in ("", []):
+        return []
+    text = ", ".join(map(str, facts)) if isinstance(facts, list) else str(facts)
+    return [(prefix, text)]

@@ -9,8 +9,7 @@ import pytest
 
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.metrics import latency_csv, latency_json
-from s2a_bench.experiments.latency.view import show
-from s2a_bench.experiments.latency.view.figures import build_stage_breakdown
+from s2a_bench.experiments.latency.view import build_stage_breakdown, show
 from s2a_bench.report.compare.comparison import metrics_of, open_comparison
 from s2a_bench.store.run import StoredRun
 from tests.experiments.view.test_latency_json import validate

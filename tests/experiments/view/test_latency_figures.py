@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 
 from s2a_bench.experiments import write_shown
 from s2a_bench.experiments.latency import EXPERIMENT
-from s2a_bench.experiments.latency.view.figures import (
+from s2a_bench.experiments.latency.view import (
     build_latency_bars,
     build_latency_distribution,
     build_stage_breakdown,

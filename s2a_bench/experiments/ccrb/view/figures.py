@@ -22,7 +22,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.labels import NAIVE, ORDERING, PAPER, ahead, law, operating_point, outcome_label
 from s2a_bench.store.requests import SKILLS
-from s2a_bench.writers.figures import new_figure
+from s2a_bench.writers.figures import new_figure, shade_plane
 from s2a_bench.writers.style import WIDE_IN
 
 if TYPE_CHECKING:
@@ -237,20 +237,11 @@ def _draw_panel(axes: Axes, scenes: pd.DataFrame, settings: dict[str, Any], run:
     named = region_of(scenes)
     order = list(REGIONS)
     codes = scenes.assign(code=[order.index(name) for name in named])
-    table = codes.pivot_table(index="rear_gap_m", columns="tokens_per_s", values="code")
-    rates = table.columns.to_numpy(dtype="float64")
-    axes.pcolormesh(
-        rates,
-        table.index.to_numpy(dtype="float64"),
-        table.to_numpy(dtype="float64"),
-        cmap=ListedColormap([colour for _, colour in REGIONS.values()]),
-        vmin=-0.5,
-        vmax=len(order) - 0.5,
-        shading="nearest",
-        rasterized=True,
-    )
+    colours = ListedColormap([colour for _, colour in REGIONS.values()])
+    shade_plane(axes, codes, "tokens_per_s", "rear_gap_m", "code", cmap=colours, vmin=-0.5, vmax=len(order) - 0.5)
+    slowest, fastest = scenes["tokens_per_s"].min(), scenes["tokens_per_s"].max()
     axes.set_xscale("log")
-    ticks = [rate for rate in (0.5, 1, 2, 3, 4, 6, 8, 12, 20, 35) if rates[0] <= rate <= rates[-1]]
+    ticks = [rate for rate in (0.5, 1, 2, 3, 4, 6, 8, 12, 20, 35) if slowest <= rate <= fastest]
     axes.set_xticks(ticks, [f"{rate:g}" for rate in ticks])
     axes.set_xticks([], minor=True)
     rate = run.manifest["boards"][0]["tokens_per_s"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from s2a_bench.experiments import TIME, Shown, Tables, requests
+from s2a_bench.experiments import TIME, Metric, Shown, requests
 from s2a_bench.experiments.ccrb.rows import IMPACTS, LOOP, MARGINS, METRICS, MOTION, TIMES, RolloutRow
 from s2a_bench.experiments.ccrb.view.figures import ccrb_figures
 from s2a_bench.experiments.ccrb.view.outcomes import (
@@ -31,14 +31,19 @@ from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, entries, n
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from s2a_bench.experiments import Metric
     from s2a_bench.store.run import StoredRun
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
     return Shown.build(
         sentences=lambda: _ccrb_sentences(run),
-        tables=ccrb_tables(run),
+        tables={
+            "random": lambda: _random_table(run) if has(run, "random") else None,
+            "phase": lambda: _phase_table(run) if has(run, "phase") else None,
+            "margins": lambda: _margin_table(run),
+            "stages": lambda: _stage_table(run) if "live" in run.manifest and has(run, "rollout") else None,
+            "outcomes": lambda: _outcome_table(run),
+        },
         main=["outcomes", "stages", "phase", "random"],
         csvs=lambda: _ccrb_csv(run),
         figures=lambda: ccrb_figures(run),
@@ -160,16 +165,6 @@ def _share_rows(run: StoredRun, study: str, written: Callable[[Share], str]) -> 
     checked = all(found["survives"].notna().all() for found in scenes.values())
     counted = {**ORDERINGS, **({"survives": "follower survives fast tokens"} if checked else {})}
     return [(text, *(written(share_of(scenes[gap], name)) for gap in GAPS)) for name, text in counted.items()]
-
-
-def ccrb_tables(run: StoredRun) -> Tables:
-    return {
-        "random": lambda: _random_table(run) if has(run, "random") else None,
-        "phase": lambda: _phase_table(run) if has(run, "phase") else None,
-        "margins": lambda: _margin_table(run),
-        "stages": lambda: _stage_table(run) if "live" in run.manifest and has(run, "rollout") else None,
-        "outcomes": lambda: _outcome_table(run),
-    }
 
 
 def _ccrb_csv(run: StoredRun) -> dict[str, CsvTable]:

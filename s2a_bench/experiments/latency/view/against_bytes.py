@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from s2a_bench.experiments import Tables
-from s2a_bench.experiments.requests import RequestCell, payloads_of, stand_ins
+from s2a_bench.experiments.requests import RequestCell, Split, payloads_of, stand_ins
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.change import FEWEST_LAUNCHES, Blocks, ratio_of_launches
 from s2a_bench.stats.line import Estimate, Line, fit_line
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.experiments.requests import Split
     from s2a_bench.store.run import StoredRun
 
 METRIC = "e2e_without_inference"

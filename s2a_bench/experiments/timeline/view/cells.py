@@ -65,6 +65,12 @@ class Timelines:
         """The arrival times of the shown plan's tokens, in s from the request."""
         return (self.tokens["client_ns"].to_numpy(dtype="float64") - float(self.about("requested_ns"))) / 1e9
 
+    @property
+    def complete_s(self) -> Floats:
+        """The times at which the shown plan's skills were complete, in s from the request."""
+        values: Floats = self.skills["arrival_ns"].to_numpy(dtype="float64") / 1e9
+        return values
+
     def moment_s(self, metric: str) -> float:
         return float(self.rows[METRICS[metric].column].iloc[0]) / 1e9
 

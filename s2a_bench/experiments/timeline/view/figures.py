@@ -129,8 +129,7 @@ def _draw_skills(axes: Axes, cell: Timelines, lane: int, colour: str, end_s: flo
 def _draw_tokens(axes: Axes, cell: Timelines, low: float, high: float) -> None:
     middle = (low + high) / 2
     axes.vlines(cell.token_s, low, middle, "#888888", linewidth=0.4)
-    arrivals_s = cell.skills["arrival_ns"].to_numpy(dtype="float64") / 1e9
-    axes.vlines(arrivals_s, low, high, "black", linewidth=0.8)
+    axes.vlines(cell.complete_s, low, high, "black", linewidth=0.8)
 
 
 def _legend(cells: Sequence[Timelines]) -> list[object]:
@@ -181,7 +180,7 @@ def _panel(setting: tuple[str, int, int, float], cells: Sequence[Timelines], col
         end_s,
         [_lane(cell, colours[cell.policy], own_tokens=not shared) for cell in cells],
         tuple(cells[0].token_s) if shared else (),
-        _complete_s(cells[0]) if shared else (),
+        tuple(cells[0].complete_s) if shared else (),
     )
 
 
@@ -210,9 +209,5 @@ def _lane(cell: Timelines, colour: str, *, own_tokens: bool) -> Lane:
         summary,
         cell.moment_s("safe_start_s"),
         tuple(cell.token_s) if own_tokens else (),
-        _complete_s(cell) if own_tokens else (),
+        tuple(cell.complete_s) if own_tokens else (),
     )
-
-
-def _complete_s(cell: Timelines) -> tuple[float, ...]:
-    return tuple(cell.skills["arrival_ns"].to_numpy(dtype="float64") / 1e9)

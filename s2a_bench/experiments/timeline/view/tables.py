@@ -6,7 +6,8 @@ from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Shown, Tables
+from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Shown
+from s2a_bench.experiments.requests import span_of
 from s2a_bench.experiments.timeline.rows import METRICS, TimelineMetric
 from s2a_bench.experiments.timeline.view.cells import (
     Timelines,
@@ -29,25 +30,30 @@ if TYPE_CHECKING:
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
+    cells = timelines_of(run)
+    shape = _common(cells)
     return Shown.build(
-        sentences=lambda: _timeline_sentences(run),
-        tables=timeline_tables(run),
+        sentences=lambda: _timeline_sentences(cells),
+        tables={
+            "skills": lambda: skill_table(cells),
+            "motion": lambda: _table(cells, f"Motion{shape}", _MOTION, _MOTION_NOTES),
+            "waiting": lambda: _table(cells, f"Waiting and age{shape}: times in s", _WAITING, _WAITING_NOTES),
+            "timelines": lambda: execution_table(run),
+        },
         main=["timelines"],
         csvs=lambda: timeline_csv(run),
         figures=lambda: timeline_figures(run),
         json=lambda: timelines_json(run),
-        lanes=lambda: page_lanes(timelines_of(run)),
+        lanes=lambda: page_lanes(cells),
     )
 
 
-def _timeline_sentences(run: StoredRun) -> list[str]:
-    cells = timelines_of(run)
+def _timeline_sentences(cells: Sequence[Timelines]) -> list[str]:
     by_policy: dict[str, list[Timelines]] = {}
     for cell in cells:
         by_policy.setdefault(cell.policy, []).append(cell)
     settings = len({cell.setting for cell in cells})
-    counts = sorted({cell.n for cell in cells})
-    plans = f"{' to '.join(map(str, dict.fromkeys((counts[0], counts[-1]))))} plan{'s' * (counts[-1] != 1)}"
+    plans = span_of((cell.n for cell in cells), "plan")
     sentences = [f"{settings} setting{'s' * (settings != 1)} of board and granularity, {plans} a policy in each."]
     return sentences + [_policy_sentence(policy, mine) for policy, mine in by_policy.items()]
 
@@ -121,17 +127,6 @@ def skill_table(cells: Sequence[Timelines]) -> TextTable:
     header = ("board", "L", "policy", "skill", "arrives", "starts", "ends", "stall before", "queue wait", "stretch")
     plan = "the first plan, times in s" if any(cell.n > 1 for cell in cells) else "times in s"
     return TextTable.grouped(f"Skills{_common(cells)}: {plan}", header, groups, 4, once=3, cells=names)
-
-
-def timeline_tables(run: StoredRun) -> Tables:
-    cells = timelines_of(run)
-    shape = _common(cells)
-    return {
-        "skills": lambda: skill_table(cells),
-        "motion": lambda: _table(cells, f"Motion{shape}", _MOTION, _MOTION_NOTES),
-        "waiting": lambda: _table(cells, f"Waiting and age{shape}: times in s", _WAITING, _WAITING_NOTES),
-        "timelines": lambda: execution_table(run),
-    }
 
 
 def timeline_csv(run: StoredRun) -> dict[str, CsvTable]:
