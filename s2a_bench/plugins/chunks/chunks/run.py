@@ -2,77 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
-from s2a_bench.errors import UsageError
-from s2a_bench.harness.warnings import exchange_warnings
-from s2a_bench.machine import environment
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, mean_rows, trigger_rows
-from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes, draw
-from s2a_bench.plugins.chunks.chunks.config import PROMISING
+from s2a_bench.plugins.chunks.chunks.plan import resolve
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
-from s2a_bench.plugins.chunks.chunks.smooth import TrackingPlant, follower
 from s2a_bench.plugins.chunks.latencies import delay_rows, write_delays
-from s2a_bench.provenance import Origins, Provenance
-from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
+    from s2a_bench.plugins.chunks.chunks.cells import ChunkCell
     from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
+    from s2a_bench.plugins.chunks.chunks.smooth import TrackingPlant
     from s2a_bench.plugins.chunks.modes import ControlSetting
     from s2a_bench.progress import Progress
-
-MOST_TICKS: Final = 100_000_000
-"""Control ticks of a cell, which are held in memory."""
 
 
 def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path:
     """Act in virtual time and return the run folder; raises S2AError."""
-    control, rules, setting = config.control, config.rules_plan, config.setting
-    drawn = [draw(source, config.cycles, config.learnt, config.seed) for source in config.sources]
-    for each in drawn:
-        _check_memory(each, setting)
-    tried = [cell.followed(setting) for each in drawn for cell in cells(control, rules, each)]
-    calibrations = {cell.drawn.source.name: asdict(cell.calibration) for cell in tried if cell.calibration}
-    warnings = exchange_warnings(calibrations, FOLLOW)
-    if config.learnt and (missing := ", ".join(rule for rule in config.rules if rule not in rules.tried)):
-        few = f"without the rules {missing}: {config.too_few}"
-        warnings = [RunWarning("few-latencies", few, "record more, or raise --eps"), *warnings]
-    for each in {cell.drawn.source.name: cell.drawn for cell in tried if cell.rule in PROMISING}.values():
-        name, recorded = each.source.name, each.source.recorded_ns is not None
-        if recorded and (changed := changes(setting, name, each)):
-            warnings += changed
-            calibrations.get(name, {})["changed"] = True
-    manifest = {
-        "configuration": config.to_manifest(),
-        "environment": environment.collect(),
-        "seeds": {"latencies": config.seed},
-        "calibrations": calibrations,
-        "warnings": [warning.to_manifest() for warning in warnings],
-        "provenance": Origins(
-            Provenance.computed(), {cell.cell: cell.drawn.source.provenance for cell in tried}
-        ).to_manifest(),
-    }
-    with RunWriter.create(output, "chunks", manifest, (CHUNKS, REACTIONS, TICKS, REQUESTS)) as writer:
+    plan = resolve(config)
+    setting, mode, first = plan.control.setting, plan.rules.mode, plan.drawn[0]
+    with RunWriter.create(output, "chunks", plan.manifest, (CHUNKS, REACTIONS, TICKS, REQUESTS)) as writer:
         progress.opened(writer.path)
         progress.stage("acting in virtual time")
-        progress.expect(len(tried))
-        plant = config.robot_kind if config.slow_down == 1 else None
-        follows = None if plant is None else follower(plant, control)
-        for cell in tried:
-            acted = _acted(cell, setting.slowed(cell.slower), follows)
-            for table, rows in cell_rows(acted, config.shown_ticks, rules.epsilon, config.seed).items():
+        progress.expect(len(plan.cells))
+        for cell in plan.cells:
+            acted = _acted(cell, setting.slowed(cell.slower), plan.follows)
+            for table, rows in cell_rows(acted, plan.shown_ticks, plan.rules.epsilon, plan.control.seed).items():
                 writer.append(table, rows)
             progress.advance()
-        if rules.mode is not None:
-            for each in drawn:
-                writer.append(TRIGGERS, trigger_rows(rules.mode, setting, each))
-        writer.append(MEANS, mean_rows(control, drawn[0], follows))
-        if config.export_delays is not None:
-            delays = delay_rows(drawn[0].source, drawn[0].judged, tried[0].mode, setting)
-            write_delays(config.export_delays, delays)
+        if mode is not None:
+            for drawn in plan.drawn:
+                writer.append(TRIGGERS, trigger_rows(mode, setting, drawn))
+        writer.append(MEANS, mean_rows(plan.control, first, plan.follows))
+        if plan.export_delays is not None:
+            write_delays(plan.export_delays, delay_rows(first.source, first.judged, plan.cells[0].mode, setting))
         return writer.path
 
 
@@ -81,13 +46,3 @@ def _acted(cell: ChunkCell, setting: ControlSetting, follows: TrackingPlant | No
     cycles, ticks = mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)
     smooth = follows.measure(cell.mode, cycles, ticks) if follows and cell.slower == 1 else {}
     return ActedCell(cell, setting, cycles, ticks, smooth)
-
-
-def _check_memory(drawn: LatencyDraw, setting: ControlSetting) -> None:
-    """Raise UsageError for latencies of more ticks than are held in memory."""
-    ticks = int(drawn.judged.size) * setting.horizon + int(setting.known_ticks(drawn.judged).sum())
-    if ticks > MOST_TICKS:
-        raise UsageError(
-            f"`cycles`: {drawn.judged.size} chunks @ {drawn.source.name} make {ticks:.2g} control ticks, more than "
-            f"{MOST_TICKS:.0e}; take fewer, or a lower `control_hz`"
-        )
