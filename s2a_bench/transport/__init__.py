@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from s2a_bench.types import Frame, Piece, Request
 
 PAYLOADS: Final = ("raw", "yuyv", "jpeg", "jpeg-preencoded", "png")
-"""Forms of a picture, as tables order them: ``bgr8`` pixels, the camera's YUYV, JPEG, a JPEG encoded before the run, PNG."""
+"""Forms of a picture, in the order of tables: BGR pixels, the camera's YUYV, JPEG, JPEG encoded before the run, PNG."""
 RAW, YUYV, JPEG, PREENCODED, PNG = PAYLOADS
 
 LOSSLESS: Final = frozenset({"", RAW, YUYV, PNG})
