@@ -70,7 +70,7 @@ class TimelineComputed(TimelineOptions):
     MODE: ClassVar[str] = "virtual"
     virtual: ClassVar[bool] = True
 
-    profiles: Names = option(PROFILES, ABOUT_PROFILES, flag="profile", first=True, names=profile_files)
+    profiles: Names = option(PROFILES, ABOUT_PROFILES, flag="profile", panel="Plans", first=True, names=profile_files)
     rates: Rates = option((), "boards known by their tokens/s alone; several with commas", flag="rate", first=True)
     prompt_s: float | None = PROMPT_TIME
     t_nom_cv: float = option(0.0, "how much T_nom differs from skill to skill: sd / mean", ge=0, le=MOST_CV)
