@@ -53,7 +53,6 @@ _PLACE = re.compile(
 )
 _IN_TEXT = re.compile(r"\{\{|\}\}|\{prompt\}|\{session\}|[{}]")
 _BRACES = {"{{": "{", "}}": "}"}
-_FORMS = (None, "CHW", "bytes")
 
 
 class _Missing(Exception):
@@ -245,7 +244,7 @@ class Template:
         return make
 
     def _picture(self, path: str, index: int, form: str | None) -> _Make:
-        if index >= CAMERAS or form not in _FORMS:
+        if index >= CAMERAS or form not in {None, "CHW", "bytes"}:
             self._refuse(path, f"wants picture {index} as {form}; there are up to {CAMERAS}, as CHW or bytes")
         if form and self.server.image_maps:
             self._refuse(path, f"wants {form}, and {EXTENSION}.image_maps has pictures as maps; leave one out")

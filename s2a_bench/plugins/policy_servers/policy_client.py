@@ -81,5 +81,4 @@ class PolicyClient(Client, Generic[P]):
         return RequestFailed(f"{self._url}: {reason}", retry_after_s=retry_after_s)
 
     def describe(self) -> dict[str, str]:
-        """Return where the server is, and the template, for the manifest."""
         return {"url": self._url, "template": self._template.name}

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import atexit
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as NoAnswer
-from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as package_version
 from typing import Any
@@ -29,7 +28,7 @@ from s2a_bench.plugins.rclpy.types import from_ros, interface_class, message_cla
 from s2a_bench.ros import SERVICE_QOS, Offer, QoS, Tuning
 from s2a_bench.ros.config import CYCLONE_URI, LARGE_PICTURES, RMW_CYCLONE
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise
-from s2a_bench.ros.service import appeared
+from s2a_bench.ros.service import appeared, awaited
 
 
 class RclpyServiceClient:
@@ -94,16 +93,9 @@ class _RclpySubscription:
         self.interrupt, self.close = self._waiter.interrupt, self._waiter.close
 
     def take(self, timeout_s: float) -> bytes | None:
-        deadline_ns = now_ns() + int(timeout_s * 1e9)
         with self._waiter.consuming():
-            more = True
-            while not self._waiter.interrupted:
-                if (taken := self._subscription.handle.take_message(self._class, True)) is not None:
-                    return taken[0]  # type: ignore[no-any-return]
-                if not more:
-                    break
-                more = self._waiter.wait_until(deadline_ns)
-        return None
+            taken = awaited(lambda: self._subscription.handle.take_message(self._class, True), self._waiter, timeout_s)
+        return taken and taken[0]
 
     def unpack(self, packed: bytes) -> Any:
         return deserialise(memoryview(packed), self._type_name)
@@ -119,30 +111,23 @@ class _RclpySubscription:
         return publisher.matched() >= sender
 
 
-@contextmanager
-def _configured(tuning: Tuning) -> Iterator[str]:
-    """Yield the value of CYCLONEDDS_URI, which makes room for large pictures where the user has set none.
-
-    rmw_cyclonedds_cpp reads it as the first node joins a domain. Cyclone DDS from PyPI reads it as well, so it is unset
-    afterwards.
-    """
-    uri = os.environ.get(CYCLONE_URI, "")
-    if uri or tuning != "tuned" or rclpy.get_rmw_implementation_identifier() != RMW_CYCLONE:
-        yield uri
-        return
-    os.environ[CYCLONE_URI] = LARGE_PICTURES
-    try:
-        yield LARGE_PICTURES
-    finally:
-        del os.environ[CYCLONE_URI]
-
-
 class RclpyMiddleware:
     def __init__(self, domain_id: int, tuning: Tuning, node_name: str) -> None:
-        """Join ``domain_id`` as the node ``/namespace/name``; of the rmws, Cyclone alone is tuned."""
+        """Join ``domain_id`` as the node ``/namespace/name``.
+
+        Of the rmws, Cyclone alone is tuned: with room for large pictures where the user has set no CYCLONEDDS_URI.
+        """
         self._domain_id = domain_id
-        with _configured(tuning) as self._configuration:
+        self._configuration = os.environ.get(CYCLONE_URI, "")
+        rmw = rclpy.get_rmw_implementation_identifier()
+        tunes = tuning == "tuned" and not self._configuration and rmw == RMW_CYCLONE
+        if tunes:  # it is read as the first node joins a domain
+            os.environ[CYCLONE_URI] = self._configuration = LARGE_PICTURES
+        try:
             self._node = SpinningNode(domain_id, node_name)
+        finally:
+            if tunes:  # Cyclone DDS from PyPI reads it as well
+                del os.environ[CYCLONE_URI]
         self._close: list[Callable[[], None]] = []
         atexit.register(self.close)
 

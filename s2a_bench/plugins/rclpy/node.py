@@ -134,7 +134,7 @@ class RclpyWaiter:
         self.interrupted = False
 
     def wait_until(self, deadline_ns: int) -> bool:
-        """Look once, wait for the entity, a time slice or `wake`; False once the deadline or an interrupt has come."""
+        """Look once, wait for the entity, a time slice or an interrupt; False after the deadline or an interrupt."""
         left_ns = max(0, deadline_ns - now_ns())
         if self.interrupted:
             return False
@@ -145,14 +145,11 @@ class RclpyWaiter:
             self.wait_set.wait(min(left_ns, WAIT_SLICE_NS))
         return left_ns > 0 and not self.interrupted
 
-    def wake(self) -> None:
-        """End a wait under way, or the next one; callable from any thread, after the node has gone too."""
+    def interrupt(self) -> None:
+        """End a wait under way, and every later one; callable from any thread, after the node has gone too."""
+        self.interrupted = True
         with suppress(RuntimeError):  # InvalidHandle
             self._guard.trigger()
-
-    def interrupt(self) -> None:
-        self.interrupted = True
-        self.wake()
 
     @contextmanager
     def consuming(self) -> Iterator[None]:

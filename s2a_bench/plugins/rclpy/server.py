@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from functools import partialmethod
 from inspect import signature
-from threading import Condition, Lock, RLock, Thread
+from threading import Condition, RLock, Thread
 from typing import Any
 
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
@@ -59,7 +59,7 @@ class RclpyServerGoal:
         return ""
 
     def unpack(self) -> Any:
-        return self._server.convert_goal(self._request[1].goal)
+        return from_ros(self._request[1].goal, *self._server.goal_type)
 
     def accept(self) -> None:
         self._handle = self._server.decide(self._request, accepted=True)
@@ -169,10 +169,10 @@ class RclpyActionServer:
         self.version = installed_version(self._action, type_name)
         if version not in {"", self.version}:
             raise MissingInterface(f"this workspace has llama_msgs {self.version}, not {version}")
-        self._lock = Lock()
+        self.goal_type = type_name + "_Goal", self.version
         self._offered: set[bytes] = set()
         self._goals: deque[RclpyServerGoal] = deque()
-        self._came = Condition(self._lock)
+        self._came = Condition()
         self._interrupted = False
         self._server = _PullingServer(
             self,
@@ -207,7 +207,7 @@ class RclpyActionServer:
     def offer(self, request: Any) -> bool:
         """Queue a goal; False if one of this id waits for its decision."""
         goal = RclpyServerGoal(self, request)
-        with self._lock:
+        with self._came:
             if goal.id in self._offered:
                 return False
             self._offered.add(goal.id)
@@ -228,16 +228,13 @@ class RclpyActionServer:
     def decide(self, request: Any, *, accepted: bool) -> Any:
         """Accept or reject a goal once, and return rclpy's handle of an accepted one."""
         goal_id = bytes(request[1].goal_id.uuid)
-        with self._lock:
+        with self._came:
             if goal_id not in self._offered:
                 raise TransportError(f"goal {goal_id.hex()} was accepted or rejected already")
             self._offered.remove(goal_id)
         verdict = GoalResponse.ACCEPT if accepted else GoalResponse.REJECT
         self._node.check_open()
         return self._server.decide(request, verdict)
-
-    def convert_goal(self, goal: Any) -> Any:
-        return from_ros(goal, self._type + "_Goal", self.version)
 
     def publish_feedback(self, handle: Any, feedback: Any) -> None:
         message = to_ros(feedback, self._action.Feedback, self._type + "_Feedback", self.version)

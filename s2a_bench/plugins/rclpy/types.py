@@ -21,8 +21,6 @@ from s2a_bench.errors import MissingInterface
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.llama import images_of
 
-NO_PIXELS = np.empty(0, np.uint8)
-
 
 def interface_class(type_name: str) -> Any:
     """Return the generated class of ``pkg/msg/Name`` or ``pkg/action/Name``; raises MissingInterface without it."""
@@ -37,7 +35,7 @@ def interface_class(type_name: str) -> Any:
 
 
 def to_ros(message: Any, cls: Any, type_name: str, version: str) -> Any:
-    with _without_pixels(message, NO_PIXELS) as pixels:
+    with _without_pixels(message, np.empty(0, np.uint8)) as pixels:
         made = deserialize_message(bytes(ros.serialise(message, type_name, version)), cls)
     for image, its in zip(images_of(made), pixels, strict=True):
         data = array("B")

@@ -4,6 +4,6 @@ from pathlib import Path
 
 SWEEPS = Path(__file__).with_name("profiles")
 ADVISE = (
-    "s2a_bench.plugins.two_hosts.advise.command:advise",
+    "s2a_bench.plugins.two_hosts.advise:advise",
     "Advise on a transport for a link, from a sweep of transports: what is fastest.",
 )

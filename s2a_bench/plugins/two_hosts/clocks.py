@@ -7,11 +7,13 @@ one; the possible (a, b) are a polygon, and the interval at t is the least and t
 Skelly, Towsley, Infocom 1999; Zhang, Liu, Xia, Infocom 2002). If a clock was stepped or slewed, no line is left: that
 is an error and never widened away.
 
-`RemoteClock` makes exchanges beside a session's requests, and puts its server's reports on this host's clock.
+`RemoteClock` makes exchanges beside a session's requests, and puts its server's reports on this host's clock. With
+`--clock` both hosts also ask chrony or PTP for the error of their wall clocks, which bounds the offset, too.
 """
 
 from __future__ import annotations
 
+import subprocess
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
@@ -19,14 +21,14 @@ from dataclasses import dataclass
 from functools import reduce
 from itertools import pairwise, product
 from math import ceil, floor
+from platform import node
 from typing import Any, Final, TypeAlias
 
 import numpy as np
 
-from s2a_bench.clock import SystemClock, now_ns
+from s2a_bench.clock import SystemClock, now_ns, realtime_offset_ns
 from s2a_bench.errors import ClockMoved, RequestFailed, S2AError
-from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WALL_CLOCKS
-from s2a_bench.plugins.two_hosts.wall_clocks import FRESH_NS
+from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WALL_CLOCKS, WallClock
 from s2a_bench.trace import Trace
 from s2a_bench.transport.surroundings import Joined
 
@@ -50,6 +52,10 @@ WANDER: Final = 1e-5
 """Rate at which a disciplined wall clock may leave its bound while a reading is fresh."""
 PERIOD_NS: Final = 10**9
 """Between requests, one burst of exchanges in this time at most."""
+PATIENCE_S: Final = 3.0
+"""Most time in which a program tells the wall clock's error."""
+FRESH_NS: Final = 10**9
+"""A reading of the wall clock is used again for so long, whatever clients request."""
 
 Point: TypeAlias = tuple[int, int]
 """Time on this host's clock, and a bound of the offset there, in ns."""
@@ -95,15 +101,6 @@ class Interval:
 
     lo_ns: int
     hi_ns: int
-
-    @property
-    def middle_ns(self) -> int:
-        return (self.lo_ns + self.hi_ns) // 2
-
-    @property
-    def half_ns(self) -> int:
-        """Return the distance from the middle to the farther end."""
-        return self.hi_ns - self.middle_ns
 
     def __or__(self, other: Interval) -> Interval:
         return Interval(min(self.lo_ns, other.lo_ns), max(self.hi_ns, other.hi_ns))
@@ -217,8 +214,9 @@ class RemoteClock:
         early_ns = min((stamp - own.upper[1] for _, stamp in remote.frame_marks), default=own.sent_ns)
         near = offset.over(own.sent_ns, own.seen_ns)
         whole = near | offset.over(min(early_ns, own.sent_ns), last_ns)
-        trace.remote = remote.shifted(near.middle_ns)
-        return Joined(near.half_ns, whole.hi_ns - near.middle_ns, near.middle_ns - whole.lo_ns)
+        middle_ns = (near.lo_ns + near.hi_ns) // 2  # its farther end is the upper one
+        trace.remote = remote.shifted(middle_ns)
+        return Joined(near.hi_ns - middle_ns, whole.hi_ns - middle_ns, middle_ns - whole.lo_ns)
 
     def _burst(self, count: int, pause_ns: int) -> None:
         clock = SystemClock()
@@ -239,3 +237,51 @@ class RemoteClock:
         theirs_ns, error_ns = (round(trace.facts[name] * 1e6) for name in (REALTIME_MS, REALTIME_ERROR_MS))
         error_ns += ours.error_ns + FLOAT_NS + round(2 * FRESH_NS * WANDER)
         self._offsets[self._id].add(Exchange.bounded(now_ns(), ours.offset_ns - theirs_ns, error_ns))
+
+
+@dataclass(slots=True)
+class Asked:
+    """A program that knows the error of the wall clock."""
+
+    system: str
+    command: tuple[str, ...]
+    error_s: Callable[[str], float]
+    """Reads the error off its output."""
+    known: WallClock | None = None
+
+    def __call__(self) -> WallClock:
+        """Read the wall clock, and ask for its error; raises RequestFailed if that is not told."""
+        if self.known and now_ns() - self.known.read_ns < FRESH_NS:
+            return self.known
+        try:
+            done = subprocess.run(  # noqa: S603 - one of two fixed commands
+                self.command, capture_output=True, text=True, timeout=PATIENCE_S, check=True
+            )
+            error_s = self.error_s(done.stdout)
+        except (OSError, subprocess.SubprocessError, ValueError, LookupError) as error:
+            raise RequestFailed(
+                f"`clock` {self.system}: '{' '.join(self.command)}' tells no bound on the host {node()}: {error}"
+            ) from error
+        began_ns, offset_ns = now_ns(), realtime_offset_ns()
+        ended_ns = now_ns()
+        self.known = WallClock(offset_ns, round(error_s * 1e9) + ended_ns - began_ns, ended_ns)
+        return self.known
+
+
+def chrony_error_s(csv: str) -> float:
+    """Return |offset| + root dispersion + root delay / 2 of ``chronyc -c tracking``, RFC 5905's root distance."""
+    fields = csv.strip().split(",")
+    if fields[13] != "Normal":
+        raise ValueError(f"chronyd is not synchronised ({fields[13]})")
+    return abs(float(fields[4])) + float(fields[11]) + float(fields[10]) / 2
+
+
+def ptp_error_s(text: str) -> float:
+    """Return |offset| + mean path delay of pmc's CURRENT_DATA_SET: the path may be as asymmetric as it is long."""
+    words = text.split()
+    offset_ns, delay_ns = (float(words[words.index(name) + 1]) for name in ("offsetFromMaster", "meanPathDelay"))
+    return (abs(offset_ns) + delay_ns) / 1e9
+
+
+CHRONY: Final = Asked("chrony", ("chronyc", "-c", "tracking"), chrony_error_s)
+PTP: Final = Asked("ptp", ("pmc", "-u", "-b", "0", "GET CURRENT_DATA_SET"), ptp_error_s)

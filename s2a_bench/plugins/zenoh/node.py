@@ -22,8 +22,7 @@ import zenoh
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.plugins.zenoh import names
-from s2a_bench.plugins.zenoh.router import endpoint_of
+from s2a_bench.plugins.zenoh import endpoint_of, names
 from s2a_bench.ros import Offer, QoS, Tuning
 from s2a_bench.ros.messages import dds_type_name, ros_type_name
 from s2a_bench.ros.remap import check_node_name

@@ -12,7 +12,7 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from s2a_bench.plugins.policy_servers.zmq.npy import file_of
+from s2a_bench.plugins.policy_servers.zmq.wire import file_of
 from s2a_bench.transport import Wiring
 from tests.hostile.suite import FAILED, PATIENCE_S, Attack, Case, Trap
 from tests.hostile.tcp import CLIENTS as ANY_CLIENT

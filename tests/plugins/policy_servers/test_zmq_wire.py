@@ -12,8 +12,7 @@ import pytest
 
 from s2a_bench.errors import EngineError, RequestFailed
 from s2a_bench.plugins.policy_servers.zmq.layouts import actions_in, answer_of
-from s2a_bench.plugins.policy_servers.zmq.npy import PictureFile, array_of, file_of
-from s2a_bench.plugins.policy_servers.zmq.wire import pack, read
+from s2a_bench.plugins.policy_servers.zmq.wire import PictureFile, array_of, file_of, pack, read
 from s2a_bench.types import Token
 
 DTYPES = ["bool", "int8", "uint8", ">u2", "int32", "uint64", "float16", "float32", ">f4", "float64"]

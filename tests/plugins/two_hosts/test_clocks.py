@@ -20,7 +20,7 @@ from scipy.optimize import linprog
 from s2a_bench.clock import VirtualClock, clock_id
 from s2a_bench.errors import ClockMoved, RequestFailed, UsageError
 from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WALL_CLOCKS, WallClock
-from s2a_bench.plugins.two_hosts import wall_clocks as clocks
+from s2a_bench.plugins.two_hosts import clocks
 from s2a_bench.plugins.two_hosts.clocks import (
     KEPT,
     RATE,

@@ -17,7 +17,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import SourceError, TransportError, UsageError
 from s2a_bench.frames.ros import TopicCamera
 from s2a_bench.machine.doctor import Finding, Machine, examine
-from s2a_bench.plugins.zenoh.router import free_endpoint
+from s2a_bench.plugins.zenoh import free_endpoint
 from s2a_bench.policy.parameters import build
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros.join import RosParameters

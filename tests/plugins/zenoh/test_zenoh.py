@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from s2a_bench.errors import TransportError
-from s2a_bench.plugins.zenoh.router import endpoint_of, free_endpoint, listens
+from s2a_bench.plugins.zenoh import endpoint_of, free_endpoint, listens
 from s2a_bench.ros import REQUEST_BYTES, QoS, Rejected, Result, llama, open_middleware
 from s2a_bench.ros import messages as ros
 from tests.ros.action_suite import NAME, ActionSuite, event, offer, receive, start

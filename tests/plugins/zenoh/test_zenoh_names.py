@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.plugins.zenoh.router import endpoint_of, may_host
+from s2a_bench.plugins.zenoh import endpoint_of, may_host
 from s2a_bench.ros import QoS
 
 names = pytest.importorskip(

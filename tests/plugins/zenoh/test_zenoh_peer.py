@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.frames import open_source
-from s2a_bench.plugins.zenoh.router import endpoint_of, free_endpoint
+from s2a_bench.plugins.zenoh import endpoint_of, free_endpoint
 from s2a_bench.ros import Middleware, QoS, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.types import Frame

@@ -24,6 +24,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
 )
 from s2a_bench.experiments.timeline.view.cells import Timelines, timelines_of
 from s2a_bench.plan.skillset import GAPS
+from s2a_bench.plugins.paper import ORIN, Published
 from s2a_bench.plugins.paper.claims import Check, Need, RunPart, Trial
 from s2a_bench.plugins.paper.claims.requests import (
     NEAR,
@@ -35,7 +36,6 @@ from s2a_bench.plugins.paper.claims.requests import (
     on_board,
     one_of,
 )
-from s2a_bench.plugins.paper.figures import ORIN, Published
 from s2a_bench.policy import TOLERANCE_S, Floats, Plans
 from s2a_bench.policy.schedule import elastic, safe_start, work_conserving
 from s2a_bench.provenance import UNKNOWN
@@ -85,9 +85,9 @@ def _unlike(settings: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {found[name]}" for name in wanted if found[name] != wanted[name]) or AS_CHOSEN
 
 
-def _chosen(name: str, wanted: Mapping[str, Any], *more: str) -> Need:
+def _chosen(wanted: Mapping[str, Any], *more: str) -> Need:
     listed = ", ".join((*(f"{key} {value}" for key, value in wanted.items()), *more))
-    return Need(name, f"{listed}: chosen, as the paper gives none", AS_CHOSEN.__eq__, chosen=True)
+    return Need("settings", f"{listed}: chosen, as the paper gives none", AS_CHOSEN.__eq__, chosen=True)
 
 
 def timelines(run: StoredRun) -> Iterator[RunPart]:
@@ -142,7 +142,7 @@ def _stall_s(cell: Timelines) -> float:
     return cell.mean("stall_s") or 0.0
 
 
-SETTINGS: Final = _chosen("settings", PLANS, f"jitter none or {NAMED_JITTER}")
+SETTINGS: Final = _chosen(PLANS, f"jitter none or {NAMED_JITTER}")
 EVEN, UNEVEN = (one_of("times", times) for times in (EXACT, VARYING))
 SEVERAL: Final = Need("L", "two or more", lambda found: ", " in found), more("stall of naive in s", TOLERANCE_S)
 WAITS: Final = more("S0 after the first arrival in s", TOLERANCE_S)
@@ -261,7 +261,7 @@ def plane(run: StoredRun) -> Iterator[RunPart]:
 
 
 EVENLY: Final = Need("tokens", "evenly: with jitter no line separates the regions", lambda found: found == "evenly")
-OF_THE_PLANE: Final = _chosen("settings", PLANE)
+OF_THE_PLANE: Final = _chosen(PLANE)
 
 
 def stalls_at(side: str, part: RunPart) -> tuple[list[Ratio], str]:

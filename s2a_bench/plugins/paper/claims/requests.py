@@ -12,8 +12,8 @@ import numpy as np
 
 from s2a_bench.experiments.requests import RequestCell, cells_of
 from s2a_bench.experiments.throughput.metrics import throughput_cells
+from s2a_bench.plugins.paper import Published
 from s2a_bench.plugins.paper.claims import Need, RunPart
-from s2a_bench.plugins.paper.figures import Published
 from s2a_bench.policy import Floats
 from s2a_bench.provenance import NONE, UNKNOWN, Provenance
 from s2a_bench.stats import Ratio, summarise, summary_of

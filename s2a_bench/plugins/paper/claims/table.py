@@ -7,6 +7,7 @@ from functools import partial
 from math import inf, nextafter
 from typing import Final
 
+from s2a_bench.plugins.paper import HTTP, NANO, ORIN, ROS, RTX
 from s2a_bench.plugins.paper.claims import (
     CONTRADICTED,
     IDENTITY,
@@ -22,7 +23,6 @@ from s2a_bench.plugins.paper.claims import plans as of
 from s2a_bench.plugins.paper.claims import requests as timed
 from s2a_bench.plugins.paper.claims.plans import NAIVE, STREAM, WAIT, figure_5, listed
 from s2a_bench.plugins.paper.claims.requests import COMPARED, NEAR, on_board, one_of
-from s2a_bench.plugins.paper.figures import HTTP, NANO, ORIN, ROS, RTX
 from s2a_bench.policy import TOLERANCE_S
 from s2a_bench.report.verdicts import ClaimVerdict
 from s2a_bench.store.run import StoredRun

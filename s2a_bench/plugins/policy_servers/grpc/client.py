@@ -49,7 +49,7 @@ class GrpcClient(PolicyClient[GrpcOptions]):
     def __init__(self, wiring: Wiring[GrpcOptions], alive: Callable[[], bool]) -> None:
         """Prepare to ask the server at ``wiring.address``; the first request connects and has it load the policy."""
         super().__init__(wiring, alive)
-        self._channel: grpc.Channel | None = None
+        self._channel: grpc.Channel | None = None  # kept when a request fails: each call is a stream of its own
         self._connected = False
         self._timestep = 0
 
@@ -72,9 +72,6 @@ class GrpcClient(PolicyClient[GrpcOptions]):
         actions = actions_of(chunk)
         trace.mark("pickle_parse")
         yield from actions
-
-    def _abandon(self) -> None:
-        """Keep the channel, on which each call is a stream of its own."""
 
     def _open(self, features: dict[str, Any], bounds: Bounds, trace: Trace) -> grpc.Channel:
         """Return the channel to the server, which holds our policy; marks `connect` if it had to load it."""

@@ -142,8 +142,6 @@ def _storage(data: bytes) -> Numbers:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Knows its names alone."""
-
     def __init__(self, file: BytesIO, names: Names) -> None:
         super().__init__(file)
         self._names = names
@@ -158,7 +156,6 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _load(file: BytesIO, names: Names) -> Any:
-    """Return what the next pickle of a file holds."""
     start = file.tell()
     for number, (opcode, _, _) in enumerate(pickletools.genops(file)):
         if number == OPCODES or opcode.name not in NEEDED:

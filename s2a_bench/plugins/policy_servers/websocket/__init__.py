@@ -16,10 +16,7 @@ from s2a_bench.transport import Urls, Wiring
 from s2a_bench.transport.access import WebOptions
 from s2a_bench.transport.listening import ListeningTransport
 
-VARIANTS = ("openpi", "openpi-stream")
-OPENPI, STREAM = VARIANTS
-PACKAGES = ("msgpack", "websockets")
-"""What the extra of its name brings."""
+OPENPI, STREAM = "openpi", "openpi-stream"
 PREV_TOTAL_MS = Fact(
     "prev_total_ms", "ms", "duration of the connection's last request, as the policy server reports it"
 )
@@ -36,16 +33,16 @@ class WebsocketOptions(WebOptions, TemplateOptions):
 class Websocket(ListeningTransport[WebsocketOptions], PolicyTransport[WebsocketOptions]):
     name = "websocket"
     options = WebsocketOptions
-    variants = VARIANTS
+    variants = (OPENPI, STREAM)
     urls = Urls(WebsocketOptions.SCHEMES, examine="s2a_bench.plugins.policy_servers.websocket.client:examine")
-    needs = ("websocket", *PACKAGES)
+    needs = ("websocket", "msgpack", "websockets")
     client_class = "s2a_bench.plugins.policy_servers.websocket.client:WebsocketClient"
     server_class = "s2a_bench.plugins.policy_servers.websocket.server:WebsocketServer"
     reads_server = ("path", "greets", "text_keys", "answer", "reset", "idle_s", "image_maps")
     facts = (PAYLOAD_BYTES, RECONNECTS, INFER_MS, PREV_TOTAL_MS)
     order = 20
     style = {OPENPI: ("#000000", "-"), STREAM: ("#000000", "--")}
-    packages = PACKAGES
+    packages = ("msgpack", "websockets")
 
     def ready(self, wiring: Wiring[WebsocketOptions]) -> str:
         address = wiring.address

@@ -45,7 +45,9 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         super().__init__(wiring, alive)
         self._streams = wiring.variant == STREAM
         self._server = ExternalServer() if self._native else self._template.server
-        self._url = _with_path(wiring.address, self._server.path)
+        parts = urlsplit(self._url)
+        if self._server.path and not parts.path.strip("/"):
+            self._url = urlunsplit(parts._replace(path=self._server.path))
         if self._native and self._streams:
             self._url += STREAM_PATH
         key = read_key(wiring.options.api_key_env)
@@ -206,10 +208,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
     def describe(self) -> dict[str, str]:
         """Return the server and its metadata, for the manifest; connects to a foreign server."""
         if not self._native and self._link is None:
-            try:
-                self._connected(self._wiring.bounds(self._url, 1))
-            except Broken as error:
-                raise RequestFailed(str(error), starting=error.starting) from error
+            self._connected(self._wiring.bounds(self._url, 1))
         return {**super().describe(), **self._metadata}
 
     def close(self) -> None:
@@ -252,14 +251,7 @@ def examine(parts: SplitResult) -> Iterator[Finding | str]:
     yield NO_KEY
 
 
-def _with_path(url: str, path: str) -> str:
-    """Return a URL that has no path with ``path``, any other as it is."""
-    parts = urlsplit(url)
-    return url if parts.path.strip("/") or not path else urlunsplit(parts._replace(path=path))
-
-
 def _kind(answer: Any) -> str:
-    """Return the type that a message states, if any."""
     kind = answer.get(codec.TYPE) if isinstance(answer, dict) else None
     return kind if isinstance(kind, str) else ""
 

@@ -82,7 +82,7 @@ class PolicyConnection:
         self._lock = RLock()  # of the protocol, and of what is sent
         self._message = bytearray()
         self._timed = False
-        self._requests: SimpleQueue[tuple[Exchange, ExitStack] | None] = SimpleQueue()
+        self._requests: SimpleQueue[WebsocketExchange | None] = SimpleQueue()
         self._room = Semaphore(2)
         self._held = ExitStack()
         self._count()
@@ -215,7 +215,7 @@ class PolicyConnection:
                 return
             message, self._message = bytes(self._message), bytearray()
         self._room.acquire()
-        self._requests.put((WebsocketExchange(self, message), self._held.pop_all()))
+        self._requests.put(WebsocketExchange(self, message, self._held.pop_all()))
         self._count()
 
     def _count(self) -> None:
@@ -226,23 +226,14 @@ class PolicyConnection:
     # the thread that answers
 
     def _answer_all(self) -> None:
-        more = True
-        while more:
+        while (exchange := self._requests.get()) is not None:
             try:
-                more = self._answer_next()
+                with exchange.held:
+                    if self._open and not self.core.answer(exchange):
+                        self.wire.hang_up()
             finally:
                 self._room.release()
-
-    def _answer_next(self) -> bool:
-        """Answer a request, of which nothing is kept; return False at the end."""
-        if (waiting := self._requests.get()) is None:
-            return False
-        exchange, held = waiting
-        with held:
-            exchange.held = held
-            if self._open and not self.core.answer(exchange):
-                self.wire.hang_up()
-        return True
+            del exchange  # nothing of a request is kept while the next is waited for
 
     def flush(self, left_s: float) -> None:
         """Wait for the client to read what it was sent; raises Disconnected."""
@@ -289,8 +280,9 @@ class PolicyConnection:
 class WebsocketExchange(Exchange):
     parse_stage = "msgpack_parse"
 
-    def __init__(self, connection: PolicyConnection, message: bytes) -> None:
+    def __init__(self, connection: PolicyConnection, message: bytes, held: ExitStack) -> None:
         super().__init__()
+        self.held = held
         self.trace.mark("network")
         self.disconnected = connection.wire.disconnected  # type: ignore[method-assign]
         self._connection, self._message = connection, message

@@ -19,8 +19,6 @@ from s2a_bench.transport import SERVER, Urls, Wiring
 from s2a_bench.transport.listening import ListeningOptions, ListeningTransport
 
 GR00T = "gr00t"
-PACKAGES = ("msgpack", "zmq")
-"""What the extra of its name brings, by the names under which they are imported."""
 
 
 class ZmqOptions(ListeningOptions, TemplateOptions):
@@ -40,7 +38,7 @@ class Zmq(ListeningTransport[ZmqOptions], PolicyTransport[ZmqOptions]):
     options = ZmqOptions
     variants = (GR00T,)
     urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.plugins.policy_servers.zmq.client:examine")
-    needs = ("zmq", *PACKAGES)
+    needs = ("zmq", "msgpack", "zmq")
     client_class = "s2a_bench.plugins.policy_servers.zmq.client:ZmqClient"
     server_class = "s2a_bench.plugins.policy_servers.zmq.server:ZmqServer"
     facts = (PAYLOAD_BYTES, RECONNECTS)

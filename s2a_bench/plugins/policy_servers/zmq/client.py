@@ -24,9 +24,8 @@ from s2a_bench.plugins.policy_servers import observed
 from s2a_bench.plugins.policy_servers.observation import EXTENSION
 from s2a_bench.plugins.policy_servers.policy_client import PolicyClient
 from s2a_bench.plugins.policy_servers.zmq import ZMQ, ZmqOptions, layouts
-from s2a_bench.plugins.policy_servers.zmq.npy import PictureFile
 from s2a_bench.plugins.policy_servers.zmq.watch import ConnectionWatch
-from s2a_bench.plugins.policy_servers.zmq.wire import pack, read
+from s2a_bench.plugins.policy_servers.zmq.wire import PictureFile, pack, read
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Bounds

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any, Final
 
 import zmq
@@ -14,13 +15,11 @@ BEGUN: Final = {zmq.EVENT_ACCEPTED, zmq.EVENT_CONNECTED}
 REFUSED: Final = {zmq.EVENT_CONNECT_RETRIED, zmq.EVENT_CLOSED}
 
 
+@dataclass(slots=True, eq=False)
 class Connection:
-    __slots__ = ("disconnected", "ready")
-
-    def __init__(self) -> None:
-        self.disconnected = False
-        self.ready = False
-        """Whether both sides have greeted."""
+    disconnected: bool = False
+    ready: bool = False
+    """Whether both sides have greeted."""
 
 
 class ConnectionWatch:

@@ -1,32 +1,62 @@
 """Messages as GR00T packs them: MessagePack in which an array of numbers is a map.
 
-Up to N1.6 the map holds a NumPy file, ``{"__ndarray_class__": True, "as_npy"}``. From N1.7 on it is that of
-msgpack-numpy 0.4.8, ``{b"nd": True, b"type", b"kind", b"shape", b"data"}``, or ``{b"nd": False, b"type", b"data"}`` for
-NumPy's scalars, whose kinds O (a pickle) and V (records) are refused. Both are read wherever they stand.
+Up to N1.6 the map holds a NumPy file, ``{"__ndarray_class__": True, "as_npy"}``, of format 1.0 or later. From N1.7 on
+it is that of msgpack-numpy 0.4.8, ``{b"nd": True, b"type", b"kind", b"shape", b"data"}``, or ``{b"nd": False, b"type",
+b"data"}`` for NumPy's scalars, whose kinds O (a pickle) and V (records) are refused. Both are read wherever they stand,
+without a copy; nothing is ever unpickled.
 """
 
 from __future__ import annotations
 
+import io
 import re
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any, Final
 
 import msgpack
 import numpy as np
+from numpy.lib import format as npy
+from numpy.typing import NDArray
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.plugins.policy_servers.messagepack import array_in, unpacked
 from s2a_bench.plugins.policy_servers.zmq.layouts import CONFIG_MARKS, N1_5, N1_6, N1_7, OURS
-from s2a_bench.plugins.policy_servers.zmq.npy import PictureFile, array_of, file_of
+from s2a_bench.types import Pixels
 
 ARRAY, FILE = "__ndarray_class__", "as_npy"
 ND, TYPE, KIND, SHAPE, BYTES = "nd", "type", "kind", "shape", "data"
 SMALL: Final = 1 << 16
 """Bytes that a message without large pictures takes, or fewer."""
 NO_FILES: Final[Mapping[int, PictureFile]] = {}
+HEAD: Final = 4096
+"""Bytes of the longest header that is read; NumPy's own take 128."""
+BEFORE: Final = 128
+"""Bytes of the header of a picture, and of most."""
+PREFIX: Final = {b"\x01\x00": 10, b"\x02\x00": 12, b"\x03\x00": 12}
+"""Version -> bytes before the header's text: the magic, the version, the text's length."""
 
 _NUMBERS = re.compile(r"[<>|=](b1|[iu][1248]|f[248])")
 """What msgpack-numpy calls types of numbers."""
+
+
+class PictureFile:
+    """A NumPy file, whose head stands before its pixels: a conversion writes them where they are sent from."""
+
+    def __init__(self, height: int, width: int) -> None:
+        self._whole = np.empty(BEFORE + height * width * 3, np.uint8)
+        self.pixels: Pixels = self._whole[BEFORE:].reshape(height, width, 3)
+        self.address: int = self.pixels.__array_interface__["data"][0]
+
+    def file(self, array: NDArray[Any]) -> memoryview | None:
+        """Return the file of these very pixels in any shape; None where the array is something else."""
+        if array.dtype != np.uint8 or array.size != self.pixels.size or not array.flags.c_contiguous:
+            return None
+        head = _head(array.shape, "|u1")
+        if len(head) > BEFORE:
+            return None
+        self._whole[BEFORE - len(head) : BEFORE] = np.frombuffer(head, np.uint8)
+        return self._whole[BEFORE - len(head) :].data
 
 
 def pack(message: Any, files: Mapping[int, PictureFile] = NO_FILES, *, maps: bool = False) -> memoryview:
@@ -90,3 +120,51 @@ def _array_in(fields: Mapping[str, Any]) -> Any:
         )
     array = array_in(data, shape, np.dtype(descr))
     return array if fields[ND] else array[()]
+
+
+def file_of(array: NDArray[Any]) -> bytes:
+    solid = np.ascontiguousarray(array)
+    return b"".join((_head(array.shape, solid.dtype.str), solid.reshape(-1).view(np.uint8).data))
+
+
+def array_of(data: Any) -> NDArray[Any]:
+    """Return the read-only array in a file, without copying it.
+
+    Raises RequestFailed for what is no such file, for other than numbers, and where the size is not that of the shape.
+    """
+    if not isinstance(data, bytes):
+        raise RequestFailed(f"an array whose as_npy is {type(data).__name__}, not bytes")
+    start, shape, fortran, dtype = _read_head(_head_in(data))
+    return array_in(data, shape, dtype, start, fortran=fortran)
+
+
+def _head_in(data: bytes) -> bytes:
+    version = data[6:8]
+    prefix = PREFIX.get(version, 0) if data.startswith(npy.MAGIC_PREFIX) else 0
+    if not prefix or len(data) < prefix:
+        raise RequestFailed(f"{len(data)} bytes that are no NumPy file")
+    length = int.from_bytes(data[8:prefix], "little")
+    if length > HEAD or len(data) < prefix + length:
+        raise RequestFailed(f"a NumPy file whose header has {length} bytes")
+    return data[: prefix + length]
+
+
+@lru_cache(64)
+def _read_head(head: bytes) -> tuple[int, tuple[int, ...], bool, np.dtype[Any]]:
+    """Return where the array begins, its shape, whether it is in Fortran's order, and its type."""
+    file, wrong = io.BytesIO(head), RequestFailed(f"a NumPy file of {head[10:90]!r}; numbers are taken, nothing else")
+    read = npy.read_array_header_1_0 if npy.read_magic(file) == (1, 0) else npy.read_array_header_2_0
+    try:
+        shape, fortran, dtype = read(file)
+    except Exception as error:  # NumPy's reader raises whatever Python's tokenizer does
+        raise wrong from error
+    if dtype.kind not in "biuf":
+        raise wrong
+    return len(head), shape, fortran, dtype
+
+
+@lru_cache(64)
+def _head(shape: tuple[int, ...], descr: str) -> bytes:
+    file = io.BytesIO()
+    npy.write_array_header_1_0(file, {"shape": shape, "fortran_order": False, "descr": descr})
+    return file.getvalue()

@@ -119,12 +119,11 @@ def _join(namespace: int) -> None:
 
 
 def _new_namespace() -> None:
-    if not _libc.unshare(CLONE_NEWNET):
-        return
-    raise NotPermitted(
-        f"`link` needs network namespaces ({os.strerror(ctypes.get_errno())}): run it as root, or allow user "
-        "namespaces until `unshare -Urn true` works"
-    )
+    if _libc.unshare(CLONE_NEWNET):
+        raise NotPermitted(
+            f"`link` needs network namespaces ({os.strerror(ctypes.get_errno())}): run it as root, or allow user "
+            "namespaces until `unshare -Urn true` works"
+        )
 
 
 def _configure(tun: int, own: str, peer: str) -> None:

@@ -151,24 +151,20 @@ class Relay:
 
 
 def main() -> None:
-    def answer(facts: Mapping[str, Any]) -> None:
-        sys.stdout.write(json.dumps(facts) + "\n")
-        sys.stdout.flush()
-
     with suppress(OSError):  # not allowed in a user namespace: then the scheduler decides
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
     ctypes.CDLL(None).prctl(PR_SET_TIMERSLACK, 1, 0, 0, 0)
     gc.disable()
-    control = sys.stdin.buffer
+    control, answers = sys.stdin.buffer, sys.stdout
     job = json.loads(control.readline())
     number = control.fileno()
     for device in job["devices"]:
         os.set_blocking(device, False)
     relay = Relay(job["devices"], job["directions"])
-    answer({"address": ""})
+    print(json.dumps({"address": ""}), file=answers, flush=True)
     relay.run_until(number)
     while control.readline():
-        answer(relay.facts())
+        print(json.dumps(relay.facts()), file=answers, flush=True)
         relay.run_until(number)
 
 
