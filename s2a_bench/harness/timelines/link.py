@@ -30,7 +30,6 @@ from s2a_bench.store.manifest import RunWarning
 
 TOKENS_A_SKILL: Final = 16
 """Tokens a skill that a model of unknown tokenizer may need for the paper's format."""
-MODE = "live"
 LATE = 1.05
 """An answer slower than the pace by this factor was not held back."""
 
@@ -185,7 +184,7 @@ class ModelLink:
             tokens_per_skill=of.tokens_per_skill,
             n_skills=of.n_skills,
             t_nom_s=of.shape.expected.nominal_s,
-            mode=MODE,
+            mode="live",
             emulated=self.origin.emulated,
         )
 
