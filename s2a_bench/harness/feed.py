@@ -174,19 +174,18 @@ class Camera:
             self._on_frame(captured)
 
 
+@dataclass(slots=True)
 class StreamFeed:
     """Prompts about the camera's newest frame, at a random moment between two frames.
 
     ``sink`` is for pipelines whose server keeps the newest frame itself.
     """
 
-    def __init__(self, camera: Camera, sink: CameraSink | None, period_ns: int, random: Random) -> None:
-        self.camera = camera
-        self.sink = sink
-        self._period_ns = period_ns
-        self._random = random
-        self._clock = SystemClock()
-        self.last: StreamedFrame | None = None
+    camera: Camera
+    sink: CameraSink | None
+    period_ns: int
+    random: Random
+    last: StreamedFrame | None = None
 
     def get_ready(self) -> None:
         """Wait for two new frames, so that the server has one, then for a random part of the period."""
@@ -194,7 +193,8 @@ class StreamFeed:
         newest = self.camera.newest()
         first = self.camera.next_frame(newest[0].index if newest else -1)
         self.camera.next_frame(first)
-        self._clock.sleep_until_ns(self._clock.now_ns() + self._random.randrange(self._period_ns))
+        clock = SystemClock()
+        clock.sleep_until_ns(clock.now_ns() + self.random.randrange(self.period_ns))
 
     def capture(self, trace: Trace) -> tuple[Frame, ...]:
         """Start the prompt's clock and take the newest frame; none if the server has it."""

@@ -83,7 +83,10 @@ class RunningLaunch:
         for row in session.frames():
             writer.frame(row)
         self.guard.see(sample, measured.fingerprint, measured.odd, client)
-        self.servers.raise_if_over(session.cell, measured, suspect=bool(sample.error) and clients == 1)
+        if not isinstance(measured.fatal, KeyboardInterrupt):
+            self.servers.raise_if_dead(session.cell, suspect=bool(sample.error) and clients == 1)
+        if measured.fatal is not None:
+            raise measured.fatal
         most = GIVE_UP_AFTER + session.answered * ceil(self.plan.wait_s / LONGEST_PAUSE_S)
         if sum(failures >= most for failures in self.guard.in_a_row[name].values()) >= clients:
             raise TransportError(f"{name} failed {most} times in a row, at last with {sample.error}")
@@ -267,9 +270,8 @@ class _Run:
             frames, state = feed.capture(trace), (0.0,) * request.state
             try:
                 with closing(servers.client(cell)) as client:
-                    list(
-                        client.request(Request("wait", request.prompt, frames, request.max_pieces, state=state), trace)
-                    )
+                    waiting = Request("wait", request.prompt, frames, request.max_pieces, state=state)
+                    list(client.request(waiting, trace))
                     return
             except TransportError as error:
                 if not error.starting:

@@ -16,7 +16,6 @@ from s2a_bench.errors import ServerDied
 from s2a_bench.harness.plan import RunPlan
 from s2a_bench.harness.processes import OwnServer, ServerProcess, start_program
 from s2a_bench.harness.serving import ServerJob, engine_handler
-from s2a_bench.harness.session import Measured
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.models import resolve
 from s2a_bench.progress import Progress
@@ -129,9 +128,9 @@ class ServerSet:
     def cache_hits(self) -> Mapping[str, float]:
         """Return counter -> cache hits that the external servers have counted so far."""
         hits: Counter[str] = Counter()
-        for server, pipeline in {each.server: each for each in self._plan.cells}.items():
+        for pipeline in {each.server: each for each in self._plan.cells}.values():
             if pipeline.black_box and (hits_of := pipeline.transport.urls.cache_hits):
-                hits.update(resolve_name(hits_of)(self._wiring(pipeline, self._servers[server].address)))
+                hits.update(resolve_name(hits_of)(self.wiring(pipeline)))
         return hits
 
     def model(self, facts: dict[str, Any]) -> dict[str, Any]:
@@ -169,14 +168,6 @@ class ServerSet:
         process = self._servers[pipeline.server].process
         if process is not None and process.ends_within(LAST_MOMENT_S if suspect else 0):
             raise process.death()
-
-    def raise_if_over(self, pipeline: Pipeline, measured: Measured, *, suspect: bool) -> None:
-        """Raise what makes the next request useless: Ctrl-C, the server's end, an error that will repeat."""
-        if isinstance(measured.fatal, KeyboardInterrupt):
-            raise measured.fatal
-        self.raise_if_dead(pipeline, suspect=suspect)
-        if measured.fatal is not None:
-            raise measured.fatal
 
     @contextmanager
     def death_explained(self, pipeline: Pipeline) -> Iterator[None]:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import InitVar, asdict, dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeAlias
 
 from s2a_bench.act.events import PlanFeed
 from s2a_bench.clock import clock_id, now_ns
@@ -51,13 +51,14 @@ from s2a_bench.types import Frame, Piece, Request, Token
 FATAL = (ServerDied, SourceError, UsageError, EngineError)
 """Errors after which the next request cannot succeed either."""
 
+Seen: TypeAlias = tuple[Piece, int]
+"""A piece, and its time of arrival in ns."""
+
 INTERRUPTED = "Interrupted: the run was ended during this request"
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """The position of a request in the run."""
-
     block: int
     position: int
     warmup: bool
@@ -104,34 +105,25 @@ KEPT_FRAMES = 90
 """Frames that a later answer may name: three seconds at 30 Hz."""
 
 
+@dataclass(eq=False)
 class Session:
-    """The client side of one cell."""
+    """The client side of one cell, with an open client."""
 
-    def __init__(
-        self,
-        cell: Pipeline,
-        client: Client,
-        feed: Feed,
-        request: RequestPlan,
-        recorder: RunRecorder | None = None,
-        sampler: ResourceSampler | None = None,
-        origin: Provenance = UNKNOWN_ORIGIN,
-        clocks: dict[str, Any] | None = None,
-    ) -> None:
-        """Measure ``cell`` with an open client. ``origin`` is replaced by the provenance that an answer carries.
+    cell: Pipeline
+    client: Client
+    feed: Feed
+    request: RequestPlan
+    recorder: RunRecorder | None = None
+    sampler: ResourceSampler = field(default_factory=lambda: ResourceSampler({}, 1))
+    origin: Provenance = UNKNOWN_ORIGIN
+    """It is replaced by the provenance that an answer carries."""
+    clocks: InitVar[dict[str, Any] | None] = None
+    """What sessions share of other hosts' clocks; see `Surroundings.clock` for none."""
 
-        ``clocks`` is what sessions share of other hosts' clocks; see `Surroundings.clock` for none.
-        """
-        self.origin = origin
-        self.cell = cell
-        self.client = client
-        self.feed = feed
-        self.request = request
-        self._recorder = recorder
-        self._sampler = sampler or ResourceSampler({}, 1)
-        self._frames: dict[int, StreamedFrame] = {}
-        others = (each.clock(self._exchange, clocks) for each in request.surroundings)
+    def __post_init__(self, clocks: dict[str, Any] | None) -> None:
+        others = (each.clock(self._exchange, clocks) for each in self.request.surroundings)
         self._clock = next(filter(None, others), None)
+        self._frames: dict[int, StreamedFrame] = {}
         self._pictures = 0
         """Of the last request."""
         self._absent, self.answered = 0, False
@@ -154,7 +146,7 @@ class Session:
     def _measure(self, place: Place, context: RequestContext) -> Measured:
         self.feed.get_ready()
         request_id = f"{self.cell.name}-{place.block}"
-        seen: list[tuple[Piece, int]] = []
+        seen: list[Seen] = []
         trace = Trace()
         error, retry_after_s = "", 0.0
         fatal: S2AError | KeyboardInterrupt | None = None
@@ -162,7 +154,7 @@ class Session:
         if state is None:  # another one in each block, float32
             state = tuple(swing(1, plan.state, place.block)[0].tolist()) if plan.state else ()
         started_ns = now_ns()
-        self._sampler.edge()
+        self.sampler.edge()
         frames = self.feed.capture(trace)
         sent = frames if self.origin.pictures != NOT_SENT else ()
         request = Request(request_id, plan.prompt, sent, plan.max_pieces, plan.grammar, plan.seed, state=state)
@@ -174,19 +166,19 @@ class Session:
             fatal, retry_after_s = self._failed(failure)
         except KeyboardInterrupt as interrupt:
             error, fatal = INTERRUPTED, interrupt
-        self._sampler.edge()
+        self.sampler.edge()
         self._pictures = len(frames)
         texts = iter(struck_pieces([piece.text for piece, _ in seen if isinstance(piece, Token)]))
         seen = [(replace(piece, text=next(texts)) if isinstance(piece, Token) else piece, at) for piece, at in seen]
-        trace.facts.update(self._sampler.window(started_ns, now_ns()))
+        trace.facts.update(self.sampler.window(started_ns, now_ns()))
         if not error and not seen:
             error = "RequestFailed: the answer was empty"
-        if self._recorder is not None:
+        if self.recorder is not None:
             if plan.mode == "request":  # in stream mode the camera records its frames
                 for frame in frames:
-                    self._recorder.frame(frame)
-            self._recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
-            self._recorder.flush()
+                    self.recorder.frame(frame)
+            self.recorder.answer(self.cell.name, request, trace.marks[0][1], seen, error)
+            self.recorder.flush()
         rows = self._rows(place, request_id, frames, trace, seen, error)
         if not rows.sample.error:
             self._absent, self.answered = 0, True
@@ -216,7 +208,7 @@ class Session:
             pass
         return trace
 
-    def _pieces(self, request: Request, trace: Trace, context: RequestContext) -> Iterator[tuple[Piece, int]]:
+    def _pieces(self, request: Request, trace: Trace, context: RequestContext) -> Iterator[Seen]:
         plan = context.plan
         if plan is not None:
             plan.requested(trace.marks[0][1])
@@ -236,13 +228,7 @@ class Session:
             plan.ended(now_ns())
 
     def _rows(
-        self,
-        place: Place,
-        request_id: str,
-        frames: Sequence[Frame],
-        trace: Trace,
-        seen: list[tuple[Piece, int]],
-        error: str,
+        self, place: Place, request_id: str, frames: Sequence[Frame], trace: Trace, seen: list[Seen], error: str
     ) -> Measured:
         facts = trace.facts
         origin = Provenance.from_dict(trace.provenance or (trace.remote.provenance if trace.remote else {}))
@@ -250,9 +236,13 @@ class Session:
             self.origin = replace(self.origin, link="real" if trace.remote.clock == clock_id() else UNKNOWN)
         if origin.known:
             self.origin = replace(origin, link=self.origin.link, link_profile=self.origin.link_profile)
-        joined, apart = self._joined(trace, seen) if seen and not error else (None, None)
-        if apart:
-            error = f"{type(apart).__name__}: {apart}"
+        other_host = trace.remote is not None and trace.remote.clock != clock_id()
+        joined, apart = None, None
+        if self._clock and other_host and seen and not error:
+            try:
+                joined = self._clock.join(trace, seen[-1][1])
+            except TransportError as failure:
+                apart, error = failure, f"{type(failure).__name__}: {failure}"
         streamed = self._streamed(trace, request_id, joined)
         if streamed:
             index, captured_ns, picture = streamed.index, streamed.captured_ns, streamed.index
@@ -268,7 +258,7 @@ class Session:
         error = error or self._doubt(trace, rgb_source, rgb_engine)
         started_ns = inference_start_ns(trace)
         age_ns = started_ns - captured_ns if started_ns is not None and captured_ns >= 0 else None
-        if joined or (trace.remote and trace.remote.clock != clock_id()):
+        if joined or other_host:
             facts.pop(CAMERA_STAMP_AGE_MS, None)  # the difference of two hosts' wall clocks
         self.prompt_n = _whole(facts.get(PROMPT_N)) or self.prompt_n
         sample = SampleRow(
@@ -316,15 +306,6 @@ class Session:
             for left_ns in (engine_ns.get(position),)
         ]
         return Measured(sample, tokens, picture, apart, odd=frozenset(trace.odd))
-
-    def _joined(self, trace: Trace, seen: list[tuple[Piece, int]]) -> tuple[Joined | None, TransportError | None]:
-        """Put the report of a server on another host on this host's clock, or return why that cannot be done."""
-        if self._clock is None or trace.remote is None or trace.remote.clock == clock_id():
-            return None, None
-        try:
-            return self._clock.join(trace, seen[-1][1]), None
-        except TransportError as failure:
-            return None, failure
 
     def _doubt(self, trace: Trace, rgb_source: int | None, rgb_engine: int | None) -> str:
         if unknown := {stage for stage, _ in trace.chain() if stage} - self.request.stages.keys():

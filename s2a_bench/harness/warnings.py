@@ -20,7 +20,6 @@ from s2a_bench.stats.change import change_of_ranks
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.trace import RESIDUAL_LIMIT, budget
-from s2a_bench.transport import Sleep
 from s2a_bench.transport.pipeline import Pipeline
 
 CLOCK_STEP_NS = 50_000_000
@@ -184,11 +183,6 @@ DOUBTS: Final = (
 """In the order of the warnings."""
 
 
-def padded_by(sleep: Sleep) -> Doubt:
-    together = f"no answers came earlier than {sleep.ms:.0f} ms after the request, and these together just then"
-    return Doubt("padded-answers", f"{together}: the server may have slept", sleep.advice)
-
-
 class SampleGuard:
     """Checks the samples of a run's ``cells`` as they arrive."""
 
@@ -255,7 +249,9 @@ class SampleGuard:
             after_ms = np.array(waits_ms) - min(waits_ms)
             pile, beyond = (int(np.sum(after_ms // PILE_MS == place)) for place in (0, 1))
             if 0 <= min(waits_ms) - sleep.ms < AWAKE_MS and pile > max(beyond, PILED * after_ms.size):
-                self._counts.setdefault(padded_by(sleep), Counter())[cell] = pile
+                what = f"no answers came earlier than {sleep.ms:.0f} ms after the request, and these together just then"
+                doubt = Doubt("padded-answers", f"{what}: the server may have slept", sleep.advice)
+                self._counts.setdefault(doubt, Counter())[cell] = pile
         for doubt, counts in self._counts.items():
             if doubt is FAILED:
                 found += self._odd_facts()

@@ -19,8 +19,6 @@ Value: TypeAlias = str | int | float
 
 @dataclass(frozen=True, slots=True)
 class Argument:
-    """An argument of a skill: its name and the vocabulary of its values."""
-
     name: str
     vocabulary: str
     values: tuple[Value, ...]
@@ -31,8 +29,6 @@ class Argument:
 
 @dataclass(frozen=True, slots=True)
 class Skill:
-    """One ability of the robot."""
-
     name: str
     arguments: tuple[Argument, ...]
     durations: Timing

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from s2a_bench.policy import Floats, Plans, PlanShape, Schedule
+from s2a_bench.policy import Floats, Plans, Schedule
 from s2a_bench.policy.changes import learned_along
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.schedule import align, hold
@@ -23,25 +23,21 @@ def schedule(prior: GapPrior, caution: ArrayLike, plans: Plans, rule: StartRule)
 
     Plans need ``token_s`` and ``shape``; raises ValueError without. The stream ends with its last token or fragment.
     """
-    if plans.token_s is None or plans.shape is None:
-        raise ValueError("an online policy learns from tokens: plans need token_s and shape")
     arrival_s, nominal_s, least_s, most_s = align(plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s)
     cautions = np.broadcast_to(np.asarray(caution, dtype=np.float64), arrival_s.shape[1:])
-    learned = learned_along(prior, plans.token_s) if rule.detect else None
-    known = _Known(prior, cautions, plans.shape, rule, learned)
-    stream = _Arrivals(plans.token_s, arrival_s)
+    stream = _Stream(prior, cautions, plans, rule, arrival_s)
     nominal_sum, most_sum = _sums_before(nominal_s), _sums_before(most_s)
     start_s = np.empty(arrival_s.shape)
     duration_s = np.empty(arrival_s.shape)
-    start_s[0] = _first_start(known, stream, nominal_sum, most_sum)
+    start_s[0] = _first_start(stream, nominal_sum, most_sum)
     for i, now_s in enumerate(start_s):
         duration_s[i] = nominal_s[i]
         if rule.elastic:
             if rule.detect and i:
-                now_s[:] = _resume(known, stream, now_s, most_sum, i)
+                now_s[:] = _resume(stream, now_s, most_sum, i)
             late_s = now_s - (start_s[0] + nominal_sum[i])
             least = np.minimum(np.maximum(1 - late_s / nominal_s[i], least_s[i] / nominal_s[i]), 1.0)
-            demand = _demand(known, stream, now_s, nominal_sum, i)
+            demand = _demand(stream, now_s, nominal_sum, i)
             duration_s[i] *= np.minimum(np.maximum(demand, least), most_s[i] / nominal_s[i])
         if i + 1 < len(start_s):
             np.maximum(now_s + duration_s[i], arrival_s[i + 1], out=start_s[i + 1])
@@ -53,15 +49,20 @@ def _sums_before(duration_s: Floats) -> Floats:
     return np.vstack([np.zeros(duration_s.shape[1]), np.cumsum(duration_s, axis=0)])
 
 
-class _Arrivals:
-    """Tokens and fragments of M plans in order of time, one event a row."""
+class _Stream:
+    """Tokens and fragments of M plans in order of time, one event a row, and what the rule knows of them."""
 
-    def __init__(self, token_s: Floats, arrival_s: Floats) -> None:
-        both = np.concatenate([token_s, arrival_s])
+    def __init__(self, prior: GapPrior, caution: Floats, plans: Plans, rule: StartRule, arrival_s: Floats) -> None:
+        if plans.token_s is None or plans.shape is None:
+            raise ValueError("an online policy learns from tokens: plans need token_s and shape")
+        self.prior, self.caution, self.shape, self.rule = prior, caution, plans.shape, rule
+        self.token_s = plans.token_s
+        # `GapPrior.learned` after each token, where changes of the rate are detected.
+        self.learned = learned_along(prior, self.token_s) if rule.detect else None
+        both = np.concatenate([self.token_s, arrival_s])
         # Stable: at one instant tokens come before the fragment that they complete.
         order = np.argsort(both, axis=0, kind="stable")
-        is_token = order < len(token_s)
-        self.token_s = token_s
+        is_token = order < len(self.token_s)
         self.event_s = np.take_along_axis(both, order, axis=0)
         # Tokens and fragments up to each event.
         self.tokens = np.cumsum(is_token, axis=0)
@@ -70,24 +71,14 @@ class _Arrivals:
         self.at_fragment = np.zeros((len(arrival_s) + 1, arrival_s.shape[1]), dtype=np.intp)
         self.at_fragment[1:] = self.tokens.T[~is_token.T].reshape(arrival_s.shape[::-1]).T
 
-
-@dataclass(frozen=True, slots=True)
-class _Known:
-    prior: GapPrior
-    caution: Floats
-    shape: PlanShape
-    rule: StartRule
-    learned: tuple[Floats, Floats] | None
-    """`GapPrior.learned` after each token, where changes of the rate are detected."""
-
-    def view(self, stream: _Arrivals, plans: Ints, event: Ints) -> _View:
-        tokens, parsed = stream.tokens[event, plans], stream.parsed[event, plans]
-        last_s = stream.token_s[np.maximum(tokens, 1) - 1, plans]
+    def view(self, plans: Ints, event: Ints) -> _View:
+        tokens, parsed = self.tokens[event, plans], self.parsed[event, plans]
+        last_s = self.token_s[np.maximum(tokens, 1) - 1, plans]
         if self.learned is None:
-            mean_s, variance = self.prior.learned(np.maximum(tokens - 1.0, 0.0), last_s - stream.token_s[0, plans])
+            mean_s, variance = self.prior.learned(np.maximum(tokens - 1.0, 0.0), last_s - self.token_s[0, plans])
         else:
             mean_s, variance = (each[np.maximum(tokens, 1) - 1, plans] for each in self.learned)
-        next_in = np.maximum(self.shape.tokens_per_skill - (tokens - stream.at_fragment[parsed, plans]), 1.0)
+        next_in = np.maximum(self.shape.tokens_per_skill - (tokens - self.at_fragment[parsed, plans]), 1.0)
         missing = np.maximum(self.shape.n_skills - parsed, 0)
         unknown = np.arange(missing.max(initial=0), dtype=np.float64)[:, np.newaxis]
         return _View(self, plans, parsed, missing, last_s, mean_s, variance, next_in, unknown)
@@ -97,7 +88,7 @@ class _Known:
 class _View:
     """State of some plans after an event: one value per plan, and a row for each missing skill."""
 
-    known: _Known
+    stream: _Stream
     plans: Ints
     parsed: Ints
     missing: Ints
@@ -117,7 +108,7 @@ class _View:
         """
         at_s = np.full(self.plans.shape, -np.inf)
         for unknown in (np.zeros_like(self.next_in), np.maximum(self.missing - 1.0, 0.0)):
-            tokens = self.next_in + unknown * self.known.shape.tokens_per_skill
+            tokens = self.next_in + unknown * self.stream.shape.tokens_per_skill
             budget_s = known_s + unknown * unknown_s
             each_s = self.last_s + tokens * self.mean_s - budget_s
             each_s[(tokens - 1) * self.mean_s > budget_s] = np.inf
@@ -139,16 +130,16 @@ class _View:
 
     @property
     def caution(self) -> Floats:
-        return self.known.caution[self.plans]
+        return self.stream.caution[self.plans]
 
     def _forecasts(self, unknown_s: float, caution: Floats) -> tuple[Floats, Floats]:
         """Return the cautious forecasts in s from the last token, and from a token that arrives now."""
-        tokens = self.next_in + self.unknown * self.known.shape.tokens_per_skill
-        skills = self.unknown * (self.known.shape.expected_cv * unknown_s) ** 2
+        tokens = self.next_in + self.unknown * self.stream.shape.tokens_per_skill
+        skills = self.unknown * (self.stream.shape.expected_cv * unknown_s) ** 2
         return self._forecast(tokens, skills, caution), self._forecast(tokens - 1, skills, caution)
 
     def _forecast(self, tokens: Floats, skills: Floats, caution: Floats) -> Floats:
-        gaps = tokens * self.known.prior.token_cv**2 + tokens**2 * self.variance
+        gaps = tokens * self.stream.prior.token_cv**2 + tokens**2 * self.variance
         noise = np.sqrt(self.mean_s**2 * gaps + skills)
         # Zero noise stays zero, also with infinite caution.
         np.multiply(noise, caution, out=noise, where=noise > 0)
@@ -158,11 +149,11 @@ class _View:
         return np.asarray(each.max(axis=0, initial=-np.inf, where=self.unknown < self.missing))
 
 
-def _first_start(known: _Known, stream: _Arrivals, nominal_sum: Floats, most_sum: Floats) -> Floats:
-    rule, expected = known.rule, known.shape.expected
+def _first_start(stream: _Stream, nominal_sum: Floats, most_sum: Floats) -> Floats:
+    rule, expected = stream.rule, stream.shape.expected
 
     def at_s(event: int, live: Ints, until_s: Floats) -> Floats:
-        view = known.view(stream, live, np.full(live.shape, event))
+        view = stream.view(live, np.full(live.shape, event))
         nominal_s, most_s = nominal_sum[view.parsed, live], most_sum[view.parsed, live]
         if not rule.elastic:
             return view.cautious_start_s(nominal_s, expected.nominal_s, view.caution)
@@ -173,7 +164,7 @@ def _first_start(known: _Known, stream: _Arrivals, nominal_sum: Floats, most_sum
             found = np.where(found > rule.within * whole_s, view.mean_start_s(nominal_s, expected.nominal_s), found)
         # The cheap mean forecast rules out most plans; the cautious one is computed for the rest.
         near = np.flatnonzero(found < until_s)
-        view = known.view(stream, live[near], np.full(near.shape, event))
+        view = stream.view(live[near], np.full(near.shape, event))
         cautious_s = view.cautious_start_s(most_s[near], expected.most_s, rule.start_caution * view.caution)
         found[near] = np.maximum(found[near], cautious_s)
         return found
@@ -182,16 +173,16 @@ def _first_start(known: _Known, stream: _Arrivals, nominal_sum: Floats, most_sum
     return _first(stream, waiting, np.full(waiting.shape, -np.inf), at_s)
 
 
-def _resume(known: _Known, stream: _Arrivals, now_s: Floats, most_sum: Floats, skill: int) -> Floats:
+def _resume(stream: _Stream, now_s: Floats, most_sum: Floats, skill: int) -> Floats:
     """Return when the skill of that number starts: later than now where no forecast is met."""
-    unknown_s = known.shape.expected.most_s
-    plans, view = _unfinished(known, stream, now_s)
+    unknown_s = stream.shape.expected.most_s
+    plans, view = _unfinished(stream, now_s)
     most_s = most_sum[view.parsed, plans] - most_sum[skill, plans]
     favourable = np.full(plans.shape, -FAVOURABLE)
     holding = plans[view.cautious_start_s(most_s, unknown_s, favourable) > now_s[plans]]
 
     def at_s(event: int, live: Ints, until_s: Floats) -> Floats:  # noqa: ARG001 - no cheaper test
-        view = known.view(stream, live, np.full(live.shape, event))
+        view = stream.view(live, np.full(live.shape, event))
         return view.cautious_start_s(most_sum[view.parsed, live] - most_sum[skill, live], unknown_s, view.caution)
 
     start_s = now_s.copy()
@@ -199,7 +190,7 @@ def _resume(known: _Known, stream: _Arrivals, now_s: Floats, most_sum: Floats, s
     return start_s
 
 
-def _first(stream: _Arrivals, plans: Ints, from_s: Floats, at_s: Callable[[int, Ints, Floats], Floats]) -> Floats:
+def _first(stream: _Stream, plans: Ints, from_s: Floats, at_s: Callable[[int, Ints, Floats], Floats]) -> Floats:
     """Return the first time from ``from_s`` on that ``at_s`` allows, at the latest the last event.
 
     ``at_s`` takes an event, plans, and the times of their next events.
@@ -221,17 +212,17 @@ def _first(stream: _Arrivals, plans: Ints, from_s: Floats, at_s: Callable[[int, 
     return start_s
 
 
-def _unfinished(known: _Known, stream: _Arrivals, now_s: Floats) -> tuple[Ints, _View]:
+def _unfinished(stream: _Stream, now_s: Floats) -> tuple[Ints, _View]:
     """Return the plans with further events, and their present state."""
     plans = np.flatnonzero(now_s < stream.event_s[-1])
     event = (stream.event_s[:, plans] <= now_s[plans]).sum(axis=0) - 1
-    return plans, known.view(stream, plans, event)
+    return plans, stream.view(plans, event)
 
 
-def _demand(known: _Known, stream: _Arrivals, now_s: Floats, nominal_sum: Floats, skill: int) -> Floats:
+def _demand(stream: _Stream, now_s: Floats, nominal_sum: Floats, skill: int) -> Floats:
     """Return each plan's demand when the skill of that number (from 0) starts; -inf after the last event."""
     demand = np.full(now_s.shape, -np.inf)
-    plans, view = _unfinished(known, stream, now_s)
+    plans, view = _unfinished(stream, now_s)
     known_s = nominal_sum[view.parsed, plans] - nominal_sum[skill, plans]
-    demand[plans] = view.demand(now_s[plans], known_s, known.shape.expected.nominal_s)
+    demand[plans] = view.demand(now_s[plans], known_s, stream.shape.expected.nominal_s)
     return demand

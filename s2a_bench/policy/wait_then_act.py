@@ -70,8 +70,6 @@ class Clairvoyant(Policy):
 
 
 class ClairvoyantStepper(NominalQueue):
-    """Wait for S0, then act as naive."""
-
     def __init__(self, start_s: float) -> None:
         super().__init__()
         self.start_s = start_s

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -53,60 +54,56 @@ seeded = st.builds(
 )
 
 
+def for_random_plans(test: Callable[..., None]) -> Callable[..., None]:
+    return shared(given(plans=seeded)(test))
+
+
 class PolicySuite:
     """Fixture: ``policy``, whose name is in `POLICIES`."""
 
     def test_its_name_is_the_one_it_is_found_by(self, policy: Policy) -> None:
         assert policy.name in POLICIES
 
-    @shared
-    @given(plans=seeded)
+    @for_random_plans
     def test_the_stepper_and_the_arrays_agree(self, policy: Policy, plans: Plans) -> None:
         schedule, stepped = policy.schedule(plans), stepping.schedule(policy, plans)
         np.testing.assert_allclose(stepped.start_s, schedule.start_s, rtol=0, atol=EXACT)
         np.testing.assert_allclose(stepped.duration_s, schedule.duration_s, rtol=0, atol=EXACT)
 
-    @shared
-    @given(plans=seeded)
+    @for_random_plans
     def test_no_skill_starts_before_it_has_arrived(self, policy: Policy, plans: Plans) -> None:
         assert (policy.schedule(plans).start_s >= plans.arrival_s).all()
 
-    @shared
-    @given(plans=seeded)
+    @for_random_plans
     def test_no_two_skills_run_at_once(self, policy: Policy, plans: Plans) -> None:
         schedule = policy.schedule(plans)
         assert (schedule.start_s[1:] >= (schedule.start_s + schedule.duration_s)[:-1] - EXACT).all()
 
-    @shared
-    @given(plans=seeded)
+    @for_random_plans
     def test_every_skill_takes_at_least_its_least_and_at_most_its_most(self, policy: Policy, plans: Plans) -> None:
         duration_s = policy.schedule(plans).duration_s
         assert (duration_s >= plans.least_s - EXACT).all()
         assert (duration_s <= plans.most_s + EXACT).all()
 
-    @shared
-    @given(plans=seeded)
+    @for_random_plans
     def test_a_started_robot_idles_only_when_the_next_skill_is_missing(self, policy: Policy, plans: Plans) -> None:
         schedule = policy.schedule(plans)
         ready_s = np.maximum((schedule.start_s + schedule.duration_s)[:-1], plans.arrival_s[1:])
         np.testing.assert_allclose(schedule.start_s[1:], ready_s, rtol=0, atol=EXACT)
 
-    @shared
-    @given(plans=seeded)
+    @for_random_plans
     def test_nothing_ends_before_the_elastic_optimum(self, policy: Policy, plans: Plans) -> None:
         schedule = policy.schedule(plans)
         end_s = schedule.start_s[-1] + schedule.duration_s[-1]
         assert (end_s >= least_end(plans.arrival_s, plans.least_s) - EXACT).all()
 
-    @shared
-    @given(plans=seeded)
+    @for_random_plans
     def test_a_start_before_that_of_the_elastic_optimum_stalls(self, policy: Policy, plans: Plans) -> None:
         schedule = policy.schedule(plans)
         early = schedule.start_s[0] < safe_start(plans.arrival_s, plans.most_s) - EXACT
         assert (stalls(schedule).sum(axis=0)[early] > 0).all()
 
-    @shared
-    @given(plans=seeded)
+    @for_random_plans
     def test_every_plan_is_decided_by_itself(self, policy: Policy, plans: Plans) -> None:
         schedule = policy.schedule(plans)
         for column in range(plans.arrival_s.shape[1]):
@@ -127,8 +124,7 @@ class PolicySuite:
         step(policy, plans, 1)
         assert step(policy, plans, 0) == first
 
-    @shared
-    @given(plans=seeded)
+    @for_random_plans
     def test_a_plan_of_one_skill_starts_when_it_arrives(self, policy: Policy, plans: Plans) -> None:
         assert plans.token_s is not None
         assert plans.shape is not None
@@ -142,8 +138,7 @@ class PolicySuite:
         )
         np.testing.assert_array_equal(policy.schedule(single).start_s, single.arrival_s)
 
-    @shared
-    @given(plans=seeded)
+    @for_random_plans
     def test_a_stream_that_breaks_off_is_carried_out_as_far_as_it_came(self, policy: Policy, plans: Plans) -> None:
         starts, durations = step(policy, plans, missing=3)
         assert len(starts) == len(durations) == len(plans.arrival_s)

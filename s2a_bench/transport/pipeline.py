@@ -216,7 +216,7 @@ def require_payload(pipeline: Pipeline, mode: str, *, resized: bool) -> None:
         raise UsageError(f"`resize`: {pipeline.payload} is what the camera gave; use `payload` raw, jpeg or png")
     if mode == "stream" and pipeline.preencoded:
         raise UsageError(f"`payload` {PREENCODED} has no meaning in `mode` stream; use jpeg")
-    can = pipeline.capabilities.payloads
+    can = pipeline.transport.capabilities(Choice(pipeline.options, pipeline.variant, mode)).payloads
     if pipeline.payload and pipeline.payload not in can:
         path = pipeline.name.partition("?")[0]
         raise UsageError(

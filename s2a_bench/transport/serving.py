@@ -360,7 +360,7 @@ class SharedSourceWorkers:
     always waits; surplus threads end when they are idle.
     """
 
-    def __init__(self, take: Callable[[], Callable[[], None] | None], stopped: Event) -> None:
+    def __init__(self, take: Callable[[], Callable[[], object] | None], stopped: Event) -> None:
         """Receive with ``take``, which waits a moment and returns the function that answers a request, or None."""
         self._take, self._stopped = take, stopped
         self._waits, self._count = Lock(), Lock()

@@ -273,7 +273,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"options": {"ros": {"action": "/x"}}, "mode": "stream"}, "`action`: `mode` stream needs our own server"),
         (
             {"transports": "ros/action", "payload": "jpeg"},
-            "`payload`: a goal carries sensor_msgs/Image, not jpeg",
+            "`payload`: ros/action can send a picture as raw, yuyv, not as jpeg",
         ),
         ({"options": {"http": {"url": "http://x", "llama_server": Path("y")}}}, "`url` and `llama_server`"),
         ({"options": URL, "payload": "raw"}, "can send a picture as jpeg, jpeg-preencoded, png, not as raw"),

@@ -14,7 +14,7 @@ from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.llama_cpp import LlamaCppEngine, llama_cpp
 from s2a_bench.inference.llama_prompt import Steps, mtmd_cpp
 from s2a_bench.testing.engine import EngineSuite, ask, rgb_frame
-from s2a_bench.transport.ros.action_source import BOUNDS
+from s2a_bench.transport.ros.action import BOUNDS
 from s2a_bench.types import Frame, Request
 
 PLAN = r"""

@@ -12,7 +12,7 @@ import pytest
 
 from s2a_bench.machine.doctor import Machine
 from s2a_bench.transport.pipeline import one_pipeline
-from s2a_bench.transport.ros.buffers import check, cyclone_line
+from s2a_bench.transport.ros.checks import buffers, cyclone_line
 
 SOURCED = {"ROS_DISTRO": "jazzy", "AMENT_PREFIX_PATH": "/opt/ros/jazzy"}
 CYCLONE = SOURCED | {"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}
@@ -76,7 +76,7 @@ def test_the_doctor_looks_at_the_buffers(tmp_path: Path, environ: dict[str, str]
     (tmp_path / "etc").mkdir()
     size = "<MinimumSocketReceiveBufferSize>8MB</MinimumSocketReceiveBufferSize>"
     (tmp_path / "etc" / "dds.xml").write_text(f"<CycloneDDS><Domain><Internal>{size}</Internal></Domain></CycloneDDS>")
-    finding = check(Machine(tmp_path, environ))
+    finding = buffers(Machine(tmp_path, environ))
     assert (finding.level if finding else "") == level
     assert says in (finding.message if finding else "")
     if finding and level in {"warning", "advice"}:
@@ -89,4 +89,4 @@ def test_cyclone_takes_the_line_as_it_stands() -> None:
     shell = f"{cyclone_line(environ)}\n{sys.executable} -c '{code}' && echo $CYCLONEDDS_URI"
     done = subprocess.run(["bash", "-c", shell], env=environ, capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.startswith(LOOPBACK)
-    assert check(Machine(environ={"CYCLONEDDS_URI": done.stdout})).level == "state"  # type: ignore[union-attr]
+    assert buffers(Machine(environ={"CYCLONEDDS_URI": done.stdout})).level == "state"  # type: ignore[union-attr]

@@ -8,7 +8,7 @@ from s2a_bench.errors import RequestFailed
 from s2a_bench.inference import ENGINES
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.ros.messages import VERSIONS, default, deserialise, serialise
-from s2a_bench.transport.ros.action_source import BOUNDS, Wishes
+from s2a_bench.transport.ros.action import BOUNDS, Wishes
 
 HONOURED = ENGINES["llama"].honours
 

@@ -9,7 +9,7 @@ from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.facts import PROMPT_N
 from s2a_bench.trace import Trace
 from s2a_bench.transport.chunks import request_of, state_of
-from s2a_bench.transport.http import blocks, native
+from s2a_bench.transport.http import native
 from s2a_bench.transport.limits import Limits, check_values, text
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.serving import Disconnected, Exchange
@@ -100,7 +100,7 @@ class ChatExchange(Exchange):
 
     parse_stage = "json_parse"
     takes_blocks = False
-    """Whether the client reads actions as `blocks`."""
+    """Whether the client reads actions as `native.Blocks`."""
 
     def __init__(self, codec: native.Codec, trace: Trace | None = None) -> None:
         super().__init__(trace)
@@ -135,7 +135,7 @@ class ChatExchange(Exchange):
             event["choices"][0]["token"] = piece.id
             self._write(self._framed(event))
         elif self.takes_blocks:
-            self._write(blocks.of_action(piece), blocks.MEDIA_TYPE)
+            self._write(native.action_block(piece), native.BLOCKS)
         else:
             event = native.stream_event(self._request.id, {})
             event["choices"][0] |= {"tick": piece.index, "action": piece.values.tolist()}
@@ -156,7 +156,7 @@ class ChatExchange(Exchange):
             answer = {"id": request_id, "object": "chat.completion", "model": "s2a"}
             choice = {"index": 0, "message": message, "finish_reason": finish}
             self.whole(200, {**answer, "choices": [choice], "usage": usage, "s2a": marks}, {})
-        elif self._kind == blocks.MEDIA_TYPE:
+        elif self._kind == native.BLOCKS:
             self._write(self._framed(native.stream_event(request_id, {}, finish, s2a=marks)), last=True)
         else:
             end = (
@@ -177,8 +177,8 @@ class ChatExchange(Exchange):
         self.write(data, self._kind if first else "", last=last)
 
     def _framed(self, value: Any) -> bytes:
-        if self._kind == blocks.MEDIA_TYPE:
-            return blocks.json_block(value)
+        if self._kind == native.BLOCKS:
+            return native.json_block(value)
         return b"data: " + self._codec.dumps(value) + b"\n\n"
 
 

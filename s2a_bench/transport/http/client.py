@@ -22,7 +22,7 @@ from s2a_bench.facts import HEADERS_OFF_MS, PAYLOAD_BYTES, PROMPT_MS, RECONNECTS
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Client, Wiring
-from s2a_bench.transport.http import HEADERS_MS, THINKING_MS, THINKING_PIECES, blocks, native
+from s2a_bench.transport.http import HEADERS_MS, THINKING_MS, THINKING_PIECES, native
 from s2a_bench.transport.http.clients import BoundedClient, HttpResponse, LeanClient
 from s2a_bench.transport.http.detect import body_of, met
 from s2a_bench.transport.http.dialects import NATIVE, Event, open_dialect
@@ -117,7 +117,7 @@ class HttpClient(Client):
     def _check(self, response: HttpResponse) -> None:
         """Raise RequestFailed unless the headers announce a good answer."""
         kind = response.headers.get("content-type", "")
-        expected = self._dialect.media_type, *((blocks.MEDIA_TYPE,) if self._dialect.name == NATIVE else ())
+        expected = self._dialect.media_type, *((native.BLOCKS,) if self._dialect.name == NATIVE else ())
         if response.status_code != httpx.codes.OK or not kind.startswith(expected):
             text = body_of(response, ERROR_LIMIT, self._wiring.timeout_s)
             raise refusal(self._url, response, text, self._options, self._dialect.media_type)
@@ -202,8 +202,8 @@ class HttpClient(Client):
 
     def _events(self, response: HttpResponse) -> Iterator[Event]:
         """Yield the events of an answer; comments and incomplete events count as silence."""
-        if response.headers.get("content-type") == blocks.MEDIA_TYPE:
-            decoder = Decoder(self._dialect, blocks.read_block, blocks.Blocks)
+        if response.headers.get("content-type") == native.BLOCKS:
+            decoder = Decoder(self._dialect, native.read_block, native.Blocks)
         else:
             decoder = Decoder(self._dialect, self._codec.loads)
         event_ns, patience_ns = now_ns(), int(self._wiring.timeout_s * 1e9)

@@ -9,7 +9,7 @@ the interface of httpx as far as `client` uses it, exceptions included.
 from __future__ import annotations
 
 import socket
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from http.client import HTTPConnection, HTTPException, HTTPResponse, InvalidURL
 from math import inf
@@ -52,16 +52,10 @@ class _Network(httpcore.NetworkBackend):
         self._backend, self._client = backend, client
 
     def connect_tcp(
-        self,
-        host: str,
-        port: int,
-        timeout: float | None = None,
-        local_address: str | None = None,
-        socket_options: Iterable[Any] | None = None,
+        self, host: str, port: int, timeout: float | None = None, *rest: Any, **options: Any
     ) -> httpcore.NetworkStream:
         with _in_time(self._client.bounds, timeout) as left_s:
-            stream = self._backend.connect_tcp(host, port, left_s, local_address, socket_options)
-        return _BoundedStream(stream, self._client)
+            return _BoundedStream(self._backend.connect_tcp(host, port, left_s, *rest, **options), self._client)
 
 
 class _BoundedStream(httpcore.NetworkStream):

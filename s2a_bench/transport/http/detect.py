@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Any
 from urllib.parse import SplitResult, urlsplit, urlunsplit
 
@@ -18,7 +19,7 @@ from s2a_bench.trace import FACT_LIMIT
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.http.clients import BoundedClient, HttpResponse
 from s2a_bench.transport.http.dialects import DIALECTS, NATIVE, open_dialect
-from s2a_bench.transport.http.dialects.common import NO_LIST, NO_MODEL, Dialect, Get, endpoint, first_model
+from s2a_bench.transport.http.dialects.common import NO_LIST, NO_MODEL, Dialect, endpoint, first_model
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
@@ -41,10 +42,12 @@ def met(base: str, key: str, options: HttpOptions) -> tuple[Dialect, str, str]:
     spoken, model = options.spoken, options.served_model
     with probe(base) as client:
         if not spoken:
-            owner, first = first_model(base, getter(client, open_dialect("openai").authorization(key) if key else {}))
+            headers = open_dialect("openai").authorization(key) if key else {}
+            owner, first = first_model(base, partial(_json, client, headers))
             spoken, model = OWNERS.get(owner, "openai"), model or first or NO_MODEL
         dialect = open_dialect(spoken, options)
-        base, model = dialect.met(base, model, getter(client, dialect.authorization(key) if key else {}))
+        headers = dialect.authorization(key) if key else {}
+        base, model = dialect.met(base, model, partial(_json, client, headers))
     return dialect, dialect.url(base, model), model
 
 
@@ -62,7 +65,7 @@ def cache_hits(wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
         with probe(wiring.address) as client:
             key = read_key(wiring.options.api_key_env)
             headers = {"authorization": f"Bearer {key}"} if key else {}
-            text = _text(urlunsplit((url.scheme, url.netloc, path, "", "")), client, headers)
+            text = _text(client, headers, urlunsplit((url.scheme, url.netloc, path, "", "")))
         for name, value in HITS.findall(text):
             if 0 <= float(value) <= FACT_LIMIT:
                 hits[name] = hits.get(name, 0.0) + float(value)
@@ -78,7 +81,7 @@ def examine(parts: SplitResult) -> Iterator[Finding | str]:
     try:
         with probe(url) as client:
             client.event_hooks["response"] = [heads.append]
-            _, model = first_model(url, getter(client, {}))
+            _, model = first_model(url, partial(_json, client, {}))
     except ServerDied as error:
         raise OSError(str(error).rpartition(": ")[2]) from error
     except (*NO_LIST, S2AError, httpx.HTTPError, httpx.InvalidURL) as error:
@@ -104,17 +107,14 @@ def _acts(base: str) -> bool:
     return False
 
 
-def getter(client: BoundedClient, headers: dict[str, str]) -> Get:
-    def get(url: str) -> Any:
-        try:
-            return json.loads(_text(url, client, headers))
-        except (RequestFailed, httpx.HTTPError, httpx.InvalidURL) as error:
-            raise ValueError(str(error)) from error
-
-    return get
+def _json(client: BoundedClient, headers: dict[str, str], url: str) -> Any:
+    try:
+        return json.loads(_text(client, headers, url))
+    except (RequestFailed, httpx.HTTPError, httpx.InvalidURL) as error:
+        raise ValueError(str(error)) from error
 
 
-def _text(url: str, client: BoundedClient, headers: dict[str, str]) -> str:
+def _text(client: BoundedClient, headers: dict[str, str], url: str) -> str:
     """Return the body of a GET; raises ServerDied if nothing answers, RequestFailed if the answer does not end."""
     client.bounds = Bounds(url, PATIENCE_S, 0)
     try:

@@ -3,26 +3,34 @@
 The dialect is OpenAI's ``chat/completions`` with Server-Sent Events and three optional additions: the media type
 ``application/x-raw`` for uncompressed pixels, the fields ``grammar`` (as in llama-server) and ``request_id``, and in
 the last event the key ``s2a`` with the server's marks.
+
+Answers of *binary* with actions are blocks: each action as bytes, the end or an error as a block of JSON. A block is
+the length of what follows (uint32), then b"A", the tick (uint32) and the float32 of one action, or b"J" and JSON; all
+little endian.
 """
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable, Iterable, Mapping
+import struct
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any, Final
 
+import numpy as np
 import orjson
 import pybase64
 
 from s2a_bench.errors import BadRequest, Busy, EngineError, Overdue, S2AError, TooLarge
 from s2a_bench.transport.access import Access
+from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http import VARIANTS
 from s2a_bench.transport.http.dialects.common import sampled
+from s2a_bench.transport.http.dialects.framing import LIMIT
 from s2a_bench.transport.serving import Core, Queued
-from s2a_bench.types import Request
+from s2a_bench.types import Action, Request
 
 AS_DEPLOYED, BEST_EFFORT, BINARY, LLAMA_SERVER = VARIANTS
 
@@ -41,6 +49,9 @@ LINES: Final = 128
 
 PARAMETERS_HEADER = "s2a-request"
 """Binary variant: this header has the parameters as ASCII JSON, the body the picture's bytes."""
+BLOCKS: Final = "application/x-s2a-actions"
+LENGTH: Final = struct.Struct("<I")
+ACTION_BLOCK, JSON_BLOCK = b"A", b"J"
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,3 +159,49 @@ def stream_event(
     """Return one streamed event; the last one has ``usage`` and no choices."""
     choices = [] if "usage" in extra else [{"index": 0, "delta": delta, "finish_reason": finish_reason}]
     return {"id": request_id, "object": "chat.completion.chunk", "model": "s2a", "choices": choices, **extra}
+
+
+def action_block(action: Action) -> bytes:
+    block = ACTION_BLOCK + LENGTH.pack(action.index) + action.values.astype("<f4").tobytes()
+    return LENGTH.pack(len(block)) + block
+
+
+def json_block(message: Any) -> bytes:
+    block = JSON_BLOCK + orjson.dumps(message)
+    return LENGTH.pack(len(block)) + block
+
+
+def read_block(block: bytes) -> Any:
+    """Return a block's content as a message of the native dialect; raises ValueError or RequestFailed."""
+    if block[:1] == JSON_BLOCK:
+        return orjson.loads(block[1:])
+    if block[:1] != ACTION_BLOCK or len(block) <= 1 + LENGTH.size or (len(block) - 1 - LENGTH.size) % 4:
+        raise ValueError("a block that is neither an action nor JSON")
+    (index,) = LENGTH.unpack_from(block, 1)
+    values = np.frombuffer(block, "<f4", offset=1 + LENGTH.size)
+    return {"choices": [{"actions": actions_of(values, index)}]}
+
+
+class Blocks:
+    """A framing that cuts a body into blocks, see `dialects.framing`."""
+
+    def __init__(self) -> None:
+        self._held = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[bytes]:
+        self._held += data
+        while len(self._held) >= LENGTH.size:
+            (size,) = LENGTH.unpack_from(self._held)
+            if size > LIMIT:
+                raise ValueError(f"a block of {size} bytes")
+            if len(self._held) < LENGTH.size + size:
+                return
+            block = bytes(self._held[LENGTH.size : LENGTH.size + size])
+            del self._held[: LENGTH.size + size]
+            yield block
+
+    def end(self) -> Iterator[bytes]:
+        """Yield nothing; raises ValueError for a truncated block."""
+        if self._held:
+            raise ValueError("a block that is cut off")
+        yield from ()

@@ -61,6 +61,3 @@ class LoopbackClient(Client):
         except EngineError as error:
             raise RequestFailed(str(error)) from error
         trace.receive(served.to_remote())
-
-    def close(self) -> None:
-        """Own no connection."""

@@ -48,7 +48,7 @@ class Ros(Transport[RosOptions]):
         "ros": "s2a_bench.transport.ros.checks:ros",
         "middleware": "s2a_bench.transport.ros.checks:middleware",
         **{code: check for _, kind in MIDDLEWARES.loaded() for code, check in kind.checks.items()},
-        "dds-buffers": "s2a_bench.transport.ros.buffers:check",
+        "dds-buffers": "s2a_bench.transport.ros.checks:buffers",
     }
     udp_checks = ("rmem-max",)
     urls = Urls(("ros",))
@@ -75,8 +75,8 @@ class Ros(Transport[RosOptions]):
         return replace(can, payloads=payloads, answer_kinds=(TOKENS,), accepts_state=False)
 
     def require(self, choice: Choice[RosOptions]) -> None:
-        """Raise UsageError for what a goal cannot carry, and for a stream to an external server."""
-        variant, options, mode = choice.variant, choice.options, choice.mode
+        """Raise UsageError for options of another middleware or variant, and for a stream to an external server."""
+        variant, options = choice.variant, choice.options
         domain_id(os.environ)
         if options.kind.extra:
             extras.need(options.kind.extra, options.kind.module)
@@ -86,13 +86,8 @@ class Ros(Transport[RosOptions]):
                 raise UsageError(f"`{at.option}` is {name.title()}'s: choose `middleware` {name}, or leave it out")
         if options.action and variant != ACTION:
             raise UsageError(f"`action` is spoken by ros/{ACTION}, not by ros/{variant}")
-        if options.action and mode == "stream":
+        if options.action and choice.mode == "stream":
             raise UsageError("`action`: `mode` stream needs our own server, which keeps the camera's newest frame")
-        if variant == ACTION and mode == "request" and options.payload not in {"raw", "yuyv"}:
-            raise UsageError(
-                f"`payload`: a goal carries sensor_msgs/Image, not {options.payload}; say it for this transport alone: "
-                f"ros/{ACTION}?payload=raw"
-            )
 
     def tuned(self, options: RosOptions) -> bool:
         """Return False for DDS, and processes, as they come."""
@@ -102,7 +97,7 @@ class Ros(Transport[RosOptions]):
         return not loss_advice(options.kind.dds_in(os.environ))
 
     def against_loss(self, options: RosOptions) -> str:
-        from s2a_bench.transport.ros.buffers import against_loss
+        from s2a_bench.transport.ros.checks import against_loss
 
         return against_loss(options.kind.dds_in(os.environ), os.environ)
 
@@ -114,8 +109,8 @@ class Ros(Transport[RosOptions]):
 
     def ready(self, wiring: Wiring[RosOptions]) -> str:
         from s2a_bench.ros.llama import GENERATE_RESPONSE
-        from s2a_bench.transport.ros.buffers import hint
         from s2a_bench.transport.ros.camera import CAMERA
+        from s2a_bench.transport.ros.checks import hint
         from s2a_bench.transport.ros.joining import AT, place_of, remapped
 
         kind, names = wiring.options.kind, remapped(wiring)

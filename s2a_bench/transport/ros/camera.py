@@ -69,6 +69,7 @@ class CameraPublisher:
         self._offset_ns = realtime_offset_ns()
         topic, type_name = (CAMERA, ros.IMAGE) if payload in PIXELS else (COMPRESSED_CAMERA, ros.COMPRESSED_IMAGE)
         self._publisher = middleware.publisher(namespace + topic, type_name, CAMERA_QOS[qos])
+        self.matched = self._publisher.matched
 
     def stamp_ns(self, frame: Frame) -> int:
         return frame.stamp_ns + self._offset_ns
@@ -78,9 +79,6 @@ class CameraPublisher:
         packed = self._publisher.pack(message)
         trace.mark("cdr_pack")
         self._publisher.send(packed)
-
-    def matched(self) -> int:
-        return self._publisher.matched()
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,19 +17,16 @@ END_S: Final = 5.0
 """The longest that an answer's end waits for that of the answer before."""
 
 
-def _ended() -> Event:
-    event = Event()
-    event.set()
-    return event
-
-
 @dataclass(slots=True)
 class Shared:
     cache: CameraCache
     activity: Activity
     stopped: Event = field(default_factory=Event)
-    ended: Event = field(default_factory=_ended)
+    ended: Event = field(default_factory=Event)
     """Set when the end of the last answer that was begun has been sent."""
+
+    def __post_init__(self) -> None:
+        self.ended.set()
 
 
 class RosExchange(Exchange):
@@ -40,7 +37,8 @@ class RosExchange(Exchange):
     def __init__(self, shared: Shared, trace: Trace) -> None:
         super().__init__(trace)
         self._shared = shared
-        self._before = self._ended = _ended()
+        self._before = self._ended = Event()
+        self._before.set()
 
     def cancelled(self) -> bool:
         """Whether the client wants no answer any more; a topic cannot tell."""

@@ -93,26 +93,6 @@ def remapped(wiring: Wiring[RosOptions]) -> dict[str, str]:
     return names
 
 
-def wait_until(arrived: Callable[[], bool], alive: Callable[[], bool], what: str) -> None:
-    """Wait for a peer to be matched; raises ServerDied, saying ``what`` did not appear."""
-    if not appeared(arrived, MATCH_TIMEOUT_S, lambda: not alive()):
-        raise ServerDied(
-            f"{what}; is ROS_DOMAIN_ID the same on both sides, and between hosts ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET?"
-        )
-
-
-def open_camera(middleware: Middleware, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> CameraPublisher:
-    """Publish as the server's camera, which subscribes before this returns: what is sent earlier is lost.
-
-    Raises ServerDied. Made for a stream only: a server fails what comes without a picture where its camera is silent.
-    """
-    namespace = namespace_of(wiring)
-    camera = CameraPublisher(middleware, namespace, wiring.options.payload, wiring.options.qos)
-    absent = f"no server subscribed to {namespace}{CAMERA} in {place_of(wiring)}"
-    wait_until(lambda: bool(camera.matched()), alive, absent)
-    return camera
-
-
 def refuse_company(wiring: Wiring[RosOptions], namespace: str) -> None:
     """Raise TransportError if another server listens under ``namespace``: both would answer every request."""
     probe = join(wiring, "probe")
@@ -134,14 +114,41 @@ class RosClient(Client):
     """What the clients of both variants have: a node, the server's camera, and messages that they wait for."""
 
     def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
+        """Join the domain and wait for the server; raises ServerDied if it does not appear."""
         self._wiring, self._alive = wiring, alive
         self._offset_ns = realtime_offset_ns()
         self.middleware = join(wiring, "client")
+        try:
+            self._meet_server(namespace_of(wiring))
+        except TransportError:
+            self.close()
+            raise
+
+    def _meet_server(self, namespace: str) -> None:
+        """Make what the client needs and wait until the server has matched it; raises TransportError."""
+        raise NotImplementedError
 
     @cached_property
     def camera(self) -> CameraPublisher | None:
-        """The server's camera, from the first use on; none of a server that is not ours."""
-        return None if self._wiring.options.action else open_camera(self.middleware, self._wiring, self._alive)
+        """The server's camera, from the first use on; none of a server that is not ours. Raises ServerDied.
+
+        The server has subscribed to it: what is sent earlier is lost. Made for a stream only: a server fails what comes
+        without a picture where its camera is silent.
+        """
+        options, namespace = self._wiring.options, namespace_of(self._wiring)
+        if options.action:
+            return None
+        camera = CameraPublisher(self.middleware, namespace, options.payload, options.qos)
+        self.wait_until(lambda: bool(camera.matched()), f"no server subscribed to {namespace}{CAMERA}")
+        return camera
+
+    def wait_until(self, arrived: Callable[[], bool], absent: str) -> None:
+        """Wait for the server to be matched; raises ServerDied, saying what is ``absent``."""
+        if not appeared(arrived, MATCH_TIMEOUT_S, lambda: not self._alive()):
+            raise ServerDied(
+                f"{absent} in {place_of(self._wiring)}; is ROS_DOMAIN_ID the same on both sides, and between hosts "
+                "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET?"
+            )
 
     def taken(self, take: Callable[[float], T | None], bounds: Bounds) -> Iterator[T | None]:
         """Yield what comes, None where nothing came for a moment, until the longest silence is over."""

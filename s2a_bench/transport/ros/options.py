@@ -11,7 +11,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.options import Names, one_of, option
 from s2a_bench.ros import MIDDLEWARES, MiddlewareKind, chosen
 from s2a_bench.ros.join import PLACES
-from s2a_bench.ros.remap import ABSOLUTE
+from s2a_bench.ros.remap import ABSOLUTE, RULE
 from s2a_bench.transport import EXTERNAL, SERVER, SERVING, TransportOptions
 
 NAMESPACE = "/s2a_bench"
@@ -106,8 +106,6 @@ class RosOptions(PlaceOptions):
     @field_validator("remap")
     @classmethod
     def _are_rules(cls, rules: tuple[str, ...]) -> tuple[str, ...]:
-        from s2a_bench.ros.remap import RULE
-
         for rule in rules:
             if not RULE.fullmatch(rule):
                 raise ValueError(f"'{rule}' should look like from:=to, both names as name, name/name, /name or ~/name")

@@ -21,7 +21,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.ros import ACTION
-from s2a_bench.transport.ros.action_source import ActionSource
+from s2a_bench.transport.ros.action import ActionSource
 from s2a_bench.transport.ros.camera import POLL_S, CameraCache
 from s2a_bench.transport.ros.exchange import Shared
 from s2a_bench.transport.ros.joining import join, namespace_of, refuse_company, server_name, settled
@@ -107,7 +107,7 @@ class RosServer:
     def _findings(self) -> Iterator[PartHealth]:
         return self._shared.activity.findings(*self._cache.seen(), self._cache.silence, self._options.max_frame_age)
 
-    def _take(self, source: RequestSource) -> Callable[[], None] | None:
+    def _take(self, source: RequestSource) -> Callable[[], object] | None:
         """Wait for a request and give it its place in the queue; return what answers it."""
         packed = source.take(POLL_S)
         if packed is None:
@@ -124,8 +124,4 @@ class RosServer:
                 source.refuse(packed, str(error))
                 return None
             exchange.held = held.pop_all()
-
-        def answer() -> None:
-            self._core.answer(exchange, turn)
-
-        return answer
+        return partial(self._core.answer, exchange, turn)

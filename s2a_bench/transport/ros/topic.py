@@ -2,55 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
-from s2a_bench.errors import MessagesLost, RequestFailed, ServerDied, TransportError
+from s2a_bench.errors import MessagesLost, RequestFailed, ServerDied
 from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.ros import Middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.service import REACH_S, READER_QOS, REMEMBERED_CLIENTS, appeared
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring
 from s2a_bench.transport.chunks import state_of
 from s2a_bench.transport.limits import Bounds, Limits, whole_number
+from s2a_bench.transport.ros import wire
 from s2a_bench.transport.ros.camera import picture_message, picture_of
 from s2a_bench.transport.ros.exchange import RosExchange, Shared
-from s2a_bench.transport.ros.joining import RosClient, namespace_of, place_of, wait_until
-from s2a_bench.transport.ros.options import RosOptions
-from s2a_bench.transport.ros.wire import (
-    REQUEST_QOS,
-    TOKEN_QOS,
-    marks_message,
-    pieces_of,
-    plain,
-    readable,
-    remote_of,
-    request_message,
-    token_message,
-    unguessable,
-)
+from s2a_bench.transport.ros.joining import RosClient
 from s2a_bench.types import Piece, Request, Token
 
 
 class TopicClient(RosClient):
     """Publishes requests and collects the tokens that carry their id."""
 
-    def __init__(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> None:
-        """Join the domain and wait for the server; raises ServerDied if it does not appear."""
-        super().__init__(wiring, alive)
-        namespace = namespace_of(wiring)
+    def _meet_server(self, namespace: str) -> None:
         # announced first: a server that knows the requests' writer should know the tokens' reader as well
         self._subscription = self.middleware.subscription(namespace + "/token", ros.TOKEN, READER_QOS)
-        self._publisher = self.middleware.publisher(namespace + "/request", ros.REQUEST, REQUEST_QOS)
+        self._publisher = self.middleware.publisher(namespace + "/request", ros.REQUEST, wire.REQUEST_QOS)
         ends = (self._publisher, self._subscription)  # volatile: what is sent before they match is lost
-        absent = f"no server appeared under {namespace} in {place_of(wiring)}"
-        try:
-            wait_until(lambda: all(end.matched() for end in ends), alive, absent)
-        except TransportError:
-            self.close()
-            raise
+        self.wait_until(lambda: all(end.matched() for end in ends), f"no server appeared under {namespace}")
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Publish the request, with its frames if it has any, and yield its tokens."""
@@ -58,8 +37,8 @@ class TopicClient(RosClient):
         for frame in request.images:
             type_name, message = picture_message(frame, self._wiring.options.payload, self._offset_ns, trace)
             images[type_name].append(message)
-        name = unguessable(request.id)
-        message = request_message(replace(request, id=name), images[ros.IMAGE], images[ros.COMPRESSED_IMAGE])
+        name = wire.unguessable(request.id)
+        message = wire.request_message(replace(request, id=name), images[ros.IMAGE], images[ros.COMPRESSED_IMAGE])
         packed = self._publisher.pack(message)
         trace.mark("cdr_pack")
         self._publisher.send(packed)
@@ -75,13 +54,13 @@ class TopicClient(RosClient):
             if token.last:
                 break
             bounds.count_piece()
-            pieces = pieces_of(token)
+            pieces = wire.pieces_of(token)
             if not expected:
                 trace.mark("return")
             yield from pieces
             expected += len(pieces)
         if token.marks:
-            trace.receive(remote_of(token.marks[0]))
+            trace.receive(wire.remote_of(token.marks[0]))
         if token.error:
             raise RequestFailed(f"the server broke off: {token.error}")
 
@@ -89,7 +68,7 @@ class TopicClient(RosClient):
         """Wait for the next token of this request, dropping what belongs to others and what is none."""
         for packed in self.taken(self._subscription.take, bounds):
             if packed is not None:
-                token = readable(self._subscription, packed, trace)
+                token = wire.readable(self._subscription, packed, trace)
                 if token is not None and token.id == name:
                     bounds.count_bytes(len(packed))
                     return token
@@ -104,7 +83,7 @@ class TopicSource:
     def __init__(self, middleware: Middleware, namespace: str, limits: Limits) -> None:
         self.limits = limits
         self._requests = middleware.subscription(namespace + "/request", ros.REQUEST, READER_QOS)
-        self._tokens = middleware.publisher(namespace + "/token", ros.TOKEN, TOKEN_QOS)
+        self._tokens = middleware.publisher(namespace + "/token", ros.TOKEN, wire.TOKEN_QOS)
         self._reached: set[Any] = set()
         self.take, self.sender, self.interrupt = self._requests.take, self._requests.sender, self._requests.interrupt
 
@@ -120,7 +99,7 @@ class TopicSource:
     def refuse(self, packed: Any, why: str) -> None:
         """Answer a request with an error only; raises TransportError for bytes that are no request."""
         request_id = self._requests.unpack(packed).id
-        marks = [marks_message(request_id, Trace().to_remote())]
+        marks = [wire.marks_message(request_id, Trace().to_remote())]
         self.send(request_id, self.sender(), Token(0, "", -1), marks, why)
 
     def send(self, request_id: str, sender: Any, token: Piece, marks: list[Any], error: str = "") -> None:
@@ -133,9 +112,8 @@ class TopicSource:
             if len(self._reached) >= REMEMBERED_CLIENTS:
                 self._reached.clear()
             self._reached.add(sender)
-        self._tokens.send(
-            self._tokens.pack(token_message(request_id, token, last=bool(marks), error=error, marks=marks))
-        )
+        message = wire.token_message(request_id, token, last=bool(marks), error=error, marks=marks)
+        self._tokens.send(self._tokens.pack(message))
 
 
 class TopicExchange(RosExchange):
@@ -151,7 +129,7 @@ class TopicExchange(RosExchange):
         pictures = (*message.images, *message.compressed_images)
         images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
         settings = message.max_tokens, message.grammar, message.seed
-        return Request(plain(message.id), message.prompt, images, *settings, state=state_of(message.state))
+        return Request(wire.plain(message.id), message.prompt, images, *settings, state=state_of(message.state))
 
     def piece(self, piece: Piece) -> bool:
         self._source.send(*self._client, piece, [])
@@ -159,5 +137,5 @@ class TopicExchange(RosExchange):
         return True
 
     def finish(self, error: str) -> None:
-        marks = marks_message(self._client[0], self.trace.to_remote())
+        marks = wire.marks_message(self._client[0], self.trace.to_remote())
         self._source.send(*self._client, Token(self._sent, "", -1), [marks], error)

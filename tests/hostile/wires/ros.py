@@ -14,11 +14,11 @@ from s2a_bench.clock import now_ns
 from s2a_bench.ros import QoS, Rejected, Result
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
-from s2a_bench.ros.service import READER_QOS
+from s2a_bench.ros.service import READER_QOS, appeared
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.ros.action import ACTION
 from s2a_bench.transport.ros.camera import CAMERA, POLL_S
-from s2a_bench.transport.ros.joining import domain_of, join, namespace_of, wait_until
+from s2a_bench.transport.ros.joining import domain_of, join, namespace_of
 from s2a_bench.transport.ros.wire import request_message
 from s2a_bench.types import Frame, Request
 from tests.hostile.suite import Attack, Case
@@ -41,7 +41,7 @@ def publishes(
         with closing(join(wiring, "hostile")) as middleware:
             tokens = middleware.subscription(namespace_of(wiring) + "/token", ros.TOKEN, READER_QOS)
             publisher = middleware.publisher(namespace_of(wiring) + topic, kind, qos)
-            wait_until(lambda: bool(publisher.matched() and tokens.matched()), lambda: True, "no server to attack")
+            assert appeared(lambda: bool(publisher.matched() and tokens.matched()), MATCHES_S), "no server to attack"
             for packed in make():
                 publisher.send(bytearray(packed))
             deadline = now_ns() + round(MATCHES_S * 1e9)
@@ -60,7 +60,7 @@ def sends_goals(acts: Callable[[Any], Iterable[Any]]) -> Attack:
     def attack(wiring: Wiring[Any]) -> str:
         with closing(join(wiring, "hostile")) as middleware:
             client = middleware.action_client(namespace_of(wiring) + ACTION, GENERATE_RESPONSE)
-            wait_until(client.server_present, lambda: True, "no server to attack")
+            assert appeared(client.server_present, MATCHES_S), "no server to attack"
             return "\n".join(str(said) for said in acts(client))
 
     return attack

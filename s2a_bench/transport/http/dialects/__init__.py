@@ -25,8 +25,6 @@ NATIVE = "s2a"
 
 @dataclass(frozen=True, slots=True)
 class EncodedPicture:
-    """A picture ready to be packed."""
-
     media_type: str
     base64: str
 

@@ -152,7 +152,7 @@ class Native(OpenAI):
         for choice in message.get("choices") or ():
             if "action" in choice:
                 actions = actions_of(choice["action"], whole_number("index", choice.get("tick"), 0, TICKS, 0))
-            elif "actions" in choice:  # as `blocks.read_block` returns them
+            elif "actions" in choice:  # as `native.read_block` returns them
                 actions = choice["actions"]
             delta = choice.get("delta") or {}
             text = text_of(delta["content"]) if "content" in delta else None
