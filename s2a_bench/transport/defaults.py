@@ -8,8 +8,6 @@ COMPARED: Final = ("http", "ros")
 """Transports of requests."""
 FOLLOWED: Final = "ros"
 """The transport of a streamed plan."""
-BLACK_BOX: Final = "http"
-"""The transport of an external server."""
 LOOPBACK: Final = "loopback"
 """An engine in this process."""
 LLAMA_SERVER: Final = "http/llama-server"

@@ -16,6 +16,7 @@ from s2a_bench import __version__
 from s2a_bench.cli import app
 from tests.cli.program import called
 
+LIVE = "with --live"
 HEAVY = ("cv2", "llama_cpp", "matplotlib", "pandas", "ray", "scipy")
 
 
@@ -47,9 +48,12 @@ def test_help_is_code_zero_and_names_every_flag(path: tuple[str, ...]) -> None:
     [
         ("latency", ["Transport", "Pictures", "Model", "Requests", "Options"]),
         ("throughput", ["Transport", "Pictures", "Model", "Requests", "Options"]),
-        ("timeline", ["Plans", "Tokens that are modelled", "A model that answers", "Options"]),
-        ("chunks", ["Modes", "Control loop", "Transport (with --live)", "Options"]),
-        ("ccrb", ["Drives", "Scenario", "A model that answers", "Options"]),
+        (
+            "timeline",
+            ["Modes", "Policies", "Plans", f"Tokens that are modelled (not {LIVE})", f"Transport ({LIVE})", "Options"],
+        ),
+        ("chunks", ["Modes", "Control loop", f"Transport ({LIVE})", "Options"]),
+        ("ccrb", ["Modes", "Policies", "Drives", "Scenario", f"Drives (not {LIVE} or --closed-loop)", "Options"]),
         ("serve", ["Arguments", "Model", "Transport", "ROS 2", "Options"]),
     ],
 )

@@ -18,12 +18,11 @@ from s2a_bench.cli.progress import RunProgress
 from s2a_bench.clock import SystemClock, VirtualClock
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbLiveLoop, DrivingRequests
-from s2a_bench.experiments.ccrb.drives import Prepared, TableRows, loop_rows, motion_of
+from s2a_bench.experiments.ccrb.drives import TableRows, loop_rows, motion_of
 from s2a_bench.experiments.ccrb.live import run_live_loop
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
-from s2a_bench.experiments.ccrb.plan import resolve
+from s2a_bench.experiments.ccrb.plan import Prepared, resolve
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.ccrb.run import prepare
 from s2a_bench.frames import FrameSource
 from s2a_bench.inference import EngineConfig
 from s2a_bench.plan.skillset import GAPS, Gap
@@ -67,7 +66,7 @@ def differ_m(one: Driven, other: Driven) -> float:
 @pytest.mark.parametrize("number", range(20))
 def test_on_the_same_arrivals_a_loop_ends_as_its_roll_out(number: int) -> None:
     config = scenario(number)
-    ready, name = prepare(resolve(config)), COMPARED[number % 3]
+    ready, name = resolve(config).ready, COMPARED[number % 3]
     looped = replayed(config.scenario, Embedded(), ready.policies[name], ready.plans)
     expected = driven(ready, name)
     assert looped.record.outcome == "completed"
@@ -78,7 +77,7 @@ def test_on_the_same_arrivals_a_loop_ends_as_its_roll_out(number: int) -> None:
 
 def test_a_board_of_which_the_first_token_takes_minutes_hits_the_lead_as_in_its_roll_out() -> None:
     config = CcrbClosedLoop(prompt_s=200.0)
-    ready = prepare(resolve(config))
+    ready = resolve(config).ready
     looped = replayed(config.scenario, Longitudinal(), ready.policies["naive"], ready.plans)
     assert (looped.record.outcome, len(looped.record.ran)) == ("completed", 5)
     assert looped.driven.outcomes.name(0) == driven(ready, "naive").outcomes.name(0) == "front"
@@ -86,7 +85,7 @@ def test_a_board_of_which_the_first_token_takes_minutes_hits_the_lead_as_in_its_
 
 def test_motion_does_not_depend_on_when_the_first_sample_was() -> None:
     config = CcrbClosedLoop()
-    schedule = prepare(resolve(config)).schedules["naive"]
+    schedule = resolve(config).ready.schedules["naive"]
     path = drive(Longitudinal(), config.scenario.cars, config.scenario.driving, schedule, record=True).trajectory
     assert path is not None
     assert motion_of(replace(path, time_s=path.time_s + 0.013)) == pytest.approx(motion_of(path))
@@ -95,7 +94,7 @@ def test_motion_does_not_depend_on_when_the_first_sample_was() -> None:
 @pytest.mark.parametrize("number", range(4))
 def test_a_step_as_on_the_clock_changes_gaps_by_decimetres_at_most(number: int) -> None:
     config, world = scenario(number), Longitudinal()
-    ready, world.step_s = prepare(resolve(config)), 0.02
+    ready, world.step_s = resolve(config).ready, 0.02
     for name in COMPARED:
         looped = replayed(config.scenario, world, ready.policies[name], ready.plans)
         expected = driven(ready, name)

@@ -35,10 +35,10 @@ class CcrbDrives(PolicyOptions):
     """The clock of the world."""
 
     tokens_per_skill: int = option(6, "L, the delimiter included", ge=1, le=1000)
-    scenario: CcrbOptions = Field(default_factory=CcrbOptions)
     simulator: str = option(
         "longitudinal", f"{', '.join(SIMULATORS)}; or NAME?parameter=value", first=True, names=lambda: SIMULATORS
     )
+    scenario: CcrbOptions = Field(default_factory=CcrbOptions)
 
     @property
     def board(self) -> Board:
@@ -119,7 +119,7 @@ class CcrbRequested(CcrbDrives):
     """Drives on the tokens of a model."""
 
     requests: DrivingRequests = group(
-        DrivingRequests, only=(*(each for each in GROUPED if each != "source"), "record"), first=("transports",)
+        DrivingRequests, only=(*(each for each in GROUPED if each != "source"), "record"), first=()
     )
 
     @property

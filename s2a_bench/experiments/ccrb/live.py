@@ -20,9 +20,9 @@ from s2a_bench.act.ros import STRING
 from s2a_bench.clock import SystemClock, now_ns, quick_switching
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbLive, CcrbLiveLoop
-from s2a_bench.experiments.ccrb.drives import Prepared, complete, loop_rows, point_rows
+from s2a_bench.experiments.ccrb.drives import loop_rows, point_rows
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, Looped
-from s2a_bench.experiments.ccrb.plan import CcrbLivePlan, resolve_live
+from s2a_bench.experiments.ccrb.plan import CcrbLivePlan, Prepared, complete, resolve_live
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from time import process_time
 from typing import TYPE_CHECKING
 
 from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbComputed
-from s2a_bench.experiments.ccrb.drives import Prepared, complete, loop_rows, point_rows
+from s2a_bench.experiments.ccrb.drives import loop_rows, point_rows
 from s2a_bench.experiments.ccrb.loop import replayed
 from s2a_bench.experiments.ccrb.plan import CcrbPlan, resolve, studies
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.studies import SCENES, drive_block
-from s2a_bench.harness.timelines.policies import draw
 from s2a_bench.harness.timelines.rows import token_rows
 from s2a_bench.scenario import open_simulator
 from s2a_bench.scenario.ccrb.options import CcrbOptions
@@ -27,36 +26,29 @@ if TYPE_CHECKING:
 
 
 def run_ccrb(config: CcrbComputed, output: Path, progress: Progress) -> Path:
-    plan = resolve(config)
-    ready = prepare(plan)
-    with closing(open_simulator(plan.simulator)) as world, _create(plan, ready, output, progress) as writer:
-        for table, rows in point_rows(ready.with_ttc() if config.ttc else ready, world):
+    plan, every = resolve(config), [*studies(config)]
+    with closing(open_simulator(plan.simulator)) as world, _create(plan, output, progress) as writer:
+        for table, rows in point_rows(plan.ready.with_ttc() if config.ttc else plan.ready, world):
             writer.append(table, rows)
-        _drive_studies(plan.scenario, studies(config), writer, progress)
+        _drive_studies(plan.ready.scenario, every, writer, progress)
         return writer.path
 
 
 def run_closed_loop(config: CcrbClosedLoop, output: Path, progress: Progress) -> Path:
     plan = resolve(config)
-    ready = prepare(plan)
-    with closing(open_simulator(plan.simulator)) as world, _create(plan, ready, output, progress) as writer:
+    ready = plan.ready
+    with closing(open_simulator(plan.simulator)) as world, _create(plan, output, progress) as writer:
         writer.update(step_s=world.step_s)
         for name, policy in ready.policies.items():
-            looped = replayed(plan.scenario, world, policy, ready.plans)
+            looped = replayed(ready.scenario, world, policy, ready.plans)
             for table, rows in loop_rows(ready, world, name, looped):
                 writer.append(table, rows)
         return writer.path
 
 
-def prepare(plan: CcrbPlan) -> Prepared:
-    """Draw the board's tokens, which are the plans' ``token_s``, and schedule them under every policy."""
-    setting, (_, plans) = plan.case.setting, draw(plan.case, plan.seed, 1, "plans")
-    return complete(plan.scenario, setting, setting.request_id(0), plans, plan.policies)
-
-
-def _create(plan: CcrbPlan, ready: Prepared, output: Path, progress: Progress) -> RunWriter:
+def _create(plan: CcrbPlan, output: Path, progress: Progress) -> RunWriter:
     """Create the run folder, with the tokens of the plan."""
-    tokens_s = ready.plans.token_s
+    ready, tokens_s = plan.ready, plan.ready.plans.token_s
     assert tokens_s is not None  # noqa: S101 - drawn plans have tokens
     writer = RunWriter.create(output, "ccrb", plan.manifest, (ROLLOUTS, TRAJECTORIES, SKILLS, TOKENS))
     progress.opened(writer.path)
@@ -66,7 +58,7 @@ def _create(plan: CcrbPlan, ready: Prepared, output: Path, progress: Progress) -
 
 
 def _drive_studies(
-    scenario: CcrbOptions, every: Iterable[tuple[str, Scenes]], writer: RunWriter, progress: Progress
+    scenario: CcrbOptions, every: Sequence[tuple[str, Scenes]], writer: RunWriter, progress: Progress
 ) -> None:
     blocks = [
         (study, scenes.cut(slice(first, first + SCENES)))

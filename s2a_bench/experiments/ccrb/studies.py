@@ -21,7 +21,6 @@ from s2a_bench.scenario.ccrb.cars import start_deadline
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.studies import Scenes, drive_along, survived
 from s2a_bench.scenario.longitudinal import Longitudinal
-from s2a_bench.types import Timing
 
 FORMS: Final = {name: policy(name).foreseeing for name in COMPARED}
 SCENES: Final = 1366
@@ -38,7 +37,7 @@ def drive_block(scenario: CcrbOptions, study: str, scenes: Scenes) -> tuple[int,
     gaps = np.repeat([gap for _, gap in cases], len(scenes))
     every = scenes.times(len(cases))
     cars = every.cars(gaps, scenario)
-    schedule = schedules(scenario.durations, scenes, [name for name, _ in cases])
+    schedule = schedules(scenes, [name for name, _ in cases])
     deadline_s = start_deadline(cars, every.numbers["plan_decel_mps2"])
     about: dict[str, Any] = {
         **every.numbers,
@@ -68,12 +67,8 @@ def drive_block(scenario: CcrbOptions, study: str, scenes: Scenes) -> tuple[int,
     return len(scenes) + len(rows), rows + again
 
 
-def schedules(durations: Timing, scenes: Scenes, names: Sequence[str]) -> Schedule:
-    """Concatenate the policies' schedules, with skills in proportion to ``durations``.
-
-    Shorter plans are padded with skills of no length.
-    """
-    t_min, t_max = durations.least_s / durations.nominal_s, durations.most_s / durations.nominal_s
+def schedules(scenes: Scenes, names: Sequence[str]) -> Schedule:
+    """Concatenate the policies' schedules; shorter plans are padded with skills of no length."""
     at, count = scenes.numbers, len(scenes)
     longest = int(at["n_skills"].max())
     start_s = {name: np.empty((longest, count)) for name in FORMS}
@@ -82,7 +77,7 @@ def schedules(durations: Timing, scenes: Scenes, names: Sequence[str]) -> Schedu
         mine = at["n_skills"] == length
         arrival_s = uniform(at["prompt_s"][mine], at["tokens_per_skill"][mine], at["tokens_per_s"][mine], length)
         nominal_s = np.broadcast_to(at["t_nom_s"][mine], arrival_s.shape)
-        plans = Plans(arrival_s, nominal_s, t_min * nominal_s, t_max * nominal_s)
+        plans = Plans(arrival_s, nominal_s, nominal_s, nominal_s)  # the closed forms neither compress nor extend
         for name, form in FORMS.items():
             found = form.schedule(plans)
             start_s[name][:length, mine], duration_s[name][:length, mine] = found.start_s, found.duration_s

@@ -23,7 +23,6 @@ from s2a_bench.policy import PlanShape, Timing
 from s2a_bench.policy.conformal import GUARANTEE, Guarantee
 from s2a_bench.policy.conformal import check as check_calibration
 
-LENGTHS: Final = (6, 4, 2, 1)
 PROFILES: Final = ("rtx-4080", "jetson-agx-orin", "jetson-orin-nano")
 PLANS: Final = 1000
 """Default number of plans a cell if plans are random; else 1."""
@@ -47,7 +46,7 @@ class TimelineOptions(PolicyOptions):
 
     PANEL: ClassVar[str] = "Plans"
 
-    tokens_per_skill: Counts = option(LENGTHS, ABOUT_L, min_length=1, first=True)
+    tokens_per_skill: Counts = option((6, 4, 2, 1), ABOUT_L, min_length=1, first=True)
     n_skills: Counts = option((8,), "N, skills a plan; several with commas", min_length=1)
     t_nom_s: Seconds = option((1.0,), ABOUT_T_NOM, flag="t-nom", min_length=1)
     t_min: float = option(0.8, "least duration of a skill, as a factor of T_nom", gt=0, le=1)
@@ -70,7 +69,7 @@ class TimelineComputed(TimelineOptions):
     MODE: ClassVar[str] = "virtual"
     virtual: ClassVar[bool] = True
 
-    profiles: Names = option(PROFILES, ABOUT_PROFILES, flag="profile", first=True, names=profile_files)
+    profiles: Names = option(PROFILES, ABOUT_PROFILES, flag="profile", panel="Plans", first=True, names=profile_files)
     rates: Rates = option((), "boards known by their tokens/s alone; several with commas", flag="rate", first=True)
     prompt_s: float | None = PROMPT_TIME
     t_nom_cv: float = option(0.0, "how much T_nom differs from skill to skill: sd / mean", ge=0, le=MOST_CV)

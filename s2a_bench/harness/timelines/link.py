@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count, product
-from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -21,7 +20,7 @@ from s2a_bench.harness.timelines.config import PlanRequests
 from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.harness.warnings import change_warnings
 from s2a_bench.machine.tuning import limit_threads
-from s2a_bench.plan import Format, SkillSet, choose_format, grammar, paper_format, prompt
+from s2a_bench.plan import Format, SkillSet, Tokenize, choose_format, grammar, paper_format, prompt
 from s2a_bench.policy import Floats, PlanShape, Timing
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.progress import Progress
@@ -30,7 +29,6 @@ from s2a_bench.store.manifest import RunWarning
 
 TOKENS_A_SKILL: Final = 16
 """Tokens a skill that a model of unknown tokenizer may need for the paper's format."""
-MODE = "live"
 LATE = 1.05
 """An answer slower than the pace by this factor was not held back."""
 
@@ -75,25 +73,23 @@ class PromptPlan:
 def plan_requests(requests: PlanRequests, plan: PromptPlan, progress: Progress) -> tuple[RunPlan, list[PlanPrompt]]:
     """Plan requests of sufficient length, find the model's files, and write the prompts; raises S2AError."""
     limit_threads()
-    run, model = resolve(requests, progress.say), None
+    run = resolve(requests, progress.say)
+    tokenize: Tokenize | None = None
     if run.finds_model:
+        from s2a_bench.inference.tokenizer import Tokenizer
+
         run = replace(run, engine=on_files(run.engine, progress), finds_model=False)
-        model = run.engine.model
-    prompts = write_prompts(plan, model, exact=model is not None or run.engine.kind.plays is not None)
+        tokenize = Tokenizer(run.engine.model)
+    prompts = write_prompts(plan, tokenize, exact=tokenize is not None or run.engine.kind.plays is not None)
     request = replace(run.request, max_pieces=max(each.max_tokens for each in prompts))
     return replace(run, request=request), prompts
 
 
-def write_prompts(plan: PromptPlan, model: Path | None, *, exact: bool) -> list[PlanPrompt]:
-    """Write the prompts for the tokenizer of ``model``, in the paper's format if it is unknown.
+def write_prompts(plan: PromptPlan, tokenize: Tokenize | None, *, exact: bool) -> list[PlanPrompt]:
+    """Write the prompts for a tokenizer, in the paper's format if it is unknown; raises UsageError if no format fits.
 
-    ``exact``: every skill has the planned number of tokens. Raises UsageError if no format fits.
+    ``exact``: every skill has the planned number of tokens.
     """
-    tokenize = None
-    if model is not None:
-        from s2a_bench.inference.tokenizer import Tokenizer
-
-        tokenize = Tokenizer(model)
     prompts = []
     for tokens, n_skills, skills in product(plan.tokens_per_skill, plan.n_skills, plan.skill_sets):
         format_ = paper_format(skills) if tokenize is None else choose_format(skills, tokens, tokenize, n_skills)
@@ -185,7 +181,7 @@ class ModelLink:
             tokens_per_skill=of.tokens_per_skill,
             n_skills=of.n_skills,
             t_nom_s=of.shape.expected.nominal_s,
-            mode=MODE,
+            mode="live",
             emulated=self.origin.emulated,
         )
 
