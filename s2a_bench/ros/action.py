@@ -377,8 +377,14 @@ class ServedAction(Generic[Caller]):
             if len(packed) < id_ends:
                 self.send_goal.drop(caller)
                 _log.warning("%s: dropped a goal request of %d bytes, too short for an id", self._name, len(packed))
-            elif (goal := self._offered(bytes(packed[id_ends - 16 : id_ends]), packed, caller)) is not None:
-                return goal
+                continue
+            goal_id = bytes(packed[id_ends - 16 : id_ends])
+            with self._lock:
+                new = self._goals.offer(goal_id)
+            if new:
+                return ServedGoal(self, goal_id, packed, caller)
+            _log.warning("%s: rejected a goal whose id %s is taken", self._name, goal_id.hex())
+            self._reply(goal_id, caller, accepted=False, stamp_ns=0)
         return None
 
     def _serve(self) -> None:
@@ -413,16 +419,6 @@ class ServedAction(Generic[Caller]):
     def status(self, goal_id: bytes) -> Status:
         with self._lock:
             return self._goals.status(goal_id)
-
-    def _offered(self, goal_id: bytes, packed: memoryview, caller: Caller) -> ServedGoal[Caller] | None:
-        """Return a goal that waits for a decision; None for one whose id is taken, which is rejected."""
-        with self._lock:
-            new = self._goals.offer(goal_id)
-        if new:
-            return ServedGoal(self, goal_id, packed, caller)
-        _log.warning("%s: rejected a goal whose id %s is taken", self._name, goal_id.hex())
-        self._reply(goal_id, caller, accepted=False, stamp_ns=0)
-        return None
 
     def decide(self, goal_id: bytes, caller: Caller, *, accepted: bool) -> None:
         stamp_ns = time.time_ns()  # ROS time, as rclpy stamps

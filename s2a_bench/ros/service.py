@@ -45,6 +45,9 @@ class Waits(Protocol):
         """End a wait under way and every later one; callable from any thread."""
 
 
+Waiter = TypeVar("Waiter", bound=Waits)
+
+
 def appeared(present: Callable[[], bool], timeout_s: float, given_up: Callable[[], bool] = lambda: False) -> bool:
     """Poll ``present`` every 10 ms; False after ``timeout_s``, or once ``given_up`` is True."""
     deadline_ns = now_ns() + int(timeout_s * 1e9)
@@ -141,10 +144,10 @@ class LogOnce:
             self._log.warning(message, *values)
 
 
-class Services(Generic[Caller]):
+class Services(Generic[Caller, Waiter]):
     """The services of one node, answered by one thread."""
 
-    def __init__(self, waiter: Waits) -> None:
+    def __init__(self, waiter: Waiter) -> None:
         """Start the thread; ``waiter`` wakes it for requests."""
         self.waiter = waiter
         self._offered: dict[str, tuple[ServiceEnd[Caller], Callable[[Any], Any]]] = {}
@@ -205,14 +208,11 @@ class Calling:
                 raise TransportError(silent)
 
 
-Waiter = TypeVar("Waiter", bound=Waits)
-
-
 class ServiceNode(ABC, Generic[Caller, Waiter]):
     """One node whose services are built from a middleware's endpoints; each endpoint is announced when it is made."""
 
     def __init__(self) -> None:
-        self._services: Services[Caller] | None = None
+        self._services: Services[Caller, Waiter] | None = None
         self._servers: list[Any] = []
         self._closed = False
         atexit.register(self.close)
@@ -253,9 +253,10 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
         """Create a service; the first starts the thread that answers all."""
         self.check_open()
         if self._services is None:
-            self._requests = self.waiter()
-            self._services = Services(self._requests)
-        self._services.offer(name, self.service_end(name, type_name, DEFAULT_VERSION, self._requests, qos), answer)
+            self._services = Services(self.waiter())
+            self._servers.append(self._services)
+        end = self.service_end(name, type_name, DEFAULT_VERSION, self._services.waiter, qos)
+        self._services.offer(name, end, answer)
 
     def service_client(self, name: str, type_name: str) -> Calling:
         waiter = self.waiter()
@@ -265,9 +266,8 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
         if not self._closed:
             self._closed = True
             atexit.unregister(self.close)
-            for server in (*self._servers, self._services):
-                if server is not None:
-                    server.close()
+            for server in self._servers:
+                server.close()
             self.leave()
 
     def check_open(self) -> None:
