@@ -42,8 +42,6 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class DriveCommand:
-    """Commands to the cars for one step."""
-
     acceleration_mps2: Floats
     """Shape (3, M)."""
     lane: NDArray[np.int64]

@@ -25,8 +25,6 @@ LENGTHS: Final = {LEAD: 1.0, EGO: 0.0, REAR: -1.0}
 
 
 class Embedded:
-    """One road with three vehicles."""
-
     name: ClassVar[str] = "embedded"
     real: ClassVar[bool] = False
     steers: ClassVar[bool] = True

@@ -121,7 +121,6 @@ class Drive(LockStep):
         self._steps = 0
 
     def run(self, *, resting_mps: float) -> Outcomes:
-        """Step until all roll-outs are decided."""
         step_s = self._simulator.step_s
         last = int((float(self._ego.end_s.max()) + AFTER_S) / step_s)
         for step in range(last):
@@ -143,7 +142,6 @@ class Drive(LockStep):
         self._watch.see(self._state)
 
     def decided(self, resting_mps: float = RESTING_MPS) -> NDArray[np.bool_]:
-        """Return which roll-outs have a certain outcome."""
         speed = self._state.speed_mps
         over = self._ego.phase == DONE
         # Until the driver behind has seen the ego at rest, the rear car may stop and start again.

@@ -127,8 +127,6 @@ class Careful(Follower):
 
 
 class Idm(Follower):
-    """The Intelligent Driver Model, without delay."""
-
     law: ClassVar[str] = f"IDM follower on the present, without delay; {AT_EASE}; {BRAKE}"
 
     def __init__(self, cars: Cars, rollouts: int) -> None:
@@ -153,8 +151,6 @@ class Idm(Follower):
 
 
 class Hdm(Idm):
-    """The Human Driver Model's delay and temporal anticipation, for one leader and without estimation errors."""
-
     law: ClassVar[str] = (
         "HDM follower: IDM on the gap s - T' dv, the speed v + T' a and dv of T' = {reaction:g} s ago, one leader, no "
         f"estimation errors; {AT_EASE}; {BRAKE}"
@@ -168,8 +164,6 @@ class Hdm(Idm):
 
 
 class Hybrid(Idm):
-    """The IDM on the rear car's present state, and the ego of a reaction time ago extrapolated at steady speed."""
-
     law: ClassVar[str] = (
         "hybrid follower (ours): IDM on its own state now and the ego seen {reaction:g} s ago, extrapolated at steady "
         f"speed; {AT_EASE}; {BRAKE}"
