@@ -97,8 +97,6 @@ class RobotKind:
 
 
 class SkillKind(RobotKind):
-    """A kind of robot that executes skills."""
-
     lacks: ClassVar[str] = "carries out no skills"
     several: ClassVar[bool] = False
     """Whether several may be open at once, one per policy: nothing moves."""

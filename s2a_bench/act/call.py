@@ -139,8 +139,6 @@ SkillFunction: TypeAlias = Callable[[SkillMotion], object]
 
 
 class CallableRobot:
-    """Calls one function per skill."""
-
     def __init__(
         self, skills: SkillSet, functions: Mapping[str, SkillFunction], hold: Callable[[Gap], None] | None = None
     ) -> None:

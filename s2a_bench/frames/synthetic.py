@@ -47,13 +47,10 @@ class SyntheticCamera(NumberedSource):
         self._scene = render_scene(width + self._margin[0], height + self._margin[1], seed)
 
     def _picture(self) -> Pixels:
-        x, y = self._corner(self._index / self.fps)
-        return self._scene[y : y + self.height, x : x + self.width].copy()
-
-    def _corner(self, t_s: float) -> tuple[int, int]:
-        """Return the window's upper left corner; x is even, so that pixel pairs stay whole."""
+        t_s = self._index / self.fps
         across, down = (0.5 + 0.5 * math.sin(math.tau * t_s / period_s) for period_s in PERIODS_S)
-        return round(across * self._margin[0] / 2) * 2, round(down * self._margin[1])
+        x, y = round(across * self._margin[0] / 2) * 2, round(down * self._margin[1])  # x is even: pixel pairs
+        return self._scene[y : y + self.height, x : x + self.width].copy()
 
 
 OBJECTS = 700
