@@ -204,24 +204,26 @@ FAMILIES: dict[str, type[Constant | Lognormal | Markov | Bursty | Quantiles | Re
 """A family's name in a profile -> the class; its fields are the keys beside ``family``."""
 
 
-def from_table(table: Mapping[str, Any], mean_s: float) -> Gaps:
+def from_table(table: Mapping[str, Any], mean_s: float, where: str = "") -> Gaps:
     """Make gaps from a TOML table: ``family`` and all of that family's parameters except the mean.
 
-    Raises UsageError, naming the key, for an unknown family or key and a value of the wrong type or size.
+    Raises UsageError, naming the key after ``where``, for an unknown family or key and a wrong value.
     """
     name = table.get("family")
     if not isinstance(name, str) or name not in FAMILIES:
-        raise UsageError(f"family: {name!r} is none of {', '.join(FAMILIES)}")
+        raise UsageError(f"{where}family: {name!r} is none of {', '.join(FAMILIES)}")
     family = FAMILIES[name]
     keys = [field.name for field in fields(family) if field.name != "mean_s"]
     values = {key: value for key, value in table.items() if key != "family"}
     if unknown := [key for key in values if key not in keys]:
-        raise UsageError(f"{unknown[0]}: {name} gaps have no such key; they have {', '.join(keys) or 'none'}")
+        raise UsageError(f"{where}{unknown[0]}: {name} gaps have no such key; they have {', '.join(keys) or 'none'}")
     try:
         return family(mean_s=mean_s, **values)
     except ValidationError as error:
         first = error.errors()[0]
-        raise UsageError(f"{first['loc'][0]}: {wrong(first)}") from error
+        raise UsageError(f"{where}{first['loc'][0]}: {wrong(first)}") from error
+    except UsageError as error:
+        raise UsageError(f"{where}{error}") from error
 
 
 def read_family(written: str, field: str) -> dict[str, str | int | float]:

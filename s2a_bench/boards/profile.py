@@ -134,10 +134,7 @@ def _profile(name: str, file: _ProfileFile) -> Profile:
     facts = file.model_dump(include=set(FACTS), exclude_none=True)
     for key, table in facts.items():
         _check_fact(key, table)
-    try:
-        gaps = from_table(file.gaps, 1 / file.tokens_per_s)
-    except UsageError as error:
-        raise UsageError(f"gaps.{error}") from error
+    gaps = from_table(file.gaps, 1 / file.tokens_per_s, "gaps.")
     trace_s = file.trace.gaps_s if file.trace else ()
     if trace_s and abs((rate := len(trace_s) / math.fsum(trace_s)) / file.tokens_per_s - 1) > _RATE_TOLERANCE:
         raise UsageError(

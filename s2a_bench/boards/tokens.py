@@ -104,10 +104,7 @@ def board_of_rate(tokens_per_s: float, jitter: str, prompt_s: float | None) -> B
 def gaps_of(jitter: str, mean_s: float) -> Gaps:
     """Read ``none`` or ``FAMILY:key=value,...`` of `jitter.FAMILIES`; raises UsageError naming the field."""
     table = read_family("constant" if jitter == NO_JITTER else jitter, "jitter")
-    try:
-        return from_table(table, mean_s)
-    except UsageError as error:
-        raise UsageError(f"`jitter` {jitter}: {error}") from error
+    return from_table(table, mean_s, f"`jitter` {jitter}: ")
 
 
 def _factors(cv: float, rng: np.random.Generator, plans: int) -> Floats | float:
