@@ -24,9 +24,8 @@ from s2a_bench.machine import environment
 from s2a_bench.policy import Plans, Policy, Schedule
 from s2a_bench.provenance import Origins
 from s2a_bench.scenario import Simulator, open_simulator
+from s2a_bench.scenario.ccrb.cars import TTC, ttc_aware
 from s2a_bench.scenario.ccrb.drive import Driven, drive
-from s2a_bench.scenario.ccrb.ttc import NAME as TTC
-from s2a_bench.scenario.ccrb.ttc import ttc_aware
 from s2a_bench.scenario.ros import with_ego
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import RunWriter
