@@ -21,6 +21,8 @@ class LockStep:
                 setattr(self, name, value[..., columns])
             elif isinstance(value, LockStep):
                 value.keep(columns)
+            elif isinstance(value, State):
+                setattr(self, name, value.keep(columns))
 
 
 def each(number: ArrayLike, rollouts: int) -> Floats:
@@ -60,7 +62,3 @@ class Longitudinal(LockStep):
         return Windscreen(lambda: (self._state, self._acceleration), width, height)
 
     def close(self) -> None: ...
-
-    def keep(self, columns: NDArray[np.int64]) -> None:
-        super().keep(columns)
-        self._state = self._state.keep(columns)

@@ -182,9 +182,7 @@ class Drive(LockStep):
         if self._every or share < DROP_SHARE or not isinstance(self._simulator, LockStep):
             return True
         self._outcomes.put(self._left, self._watch.outcomes())
-        columns = np.flatnonzero(~decided)
-        self.keep(columns)
-        self._state = self._state.keep(columns)
+        self.keep(np.flatnonzero(~decided))
         return True
 
     def _decide(self, now_s: float) -> None:
