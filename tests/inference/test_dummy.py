@@ -4,7 +4,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from s2a_bench.errors import UsageError
 from s2a_bench.inference import dummy
 from s2a_bench.inference.dummy import write_dummy
 from s2a_bench.inference.dummy.families import FAMILIES, mmproj_tensors, model_tensors
@@ -75,9 +74,3 @@ def test_a_crash_leaves_no_half_file(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         write_dummy(tmp_path, progress=crash)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("choice", [{"size": "huge"}, {"quant": "q2"}, {"like": "llava"}])
-def test_a_wrong_choice_names_its_flag(tmp_path: Path, choice: dict[str, str]) -> None:
-    with pytest.raises(UsageError, match="`{}`: '{}'".format(*next(iter(choice.items())))):
-        write_dummy(tmp_path, **choice)

@@ -13,17 +13,16 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, get_args
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from s2a_bench import extras
-from s2a_bench.errors import ModelError, UsageError
+from s2a_bench.errors import ModelError
 from s2a_bench.inference import Like, Quant, Size
 from s2a_bench.inference.dummy.families import FAMILIES, Family, mmproj_tensors, model_tensors
 from s2a_bench.inference.dummy.tensors import Tensor
 from s2a_bench.inference.dummy.vocab import make_vocab
-from s2a_bench.text import none_of
 
 Progress: TypeAlias = Callable[[int, int], None]
 """(bytes written, total bytes) -> None."""
@@ -59,12 +58,8 @@ def write_dummy(
 ) -> DummyFiles:
     """Write both files into ``folder``; each gets its name once it is complete.
 
-    Two processes may write the same files at once. Raises UsageError for an unknown size, type or model, ModelError
-    if the folder cannot be written.
+    Two processes may write the same files at once. Raises ModelError if the folder cannot be written.
     """
-    for key, value, known in (("size", size, get_args(Size)), ("quant", quant, _FILE_TYPES), ("like", like, FAMILIES)):
-        if value not in known:
-            raise UsageError(f"`{key}`: {none_of(value, known)}")
     family = FAMILIES[like]
     shape, files = family.shapes[size], dummy_files(folder, size, quant, seed, like=like)
     vocab = make_vocab(full=size == "full", size=family.vocab, special=family.special)

@@ -25,12 +25,10 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from s2a_bench.errors import UsageError
 from s2a_bench.policy import Floats
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import Cars
 from s2a_bench.scenario.longitudinal import LockStep, each
-from s2a_bench.text import none_of
 
 BRAKES_MPS2: Final = 0.5
 """Above this a car ahead counts as braking."""
@@ -199,8 +197,6 @@ def idm_acceleration(
 
 
 def follower(cars: Cars, rollouts: int) -> Follower:
-    """Build the trailing car's law for M roll-outs; raises UsageError for an unknown name."""
-    if cars.follower not in FOLLOWERS:
-        raise UsageError(f"`follower`: {none_of(cars.follower, FOLLOWERS)}")
+    """Build the trailing car's law for M roll-outs."""
     build: Callable[[Cars, int], Follower] = resolve_name(FOLLOWERS[cars.follower])
     return build(cars, rollouts)
