@@ -134,7 +134,6 @@ ROBOTS: Final[Registry[type[RobotKind]]] = Registry(
         "call": "s2a_bench.act.call:PythonCall",
     },
 )
-"""Kinds of robots, for skills, for actions or for both."""
 
 _Able = TypeVar("_Able", SkillKind, ActionKind)
 

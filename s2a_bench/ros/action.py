@@ -152,21 +152,15 @@ class Goals:
 
     def cancel(self, goal_id: bytes, stamp_ns: int) -> tuple[CancelCode, list[Goal]]:
         """Select the goals a cancel request means, make them CANCELING, and return them with the return code."""
-        if goal_id != ALL_GOALS and not stamp_ns:
-            goal = self.find(goal_id)
-            if goal is None:
-                return CancelCode.UNKNOWN_GOAL_ID, []
-            if Status.CANCELING not in NEXT[goal.status]:
-                return CancelCode.GOAL_TERMINATED, []
-            chosen = [goal]
-        else:
-            everything = goal_id == ALL_GOALS and not stamp_ns
-            chosen = [
-                goal
-                for goal in self._live.values()
-                if Status.CANCELING in NEXT[goal.status]
-                and (everything or goal.stamp_ns <= stamp_ns or goal.id == goal_id)
-            ]
+        everything = goal_id == ALL_GOALS and not stamp_ns
+        chosen = [
+            goal
+            for goal in self._live.values()
+            if Status.CANCELING in NEXT[goal.status]
+            and (everything or goal.id == goal_id or (stamp_ns and goal.stamp_ns <= stamp_ns))
+        ]
+        if not (chosen or everything or stamp_ns):
+            return (CancelCode.GOAL_TERMINATED if self.find(goal_id) else CancelCode.UNKNOWN_GOAL_ID), []
         for goal in chosen:
             goal.status = Status.CANCELING
         return CancelCode.NONE, chosen

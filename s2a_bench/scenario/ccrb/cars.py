@@ -32,7 +32,6 @@ CAR_WIDTH_M: Final = 2.0
 OUTCOMES: Final = ("none", "front", "rear", "both")
 """By code: bit 0 is a front impact, bit 1 a rear impact."""
 TTC: Final = "s2a-ttc"
-"""The name of the policy `ttc_aware`."""
 
 
 @dataclass(frozen=True, slots=True)
