@@ -74,6 +74,7 @@ class ActionRobot(Protocol):
 
     def state(self) -> tuple[float, ...]:
         """Return the state that a request sends to the policy, in the robot's units; empty: none."""
+        return ()
 
     def moved(self, most: int) -> tuple[Motion, Floats] | None:  # noqa: ARG002 - for subclasses
         """Return the motion from the first action on, and the actions, of ``most`` ticks; None: unknown."""

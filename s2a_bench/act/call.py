@@ -69,9 +69,6 @@ class CallableActions(ActionRobot):
         except Exception as error:
             raise RobotError(f"`robot`: call: {self._name}: {type(error).__name__}: {error}") from error
 
-    def state(self) -> tuple[float, ...]:
-        return ()
-
     def describe(self) -> dict[str, str]:
         return {"robot": "call", "function": self._name}
 

@@ -114,9 +114,6 @@ class RosActions(ActionRobot):
         point = ros.default(POINT, positions=values, time_from_start=self._period)
         return ros.default(TRAJECTORY, joint_names=self._joints, points=[point])
 
-    def state(self) -> tuple[float, ...]:
-        return ()
-
     def describe(self) -> dict[str, str]:
         facts = {name: value for name, value in asdict(self._kind).items() if name not in FOR_SKILLS}
         facts |= {"robot": "ros", "joints": ":".join(self._joints), **self._middleware.describe()}

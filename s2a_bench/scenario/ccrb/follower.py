@@ -197,6 +197,5 @@ def idm_acceleration(
 
 
 def follower(cars: Cars, rollouts: int) -> Follower:
-    """Build the trailing car's law for M roll-outs."""
     build: Callable[[Cars, int], Follower] = resolve_name(FOLLOWERS[cars.follower])
     return build(cars, rollouts)
