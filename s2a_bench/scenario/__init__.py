@@ -57,11 +57,11 @@ class Simulator(Protocol):
     """Whether it has physics of its own, so that cars follow a command with an error; else they follow exactly."""
     steers: ClassVar[bool]
     """Whether cars can leave their lane."""
-    most: ClassVar[int | None]
+    most: ClassVar[int | None] = None
     """Most roll-outs in lock step; None: no limit."""
-    over_ros: ClassVar[bool]
+    over_ros: ClassVar[bool] = False
     """Whether its ego can be driven and seen over ROS 2; `step` then takes NaN as its acceleration."""
-    step_s: float
+    step_s: float = STEP_S
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         """Restart with the cars in one lane, arrays of shape (3, M)."""
