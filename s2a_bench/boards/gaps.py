@@ -182,11 +182,9 @@ class Recorded:
 
     def in_order(self, tokens: int, start: int = 0) -> Floats:
         """Return the gaps from number ``start`` on, of shape (tokens,), as recorded."""
-        import numpy as np
+        return self._at([start], tokens)[:, 0]
 
-        return self._at(np.array([start]), tokens)[:, 0]
-
-    def _at(self, starts: NDArray[np.int64], tokens: int) -> Floats:
+    def _at(self, starts: NDArray[np.int64] | list[int], tokens: int) -> Floats:
         import numpy as np
 
         gaps = np.asarray(self.trace, dtype=np.float64) * (self.mean_s / _mean(self.trace))

@@ -55,12 +55,10 @@ class Board:
 
     def tokens(self, count: int, rng: np.random.Generator, plans: int) -> Floats:
         """Draw when each token arrives, shape (count, plans), in s from the request: prompt time, rate, then gaps."""
-        import numpy as np
-
         token_s = self.gaps.sample(rng, count, plans)
         token_s *= _factors(self.rate_cv, rng, plans)
         token_s[0] += self.prompt_s * _factors(self.prompt_cv, rng, plans)
-        np.cumsum(token_s, axis=0, out=token_s)
+        token_s.cumsum(axis=0, out=token_s)
         return token_s
 
 
