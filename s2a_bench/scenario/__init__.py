@@ -78,6 +78,7 @@ class Simulator(Protocol):
 
     def close(self) -> None:
         """Let go of the world, and restore what was changed outside of it; may be called twice."""
+        return
 
 
 SIMULATORS: Final[Registry[type[Simulator]]] = Registry(

@@ -66,8 +66,6 @@ class Embedded(Simulator):
     def camera(self, width: int, height: int) -> Windscreen:
         return Windscreen(lambda: self._shown, width, height)
 
-    def close(self) -> None: ...
-
     def _state(self, acceleration_mps2: Floats) -> State:
         position = [[vehicle.position[0] - LENGTHS[car] * vehicle.LENGTH] for car, vehicle in self._cars.items()]
         speed = [[vehicle.speed] for vehicle in self._cars.values()]

@@ -56,5 +56,3 @@ class Longitudinal(LockStep, Simulator):
 
     def camera(self, width: int, height: int) -> Windscreen:
         return Windscreen(lambda: (self._state, self._acceleration), width, height)
-
-    def close(self) -> None: ...
