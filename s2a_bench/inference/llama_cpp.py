@@ -8,6 +8,7 @@ import hashlib
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from importlib.metadata import version
 from typing import Any
 
@@ -114,7 +115,6 @@ class LlamaCppEngine(Engine):
         self._config = config
         self._threads = config.threads or len(os.sched_getaffinity(0))
         self._turn = 0
-        self._grammar_errors: dict[str, str] = {}  # a request's grammar rarely changes
         self._llama: _Prefilled | None = None
         llama_log.silence()
         llama_log.reason()
@@ -140,14 +140,17 @@ class LlamaCppEngine(Engine):
         except (ValueError, RuntimeError, OSError) as error:
             raise ModelError(f"`model` {files.model.path}: llama.cpp: {llama_log.reason() or error}") from error
         llama_log.silence()  # the library sets its own log level while it loads
-        self._pieces = TokenBytes(llama._model.vocab)  # noqa: SLF001
+        vocab = llama._model.vocab  # noqa: SLF001
+        self._pieces = TokenBytes(vocab)
+        check = lru_cache(_GRAMMARS)  # a request's grammar rarely changes
+        self._grammar_error = check(lambda grammar: beyond_limits(grammar) or grammar_error(vocab, grammar))
         self._prefill: Callable[[Any, str, tuple[Frame, ...], int], tuple[int, int]] = evaluate_text
         if files.mmproj:
             path = str(files.mmproj.path)
             with _refused(f"`mmproj` {path}: llama.cpp", llama):
                 self._prefill = VisionTower(llama, path, use_gpu=config.gpu_layers != 0).evaluate
         with _refused(f"`chat_template` {config.chat_template or files.model.path}", llama):
-            self._template = ChatTemplate(files.chat_template, llama._model.vocab)  # noqa: SLF001
+            self._template = ChatTemplate(files.chat_template, vocab)
         return llama
 
     def generate(self, request: Request) -> Iterator[Token]:
@@ -160,7 +163,7 @@ class LlamaCppEngine(Engine):
             raise EngineError("llama: the engine is closed; open a new one")
         self._turn += 1
         turn = self._turn
-        self._check(llama, request)
+        self._check(request)
         started = now_ns()
         prepared_ns, encode_ns = self._evaluate(llama, request)
         prompt_done = now_ns()
@@ -219,7 +222,7 @@ class LlamaCppEngine(Engine):
             raise BadRequest(f"llama: request {request.id} has a prompt without a token; write one")
         return times
 
-    def _check(self, llama: _Prefilled, request: Request) -> None:
+    def _check(self, request: Request) -> None:
         """Refuse requests that would crash llama.cpp: pictures of another size than declared, damaged grammars."""
         for frame in request.images:
             if frame.encoding != "rgb8":
@@ -229,13 +232,7 @@ class LlamaCppEngine(Engine):
                     f"llama: request {request.id} has a picture of {frame.width}x{frame.height} whose data are "
                     f"{frame.data.dtype} of shape {frame.data.shape}"
                 )
-        wrong = self._grammar_errors.get(request.grammar) if request.grammar else ""
-        if wrong is None:
-            wrong = beyond_limits(request.grammar) or grammar_error(llama._model.vocab, request.grammar)  # noqa: SLF001
-            if len(self._grammar_errors) >= _GRAMMARS:
-                self._grammar_errors.clear()
-            self._grammar_errors[request.grammar] = wrong
-        if wrong:
+        if request.grammar and (wrong := self._grammar_error(request.grammar)):
             raise BadRequest(f"llama: the grammar of request {request.id} is not valid GBNF: {wrong}")
 
     def describe(self) -> dict[str, str | int | float | bool]:
