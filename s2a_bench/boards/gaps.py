@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import fields
+from statistics import fmean
 from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol, TypeAlias
 
 from pydantic import ConfigDict, Field, ValidationError
@@ -175,7 +176,7 @@ class Recorded:
 
     @staticmethod
     def of(trace_s: tuple[float, ...]) -> Recorded:
-        return Recorded(_mean(trace_s), trace_s)
+        return Recorded(fmean(trace_s), trace_s)
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
         return self._at(rng.integers(len(self.trace), size=plans), tokens)
@@ -187,7 +188,7 @@ class Recorded:
     def _at(self, starts: NDArray[np.int64] | list[int], tokens: int) -> Floats:
         import numpy as np
 
-        gaps = np.asarray(self.trace, dtype=np.float64) * (self.mean_s / _mean(self.trace))
+        gaps = np.asarray(self.trace, dtype=np.float64) * (self.mean_s / fmean(self.trace))
         return np.asarray(gaps[(np.arange(tokens)[:, None] + starts) % len(gaps)])
 
 
@@ -245,10 +246,6 @@ def to_table(gaps: Gaps) -> dict[str, Any]:
     name = next(name for name, each in FAMILIES.items() if each is family)
     values = {field.name: getattr(gaps, field.name) for field in fields(family) if field.name != "mean_s"}
     return {"family": name} | {key: list(each) if isinstance(each, tuple) else each for key, each in values.items()}
-
-
-def _mean(values: tuple[float, ...]) -> float:
-    return math.fsum(values) / len(values)
 
 
 def _lognormal(rng: np.random.Generator, mean_s: float, cv: float, shape: tuple[int, int]) -> Floats:
