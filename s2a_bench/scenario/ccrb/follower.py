@@ -18,15 +18,12 @@ at rest it stays. Every brake gives at most 7 m/s^2, builds up at 7 / 0.6 and re
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from pkgutil import resolve_name
 from typing import ClassVar, Final
 
 import numpy as np
 
 from s2a_bench.policy import Floats
-from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import Cars
 from s2a_bench.scenario.longitudinal import LockStep, each
 
@@ -194,8 +191,3 @@ def idm_acceleration(
     wanted_m = np.maximum(IDM_STANDSTILL_M + speed_mps * headway_s + approach, 0.0)
     share = wanted_m / np.maximum(gap_m, 0.01)
     return np.asarray(IDM_ACCEL_MPS2 * (1 - (speed_mps / desired_mps) ** IDM_EXPONENT - share * share))
-
-
-def follower(cars: Cars, rollouts: int) -> Follower:
-    build: Callable[[Cars, int], Follower] = resolve_name(FOLLOWERS[cars.follower])
-    return build(cars, rollouts)
