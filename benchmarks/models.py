@@ -72,7 +72,7 @@ class Engine:
 
     def prompt(self, text: str) -> tuple[str, list[int]]:
         list(self.engine.generate(Request("prompt", text, max_tokens=1)))
-        tokens: list[int] = self.engine._llama.prompt  # type: ignore[union-attr]  # noqa: SLF001 - of the last request
+        tokens = self.engine._llama.eval_tokens  # type: ignore[union-attr]  # noqa: SLF001 - of the last request
         return self.engine._template.prompt(text, 0), list(tokens)  # noqa: SLF001
 
     def ask(self, text: str, frames: tuple[Frame, ...]) -> Asked:

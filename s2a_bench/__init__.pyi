@@ -398,6 +398,7 @@ def boundary(**options: Unpack[_Boundary]) -> Run:
 @overload
 def capacity(*, mode: Literal["measured"] = ..., **options: Unpack[_CapacityMeasured]) -> Run:
     """Find how many robots one server carries, each with its control clock: measured, or predicted."""
+
 @overload
 def capacity(*, mode: Literal["predicted"], **options: Unpack[_CapacityPredicted]) -> Run:
     """Find how many robots one server carries, each with its control clock: measured, or predicted."""
@@ -405,12 +406,15 @@ def capacity(*, mode: Literal["predicted"], **options: Unpack[_CapacityPredicted
 @overload
 def ccrb(*, mode: Literal["computed"] = ..., **options: Unpack[_CcrbComputed]) -> Run:
     """Drive car-to-car rear braking with a car behind, under each policy: who hits whom, and when."""
+
 @overload
 def ccrb(*, mode: Literal["live"], **options: Unpack[_CcrbLive]) -> Run:
     """Drive car-to-car rear braking with a car behind, under each policy: who hits whom, and when."""
+
 @overload
 def ccrb(*, mode: Literal["closed-loop"], **options: Unpack[_CcrbClosedLoop]) -> Run:
     """Drive car-to-car rear braking with a car behind, under each policy: who hits whom, and when."""
+
 @overload
 def ccrb(*, mode: Literal["live-loop"], **options: Unpack[_CcrbLiveLoop]) -> Run:
     """Drive car-to-car rear braking with a car behind, under each policy: who hits whom, and when."""
@@ -418,6 +422,7 @@ def ccrb(*, mode: Literal["live-loop"], **options: Unpack[_CcrbLiveLoop]) -> Run
 @overload
 def chunks(*, mode: Literal["virtual"] = ..., **options: Unpack[_ChunksVirtual]) -> Run:
     """Act on chunks of actions, computed or live: how often each mode and trigger stalls, on how old a picture."""
+
 @overload
 def chunks(*, mode: Literal["live"], **options: Unpack[_ChunksLive]) -> Run:
     """Act on chunks of actions, computed or live: how often each mode and trigger stalls, on how old a picture."""
@@ -431,9 +436,11 @@ def throughput(**options: Unpack[_Throughput]) -> Run:
 @overload
 def timeline(*, mode: Literal["computed"] = ..., **options: Unpack[_TimelineComputed]) -> Run:
     """Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live."""
+
 @overload
 def timeline(*, mode: Literal["real-time"], **options: Unpack[_TimelineRealTime]) -> Run:
     """Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live."""
+
 @overload
 def timeline(*, mode: Literal["live"], **options: Unpack[_TimelineLive]) -> Run:
     """Show when each policy acts on streamed skills, the same for all: computed, played in real time, or live."""

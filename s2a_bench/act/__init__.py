@@ -74,6 +74,7 @@ class ActionRobot(Protocol):
 
     def state(self) -> tuple[float, ...]:
         """Return the state that a request sends to the policy, in the robot's units; empty: none."""
+        return ()
 
     def moved(self, most: int) -> tuple[Motion, Floats] | None:  # noqa: ARG002 - for subclasses
         """Return the motion from the first action on, and the actions, of ``most`` ticks; None: unknown."""
@@ -97,8 +98,6 @@ class RobotKind:
 
 
 class SkillKind(RobotKind):
-    """A kind of robot that executes skills."""
-
     lacks: ClassVar[str] = "carries out no skills"
     several: ClassVar[bool] = False
     """Whether several may be open at once, one per policy: nothing moves."""
@@ -136,7 +135,6 @@ ROBOTS: Final[Registry[type[RobotKind]]] = Registry(
         "call": "s2a_bench.act.call:PythonCall",
     },
 )
-"""Kinds of robots, for skills, for actions or for both."""
 
 _Able = TypeVar("_Able", SkillKind, ActionKind)
 

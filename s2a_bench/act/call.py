@@ -12,7 +12,7 @@ from typing import ClassVar, Final, TypeAlias
 from s2a_bench.act import ActionKind, ActionRobot, Report, Running, SkillKind
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RobotError, UsageError
-from s2a_bench.plan import Call, Gap, SkillSet, Value
+from s2a_bench.plan import Call, Gap, SkillSet
 from s2a_bench.types import Vector
 
 _FUNCTION: Final = re.compile(r"[\w.]+:[\w.]+")
@@ -69,9 +69,6 @@ class CallableActions(ActionRobot):
         except Exception as error:
             raise RobotError(f"`robot`: call: {self._name}: {type(error).__name__}: {error}") from error
 
-    def state(self) -> tuple[float, ...]:
-        return ()
-
     def describe(self) -> dict[str, str]:
         return {"robot": "call", "function": self._name}
 
@@ -82,18 +79,11 @@ class SkillMotion:
     """Argument of a skill's function: the call and its commanded end, in ns of CLOCK_MONOTONIC, which may change."""
 
     def __init__(self, call: Call, end_ns: int) -> None:
-        self.call = call
+        self.call, self.arguments = call, call.arguments
+        self.aborted = False
         self._changed = Condition()
         self._end_ns = end_ns
-        self._aborted = self._over = False
-
-    @property
-    def arguments(self) -> dict[str, Value]:
-        return self.call.arguments
-
-    @property
-    def aborted(self) -> bool:
-        return self._aborted
+        self._over = False
 
     @property
     def remaining_s(self) -> float:
@@ -103,7 +93,7 @@ class SkillMotion:
         """Sleep until the present end, at most ``longest_s``, and return True; return False at once on an abort."""
         until_ns = None if longest_s is None else now_ns() + round(longest_s * 1e9)
         with self._changed:
-            while not self._aborted:
+            while not self.aborted:
                 end_ns = self._end_ns if until_ns is None else min(self._end_ns, until_ns)
                 left_ns = end_ns - now_ns()
                 if left_ns <= 0:
@@ -121,7 +111,7 @@ class SkillMotion:
 
     def abort(self) -> None:
         with self._changed:
-            self._aborted = True
+            self.aborted = True
             self._changed.notify_all()
 
     def run(self, function: SkillFunction, report: Report) -> None:
@@ -139,8 +129,6 @@ SkillFunction: TypeAlias = Callable[[SkillMotion], object]
 
 
 class CallableRobot:
-    """Calls one function per skill."""
-
     def __init__(
         self, skills: SkillSet, functions: Mapping[str, SkillFunction], hold: Callable[[Gap], None] | None = None
     ) -> None:

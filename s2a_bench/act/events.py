@@ -63,8 +63,6 @@ class SkillOver:
 
 @dataclass(frozen=True, slots=True)
 class AbortRequested:
-    """The robot should stop."""
-
     at_ns: int
     why: str = "abort requested"
 

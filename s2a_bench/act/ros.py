@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from threading import Lock, Thread
 from typing import Annotated, Any, Final, Literal
 
@@ -114,9 +115,6 @@ class RosActions(ActionRobot):
         point = ros.default(POINT, positions=values, time_from_start=self._period)
         return ros.default(TRAJECTORY, joint_names=self._joints, points=[point])
 
-    def state(self) -> tuple[float, ...]:
-        return ()
-
     def describe(self) -> dict[str, str]:
         facts = {name: value for name, value in asdict(self._kind).items() if name not in FOR_SKILLS}
         facts |= {"robot": "ros", "joints": ":".join(self._joints), **self._middleware.describe()}
@@ -195,7 +193,7 @@ class RosSkills:
 
 class _Goal:
     def __init__(self, client: ActionClient, goal_id: bytes) -> None:
-        self._client, self._id = client, goal_id
+        self.abort = partial(client.cancel, goal_id)
 
     def retime(self, end_ns: int) -> None:
         """Do nothing: a sent goal keeps its duration."""
@@ -203,6 +201,3 @@ class _Goal:
     def ended(self) -> bool:
         """Return False: the result reports the end."""
         return False
-
-    def abort(self) -> None:
-        self._client.cancel(self._id)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import fields
+from statistics import fmean
 from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol, TypeAlias
 
 from pydantic import ConfigDict, Field, ValidationError
@@ -175,21 +176,19 @@ class Recorded:
 
     @staticmethod
     def of(trace_s: tuple[float, ...]) -> Recorded:
-        return Recorded(_mean(trace_s), trace_s)
+        return Recorded(fmean(trace_s), trace_s)
 
     def sample(self, rng: np.random.Generator, tokens: int, plans: int) -> Floats:
         return self._at(rng.integers(len(self.trace), size=plans), tokens)
 
     def in_order(self, tokens: int, start: int = 0) -> Floats:
         """Return the gaps from number ``start`` on, of shape (tokens,), as recorded."""
+        return self._at([start], tokens)[:, 0]
+
+    def _at(self, starts: NDArray[np.int64] | list[int], tokens: int) -> Floats:
         import numpy as np
 
-        return self._at(np.array([start]), tokens)[:, 0]
-
-    def _at(self, starts: NDArray[np.int64], tokens: int) -> Floats:
-        import numpy as np
-
-        gaps = np.asarray(self.trace, dtype=np.float64) * (self.mean_s / _mean(self.trace))
+        gaps = np.asarray(self.trace, dtype=np.float64) * (self.mean_s / fmean(self.trace))
         return np.asarray(gaps[(np.arange(tokens)[:, None] + starts) % len(gaps)])
 
 
@@ -204,24 +203,26 @@ FAMILIES: dict[str, type[Constant | Lognormal | Markov | Bursty | Quantiles | Re
 """A family's name in a profile -> the class; its fields are the keys beside ``family``."""
 
 
-def from_table(table: Mapping[str, Any], mean_s: float) -> Gaps:
+def from_table(table: Mapping[str, Any], mean_s: float, where: str = "") -> Gaps:
     """Make gaps from a TOML table: ``family`` and all of that family's parameters except the mean.
 
-    Raises UsageError, naming the key, for an unknown family or key and a value of the wrong type or size.
+    Raises UsageError, naming the key after ``where``, for an unknown family or key and a wrong value.
     """
     name = table.get("family")
     if not isinstance(name, str) or name not in FAMILIES:
-        raise UsageError(f"family: {name!r} is none of {', '.join(FAMILIES)}")
+        raise UsageError(f"{where}family: {name!r} is none of {', '.join(FAMILIES)}")
     family = FAMILIES[name]
     keys = [field.name for field in fields(family) if field.name != "mean_s"]
     values = {key: value for key, value in table.items() if key != "family"}
     if unknown := [key for key in values if key not in keys]:
-        raise UsageError(f"{unknown[0]}: {name} gaps have no such key; they have {', '.join(keys) or 'none'}")
+        raise UsageError(f"{where}{unknown[0]}: {name} gaps have no such key; they have {', '.join(keys) or 'none'}")
     try:
         return family(mean_s=mean_s, **values)
     except ValidationError as error:
         first = error.errors()[0]
-        raise UsageError(f"{first['loc'][0]}: {wrong(first)}") from error
+        raise UsageError(f"{where}{first['loc'][0]}: {wrong(first)}") from error
+    except UsageError as error:
+        raise UsageError(f"{where}{error}") from error
 
 
 def read_family(written: str, field: str) -> dict[str, str | int | float]:
@@ -245,10 +246,6 @@ def to_table(gaps: Gaps) -> dict[str, Any]:
     name = next(name for name, each in FAMILIES.items() if each is family)
     values = {field.name: getattr(gaps, field.name) for field in fields(family) if field.name != "mean_s"}
     return {"family": name} | {key: list(each) if isinstance(each, tuple) else each for key, each in values.items()}
-
-
-def _mean(values: tuple[float, ...]) -> float:
-    return math.fsum(values) / len(values)
 
 
 def _lognormal(rng: np.random.Generator, mean_s: float, cv: float, shape: tuple[int, int]) -> Floats:

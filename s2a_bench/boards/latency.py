@@ -94,10 +94,7 @@ def family(written: str) -> Gaps:
         table["family"] = "markov"
         if isinstance(share := table.get("pause_share"), int | float) and 0 <= share < 1:
             table["pause_tokens"] = 1 / (1 - share)
-    try:
-        return from_table(table, mean_ms / 1e3)
-    except UsageError as error:
-        raise UsageError(f"`latency`: {written}: {error}") from error
+    return from_table(table, mean_ms / 1e3, f"`latency`: {written}: ")
 
 
 def read_delays(path: Path) -> Ints:

@@ -124,24 +124,14 @@ def read_profile(path: Path) -> Profile:
 def parse_profile(name: str, text: str, where: str) -> Profile:
     """Read a profile; ``where`` begins every error. Raises UsageError naming the key that is wrong."""
     file = parse(_ProfileFile, text, where)
-    try:
-        return _profile(name, file)
-    except UsageError as error:
-        raise UsageError(f"{where}: {error}") from error
-
-
-def _profile(name: str, file: _ProfileFile) -> Profile:
     facts = file.model_dump(include=set(FACTS), exclude_none=True)
     for key, table in facts.items():
-        _check_fact(key, table)
-    try:
-        gaps = from_table(file.gaps, 1 / file.tokens_per_s)
-    except UsageError as error:
-        raise UsageError(f"gaps.{error}") from error
+        _check_fact(f"{where}: {key}", table)
+    gaps = from_table(file.gaps, 1 / file.tokens_per_s, f"{where}: gaps.")
     trace_s = file.trace.gaps_s if file.trace else ()
     if trace_s and abs((rate := len(trace_s) / math.fsum(trace_s)) / file.tokens_per_s - 1) > _RATE_TOLERANCE:
         raise UsageError(
-            f"tokens_per_s: {file.tokens_per_s:g}, but the gaps of [trace] make {rate:g}; correct one of them"
+            f"{where}: tokens_per_s: {file.tokens_per_s:g}, but the gaps of [trace] make {rate:g}; correct one of them"
         )
     values = file.model_dump(include={"title", "origin", "tokens_per_s", "prompt_s", "prompt_cv", "rate_cv"})
     return Profile(name=name, gaps=gaps, trace_s=trace_s, assumed=tuple(file.assumed), facts=facts, **values)

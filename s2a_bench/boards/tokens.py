@@ -55,19 +55,20 @@ class Board:
 
     def tokens(self, count: int, rng: np.random.Generator, plans: int) -> Floats:
         """Draw when each token arrives, shape (count, plans), in s from the request: prompt time, rate, then gaps."""
-        import numpy as np
-
         token_s = self.gaps.sample(rng, count, plans)
         token_s *= _factors(self.rate_cv, rng, plans)
         token_s[0] += self.prompt_s * _factors(self.prompt_cv, rng, plans)
-        np.cumsum(token_s, axis=0, out=token_s)
+        token_s.cumsum(axis=0, out=token_s)
         return token_s
 
 
 def board_of_profile(profile: Profile, jitter: str, prompt_s: float | None) -> Board:
     """Make a board of a profile; ``prompt_s`` replaces its c, and ``--jitter profile`` adds its spreads."""
     assumed = "assumed" if "prompt_s" in profile.assumed else "measured"
-    gaps = _gaps(jitter, profile)
+    own, mean_s = jitter == AS_PROFILE, 1 / profile.tokens_per_s
+    gaps = profile.gaps if own else gaps_of(jitter, mean_s)
+    if own and profile.trace_s:
+        gaps = Recorded(mean_s, profile.trace_s)
     recorded = isinstance(gaps, Recorded)  # it holds each answer's own rate already
     return Board(
         name=profile.name,
@@ -77,8 +78,8 @@ def board_of_profile(profile: Profile, jitter: str, prompt_s: float | None) -> B
         prompt_s=profile.prompt_s if prompt_s is None else prompt_s,
         prompt_origin=assumed if prompt_s is None else "given",
         gaps=gaps,
-        prompt_cv=profile.prompt_cv if jitter == AS_PROFILE else 0.0,
-        rate_cv=profile.rate_cv if jitter == AS_PROFILE and not recorded else 0.0,
+        prompt_cv=profile.prompt_cv if own else 0.0,
+        rate_cv=profile.rate_cv if own and not recorded else 0.0,
         profile_origin=profile.provenance,
     )
 
@@ -101,16 +102,7 @@ def board_of_rate(tokens_per_s: float, jitter: str, prompt_s: float | None) -> B
 def gaps_of(jitter: str, mean_s: float) -> Gaps:
     """Read ``none`` or ``FAMILY:key=value,...`` of `jitter.FAMILIES`; raises UsageError naming the field."""
     table = read_family("constant" if jitter == NO_JITTER else jitter, "jitter")
-    try:
-        return from_table(table, mean_s)
-    except UsageError as error:
-        raise UsageError(f"`jitter` {jitter}: {error}") from error
-
-
-def _gaps(jitter: str, profile: Profile) -> Gaps:
-    if jitter != AS_PROFILE:
-        return gaps_of(jitter, 1 / profile.tokens_per_s)
-    return Recorded(1 / profile.tokens_per_s, profile.trace_s) if profile.trace_s else profile.gaps
+    return from_table(table, mean_s, f"`jitter` {jitter}: ")
 
 
 def _factors(cv: float, rng: np.random.Generator, plans: int) -> Floats | float:

@@ -63,9 +63,9 @@ def open_source(spec: str, width: int, height: int, *, fps: float = 30.0, seed: 
 
 
 class NumberedSource:
-    """Base of the built-in sources: numbers the pictures of a subclass and stamps them."""
+    """Base of built-in sources: numbers and stamps the pictures of a subclass, ``bgr8`` unless it says otherwise."""
 
-    encoding: Encoding
+    encoding: Encoding = "bgr8"
 
     def __init__(self, name: str, width: int, height: int, *, smallest: int = 1, even: bool = False) -> None:
         check_size(width, height, smallest=smallest, even=even)

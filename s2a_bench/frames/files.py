@@ -10,14 +10,13 @@ import cv2
 from s2a_bench.errors import SourceError
 from s2a_bench.frames import NumberedSource
 from s2a_bench.frames.convert import bgr_to_rgb, decode_image, resize
-from s2a_bench.types import Encoding, Pixels
+from s2a_bench.types import Pixels
 
 
 class VideoFile(NumberedSource):
     """A video file as a camera: (h, w, 3) ``bgr8``; unlike with a camera, capture includes decoding."""
 
     where: ClassVar[str] = "FILE"
-    encoding: Encoding = "bgr8"
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
         super().__init__(f"video:{where}", width, height)
@@ -63,7 +62,6 @@ class ImageFolder(NumberedSource):
     """
 
     where: ClassVar[str] = "FOLDER"
-    encoding: Encoding = "bgr8"
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:  # noqa: ARG002
         super().__init__(f"images:{where}", width, height)

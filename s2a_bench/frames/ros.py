@@ -91,7 +91,6 @@ class TopicCamera(ImageMessages):
         )
 
     def _receive(self) -> None:
-        """Keep the newest message."""
         while not self._closed:
             newest: tuple[Any, int] | TransportError | None = None
             try:

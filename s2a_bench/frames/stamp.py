@@ -34,13 +34,6 @@ class Stamped:
             return frame
         if not frame.data.flags.writeable:
             frame = replace(frame, data=frame.data.copy())
-        self._stamp(frame)
-        return frame
-
-    def close(self) -> None:
-        self._source.close()
-
-    def _stamp(self, frame: Frame) -> None:
         digest = blake2b(f"{self._nonce}/{frame.index}".encode(), digest_size=SIDE * SIDE // 8).digest()
         bits = np.unpackbits(np.frombuffer(digest, np.uint8)).reshape(SIDE, SIDE)
         corner = frame.data[: 2 * SIDE, : 2 * SIDE]
@@ -50,3 +43,7 @@ class Stamped:
             corner[..., 0], corner[..., 1] = luma, GREY
         else:
             corner[...] = luma.reshape(height, width, *(1,) * (corner.ndim - 2))
+        return frame
+
+    def close(self) -> None:
+        self._source.close()

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from s2a_bench.errors import UsageError
 from s2a_bench.frames import NumberedSource
 from s2a_bench.types import Encoding, Pixels
 
@@ -39,21 +38,16 @@ class SyntheticCamera(NumberedSource):
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:
         super().__init__(f"synthetic:{where}" if where else "synthetic", width, height, smallest=16, even=True)
-        if not fps > 0:
-            raise UsageError(f"`fps`: {fps} should be above 0")
         self.fps = fps
         # a quarter of the frame each way is enough for the motion, and soon rendered
         self._margin = (width // 8 * 2, height // 4)
         self._scene = render_scene(width + self._margin[0], height + self._margin[1], seed)
 
     def _picture(self) -> Pixels:
-        x, y = self._corner(self._index / self.fps)
-        return self._scene[y : y + self.height, x : x + self.width].copy()
-
-    def _corner(self, t_s: float) -> tuple[int, int]:
-        """Return the window's upper left corner; x is even, so that pixel pairs stay whole."""
+        t_s = self._index / self.fps
         across, down = (0.5 + 0.5 * math.sin(math.tau * t_s / period_s) for period_s in PERIODS_S)
-        return round(across * self._margin[0] / 2) * 2, round(down * self._margin[1])
+        x, y = round(across * self._margin[0] / 2) * 2, round(down * self._margin[1])  # x is even: pixel pairs
+        return self._scene[y : y + self.height, x : x + self.width].copy()
 
 
 OBJECTS = 700

@@ -40,7 +40,6 @@ class Engine(Protocol):
     exclusive_options: ClassVar[tuple[str, ...]] = ()
     """The options that no other engine honours."""
     declared_facts: ClassVar[Sequence[Fact]] = ()
-    """The facts that it may report."""
     honours: ClassVar[Sequence[str]] = ()
     """The names in `Request.sampling` that it honours."""
     _facts: dict[str, float] = {}  # noqa: RUF012 - replaced, never changed
@@ -92,7 +91,6 @@ ENGINES: Final[Registry[type[Engine]]] = Registry(
         "replay": "s2a_bench.inference.replay:ReplayEngine",
     },
 )
-"""Name -> the engine's class."""
 
 MODEL, STAND_IN = "llama", "echo"
 """The default engine, and the one without its library."""

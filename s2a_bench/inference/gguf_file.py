@@ -12,7 +12,7 @@ import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from s2a_bench import extras
 from s2a_bench.errors import ModelError
@@ -54,13 +54,10 @@ class _Cursor:
         self.data = data
         self.at = 0
 
-    def scalar(self, form: str) -> int | float | bool:
-        value: int | float | bool = struct.unpack_from(form, self.data, self.at)[0]
+    def number(self, form: str) -> Any:
+        (value,) = struct.unpack_from(form, self.data, self.at)
         self.at += struct.calcsize(form)
         return value
-
-    def integer(self, form: str) -> int:
-        return int(self.scalar(form))
 
     def skip(self, size: int) -> None:
         self.at += size
@@ -68,16 +65,16 @@ class _Cursor:
             raise EOFError
 
     def string(self) -> str:
-        size = self.integer("<Q")
+        size = self.number("<Q")
         start = self.at
         self.skip(size)
         return self.data[start : self.at].decode()
 
     def skip_array(self) -> None:
-        kind, length = self.integer("<I"), self.integer("<Q")
+        kind, length = self.number("<I"), self.number("<Q")
         if kind == _STRING:
             for _ in range(_at_most(length, _MAX_STRINGS)):
-                self.skip(self.integer("<Q"))
+                self.skip(self.number("<Q"))
         else:
             self.skip(length * struct.calcsize(_SCALARS[kind]))
 
@@ -108,17 +105,17 @@ def _parse(path: Path, data: mmap.mmap, flag: str) -> GgufHeader:
         raise ModelError(f"{flag} {path}: not a GGUF file; give one that llama.cpp can load")
     cursor = _Cursor(data)
     cursor.skip(len(MAGIC))
-    version = cursor.integer("<I")
+    version = cursor.number("<I")
     if version not in (2, 3):
         raise ModelError(f"{flag} {path}: GGUF version {version} is not known (2 and 3 are); convert the model again")
-    n_tensors, n_fields = _at_most(cursor.integer("<Q"), _MAX_TENSORS), _at_most(cursor.integer("<Q"), _MAX_FIELDS)
+    n_tensors, n_fields = _at_most(cursor.number("<Q"), _MAX_TENSORS), _at_most(cursor.number("<Q"), _MAX_FIELDS)
     fields: dict[str, Value] = {}
     for _ in range(n_fields):
-        key, kind = cursor.string(), cursor.integer("<I")
+        key, kind = cursor.string(), cursor.number("<I")
         if kind == _ARRAY:
             cursor.skip_array()
         else:
-            fields[key] = cursor.string() if kind == _STRING else cursor.scalar(_SCALARS[kind])
+            fields[key] = cursor.string() if kind == _STRING else cursor.number(_SCALARS[kind])
     last, parameters = _tensors(cursor, n_tensors)
     alignment = int(fields.get("general.alignment", 32))
     end = -(-cursor.at // alignment) * alignment + last
@@ -132,14 +129,14 @@ def _tensors(cursor: _Cursor, count: int) -> tuple[int, int]:
     sizes = extras.require("gguf.constants", "model").GGML_QUANT_SIZES
     last = numbers = 0
     for _ in range(count):
-        _name, n_dims = cursor.string(), cursor.integer("<I")
+        _name, n_dims = cursor.string(), cursor.number("<I")
         if n_dims > _MAX_DIMS:
             raise ValueError(n_dims)
-        shape = [cursor.integer("<Q") for _ in range(n_dims)]
-        block, block_bytes = sizes[cursor.integer("<I")]
+        shape = [cursor.number("<Q") for _ in range(n_dims)]
+        block, block_bytes = sizes[cursor.number("<I")]
         size = math.prod(shape)
         numbers += size
-        last = max(last, cursor.integer("<Q") + size // block * block_bytes)
+        last = max(last, cursor.number("<Q") + size // block * block_bytes)
     return last, numbers
 
 

@@ -6,8 +6,9 @@ import codecs
 import ctypes
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import lru_cache
 from importlib.metadata import version
 from typing import Any
 
@@ -44,9 +45,9 @@ from s2a_bench.inference.llama_decode import (
     beyond_limits,
     grammar_error,
 )
-from s2a_bench.inference.llama_prompt import ChatTemplate, PixelHandler, TextHandler, TooLong
+from s2a_bench.inference.llama_prompt import ChatTemplate, TooLong, VisionTower, evaluate_text
 from s2a_bench.inference.models import ModelFiles, load_headers
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Frame, Request, Token
 
 llama_cpp = extras.require("llama_cpp", "llama")
 
@@ -57,9 +58,7 @@ _GRAMMARS = 64
 
 
 class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the library has no types
-    """A Llama that keeps the evaluated prompt and leaves the generation of tokens to `TokenBatch`."""
-
-    prompt: list[int]
+    """A Llama that leaves the generation of tokens to `TokenBatch`."""
 
     def __init__(self, model: str, *, flash_attention: int, **settings: Any) -> None:
         self._flash_attention = flash_attention
@@ -88,10 +87,9 @@ class _Prefilled(llama_cpp.Llama):  # type: ignore[misc, name-defined]  # the li
         super().eval(tokens)
         llama_cpp.llama_synchronize(self.ctx)
 
-    def create_completion(self, prompt: list[int], **_settings: Any) -> Iterator[Any]:
-        """Keep the prompt; the library's loop joins tokens into characters and drops their indices."""
-        self.prompt = prompt
-        return iter(())
+    def restart(self) -> None:
+        self.reset()
+        self._ctx.kv_cache_clear()
 
 
 @contextmanager
@@ -117,13 +115,9 @@ class LlamaCppEngine(Engine):
         self._config = config
         self._threads = config.threads or len(os.sched_getaffinity(0))
         self._turn = 0
-        self._grammar_errors: dict[str, str] = {}  # a request's grammar rarely changes
         self._llama: _Prefilled | None = None
         llama_log.silence()
         llama_log.reason()
-        mmproj = self._files.mmproj
-        tower = PixelHandler(str(mmproj.path), use_gpu=config.gpu_layers != 0) if mmproj else None
-        self._handler: PixelHandler | TextHandler = tower or TextHandler()
         self._llama = self._load(self._files)
         self._batch = TokenBatch()
 
@@ -146,11 +140,17 @@ class LlamaCppEngine(Engine):
         except (ValueError, RuntimeError, OSError) as error:
             raise ModelError(f"`model` {files.model.path}: llama.cpp: {llama_log.reason() or error}") from error
         llama_log.silence()  # the library sets its own log level while it loads
-        self._pieces = TokenBytes(llama._model.vocab)  # noqa: SLF001
-        with _refused(f"`mmproj` {files.mmproj and files.mmproj.path}: llama.cpp", llama):
-            self._handler.load(llama)  # now, not within the first request's time
+        vocab = llama._model.vocab  # noqa: SLF001
+        self._pieces = TokenBytes(vocab)
+        check = lru_cache(_GRAMMARS)  # a request's grammar rarely changes
+        self._grammar_error = check(lambda grammar: beyond_limits(grammar) or grammar_error(vocab, grammar))
+        self._prefill: Callable[[Any, str, tuple[Frame, ...], int], tuple[int, int]] = evaluate_text
+        if files.mmproj:
+            path = str(files.mmproj.path)
+            with _refused(f"`mmproj` {path}: llama.cpp", llama):
+                self._prefill = VisionTower(llama, path, use_gpu=config.gpu_layers != 0).evaluate
         with _refused(f"`chat_template` {config.chat_template or files.model.path}", llama):
-            self._template = ChatTemplate(files.chat_template, llama._model.vocab)  # noqa: SLF001
+            self._template = ChatTemplate(files.chat_template, vocab)
         return llama
 
     def generate(self, request: Request) -> Iterator[Token]:
@@ -163,7 +163,7 @@ class LlamaCppEngine(Engine):
             raise EngineError("llama: the engine is closed; open a new one")
         self._turn += 1
         turn = self._turn
-        self._check(llama, request)
+        self._check(request)
         started = now_ns()
         prepared_ns, encode_ns = self._evaluate(llama, request)
         prompt_done = now_ns()
@@ -182,7 +182,7 @@ class LlamaCppEngine(Engine):
         decode = codecs.getincrementaldecoder("utf-8")("replace").decode
         llama.set_seed(request.seed & 0x7FFF_FFFF)  # 2**32-1 would mean a random seed
         sampler = llama.sampler(self._config.sampling, request.grammar, dict(request.sampling))
-        ids = self._batch.answer(llama._ctx, sampler, len(llama.prompt))  # noqa: SLF001
+        ids = self._batch.answer(llama._ctx, sampler, llama.n_tokens)  # noqa: SLF001
         count, last_ns, pieces = 0, prompt_done, self._pieces
         try:
             for index in range(request.max_tokens):
@@ -210,7 +210,7 @@ class LlamaCppEngine(Engine):
         llama_log.reason()
         llama_cpp.llama_perf_context_reset(llama.ctx)
         try:
-            times = self._handler.evaluate(llama, prompt, request.images, llama.n_ctx() - request.max_tokens)
+            times = self._prefill(llama, prompt, request.images, llama.n_ctx() - request.max_tokens)
         except TooLong as error:
             raise BadRequest(
                 f"llama: request {request.id} does not fit the context of {llama.n_ctx()} tokens (prompt of {error} "
@@ -222,7 +222,7 @@ class LlamaCppEngine(Engine):
             raise BadRequest(f"llama: request {request.id} has a prompt without a token; write one")
         return times
 
-    def _check(self, llama: _Prefilled, request: Request) -> None:
+    def _check(self, request: Request) -> None:
         """Refuse requests that would crash llama.cpp: pictures of another size than declared, damaged grammars."""
         for frame in request.images:
             if frame.encoding != "rgb8":
@@ -232,13 +232,7 @@ class LlamaCppEngine(Engine):
                     f"llama: request {request.id} has a picture of {frame.width}x{frame.height} whose data are "
                     f"{frame.data.dtype} of shape {frame.data.shape}"
                 )
-        wrong = self._grammar_errors.get(request.grammar) if request.grammar else ""
-        if wrong is None:
-            wrong = beyond_limits(request.grammar) or grammar_error(llama._model.vocab, request.grammar)  # noqa: SLF001
-            if len(self._grammar_errors) >= _GRAMMARS:
-                self._grammar_errors.clear()
-            self._grammar_errors[request.grammar] = wrong
-        if wrong:
+        if request.grammar and (wrong := self._grammar_error(request.grammar)):
             raise BadRequest(f"llama: the grammar of request {request.id} is not valid GBNF: {wrong}")
 
     def describe(self) -> dict[str, str | int | float | bool]:

@@ -1,11 +1,9 @@
-"""A model's prompt: its chat template, rendered as llama.cpp's own server does, and its evaluation.
-
-Pictures are RGB pixels, which llama-cpp-python's handler takes for any of its models.
-"""
+"""A model's prompt: its chat template, rendered as llama.cpp's server does, and its evaluation with RGB pictures."""
 
 from __future__ import annotations
 
 import ctypes
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
@@ -64,127 +62,84 @@ class ChatTemplate:
         return _PROBE in found and "'text'" not in found
 
 
-class TextHandler:
-    """Evaluates prompts of a model without a vision tower, which does not see a request's pictures."""
+def evaluate_text(llama: Any, prompt: str, _frames: tuple[Frame, ...], room: int) -> tuple[int, int]:
+    """Evaluate a prompt of up to ``room`` tokens on an empty KV cache, without its pictures; raises TooLong.
 
-    def load(self, llama: Any) -> None:
-        """Load nothing more."""
-
-    def evaluate(self, llama: Any, prompt: str, _frames: tuple[Frame, ...], room: int) -> tuple[int, int]:
-        """Evaluate a prompt of up to ``room`` tokens on an empty KV cache; raises TooLong.
-
-        Return when it was tokenised, and 0, the time of the pictures that it has not.
-        """
-        tokens = llama.tokenize(prompt.encode(), add_bos=True, special=True)
-        if len(tokens) > room:
-            raise TooLong(len(tokens))
-        prepared_ns = now_ns()
-        llama.reset()
-        llama._ctx.kv_cache_clear()  # noqa: SLF001 - as the library does
-        llama.eval(tokens)
-        llama.prompt = tokens
-        return prepared_ns, 0
-
-
-class Steps:
-    """MTMD's bindings, except that a call of the library's handler is split into steps, each timed.
-
-    ``prepared_ns`` is the time at which the last prompt was tokenised and its pictures sliced; ``encode_ns`` is the
-    vision tower's time for them so far; ``room`` is the most tokens of a prompt, which are more than its positions
-    where a picture's share them (M-RoPE).
+    Return when it was tokenised, and 0, the time of the pictures.
     """
-
-    def __init__(self) -> None:
-        self.prepared_ns = 0
-        self.encode_ns = 0
-        self.room = 0
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(mtmd_cpp, name)
-
-    def mtmd_tokenize(self, mtmd: Any, chunks: Any, *arguments: Any) -> int:
-        failed: int = mtmd_cpp.mtmd_tokenize(mtmd, chunks, *arguments)
-        if not failed and (count := mtmd_cpp.mtmd_helper_get_n_tokens(chunks)) > self.room:
-            raise TooLong(count)
-        self.prepared_ns, self.encode_ns = now_ns(), 0
-        return failed
-
-    def mtmd_helper_eval_chunk_single(
-        self, mtmd: Any, llama: Any, chunk: Any, n_past: Any, sequence: Any, n_batch: int, _last: bool, past: Any
-    ) -> int:
-        """Evaluate a slice in the vision tower, then in the language model, and wait for each."""
-        started_ns = now_ns()
-        failed: int = mtmd_cpp.mtmd_encode_chunk(mtmd, chunk)
-        self.encode_ns += now_ns() - started_ns
-        if failed:
-            return failed
-        embedding = mtmd_cpp.mtmd_get_output_embd(mtmd)
-        failed = mtmd_cpp.mtmd_helper_decode_image_chunk(
-            mtmd, llama, chunk, embedding, n_past, sequence, n_batch, past, _NO_CALLBACK, None
-        )
-        llama_cpp.llama_synchronize(llama)
-        return failed
+    tokens = llama.tokenize(prompt.encode(), add_bos=True, special=True)
+    if len(tokens) > room:
+        raise TooLong(len(tokens))
+    prepared_ns = now_ns()
+    llama.restart()
+    llama.eval(tokens)
+    return prepared_ns, 0
 
 
-class PixelHandler(chat_format.MTMDChatHandler):  # type: ignore[misc, name-defined]  # the library has no types
-    """The library's handler, except that a picture is an RGB array, and that the prompt is rendered already."""
+class VisionTower:
+    """A loaded mmproj, which evaluates prompts with pictures as llama-cpp-python's handler does, but timed in steps."""
 
-    def __init__(self, mmproj: str, *, use_gpu: bool) -> None:
-        super().__init__(clip_model_path=mmproj, verbose=False, use_gpu=use_gpu)
-        self._mtmd_cpp = self.steps = Steps()
-        self._prompt = ""
-        self._frames: tuple[Frame, ...] = ()
-        self.mtmd_ctx: Any = None
+    def __init__(self, llama: Any, mmproj: str, *, use_gpu: bool) -> None:
+        """Load it with the language model's kind of flash attention; raises ValueError."""
+        params = mtmd_cpp.mtmd_context_params_default()
+        params.use_gpu = use_gpu
+        params.print_timings = False
+        params.n_threads = llama.n_threads
+        params.flash_attn_type = llama.context_params.flash_attn_type
+        self._mtmd = mtmd_cpp.mtmd_init_from_file(mmproj.encode(), llama.model, params)
+        if self._mtmd is None:
+            raise ValueError(llama_log.reason() or "MTMD cannot load it")
+        llama._stack.callback(mtmd_cpp.mtmd_free, self._mtmd)  # noqa: SLF001 - as the library does
 
     def evaluate(self, llama: Any, prompt: str, frames: tuple[Frame, ...], room: int) -> tuple[int, int]:
         """Evaluate a prompt with markers, of up to ``room`` tokens, on an empty KV cache; raises TooLong.
 
-        Return ``prepared_ns`` and ``encode_ns`` of its `Steps`.
+        Where a picture's tokens share positions (M-RoPE) they are more than its positions. Return when the prompt was
+        tokenised and its pictures sliced, and the tower's time for these, in ns.
         """
-        self._prompt, self._frames, self.steps.room = prompt, frames, room
-        pictures = [{"type": "image_url", "image_url": str(place)} for place in range(len(frames))]
-        try:
-            self(llama=llama, messages=[{"role": "user", "content": pictures}], stream=True)
-        finally:
-            self._frames = ()
-        return self.steps.prepared_ns, self.steps.encode_ns
+        data = prompt.encode()
+        text = mtmd_cpp.mtmd_input_text(text=data, text_len=len(data), add_special=True, parse_special=True)
+        with ExitStack() as stack:
+            bitmaps = (mtmd_cpp.mtmd_bitmap_p_ctypes * len(frames))(*map(bitmap_of, frames))
+            for bitmap in bitmaps:
+                stack.callback(mtmd_cpp.mtmd_bitmap_free, bitmap)
+            chunks = mtmd_cpp.mtmd_input_chunks_init()
+            stack.callback(mtmd_cpp.mtmd_input_chunks_free, chunks)
+            if code := mtmd_cpp.mtmd_tokenize(self._mtmd, chunks, ctypes.byref(text), bitmaps, len(frames)):
+                raise ValueError(f"Failed to tokenize input: error code {code}")
+            if (count := mtmd_cpp.mtmd_helper_get_n_tokens(chunks)) > room:
+                raise TooLong(count)
+            prepared_ns, encode_ns = now_ns(), 0
+            llama.restart()
+            for place in range(mtmd_cpp.mtmd_input_chunks_size(chunks)):
+                chunk = mtmd_cpp.mtmd_input_chunks_get(chunks, place)
+                if mtmd_cpp.mtmd_input_chunk_get_type(chunk) == mtmd_cpp.MTMD_INPUT_CHUNK_TYPE_TEXT:
+                    size = ctypes.c_size_t()
+                    tokens = mtmd_cpp.mtmd_input_chunk_get_tokens_text(chunk, ctypes.byref(size))
+                    llama.eval(tokens[: size.value])
+                else:
+                    encode_ns += self._evaluate_slice(llama, chunk)
+        return prepared_ns, encode_ns
 
-    def load(self, llama: Any) -> None:
-        """Load the vision tower; raises ValueError."""
-        self._init_mtmd_context(llama)
+    def _evaluate_slice(self, llama: Any, chunk: Any) -> int:
+        """Evaluate a slice here, then in the language model, and wait for each; return the time of the former in ns."""
+        started_ns, past = now_ns(), llama_cpp.llama_pos(0)
+        code = mtmd_cpp.mtmd_encode_chunk(self._mtmd, chunk)
+        encode_ns = now_ns() - started_ns
+        if not code:
+            embedding = mtmd_cpp.mtmd_get_output_embd(self._mtmd)
+            where = llama.n_tokens, 0, llama.n_batch, ctypes.byref(past)
+            code = mtmd_cpp.mtmd_helper_decode_image_chunk(
+                self._mtmd, llama.ctx, chunk, embedding, *where, _NO_CALLBACK, None
+            )
+            llama_cpp.llama_synchronize(llama.ctx)
+        if code:
+            raise ValueError(f"Failed to evaluate chunk: error code {code}")
+        llama.n_tokens = past.value
+        return encode_ns
 
-    def _get_chat_template(self, _llama: Any) -> str:
-        return "{{ messages }}"
 
-    def _get_template_messages(self, _messages: Any, _marker: str) -> str:
-        return self._prompt
-
-    def _postprocess_template_text(self, text: str, _urls: Any, _marker: str) -> str:
-        return text
-
-    def _init_mtmd_context(self, llama_model: Any) -> None:
-        """Load with the language model's kind of flash attention; the library turns llama.cpp's own choice off."""
-        if self.mtmd_ctx is not None:
-            return
-        mtmd = self._mtmd_cpp
-        params = mtmd.mtmd_context_params_default()
-        params.use_gpu = self.use_gpu
-        params.print_timings = False
-        params.n_threads = llama_model.n_threads
-        params.flash_attn_type = llama_model.context_params.flash_attn_type
-        self.mtmd_ctx = mtmd.mtmd_init_from_file(self.clip_model_path.encode(), llama_model.model, params)
-        if self.mtmd_ctx is None:
-            raise ValueError(llama_log.reason() or "MTMD cannot load it")
-        llama_model._stack.callback(self._free)  # noqa: SLF001 as the library does
-
-    def _free(self) -> None:
-        self._mtmd_cpp.mtmd_free(self.mtmd_ctx)
-        self.mtmd_ctx = None
-
-    def load_image(self, image_url: str) -> Frame:
-        return self._frames[int(image_url)]
-
-    def _create_bitmap_from_bytes(self, image_bytes: Frame) -> Any:
-        pixels = np.ascontiguousarray(image_bytes.data)
-        pointer = pixels.ctypes.data_as(ctypes.POINTER(ctypes.c_uint8))
-        return self._mtmd_cpp.mtmd_bitmap_init(image_bytes.width, image_bytes.height, pointer)
+def bitmap_of(frame: Frame) -> Any:
+    pixels = np.ascontiguousarray(frame.data)
+    pointer = pixels.ctypes.data_as(ctypes.POINTER(ctypes.c_uint8))
+    return mtmd_cpp.mtmd_bitmap_init(frame.width, frame.height, pointer)

@@ -114,8 +114,7 @@ class ModelFiles:
 
     def describe(self) -> dict[str, str | bool]:
         """Return what a manifest tells of the files; the first call hashes them, which takes seconds for gigabytes."""
-        found: dict[str, str | bool] = {"dummy": self.dummy}
-        found["name"] = str(self.model.fields.get("general.name", ""))
+        found: dict[str, str | bool] = {"dummy": self.dummy, "name": str(self.model.fields.get("general.name", ""))}
         for kind, header in (("model", self.model), ("mmproj", self.mmproj)):
             if header:
                 found |= {kind: str(header.path), f"{kind}_sha256": sha256(header.path)}

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from itertools import accumulate, count, islice
 from random import Random
-from typing import TypeAlias
 
 import numpy as np
 
@@ -22,38 +21,30 @@ from s2a_bench.inference import Engine, EngineConfig, chunk
 from s2a_bench.text import none_of
 from s2a_bench.types import Piece, Request, Token
 
-Draw: TypeAlias = Callable[[np.random.Generator, int, int], list[float]]
-"""(generator, number of gaps, number of gaps played before) -> gaps in s."""
-
 _PLACES = ("kitchen", "table", "shelf", "sofa")
 _OBJECTS = ("cup", "box", "bottle", "jar")
 _ARGUMENTS = {"go_to": _PLACES, "open": _OBJECTS, "close": _OBJECTS, "pick": _OBJECTS}
 """Skills of the household set with one argument, so that its parser accepts the plans."""
 
 
-def _trace(profile: Profile) -> Draw:
+def _trace(profile: Profile) -> Gaps:
     if not profile.trace_s:
         raise UsageError(
             f"`gaps` trace: profile {profile.name} holds no recording; choose parametric or constant, "
             "or record one with 's2a-bench profile capture'"
         )
-    recorded = Recorded.of(profile.trace_s)
-    return lambda _rng, tokens, start: recorded.in_order(tokens, start).tolist()
+    return Recorded.of(profile.trace_s)
 
 
-def _drawn(gaps: Gaps) -> Draw:
-    return lambda rng, tokens, _start: gaps.sample(rng, tokens, 1)[:, 0].tolist()
-
-
-GAPS: dict[str, Callable[[Profile], Draw]] = {
-    "constant": lambda profile: _drawn(Constant(profile.gaps.mean_s)),
-    "parametric": lambda profile: _drawn(profile.gaps),
+GAPS: dict[str, Callable[[Profile], Gaps]] = {
+    "constant": lambda profile: Constant(profile.gaps.mean_s),
+    "parametric": lambda profile: profile.gaps,
     "trace": _trace,
 }
 """Value of ``--gaps`` -> where the gaps come from."""
 
 
-def _settings(config: EngineConfig) -> tuple[Profile, str, Draw]:
+def _settings(config: EngineConfig) -> tuple[Profile, str, Gaps]:
     if not config.profile:
         raise UsageError("`engine` replay needs `profile` NAME ('s2a-bench profile list' names them)")
     profile = load_profile(config.profile)
@@ -81,7 +72,7 @@ class ReplayEngine(Engine):
         _settings(config)
 
     def __init__(self, config: EngineConfig, clock: Clock | None = None) -> None:
-        self._profile, self._gaps, self._draw = _settings(config)
+        self._profile, self._gaps, self._source = _settings(config)
         self._config = config
         self._clock = clock or SystemClock()
         self._requests = 0
@@ -110,7 +101,10 @@ class ReplayEngine(Engine):
     def _gaps_s(self, rng: np.random.Generator, prompt_s: float, pieces: int) -> Iterator[float]:
         """Yield the time to the first piece, then the gaps, all drawn together when the second is needed."""
         yield prompt_s + self._profile.gaps.mean_s
-        yield from self._draw(rng, pieces - 1, self._played)
+        if self._gaps == "trace" and isinstance(self._source, Recorded):
+            yield from self._source.in_order(pieces - 1, self._played).tolist()
+        else:
+            yield from self._source.sample(rng, pieces - 1, 1)[:, 0].tolist()
 
     def _pieces(self, request: Request) -> Iterator[Piece]:
         if self._config.chunks:

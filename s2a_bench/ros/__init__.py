@@ -372,10 +372,9 @@ def open_middleware(
     name = name or default_middleware(os.environ)
     kind = MIDDLEWARES[name]
     try:
-        implementation = resolve_name(kind.opens)
+        implementation: Callable[..., Middleware] = resolve_name(kind.opens)
     except ModuleNotFoundError as error:
         way = f"{way_out(kind)}; of a source, robot or ego with ?middleware="
         raise TransportError(f"middleware {name} is not installed ({error}); {way}") from error
     more = (place or kind.meeting_place.default, host) if kind.meeting_place else ()
-    middleware: Middleware = implementation(config.domain_id(os.environ, domain_id), tuning, node_name, *more)
-    return middleware
+    return implementation(config.domain_id(os.environ, domain_id), tuning, node_name, *more)

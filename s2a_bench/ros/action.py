@@ -152,21 +152,15 @@ class Goals:
 
     def cancel(self, goal_id: bytes, stamp_ns: int) -> tuple[CancelCode, list[Goal]]:
         """Select the goals a cancel request means, make them CANCELING, and return them with the return code."""
-        if goal_id != ALL_GOALS and not stamp_ns:
-            goal = self.find(goal_id)
-            if goal is None:
-                return CancelCode.UNKNOWN_GOAL_ID, []
-            if Status.CANCELING not in NEXT[goal.status]:
-                return CancelCode.GOAL_TERMINATED, []
-            chosen = [goal]
-        else:
-            everything = goal_id == ALL_GOALS and not stamp_ns
-            chosen = [
-                goal
-                for goal in self._live.values()
-                if Status.CANCELING in NEXT[goal.status]
-                and (everything or goal.stamp_ns <= stamp_ns or goal.id == goal_id)
-            ]
+        everything = goal_id == ALL_GOALS and not stamp_ns
+        chosen = [
+            goal
+            for goal in self._live.values()
+            if Status.CANCELING in NEXT[goal.status]
+            and (everything or goal.id == goal_id or (stamp_ns and goal.stamp_ns <= stamp_ns))
+        ]
+        if not (chosen or everything or stamp_ns):
+            return (CancelCode.GOAL_TERMINATED if self.find(goal_id) else CancelCode.UNKNOWN_GOAL_ID), []
         for goal in chosen:
             goal.status = Status.CANCELING
         return CancelCode.NONE, chosen
@@ -377,8 +371,14 @@ class ServedAction(Generic[Caller]):
             if len(packed) < id_ends:
                 self.send_goal.drop(caller)
                 _log.warning("%s: dropped a goal request of %d bytes, too short for an id", self._name, len(packed))
-            elif (goal := self._offered(bytes(packed[id_ends - 16 : id_ends]), packed, caller)) is not None:
-                return goal
+                continue
+            goal_id = bytes(packed[id_ends - 16 : id_ends])
+            with self._lock:
+                new = self._goals.offer(goal_id)
+            if new:
+                return ServedGoal(self, goal_id, packed, caller)
+            _log.warning("%s: rejected a goal whose id %s is taken", self._name, goal_id.hex())
+            self._reply(goal_id, caller, accepted=False, stamp_ns=0)
         return None
 
     def _serve(self) -> None:
@@ -413,16 +413,6 @@ class ServedAction(Generic[Caller]):
     def status(self, goal_id: bytes) -> Status:
         with self._lock:
             return self._goals.status(goal_id)
-
-    def _offered(self, goal_id: bytes, packed: memoryview, caller: Caller) -> ServedGoal[Caller] | None:
-        """Return a goal that waits for a decision; None for one whose id is taken, which is rejected."""
-        with self._lock:
-            new = self._goals.offer(goal_id)
-        if new:
-            return ServedGoal(self, goal_id, packed, caller)
-        _log.warning("%s: rejected a goal whose id %s is taken", self._name, goal_id.hex())
-        self._reply(goal_id, caller, accepted=False, stamp_ns=0)
-        return None
 
     def decide(self, goal_id: bytes, caller: Caller, *, accepted: bool) -> None:
         stamp_ns = time.time_ns()  # ROS time, as rclpy stamps

@@ -24,8 +24,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import MSGParser, make_typesdict
 
-from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.text import none_of
+from s2a_bench.errors import TransportError
 from s2a_bench.types import Deep, Frame, Pixels
 
 if TYPE_CHECKING:
@@ -146,8 +145,6 @@ def char_as_uint8(description: Description) -> Description:
 
 @cache
 def _types(version: str) -> tuple[Typestore, Defaults]:
-    if version not in VERSIONS:
-        raise UsageError(f"llama_msgs version {none_of(version, VERSIONS)}")
     humble = os.environ.get("ROS_DISTRO") == "humble"
     store = get_typestore(Stores.ROS2_HUMBLE if humble else Stores.ROS2_JAZZY)
     for name, (constants, fields) in store.fielddefs.items():
@@ -164,10 +161,7 @@ def _types(version: str) -> tuple[Typestore, Defaults]:
 
 
 def typestore(version: str = DEFAULT_VERSION) -> Typestore:
-    """Return the message types of this ROS distribution (Jazzy without one), ours and a version of llama_msgs included.
-
-    Raises UsageError for a version that is none of `VERSIONS`.
-    """
+    """Return the message types of this ROS distribution (Jazzy without one), ours and one of `VERSIONS` included."""
     return _types(version)[0]
 
 

@@ -150,7 +150,6 @@ class BagRecorder(AbstractContextManager["BagRecorder"]):
             self._failure = self._failed(error)
 
     def _failed(self, error: Exception) -> StoreError:
-        """Name the file and where its remains are."""
         place = self._folder if self._folder.exists() else self.path
         return StoreError(
             f"`record`: writing {self.path} failed: {error or type(error).__name__}; "

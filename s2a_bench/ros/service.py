@@ -45,6 +45,9 @@ class Waits(Protocol):
         """End a wait under way and every later one; callable from any thread."""
 
 
+Waiter = TypeVar("Waiter", bound=Waits)
+
+
 def appeared(present: Callable[[], bool], timeout_s: float, given_up: Callable[[], bool] = lambda: False) -> bool:
     """Poll ``present`` every 10 ms; False after ``timeout_s``, or once ``given_up`` is True."""
     deadline_ns = now_ns() + int(timeout_s * 1e9)
@@ -141,47 +144,6 @@ class LogOnce:
             self._log.warning(message, *values)
 
 
-class Services(Generic[Caller]):
-    """The services of one node, answered by one thread."""
-
-    def __init__(self, waiter: Waits) -> None:
-        """Start the thread; ``waiter`` wakes it for requests."""
-        self.waiter = waiter
-        self._offered: dict[str, tuple[ServiceEnd[Caller], Callable[[Any], Any]]] = {}
-        self._once = LogOnce(_log)
-        self._thread = Thread(target=self._serve, name="services", daemon=True)
-        self._thread.start()
-
-    def offer(self, name: str, service: ServiceEnd[Caller], answer: Callable[[Any], Any]) -> None:
-        self._offered = {**self._offered, name: (service, answer)}  # while the thread goes through the old ones
-
-    def close(self) -> None:
-        self.waiter.interrupt()
-        self._thread.join()
-
-    def _serve(self) -> None:
-        while not self.waiter.interrupted:
-            for name, (service, answer) in self._offered.items():
-                for packed, caller in service.arrived():
-                    self._handle(name, service, answer, packed, caller)
-                    service.drop(caller)
-            self.waiter.wait_until(now_ns() + WAIT_SLICE_NS)
-
-    def _handle(
-        self, name: str, service: ServiceEnd[Caller], answer: Callable[[Any], Any], packed: memoryview, caller: Caller
-    ) -> None:
-        """Answer one request, unless its client has left; what cannot be answered is dropped."""
-        try:
-            if not service.body_at < len(packed) <= REQUEST_BYTES:
-                raise TransportError(f"{len(packed)} bytes are no request; the most is {REQUEST_BYTES}")
-            response = service.pack(answer(service.unpack(packed)))
-            if service.reaches(caller):
-                service.respond(response, caller)
-        except Exception as error:  # noqa: BLE001 - a bad request is no reason to stop
-            kind = f"{name} {type(error).__name__}"  # not its text, which a client can vary each time
-            self._once.warning(kind, "%s: dropped a request: %s", name, str(error)[:200])
-
-
 class Calling:
     def __init__(self, name: str, client: ClientEnd, waiter: Waits) -> None:
         self._name, self._client, self._waiter = name, client, waiter
@@ -205,14 +167,16 @@ class Calling:
                 raise TransportError(silent)
 
 
-Waiter = TypeVar("Waiter", bound=Waits)
-
-
 class ServiceNode(ABC, Generic[Caller, Waiter]):
-    """One node whose services are built from a middleware's endpoints; each endpoint is announced when it is made."""
+    """One node whose services are built from a middleware's endpoints, each announced when it is made.
+
+    One thread answers all services.
+    """
 
     def __init__(self) -> None:
-        self._services: Services[Caller] | None = None
+        self._offered: dict[str, tuple[ServiceEnd[Caller], Callable[[Any], Any]]] = {}
+        self._serving: Thread | None = None
+        self._once = LogOnce(_log)
         self._servers: list[Any] = []
         self._closed = False
         atexit.register(self.close)
@@ -250,12 +214,36 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
         """Leave the domain, which tells peers at once."""
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
-        """Create a service; the first starts the thread that answers all."""
+        """Create a service; the first starts the thread."""
         self.check_open()
-        if self._services is None:
+        if self._serving is None:
             self._requests = self.waiter()
-            self._services = Services(self._requests)
-        self._services.offer(name, self.service_end(name, type_name, DEFAULT_VERSION, self._requests, qos), answer)
+            self._serving = Thread(target=self._serve, name="services", daemon=True)
+            self._serving.start()
+        end = self.service_end(name, type_name, DEFAULT_VERSION, self._requests, qos)
+        self._offered = {**self._offered, name: (end, answer)}  # while the thread goes through the old ones
+
+    def _serve(self) -> None:
+        while not self._requests.interrupted:
+            for name, (service, answer) in self._offered.items():
+                for packed, caller in service.arrived():
+                    self._handle(name, service, answer, packed, caller)
+                    service.drop(caller)
+            self._requests.wait_until(now_ns() + WAIT_SLICE_NS)
+
+    def _handle(
+        self, name: str, service: ServiceEnd[Caller], answer: Callable[[Any], Any], packed: memoryview, caller: Caller
+    ) -> None:
+        """Answer one request, unless its client has left; what cannot be answered is dropped."""
+        try:
+            if not service.body_at < len(packed) <= REQUEST_BYTES:
+                raise TransportError(f"{len(packed)} bytes are no request; the most is {REQUEST_BYTES}")
+            response = service.pack(answer(service.unpack(packed)))
+            if service.reaches(caller):
+                service.respond(response, caller)
+        except Exception as error:  # noqa: BLE001 - a bad request is no reason to stop
+            kind = f"{name} {type(error).__name__}"  # not its text, which a client can vary each time
+            self._once.warning(kind, "%s: dropped a request: %s", name, str(error)[:200])
 
     def service_client(self, name: str, type_name: str) -> Calling:
         waiter = self.waiter()
@@ -265,9 +253,11 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
         if not self._closed:
             self._closed = True
             atexit.unregister(self.close)
-            for server in (*self._servers, self._services):
-                if server is not None:
-                    server.close()
+            for server in self._servers:
+                server.close()
+            if self._serving is not None:
+                self._requests.interrupt()
+                self._serving.join()
             self.leave()
 
     def check_open(self) -> None:

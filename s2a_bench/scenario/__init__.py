@@ -42,8 +42,6 @@ class State:
 
 @dataclass(frozen=True, slots=True)
 class DriveCommand:
-    """Commands to the cars for one step."""
-
     acceleration_mps2: Floats
     """Shape (3, M)."""
     lane: NDArray[np.int64]
@@ -59,11 +57,11 @@ class Simulator(Protocol):
     """Whether it has physics of its own, so that cars follow a command with an error; else they follow exactly."""
     steers: ClassVar[bool]
     """Whether cars can leave their lane."""
-    most: ClassVar[int | None]
+    most: ClassVar[int | None] = None
     """Most roll-outs in lock step; None: no limit."""
-    over_ros: ClassVar[bool]
+    over_ros: ClassVar[bool] = False
     """Whether its ego can be driven and seen over ROS 2; `step` then takes NaN as its acceleration."""
-    step_s: float
+    step_s: float = STEP_S
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         """Restart with the cars in one lane, arrays of shape (3, M)."""
@@ -80,6 +78,7 @@ class Simulator(Protocol):
 
     def close(self) -> None:
         """Let go of the world, and restore what was changed outside of it; may be called twice."""
+        return
 
 
 SIMULATORS: Final[Registry[type[Simulator]]] = Registry(

@@ -11,7 +11,7 @@ import numpy as np
 
 from s2a_bench import extras
 from s2a_bench.policy import Floats
-from s2a_bench.scenario import EGO, LANE_WIDTH_M, LEAD, REAR, STEP_S, DriveCommand, State
+from s2a_bench.scenario import EGO, LANE_WIDTH_M, LEAD, REAR, DriveCommand, Simulator, State
 from s2a_bench.scenario.windscreen import Windscreen
 
 ROAD_M: Final = 5000.0
@@ -24,16 +24,11 @@ LENGTHS: Final = {LEAD: 1.0, EGO: 0.0, REAR: -1.0}
 """Car lengths from a position, which is bumper to bumper, to the car's centre."""
 
 
-class Embedded:
-    """One road with three vehicles."""
-
+class Embedded(Simulator):
     name: ClassVar[str] = "embedded"
     real: ClassVar[bool] = False
     steers: ClassVar[bool] = True
     most: ClassVar[int | None] = 1
-    over_ros: ClassVar[bool] = False
-
-    step_s = STEP_S
 
     def __init__(self) -> None:
         extras.need("ccrb", "highway_env")
@@ -70,8 +65,6 @@ class Embedded:
 
     def camera(self, width: int, height: int) -> Windscreen:
         return Windscreen(lambda: self._shown, width, height)
-
-    def close(self) -> None: ...
 
     def _state(self, acceleration_mps2: Floats) -> State:
         position = [[vehicle.position[0] - LENGTHS[car] * vehicle.LENGTH] for car, vehicle in self._cars.items()]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from s2a_bench.policy import Floats
-from s2a_bench.scenario import STEP_S, DriveCommand, State
+from s2a_bench.scenario import DriveCommand, Simulator, State
 from s2a_bench.scenario.windscreen import Windscreen
 
 
@@ -21,6 +21,8 @@ class LockStep:
                 setattr(self, name, value[..., columns])
             elif isinstance(value, LockStep):
                 value.keep(columns)
+            elif isinstance(value, State):
+                setattr(self, name, value.keep(columns))
 
 
 def each(number: ArrayLike, rollouts: int) -> Floats:
@@ -28,16 +30,12 @@ def each(number: ArrayLike, rollouts: int) -> Floats:
     return np.broadcast_to(np.asarray(number, dtype=np.float64), (rollouts,))
 
 
-class Longitudinal(LockStep):
+class Longitudinal(LockStep, Simulator):
     """Cars without width or steering; constant acceleration within a step, down to rest."""
 
     name: ClassVar[str] = "longitudinal"
     real: ClassVar[bool] = False
     steers: ClassVar[bool] = False
-    most: ClassVar[int | None] = None
-    over_ros: ClassVar[bool] = False
-
-    step_s = STEP_S
 
     def __init__(self) -> None:
         self._acceleration = np.empty((3, 0))
@@ -58,9 +56,3 @@ class Longitudinal(LockStep):
 
     def camera(self, width: int, height: int) -> Windscreen:
         return Windscreen(lambda: (self._state, self._acceleration), width, height)
-
-    def close(self) -> None: ...
-
-    def keep(self, columns: NDArray[np.int64]) -> None:
-        super().keep(columns)
-        self._state = self._state.keep(columns)

@@ -89,7 +89,7 @@ class EgoCamera(TopicCamera):
         return self._stamp_ns
 
 
-class RosEgo(Simulator):
+class RosEgo:
     """A simulator whose ego is commanded and seen over ROS 2; all else is the wrapped world's, `close` included."""
 
     def __init__(self, world: Simulator, how: EgoParameters) -> None:
@@ -153,4 +153,4 @@ class RosEgo(Simulator):
 
 def with_ego(world: Simulator, written: str) -> Simulator:
     """Return a world with its ego as ``ros[?parameter=value&...]``, or as it is; raises TransportError."""
-    return RosEgo(world, ego_parameters(written, type(world))) if written else world  # type: ignore[abstract]
+    return RosEgo(world, ego_parameters(written, type(world))) if written else world  # type: ignore[return-value]

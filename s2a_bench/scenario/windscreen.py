@@ -13,7 +13,7 @@ import numpy as np
 from s2a_bench.frames import NumberedSource
 from s2a_bench.policy import Floats
 from s2a_bench.scenario import EGO, LANE_WIDTH_M, LEAD, State
-from s2a_bench.types import Encoding, Pixels
+from s2a_bench.types import Pixels
 
 VIEW_DEG: Final = 60.0
 """Horizontal angle of view."""
@@ -52,8 +52,6 @@ class Windscreen(NumberedSource):
 
     ``now`` returns it with the accelerations in m/s^2, of shape (3, M), whose first roll-out is shown.
     """
-
-    encoding: Encoding = "bgr8"
 
     def __init__(self, now: Callable[[], tuple[State, Floats]], width: int, height: int) -> None:
         super().__init__("windscreen", width, height)

@@ -12,10 +12,10 @@ from s2a_bench.errors import BadRequest, EngineError, ModelError, UsageError
 from s2a_bench.facts import LLAMA
 from s2a_bench.inference import Engine, EngineConfig, open_engine
 from s2a_bench.inference.llama_cpp import LlamaCppEngine, llama_cpp
-from s2a_bench.inference.llama_prompt import Steps, mtmd_cpp
+from s2a_bench.inference.llama_prompt import VisionTower, bitmap_of, mtmd_cpp
 from s2a_bench.testing.engine import EngineSuite, ask, rgb_frame
 from s2a_bench.transport.ros.action import BOUNDS
-from s2a_bench.types import Frame, Request
+from s2a_bench.types import Request
 
 PLAN = r"""
 root ::= "[" skill ("," skill){2} "]"
@@ -120,7 +120,6 @@ def test_the_vision_tower_of_a_request_before_is_not_counted_again(shared: Llama
     ask(shared, images=(rgb_frame(5, 640, 480),))
     ask(shared)
     assert "vision_encode_ms" not in shared.facts
-    assert shared._handler.steps.encode_ns == 0
 
 
 def test_timing_a_picture_step_by_step_changes_no_token(
@@ -128,22 +127,28 @@ def test_timing_a_picture_step_by_step_changes_no_token(
 ) -> None:
     pictures = (rgb_frame(5, 640, 480), rgb_frame(6))
     answer = ask(shared, images=pictures, max_tokens=24)
-    monkeypatch.setattr(Steps, "mtmd_helper_eval_chunk_single", lambda _, *rest: single(*rest))
-    single = mtmd_cpp.mtmd_helper_eval_chunk_single
+
+    def in_one_step(self: VisionTower, llama: Any, chunk: Any) -> int:
+        past, where = llama_cpp.llama_pos(0), (llama.n_tokens, 0, llama.n_batch, False)
+        assert not mtmd_cpp.mtmd_helper_eval_chunk_single(self._mtmd, llama.ctx, chunk, *where, ctypes.byref(past))
+        llama.n_tokens = past.value
+        return 0
+
+    monkeypatch.setattr(VisionTower, "_evaluate_slice", in_one_step)
     assert ask(shared, images=pictures, max_tokens=24) == answer
 
 
-def test_the_bitmap_holds_exactly_the_pixels(shared: LlamaCppEngine) -> None:
-    mtmd = shared._handler._mtmd_cpp
+def test_the_bitmap_holds_exactly_the_pixels() -> None:
     for frame in (
         rgb_frame(3, 31, 17),
         replace(rgb_frame(4, 40, 30), width=20, data=rgb_frame(4, 40, 30).data[:, ::2]),
     ):
-        bitmap = shared._handler._create_bitmap_from_bytes(frame)
-        size = mtmd.mtmd_bitmap_get_n_bytes(bitmap)
-        pixels = np.ctypeslib.as_array(mtmd.mtmd_bitmap_get_data(bitmap), (size,)).copy()
-        assert (mtmd.mtmd_bitmap_get_nx(bitmap), mtmd.mtmd_bitmap_get_ny(bitmap)) == (frame.width, frame.height)
-        mtmd.mtmd_bitmap_free(bitmap)
+        bitmap = bitmap_of(frame)
+        size = mtmd_cpp.mtmd_bitmap_get_n_bytes(bitmap)
+        pixels = np.ctypeslib.as_array(mtmd_cpp.mtmd_bitmap_get_data(bitmap), (size,)).copy()
+        shape = mtmd_cpp.mtmd_bitmap_get_nx(bitmap), mtmd_cpp.mtmd_bitmap_get_ny(bitmap)
+        assert shape == (frame.width, frame.height)
+        mtmd_cpp.mtmd_bitmap_free(bitmap)
         np.testing.assert_array_equal(pixels, frame.data.reshape(-1))
 
 
@@ -242,12 +247,6 @@ def test_nothing_is_printed(tiny: EngineConfig, capfd: pytest.CaptureFixture[str
     ask(engine, images=(rgb_frame(1, 640, 480),), grammar=PLAN, max_tokens=200)
     engine.close()
     assert capfd.readouterr() == ("", "")
-
-
-def test_the_frame_is_not_kept_after_the_request(shared: LlamaCppEngine) -> None:
-    frame: Frame = rgb_frame()
-    ask(shared, images=(frame,))
-    assert shared._handler._frames == ()
 
 
 def test_layers_on_a_gpu_are_refused_by_a_build_for_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,8 @@ def by_the_library(engine: LlamaCppEngine, request: Request) -> list[int]:
     llama = engine._llama
     engine._evaluate(llama, request)
     llama.set_seed(request.seed)
-    return list(islice(llama.generate(llama.prompt, **SAMPLINGS[engine._config.sampling]), request.max_tokens))
+    tokens = llama.generate(list(llama.eval_tokens), **SAMPLINGS[engine._config.sampling])
+    return list(islice(tokens, request.max_tokens))
 
 
 @pytest.mark.parametrize("seed", range(3))

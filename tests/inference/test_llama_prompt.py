@@ -78,8 +78,8 @@ def test_what_the_tokenizer_adds_is_not_there_twice(base: LlamaCppEngine) -> Non
     assert ChatTemplate(PARTS, vocab_of(base)).prompt("go", 0) == "<user>go<model>"
     for prompt in ("go", "<bos>go"):
         ask(base, prompt, max_tokens=1)
-        assert base._llama.prompt[0] == 2
-        assert base._llama.prompt[1] != 2
+        assert base._llama.eval_tokens[0] == 2
+        assert base._llama.eval_tokens[1] != 2
 
 
 @pytest.mark.parametrize(
@@ -147,4 +147,4 @@ def test_a_real_model_goes_on_with_the_raw_prompt(base: LlamaCppEngine) -> None:
     assert "(" in answer
     assert "\n4." in answer
     assert answer == "".join(token.text for token in ask(base, prompt, max_tokens=24, images=(rgb_frame(),)))
-    assert (base.facts["prompt_n"], base.facts["predicted_n"]) == (len(base._llama.prompt), 24)  # type: ignore[union-attr]
+    assert (base.facts["prompt_n"], base.facts["predicted_n"]) == (base._llama.n_tokens, 24)  # type: ignore[union-attr]

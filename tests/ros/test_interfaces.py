@@ -72,8 +72,3 @@ def test_images_of_a_goal_are_found_in_both_versions() -> None:
 def test_llama_msgs_4_4_takes_one_image() -> None:
     with pytest.raises(UsageError, match="one image in a goal, not 2"):
         llama.generate_goal("p", [None, None], version="4.4")
-
-
-def test_an_unknown_version_is_named() -> None:
-    with pytest.raises(UsageError, match=r"'7.0' is none of 6.0, 4.4"):
-        ros.typestore("7.0")

@@ -25,10 +25,10 @@ from s2a_bench.harness.timelines.rows import skill_rows, to_ns
 from s2a_bench.policy import TOLERANCE_S, Plans, Schedule
 from s2a_bench.policy.metrics import peak_jerk, rms_jerk, sparc, stalls
 from s2a_bench.scenario import EGO, ROLES, Simulator, open_simulator
+from s2a_bench.scenario.ccrb.cars import TTC
 from s2a_bench.scenario.ccrb.drive import Driven, Trajectory, drive
 from s2a_bench.scenario.ccrb.ego import PHASES
 from s2a_bench.scenario.ccrb.outcome import Outcomes
-from s2a_bench.scenario.ccrb.ttc import NAME as TTC
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.schema import Table
 

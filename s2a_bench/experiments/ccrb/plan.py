@@ -19,11 +19,10 @@ from s2a_bench.policy import Plans, PlanShape, Policy, Schedule
 from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins
 from s2a_bench.scenario import simulator_class
+from s2a_bench.scenario.ccrb.cars import TTC, ttc_aware
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.studies import Scenes, plane
 from s2a_bench.scenario.ccrb.studies import draw as draw_scenes
-from s2a_bench.scenario.ccrb.ttc import NAME as TTC
-from s2a_bench.scenario.ccrb.ttc import ttc_aware
 from s2a_bench.stats.seeds import generator
 
 _BOARD: Final = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_origin")

@@ -2,8 +2,8 @@
 
 Token speed depends on shapes and types, not on values. `families` has the models.
 
-Weights are drawn as bytes of each type's blocks, not quantised from floats, from a generator of 64-bit integers: a seed
-gives the same bytes with every numpy. A matrix has a spread of about ``1 / sqrt(columns)``, so that activations keep
+Weights are drawn as bytes of each type's blocks, not quantised from floats, from a generator of 64-bit integers: they
+are the same bytes with every numpy. A matrix has a spread of about ``1 / sqrt(columns)``, so that activations keep
 their size through the layers.
 """
 
@@ -13,17 +13,16 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias, get_args
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from s2a_bench import extras
-from s2a_bench.errors import ModelError, UsageError
+from s2a_bench.errors import ModelError
 from s2a_bench.inference import Like, Quant, Size
 from s2a_bench.inference.dummy.families import FAMILIES, Family, mmproj_tensors, model_tensors
 from s2a_bench.inference.dummy.tensors import Tensor
 from s2a_bench.inference.dummy.vocab import make_vocab
-from s2a_bench.text import none_of
 
 Progress: TypeAlias = Callable[[int, int], None]
 """(bytes written, total bytes) -> None."""
@@ -42,9 +41,9 @@ class DummyFiles(NamedTuple):
     mmproj: Path
 
 
-def dummy_files(folder: Path, size: Size, quant: Quant, seed: int = 0, *, like: Like = "minicpm-v-2.6") -> DummyFiles:
+def dummy_files(folder: Path, size: Size, quant: Quant, *, like: Like = "minicpm-v-2.6") -> DummyFiles:
     name = FAMILIES[like].title.replace(" ", "-").replace(".", "_")
-    stem = f"{name}-dummy-{size}-r{REVISION}-s{seed}"
+    stem = f"{name}-dummy-{size}-r{REVISION}-s0"
     return DummyFiles(folder / f"{stem}-{quant}.gguf", folder / f"mmproj-{stem}-f16.gguf")
 
 
@@ -53,20 +52,15 @@ def write_dummy(
     size: Size = "tiny",
     quant: Quant = "f16",
     *,
-    seed: int = 0,
     progress: Progress | None = None,
     like: Like = "minicpm-v-2.6",
 ) -> DummyFiles:
     """Write both files into ``folder``; each gets its name once it is complete.
 
-    Two processes may write the same files at once. Raises UsageError for an unknown size, type or model, ModelError
-    if the folder cannot be written.
+    Two processes may write the same files at once. Raises ModelError if the folder cannot be written.
     """
-    for key, value, known in (("size", size, get_args(Size)), ("quant", quant, _FILE_TYPES), ("like", like, FAMILIES)):
-        if value not in known:
-            raise UsageError(f"`{key}`: {none_of(value, known)}")
     family = FAMILIES[like]
-    shape, files = family.shapes[size], dummy_files(folder, size, quant, seed, like=like)
+    shape, files = family.shapes[size], dummy_files(folder, size, quant, like=like)
     vocab = make_vocab(full=size == "full", size=family.vocab, special=family.special)
     texts = vocab.texts() if size == "tiny" else ()  # half of its few tokens are no text
     tensors = list(model_tensors(family, shape, len(vocab.tokens), quant, texts))
@@ -78,20 +72,20 @@ def write_dummy(
         if progress is not None:
             progress(done, total)
 
-    write_mmproj(files.mmproj, shape.width, size, like=like, seed=seed, written=written)
+    write_mmproj(files.mmproj, shape.width, size, like=like, written=written)
     keys = _general_keys(family, size, quant, "language model") | family.model_keys(shape, vocab)
-    _write(files.model, family.architecture, keys, tensors, seed, written)
+    _write(files.model, family.architecture, keys, tensors, written)
     return files
 
 
 def write_mmproj(
-    path: Path, width: int, size: Size, *, like: Like, seed: int = 0, written: Callable[[int], None] | None = None
+    path: Path, width: int, size: Size, *, like: Like, written: Callable[[int], None] | None = None
 ) -> None:
     """Write a vision tower with its projector for a language model that is ``width`` wide; raises ModelError."""
     family = FAMILIES[like]
     shape = family.shapes[size]
     keys = _general_keys(family, size, "f16", f"vision tower and {family.projector}") | family.mmproj_keys(shape, width)
-    _write(path, "clip", keys, list(mmproj_tensors(family, shape, width)), seed, written or (lambda _: None))
+    _write(path, "clip", keys, list(mmproj_tensors(family, shape, width)), written or (lambda _: None))
 
 
 def _general_keys(family: Family, size: Size, quant: Quant, content: str) -> dict[str, Any]:
@@ -106,9 +100,7 @@ def _general_keys(family: Family, size: Size, quant: Quant, content: str) -> dic
     }
 
 
-def _write(
-    path: Path, kind: str, keys: dict[str, Any], tensors: list[Tensor], seed: int, written: Callable[[int], None]
-) -> None:
+def _write(path: Path, kind: str, keys: dict[str, Any], tensors: list[Tensor], written: Callable[[int], None]) -> None:
     """Write one file of llama.cpp's architecture ``kind``; it gets its name once it is complete."""
     gguf = extras.require("gguf", "model")
     try:
@@ -129,7 +121,7 @@ def _write(
             (file,) = writer.fout
             writer.write_padding(file, file.tell())
             for tensor in tensors:
-                for part in tensor.parts(seed):
+                for part in tensor.parts():
                     file.write(part.data)
                     written(part.nbytes)
                 writer.write_padding(file, tensor.nbytes)

@@ -76,7 +76,7 @@ class Reader(Protocol):
     """Reads one source. Built as ``Class(pids)`` with the servers' process ids; raises Unreadable."""
 
     about: str
-    cheap: bool
+    cheap: bool = False
     """True if a reading takes microseconds, so that it is taken before and after every request."""
 
     def read(self) -> Mapping[str, float]:

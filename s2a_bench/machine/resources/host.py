@@ -42,8 +42,6 @@ class CpuTimes(Reader):
 
 
 class HostMemory(Reader):
-    cheap = False
-
     def __init__(self, pids: Sequence[int], root: Path = PROC) -> None:
         self.about = str(root)
         self._root = root

@@ -16,7 +16,7 @@ from typing import Any
 
 from s2a_bench import extras
 from s2a_bench.errors import MissingExtra
-from s2a_bench.machine.resources import Unreadable
+from s2a_bench.machine.resources import Reader, Unreadable
 
 Query = Callable[[Any], float]
 
@@ -30,10 +30,8 @@ GPU = re.compile(r"\bGR3D_FREQ (\d+)%(?:@\[?(\d+))?")
 TEMPERATURE = re.compile(r"\b(?:gpu|GPU)@(-?\d+(?:\.\d+)?)C")
 
 
-class Nvml:
+class Nvml(Reader):
     """Utilisation (the busiest GPU's), memory, power and energy (sums), temperature (the hottest) of all GPUs."""
-
-    cheap = False
 
     def __init__(self, pids: Sequence[int] = ()) -> None:  # noqa: ARG002 - a GPU's figures are the whole GPU's
         """Load the driver's library and find what every GPU can report; raises Unreadable without library or GPU."""
@@ -112,10 +110,8 @@ def board_power(rails_w: Mapping[str, float]) -> float | None:
     return sum(rails_w[name] for name in AGX_ORIN) if set(AGX_ORIN) <= rails_w.keys() else None
 
 
-class Tegrastats:
+class Tegrastats(Reader):
     """The program in the background; each reading is its newest whole line."""
-
-    cheap = False
 
     def __init__(self, pids: Sequence[int] = ()) -> None:  # noqa: ARG002 - the whole board's
         program = shutil.which("tegrastats")

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.plan.skillset import Gap
-from s2a_bench.policy import Floats
+from s2a_bench.policy import Floats, Plans, Schedule
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,6 +31,7 @@ SAFETY_M: Final = 2.0
 CAR_WIDTH_M: Final = 2.0
 OUTCOMES: Final = ("none", "front", "rear", "both")
 """By code: bit 0 is a front impact, bit 1 a rear impact."""
+TTC: Final = "s2a-ttc"
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,3 +112,29 @@ def start_deadline(cars: Cars, plan_decel_mps2: ArrayLike) -> Floats:
     meeting = np.sqrt(2 * distance * harder / (lead * plan))
     meets_at = np.divide(plan * meeting, harder, out=np.full(plan.shape, np.inf), where=harder > 0)
     return np.asarray(np.where(meets_at < speed / lead, meeting, at_rest))
+
+
+def ttc_aware(plans: Plans, deadline_s: ArrayLike) -> tuple[Schedule, NDArray[np.bool_]]:
+    """Start at S0 if that keeps the deadline; else at the deadline, if stretching makes that stall-free.
+
+    The paper's future work. Starts from S_lo on are stall-free, so [S_lo, deadline] is feasible, and the deadline
+    stretches skills least. If S_lo is past the deadline too, the plan starts with its first skill, each skill is held
+    on up to T_max, and the roll-out is late, as the mask says: safety goes before smoothness. All arrivals are known;
+    ``deadline_s`` is one number, or of shape (M,).
+    """
+    import numpy as np
+
+    from s2a_bench.policy.schedule import align, safe_start, work_conserving
+
+    arrival_s, nominal_s, most_s = align(plans.arrival_s, plans.nominal_s, plans.most_s)
+    deadline = np.broadcast_to(np.asarray(deadline_s, float), arrival_s.shape[1:])
+    safe, least = safe_start(arrival_s, nominal_s), safe_start(arrival_s, most_s)
+    late = least > deadline
+    first = np.where(safe <= deadline, safe, np.where(late, arrival_s[0], deadline))
+    start = work_conserving(arrival_s, nominal_s, first)
+    # Stretch early skills instead of stalling later: backwards, but not in late plans.
+    for i in reversed(range(1, len(start) - 1)):
+        np.maximum(start[i], start[i + 1] - most_s[i], out=start[i], where=~late)
+    duration = nominal_s.copy()
+    np.minimum(np.diff(start, axis=0), most_s[:-1], out=duration[:-1])
+    return Schedule(start, duration), late

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pkgutil import resolve_name
 from typing import Final
 
 import numpy as np
@@ -11,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Floats, Schedule
 from s2a_bench.scenario import EGO, LEAD, REAR, DriveCommand, Simulator, State
+from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import LEAD_JERK_MPS3, LEAST_IMPACT_MPS, Cars, DrivingPlan
 from s2a_bench.scenario.ccrb.ego import DONE, Ego
-from s2a_bench.scenario.ccrb.follower import CarMotion, DriverView, follower
+from s2a_bench.scenario.ccrb.follower import CarMotion, DriverView, Follower
 from s2a_bench.scenario.ccrb.outcome import CollisionWatch, Outcomes
 from s2a_bench.scenario.longitudinal import LockStep, Longitudinal, each
 
@@ -106,7 +108,7 @@ class Drive(LockStep):
         """Place the cars; ``record`` a `trajectory` from the request on."""
         self._simulator = simulator
         self._ego = ego
-        self._rear = follower(cars, rollouts)
+        self._rear: Follower = resolve_name(FOLLOWERS[cars.follower])(cars, rollouts)
         self._lead_decel = each(cars.lead_decel_mps2, rollouts)
         self._state = state = place(simulator, cars, rollouts)
         reaction_s = np.asarray(cars.reaction_s, float)
@@ -121,7 +123,6 @@ class Drive(LockStep):
         self._steps = 0
 
     def run(self, *, resting_mps: float) -> Outcomes:
-        """Step until all roll-outs are decided."""
         step_s = self._simulator.step_s
         last = int((float(self._ego.end_s.max()) + AFTER_S) / step_s)
         for step in range(last):
@@ -143,7 +144,6 @@ class Drive(LockStep):
         self._watch.see(self._state)
 
     def decided(self, resting_mps: float = RESTING_MPS) -> NDArray[np.bool_]:
-        """Return which roll-outs have a certain outcome."""
         speed = self._state.speed_mps
         over = self._ego.phase == DONE
         # Until the driver behind has seen the ego at rest, the rear car may stop and start again.
@@ -184,9 +184,7 @@ class Drive(LockStep):
         if self._every or share < DROP_SHARE or not isinstance(self._simulator, LockStep):
             return True
         self._outcomes.put(self._left, self._watch.outcomes())
-        columns = np.flatnonzero(~decided)
-        self.keep(columns)
-        self._state = self._state.keep(columns)
+        self.keep(np.flatnonzero(~decided))
         return True
 
     def _decide(self, now_s: float) -> None:

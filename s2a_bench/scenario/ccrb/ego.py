@@ -12,8 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from s2a_bench.errors import UsageError
-from s2a_bench.plan.skillset import GAPS, Gap
+from s2a_bench.plan.skillset import Gap
 from s2a_bench.policy import Floats, Schedule
 from s2a_bench.scenario.ccrb.cars import (
     EGO_JERK_MPS3,
@@ -26,7 +25,6 @@ from s2a_bench.scenario.ccrb.cars import (
 )
 from s2a_bench.scenario.ccrb.follower import needed
 from s2a_bench.scenario.longitudinal import LockStep
-from s2a_bench.text import none_of
 
 WAITING, ACTING, GAP, DONE = 0, 1, 2, 3
 PHASES: Final = ("waiting", "acting", "gap", "done")
@@ -47,15 +45,13 @@ class Ego(LockStep):
 
     def __init__(self, cars: Cars, plan: DrivingPlan, schedule: Schedule, rollouts: int) -> None:
         gaps = np.broadcast_to(np.asarray(cars.gap), (rollouts,))
-        if unknown := set(gaps.tolist()) - set(GAPS):
-            raise UsageError(f"`gap`: {none_of(min(unknown), GAPS)}")
         shape = (len(plan.lane), rollouts)
         self._start_s = np.broadcast_to(np.asarray(schedule.start_s, float), shape)
         self._duration_s = np.broadcast_to(np.asarray(schedule.duration_s, float), shape)
         self._points = np.broadcast_to(plan.set_point_mps, (shape[0] + 1, rollouts))
         self._lanes = (0, *plan.lane)
         self._gaps = gaps
-        self._between = {gap: rule for gap, rule in BETWEEN.items() if (gaps == gap).any()}
+        self._between = {gap: BETWEEN[gap] for gap in set(gaps.tolist())}
         self._reflex = Reflex(rollouts) if cars.reflex else None
         self.index = np.full(rollouts, -1)
         """The current or last skill, from 0 on; -1 before the first."""

@@ -18,19 +18,14 @@ at rest it stays. Every brake gives at most 7 m/s^2, builds up at 7 / 0.6 and re
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from pkgutil import resolve_name
 from typing import ClassVar, Final
 
 import numpy as np
 
-from s2a_bench.errors import UsageError
 from s2a_bench.policy import Floats
-from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import Cars
 from s2a_bench.scenario.longitudinal import LockStep, each
-from s2a_bench.text import none_of
 
 BRAKES_MPS2: Final = 0.5
 """Above this a car ahead counts as braking."""
@@ -74,26 +69,23 @@ class DriverView:
 
 
 class Follower(LockStep):
-    """A law for the trailing car of M roll-outs, with state from step to step."""
+    """A law for the trailing car of M roll-outs, with its brake, whose force builds up slowly and releases fast."""
 
     law: ClassVar[str]
     """Description of the law; ``{reaction:g}`` is the reaction time in s."""
+
+    def __init__(self, cars: Cars, rollouts: int) -> None:
+        self._reaction_s = each(cars.reaction_s, rollouts)
+        self._force_mps2 = np.zeros(rollouts)
 
     def acceleration(self, seen: DriverView, step_s: float) -> Floats:
         """Return the acceleration in m/s^2 for the next step, shape (M,)."""
         raise NotImplementedError
 
-
-class Brake(LockStep):
-    """The trailing car's brake: its force builds up slowly and releases fast."""
-
-    def __init__(self, rollouts: int) -> None:
-        self.force_mps2 = np.zeros(rollouts)
-
-    def press(self, want_mps2: Floats, step_s: float) -> Floats:
-        change = np.minimum(want_mps2, MOST_MPS2) - self.force_mps2
-        self.force_mps2 += np.clip(change, -MOST_MPS2 / RELEASE_S * step_s, MOST_MPS2 / BUILD_S * step_s)
-        return self.force_mps2.copy()
+    def brake(self, want_mps2: Floats, step_s: float) -> Floats:
+        change = np.minimum(want_mps2, MOST_MPS2) - self._force_mps2
+        self._force_mps2 += np.clip(change, -MOST_MPS2 / RELEASE_S * step_s, MOST_MPS2 / BUILD_S * step_s)
+        return self._force_mps2.copy()
 
 
 class Careful(Follower):
@@ -103,10 +95,9 @@ class Careful(Follower):
     )
 
     def __init__(self, cars: Cars, rollouts: int) -> None:
-        self._reaction_s = each(cars.reaction_s, rollouts)
+        super().__init__(cars, rollouts)
         self._far_m = each(cars.rear_gap_m, rollouts)
         self._braking = np.zeros(rollouts, bool)
-        self._brake = Brake(rollouts)
 
     def acceleration(self, seen: DriverView, step_s: float) -> Floats:
         ego, rear = seen.ego_then, seen.rear
@@ -121,28 +112,25 @@ class Careful(Follower):
         faster = rear.speed_mps > ahead_mps + 1e-9
         self._braking |= alarmed | (need > ACTS_MPS2)
         self._braking &= faster | alarmed
-        force = self._brake.press(np.where(self._braking, need, 0.0), step_s)
+        force = self.brake(np.where(self._braking, need, 0.0), step_s)
         idle = ~self._braking & (force <= 0) & (rear.speed_mps < ego.speed_mps) & (gap_m > self._far_m)
         return np.where(idle, CATCH_UP_MPS2, -force)
 
 
 class Idm(Follower):
-    """The Intelligent Driver Model, without delay."""
-
     law: ClassVar[str] = f"IDM follower on the present, without delay; {AT_EASE}; {BRAKE}"
 
     def __init__(self, cars: Cars, rollouts: int) -> None:
+        super().__init__(cars, rollouts)
         speed = each(cars.speed_mps, rollouts)
-        self._reaction_s = each(cars.reaction_s, rollouts)
         self._desired_mps = IDM_HASTE * speed
         at_ease_m = np.asarray(cars.rear_gap_m, float) * np.sqrt(1 - IDM_HASTE**-IDM_EXPONENT)
         self._headway_s = np.maximum((at_ease_m - IDM_STANDSTILL_M) / speed, IDM_LEAST_HEADWAY_S)
-        self._brake = Brake(rollouts)
 
     def acceleration(self, seen: DriverView, step_s: float) -> Floats:
         gap_m, speed, closing, ahead = self._perceived(seen)
         wish = idm_acceleration(gap_m, speed, closing, self._desired_mps, self._headway_s)
-        force = self._brake.press(np.maximum(-wish, 0.0), step_s)
+        force = self.brake(np.maximum(-wish, 0.0), step_s)
         standing = (seen.rear.speed_mps <= 0) & (ahead.speed_mps <= 0)
         going = np.where(standing, 0.0, np.maximum(wish, 0.0))
         return np.where(force > 0, -force, going)
@@ -153,8 +141,6 @@ class Idm(Follower):
 
 
 class Hdm(Idm):
-    """The Human Driver Model's delay and temporal anticipation, for one leader and without estimation errors."""
-
     law: ClassVar[str] = (
         "HDM follower: IDM on the gap s - T' dv, the speed v + T' a and dv of T' = {reaction:g} s ago, one leader, no "
         f"estimation errors; {AT_EASE}; {BRAKE}"
@@ -168,8 +154,6 @@ class Hdm(Idm):
 
 
 class Hybrid(Idm):
-    """The IDM on the rear car's present state, and the ego of a reaction time ago extrapolated at steady speed."""
-
     law: ClassVar[str] = (
         "hybrid follower (ours): IDM on its own state now and the ego seen {reaction:g} s ago, extrapolated at steady "
         f"speed; {AT_EASE}; {BRAKE}"
@@ -207,11 +191,3 @@ def idm_acceleration(
     wanted_m = np.maximum(IDM_STANDSTILL_M + speed_mps * headway_s + approach, 0.0)
     share = wanted_m / np.maximum(gap_m, 0.01)
     return np.asarray(IDM_ACCEL_MPS2 * (1 - (speed_mps / desired_mps) ** IDM_EXPONENT - share * share))
-
-
-def follower(cars: Cars, rollouts: int) -> Follower:
-    """Build the trailing car's law for M roll-outs; raises UsageError for an unknown name."""
-    if cars.follower not in FOLLOWERS:
-        raise UsageError(f"`follower`: {none_of(cars.follower, FOLLOWERS)}")
-    build: Callable[[Cars, int], Follower] = resolve_name(FOLLOWERS[cars.follower])
-    return build(cars, rollouts)

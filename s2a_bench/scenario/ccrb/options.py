@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import cached_property
 from typing import Annotated, ClassVar, Final
 
@@ -71,16 +71,8 @@ class CcrbOptions(Options):
 
     @property
     def cars(self) -> Cars:
-        return Cars(
-            front_gap_m=self.front_gap_m,
-            lead_decel_mps2=self.lead_decel_mps2,
-            rear_gap_m=self.rear_gap_m,
-            reaction_s=self.reaction_s,
-            speed_mps=self.speed_kmh * KMH,
-            gap=self.gap,
-            follower=self.follower,
-            reflex=self.reflex,
-        )
+        """Return the cars, whose fields but the speed are options."""
+        return Cars(speed_mps=self.speed_kmh * KMH, **self.model_dump(include={each.name for each in fields(Cars)}))
 
     @property
     def follower_law(self) -> str:

@@ -32,6 +32,7 @@ RANGES: Final[dict[str, tuple[float, float]]] = {
 """Ranges of random scenarios, drawn uniformly; the rate on a logarithmic scale."""
 LENGTHS: Final = (1, 2, 3, 4, 5, 6)
 SKILLS: Final = (3, 4, 5, 6, 8)
+OF_CARS: Final = ("front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s", "speed_mps")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +51,7 @@ class Scenes:
         return Scenes({name: np.tile(values, count) for name, values in self.numbers.items()})
 
     def cars(self, gap: NDArray[np.str_], options: CcrbOptions) -> Cars:
-        names = ("front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s", "speed_mps")
-        numbers = {name: self.numbers[name] for name in names}
+        numbers = {name: self.numbers[name] for name in OF_CARS}
         return Cars(**numbers, gap=gap, follower=options.follower, reflex=options.reflex)
 
 
@@ -75,10 +75,7 @@ def plane(
         "tokens_per_skill": tokens_per_skill,
         "n_skills": options.n_skills,
         "t_nom_s": options.durations.nominal_s,
-        "speed_mps": cars.speed_mps,
-        "front_gap_m": cars.front_gap_m,
-        "lead_decel_mps2": cars.lead_decel_mps2,
-        "reaction_s": cars.reaction_s,
+        **{name: getattr(cars, name) for name in OF_CARS},
     }
     numbers = {name: np.full(rate.shape, value) for name, value in fixed.items()}
     decel = options.plan_decel_mps2 or plan_decel(cars, options.n_skills, options.durations.nominal_s)

@@ -156,19 +156,6 @@ def test_a_world_for_one_refuses_many() -> None:
         drive(SIMULATORS["embedded"](), Cars(), braking_plan(Cars(), 5, 0.8), many)
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"gap": "panic"}, "`gap`: 'panic'"),
-        ({"follower": "drunk"}, "`follower`: 'drunk' is none of careful, hdm, idm, hybrid"),
-    ],
-)
-def test_names_that_there_are_not_are_refused(changed: dict[str, str], message: str) -> None:
-    cars = Cars(**changed)  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match=message):
-        drive(SIMULATORS["longitudinal"](), cars, braking_plan(cars, 5, 0.8), schedule("naive"))
-
-
 def draw(seed: int, follower: str, *, reflex: bool) -> tuple[Cars, Schedule]:
     """Draw many scenarios, of all kinds, with plans at many rates under all policies."""
     rng = np.random.default_rng(seed)
