@@ -152,10 +152,5 @@ def kind(written: str, able: type[_Able]) -> _Able:
     return build(made_by, written, ROBOTS.field)
 
 
-def open_robot(written: str, dims: int, period_ns: int) -> ActionRobot:
-    """Open the robot ``name[?parameter=value&...]`` for actions; raises S2AError."""
-    return kind(written, ActionKind).open_actions(dims, period_ns)
-
-
 def _is(entry: object, able: type[_Able]) -> TypeGuard[type[_Able]]:
     return isinstance(entry, type) and issubclass(entry, able)

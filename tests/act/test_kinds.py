@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.act import ROBOTS, ActionKind, ActionRobot, SkillKind, SkillRobot, kind, open_robot
+from s2a_bench.act import ROBOTS, ActionKind, ActionRobot, SkillKind, SkillRobot, kind
 from s2a_bench.act.call import CallableRobot
 from s2a_bench.errors import UsageError
 from s2a_bench.plan import SkillSet, load_skills
@@ -59,7 +59,7 @@ def test_one_of_another_package_is_found_by_its_name(offer: ModuleType) -> None:
     offer.arm = Arm  # type: ignore[attr-defined]
     assert kind("arm?stiff=true", SkillKind) == Arm(stiff=True)
     assert isinstance(kind("arm", SkillKind).open_skills(load_skills("household")), CallableRobot)
-    assert open_robot("arm?stiff=true", 1, 1).describe()["frequency_hz"] == "20"
+    assert kind("arm?stiff=true", ActionKind).open_actions(1, 1).describe()["frequency_hz"] == "20"
     with pytest.raises(UsageError, match="`robot`: arm: 'soft' is no parameter; its parameters are stiff"):
         kind("arm?soft=true", ActionKind)
     with pytest.raises(UsageError, match="`robot`: timed takes no actions; ros, call, arm do"):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from s2a_bench.act import ActionKind, kind, open_robot
+from s2a_bench.act import ActionKind, kind
 from s2a_bench.act.ros import RosRobot
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RobotError, UsageError
@@ -57,9 +57,9 @@ def taken(of: DataReader[Any], count: int) -> list[Any]:
 
 
 def test_a_trajectory_of_one_point_is_what_a_peer_of_its_own_types_reads(dds_domain: int) -> None:
-    robot = open_robot("ros?topic=/arm/joint_trajectory&wait_s=0", 2, 20_000_000)
+    robot = kind("ros?topic=/arm/joint_trajectory&wait_s=0", ActionKind).open_actions(2, 20_000_000)
     listener = reader(dds_domain, "/arm/joint_trajectory", JointTrajectory)
-    other = open_robot("ros?topic=/arm/joint_trajectory", 2, 20_000_000)  # it waits until the reader is matched
+    other = kind("ros?topic=/arm/joint_trajectory", ActionKind).open_actions(2, 20_000_000)  # waits for the reader
     robot.close()
     for action in (np.array([0.25, -1.5], np.float32), None, np.array([3, 4], np.float32)):
         other.send(action, now_ns())
@@ -78,7 +78,7 @@ def test_a_trajectory_of_one_point_is_what_a_peer_of_its_own_types_reads(dds_dom
 
 def test_an_array_has_the_action_alone(dds_domain: int) -> None:
     listener = reader(dds_domain, "/forward/commands", Float64MultiArray)
-    robot = open_robot("ros?topic=/forward/commands&type=Float64MultiArray", 3, 1_500_000_000)
+    robot = kind("ros?topic=/forward/commands&type=Float64MultiArray", ActionKind).open_actions(3, 1_500_000_000)
     robot.send(np.array([0.5, 0, -2], np.float32), now_ns())
     (message,) = taken(listener, 1)
     assert list(message.data) == [0.5, 0, -2]
@@ -89,7 +89,7 @@ def test_an_array_has_the_action_alone(dds_domain: int) -> None:
 
 def test_joints_have_the_names_that_are_given(dds_domain: int) -> None:
     listener = reader(dds_domain, "/named", JointTrajectory)
-    robot = open_robot("ros?topic=/named&joints=lift:grip", 2, 1_500_000_000)
+    robot = kind("ros?topic=/named&joints=lift:grip", ActionKind).open_actions(2, 1_500_000_000)
     robot.send(np.zeros(2, np.float32), now_ns())
     (message,) = taken(listener, 1)
     assert message.joint_names == ["lift", "grip"]
@@ -101,7 +101,7 @@ def test_joints_have_the_names_that_are_given(dds_domain: int) -> None:
 
 def test_a_robot_that_nobody_listens_to_is_no_robot(dds_domain: int) -> None:
     with pytest.raises(RobotError, match=r"`robot`: ros: no subscription to /nowhere \(trajectory_msgs/msg/Joint"):
-        open_robot(f"ros?topic=/nowhere&wait_s=0.2&domain_id={dds_domain}", 2, 20_000_000)
+        kind(f"ros?topic=/nowhere&wait_s=0.2&domain_id={dds_domain}", ActionKind).open_actions(2, 20_000_000)
 
 
 @pytest.mark.parametrize(
@@ -129,4 +129,4 @@ def test_other_joints_than_the_action_has_are_refused() -> None:
 
 def test_what_is_about_skills_is_refused() -> None:
     with pytest.raises(UsageError, match=r"^`robot`: ros: namespace is about skills, not actions$"):
-        open_robot("ros?namespace=/arm", 3, 1)
+        kind("ros?namespace=/arm", ActionKind).open_actions(3, 1)
