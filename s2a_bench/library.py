@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 from s2a_bench.errors import S2AError, UsageError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, experiment_of, write_shown
 from s2a_bench.machine import tuning
-from s2a_bench.options import placed, places
+from s2a_bench.options import placed
 from s2a_bench.progress import NullProgress, Progress
 from s2a_bench.store import run as store
 from s2a_bench.store.schema import PROVENANCE
@@ -179,7 +179,9 @@ def run(
         if written not in modes:
             raise UsageError(f"`mode`: {none_of(written, modes)}")
         mode = modes[written]
-        experiment.refuse_foreign(mode, options, places)
+        for keyword in options:
+            if other := experiment.other_mode(mode, keyword):
+                raise UsageError(f"`{keyword}` is of mode {other.name}: give `mode` '{other.name}'")
     config = mode.options(**placed(mode.options, options))
     with tuning.allowed(tune):
         return Run(experiment.run_with(config, Path(output), progress or NullProgress()))

@@ -146,13 +146,16 @@ def beside(path: Place, other: Place) -> bool:
 def places(options: type[Options]) -> dict[str, list[Place]]:
     """Return every name of an option, its field's and its flag's, with the paths to its fields.
 
-    The options of a group keep their names; sibling groups share the names that both have.
+    The options of a group that are flags keep their names; sibling groups share the names that both have.
     """
     found: dict[str, list[Place]] = {}
     for name, field in options.model_fields.items():
         if inner := group_of(field):
+            only = extra_of(field).get("only")
             for each, paths in places(inner).items():
-                new = [(name, *path) for path in paths]
+                new = [(name, *path) for path in paths if not only or path[0] in only]
+                if not new:
+                    continue
                 known = found.setdefault(each, new)
                 if known is not new and beside(known[0], new[0]):
                     known += new

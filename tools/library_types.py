@@ -136,7 +136,7 @@ def _functions(command: str) -> str:
         written = f'mode: Literal["{mode.name}"]{"" if place else " = ..."}'
         options = f"**options: Unpack[{_named(command, mode.name)}]"
         signatures.append(f"@overload\ndef {command}(*, {written}, {options}) -> Run:\n{about}")
-    return "".join(signatures)
+    return "\n".join(signatures)
 
 
 if __name__ == "__main__":

@@ -104,12 +104,16 @@ class OneOf:
     def build(self, given: Mapping[str, Any]) -> Options:
         """Build the configuration of the mode that the flags pick; raises UsageError for options of another."""
         modes = self.experiment.every_mode
-        picking = {flag for mode in modes for flag in mode.flags if given.get(flag)}
-        mode = next((each for each in modes if picking == {*each.flags}), None)
+        flags = {flag for mode in modes for flag in mode.flags}
+        given = {name: value for name, value in given.items() if value is not None and (value or name not in flags)}
+        mode = next((each for each in modes if {*each.flags} == flags & given.keys()), None)
         if mode is None:
-            raise UsageError(f"{' and '.join(f'`{flag}`' for flag in sorted(picking))} exclude each other")
-        names = [flag.key for flag in self.flags() if given.get(flag.key) is not None]
-        self.experiment.refuse_foreign(mode, names, lambda options: {flag.key for flag in flags_of(options)})
+            raise UsageError(f"{' and '.join(f'`{flag}`' for flag in sorted(flags & given.keys()))} exclude each other")
+        for name in (flag.key for flag in self.flags() if flag.key in given):
+            if other := self.experiment.other_mode(mode, name):
+                missing = [f"give `{flag}`" for flag in other.flags if flag not in mode.flags]
+                spare = [f"leave out `{flag}`" for flag in mode.flags if flag not in other.flags]
+                raise UsageError(f"`{name}` is an option of mode {other.name}: {', '.join(missing + spare)}")
         return build(mode.options, given)
 
 

@@ -17,7 +17,7 @@ packages offer experiments as entry points of the group ``s2a_bench.experiments`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -236,16 +236,12 @@ class Experiment:
     def every_mode(self) -> tuple[RunMode, ...]:
         return (RunMode(self.mode, self.config, self.run), *self.modes)
 
-    def refuse_foreign(
-        self, mode: RunMode, names: Iterable[str], known: Callable[[type[Options]], Container[str]]
-    ) -> None:
-        """Raise UsageError for a name that ``mode`` lacks and another mode has; ``known`` returns a class's names."""
-        for name in names:
-            owners = [each for each in self.every_mode if name in known(each.options)]
-            if owners and mode not in owners:
-                missing = [f"give `{flag}`" for flag in owners[0].flags if flag not in mode.flags]
-                spare = [f"leave out `{flag}`" for flag in mode.flags if flag not in owners[0].flags]
-                raise UsageError(f"`{name}` is an option of mode {owners[0].name}: {', '.join(missing + spare)}")
+    def other_mode(self, mode: RunMode, name: str) -> RunMode | None:
+        """Return a mode that has the option or the flag ``name``, which ``mode`` lacks; None if there is none."""
+        from s2a_bench.options import places
+
+        owners = [each for each in self.every_mode if name in each.flags or name in places(each.options)]
+        return owners[0] if owners and mode not in owners else None
 
     def run_with(self, config: Options, output: Path, progress: Progress) -> Path:
         """Run the mode whose options ``config`` has."""

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from s2a_bench.errors import UsageError
 from s2a_bench.frames import NumberedSource
 from s2a_bench.types import Encoding, Pixels
 
@@ -38,6 +39,8 @@ class SyntheticCamera(NumberedSource):
 
     def __init__(self, where: str, width: int, height: int, *, fps: float = 30.0, seed: int = 0) -> None:
         super().__init__(f"synthetic:{where}" if where else "synthetic", width, height, smallest=16, even=True)
+        if not fps > 0:
+            raise UsageError(f"`fps`: {fps} should be above 0")
         self.fps = fps
         # a quarter of the frame each way is enough for the motion, and soon rendered
         self._margin = (width // 8 * 2, height // 4)

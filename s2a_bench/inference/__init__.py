@@ -139,6 +139,10 @@ def _written(value: Any) -> Any:
     return str(value) if isinstance(value, (int, float)) else value
 
 
+Written = Annotated[str, BeforeValidator(_written, json_schema_input_type=str | float)]
+"""A text, or a number."""
+
+
 class EngineConfig(Options):
     PANEL: ClassVar[str] = "Model"
 
@@ -150,7 +154,7 @@ class EngineConfig(Options):
     )
     profile: str = option("", "what --engine replay plays: a name of 'profile list', or a path", names=profile_files)
     gaps: str = option("", "replay: trace, parametric, constant [default: trace if recorded]")
-    latency: Annotated[str, BeforeValidator(_written, json_schema_input_type=str | float)] = option(
+    latency: Written = option(
         "",
         "echo: time to the whole answer: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: at once]",
     )

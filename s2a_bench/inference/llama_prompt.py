@@ -100,9 +100,10 @@ class VisionTower:
         data = prompt.encode()
         text = mtmd_cpp.mtmd_input_text(text=data, text_len=len(data), add_special=True, parse_special=True)
         with ExitStack() as stack:
-            bitmaps = (mtmd_cpp.mtmd_bitmap_p_ctypes * len(frames))(*map(bitmap_of, frames))
-            for bitmap in bitmaps:
-                stack.callback(mtmd_cpp.mtmd_bitmap_free, bitmap)
+            bitmaps = (mtmd_cpp.mtmd_bitmap_p_ctypes * len(frames))()
+            for place, frame in enumerate(frames):
+                bitmaps[place] = bitmap_of(frame)
+                stack.callback(mtmd_cpp.mtmd_bitmap_free, bitmaps[place])
             chunks = mtmd_cpp.mtmd_input_chunks_init()
             stack.callback(mtmd_cpp.mtmd_input_chunks_free, chunks)
             if code := mtmd_cpp.mtmd_tokenize(self._mtmd, chunks, ctypes.byref(text), bitmaps, len(frames)):

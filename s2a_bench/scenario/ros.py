@@ -90,7 +90,10 @@ class EgoCamera(TopicCamera):
 
 
 class RosEgo:
-    """A simulator whose ego is commanded and seen over ROS 2; all else is the wrapped world's, `close` included."""
+    """A simulator whose ego is commanded and seen over ROS 2; all else is the wrapped world's, `close` included.
+
+    It derives from no `Simulator`, whose defaults would hide the world's own.
+    """
 
     def __init__(self, world: Simulator, how: EgoParameters) -> None:
         topic, self._type = COMMANDS[how.preset, how.message]

@@ -9,7 +9,6 @@ import pytest
 
 from s2a_bench import library
 from s2a_bench.cli.adapter import OneOf, build, flags_named, flags_of
-from s2a_bench.cli.experiment import options_of
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, RunMode
 from s2a_bench.options import Options, group, option
@@ -84,6 +83,7 @@ def test_flags_pick_the_class_and_its_function() -> None:
     assert made(live=True, seed=3) == Live(seed=3)
     assert made(live=True, closed_loop=True, step_s=0.5, url="x") == Looped(step_s=0.5, requests={"url": "x"})
     assert made(predict="runs/1") == Predicted(predict="runs/1")
+    assert made(predict="") == Computed()
     kinds = [type(config) for config in (made(), made(live=True), made(predict="a"))]
     assert [kind.virtual for kind in kinds] == [True, False, False]
     folders = [TOY.run_with(config, Path(), NullProgress()) for config in (made(), made(live=True), made(predict="a"))]
@@ -133,11 +133,9 @@ def toy(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_library_picks_a_mode_by_its_name(tmp_path: Path) -> None:
     assert library.run("toy", output=tmp_path, plans=2) == tmp_path / "Computed"
     assert library.run("toy", output=tmp_path, mode="live", url="x") == tmp_path / "Live/live"
-    with pytest.raises(UsageError, match=r"^`url` is an option of mode live: give `live`$"):
+    with pytest.raises(UsageError, match=r"^`url` is of mode live: give `mode` 'live'$"):
         library.run("toy", output=tmp_path, url="x")
+    with pytest.raises(UsageError, match=r"^`live` is of mode live: give `mode` 'live'$"):
+        library.run("toy", output=tmp_path, live=True)
     with pytest.raises(UsageError, match="`mode`: 'lives' is none of computed, live, loop, predicted"):
         library.run("toy", output=tmp_path, mode="lives")
-
-
-def test_an_experiment_without_modes_has_the_flags_of_its_one_class() -> None:
-    assert options_of(EXPERIMENTS["latency"])[0] is EXPERIMENTS["latency"].every_mode[0].options

@@ -92,3 +92,9 @@ def test_odd_and_tiny_sizes_are_refused(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize("size", [(16, 16), (18, 200), (400, 17)])
 def test_small_and_long_sizes_work(size: tuple[int, int]) -> None:
     assert len({frame.data.tobytes() for frame in frames(5, *size, step=20)}) > 1
+
+
+@pytest.mark.parametrize("fps", [0.0, -1.0, float("nan")])
+def test_a_rate_that_is_none_is_refused(fps: float) -> None:
+    with pytest.raises(UsageError, match="`fps`"):
+        SyntheticCamera("", 64, 48, fps=fps)

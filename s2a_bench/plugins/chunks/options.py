@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Final
-
-from pydantic import BeforeValidator
+from typing import Any, ClassVar, Final
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
 from s2a_bench.harness.config import GROUPED, FirstVariants
-from s2a_bench.inference import STAND_IN, EngineConfig
+from s2a_bench.inference import STAND_IN, EngineConfig, Written
 from s2a_bench.options import Names, Options, group, option
 from s2a_bench.plugins.chunks.modes import COMPARED, MODES, ControlSetting, Mode, Rounding, modes
 from s2a_bench.transport import ACTIONS, TRANSPORTS
@@ -95,7 +93,7 @@ class LoopRequests(FirstVariants):
 class ServedOptions(ControlOptions):
     """Robots that act on the answers of a server."""
 
-    latency: Annotated[str, BeforeValidator(str, json_schema_input_type=str | float)] = option(
+    latency: Written = option(
         "", "how long echo takes to answer: ms, FAMILY:mean_ms=...,key=value, FILE.csv [default: no time]", first=True
     )
     requests: LoopRequests = group(LoopRequests, only=(*GROUPED, "prompt"), first=("transports",))

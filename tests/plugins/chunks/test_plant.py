@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from s2a_bench.act import ActionKind, kind, open_robot
+from s2a_bench.act import ActionKind, kind
 from s2a_bench.errors import UsageError
 from s2a_bench.plugins.chunks.plant import SUBSTEPS, Plant, PlantRobot
 
@@ -98,7 +98,7 @@ def test_before_its_first_action_it_does_not_move() -> None:
 
 
 def test_it_is_opened_by_its_name_with_parameters_and_says_what_it_is() -> None:
-    robot = open_robot("plant?frequency_hz=3&damping=.7", 2, PERIOD_NS)
+    robot = kind("plant?frequency_hz=3&damping=.7", ActionKind).open_actions(2, PERIOD_NS)
     assert robot.describe() == {"robot": "plant", "frequency_hz": "3", "damping": "0.7"}
     robot.close()
     with pytest.raises(UsageError, match="`robot`: plant: an action of shape \\(3,\\) for 2 joints"):

@@ -292,7 +292,10 @@ class CapacityPredicted(CapacityOptions):
     MOST_ROBOTS: ClassVar[int] = 10_000
 
     predict: str = option(
-        ..., "predict, in virtual time: the run folder of one robot, or service times as in --latency", first=True
+        ...,
+        "predict, in virtual time: the run folder of one robot, or service times as in --latency",
+        first=True,
+        min_length=1,
     )
     servers: int = option(1, "servers that share one queue", ge=1, le=1000)
     batch: Path | None = option(

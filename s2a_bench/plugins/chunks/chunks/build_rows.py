@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
-from itertools import repeat
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -169,9 +168,9 @@ def _reaction_rows(acted: ActedCell, reaction_s: Floats) -> Iterator[ReactionRow
 
 def _tick_rows(acted: ActedCell, shown: int) -> Iterator[TickRow]:
     ticks = acted.ticks
-    late: Iterable[int | None] = repeat(None) if acted.late_ns is None else acted.late_ns.tolist()
+    late = [None] * ticks.chunk.size if acted.late_ns is None else acted.late_ns.tolist()
     columns = (each[:shown].tolist() for each in (ticks.chunk, ticks.index, ticks.age, ticks.stalled))
-    for tick, (chunk, index, age, stalled, late_ns) in enumerate(zip(*columns, late, strict=False)):
+    for tick, (chunk, index, age, stalled, late_ns) in enumerate(zip(*columns, late[:shown], strict=True)):
         known = chunk >= 0
         yield TickRow(
             cell=acted.cell.cell,

@@ -244,7 +244,7 @@ def _accepts_state(session: Session, robot: ActionRobot) -> bool:
     """Return whether requests carry the robot's state; raises UsageError where its size contradicts `state`."""
     numbers, wanted = len(robot.state()), session.request.state
     if numbers and wanted and numbers != wanted:
-        name = robot.describe()["robot"]
+        name = robot.describe().get("robot", type(robot).__name__)
         raise UsageError(f"`state`: `robot` {name} has {numbers} numbers, not {wanted}; leave it out")
     return bool(numbers) and session.cell.capabilities.accepts_state
 
