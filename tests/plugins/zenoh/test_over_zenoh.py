@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from s2a_bench.act import open_robot
+from s2a_bench.act import ActionKind, kind
 from s2a_bench.act.ros import TRAJECTORY, RosRobot
 from s2a_bench.cli.doctor import all_checks
 from s2a_bench.clock import now_ns
@@ -87,7 +87,7 @@ def test_over_zenoh_nodes_meet_at_a_router(dds_domain: int) -> None:
     endpoint = free_endpoint()
     controller = open_middleware("zenoh", domain_id=dds_domain, place=endpoint, host=True)
     listener = controller.subscription("/arm", TRAJECTORY, QoS())
-    robot = open_robot(f"ros?topic=/arm&middleware=zenoh&router={endpoint}", 2, 20_000_000)
+    robot = kind(f"ros?topic=/arm&middleware=zenoh&router={endpoint}", ActionKind).open_actions(2, 20_000_000)
     robot.send(np.array([1, 2], np.float32), now_ns())
     message = listener.unpack(listener.take(WAIT_S))
     assert message.points[0].positions.tolist() == [1, 2]
