@@ -175,7 +175,7 @@ def run(
     mode = experiment.every_mode[0]
     if experiment.modes:
         modes = {each.name: each for each in experiment.every_mode}
-        written = options.pop("mode", mode.name)
+        written = str(options.pop("mode", mode.name))
         if written not in modes:
             raise UsageError(f"`mode`: {none_of(written, modes)}")
         mode = modes[written]

@@ -225,10 +225,14 @@ def _shared(flags: Sequence[Flag]) -> Flag:
 def _with_defaults(abouts: Mapping[str, str]) -> str:
     """Return the first of several helps, by owner, ending with the defaults of all if they differ."""
     first = next(iter(abouts.values()))
-    defaults = {owner: default[1] for owner, about in abouts.items() if (default := DEFAULT.search(about))}
-    if len(set(defaults.values())) < 2:  # noqa: PLR2004 - they agree
+    owners: dict[str, list[str]] = {}
+    for owner, about in abouts.items():
+        if default := DEFAULT.search(about):
+            owners.setdefault(default[1], []).append(owner)
+    if len(owners) < 2:  # noqa: PLR2004 - they agree
         return first
-    return DEFAULT.sub(f" [default: {', '.join(f'{owner} {default}' for owner, default in defaults.items())}]", first)
+    defaults = "; ".join(f"{', '.join(names)} {default}" for default, names in owners.items())
+    return DEFAULT.sub(f" [default: {defaults}]", first)
 
 
 def build(options: type[Options] | OneOf, given: Mapping[str, Any]) -> Options:

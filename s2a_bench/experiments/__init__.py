@@ -199,7 +199,7 @@ class RunMode:
     config: str
     run: str
     flags: Mapping[str, str] = field(default_factory=dict, hash=False)
-    """The flags that pick it, as names of fields -> their help; empty where a flag is an option of the mode."""
+    """The flags that pick it, as names of fields -> their help; empty where an option or another mode has it."""
 
     @property
     def options(self) -> type[Options]:
@@ -237,11 +237,13 @@ class Experiment:
         return (RunMode(self.mode, self.config, self.run), *self.modes)
 
     def other_mode(self, mode: RunMode, name: str) -> RunMode | None:
-        """Return a mode that has the option or the flag ``name``, which ``mode`` lacks; None if there is none."""
+        """Return the mode nearest to ``mode`` with the option or flag ``name``; None if none or ``mode`` has it."""
         from s2a_bench.options import places
 
         owners = [each for each in self.every_mode if name in each.flags or name in places(each.options)]
-        return owners[0] if owners and mode not in owners else None
+        if not owners or mode in owners:
+            return None
+        return min(owners, key=lambda each: len({*each.flags} ^ {*mode.flags}))
 
     def run_with(self, config: Options, output: Path, progress: Progress) -> Path:
         """Run the mode whose options ``config`` has."""

@@ -111,7 +111,7 @@ GROUPED: Final = (
     *("transports", "options", "url", "engine", "payload", "source", "size", "cameras", "resize", "state"),
     *("warmup", "timeout_s", "wait_for_server", "deadline_s", "sample_resources_hz", "nonce"),
 )
-"""The flags of requests in experiments of which these are a part, a group of options."""
+"""The fields of requests that are flags where requests are one group of an experiment's options."""
 
 
 class RequestsConfig(Surrounded):

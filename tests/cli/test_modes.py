@@ -96,6 +96,14 @@ def test_flags_pick_the_class_and_its_function() -> None:
         ({"url": "x"}, "--url is an option of mode live: give --live"),
         ({"plans": 2, "live": True}, "--plans is an option of mode computed: leave out --live"),
         ({"step_s": 0.5}, "--step-s is an option of mode loop: give --live, give --closed-loop"),
+        (
+            {"plans": 2, "live": True, "closed_loop": True},
+            "--plans is an option of mode computed: leave out --live, leave out --closed-loop",
+        ),
+        (
+            {"url": "x", "closed_loop": True, "live": True, "predict": "a"},
+            "--closed-loop and --live and --predict exclude each other",
+        ),
         ({"url": "x", "predict": "a"}, "--url is an option of mode live: give --live, leave out --predict"),
         ({"closed_loop": True, "predict": "a"}, "--closed-loop and --predict exclude each other"),
     ],
@@ -119,7 +127,7 @@ def test_help_groups_options_by_mode_and_names_the_defaults_of_each() -> None:
         "Plans (with --predict)": ["predict"],
     }
     abouts = {flag.name: flag.about for flag in flags_of(OneOf(TOY))}
-    assert abouts["lengths"] == "tokens a skill [default: computed 6, live 4, loop 4]"
+    assert abouts["lengths"] == "tokens a skill [default: computed 6; live, loop 4]"
     assert not any(flag.needed for flag in flags_of(OneOf(TOY)))
 
 

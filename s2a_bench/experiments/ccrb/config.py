@@ -33,6 +33,8 @@ class CcrbDrives(PolicyOptions):
     """Whether the world runs while the plan arrives."""
     time: ClassVar[str] = "virtual"
     """The clock of the world."""
+    PACED_BY: ClassVar[str]
+    """The options that set the rate of the tokens."""
 
     tokens_per_skill: int = option(6, "L, the delimiter included", ge=1, le=1000)
     simulator: str = option(
@@ -53,8 +55,8 @@ class CcrbDrives(PolicyOptions):
         whole_s = self.board.prompt_s + self.tokens_per_skill * (self.scenario.n_skills + 1) / self.board.tokens_per_s
         if whole_s > LONG_S:
             raise UsageError(
-                f"`rate`, `pace` or `profile`: the whole plan takes {whole_s:.0f} s to arrive, "
-                f"which is no driving; at most {LONG_S:.0f} s"
+                f"{self.PACED_BY}: the whole plan takes {whole_s:.0f} s to arrive, which is no driving; "
+                f"at most {LONG_S:.0f} s"
             )
 
     def to_manifest(self) -> dict[str, Any]:
@@ -66,6 +68,7 @@ class CcrbDrives(PolicyOptions):
 class CcrbModelled(CcrbDrives):
     """Drives on a board's modelled tokens."""
 
+    PACED_BY: ClassVar[str] = "`rate` or `profile`"
     virtual: ClassVar[bool] = True
 
     profile: str = option(BOARD, "the board: a name of 'profile list', or a path", first=True, names=profile_files)
@@ -118,6 +121,7 @@ class DrivingRequests(PlanRequests):
 class CcrbRequested(CcrbDrives):
     """Drives on the tokens of a model."""
 
+    PACED_BY: ClassVar[str] = "`pace` or `profile`"
     requests: DrivingRequests = group(
         DrivingRequests, only=(*(each for each in GROUPED if each != "source"), "record"), first=()
     )

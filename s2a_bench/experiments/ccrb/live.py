@@ -54,18 +54,18 @@ CRUISE_S: Final = 0.5
 
 def run_live(config: CcrbLive, output: Path, progress: Progress) -> Path:
     """Request one plan and drive it under every policy; raises S2AError. The folder keeps the requests so far."""
-    plan = resolve_live(config, progress)
-    with closing(open_simulator(plan.simulator)) as world:
+    with closing(open_simulator(config.simulator)) as world:
+        plan = resolve_live(config, progress)
         task = _task(plan, world, partial(_roll_out, plan, world, ttc=config.ttc))
         return run_requests(task, plan.requests, output, progress)
 
 
 def run_live_loop(config: CcrbLiveLoop, output: Path, progress: Progress) -> Path:
     """Request a plan a policy and execute it as it arrives; raises S2AError. The folder keeps the loops so far."""
-    plan = resolve_live(config, progress)
-    with closing(open_simulator(plan.simulator)) as bare, closing(with_ego(bare, config.ego)) as world:
+    with closing(open_simulator(config.simulator)) as bare, closing(with_ego(bare, config.ego)) as world:
         if not world.real:
             world.step_s = STEP_S
+        plan = resolve_live(config, progress)
         task = _task(plan, world, partial(_close_loops, plan, world))
         return run_requests(task, plan.requests, output, progress)
 

@@ -63,7 +63,6 @@ def complete(
 class CcrbPlan:
     """Drives on modelled tokens: as these come evenly, the plan is known beforehand."""
 
-    simulator: str
     ready: Prepared
     manifest: dict[str, Any]
 
@@ -73,7 +72,6 @@ class CcrbLivePlan:
     """Drives on a model's tokens."""
 
     scenario: CcrbOptions
-    simulator: str
     requests: RunPlan
     prompt: PlanPrompt
     shape: PlanShape
@@ -95,7 +93,7 @@ def resolve(config: CcrbModelled) -> CcrbPlan:
     _, plans = draw(case, config.seed, 1, "plans")
     policies = certain(config.chosen, board)
     ready = complete(scenario, case.setting, case.setting.request_id(0), plans, policies)
-    return CcrbPlan(config.simulator, ready, manifest)
+    return CcrbPlan(ready, manifest)
 
 
 def studies(config: CcrbComputed) -> Iterator[tuple[str, Scenes]]:
@@ -120,4 +118,4 @@ def resolve_live(config: CcrbRequested, progress: Progress) -> CcrbLivePlan:
         seeds={"sampling": config.seed, "nonce": requests.feed.nonce},
     )
     shape, learning = PlanShape(scenario.skills, tokens, scenario.durations), LearningPlan(config.chosen, config.seed)
-    return CcrbLivePlan(scenario, config.simulator, requests, prompt, shape, learning)
+    return CcrbLivePlan(scenario, requests, prompt, shape, learning)

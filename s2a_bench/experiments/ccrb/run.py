@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 def run_ccrb(config: CcrbComputed, output: Path, progress: Progress) -> Path:
     plan, every = resolve(config), [*studies(config)]
-    with closing(open_simulator(plan.simulator)) as world, _create(plan, output, progress) as writer:
+    with closing(open_simulator(config.simulator)) as world, _create(plan, output, progress) as writer:
         for table, rows in point_rows(plan.ready.with_ttc() if config.ttc else plan.ready, world):
             writer.append(table, rows)
         _drive_studies(plan.ready.scenario, every, writer, progress)
@@ -37,7 +37,7 @@ def run_ccrb(config: CcrbComputed, output: Path, progress: Progress) -> Path:
 def run_closed_loop(config: CcrbClosedLoop, output: Path, progress: Progress) -> Path:
     plan = resolve(config)
     ready = plan.ready
-    with closing(open_simulator(plan.simulator)) as world, _create(plan, output, progress) as writer:
+    with closing(open_simulator(config.simulator)) as world, _create(plan, output, progress) as writer:
         writer.update(step_s=world.step_s)
         for name, policy in ready.policies.items():
             looped = replayed(ready.scenario, world, policy, ready.plans)

@@ -38,7 +38,9 @@ Rates = Annotated[tuple[Annotated[float, Field(gt=0, allow_inf_nan=False)], ...]
 Seconds = Annotated[tuple[Annotated[float, Field(ge=LEAST_T_NOM_S, allow_inf_nan=False)], ...], SEVERAL]
 ABOUT_L: Final = "L, the delimiter included; several with commas"
 ABOUT_T_NOM: Final = "seconds a skill takes; several with commas"
-ABOUT_PROFILES: Final = "boards: names of 'profile list', or paths; none by default with --rate"
+ABOUT_PROFILES: Final = (
+    "boards: names of 'profile list', or paths; none by default with --rate; with --live what --engine replay plays"
+)
 
 
 class TimelineOptions(PolicyOptions):

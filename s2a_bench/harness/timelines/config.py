@@ -57,16 +57,18 @@ class PlanRequests(FirstVariants):
         60.0, "seconds without a token after which the robot holds", flag="timeout", ge=0.1, le=86_400
     )
     sample_resources_hz: float = option(
-        0.0, "readings a second of CPU, memory, GPU and power beside the run; 0: none", flag="sample-resources", ge=0
+        0.0,
+        "readings a second of CPU, memory, GPU and power beside the run; 0: none",
+        flag="sample-resources",
+        ge=0,
+        le=1000,
     )
 
     def check(self) -> None:
         super().check()
         if len(self.pipelines) != 1:
-            names = ", ".join(each.name for each in self.pipelines)
-            raise UsageError(
-                f"`transport`: one stream is followed, not {names}; name one, as ros/action or http/binary"
-            )
+            names, field = ", ".join(each.name for each in self.pipelines), "payload" if self.payload else "transport"
+            raise UsageError(f"`{field}`: one stream is followed, not {names}; name one, as ros/action or http/binary")
         if self.engine.pace and self.foreign:
             where = f"leave out `{self.foreign}`"
             raise UsageError(f"`pace` needs the package's server, which holds its engine back; {where}")

@@ -81,7 +81,8 @@ def plan_requests(requests: PlanRequests, plan: PromptPlan, progress: Progress) 
         run = replace(run, engine=on_files(run.engine, progress), finds_model=False)
         tokenize = Tokenizer(run.engine.model)
     prompts = write_prompts(plan, tokenize, exact=tokenize is not None or run.engine.kind.plays is not None)
-    request = replace(run.request, max_pieces=max(each.max_tokens for each in prompts))
+    longest = max(each.max_tokens for each in prompts)
+    request = replace(run.request, grammar=prompts[0].grammar, max_pieces=longest)
     return replace(run, request=request), prompts
 
 

@@ -86,7 +86,11 @@ class LoopRequests(FirstVariants):
     engine: EngineConfig = group(EngineConfig, only=("name", "profile", "gaps", "action_dim"))
     warmup: int = option(5, "requests before a cell's loop starts, kept and marked", ge=1, le=10**6)
     sample_resources_hz: float = option(
-        0.0, "readings a second of CPU, memory, GPU and power beside the run; 0: none", flag="sample-resources", ge=0
+        0.0,
+        "readings a second of CPU, memory, GPU and power beside the run; 0: none",
+        flag="sample-resources",
+        ge=0,
+        le=1000,
     )
 
 

@@ -127,7 +127,11 @@ class CapacityRequests(LoopRequests):
         EngineConfig, only=set(EngineConfig.model_fields) - {"answer", "horizon", "latency", "batch"}
     )
     sample_resources_hz: float = option(
-        2.0, "readings a second of CPU, memory, GPU and power beside the run; 0: none", flag="sample-resources", ge=0
+        2.0,
+        "readings a second of CPU, memory, GPU and power beside the run; 0: none",
+        flag="sample-resources",
+        ge=0,
+        le=1000,
     )
 
 
