@@ -18,11 +18,11 @@ from s2a_bench.cli.progress import RunProgress
 from s2a_bench.clock import SystemClock, VirtualClock
 from s2a_bench.errors import TransportError
 from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbLiveLoop, DrivingRequests
-from s2a_bench.experiments.ccrb.drives import TableRows, loop_rows, motion_of
+from s2a_bench.experiments.ccrb.drives import Prepared, TableRows, loop_rows, motion_of
 from s2a_bench.experiments.ccrb.live import run_live_loop
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
-from s2a_bench.experiments.ccrb.plan import Prepared, resolve
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
+from s2a_bench.experiments.ccrb.run import resolve
 from s2a_bench.frames import FrameSource
 from s2a_bench.inference import EngineConfig
 from s2a_bench.plan.skillset import GAPS, Gap

@@ -16,8 +16,7 @@ import pytest
 from s2a_bench.act.call import SkillMotion
 from s2a_bench.errors import EngineError, ServerDied, SourceError, TransportError, UsageError
 from s2a_bench.experiments.timeline.config import TimelineLive, TimelineRealTime
-from s2a_bench.experiments.timeline.live import run_live
-from s2a_bench.experiments.timeline.plan import prompt_plan
+from s2a_bench.experiments.timeline.live import prompt_plan, run_live
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_real_time
 from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_json, timelines_of

@@ -19,9 +19,8 @@ from s2a_bench.boards.tokens import board_of_profile, gaps_of
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
 from s2a_bench.experiments.timeline.config import TimelineComputed
-from s2a_bench.experiments.timeline.plan import recordings
 from s2a_bench.experiments.timeline.rows import TIMELINES
-from s2a_bench.experiments.timeline.run import run_timeline
+from s2a_bench.experiments.timeline.run import recordings, run_timeline
 from s2a_bench.experiments.timeline.view.cells import timelines_of
 from s2a_bench.experiments.timeline.view.tables import show
 from s2a_bench.harness.timelines.cases import LearningPlan, PlanSetting

@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
+from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from s2a_bench.act.record import executed
 from s2a_bench.experiments.ccrb.loop import Looped
-from s2a_bench.experiments.ccrb.plan import Prepared
 from s2a_bench.experiments.ccrb.rows import (
     IMPACTS,
     MARGINS,
@@ -21,19 +21,52 @@ from s2a_bench.experiments.ccrb.rows import (
     RolloutRow,
     TrajectoryRow,
 )
+from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import skill_rows, to_ns
-from s2a_bench.policy import TOLERANCE_S, Plans, Schedule
+from s2a_bench.policy import TOLERANCE_S, Plans, Policy, Schedule
 from s2a_bench.policy.metrics import peak_jerk, rms_jerk, sparc, stalls
 from s2a_bench.scenario import EGO, ROLES, Simulator, open_simulator
-from s2a_bench.scenario.ccrb.cars import TTC
+from s2a_bench.scenario.ccrb.cars import TTC, ttc_aware
 from s2a_bench.scenario.ccrb.drive import Driven, Trajectory, drive
 from s2a_bench.scenario.ccrb.ego import PHASES
+from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.outcome import Outcomes
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.schema import Table
 
 TableRows: TypeAlias = tuple[Table[Any], Iterable[Any]]
 """A table and rows for it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """One plan in a scenario, and its schedule under every policy."""
+
+    scenario: CcrbOptions
+    setting: PlanSetting
+    request_id: str
+    plans: Plans
+    policies: Mapping[str, Policy]
+    schedules: Mapping[str, Schedule]
+    late: bool | None = None
+    """Of s2a-ttc, if it is one of them."""
+
+    def with_ttc(self) -> Prepared:
+        schedule, (late,) = ttc_aware(self.plans, self.scenario.deadline_s)
+        return replace(self, schedules={**self.schedules, TTC: schedule}, late=bool(late))
+
+
+def complete(
+    scenario: CcrbOptions, setting: PlanSetting, request_id: str, plans: Plans, policies: Mapping[str, Policy]
+) -> Prepared:
+    """Schedule a plan, drawn or received, under every policy."""
+    if scenario.lane_change:
+        changed: dict[str, Any] = {name: np.array(getattr(plans, name)) for name in ("nominal_s", "least_s", "most_s")}
+        for name, value in changed.items():
+            value[-1] = getattr(scenario.lane_durations, name)
+        plans = replace(plans, **changed)
+    schedules = {name: policy.schedule(plans) for name, policy in policies.items()}
+    return Prepared(scenario, setting, request_id, plans, policies, schedules)
 
 
 def point_rows(ready: Prepared, world: Simulator) -> Iterator[TableRows]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -19,24 +19,25 @@ from s2a_bench.act.record import Record, observed
 from s2a_bench.act.ros import STRING
 from s2a_bench.clock import SystemClock, now_ns, quick_switching
 from s2a_bench.errors import TransportError
-from s2a_bench.experiments.ccrb.config import CcrbLive, CcrbLiveLoop
-from s2a_bench.experiments.ccrb.drives import loop_rows, point_rows
+from s2a_bench.experiments.ccrb.config import CcrbLive, CcrbLiveLoop, CcrbRequested
+from s2a_bench.experiments.ccrb.drives import Prepared, complete, loop_rows, point_rows
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, Looped
-from s2a_bench.experiments.ccrb.plan import CcrbLivePlan, Prepared, complete, resolve_live
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.frames import FrameSource
 from s2a_bench.frames.stamp import Stamped
-from s2a_bench.harness.plan import FeedPlan
+from s2a_bench.harness.plan import FeedPlan, RunPlan
 from s2a_bench.harness.recording import RunRecorder
 from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
 from s2a_bench.harness.session import Measured
-from s2a_bench.harness.timelines.link import ModelLink
+from s2a_bench.harness.timelines.cases import LearningPlan
+from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt, PromptPlan, plan_requests
 from s2a_bench.harness.timelines.policies import prepare
-from s2a_bench.plan import Parser
-from s2a_bench.policy import Policy
+from s2a_bench.plan import Parser, load_skills
+from s2a_bench.policy import PlanShape, Policy
 from s2a_bench.ros import messages as ros
-from s2a_bench.scenario import ROLES, Simulator, open_simulator
+from s2a_bench.scenario import ROLES, Simulator, open_simulator, simulator_class
 from s2a_bench.scenario.ccrb.drive import place
+from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ros import with_ego
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.types import Frame
@@ -50,6 +51,32 @@ PICTURE: Final = (320, 240)
 ODOMETRY: Final = "nav_msgs/msg/Odometry"
 CRUISE_S: Final = 0.5
 """Time on the road before the request of a closed loop."""
+
+
+@dataclass(frozen=True, slots=True)
+class CcrbLivePlan:
+    """Drives on a model's tokens."""
+
+    scenario: CcrbOptions
+    requests: RunPlan
+    prompt: PlanPrompt
+    shape: PlanShape
+    learning: LearningPlan
+
+
+def resolve_live(config: CcrbRequested, progress: Progress) -> CcrbLivePlan:
+    """Decide what follows from a configuration, with the model's files; raises S2AError."""
+    scenario, tokens = config.scenario, config.tokens_per_skill
+    prompts = PromptPlan([load_skills(config.skill_set)], [tokens], [scenario.skills])
+    requests, (prompt,) = plan_requests(config.requests.but(seed=config.seed), prompts, progress)
+    source = f"camera of {simulator_class(config.simulator).name}"
+    requests = requests.with_manifest(
+        configuration={**config.to_manifest(), "live": {**requests.manifest["configuration"], "source": source}},
+        follower_law=scenario.follower_law,
+        seeds={"sampling": config.seed, "nonce": requests.feed.nonce},
+    )
+    shape, learning = PlanShape(scenario.skills, tokens, scenario.durations), LearningPlan(config.chosen, config.seed)
+    return CcrbLivePlan(scenario, requests, prompt, shape, learning)
 
 
 def run_live(config: CcrbLive, output: Path, progress: Progress) -> Path:

@@ -2,27 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from time import process_time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbComputed
-from s2a_bench.experiments.ccrb.drives import loop_rows, point_rows
+from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbComputed, CcrbModelled
+from s2a_bench.experiments.ccrb.drives import Prepared, complete, loop_rows, point_rows
 from s2a_bench.experiments.ccrb.loop import replayed
-from s2a_bench.experiments.ccrb.plan import CcrbPlan, resolve, studies
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
 from s2a_bench.experiments.ccrb.studies import SCENES, drive_block
+from s2a_bench.harness.timelines.cases import PlanCase
+from s2a_bench.harness.timelines.policies import certain, draw
 from s2a_bench.harness.timelines.rows import token_rows
+from s2a_bench.machine import environment
+from s2a_bench.policy import PlanShape
+from s2a_bench.provenance import Origins
 from s2a_bench.scenario import open_simulator
 from s2a_bench.scenario.ccrb.options import CcrbOptions
-from s2a_bench.scenario.ccrb.studies import Scenes
+from s2a_bench.scenario.ccrb.studies import Scenes, plane
+from s2a_bench.scenario.ccrb.studies import draw as draw_scenes
+from s2a_bench.stats.seeds import generator
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.run import RunWriter
 
 if TYPE_CHECKING:
     from s2a_bench.progress import Progress
+
+
+_BOARD: Final = ("name", "title", "origin", "tokens_per_s", "prompt_s", "prompt_origin")
+
+
+@dataclass(frozen=True, slots=True)
+class CcrbPlan:
+    """Drives on modelled tokens: as these come evenly, the plan is known beforehand."""
+
+    ready: Prepared
+    manifest: dict[str, Any]
+
+
+def resolve(config: CcrbModelled) -> CcrbPlan:
+    """Decide what follows from a configuration; opens and starts nothing."""
+    scenario, board = config.scenario, config.board
+    manifest = {
+        "configuration": config.to_manifest(),
+        "environment": environment.collect(),
+        "seeds": {"plans": config.seed},
+        "follower_law": scenario.follower_law,
+        "boards": [{name: getattr(board, name) for name in _BOARD}],
+        "provenance": Origins(board.provenance).to_manifest(),
+    }
+    case = PlanCase.of(board, PlanShape(scenario.skills, config.tokens_per_skill, scenario.durations, 0.0))
+    _, plans = draw(case, config.seed, 1, "plans")
+    policies = certain(config.chosen, board)
+    ready = complete(scenario, case.setting, case.setting.request_id(0), plans, policies)
+    return CcrbPlan(ready, manifest)
+
+
+def studies(config: CcrbComputed) -> Iterator[tuple[str, Scenes]]:
+    """Yield the studies beside the operating point, with their scenarios."""
+    if config.phase:
+        axes = config.phase_rates, config.phase_gaps_m, config.phase_points
+        prompt_s, tokens = config.board.prompt_s, config.tokens_per_skill
+        yield "phase", plane(config.scenario, *axes, prompt_s=prompt_s, tokens_per_skill=tokens)
+    if config.random:
+        yield "random", draw_scenes(generator(config.seed, "ccrb", "random"), config.random)
 
 
 def run_ccrb(config: CcrbComputed, output: Path, progress: Progress) -> Path:

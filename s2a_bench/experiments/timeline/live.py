@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack, closing
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -18,16 +19,53 @@ from s2a_bench.clock import now_ns, quick_switching
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments.timeline.config import TimelineLive
 from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep
-from s2a_bench.experiments.timeline.plan import LivePlan, resolve_live
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.watch import Scene
 from s2a_bench.frames.stamp import Stamped
+from s2a_bench.harness.plan import RunPlan
 from s2a_bench.harness.rounds import RunningLaunch, Task, run_requests
-from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt
+from s2a_bench.harness.timelines.cases import LearningPlan
+from s2a_bench.harness.timelines.link import ModelLink, PlanPrompt, PromptPlan, plan_requests
 from s2a_bench.harness.timelines.policies import Following, prepare
-from s2a_bench.plan import Parser
+from s2a_bench.plan import Parser, SkillSet
 from s2a_bench.progress import Progress, watching
 from s2a_bench.store.requests import SKILLS
+from s2a_bench.types import Timing
+
+
+@dataclass(frozen=True, slots=True)
+class LivePlan:
+    """A run of timelines on a model's plans."""
+
+    requests: RunPlan
+    prompts: Sequence[PlanPrompt]
+    learning: LearningPlan
+    robot: str
+    skills: SkillSet
+
+
+def resolve_live(config: TimelineLive, progress: Progress) -> LivePlan:
+    """Decide what follows from a configuration, with the model's files; raises S2AError."""
+    plans = prompt_plan(config)
+    requests, prompts = plan_requests(config.requests.but(seed=config.seed), plans, progress)
+    engine = {"engine": requests.engine.to_manifest()}
+    requests = requests.with_manifest(
+        configuration={**requests.manifest["configuration"], **config.to_manifest(), **engine},
+        seeds={"sampling": config.seed, "source": config.seed, "nonce": requests.feed.nonce},
+    )
+    learning = LearningPlan(config.chosen, config.seed, config.epsilon, config.track)
+    return LivePlan(requests, prompts, learning, config.robot, config.skill_set)
+
+
+def prompt_plan(config: TimelineLive) -> PromptPlan:
+    skills = config.skill_set
+    given = [_lasting(skills, config.lasting(t_nom_s)) for t_nom_s in config.t_nom_s]
+    return PromptPlan(given or [skills], config.tokens_per_skill, config.n_skills, config.task, not config.no_grammar)
+
+
+def _lasting(skills: SkillSet, durations: Timing) -> SkillSet:
+    """Return a skill set in which every skill has the same durations."""
+    return replace(skills, skills=tuple(replace(skill, durations=durations) for skill in skills.skills))
 
 
 def run_live(config: TimelineLive, output: Path, progress: Progress) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -11,24 +11,28 @@ from s2a_bench.act.events import Requested, SkillArrived, StreamEnded, TokenArri
 from s2a_bench.act.executor import SILENCE_S
 from s2a_bench.act.record import Record
 from s2a_bench.act.timed import TimedRobot
+from s2a_bench.boards.gaps import to_table
+from s2a_bench.boards.tokens import Board
 from s2a_bench.clock import SystemClock, quick_switching
+from s2a_bench.errors import UsageError
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
 from s2a_bench.experiments.timeline.config import TimelineComputed, TimelineRealTime
 from s2a_bench.experiments.timeline.execution import SideBySide, jitter_facts, keep
-from s2a_bench.experiments.timeline.plan import ModelledPlan, resolve
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.watch import Scene
-from s2a_bench.harness.timelines.cases import PlanCase, PlanSetting
-from s2a_bench.harness.timelines.policies import Following, draw, finite, learn
+from s2a_bench.harness.timelines.cases import LearningPlan, PlanCase, PlanSetting
+from s2a_bench.harness.timelines.policies import Following, draw, finite, learn, plans_of
 from s2a_bench.harness.timelines.rows import KEPT_PLANS, skill_rows, token_rows
 from s2a_bench.harness.warnings import exchange_warnings
+from s2a_bench.machine import environment
 from s2a_bench.plan import Call, Skill
 from s2a_bench.policy import Plans
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.progress import Progress, watching
+from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.requests import SKILLS, TOKENS, TokenRow
-from s2a_bench.store.run import RunWriter
+from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.store.schema import Table
 from s2a_bench.types import Timing
 
@@ -36,6 +40,41 @@ if TYPE_CHECKING:
     from s2a_bench.policy import Floats
 
 TABLES: Final = (TIMELINES, SKILLS, TOKENS)
+
+
+@dataclass(frozen=True, slots=True)
+class ModelledPlan:
+    """A run of timelines on modelled tokens, computed or played."""
+
+    cases: Sequence[PlanCase]
+    plans: int
+    """Plans of a case."""
+    learning: LearningPlan
+    manifest: dict[str, Any]
+
+
+def resolve(config: TimelineComputed) -> ModelledPlan:
+    """Decide what follows from a configuration; raises S2AError for recorded answers that are missing or too short."""
+    manifest = {
+        "configuration": config.to_manifest(),
+        "environment": environment.collect(),
+        "seeds": {"plans": config.seed},
+        "boards": [_facts(board) for board in config.boards],
+        "provenance": _origins(config).to_manifest(),
+    }
+    learning = LearningPlan(
+        policies=config.chosen,
+        seed=config.seed,
+        epsilon=config.epsilon,
+        track=config.track,
+        random=config.random,
+        calibration_plans=config.calibration_plans,
+        guarantee=config.guarantee,
+        answers=recordings(config.calibrate) if config.calibrate else (),
+    )
+    for case in config.cases if learning.answers else ():
+        plans_of(case, learning)  # refuse before the folder is created
+    return ModelledPlan(config.cases, config.plans_a_cell, learning, manifest)
 
 
 def run_timeline(config: TimelineComputed, output: Path, progress: Progress) -> Path:
@@ -172,3 +211,40 @@ def _play(token_s: Floats, plans: Plans, tokens_per_skill: int, executors: SideB
             executors.send(SkillArrived(at_ns, next(calls)))
     executors.send(StreamEnded(clock.now_ns()))
     executors.finish()
+
+
+def recordings(folder: Path) -> list[Floats]:
+    """Return the token times, in s from the request, of the requests that count of a latency or throughput run.
+
+    Raises StoreError without a run, UsageError without tokens.
+    """
+    run = read_run(folder)
+    samples = run.samples
+    good = samples[~samples["warmup"] & (samples["error"] == "") & samples["ttft_ns"].notna()]
+    tokens = run.tokens.sort_values("index").groupby("request_id")["client_ns"]
+    times = {request_id: column.to_numpy(dtype="float64") for request_id, column in tokens}
+    answers = [
+        (times[sample["request_id"]] - times[sample["request_id"]][0] + float(sample["ttft_ns"])) / 1e9
+        for sample in good.to_dict("records")
+        if sample["request_id"] in times
+    ]
+    if not answers:
+        raise UsageError(f"`calibrate`: {folder} holds no answers; give the run folder of a latency or throughput run")
+    return answers
+
+
+def _origins(config: TimelineComputed) -> Origins:
+    clock = "virtual" if config.virtual else "monotonic"
+    cells = {
+        name: replace(case.board.provenance, clock=clock)
+        for case in config.cases
+        for name in (case.setting.name, *(f"{case.setting.name}/{policy}" for policy in config.chosen))
+    }
+    return Origins(next(iter(cells.values()), Provenance()), cells)
+
+
+def _facts(board: Board) -> dict[str, Any]:
+    """Return a board as plain data, without a recording's gaps."""
+    plain = asdict(board) | {"gaps": to_table(board.gaps)}
+    plain["gaps"].pop("trace", None)
+    return plain
