@@ -79,42 +79,37 @@ class Flag:
         return self.name.replace("-", "_")
 
 
-@dataclass(frozen=True, slots=True)
-class OneOf:
-    """The options of an experiment with modes: each flag once, and those that pick a mode."""
-
-    experiment: Experiment
-
-    def flags(self) -> Iterator[Flag]:
-        """Yield the flags; the headings of those that not every mode has say which flags they go with."""
-        modes = self.experiment.every_mode
-        abouts = (pair for mode in modes for pair in mode.flags.items() if pair[1])
-        for flag, about in abouts:
+def _flags_of_modes(experiment: Experiment) -> Iterator[Flag]:
+    """Yield the flags that pick a mode, and those of all modes, each once; their headings say which modes have them."""
+    modes = experiment.every_mode
+    for flag, about in (pair for mode in modes for pair in mode.flags.items()):
+        if about:
             yield Flag(flag.replace("_", "-"), (flag,), bool, about, panel="Modes", first=True)
-        found: dict[str, dict[RunMode, Flag]] = {}
-        for mode in modes:
-            for each in distinct([*flags_of(mode.options)]):
-                found.setdefault(each.name, {})[mode] = each
-        for of_mode in found.values():
-            first = next(iter(of_mode.values()))
-            panel = f"{first.panel or 'Options'}{_with(modes, of_mode)}"
-            about = _with_defaults({mode.name: each.about for mode, each in of_mode.items()})
-            yield replace(first, panel=panel, about=about, needed=False)
+    found: dict[str, dict[RunMode, Flag]] = {}
+    for mode in modes:
+        for each in distinct([*flags_of(mode.options)]):
+            found.setdefault(each.name, {})[mode] = each
+    for of_mode in found.values():
+        first = next(iter(of_mode.values()))
+        panel = f"{first.panel or 'Options'}{_with(modes, of_mode)}"
+        about = _with_defaults({mode.name: each.about for mode, each in of_mode.items()})
+        yield replace(first, panel=panel, about=about, needed=False)
 
-    def build(self, given: Mapping[str, Any]) -> Options:
-        """Build the configuration of the mode that the flags pick; raises UsageError for options of another."""
-        modes = self.experiment.every_mode
-        flags = {flag for mode in modes for flag in mode.flags}
-        given = {name: value for name, value in given.items() if value is not None and (value or name not in flags)}
-        mode = next((each for each in modes if {*each.flags} == flags & given.keys()), None)
-        if mode is None:
-            raise UsageError(f"{' and '.join(f'`{flag}`' for flag in sorted(flags & given.keys()))} exclude each other")
-        for name in (flag.key for flag in self.flags() if flag.key in given):
-            if other := self.experiment.other_mode(mode, name):
-                missing = [f"give `{flag}`" for flag in other.flags if flag not in mode.flags]
-                spare = [f"leave out `{flag}`" for flag in mode.flags if flag not in other.flags]
-                raise UsageError(f"`{name}` is an option of mode {other.name}: {', '.join(missing + spare)}")
-        return build(mode.options, given)
+
+def _picked(experiment: Experiment, given: Mapping[str, Any]) -> type[Options]:
+    """Return the class of the mode that the flags pick; raises UsageError for options of another."""
+    modes = experiment.every_mode
+    picking = {flag for mode in modes for flag in mode.flags if given.get(flag)}
+    mode = next((each for each in modes if {*each.flags} == picking), None)
+    if mode is None:
+        raise UsageError(f"{' and '.join(f'`{flag}`' for flag in sorted(picking))} exclude each other")
+    for name in (flag.key for flag in _flags_of_modes(experiment) if given.get(flag.key) is not None):
+        other = experiment.other_mode(mode, name)
+        if other and (given[name] or name not in other.flags):
+            missing = [f"give `{flag}`" for flag in other.flags if flag not in mode.flags]
+            spare = [f"leave out `{flag}`" for flag in mode.flags if flag not in other.flags]
+            raise UsageError(f"`{name}` is an option of mode {other.name}: {', '.join(missing + spare)}")
+    return mode.options
 
 
 def _with(modes: Sequence[RunMode], owners: Collection[RunMode]) -> str:
@@ -128,12 +123,12 @@ def _with(modes: Sequence[RunMode], owners: Collection[RunMode]) -> str:
     return f" ({word} {' '.join(common) or ' or '.join(single)})".replace("_", "-")
 
 
-def flags_of(options: type[Options] | OneOf) -> Iterator[Flag]:
-    """Yield the flags of a configuration in the order of its fields, groups included."""
+def flags_of(options: type[Options] | Experiment) -> Iterator[Flag]:
+    """Yield the flags of a configuration, or of an experiment with modes, in the order of fields, groups included."""
     from s2a_bench.options import completions, extra_of, group_of, help_place
 
-    if isinstance(options, OneOf):
-        yield from options.flags()
+    if not isinstance(options, type):
+        yield from _flags_of_modes(options)
         return
     for name, field in options.model_fields.items():
         extra = extra_of(field)
@@ -152,7 +147,9 @@ def flags_of(options: type[Options] | OneOf) -> Iterator[Flag]:
             yield replace(flag, panel=panel, first=first, names=completions(field))
 
 
-def command(function: Callable[..., None], *options: type[Options] | OneOf, about: str = "") -> Callable[..., None]:
+def command(
+    function: Callable[..., None], *options: type[Options] | Experiment, about: str = ""
+) -> Callable[..., None]:
     """Return a function for typer that builds every class of ``options`` from its flags and calls ``function``.
 
     ``function`` receives one configuration a class, in order. Its keyword-only parameters annotated for typer are
@@ -235,18 +232,18 @@ def _with_defaults(abouts: Mapping[str, str]) -> str:
     return DEFAULT.sub(f" [default: {defaults}]", first)
 
 
-def build(options: type[Options] | OneOf, given: Mapping[str, Any]) -> Options:
+def build(options: type[Options] | Experiment, given: Mapping[str, Any]) -> Options:
     """Build a configuration from a command's parameters; raises UsageError naming the field."""
     from s2a_bench.options import nested
 
-    if isinstance(options, OneOf):
-        return options.build(given)
+    if not isinstance(options, type):
+        options = _picked(options, given)
     typed = (flag for same in _by_name([*flags_of(options)]) for flag in same)
     return options(**nested((flag.path, given[flag.key]) for flag in typed if given.get(flag.key) is not None))
 
 
 @contextmanager
-def flags_named(*options: type[Options] | OneOf) -> Iterator[None]:
+def flags_named(*options: type[Options] | Experiment) -> Iterator[None]:
     """Translate the fields in UsageErrors to the flags of ``options``."""
     try:
         yield

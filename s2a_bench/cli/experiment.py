@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from s2a_bench.cli import output as terminal
-from s2a_bench.cli.adapter import HELP_ALL, OneOf, command
+from s2a_bench.cli.adapter import HELP_ALL, command
 from s2a_bench.cli.output import Json, print_failures, print_json, print_line
 from s2a_bench.errors import S2AError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, Shown, write_shown
@@ -111,9 +111,9 @@ def click_command(name: str) -> Any:
     return _click(name, command_of(EXPERIMENTS[name]))
 
 
-def options_of(experiment: Experiment) -> tuple[type[Options] | OneOf, ...]:
-    """Return the classes of an experiment's options: of the run, and of its view."""
-    run = OneOf(experiment) if experiment.modes else resolve_name(experiment.config)
+def options_of(experiment: Experiment) -> tuple[type[Options] | Experiment, ...]:
+    """Return what declares an experiment's options: of the run, itself if it has modes; and of its view."""
+    run = experiment if experiment.modes else resolve_name(experiment.config)
     return (run, resolve_name(experiment.view_options)) if experiment.view_options else (run,)
 
 

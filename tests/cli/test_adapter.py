@@ -96,7 +96,7 @@ def test_groups_beside_each_other_share_a_flag() -> None:
     )
     about = {flag.name: flag.prefix + flag.about for flag in distinct([*flags_of(Both)])}
     assert about == {
-        "port": "here, there: port of the server [default: here 0, there 8]",
+        "port": "here, there: port of the server [default: here 0; there 8]",
         "own": "here: what nobody else has",
     }
 

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import pytest
 
 from s2a_bench import library
-from s2a_bench.cli.adapter import OneOf, build, flags_named, flags_of
+from s2a_bench.cli.adapter import build, flags_named, flags_of
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments import EXPERIMENTS, Experiment, RunMode
 from s2a_bench.options import Options, group, option
@@ -74,8 +74,8 @@ TOY = Experiment(
 
 
 def made(**given: Any) -> Options:
-    with flags_named(OneOf(TOY)):
-        return build(OneOf(TOY), given)
+    with flags_named(TOY):
+        return build(TOY, given)
 
 
 def test_flags_pick_the_class_and_its_function() -> None:
@@ -115,7 +115,7 @@ def test_an_option_of_another_mode_is_refused_with_the_way_out(given: dict[str, 
 
 def test_help_groups_options_by_mode_and_names_the_defaults_of_each() -> None:
     panels: dict[str, list[str]] = {}
-    for flag in flags_of(OneOf(TOY)):
+    for flag in flags_of(TOY):
         panels.setdefault(flag.panel, []).append(flag.name)
     assert panels == {
         "Modes": ["live", "closed-loop"],
@@ -126,9 +126,9 @@ def test_help_groups_options_by_mode_and_names_the_defaults_of_each() -> None:
         "Plans (with --live --closed-loop)": ["step-s"],
         "Plans (with --predict)": ["predict"],
     }
-    abouts = {flag.name: flag.about for flag in flags_of(OneOf(TOY))}
+    abouts = {flag.name: flag.about for flag in flags_of(TOY)}
     assert abouts["lengths"] == "tokens a skill [default: computed 6; live, loop 4]"
-    assert not any(flag.needed for flag in flags_of(OneOf(TOY)))
+    assert not any(flag.needed for flag in flags_of(TOY))
 
 
 @pytest.fixture

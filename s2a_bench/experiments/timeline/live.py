@@ -30,7 +30,6 @@ from s2a_bench.harness.timelines.policies import Following, prepare
 from s2a_bench.plan import Parser, SkillSet
 from s2a_bench.progress import Progress, watching
 from s2a_bench.store.requests import SKILLS
-from s2a_bench.types import Timing
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,13 +58,11 @@ def resolve_live(config: TimelineLive, progress: Progress) -> LivePlan:
 
 def prompt_plan(config: TimelineLive) -> PromptPlan:
     skills = config.skill_set
-    given = [_lasting(skills, config.lasting(t_nom_s)) for t_nom_s in config.t_nom_s]
+    given = [
+        replace(skills, skills=tuple(replace(each, durations=config.lasting(t_nom_s)) for each in skills.skills))
+        for t_nom_s in config.t_nom_s
+    ]
     return PromptPlan(given or [skills], config.tokens_per_skill, config.n_skills, config.task, not config.no_grammar)
-
-
-def _lasting(skills: SkillSet, durations: Timing) -> SkillSet:
-    """Return a skill set in which every skill has the same durations."""
-    return replace(skills, skills=tuple(replace(skill, durations=durations) for skill in skills.skills))
 
 
 def run_live(config: TimelineLive, output: Path, progress: Progress) -> Path:
