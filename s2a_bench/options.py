@@ -53,13 +53,6 @@ class Options(BaseModel):
     def given_values(self) -> dict[str, Any]:
         return {name: getattr(self, name) for name in self.model_fields_set}
 
-    def given(self, options: type[Options] | None = None) -> Iterator[str]:
-        """Yield the fields that were given a value; with ``options``, a base class, only its fields."""
-        for name in type(self).model_fields:
-            if name in self.model_fields_set and (options is None or name in options.model_fields):
-                value = getattr(self, name)
-                yield from value.given() if isinstance(value, Options) else [name]
-
     def risks(self) -> Iterator[tuple[str, str, str]]:
         """Yield name, `risk` and value of the given fields that an untrusted file should not set."""
         for name in self.model_fields_set:
@@ -276,7 +269,6 @@ SEVERAL = BeforeValidator(listed)
 
 Names = Annotated[tuple[str, ...], SEVERAL]
 Numbers = Annotated[tuple[float, ...], SEVERAL]
-WholeNumbers = Annotated[tuple[int, ...], SEVERAL]
 
 Size = Annotated[tuple[int, int], BeforeValidator(_size, json_schema_input_type=str | tuple[int, int])]
 """Width and height; as text 640x480."""

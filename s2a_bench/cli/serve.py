@@ -72,7 +72,7 @@ def _serve(config: Any) -> None:
     if not chosen.serves:
         raise UsageError(f"`transport`: {chosen.name} is a client alone; start the server of which it is one")
     for other, _ in TRANSPORTS.loaded():
-        if stray := [each for each in getattr(config, other, Options()).given() if each not in served_options(chosen)]:
+        if stray := sorted(getattr(config, other, Options()).model_fields_set - {*served_options(chosen)}):
             raise UsageError(f"`{stray[0]}` is no option of {chosen.name}; it has {', '.join(served_options(chosen))}")
     flags = getattr(config, chosen.name, Options()).given_values()
     where = f"`config` {config.config}"

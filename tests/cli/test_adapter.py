@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import pytest
 import typer
@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from s2a_bench.cli.adapter import command, distinct, flags_of
 from s2a_bench.errors import UsageError
-from s2a_bench.options import Names, Options, Size, TextOrFile, WholeNumbers, group, option, placed
+from s2a_bench.options import SEVERAL, Names, Options, Size, TextOrFile, group, option, placed
 
 
 class Engine(Options):
@@ -24,7 +24,7 @@ class Asked(Options):
     runs: int = option(50, "samples", ge=1, le=100)
     t_nom_s: float = option(1.0, "seconds a skill takes", flag="t-nom", gt=0)
     names: Names = option(("a", "b"), "several with commas")
-    lengths: WholeNumbers = option((6,), "L")
+    lengths: Annotated[tuple[int, ...], SEVERAL] = option((6,), "L")
     quick: bool = option(False, "a first look")
     engine: Engine = Engine()
 

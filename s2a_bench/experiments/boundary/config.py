@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Final
+from typing import Annotated, ClassVar, Final
+
+from pydantic import Field
 
 from s2a_bench.boards.tokens import NO_JITTER, gaps_of
 from s2a_bench.errors import UsageError
-from s2a_bench.options import Names, Numbers, Options, WholeNumbers, option
+from s2a_bench.options import SEVERAL, Names, Numbers, Options, option
 
 PLANS: Final = 2000
 """Plans a point with jitter; without jitter all plans are equal."""
 MARKS, SHADES = 25, 73
 """Rates of a grid that is drawn as marks, or as shades."""
+
+Length = Annotated[int, Field(ge=1, le=1000)]
 
 
 class BoundaryConfig(Options):
@@ -24,7 +28,7 @@ class BoundaryConfig(Options):
         "boards to mark: names of 'profile list', or paths; several with commas",
         flag="profile",
     )
-    tokens_per_skill: WholeNumbers = option((6, 4, 2, 1), "L at which boards are marked")
+    tokens_per_skill: Annotated[tuple[Length, ...], SEVERAL] = option((6, 4, 2, 1), "L at which boards are marked")
     most_tokens: int = option(8, "the plane has L = 1 to this", ge=1, le=1000)
     rates: Numbers = option((0.3, 60.0), "tokens/s of the plane: from, to")
     points: int | None = option(
@@ -53,9 +57,6 @@ class BoundaryConfig(Options):
     def check(self) -> None:
         if len(self.rates) != 2 or not 0 < self.rates[0] < self.rates[1] < float("inf"):  # noqa: PLR2004 - from, to
             raise UsageError("`rates`: should be two tokens/s, the lower first, as 0.3,60")
-        for tokens in self.tokens_per_skill:
-            if not 1 <= tokens <= 1000:  # noqa: PLR2004
-                raise UsageError(f"`tokens_per_skill`: {tokens} should be 1 or more and at most 1000")
         if self.jitter == NO_JITTER and self.plans_a_point > 1:
             raise UsageError("`plans`: without `jitter` all plans are the same; leave it out")
         gaps_of(self.jitter, 1.0)

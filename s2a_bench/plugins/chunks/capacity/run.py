@@ -55,15 +55,6 @@ LATEST: Final = 0.05
 """Lateness of the generator's ticks at p99, as a share of a tick, above which a fleet is no measurement."""
 
 
-@dataclass(frozen=True, slots=True)
-class Hosts:
-    """Where the robots are: in so many processes of this host, or of a cluster."""
-
-    processes: int
-    ray: Any = None
-    """None: on this host."""
-
-
 def run_measured(config: CapacityMeasured, output: Path, progress: Progress) -> Path:
     """Measure and return the run folder, which keeps what was measured if S2AError is raised."""
     plan = resolve(config.robots_requests, progress.say)
@@ -80,8 +71,8 @@ def run_measured(config: CapacityMeasured, output: Path, progress: Progress) -> 
         ray = connect(config.ray, config.processes) if config.ray else None
         if ray is not None:
             stack.callback(ray.shutdown)
-        hosts = Hosts(config.processes, ray)
-        task = Task("capacity", drive=partial(_drive, config.loads, config.search, hosts), tables=(FLEETS, KNEES))
+        drive = partial(_drive, config.loads, config.search, config.processes, ray)
+        task = Task("capacity", drive=drive, tables=(FLEETS, KNEES))
         return run_requests(task, plan, output, progress)
 
 
@@ -97,7 +88,7 @@ def twin(cell: Pipeline) -> Pipeline:
     return replace(own, name=cell.name + TWIN, engine=(*ECHO, *ECHO_OF_MODEL))  # type: ignore[arg-type]
 
 
-def _drive(loads: Sequence[RobotLoad], plan: SearchPlan, hosts: Hosts, launch: RunningLaunch) -> None:
+def _drive(loads: Sequence[RobotLoad], plan: SearchPlan, processes: int, ray: Any, launch: RunningLaunch) -> None:
     sessions = [session for session in launch.sessions if not session.cell.name.endswith(TWIN)]
     twins = launch.sessions[len(sessions) :]
     for position, session in enumerate(launch.sessions):
@@ -108,7 +99,7 @@ def _drive(loads: Sequence[RobotLoad], plan: SearchPlan, hosts: Hosts, launch: R
     for session, instant in zip_longest(sessions, twins):
         service: Service | None = None
         for place, load in enumerate(loads):
-            robots = partial(_Robots, load, plan, hosts, launch, place * STRIDE * STRIDE)
+            robots = partial(_Robots, load, plan, processes, ray, launch, place * STRIDE * STRIDE)
             judge = Judge(plan.limit, load.beyond_alone(plan.limit), load.settle_ns, plan.confidence)
             cell = _Cell(load, plan, judge, launch, robots, session, instant, service)
             cell.run()
@@ -212,7 +203,8 @@ class _Robots(ExitStack):
         self,
         load: RobotLoad,
         search: SearchPlan,
-        hosts: Hosts,
+        processes: int,
+        ray: Any,
         launch: RunningLaunch,
         first: int,
         session: Session,
@@ -225,7 +217,7 @@ class _Robots(ExitStack):
         self._number, self._error = 1, ""
         self.name = load.of(session.cell.name)
         self._fleets: list[Any]
-        cell, processes, ray = session.cell, hosts.processes, hosts.ray
+        cell = session.cell
         in_process = cell.transport.in_process
         own = cell if twin and (ray is not None or (in_process and processes > 1)) else None
         wiring = launch.wiring(cell).to_json()

@@ -137,10 +137,10 @@ def robots_of(monkeypatch: pytest.MonkeyPatch, *, twin: bool = False, **options:
             run_module, kind, lambda plan, kind=kind: SimpleNamespace(kind=kind, plan=plan, close=lambda: None)
         )
     config = CapacityMeasured(**options)
-    plan, hosts = resolve(config.robots_requests, print), run_module.Hosts(config.processes)
+    plan = resolve(config.robots_requests, print)
     launch: Any = SimpleNamespace(plan=plan, wiring=lambda _: SimpleNamespace(to_json=dict))
     session: Any = SimpleNamespace(cell=plan.cells[0], origin=None)
-    return _Robots(config.loads[0], config.search, hosts, launch, 0, session, twin=twin)
+    return _Robots(config.loads[0], config.search, config.processes, None, launch, 0, session, twin=twin)
 
 
 @pytest.mark.parametrize(
