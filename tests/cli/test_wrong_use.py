@@ -33,7 +33,6 @@ WRONG = {
     ],
     "timeline": [
         ("--policy 'stream-to-act?cauton=2'", "; did you mean caution?"),
-        ("--live --plans 3", "--plans is an option of mode computed: leave out --live"),
         ("--jitter fog", "--jitter fog: family: 'fog' is none of"),
         ("--pace 4.8", "--pace is an option of mode live: give --live"),
         ("--live --real-time", "--live and --real-time exclude each other"),
