@@ -71,7 +71,7 @@ class CcrbModelled(CcrbDrives):
     PACED_BY: ClassVar[str] = "`rate` or `profile`"
     virtual: ClassVar[bool] = True
 
-    profile: str = option(BOARD, "the board: a name of 'profile list', or a path", first=True, names=profile_files)
+    profile: str = option(BOARD, "the board, or what replay plays: a name, or a path", first=True, names=profile_files)
     rate: float | None = option(None, "a board of which only the tokens/s are known", gt=0, allow_inf_nan=False)
     prompt_s: float | None = PROMPT_TIME
 

@@ -51,7 +51,7 @@ class RulesPlan:
 
 def rules_option(default: tuple[str, ...]) -> Any:
     about = "further rows for the first queue, its trigger chosen by each; empty text for none"
-    return option(default, about, first=True)
+    return option(default, about if default else f"{about} [default: none]", first=True)
 
 
 class ChunksOptions(ControlOptions):
