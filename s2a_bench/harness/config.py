@@ -114,6 +114,12 @@ GROUPED: Final = (
 """The fields of requests that are flags where requests are one group of an experiment's options."""
 
 
+def sampling(hz: float) -> Any:
+    """Declare the option of readings beside a run, with its default rate."""
+    about = "readings a second of CPU, memory, GPU and power beside the run; 0: none"
+    return option(hz, about, flag="sample-resources", ge=0, le=1000)
+
+
 class RequestsConfig(Surrounded):
     PANEL: ClassVar[str] = "Requests"
     QUICK: ClassVar[dict[str, int]] = {"requests": 10, "warmup": 2, "max_tokens": 8}
@@ -151,13 +157,7 @@ class RequestsConfig(Surrounded):
         ge=0,
         le=86_400,
     )
-    sample_resources_hz: float = option(
-        10.0,
-        "readings a second of CPU, memory, GPU and power beside the run; 0: none",
-        flag="sample-resources",
-        ge=0,
-        le=1000,
-    )
+    sample_resources_hz: float = sampling(10.0)
     record: Path | None = RECORD
     quick: bool = option(False, "fewer samples: a first look", first=True)
 

@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import ClassVar
 
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.config import FirstVariants
+from s2a_bench.harness.config import FirstVariants, sampling
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Names, Options, group, option
 from s2a_bench.policy import COMPARED, POLICIES, PlanShape, Policy, Timing, policies
@@ -56,13 +56,7 @@ class PlanRequests(FirstVariants):
     timeout_s: float = option(
         60.0, "seconds without a token after which the robot holds", flag="timeout", ge=0.1, le=86_400
     )
-    sample_resources_hz: float = option(
-        0.0,
-        "readings a second of CPU, memory, GPU and power beside the run; 0: none",
-        flag="sample-resources",
-        ge=0,
-        le=1000,
-    )
+    sample_resources_hz: float = sampling(0.0)
 
     def check(self) -> None:
         super().check()

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Final
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.config import GROUPED, FirstVariants
+from s2a_bench.harness.config import GROUPED, FirstVariants, sampling
 from s2a_bench.inference import STAND_IN, EngineConfig, Written
 from s2a_bench.options import Names, Options, group, option
 from s2a_bench.plugins.chunks.modes import COMPARED, MODES, ControlSetting, Mode, Rounding, modes
@@ -85,13 +85,7 @@ class LoopRequests(FirstVariants):
     )
     engine: EngineConfig = group(EngineConfig, only=("name", "profile", "gaps", "action_dim"))
     warmup: int = option(5, "requests before a cell's loop starts, kept and marked", ge=1, le=10**6)
-    sample_resources_hz: float = option(
-        0.0,
-        "readings a second of CPU, memory, GPU and power beside the run; 0: none",
-        flag="sample-resources",
-        ge=0,
-        le=1000,
-    )
+    sample_resources_hz: float = sampling(0.0)
 
 
 class ServedOptions(ControlOptions):

@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal
 from pydantic import BeforeValidator
 
 from s2a_bench.errors import UsageError
-from s2a_bench.harness.config import GROUPED
+from s2a_bench.harness.config import GROUPED, sampling
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Names, group, option
 from s2a_bench.plugins.chunks.modes import ControlSetting, Mode
@@ -126,13 +126,7 @@ class CapacityRequests(LoopRequests):
     engine: EngineConfig = group(
         EngineConfig, only=set(EngineConfig.model_fields) - {"answer", "horizon", "latency", "batch"}
     )
-    sample_resources_hz: float = option(
-        2.0,
-        "readings a second of CPU, memory, GPU and power beside the run; 0: none",
-        flag="sample-resources",
-        ge=0,
-        le=1000,
-    )
+    sample_resources_hz: float = sampling(2.0)
 
 
 class CapacityOptions(ControlOptions):
