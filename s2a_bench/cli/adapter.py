@@ -103,9 +103,9 @@ def _picked(experiment: Experiment, given: Mapping[str, Any]) -> type[Options]:
     mode = next((each for each in modes if {*each.flags} == picking), None)
     if mode is None:
         raise UsageError(f"{' and '.join(f'`{flag}`' for flag in sorted(picking))} exclude each other")
-    for name in (flag.key for flag in _flags_of_modes(experiment) if given.get(flag.key) is not None):
-        other = experiment.other_mode(mode, name)
-        if other and (given[name] or name not in other.flags):
+    for name, value in given.items():
+        other = None if value is None else experiment.other_mode(mode, name)
+        if other and (value or name not in other.flags):
             missing = [f"give `{flag}`" for flag in other.flags if flag not in mode.flags]
             spare = [f"leave out `{flag}`" for flag in mode.flags if flag not in other.flags]
             raise UsageError(f"`{name}` is an option of mode {other.name}: {', '.join(missing + spare)}")
