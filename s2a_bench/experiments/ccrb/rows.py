@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 from s2a_bench.experiments import COUNT, TIME, Better, Metric, columns
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
-from s2a_bench.store.schema import Many, NonNegative, Positive, Table, about, with_fields
+from s2a_bench.store.schema import Facts, Many, NonNegative, Positive, Table, about, with_fields
 
 _DEADLINE: Final = (
     "S_front: the latest start of the planned braking that keeps 2 m to the lead; negative: too late at the request."
@@ -70,16 +70,16 @@ class AboutRollout:
     of a live model.
     """
 
-    cell: Annotated[str, {"minLength": 1}]
+    cell: Annotated[str, Facts(minLength=1)]
     study: str
     draw: int
-    policy: Annotated[str, {"minLength": 1}]
+    policy: Annotated[str, Facts(minLength=1)]
     board: str
     title: str
     emulated: Annotated[bool, about("True where no model answered.")]
-    simulator: Annotated[str, {"minLength": 1}]
-    follower: Annotated[str, {"enum": list(FOLLOWERS)}]
-    gap_behaviour: Annotated[str, {"enum": list(GAPS)}]
+    simulator: Annotated[str, Facts(minLength=1)]
+    follower: Annotated[str, Facts(enum=list(FOLLOWERS))]
+    gap_behaviour: Annotated[str, Facts(enum=list(GAPS))]
     reflex: bool
     lane_change: bool
     tokens_per_s: float
@@ -106,7 +106,7 @@ RolloutRow: Final = with_fields(
     {
         **columns(TIMES),
         "late": Annotated[bool | None, about("s2a-ttc only: no stall-free start keeps the deadline.")],
-        "outcome": Annotated[str, {"enum": ["none", "front", "rear", "both"]}],
+        "outcome": Literal["none", "front", "rear", "both"],
         **columns((*IMPACTS, *MARGINS, *MOTION, *LOOP)),
     },
 )
