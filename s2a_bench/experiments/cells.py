@@ -52,10 +52,9 @@ class Metric:
     name: str = ""
     column: str = ""
 
-    @property
-    def schema(self) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(self, core: Any, schema_of: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
         facts = {"description": self.about or None, "minimum": self.bounds[0], "maximum": self.bounds[1]}
-        return {key: value for key, value in facts.items() if value is not None}
+        return schema_of(core) | {key: value for key, value in facts.items() if value is not None}
 
     def of_column(self, column: str, type_of_values: type) -> Self:
         """Return the metric with what follows from its column."""

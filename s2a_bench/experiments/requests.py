@@ -35,7 +35,7 @@ from s2a_bench.provenance import NONE, NOT_SENT, UNKNOWN
 from s2a_bench.stats import Floats, Ratio, Summary, SummaryEnds, summary_of
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import ONE_WAY
-from s2a_bench.store.schema import Count, about, with_fields
+from s2a_bench.store.schema import Count, Facts, about, with_fields
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport, payload_order
 from s2a_bench.transport.pipeline import without
@@ -514,7 +514,7 @@ class RequestsCell:
     connection: str
     engine: str
     mode: Literal["request", "stream"]
-    size: Annotated[str, {"pattern": "^[0-9]+x[0-9]+$"}]
+    size: Annotated[str, Facts(pattern="^[0-9]+x[0-9]+$")]
     observation: Annotated[
         str, about("What each request brings: sizes, number of pictures, scaling, numbers of the robot's state.")
     ]

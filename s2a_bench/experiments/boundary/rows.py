@@ -8,7 +8,6 @@ from typing import Annotated, Final, Literal, TypeAlias
 from s2a_bench.experiments.cells import JsonKey
 from s2a_bench.store.schema import Fraction, Many, Positive, Table, about
 
-
 Duration: TypeAlias = Literal["t_nom", "t_min"]
 
 

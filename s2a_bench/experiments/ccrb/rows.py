@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 from s2a_bench.experiments.cells import ANY, HIDDEN, JsonKey, Metric, metrics_of
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
-from s2a_bench.store.schema import Many, NonNegative, Positive, Table, about
+from s2a_bench.store.schema import Facts, Many, NonNegative, Positive, Table, about
 
 _DEADLINE: Final = (
     "S_front: the latest start of the planned braking that keeps 2 m to the lead; negative: too late at the request."
@@ -30,16 +30,16 @@ class RolloutRow:
     of a live model.
     """
 
-    cell: Annotated[str, {"minLength": 1}]
+    cell: Annotated[str, Facts(minLength=1)]
     study: str
     draw: Annotated[int, HIDDEN]
-    policy: Annotated[str, {"minLength": 1}]
+    policy: Annotated[str, Facts(minLength=1)]
     board: Annotated[str, JsonKey("profile")]
     title: Annotated[str, HIDDEN]
     emulated: Annotated[bool, about("True where no model answered.")]
-    simulator: Annotated[str, {"minLength": 1}]
-    follower: Annotated[str, {"enum": list(FOLLOWERS)}]
-    gap_behaviour: Annotated[str, {"enum": list(GAPS)}]
+    simulator: Annotated[str, Facts(minLength=1)]
+    follower: Annotated[str, Facts(enum=list(FOLLOWERS))]
+    gap_behaviour: Annotated[str, Facts(enum=list(GAPS))]
     reflex: bool
     lane_change: bool
     tokens_per_s: Annotated[Positive, JsonKey("rate_tokens_per_s")]
@@ -63,7 +63,7 @@ class RolloutRow:
     stall_ns: Annotated[int, Metric("stalled")]
     deadline_ns: Annotated[int, Metric(about=_DEADLINE, bounds=ANY)]
     late: Annotated[bool | None, about("s2a-ttc only: no stall-free start keeps the deadline.")] = None
-    outcome: Annotated[str, {"enum": ["none", "front", "rear", "both"]}]
+    outcome: Literal["none", "front", "rear", "both"]
     impact_speed_mps: Annotated[
         float | None, Metric("impact", "Of the harder impact; absent without one.", unit="m/s", bounds=_IMPACT)
     ] = None
