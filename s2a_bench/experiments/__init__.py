@@ -30,12 +30,11 @@ from s2a_bench.registry import Registry
 from s2a_bench.store.schema import PROVENANCE, Facts
 
 if TYPE_CHECKING:
-    import numpy as np
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
     from s2a_bench.options import Options
     from s2a_bench.progress import Progress
+    from s2a_bench.stats.batches import Rows
     from s2a_bench.store.run import StoredRun
     from s2a_bench.store.schema import Table
     from s2a_bench.writers.csv_text import CsvTable
@@ -44,8 +43,6 @@ if TYPE_CHECKING:
 
 TIME, COUNT, FLAG, SHARE, NUMBER = "time", "count", "flag", "share", "number"
 Better: TypeAlias = Literal["lower", "higher", "neither"]
-Rows: TypeAlias = "list[NDArray[np.float64]]"
-"""The values of a metric: one array a request or plan, in the order in which they were made."""
 Tables: TypeAlias = "dict[str, Callable[[], TextTable | None]]"
 """What builds the tables of a run, by their names; None is no table."""
 

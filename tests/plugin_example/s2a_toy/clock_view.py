@@ -6,6 +6,7 @@ from typing import Any
 
 from s2a_bench.experiments import Comparable, Metric, Shown, Subject
 from s2a_bench.stats import summary_of
+from s2a_bench.stats.batches import Rows
 from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.json import frame, summaries
 from s2a_bench.writers.lanes import Lane, LaneBar, LanePanel, Lanes
@@ -18,8 +19,8 @@ COST = Metric("cost", "ns", title="cost of a reading")
 def subjects(run: StoredRun) -> list[Subject]:
     """Return the one cell of a run."""
     rows = run.table(READINGS)
-    values = rows["cost_ns"].to_numpy(dtype="float64")[:, None]
-    return [Subject("monotonic", {}, len(rows), 0, lambda _name: list(values))]
+    values = Rows(rows["cost_ns"].to_numpy(dtype="float64"))
+    return [Subject("monotonic", {}, len(rows), 0, lambda _name: values)]
 
 
 COMPARED = Comparable({"cost": COST}, subjects, lambda _run: (), ("cost",))
