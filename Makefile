@@ -6,7 +6,7 @@ export S2A_BENCH_VENV := $(abspath $(VENV))
 export S2A_BENCH_CUDA := $(CUDA)
 BIN := $(VENV)/bin
 
-.PHONY: bench bench-capacity bench-chunks bench-coverage bench-plans bench-policy bench-ray docs test test-all check check-platforms fuzz hostile core mutate setup clean
+.PHONY: bench bench-analysis bench-capacity bench-chunks bench-coverage bench-plans bench-policy bench-ray docs test test-all check check-platforms fuzz hostile core mutate setup clean
 
 # The main job: the transports alone (no model) with raw pixels and with JPEG, for which wheels suffice; then llama.cpp
 # is compiled once, and a real model answers. Whoever stops in between keeps what was measured. The transports are measured
@@ -15,6 +15,10 @@ bench: core
 	$(BIN)/s2a-bench latency --engine echo --transport http,ros,shm,loopback --launches 3 --requests 34
 	@$(PYTHON) tools/setup.py
 	$(BIN)/s2a-bench latency
+
+# Time and memory of report, compare and the library on runs of 10^4 to 10^6 requests; some minutes, 3 GB of disk.
+bench-analysis: setup
+	$(BIN)/python -m benchmarks.analysis
 
 # How often the intervals of capacity hold the truth, and its searches err; half an hour.
 bench-capacity: setup

@@ -47,10 +47,11 @@ def test_a_long_word_costs_no_time() -> None:
     assert process_time() - began < 5  # of a search that begins at every letter: hours
 
 
-def test_rows_are_counted_by_the_footer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_values_are_counted_by_the_footer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "samples.parquet"
     parquet.write_table(pa.table({"n": pa.array([0] * 101)}), path)
-    monkeypatch.setattr(files, "ROWS", 100)
-    monkeypatch.setattr(parquet, "read_table", lambda _: pytest.fail("it was read"))
-    with pytest.raises(StoreError, match="has 101 rows; at most 100 are read"):
-        files.read_parquet(path, {"n": "int64"})
+    monkeypatch.setattr(files, "VALUES", 201)
+    assert files.read_parquet(path, {"n": "int64"}).num_rows == 101
+    monkeypatch.setattr(parquet.ParquetFile, "read", lambda *_: pytest.fail("it was read"))
+    with pytest.raises(StoreError, match="has 101 rows of 2 columns; at most 201 values are read"):
+        files.read_parquet(path, {"n": "int64", "m": "int64"})

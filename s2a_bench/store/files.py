@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from errno import EDQUOT, EIO, ENOSPC
 from importlib.metadata import version
 from pathlib import Path
@@ -72,8 +73,8 @@ def _field(value: Value) -> str:
     return f'"{text}"' if any(mark in text for mark in ',"\r\n') else text
 
 
-ROWS: Final = 10_000_000
-"""Limit on the rows of a Parquet file, by its footer: a few bytes can encode any number of equal rows."""
+VALUES: Final = 500_000_000
+"""Limit on the values (rows times columns) read of a Parquet file: a few bytes can encode any number of equal ones."""
 
 
 def _arrow(path: Path) -> tuple[Any, Any, Any]:
@@ -92,33 +93,37 @@ def _arrow(path: Path) -> tuple[Any, Any, Any]:
 
 
 def count_rows(path: Path) -> int:
-    """Return the number of rows of a Parquet or CSV file without reading their values."""
+    """Return the number of rows of a Parquet or CSV file without reading their values; raises StoreError."""
     if path.suffix == ".parquet":
-        return int(_arrow(path)[2].read_metadata(path).num_rows)
-    return max(sum(1 for _ in _ends(path.read_bytes())) - 1, 0)
+        pa, _, parquet = _arrow(path)
+        with _undamaged(path, pa):
+            return int(parquet.read_metadata(path).num_rows)
+    ends = quotes = 0
+    with path.open("rb") as file:
+        for line in file:
+            quotes += line.count(b'"')
+            ends += quotes % 2 == 0 and line.endswith(b"\n")
+    return max(ends - 1, 0)
 
 
 def whole_records(data: bytes) -> bytes:
     """Return the data up to the end of its last whole record."""
-    return data[: max(_ends(data), default=0)]
+    end = data.rfind(b"\n") + 1
+    quotes = data.count(b'"', 0, end)
+    while quotes % 2:
+        before = data.rfind(b"\n", 0, end - 1) + 1
+        quotes -= data.count(b'"', before, end)
+        end = before
+    return data[:end]
 
 
-def _ends(data: bytes) -> Iterator[int]:
-    position = quotes = 0
-    for line in data.split(b"\n")[:-1]:
-        position += len(line) + 1
-        quotes += line.count(b'"')
-        if quotes % 2 == 0:
-            yield position
-
-
-def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
+def read_csv(path: Path, columns: dict[str, Kind], *, categories: bool = False) -> Any:
     """Read a CSV as a ``pyarrow.Table``, without its torn end; an absent file is an empty table.
 
-    An absent column is null: schema 1 may gain columns.
+    An absent column is null: schema 1 may gain columns. With ``categories`` texts are of a dictionary type.
     """
     pa, csv, _ = _arrow(path)
-    schema = _schema(pa, columns)
+    schema = _schema(pa, columns, categories=categories)
     data = whole_records(path.read_bytes()) if path.exists() else b""
     if not data:
         return schema.empty_table()
@@ -156,33 +161,48 @@ def write_parquet(path: Path, table: Any) -> None:
         raise StoreError(f"cannot write {path}: {why(whole, path)}; the CSV files are complete") from error
 
 
-def read_parquet(path: Path, columns: dict[str, Kind]) -> Any:
-    """Read a Parquet file as a ``pyarrow.Table``; raises StoreError for a damaged one."""
+def read_parquet(path: Path, columns: dict[str, Kind], *, categories: bool = False) -> Any:
+    """Read these columns of a Parquet file as `read_csv` does; raises StoreError for a damaged one."""
     pa, _, parquet = _arrow(path)
-    schema = _schema(pa, columns)
+    schema = _schema(pa, columns, categories=categories)
+    texts = [name for name, kind in columns.items() if kind == "string" and categories]
+    with _undamaged(path, pa), parquet.ParquetFile(path, read_dictionary=texts) as file:
+        if (rows := file.metadata.num_rows) * len(columns) > VALUES:
+            raise StoreError(
+                f"{path} has {rows} rows of {len(columns)} columns; at most {VALUES} values are read; "
+                "remove it to read the CSV"
+            )
+        table = file.read(list(columns))
+        for name in columns.keys() - set(table.column_names):  # schema 1 may gain columns
+            table = table.append_column(name, pa.nulls(len(table), schema.field(name).type))
+        return table.select(list(columns)).cast(schema)
+
+
+@contextmanager
+def _undamaged(path: Path, pa: Any) -> Iterator[None]:
+    """Turn an error of reading a Parquet file into one that names a way out."""
     try:
-        if (rows := count_rows(path)) > ROWS:
-            raise StoreError(f"{path} has {rows} rows; at most {ROWS} are read; remove it to read the CSV")
-        found = parquet.read_table(path)
-        for name in columns.keys() - set(found.column_names):  # schema 1 may gain columns
-            found = found.append_column(name, pa.nulls(len(found), schema.field(name).type))
-        return found.select(list(columns)).cast(schema)
+        yield
     except (OSError, pa.ArrowException, ValueError) as error:
         raise StoreError(f"{path} is damaged: {str(error).splitlines()[0]}; remove it to read the CSV") from error
 
 
 def to_pandas(table: Any) -> pd.DataFrame:
-    """Convert a ``pyarrow.Table`` to a DataFrame with nullable types: integers stay integers, nulls stay nulls."""
+    """Convert a ``pyarrow.Table``, which nobody uses any more, to a DataFrame with nullable types.
+
+    Integers stay integers, nulls stay nulls.
+    """
     import pandas as pd
     import pyarrow as pa
 
     dtypes = {pa.int64(): pd.Int64Dtype(), pa.float64(): pd.Float64Dtype(), pa.string(): pd.StringDtype()}
-    frame: pd.DataFrame = table.to_pandas(types_mapper=dtypes.get)
+    frame: pd.DataFrame = table.to_pandas(types_mapper=dtypes.get, split_blocks=True, self_destruct=True)
     return frame
 
 
-def _schema(pa: Any, columns: dict[str, Kind]) -> Any:
-    types = {"string": pa.string(), "int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_()}
+def _schema(pa: Any, columns: dict[str, Kind], *, categories: bool) -> Any:
+    text = pa.dictionary(pa.int32(), pa.string()) if categories else pa.string()
+    types = {"string": text, "int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_()}
     return pa.schema([(name, types[kind]) for name, kind in columns.items()])
 
 

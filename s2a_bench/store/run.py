@@ -21,7 +21,7 @@ from s2a_bench.provenance import Origins
 from s2a_bench.store import files
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.requests import TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
-from s2a_bench.store.schema import PROVENANCE, SCHEMA, Row, Table
+from s2a_bench.store.schema import PROVENANCE, SCHEMA, Kind, Row, Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -218,15 +218,35 @@ class StoredRun:
     derived: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
     """Values that views compute from the tables once, by name."""
 
-    def table(self, table: Table[Any]) -> pd.DataFrame:
-        """Return a table with all its columns, empty if the run has none; raises StoreError for a damaged file."""
+    def table(self, table: Table[Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
+        """Return a table with all its columns, empty if the run has none; raises StoreError for a damaged file.
+
+        With ``columns`` only these are read and nothing is kept; texts are categoricals, in order of appearance.
+        """
+        if columns is not None:
+            return self._some(table, columns)
         if table.name not in self.tables:
-            csv = self.path / f"{table.name}.csv"
-            parquet = csv.with_suffix(".parquet")  # of a run that has ended
-            read, path = (files.read_parquet, parquet) if parquet.exists() else (files.read_csv, csv)
-            self.tables[table.name] = files.to_pandas(read(path, table.columns))
-            self.tables[table.name].attrs[PROVENANCE] = self.origins.line
+            self.tables[table.name] = self._read(table.name, table.columns)
         return self.tables[table.name]
+
+    def _some(self, table: Table[Any], columns: Sequence[str]) -> pd.DataFrame:
+        kinds = {name: table.columns[name] for name in columns}
+        if table.name not in self.tables:
+            return self._read(table.name, kinds, categories=True)
+        import pandas as pd
+
+        rows = self.tables[table.name][[*columns]]
+        texts = [name for name, kind in kinds.items() if kind == "string"]
+        return rows.astype({name: pd.CategoricalDtype([*rows[name].dropna().unique()]) for name in texts})
+
+    def _read(self, name: str, columns: dict[str, Kind], *, categories: bool = False) -> pd.DataFrame:
+        """Read columns of a table, from its CSV if the run has not ended."""
+        csv = self.path / f"{name}.csv"
+        parquet = csv.with_suffix(".parquet")
+        read, path = (files.read_parquet, parquet) if parquet.exists() else (files.read_csv, csv)
+        rows = files.to_pandas(read(path, columns, categories=categories))
+        rows.attrs[PROVENANCE] = self.origins.line
+        return rows
 
     @property
     def origins(self) -> Origins:
@@ -238,9 +258,9 @@ class StoredRun:
 
     def row_counts(self) -> dict[str, int]:
         counts = {name: len(table) for name, table in self.tables.items()}
-        for file in sorted([*self.path.glob("*.parquet"), *self.path.glob("*.csv")]):
-            if file.stem not in counts:
-                counts[file.stem] = files.count_rows(file)
+        by_name = {file.stem: file for kind in ("*.csv", "*.parquet") for file in self.path.glob(kind)}
+        for name in sorted(by_name.keys() - counts.keys()):
+            counts[name] = files.count_rows(by_name[name])
         return {name: count for name, count in counts.items() if count}
 
     @property

@@ -22,6 +22,7 @@ from s2a_bench.store import manifest as manifests
 from s2a_bench.store.files import RESERVE, RESERVE_BYTES, read_csv, read_parquet, why
 from s2a_bench.store.requests import TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
 from s2a_bench.store.run import RunWriter, StoredRun, fits, read_run
+from s2a_bench.store.schema import PROVENANCE
 from tests.made_runs import STAGES, row_of
 
 CHAIN = [
@@ -364,7 +365,31 @@ def test_rows_are_counted_in_files_of_either_kind_and_empty_tables_left_out(tmp_
         assert read_run(run.path).row_counts() == {"samples": 2}
         run.tokens(token(index, "x\n") for index in range(3))
         assert read_run(run.path).row_counts() == {"samples": 2, "tokens": 3}
+    (run.path / "samples.csv").write_text("not read")  # beside a whole Parquet file
     assert read_run(run.path).row_counts() == {"samples": 2, "tokens": 3}
+    (run.path / "samples.parquet").write_bytes(b"PAR1")
+    with pytest.raises(StoreError, match=r"samples\.parquet is damaged: .+; remove it to read the CSV$"):
+        read_run(run.path).row_counts()
+
+
+def test_columns_are_read_alone_and_their_texts_are_categories_in_order_of_appearance(tmp_path: Path) -> None:
+    columns = ["text", "index", "engine_lo_ns", PROVENANCE]
+    with RunWriter.create(tmp_path, "latency", {"stages": STAGES}) as run:
+        run.tokens([token(0, "b"), token(1, ""), token(2, "a"), token(3, "b")])
+        running = read_run(run.path).table(TOKENS, columns)
+    read = read_run(run.path)
+    some = read.table(TOKENS, columns)
+    assert [*some] == columns
+    assert (read.tables, some.attrs[PROVENANCE]) == ({}, read.origins.line)
+    assert some["text"].tolist() == ["b", "", "a", "b"]
+    assert some["text"].cat.categories.tolist() == ["b", "", "a"]
+    assert some.dtypes[["index", "engine_lo_ns"]].tolist() == ["Int64", "Int64"]
+    assert some["engine_lo_ns"].isna().all()
+    whole = read.tokens
+    assert whole.dtypes[["text", "index"]].tolist() == ["string", "Int64"]
+    for same in (running, read.table(TOKENS, columns)):
+        pd.testing.assert_frame_equal(same, some)
+    assert read_run(run.path).table(samples_table(STAGES), ["cell", "warmup"]).empty
 
 
 @pytest.mark.parametrize(

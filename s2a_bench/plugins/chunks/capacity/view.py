@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments import SHARE, TIME, Comparable, Metric, Shown, Subject, plain_rows
+from s2a_bench.experiments import Shown
+from s2a_bench.experiments.cells import SHARE, TIME, Comparable, Metric, Subject, mean, plain_rows
 from s2a_bench.plugins.chunks.capacity.metrics import METRICS
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, KNEES, ROBOTS, TWIN, FleetRow
 from s2a_bench.stats.batches import Rows
@@ -33,7 +34,7 @@ PREDICTED: Final = "predicted"
 LATE: Final = (
     "late: no measurement, as the generator missed its ticks, or exceeds the limit even with an instant server"
 )
-KNEE: Final = Metric("knee", "robots", "higher", "knee", "mean", "The largest fleet within the limit.")
+KNEE: Final = mean("knee", "The largest fleet within the limit.", "robots", "higher", name="knee")
 
 CapacityCell = cell_of_row("CapacityCell", "N robots on one server.", FleetRow, without=())
 
@@ -222,7 +223,7 @@ def _subjects(run: StoredRun) -> list[Subject]:
 
     def values(table: Any, name: str) -> Rows:
         if name not in METRICS:
-            return Rows(np.empty(0))
+            return Rows.of([])
         metric = METRICS[name]
         found = table[metric.column].dropna().to_numpy(dtype="float64")
         return Rows(found / 1e9 if metric.kind == TIME else found)
@@ -236,7 +237,6 @@ def _subjects(run: StoredRun) -> list[Subject]:
 COMPARED: Final = Comparable(
     metrics={KNEE.name: KNEE, **METRICS},
     subjects=_subjects,
-    origin=lambda run: (run.origins.line,),
     shown=(KNEE.name, "stalled", "latency_p50_s", "age_p99_s"),
 )
 
