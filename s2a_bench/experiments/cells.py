@@ -221,7 +221,7 @@ class Cells(Generic[Row]):
             (name, str(len(cell)), *(entries(cell.values(metric.name), metric.statistic)[0] for metric in shown))
             for name, cell in cells
         ]
-        titles = [f"{metric.title or metric.name}, {metric.statistic} ({metric.unit})" for metric in shown]
+        titles = [f"{metric.title} ({metric.unit}), {metric.statistic}" for metric in shown]
         return TextTable(title, ("cell", "n", *titles), rows, 1, notes=tuple(notes))
 
     def subjects(self, setting: Sequence[str] = (), *, exact: bool = False) -> list[Subject]:

@@ -40,7 +40,7 @@ class BoundaryCell(BoundaryRow):
     """A point of the grid, or a board on it, in ``--json``."""
 
     rho: Annotated[Positive, about("L / R over the duration: stall-free up to 1.")]
-    emulated: Literal[True] = True
+    emulated: Literal[True]
 
 
 BOUNDARY: Final[Table[BoundaryRow]] = Table("boundary", BoundaryRow)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments import Shown, requests
 from s2a_bench.experiments.ccrb.rows import METRICS, RolloutRow
@@ -24,7 +24,7 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
 from s2a_bench.experiments.cells import TIME, Metric
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.labels import NO_SCORE, ORDERING, law, operating_point, outcome_label
-from s2a_bench.store.schema import Facts, Positive
+from s2a_bench.store.schema import Positive
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, entries, number
@@ -108,7 +108,7 @@ CcrbCell = cell_of_row(
     own={
         "profile": str | None,
         "rate_tokens_per_s": Positive,
-        **{metric.name: Annotated[float, Facts(metric.schema)] for metric in _TIMES},
+        **{metric.name: float for metric in _TIMES},
     },
 )
 

@@ -14,7 +14,7 @@ from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES, TimelineRow
 from s2a_bench.stats.batches import Rows
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import SKILLS, TOKENS
-from s2a_bench.store.schema import Facts, Many, NonNegative, Positive, about, with_fields
+from s2a_bench.store.schema import Many, NonNegative, Positive, about, with_fields
 from s2a_bench.writers.json import frame
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
@@ -178,7 +178,7 @@ TimelineCell = with_fields(
     _About,
     {
         column.metric.name: Annotated[
-            float | None if NoneType in get_args(column.hint.__origin__) else float, Facts(column.metric.schema)
+            float | None if NoneType in get_args(column.hint.__origin__) else float, about(column.metric.about)
         ]
         for column in columns_of(TimelineRow)
         if column.metric
