@@ -20,6 +20,7 @@ from pydantic_core import core_schema
 
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.ccrb.view.tables import ORDERINGS
+from s2a_bench.experiments.cells import TIME, columns_of
 from s2a_bench.experiments.profile_capture import ProfileJson
 from s2a_bench.experiments.throughput.metrics import Reference
 from s2a_bench.inference.fetch import FetchedFile
@@ -51,7 +52,7 @@ class HouseForm(GenerateJsonSchema):
         made = super().dataclass_schema(schema)
         del made["title"]
         text = " ".join(made["description"].replace("``", "`").replace("None", "null").split())
-        return made | {"description": text, "additionalProperties": False}
+        return made | _keys(schema["cls"], made) | {"description": text, "additionalProperties": False}
 
     def field_is_required(self, field: Any, total: bool) -> bool:  # noqa: ARG002
         """Return True if the class names no value for a field; what a factory makes is always there."""
@@ -64,6 +65,28 @@ class HouseForm(GenerateJsonSchema):
             return made
         *kinds, _null = made.pop("anyOf")
         return made | (kinds[0] if len(kinds) == 1 else {"anyOf": kinds})
+
+
+def _keys(cls: type, made: dict[str, Any]) -> dict[str, Any]:
+    """Return properties and required keys of a class, of rows as `json_of` writes them."""
+    columns = columns_of(cls)
+    if not any(column.metric or column.json_key for column in columns):
+        return {}
+    properties, required = {}, []
+    for column in columns:
+        schema = made["properties"][column.name]
+        *others, last = schema.get("anyOf", [{}])
+        if last == {"type": "null"}:  # absent
+            schema = {**others[0], **{key: value for key, value in schema.items() if key != "anyOf"}}
+        elif column.key and column.name in made["required"]:
+            required.append(column.key)
+        if column.metric and (column.metric.kind == TIME or getattr(cls, "means", False)):
+            schema = {**schema, "type": "number"}
+        if column.json_key:
+            schema = {**schema, "type": ["string", "null"]} if schema["type"] == "string" else schema
+        if column.key:
+            properties[column.key] = schema
+    return {"properties": properties, "required": required}
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from functools import cached_property
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
-from s2a_bench.experiments import Comparable, Metric, Rows, Subject, by_name
+from s2a_bench.experiments.cells import Comparable, Metric, Rows, Subject, by_name
 from s2a_bench.facts import (
     END_N,
     FIRST_DECODE_MS,
@@ -265,7 +265,7 @@ def _delay_ends(cell: RequestCell) -> Ends:
 
 
 def in_ms(name: str, title: str = "", about: str = "", of: Of | None = None, **more: Any) -> RequestMetric:
-    return RequestMetric(name, "ms", title=title, about=about, of=of, **more)
+    return RequestMetric(title, about, "ms", name=name, of=of, **more)
 
 
 def _of_fact(fact: Fact, title: str, about: str) -> RequestMetric:
@@ -273,7 +273,7 @@ def _of_fact(fact: Fact, title: str, about: str) -> RequestMetric:
 
 
 def _rate(name: str, unit: str, title: str, about: str, of: Of) -> RequestMetric:
-    return RequestMetric(name, unit, "higher", title, about=about, of=of)
+    return RequestMetric(title, about, unit, "higher", name=name, of=of)
 
 
 ANSWER_METRICS: Final = (
@@ -303,8 +303,8 @@ ANSWER_METRICS: Final = (
         FIRST_DECODE_MS, "1st decode", "The first token to the second in the engine: the first step after the prompt."
     ),
     RequestMetric(
-        *("prompt_tokens", "tokens", "neither", "tokens"),
-        about="Prompt tokens evaluated, pictures included.",
+        *("tokens", "Prompt tokens evaluated, pictures included.", "tokens", "neither"),
+        name="prompt_tokens",
         of=lambda cell: _some(cell.fact(PROMPT_N)),
     ),
     _rate(
@@ -597,7 +597,7 @@ def compared_by(metrics: Iterable[RequestMetric], shown: tuple[str, ...], **more
         launches = {int(launch): samples[samples["launch"] == launch] for launch in samples["launch"].unique()}
         return [subject(cell, launch) for launch, mine in launches.items() for cell in _cells(run, mine)]
 
-    return Comparable(named, subjects, lambda run: stand_ins(split([run])), shown, **more)
+    return Comparable(named, subjects, shown, lambda run: stand_ins(split([run])), **more)
 
 
 def launches_note(ratios: Iterable[Ratio]) -> tuple[str, ...]:

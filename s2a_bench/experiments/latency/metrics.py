@@ -54,7 +54,7 @@ METRICS: Final = (
     *AROUND,
     *TOKEN_METRICS,
     in_ms("residual", "residual", "The time between the stages."),
-    RequestMetric("residual_share", about="The residual as a share of e2e without inference."),
+    RequestMetric(name="residual_share", about="The residual as a share of e2e without inference."),
 )
 
 

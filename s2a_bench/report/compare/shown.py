@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
 from s2a_bench.errors import StoreError
-from s2a_bench.experiments import Better
+from s2a_bench.experiments.cells import Better
 from s2a_bench.report.compare.agreement import Difference
 from s2a_bench.report.compare.comparison import LEVEL, SAME, TOO_FEW, UNCLEAR, CellComparison, ComparedRuns
 from s2a_bench.stats.batches import BATCHES
