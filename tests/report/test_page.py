@@ -225,8 +225,10 @@ def test_a_sweep_of_timelines_is_shown_as_the_one_run_that_it_amounts_to(tmp_pat
     folder = sweep_of(tmp_path / "sweeps", cells)
     whole = read_run(timeline(tmp_path, profiles=boards, tokens_per_skill=(6, 1)))
     overview, pooled = read_chapters([folder])
-    assert pooled.content.tables["timelines"] == replace(execution_table(whole), provenance=whole.origins.line)
-    assert pooled.content.csvs == timeline_csv(whole)
+    assert pooled.content.tables["timelines"] == replace(
+        execution_table(timelines_of(whole), whole.manifest), provenance=whole.origins.line
+    )
+    assert pooled.content.csvs == timeline_csv(timelines_of(whole))
     assert pooled.run.origins == whole.origins
     assert pooled.content.lanes == page_lanes(timelines_of(whole))
     assert len(overview.content.tables["cells"].rows) == 12
