@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -18,19 +18,6 @@ from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 if TYPE_CHECKING:
     from s2a_bench.policy import Floats
     from s2a_bench.store.run import StoredRun
-
-
-class Setting(NamedTuple):
-    """What the policies of a panel share."""
-
-    title: str
-    tokens_per_skill: int
-    n_skills: int
-    t_nom_s: float
-
-    @property
-    def shape(self) -> tuple[int, float]:
-        return self.n_skills, self.t_nom_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +34,14 @@ class Timelines(Cells[TimelineRow]):
         return self.first.policy
 
     @property
-    def setting(self) -> Setting:
-        first = self.first
-        return Setting(first.title, first.tokens_per_skill, first.n_skills, first.t_nom_s)
+    def shape(self) -> tuple[int, float]:
+        """N and T_nom."""
+        return self.first.n_skills, self.first.t_nom_s
+
+    @property
+    def setting(self) -> tuple[str, int, int, float]:
+        """What the policies of a panel share: board, L, N and T_nom."""
+        return self.first.title, self.first.tokens_per_skill, *self.shape
 
     @property
     def p_any_stall(self) -> float:
@@ -65,13 +57,16 @@ class Timelines(Cells[TimelineRow]):
 class Panel:
     """The cells of one setting, a policy each."""
 
-    setting: Setting
-    cells: list[Timelines] = field(default_factory=list)
+    cells: Sequence[Timelines]
+
+    @property
+    def first(self) -> TimelineRow:
+        return self.cells[0].first
 
     @property
     def board(self) -> str:
         """The board with its rate."""
-        title, rate = self.setting.title, f"{self.cells[0].first.tokens_per_s:g} tokens/s"
+        title, rate = self.first.title, f"{self.first.tokens_per_s:g} tokens/s"
         return title if rate in title else f"{title}, {rate}"
 
     @property
@@ -99,10 +94,10 @@ def timelines_of(run: StoredRun) -> list[Timelines]:
 
 
 def panels(cells: Iterable[Timelines]) -> list[Panel]:
-    by_setting: dict[Setting, Panel] = {}
+    by_setting: dict[tuple[str, int, int, float], list[Timelines]] = {}
     for cell in cells:
-        by_setting.setdefault(cell.setting, Panel(cell.setting)).cells.append(cell)
-    return list(by_setting.values())
+        by_setting.setdefault(cell.setting, []).append(cell)
+    return [*map(Panel, by_setting.values())]
 
 
 def seconds(value: float) -> str:
@@ -169,23 +164,13 @@ def _json(cell: Timelines) -> dict[str, Any]:
     return {**json_of(cell.first), "plans": len(cell), **means}
 
 
-_SETTING: Final = (
-    "policy",
-    "board",
-    "tokens_per_s",
-    "prompt_s",
-    "tokens_per_skill",
-    "n_skills",
-    "t_nom_s",
-    "mode",
-    "emulated",
-)
+_SETTING: Final = ("policy", "board", "tokens_per_s", "prompt_s", "tokens_per_skill", "n_skills", "t_nom_s")
 
 
 def _subjects(run: StoredRun) -> list[Subject]:
     settings, cells = run.manifest.get("configuration", {}), Cells.of(run, TIMELINES)
     even = settings.get("jitter") == "none" and not settings.get("t_nom_cv")
-    return cells.subjects(_SETTING, exact=even and set(cells.frame["mode"]) == {"virtual"})
+    return cells.subjects((*_SETTING, "mode", "emulated"), exact=even and set(cells.frame["mode"]) == {"virtual"})
 
 
 COMPARED: Final = Comparable(

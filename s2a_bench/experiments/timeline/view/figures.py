@@ -42,7 +42,7 @@ def timeline_figures(cells: Iterable[Timelines], notes: Sequence[str]) -> dict[s
     by_shape: dict[tuple[int, float], list[Timelines]] = {}
     for cell in cells:
         if cell.skills:
-            by_shape.setdefault(cell.setting.shape, []).append(cell)
+            by_shape.setdefault(cell.shape, []).append(cell)
     names = ["timeline"] if len(by_shape) == 1 else [f"timeline_N{n}_T{t_nom_s:g}" for n, t_nom_s in by_shape]
     return {name: partial(build_timelines, same, notes) for name, same in zip(names, by_shape.values(), strict=True)}
 
@@ -53,16 +53,18 @@ def build_timelines(cells: Sequence[Timelines], notes: Iterable[str]) -> Figure:
     ``cells`` share plan length and T_nom. Every panel has a time axis: boards differ by orders of magnitude.
     """
     every = panels(cells)
-    lengths = list(dict.fromkeys(panel.setting.tokens_per_skill for panel in every))
-    titles = list(dict.fromkeys(panel.setting.title for panel in every))
-    places = {(panel.setting.tokens_per_skill, panel.setting.title): panel for panel in every}
+    lengths = list(dict.fromkeys(panel.first.tokens_per_skill for panel in every))
+    titles = list(dict.fromkeys(panel.first.title for panel in every))
+    places = {(panel.first.tokens_per_skill, panel.first.title): panel for panel in every}
     colours = policy_colours(cells)
     width_in = WIDTH_IN if len(titles) == 1 else WIDE_IN
     columns = _LEGEND_COLUMNS[width_in]
+    n_skills, t_nom_s = cells[0].shape
+    caption = f"Execution timelines: N = {n_skills} skills, T_nom = {t_nom_s:g} s{_of_plans(cells)}", *notes
     handles = _legend(cells)
     foot_in = 0.55 + 0.17 * -(-len(handles) // columns)
     lanes = len({cell.policy for cell in cells}) + 1
-    figure = new_figure(foot_in + len(lengths) * (0.42 + 0.15 * lanes), (_title(cells), *notes), width_in)
+    figure = new_figure(foot_in + len(lengths) * (0.42 + 0.15 * lanes), caption, width_in)
     grid = figure.subplots(len(lengths), len(titles), squeeze=False)
     for row, tokens in enumerate(lengths):
         for column, title in enumerate(titles):
@@ -79,13 +81,8 @@ def build_timelines(cells: Sequence[Timelines], notes: Iterable[str]) -> Figure:
     return figure
 
 
-def _title(cells: Sequence[Timelines]) -> str:
-    n_skills, t_nom_s = cells[0].setting.shape
+def _of_plans(cells: Sequence[Timelines]) -> str:
     plans = max(map(len, cells))
-    return f"Execution timelines: N = {n_skills} skills, T_nom = {t_nom_s:g} s{_first_of(plans)}"
-
-
-def _first_of(plans: int) -> str:
     return f"; plan 1 of {plans}" if plans > 1 else ""
 
 
@@ -161,10 +158,9 @@ def page_lanes(cells: Iterable[Timelines]) -> Lanes:
 
 
 def _panel(panel: Panel, colours: dict[str, str]) -> LanePanel:
-    _, tokens, n_skills, t_nom_s = panel.setting
-    plans = _first_of(len(panel.cells[0]))
+    plan, plans = panel.first, _of_plans(panel.cells)
     return LanePanel(
-        f"{panel.board}: L = {tokens}, N = {n_skills}, T_nom = {t_nom_s:g} s{plans}",
+        f"{panel.board}: L = {plan.tokens_per_skill}, N = {plan.n_skills}, T_nom = {plan.t_nom_s:g} s{plans}",
         panel.end_s * 1.02,
         [_lane(cell, colours[cell.policy], own_tokens=not panel.shared) for cell in panel.cells],
         tuple(panel.shared.token_s) if panel.shared else (),

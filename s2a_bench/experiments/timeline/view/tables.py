@@ -72,7 +72,7 @@ def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
         high = upper_bound(int(worst.values("p_any_stall").sum()), plans, 0.975)
         share = f" there {worst.p_any_stall:.1%} of {plans} plans stall (95 % interval up to {high:.1%});"
     where = f"{len(stalling)} of {len(cells)} settings" if len(cells) > 1 else "the one setting"
-    most = f"most on {worst.setting.title} with L = {worst.setting.tokens_per_skill}: {stall_s:.2f} s a plan"
+    most = f"most on {worst.first.title} with L = {worst.first.tokens_per_skill}: {stall_s:.2f} s a plan"
     return f"{policy} stalls in {where}, {most};{share} it {moved}."
 
 
@@ -115,7 +115,7 @@ def execution_table(cells: Sequence[Timelines], manifest: Mapping[str, Any]) -> 
 def skill_table(cells: Sequence[Timelines]) -> TextTable:
     groups = []
     for cell in cells:
-        name = (cell.setting.title, str(cell.setting.tokens_per_skill), cell.policy)
+        name = (cell.first.title, str(cell.first.tokens_per_skill), cell.policy)
         rows: list[tuple[str, ...]] = []
         for skill in cell.skills:
             taken_ns, waited_ns = skill.end_ns - skill.start_ns, skill.start_ns - skill.arrival_ns
@@ -143,15 +143,14 @@ def timeline_csv(cells: Iterable[Timelines]) -> dict[str, CsvTable]:
 
 def _table(cells: Sequence[Timelines], title: str, metrics: Sequence[str], notes: Iterable[str]) -> TextTable:
     """Return a table of means, a group of rows a board."""
-    several = len({cell.setting.shape for cell in cells}) > 1
+    several = len({cell.shape for cell in cells}) > 1
     boards: dict[str, list[tuple[str, ...]]] = {}
     names: dict[str, list[str]] = {}
     for panel in panels(cells):
-        setting = panel.setting
-        board = setting.title + (f", N {setting.n_skills}, T {setting.t_nom_s:g}" if several else "")
+        title, tokens, n_skills, t_nom_s = panel.cells[0].setting
+        board = title + (f", N {n_skills}, T {t_nom_s:g}" if several else "")
         for place, cell in enumerate(panel.cells):
-            tokens = "" if place else str(setting.tokens_per_skill)
-            row = (board, tokens, cell.policy, *(_entry(cell, METRICS[name]) for name in metrics))
+            row = (board, "" if place else str(tokens), cell.policy, *(_entry(cell, METRICS[name]) for name in metrics))
             boards.setdefault(board, []).append(row)
             names.setdefault(board, []).append(cell.first.cell)
     header = ("board", "L", "policy", *(METRICS[name].title for name in metrics))
@@ -180,7 +179,7 @@ def _is_random(cells: Iterable[Timelines]) -> bool:
 
 def _common(cells: Sequence[Timelines]) -> str:
     """Return N and T_nom if all cells share them."""
-    shapes = {cell.setting.shape for cell in cells}
+    shapes = {cell.shape for cell in cells}
     return "" if len(shapes) != 1 else ", N = {}, T_nom = {:g} s".format(*shapes.pop())
 
 

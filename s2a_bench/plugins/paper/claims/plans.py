@@ -94,16 +94,16 @@ def timelines(run: StoredRun) -> Iterator[RunPart]:
     """Yield the timelines of each source of tokens, N and T_nom: L -> policy -> cell, from long to short skills."""
 
     def setting(cell: Timelines) -> tuple[str, int, float]:
-        return (cell.setting.title, *cell.setting.shape)
+        return cell.first.title, *cell.shape
 
     settings = run.manifest.get("configuration", {})
     spread, jitter = settings.get("t_nom_cv") or 0.0, settings.get("jitter", "none")
     named = {} if jitter == NAMED_JITTER else {"jitter": "none"}
     for (title, n_skills, t_nom_s), same in groupby(sorted(timelines_of(run), key=setting), key=setting):
-        every = sorted(same, key=lambda cell: -cell.setting.tokens_per_skill)
+        every = sorted(same, key=lambda cell: -cell.first.tokens_per_skill)
         cells: dict[int, dict[str, Timelines]] = {}
         for cell in every:
-            cells.setdefault(cell.setting.tokens_per_skill, {})[cell.policy] = cell
+            cells.setdefault(cell.first.tokens_per_skill, {})[cell.policy] = cell
         origins = [run.origins.of(cell.first.cell) for cell in every]
         shown = _shown(cells)
         launches = int(any(cell.first.mode != "virtual" for cell in every))
@@ -174,7 +174,7 @@ def no_stalls(*policies: str) -> Check:
             if share.k or high > promised:
                 spread = "" if even else f" [{low:.1%}, {high:.1%}]"
                 many = f"{share.k} of {share.n} plans stall{spread}, {_stall_s(cell):.2f} s in the mean"
-                stalled.append(f"{cell.policy} at L = {cell.setting.tokens_per_skill}: {many}")
+                stalled.append(f"{cell.policy} at L = {cell.first.tokens_per_skill}: {many}")
         text = "; ".join(stalled) or f"{', '.join(policies)}: no plan stalls"
         regrets = [cell.mean("signed_start_regret") for cell in cells if cell.policy == STREAM]
         starts = [late for late in regrets if late is not None]
@@ -200,7 +200,7 @@ def after(policy: str, than: str, metric: str, least: float = -inf, most: float 
 def stalled_gaps(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure the share of the gaps between skills that are stalls of naive, at every L."""
     cells = [of_length[NAIVE] for of_length in part.cells.values()]
-    shares = [(cell.mean("stalls") or 0.0) / max(cell.setting.n_skills - 1, 1) for cell in cells]
+    shares = [(cell.mean("stalls") or 0.0) / max(cell.first.n_skills - 1, 1) for cell in cells]
     return list(map(exact, shares)), _at(part, [f"{share:.0%}" for share in shares])
 
 
