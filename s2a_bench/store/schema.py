@@ -22,7 +22,8 @@ __all__ = ["PROVENANCE", "SCHEMA", "Count", "Facts", "Fraction", "Many", "NonNeg
 SCHEMA: Final = "s2a-bench/1"
 """The version of folder, columns and ``--json``; it changes if a column changes its meaning or is removed."""
 
-Kind: TypeAlias = Literal["string", "int64", "float64", "bool"]
+Kind: TypeAlias = Literal["string", "json", "category", "int64", "float64", "bool"]
+"""Of a column: JSON is another text in most rows; a category is a text that many rows share."""
 
 Value: TypeAlias = str | int | float | bool | None
 
@@ -84,10 +85,10 @@ def _sound(value: Any) -> Any:
 
 
 def _kind(hint: Any) -> Kind:
-    """Return the column type of an annotation: text unless it is a plain number or a bool."""
+    """Return the column type of an annotation: JSON of a list or dict, text unless it is a plain number or a bool."""
     plain = next((arg for arg in get_args(hint) if arg is not NoneType), hint) if NoneType in get_args(hint) else hint
-    kinds: dict[Any, Kind] = {int: "int64", float: "float64", bool: "bool"}
-    return kinds.get(plain, "string")
+    kinds: dict[Any, Kind] = {int: "int64", float: "float64", bool: "bool", list: "json", dict: "json"}
+    return kinds.get(get_origin(plain) or plain, "string")
 
 
 def with_fields(
