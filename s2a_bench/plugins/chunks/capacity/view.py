@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.experiments import Shown
-from s2a_bench.experiments.cells import SHARE, TIME, Cells, Comparable, Metric, Rows, Subject, columns_of, mean
+from s2a_bench.experiments.cells import SHARE, TIME, Cells, Comparable, Metric, Subject, columns_of, mean
 from s2a_bench.plugins.chunks.capacity.metrics import METRICS
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, KNEES, ROBOTS, TWIN, FleetRow, KneeRow
+from s2a_bench.stats.batches import Rows
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.json import frame
@@ -209,7 +210,7 @@ def _subjects(run: StoredRun) -> list[Subject]:
 
 
 def _knee(knee: KneeRow, metric: str) -> Rows:
-    return [np.array([float(knee.robots)])] if metric == KNEE.name else []
+    return Rows(np.array([float(knee.robots)] if metric == KNEE.name else []))
 
 
 COMPARED: Final = Comparable(
