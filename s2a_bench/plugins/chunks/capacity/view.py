@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.experiments import Shown
-from s2a_bench.experiments.cells import SHARE, TIME, Cells, Comparable, Metric, Subject, columns_of, mean
+from s2a_bench.experiments.cells import SHARE, TIME, Cells, Comparable, Metric, Subject, columns_of, json_of, mean
 from s2a_bench.plugins.chunks.capacity.metrics import METRICS
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, KNEES, ROBOTS, TWIN, FleetRow, KneeRow
 from s2a_bench.stats.batches import Rows
@@ -47,12 +47,8 @@ def show(run: StoredRun, **_: Any) -> Shown:
         main=["capacity"],
         csvs=lambda: {"capacity.csv": CsvTable.of(columns, (vars(fleet).values() for fleet in fleets))},
         figures=lambda: {"capacity": partial(build_capacity, drawn, knees)} if _panels(drawn) else {},
-        json=lambda: frame(run, [_json(fleet) for fleet in fleets], [], knees=[asdict(knee) for knee in knees]),
+        json=lambda: frame(run, [json_of(fleet) for fleet in fleets], [], knees=[asdict(knee) for knee in knees]),
     )
-
-
-def _json(fleet: FleetRow) -> dict[str, Any]:
-    return {name: value for name, value in vars(fleet).items() if value is not None}
 
 
 def _knee_sentences(run: StoredRun, knees: Sequence[KneeRow]) -> Iterator[str]:
