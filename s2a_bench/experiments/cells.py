@@ -174,9 +174,9 @@ class Cells(Generic[Row]):
     @cached_property
     def rows(self) -> list[Row]:
         """The rows as objects of their class, None for a missing value."""
-        frame = self.frame[[field.name for field in fields(self.row)]]  # type: ignore[arg-type]  # a row is a dataclass
-        records = frame.astype(object).where(frame.notna(), None).to_dict("records")
-        return [self.row(**{str(name): value for name, value in record.items()}) for record in records]
+        names = [field.name for field in fields(self.row)]  # type: ignore[arg-type]  # a row is a dataclass
+        columns = [self.frame[name].to_numpy(dtype=object, na_value=None) for name in names]
+        return [self.row(**dict(zip(names, values, strict=True))) for values in zip(*columns, strict=True)]
 
     @cached_property
     def first(self) -> Row:

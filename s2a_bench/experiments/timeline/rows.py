@@ -6,7 +6,7 @@ A new metric is a column, and its value of a plan in `build_rows.timeline_rows`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
 
 from s2a_bench.experiments.cells import ANY, HIDDEN, SHARE, TO_ONE, JsonKey, Metric, mean, metrics_of, share
 from s2a_bench.store.schema import Many, NonNegative, Positive, Table, about
@@ -82,7 +82,7 @@ class TimelineRow:
 class TimelineCell(TimelineRow):
     """A policy in one setting: means over its plans."""
 
-    means = True
+    means: ClassVar[bool] = True
     plans: Annotated[Many, about("Number of plans that the means are over.")]
 
 
