@@ -133,7 +133,8 @@ def sweep_of(folder: Path, runs: list[tuple[dict[str, Any], Path]], *, cells: in
 
 def test_the_page_has_the_numbers_of_the_tables(computed: Path) -> None:
     page = Page(page_of(computed))
-    table = execution_table(read_run(computed))
+    run = read_run(computed)
+    table = execution_table(timelines_of(run), run.manifest)
     rows = [text for row in table.rows for text in row]
     start = page.cells.index(rows[0])
     assert page.cells[start : start + len(rows)] == rows
