@@ -168,11 +168,11 @@ POLICIES: Final[Registry[Callable[..., Policy]]] = Registry(
     "policies",
     "policy",
     {
-        "naive": "s2a_bench.policy.naive:Naive",
-        "wait-then-act": "s2a_bench.policy.wait_then_act:WaitThenAct",
+        "naive": "s2a_bench.policy.nominal:Naive",
+        "wait-then-act": "s2a_bench.policy.nominal:WaitThenAct",
         "stream-to-act": "s2a_bench.policy.stream_to_act:StreamToAct",
         "stream-to-act-early": "s2a_bench.policy.stream_to_act:EarlyStart",
-        "s2a-clairvoyant": "s2a_bench.policy.wait_then_act:Clairvoyant",
+        "s2a-clairvoyant": "s2a_bench.policy.nominal:Clairvoyant",
         "s2a-mean": "s2a_bench.policy.stream_to_act:MeanStart",
     },
 )

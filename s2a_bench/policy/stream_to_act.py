@@ -34,7 +34,7 @@ from pydantic import Field
 
 from s2a_bench.policy import CAUTION, Plans, PlanShape, Policy, Schedule, Start, Stepper, Timing
 from s2a_bench.policy.estimator import VAGUE, GapPrior, Number
-from s2a_bench.policy.wait_then_act import Clairvoyant
+from s2a_bench.policy.nominal import Clairvoyant
 
 if TYPE_CHECKING:
     from s2a_bench.policy.changes import ChangeWatch

@@ -28,7 +28,7 @@ from s2a_bench.policy.conformal import (
     upper_bound,
 )
 from s2a_bench.policy.estimator import GapPrior
-from s2a_bench.policy.naive import Naive
+from s2a_bench.policy.nominal import Naive
 from s2a_bench.policy.stream_to_act import StreamToAct
 from studies.worlds import World
 
