@@ -9,8 +9,7 @@ from dataclasses import replace
 from itertools import product
 
 from s2a_bench.errors import UsageError
-from s2a_bench.plan.formats import Format, Tokenize, spelled
-from s2a_bench.plan.labels import CallLabels, Codes, Letters, Words
+from s2a_bench.plan.formats import CallLabels, Codes, Format, Letters, Tokenize, Words, spelled
 from s2a_bench.plan.skillset import SkillSet
 
 _FILLERS = ("-", "~", "_", ".")

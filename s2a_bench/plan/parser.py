@@ -18,8 +18,7 @@ import codecs
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from s2a_bench.plan.formats import Format
-from s2a_bench.plan.labels import normalise
+from s2a_bench.plan.formats import Format, normalise
 from s2a_bench.plan.skillset import Call
 
 Problem: TypeAlias = Literal["unknown-skill", "bad-argument", "malformed", "too-long", "incomplete"]
