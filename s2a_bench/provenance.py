@@ -109,9 +109,9 @@ class Provenance:
     @property
     def labels(self) -> tuple[str, ...]:
         """Return the labels of everything except a real, measured model that sees its pictures."""
-        found = tuple(label for (name, value), label in LABELS.items() if getattr(self, name) == value)
+        labels = tuple(label for (name, value), label in LABELS.items() if getattr(self, name) == value)
         no_model = self.weights == NONE and self.engine not in {NONE, UNKNOWN}
-        return (*found, f"{self.engine} engine") if no_model else found
+        return (*labels, f"{self.engine} engine") if no_model else labels
 
     @property
     def code(self) -> str:
@@ -197,10 +197,10 @@ class Origins:
 
     def _grouped(self, name: str, kind: Callable[[Provenance], Provenance]) -> str:
         """Return a line for each kind of provenance, with all values of one field in that kind."""
-        found: dict[Provenance, dict[str, None]] = {}
+        by_kind: dict[Provenance, dict[str, None]] = {}
         for each in self.every:
-            found.setdefault(kind(each), {})[getattr(each, name)] = None
-        lines = (replace(each, **{name: ", ".join(filter(None, values))}).line for each, values in found.items())
+            by_kind.setdefault(kind(each), {})[getattr(each, name)] = None
+        lines = (replace(each, **{name: ", ".join(filter(None, values))}).line for each, values in by_kind.items())
         return "; ".join(dict.fromkeys(lines))
 
     @property
@@ -217,7 +217,7 @@ def joined(origins: Iterable[Origins]) -> Origins:
     for name, each in (item for one in origins for item in one.cells.items()):
         named.setdefault(name, set()).add(each)
     cells = {str(place): each for place, each in enumerate(every)}
-    cells |= {name: found.pop() for name, found in named.items() if len(found) == 1}
+    cells |= {name: distinct.pop() for name, distinct in named.items() if len(distinct) == 1}
     return Origins(next(iter(every), Provenance()), cells)
 
 

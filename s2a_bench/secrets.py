@@ -39,8 +39,8 @@ def secrets_in(value: Any, name: str = "", *, inside: bool = False) -> Iterator[
     """Yield name and text of every value of a JSON object under a secret's name, at any depth."""
     if isinstance(value, dict):
         for key, item in value.items():
-            found = inside or is_secret(key)
-            yield from secrets_in(item, name if inside else key, inside=found)
+            secret = inside or is_secret(key)
+            yield from secrets_in(item, name if inside else key, inside=secret)
     elif isinstance(value, list):
         for item in value:
             yield from secrets_in(item, name, inside=inside)
@@ -65,11 +65,11 @@ def struck(text: str, *, short: bool = True) -> str:
 def struck_pieces(texts: Sequence[str]) -> list[str]:
     """Return the pieces of one text without the secrets, which may span several pieces."""
     whole, patterns = "".join(texts), [*_long.values(), *_short.values()]
-    found = list(re.finditer("|".join(patterns), whole, re.IGNORECASE)) if patterns else []
-    if not found:
+    matches = list(re.finditer("|".join(patterns), whole, re.IGNORECASE)) if patterns else []
+    if not matches:
         return list(texts)
     letters = list(whole)
-    for match in found:
+    for match in matches:
         letters[match.start() : match.end()] = [STRUCK, *[""] * (match.end() - match.start() - 1)]
     rest = iter(letters)
     return ["".join(islice(rest, len(text))) for text in texts]

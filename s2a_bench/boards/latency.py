@@ -103,12 +103,12 @@ def read_delays(path: Path) -> Ints:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
             latency_of = _reader(reader.fieldnames or (), path)
-            found = [_latency(row, latency_of, f"`latency`: {path}, line {reader.line_num}") for row in reader]
+            latencies_ns = [_latency(row, latency_of, f"`latency`: {path}, line {reader.line_num}") for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"`latency`: cannot read {path}: {error}") from error
-    if not found:
+    if not latencies_ns:
         raise UsageError(f"`latency`: {path} has no rows")
-    return np.array(found, np.int64)
+    return np.array(latencies_ns, np.int64)
 
 
 def _reader(names: Sequence[str], path: Path) -> Callable[[Mapping[str, str]], float]:

@@ -85,11 +85,11 @@ def _flags_of_modes(experiment: Experiment) -> Iterator[Flag]:
     for flag, about in (pair for mode in modes for pair in mode.flags.items()):
         if about:
             yield Flag(flag.replace("_", "-"), (flag,), bool, about, panel="Modes", first=True)
-    found: dict[str, dict[RunMode, Flag]] = {}
+    by_name: dict[str, dict[RunMode, Flag]] = {}
     for mode in modes:
         for each in distinct([*flags_of(mode.options)]):
-            found.setdefault(each.name, {})[mode] = each
-    for of_mode in found.values():
+            by_name.setdefault(each.name, {})[mode] = each
+    for of_mode in by_name.values():
         first = next(iter(of_mode.values()))
         panel = f"{first.panel or 'Options'}{_with(modes, of_mode)}"
         about = _with_defaults({mode.name: each.about for mode, each in of_mode.items()})

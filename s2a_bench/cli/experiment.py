@@ -79,10 +79,9 @@ def _click(name: str, made: Any, about: str | None = None) -> Any:
     if not isinstance(made, typer.Typer):
         group = typer.Typer(**PLAIN)
         group.command(name, help=about, cls=Flagged)(made)
-    found: Any = typer.main.get_command(group)
-    found.name = name
-    found.rest = getattr(made, "rest", ())
-    return found
+    click: Any = typer.main.get_command(group)
+    click.name, click.rest = name, getattr(made, "rest", ())
+    return click
 
 
 class Flagged(TyperCommand):

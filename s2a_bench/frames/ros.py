@@ -75,12 +75,12 @@ class TopicCamera(ImageMessages):
         """Wait for publishers of the topic and return those of pictures, of one type."""
         middleware = self._middleware
         there = appeared(lambda: any(offer.topic == self._topic for offer in middleware.offers()), self._wait_s)
-        found = middleware.offers()
+        offered = middleware.offers()
         for type_name in TYPES:
-            if offers := [offer for offer in found if (offer.topic, offer.type_name) == (self._topic, type_name)]:
+            if offers := [offer for offer in offered if (offer.topic, offer.type_name) == (self._topic, type_name)]:
                 return offers
-        others = sorted({offer.topic for offer in found if offer.type_name in TYPES})
-        types = sorted({offer.type_name for offer in found if offer.topic == self._topic})
+        others = sorted({offer.topic for offer in offered if offer.type_name in TYPES})
+        types = sorted({offer.type_name for offer in offered if offer.topic == self._topic})
         listed = f"topics of pictures here: {', '.join(others[:10]) or 'none'}"
         if there:
             raise TransportError(f"{self._topic} is of type {', '.join(types)}; {listed}")

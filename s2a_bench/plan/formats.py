@@ -118,14 +118,14 @@ class Codes(CallLabels):
 
 def _initials(names: Iterable[Value]) -> dict[Value, str]:
     """Assign each name a unique letter, one of its letters if possible, else the first unused one."""
-    found: dict[Value, str] = {}
+    letters: dict[Value, str] = {}
     for name in names:
         wanted = [char for char in name if char in LETTERS] if isinstance(name, str) else []
-        letter = next((char for char in (*wanted, *LETTERS) if char not in found.values()), None)
+        letter = next((char for char in (*wanted, *LETTERS) if char not in letters.values()), None)
         if letter is None:
             raise ValueError(f"more than {len(LETTERS)} names")
-        found[name] = letter
-    return found
+        letters[name] = letter
+    return letters
 
 
 @dataclass(frozen=True)

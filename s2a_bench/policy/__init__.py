@@ -158,9 +158,9 @@ class Policy(Protocol):
         """Decide with each lambda: arrays of shape (N, lambdas, M)."""
         import numpy as np
 
-        found = [self.informed(caution=caution).schedule(plans) for caution in cautions]
+        every = [self.informed(caution=caution).schedule(plans) for caution in cautions]
         return Schedule(
-            np.stack([each.start_s for each in found], axis=1), np.stack([each.duration_s for each in found], axis=1)
+            np.stack([each.start_s for each in every], axis=1), np.stack([each.duration_s for each in every], axis=1)
         )
 
 

@@ -102,7 +102,7 @@ def promise(calibrations: Mapping[str, Mapping[str, Any]], what: str, unit: str)
 
     Calibrations are plain data; one whose scores are not exchangeable promises nothing, and the sentence says so.
     """
-    kept = [each for each in (Calibration(**found) for found in calibrations.values()) if each.exchangeable]
+    kept = [each for each in (Calibration(**facts) for facts in calibrations.values()) if each.exchangeable]
     if not kept:
         return no_promise(calibrations)
     worst = max(kept, key=lambda each: each.expected_risk)
@@ -120,7 +120,7 @@ def no_promise(calibrations: Mapping[str, Mapping[str, Any]]) -> str:
     """Return which calibrations promise nothing, as their scores are not exchangeable; empty for none."""
     broken = ", ".join(
         f"{name} ({'changed since the calibration' if each.changed else each.lag_one})"
-        for name, each in ((name, Calibration(**found)) for name, found in calibrations.items())
+        for name, each in ((name, Calibration(**facts)) for name, facts in calibrations.items())
         if not each.exchangeable
     )
     return f"No promise about stalls, because the delays are not exchangeable: {broken}." if broken else ""

@@ -57,5 +57,5 @@ def _value(type_: Any, text: str, what: str, known: str) -> Any:
 
 
 def _parameters(made_by: Any) -> list[Field[Any]]:
-    found = fields(made_by) if is_dataclass(made_by) else ()
-    return [field for field in found if isinstance(field.default, bool | int | float | str | None)]
+    declared = fields(made_by) if is_dataclass(made_by) else ()
+    return [field for field in declared if isinstance(field.default, bool | int | float | str | None)]

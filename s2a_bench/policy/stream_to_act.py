@@ -92,9 +92,9 @@ class StreamToAct(Policy):
 
         count = plans.arrival_s.shape[1]
         copies = take(plans, np.tile(np.arange(count), len(cautions)))
-        found = schedule(self.prior, np.repeat(cautions, count), copies, self.rule)
+        decided = schedule(self.prior, np.repeat(cautions, count), copies, self.rule)
         shape = (-1, len(cautions), count)
-        return Schedule(found.start_s.reshape(shape), found.duration_s.reshape(shape))
+        return Schedule(decided.start_s.reshape(shape), decided.duration_s.reshape(shape))
 
     def informed(self, prior: GapPrior | None = None, caution: float | None = None) -> StreamToAct:
         return replace(self, prior=prior or self.prior, caution=self.caution if caution is None else caution)

@@ -75,8 +75,8 @@ class Machine:
             return None
 
     def read_all(self, pattern: str) -> dict[str, str]:
-        found = (str(path.relative_to(self.root)) for path in sorted(self.root.glob(pattern)))
-        return {name: text for name in found if (text := self.read(name)) is not None}
+        names = (str(path.relative_to(self.root)) for path in sorted(self.root.glob(pattern)))
+        return {name: text for name in names if (text := self.read(name)) is not None}
 
 
 Check: TypeAlias = Callable[[Machine], Finding | None]
@@ -109,8 +109,8 @@ BEFORE_RUN = "cpus", "cpu-governor", "jetson-clocks", "load", "temperature", "gp
 
 def examine(machine: Machine, checks: Mapping[str, str] = CHECKS) -> list[Finding]:
     """Run the checks (code -> ``module:function``) and return their findings."""
-    found = (resolve_name(check)(machine) for check in checks.values())
-    return [finding for finding in found if finding is not None]
+    results = (resolve_name(check)(machine) for check in checks.values())
+    return [finding for finding in results if finding is not None]
 
 
 def worst(findings: Iterable[Finding]) -> Level:

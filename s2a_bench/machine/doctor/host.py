@@ -48,15 +48,15 @@ def cgroup_quota(machine: Machine) -> float | None:
 
 
 def governor(machine: Machine) -> Finding | None:
-    found = machine.read_all(f"{CPU}/cpu[0-9]*/cpufreq/scaling_governor")
-    if not found:
+    governors = machine.read_all(f"{CPU}/cpu[0-9]*/cpufreq/scaling_governor")
+    if not governors:
         return None
     if is_jetson(machine):
-        return Finding("cpu-governor", "state", f"{', '.join(sorted(set(found.values())))}; see jetson-clocks")
-    if slow := sorted(set(found.values()) - {"performance"}):
+        return Finding("cpu-governor", "state", f"{', '.join(sorted(set(governors.values())))}; see jetson-clocks")
+    if slow := sorted(set(governors.values()) - {"performance"}):
         message = f"the CPU governor is {', '.join(slow)}: the clock changes while measuring"
         return Finding("cpu-governor", "warning", message, "sudo cpupower frequency-set -g performance")
-    return Finding("cpu-governor", "state", f"performance on {len(found)} CPUs")
+    return Finding("cpu-governor", "state", f"performance on {len(governors)} CPUs")
 
 
 def turbo(machine: Machine) -> Finding | None:
@@ -130,12 +130,12 @@ def clock_source(machine: Machine) -> Finding | None:
 
 
 def _listed(text: str | None) -> list[int]:
-    found: list[int] = []
+    numbers: list[int] = []
     for part in (text or "").split(","):
         first, _, last = part.partition("-")
         if first.isdecimal():
-            found += range(int(first), int(last or first) + 1)
-    return found
+            numbers += range(int(first), int(last or first) + 1)
+    return numbers
 
 
 def memory(machine: Machine) -> Finding | None:

@@ -53,10 +53,10 @@ def installed(package: str) -> str:
 
 
 def _problem(requirement: Requirement) -> str:
-    if not (found := installed(requirement.name)):
+    if not (release := installed(requirement.name)):
         return f"{requirement.name} is missing"
-    fits = requirement.specifier.contains(found, prereleases=True)
-    return "" if fits else f"{requirement.name} is {found}, not {requirement.specifier}"
+    fits = requirement.specifier.contains(release, prereleases=True)
+    return "" if fits else f"{requirement.name} is {release}, not {requirement.specifier}"
 
 
 def compiler(machine: Machine) -> Finding:

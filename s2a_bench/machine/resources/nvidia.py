@@ -92,12 +92,12 @@ def _queries(nvml: Any) -> dict[str, tuple[Callable[[list[float]], float], Query
 def parse_tegrastats(line: str) -> dict[str, float]:
     """Parse a line of tegrastats (JetPack 4 to 6); a rail's first figure is the current value, its second a mean."""
     values: dict[str, float] = {}
-    if found := GPU.search(line):
-        values["gpu_busy"] = int(found[1]) / 100
-        if found[2]:
-            values["gpu_clock_hz"] = int(found[2]) * 1e6
-    if found := TEMPERATURE.search(line):
-        values["gpu_temperature_c"] = float(found[1])
+    if match := GPU.search(line):
+        values["gpu_busy"] = int(match[1]) / 100
+        if match[2]:
+            values["gpu_clock_hz"] = int(match[2]) * 1e6
+    if match := TEMPERATURE.search(line):
+        values["gpu_temperature_c"] = float(match[1])
     board_w = board_power({name: int(milliwatts) / 1e3 for name, milliwatts in RAIL.findall(line)})
     return values if board_w is None else {**values, "board_power_w": board_w}
 

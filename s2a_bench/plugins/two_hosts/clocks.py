@@ -147,8 +147,8 @@ def interval_at(at_ns: int, exchanges: Sequence[Exchange]) -> Interval:
     pairs = [*pairwise(upper), *pairwise(lower), *product(upper, lower)]
     lines = [(one, (other[1] - one[1]) / (other[0] - one[0])) for one, other in pairs if one[0] != other[0]]
     lines += [(point, rate) for point in (*upper, *lower) for rate in (-RATE, RATE)]
-    found = np.array([(bound - rate * time, rate) for (time, bound), rate in lines if abs(rate) <= RATE])
-    at, rate = found[:, :1], found[:, 1:]
+    corners = np.array([(bound - rate * time, rate) for (time, bound), rate in lines if abs(rate) <= RATE])
+    at, rate = corners[:, :1], corners[:, 1:]
     over, under = at + rate * above[:, 0] - above[:, 1], below[:, 1] - at - rate * below[:, 0]
     beyond = np.maximum(over.max(axis=1), under.max(axis=1))
     if beyond.min() > ROUNDING_NS / 2:
