@@ -13,7 +13,7 @@ from s2a_bench.boards.profile import Profile
 from s2a_bench.clock import clock_id
 from s2a_bench.machine.doctor import Machine
 from s2a_bench.machine.doctor.gpu import current_power_mode, identity, nvml
-from s2a_bench.machine.doctor.software import installed
+from s2a_bench.machine.doctor.host import installed
 
 PACKAGES = ("huggingface-hub", "llama-cpp-python", "numpy", "nvidia-ml-py", "opencv-python-headless", "pydantic")
 """The packages that matter to every result; transports add theirs."""

@@ -82,9 +82,9 @@ class Machine:
 Check: TypeAlias = Callable[[Machine], Finding | None]
 
 CHECKS: dict[str, str] = {
-    "python": "s2a_bench.machine.doctor.software:python",
-    "packages": "s2a_bench.machine.doctor.software:packages",
-    "compiler": "s2a_bench.machine.doctor.software:compiler",
+    "python": "s2a_bench.machine.doctor.host:python",
+    "packages": "s2a_bench.machine.doctor.host:packages",
+    "compiler": "s2a_bench.machine.doctor.host:compiler",
     "board": "s2a_bench.machine.doctor.gpu:board",
     "gpu": "s2a_bench.machine.doctor.gpu:gpu",
     "gpu-throttling": "s2a_bench.machine.doctor.gpu:gpu_throttling",

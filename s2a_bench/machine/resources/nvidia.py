@@ -11,7 +11,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 from s2a_bench import extras
@@ -36,14 +36,14 @@ class Nvml(Reader):
     def __init__(self, pids: Sequence[int] = ()) -> None:  # noqa: ARG002 - a GPU's figures are the whole GPU's
         """Load the driver's library and find what every GPU can report; raises Unreadable without library or GPU."""
         try:
-            pynvml = self._nvml = extras.require("pynvml", "nvidia")
+            pynvml = extras.require("pynvml", "nvidia")
         except MissingExtra as error:
             raise Unreadable(str(error)) from error
         self._failed = pynvml.NVMLError
-        self._open = False
+        self._opened = ExitStack()
         try:
             pynvml.nvmlInit()
-            self._open = True
+            self._opened.callback(pynvml.nvmlShutdown)
             self._gpus = [pynvml.nvmlDeviceGetHandleByIndex(place) for place in range(pynvml.nvmlDeviceGetCount())]
             names = [pynvml.nvmlDeviceGetName(gpu) for gpu in self._gpus]
             driver = pynvml.nvmlSystemGetDriverVersion()
@@ -64,10 +64,8 @@ class Nvml(Reader):
         return values
 
     def close(self) -> None:
-        if self._open:
-            self._open = False
-            with suppress(self._failed):
-                self._nvml.nvmlShutdown()
+        with suppress(self._failed):
+            self._opened.close()
 
     def _answers(self, query: Query) -> bool:
         """Return True if there is a GPU and all of them answer; boards measure different things."""
