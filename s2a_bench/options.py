@@ -240,7 +240,7 @@ def _size(value: Any) -> Any:
 
 
 def _square(value: Any) -> Any:
-    return (int(value),) * 2 if isinstance(value, str) and value.isdecimal() else _size(value)
+    return (int(value), int(value)) if isinstance(value, str) and value.isdecimal() else _size(value)
 
 
 def _text(value: Any) -> Any:

@@ -64,7 +64,7 @@ class Provenance:
         weights = {True: "dummy", False: "real"}.get(facts.get("dummy", ""), UNKNOWN)
         if not facts.get("engine"):
             return cls(link=link, weights=weights)
-        emulated, paced = bool(facts.get("emulated")), "paced_tokens_per_s" in facts
+        tokens = "paced" if "paced_tokens_per_s" in facts else "measured"
         no_model = facts.get("model") == NONE
         return cls(
             engine=_text(facts["engine"]),
@@ -72,7 +72,7 @@ class Provenance:
             model_sha256=_text(facts.get("model_sha256")),
             quantisation=_text(facts.get("quantisation")),
             weights=NONE if no_model else weights,
-            tokens="emulated" if emulated else "paced" if paced else "measured",
+            tokens="emulated" if facts.get("emulated") else tokens,
             profile=_text(facts.get("profile")) or _latencies(_text(facts.get("latency"))),
             link=link,
             pictures=_text(facts.get("pictures")),
@@ -222,7 +222,8 @@ def joined(origins: Iterable[Origins]) -> Origins:
 
 
 def _latencies(written: str) -> str:
-    return f"latencies {written}{' ms' if written[-1].isdigit() and ':' not in written else ''}" if written else ""
+    number = written[-1:].isdigit() and ":" not in written
+    return f"latencies {written}{' ms' if number else ''}" if written else ""
 
 
 def _text(value: Any) -> str:

@@ -70,7 +70,7 @@ def struck_pieces(texts: Sequence[str]) -> list[str]:
         return list(texts)
     letters = list(whole)
     for match in matches:
-        letters[match.start() : match.end()] = [STRUCK, *[""] * (match.end() - match.start() - 1)]
+        letters[match.start() : match.end()] = [STRUCK] + [""] * (len(match[0]) - 1)
     rest = iter(letters)
     return ["".join(islice(rest, len(text))) for text in texts]
 

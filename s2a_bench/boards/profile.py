@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -166,13 +166,13 @@ def search_path() -> list[Path]:
     return [Path("profiles"), config / "s2a-bench" / "profiles", SHIPPED, *(folder for _, folder in OFFERED.loaded())]
 
 
+def toml_files(folders: Sequence[Path]) -> dict[str, Path]:
+    """Return name -> file, sorted; of two files with one name, that in the first folder."""
+    return dict(sorted({path.stem: path for folder in reversed(folders) for path in folder.glob("*.toml")}.items()))
+
+
 def profile_files() -> dict[str, Path]:
-    """Return name -> file of every profile, sorted; the first folder with a name wins."""
-    found: dict[str, Path] = {}
-    for folder in search_path():
-        for path in sorted(folder.glob("*.toml")):
-            found.setdefault(path.stem, path)
-    return dict(sorted(found.items()))
+    return toml_files(search_path())
 
 
 def find_profile(name: str) -> Path:
