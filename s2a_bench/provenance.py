@@ -15,7 +15,6 @@ UNKNOWN: Final = "unknown"
 NONE: Final = "none"
 NOT_SENT: Final = "not seen or sent"
 ORIGIN: Final = "Provenance: "
-"""The beginning of a line of provenance."""
 
 LABELS: Final = {
     ("weights", "dummy"): "dummy weights",

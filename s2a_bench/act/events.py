@@ -148,10 +148,10 @@ class VirtualInbox:
 
     def wait(self, until_ns: int | None) -> list[Event]:
         """Jump to the next event, or to ``until_ns``; raises RuntimeError without either."""
-        times_ns = [each for each in (until_ns, *(event[0] for event in self._events[:1])) if each is not None]
-        if not times_ns:
+        next_ns = self._events[0][0] if self._events else until_ns
+        if next_ns is None:
             raise RuntimeError("nothing will ever happen: the executor would wait for ever")
-        self._clock.sleep_until_ns(min(times_ns))
+        self._clock.sleep_until_ns(next_ns if until_ns is None else min(next_ns, until_ns))
         events = []
         while self._events and self._events[0][0] <= self._clock.now_ns():
             events.append(heapq.heappop(self._events)[2])

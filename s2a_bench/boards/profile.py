@@ -67,7 +67,6 @@ class Profile:
 
     @property
     def provenance(self) -> Provenance:
-        """Of numbers that are computed from it."""
         pictures = str(self.facts.get("model", {}).get("pictures", ""))
         return Provenance.computed(self.name, "dummy" if self.dummy else "real", pictures)
 

@@ -65,7 +65,8 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
         line += "" if one.detectable is None else f", sees {shown.detectable_text(one.detectable)}"
         print_error(f"{line}; {one.reason}" if one.reason else line)
     outcomes = {one.outcome for one in judgements}  # a tripped gate comes before an undecided one
-    raise typer.Exit(TRIPPED if gates.TRIPPED in outcomes else UNDECIDED if gates.UNDECIDED in outcomes else 0)
+    undecided = UNDECIDED if gates.UNDECIDED in outcomes else 0
+    raise typer.Exit(TRIPPED if gates.TRIPPED in outcomes else undecided)
 
 
 compare = command(_compare, CompareConfig)

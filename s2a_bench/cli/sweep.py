@@ -138,8 +138,9 @@ def command_of(name: str, key: str = "command", *, trusted: bool = False) -> Swe
             flags[parameter.name] = "argument"
         else:
             long = next(flag for flag in parameter.opts if flag.startswith("--"))
-            value = "hidden" if parameter.hidden else "value"
-            kind = value if not parameter.is_flag else "toggle" if parameter.secondary_opts else "switch"
+            kind = "hidden" if parameter.hidden else "value"
+            if parameter.is_flag:
+                kind = "toggle" if parameter.secondary_opts else "switch"
             flags[long.removeprefix("--")] = kind
     return SweepCommand(name, flags, lambda argv: _check(name, argv, trusted=trusted))
 

@@ -113,7 +113,7 @@ class TopicCamera(ImageMessages):
             raise newest
         if newest is None:
             count = self._subscription.matched()
-            what = f"no picture for {self._wait_s:g} s of {count} publisher{'s' * (count != 1)}"
+            what = f"no picture for {self._wait_s:g} s of {count} publisher{'' if count == 1 else 's'}"
             if not count:
                 raise TransportError(f"{what}: start it again, or one with the QoS and the type of ROS 2")
             raise TransportError(

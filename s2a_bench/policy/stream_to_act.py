@@ -77,7 +77,6 @@ class StreamToAct(Policy):
     caution: Caution | None = None
     """None: calibrated if a run has plans for that, else `CAUTION`."""
     detect: bool = False
-    """Whether changes of the rate within the plan are detected."""
 
     def schedule(self, plans: Plans) -> Schedule:
         from s2a_bench.policy.online import schedule

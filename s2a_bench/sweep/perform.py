@@ -89,8 +89,8 @@ def _outside(argv: list[str], log: Path) -> str:
         return ""
     lines = log.read_text(errors="replace").strip().splitlines()
     errors_of_cell = [line.removeprefix("error: ") for line in lines if line.startswith("error: ")]
-    how = how_it_ended(done.returncode)
-    return errors_of_cell[-1] if errors_of_cell else f"{how}: {lines[-1][:200]}" if lines else how
+    last_line = f": {lines[-1][:200]}" if lines else ""
+    return errors_of_cell[-1] if errors_of_cell else f"{how_it_ended(done.returncode)}{last_line}"
 
 
 class LocalWorkers(CellWorkers):

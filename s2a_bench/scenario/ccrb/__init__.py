@@ -14,4 +14,3 @@ FOLLOWERS: Final[dict[str, str]] = {
     "idm": "s2a_bench.scenario.ccrb.follower:Idm",
     "hybrid": "s2a_bench.scenario.ccrb.follower:Hybrid",
 }
-"""Laws of the car behind, by name."""

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from s2a_bench.plugins.two_hosts.links import EmulatedLink
 
 SERVER, CLIENT = "127.0.0.1", "127.0.0.2"
-"""Addresses of the two sides."""
 ATTEMPTS: Final = 3
 RATE_S: Final = 1.0
 OFFERED: Final = 1.15
@@ -158,7 +157,8 @@ class _Probe:
             last_ns = now_ns() if sent < count else max([last_ns, *arrivals[-1:]])
             if len(arrivals) == count:
                 break
-            select([receiver], [], [], SILENT_S if sent == count else max(gap_ns / 1e9, 0.0005) * (gap_ns > 0))
+            pause_s = max(gap_ns / 1e9, 0.0005) if gap_ns else 0.0
+            select([receiver], [], [], SILENT_S if sent == count else pause_s)
         return arrivals
 
 
