@@ -57,12 +57,7 @@ class PlanShape:
     @property
     def key(self) -> Verbatim:
         """Return the text that seeds the draws for such plans."""
-        of = self.expected
-        return Verbatim(
-            f"PlanShape(n_skills={self.n_skills!r}, tokens_per_skill={self.tokens_per_skill!r}, "
-            f"expected=Timing(nominal_s={of.nominal_s!r}, least_s={of.least_s!r}, most_s={of.most_s!r}), "
-            f"expected_cv={self.expected_cv!r}, safe_start_s={self.safe_start_s!r})"
-        )
+        return Verbatim(repr(self))
 
 
 class Stepper(Protocol):
