@@ -40,10 +40,7 @@ SHOWN_DPI: Final = 150
 
 
 class Run:
-    """One run, read from its folder: its rows, tables and figures. A notebook shows its main tables.
-
-    Raises StoreError if the folder is no run.
-    """
+    """One run, read from its folder; raises StoreError if it is none. A notebook shows its main tables."""
 
     def __init__(self, path: str | Path) -> None:
         self._run = store.read_run(Path(path))

@@ -13,9 +13,7 @@ from itertools import islice
 from typing import Any, Final
 
 LONG: Final = 8
-"""A secret of fewer letters is removed from servers' messages only, and only as a separate word: a placeholder such as
-`ollama` would otherwise disappear from settings."""
-
+"""A shorter secret, as the placeholder `ollama`, is removed from servers' messages only, and only as a separate word."""
 STRUCK: Final = "***"
 
 _long: dict[str, str] = {}

@@ -64,8 +64,7 @@ def draw_ns(gaps: Gaps, rng: np.random.Generator, count: int) -> Ints:
 def sequence_ns(latencies: Latencies) -> Iterator[int]:
     """Return the endless latencies of requests 0, 1, ... in ns, the same in every call.
 
-    A recording is played in its order and starts again after its end. A family with memory keeps it for `STRETCH`
-    latencies.
+    A recording is played in its order, again and again. A family with memory keeps it for `STRETCH` latencies.
     """
     if latencies.recorded_ns is not None:
         return cycle(latencies.recorded_ns.tolist())

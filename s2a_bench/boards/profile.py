@@ -37,10 +37,7 @@ Value = Literal["tokens_per_s", "prompt_s", "prompt_cv", "rate_cv", "gaps", "tra
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """One board running one model.
-
-    A timeline's time to first token is ``prompt_s + 1 / tokens_per_s`` (POLICY section 1, where ``prompt_s`` is c).
-    """
+    """One board running one model; the first token comes ``prompt_s + 1 / tokens_per_s`` after the request."""
 
     name: str
     title: str

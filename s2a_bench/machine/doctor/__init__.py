@@ -22,8 +22,7 @@ from s2a_bench.store.manifest import RunWarning
 
 Level: TypeAlias = Literal["state", "advice", "warning", "error"]
 LEVELS: tuple[Level, ...] = ("state", "advice", "warning", "error")
-"""State: correct, or a plain fact. Advice: makes results better or steadier. Warning: distorts results. Error: does not
-work."""
+"""State: a plain fact. Advice: makes results better or steadier. Warning: distorts results. Error: does not work."""
 
 COMMAND_TIMEOUT_S = 5.0
 

@@ -128,9 +128,8 @@ class Template:
     ) -> dict[str, Any]:
         """Return the observation, if possible without copies of ``pictures``, uint8 (H, W, 3) or (n,).
 
-        ``names`` are those of the pictures that the server reads, in its order.
-
-        Raises RequestFailed for a key without its picture or state, and for a value without a placeholder.
+        ``names`` are those of the pictures that the server reads, in its order. Raises RequestFailed for a key without
+        its picture or state, and for a value without a placeholder.
         """
         if len(pictures) > self.pictures:
             raise RequestFailed(f"`template` {self.name} has places for {self.pictures} pictures, not {len(pictures)}")

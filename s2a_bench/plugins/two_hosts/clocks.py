@@ -179,10 +179,8 @@ class RemoteClock:
     def __init__(self, exchange: Callable[[str], Trace], offsets: dict[str, Any] | None, system: str = "") -> None:
         """``exchange`` makes a request for its marks alone; ``offsets``, by clock, are those that others estimate too.
 
-        Without ``offsets`` nothing is exchanged, and the requests alone bound the offset, more widely.
-
-        ``exchange`` raises S2AError; its argument is ``system``, one of `WALL_CLOCKS` or "", where the
-        server's wall clock is wanted.
+        Without ``offsets`` nothing is exchanged: the requests alone bound the offset, more widely. ``exchange`` raises
+        S2AError; its argument is ``system``, one of `WALL_CLOCKS`, where the server's wall clock is wanted, else "".
         """
         self._exchange, self._system = exchange, system
         self._exchanges = offsets is not None
