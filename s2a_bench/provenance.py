@@ -171,7 +171,6 @@ class Origins:
 
     @property
     def every(self) -> tuple[Provenance, ...]:
-        """Return each provenance once, the cells' first."""
         return tuple(dict.fromkeys(self.cells.values())) or (self.run,)
 
     @property
@@ -204,7 +203,6 @@ class Origins:
 
     @property
     def code(self) -> str:
-        """Return the codes of all cells, each once."""
         return " ".join(dict.fromkeys(each.code for each in self.every))
 
 

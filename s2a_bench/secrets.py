@@ -13,7 +13,7 @@ from itertools import islice
 from typing import Any, Final
 
 LONG: Final = 8
-"""A shorter secret, as the placeholder `ollama`, is removed from servers' messages only, and only as a separate word."""
+"""A shorter secret, as the placeholder `ollama`, is removed from servers' messages only, as a separate word."""
 STRUCK: Final = "***"
 
 _long: dict[str, str] = {}

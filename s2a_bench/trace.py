@@ -229,7 +229,6 @@ def budget(chain: Iterable[Mark]) -> Budget:
 
 
 def mark_cost_ns(repeats: int = 20_000) -> float:
-    """Measure the cost of one mark on this machine, in ns."""
     mark = Trace().mark
     start = now_ns()
     for _ in range(repeats):

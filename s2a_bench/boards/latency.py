@@ -57,7 +57,6 @@ def read_latency(written: str) -> Latencies | None:
 
 
 def draw_ns(gaps: Gaps, rng: np.random.Generator, count: int) -> Ints:
-    """Draw successive latencies in ns, shape (count,)."""
     return whole_ns(gaps.sample(rng, count, 1)[:, 0])
 
 
@@ -110,7 +109,6 @@ def read_delays(path: Path) -> Ints:
 
 
 def _reader(names: Sequence[str], path: Path) -> Callable[[Mapping[str, str]], float]:
-    """Return the function from a row to its latency in ns."""
     for column, unit_ns in UNITS_NS.items():
         if column in names:
             return lambda row: float(row[column]) * unit_ns

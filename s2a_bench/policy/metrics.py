@@ -154,12 +154,10 @@ def jerk(speed_mps: Floats, sample_s: float) -> Floats:
 
 
 def rms_jerk(speed_mps: Floats, sample_s: float) -> float:
-    """Return the root of the mean squared jerk in m/s^3; raises ValueError for fewer than 3 samples."""
     return float(np.sqrt(np.mean(jerk(speed_mps, sample_s) ** 2)))
 
 
 def peak_jerk(speed_mps: Floats, sample_s: float) -> float:
-    """Return the greatest absolute jerk in m/s^3; raises ValueError for fewer than 3 samples."""
     return float(np.abs(jerk(speed_mps, sample_s)).max())
 
 

@@ -155,8 +155,6 @@ class MeanStart(StreamToAct):
 
 @dataclass(slots=True)
 class OnlineStepper:
-    """The online rule on one plan."""
-
     prior: GapPrior
     caution: float
     shape: PlanShape

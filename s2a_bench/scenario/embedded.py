@@ -1,7 +1,4 @@
-"""The embedded simulator: highway-env's kinematic bicycles on a straight road, driven by accelerations.
-
-highway-env integrates with explicit Euler steps and steers by its lane controller.
-"""
+"""The embedded simulator: highway-env's kinematic bicycles on a straight road, driven by accelerations; Euler steps."""
 
 from __future__ import annotations
 

@@ -72,10 +72,7 @@ class Exchange:
 
     @staticmethod
     def of(trace: Trace) -> Exchange:
-        """Read the exchange that a request is, from its last byte packed to its first piece seen.
-
-        Raises RequestFailed for a report without marks.
-        """
+        """Read a request as an exchange, last byte packed to first piece seen; raises RequestFailed without marks."""
         remote = trace.remote
         if remote is None or not remote.marks:
             raise RequestFailed("the server reported no marks, so that its clock cannot be compared with this host's")
@@ -117,10 +114,7 @@ class Offset:
         self._exchanges.append(exchange)
 
     def over(self, *times_ns: int) -> Interval:
-        """Return an interval that holds the offset at each of these times, and between them.
-
-        Raises ClockMoved if the exchanges around one of them contradict each other.
-        """
+        """Return an interval that holds the offset at these times, and between them; raises ClockMoved if none can."""
         return reduce(Interval.__or__, map(self._at, times_ns))
 
     def _at(self, at_ns: int) -> Interval:

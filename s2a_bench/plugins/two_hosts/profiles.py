@@ -150,7 +150,6 @@ def bound_s(link: tuple[Direction, Direction], bytes_up: float, bytes_first_down
 
 
 def published() -> dict[str, LinkProfile]:
-    """Return the shipped profiles by name."""
     tables = loads(PUBLISHED.read_text(encoding="utf-8"), str(PUBLISHED))
     return {
         name: checked(LinkProfile, {"name": name} | table, f"{PUBLISHED}: {name}") for name, table in tables.items()

@@ -1,8 +1,4 @@
-"""Car-to-car rear braking (Euro NCAP CCRb) with a car behind: options, laws, studies and labels.
-
-A scenario is `options.CcrbOptions`; `drive.drive` executes a schedule in a simulator and returns its outcomes.
-studies.py has planes of scenarios, and random ones; labels.py has the texts of results.
-"""
+"""Car-to-car rear braking (Euro NCAP CCRb) with a car behind: options, laws, studies and labels."""
 
 from __future__ import annotations
 

@@ -53,8 +53,7 @@ class Ego(LockStep):
         self._gaps = gaps
         self._between = {gap: BETWEEN[gap] for gap in set(gaps.tolist())}
         self._reflex = Reflex(rollouts) if cars.reflex else None
-        self.index = np.full(rollouts, -1)
-        """The current or last skill, from 0 on; -1 before the first."""
+        self.index = np.full(rollouts, -1)  # the current or last skill
         self._next_s = self._start_s[0].copy()
         self._from_s, self._until_s = np.zeros(rollouts), np.full(rollouts, -np.inf)
         self._level, self._slope = self._points[0].copy(), np.zeros(rollouts)
