@@ -63,7 +63,7 @@ class Executor:
         patience_s: float = PATIENCE_S,
         name: str = "",
     ) -> None:
-        """Follow the stream in ``inbox``; ``gap`` fills the time before the first skill; ``name`` is the record's policy."""
+        """Follow the stream in ``inbox``; ``gap`` fills the time before the first skill; ``name`` is the record's."""
         self.record = Record(name or policy.name)
         self._stepper = policy.stepper(shape)
         self._announced = shape.n_skills
