@@ -160,7 +160,8 @@ class Executor:
     def _decide(self, now_ns: int, due_ns: int) -> int:
         started, requested_ns = len(self.record.skills), self.record.requested_ns
         if self._failure is not None:
-            return self._settle(now_ns, *self._failure)
+            outcome, why = self._failure
+            return self._settle(now_ns, outcome, why)
         if started == self._announced:
             return self._settle(now_ns, "completed")
         answer = math.inf if requested_ns is None else self._stepper.decide(self._policy_time_s(now_ns))

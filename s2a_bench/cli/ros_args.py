@@ -73,7 +73,8 @@ def read(text: str, known: Sequence[str], node: Mapping[str, str]) -> Read:
     result.options = {renamed[source]: target for source, target in rules if source in renamed}
     if remaps := [f"{source}:={target}" for source, target in rules if source not in renamed]:
         result.options["remap"] = remaps
-    name = "{namespace}/{node_name}".format_map({**node, **result.options})
+    named = {**node, **result.options}
+    name = f"{named['namespace']}/{named['node_name']}"
     for kind, value in given:
         if kind == "param":
             if pair := _pair(value, "-p", node["node_name"]):

@@ -92,7 +92,8 @@ class Parser:
                 events.append(SkillParsed(self._skills, call, self._lines, self._feeds))
                 self._skills += 1
             else:
-                events.append(BadLine(*result, self._lines, self._feeds))
+                problem, text, why = result
+                events.append(BadLine(problem, text, why, self._lines, self._feeds))
             self._lines += 1
         return events
 

@@ -30,7 +30,8 @@ class Embedded(Simulator):
     def __init__(self) -> None:
         extras.need("ccrb", "highway_env")
         self._cars: dict[int, Any] = {}
-        self._shown = (State(*np.zeros((3, 3, 1))), np.zeros((3, 1)))
+        nothing = np.zeros((3, 1))
+        self._shown = (State(nothing, nothing, nothing), nothing)
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         controlled = extras.require("highway_env.vehicle.controller", "ccrb").ControlledVehicle
