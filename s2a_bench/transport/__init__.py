@@ -1,28 +1,6 @@
 """Transports: a Client sends a request and yields tokens or actions, a Server feeds requests to a Handler.
 
-To add a transport, write a package with a module like this and register its instance as an entry point of the group
-``s2a_bench.transports``; nothing in this repository changes::
-
-    from s2a_bench.options import option
-    from s2a_bench.transport import SERVER, Transport, TransportOptions
-
-    class ToyOptions(TransportOptions):
-        port: int = option(0, "port; 0: any free one", ge=0, le=65535, side=SERVER)
-
-    class Toy(Transport[ToyOptions]):
-        name, options = "toy", ToyOptions           # --transport 'toy?port=7000', serve toy
-        payloads = ("raw",)                         # the first is the default where raw is not possible
-        stages = {"frame_length": "pack"}           # marked by its client or server, in addition to trace.STAGES
-        facts = (PAYLOAD_BYTES,)                    # numbers beside the marks; new ones as facts.Fact(...)
-        client_class = "toy.client:ToyClient"       # loaded when it is needed; made of wiring and alive
-        server_class = "toy.server:ToyServer"       # made of wiring and handler; enforces wiring.limits
-
-    TOY = Toy()
-
-    [project.entry-points."s2a_bench.transports"]
-    toy = "toy:TOY"
-
-`s2a_bench.testing.transport` has the conformance suite.
+CONTRIBUTING.md says how a package adds one, and which example there is; `testing.transport` has the conformance suite.
 """
 
 from __future__ import annotations
@@ -305,8 +283,9 @@ class Transport(Generic[O]):
     urls: ClassVar[Urls] = Urls()
     sleep: ClassVar[Sleep | None] = None
     client_class: ClassVar[str] = ""
+    """``module:class``, made of a wiring and ``alive``, where `client` is not overridden."""
     server_class: ClassVar[str] = ""
-    """``module:class`` of client and server, where `client` and `server` are not overridden."""
+    """``module:class``, made of a wiring, whose limits it enforces, and a handler, where `server` is not overridden."""
     needs: ClassVar[tuple[str, ...]] = ()
     """The extra of both, and its modules."""
 
