@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from random import Random
 from threading import Condition, Thread
 from typing import TypeAlias
@@ -18,21 +18,20 @@ from s2a_bench.transport.pictures import JPEG_QUALITY, bgr_of
 from s2a_bench.types import Frame
 
 
+@dataclass(slots=True)
 class RequestFeed:
-    """Captures frames for each request; with ``preencoded`` the camera is one that delivers JPEG."""
+    """Captures ``cameras`` frames for each request, scaled to ``size`` (width, height) if given."""
 
-    def __init__(
-        self, source: FrameSource, *, preencoded: bool, cameras: int = 1, size: tuple[int, int] | None = None
-    ) -> None:
-        """Take ``cameras`` frames a request from ``source``, scaled to ``size`` (width, height) if given."""
-        self._source = source
-        self._preencoded = preencoded
-        self._cameras = cameras
-        self._size = size
-        self._ready: tuple[Frame, ...] = ()
+    source: FrameSource
+    _: KW_ONLY
+    preencoded: bool
+    """Whether the camera is one that delivers JPEG."""
+    cameras: int = 1
+    size: tuple[int, int] | None = None
+    _ready: tuple[Frame, ...] = ()
 
     def get_ready(self) -> None:
-        if self._preencoded:
+        if self.preencoded:
             self._ready = tuple(
                 replace(frame, encoding="jpeg", data=encode_jpeg(to_bgr(frame), JPEG_QUALITY)) for frame in self._read()
             )
@@ -41,16 +40,16 @@ class RequestFeed:
         trace.mark(RESIDUAL)
         frames = self._ready or self._read()
         trace.mark("capture")
-        return tuple(self._scaled(frame, trace) for frame in frames) if self._size else frames
+        return tuple(_scaled(frame, *self.size, trace) for frame in frames) if self.size else frames
 
     def _read(self) -> tuple[Frame, ...]:
-        return tuple(self._source.read() for _ in range(self._cameras))
+        return tuple(self.source.read() for _ in range(self.cameras))
 
-    def _scaled(self, frame: Frame, trace: Trace) -> Frame:
-        width, height = self._size or (frame.width, frame.height)
-        pixels = resize(bgr_of(frame, trace).data, width, height)
-        trace.mark("resize")
-        return replace(frame, width=width, height=height, encoding="bgr8", data=pixels)
+
+def _scaled(frame: Frame, width: int, height: int, trace: Trace) -> Frame:
+    pixels = resize(bgr_of(frame, trace).data, width, height)
+    trace.mark("resize")
+    return replace(frame, width=width, height=height, encoding="bgr8", data=pixels)
 
 
 @dataclass(slots=True)

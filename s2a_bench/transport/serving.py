@@ -189,8 +189,8 @@ def _stamped(request: Request, trace: Trace, turn: Turn) -> Generator[Piece, Non
     """Answer a client that compares its clock with this host's; at the piece the answer leaves."""
     kind, _, system = request.prompt.removeprefix(CLOCK_PROMPT).partition(" ")
     if system in WALL_CLOCKS:
-        found = WALL_CLOCKS[system]()
-        trace.facts |= {REALTIME_MS: found.offset_ns / 1e6, REALTIME_ERROR_MS: found.error_ns / 1e6}
+        clock = WALL_CLOCKS[system]()
+        trace.facts |= {REALTIME_MS: clock.offset_ns / 1e6, REALTIME_ERROR_MS: clock.error_ns / 1e6}
     trace.mark("inference")
     trace.token_ns.append(trace.marks[-1][1])
     yield Action(0, np.zeros(1, np.float32)) if kind == ACTIONS else Token(0, ".")
@@ -326,7 +326,11 @@ class Core:
         except Disconnected:
             return False
         except Exception as error:  # noqa: BLE001 - every failure is reported to the client
-            return _fail(exchange, client_error(error))
+            exchange.held.close()
+            try:
+                exchange.fail(client_error(error))
+            except Disconnected:
+                return False
         finally:
             exchange.held.close()
         return True
@@ -425,12 +429,3 @@ def client_error(error: Exception) -> S2AError:
         return error
     _log.error("a request failed", exc_info=error)
     return EngineError("internal error; the server's log has it")
-
-
-def _fail(exchange: Exchange, error: S2AError) -> bool:
-    exchange.held.close()
-    try:
-        exchange.fail(error)
-    except Disconnected:
-        return False
-    return True
