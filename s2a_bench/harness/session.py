@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import InitVar, asdict, dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise, repeat
 from typing import Any, TypeAlias
 
 from s2a_bench.act.events import PlanFeed
@@ -289,7 +289,7 @@ class Session:
             frame_age_lo_ns=max(0, age_ns - joined.error_ns) if joined and age_ns is not None else None,
             frame_age_hi_ns=age_ns + joined.error_ns if joined and age_ns is not None else None,
         )
-        engine_ns = dict(enumerate(trace.remote.token_ns if trace.remote and trace.remote.clock == clock_id() else []))
+        engine_ns = trace.remote.token_ns if trace.remote and trace.remote.clock == clock_id() else []
         tokens = [
             TokenRow(
                 request_id=request_id,
@@ -302,8 +302,7 @@ class Session:
                 engine_lo_ns=left_ns - joined.early_ns if joined and left_ns else None,
                 engine_hi_ns=min(left_ns + joined.late_ns, client_ns) if joined and left_ns else None,
             )
-            for position, (token, client_ns) in enumerate(seen)
-            for left_ns in (engine_ns.get(position),)
+            for (token, client_ns), left_ns in zip(seen, chain(engine_ns, repeat(None)), strict=False)
         ]
         return Measured(sample, tokens, picture, apart, odd=frozenset(trace.odd))
 
@@ -338,8 +337,8 @@ class Session:
         rows = []
         while len(self._frames) > keep:
             frame = self._frames.pop(next(iter(self._frames)))
-            about = frame.marks, frame.used_by, frame.clock_error_ns
-            rows.append(FrameRow(self.cell.name, frame.index, frame.intended_ns, *about))
+            used_by, error_ns = frame.used_by, frame.clock_error_ns
+            rows.append(FrameRow(self.cell.name, frame.index, frame.intended_ns, frame.marks, used_by, error_ns))
         return rows
 
 

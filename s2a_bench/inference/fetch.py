@@ -22,8 +22,6 @@ QUANTS = "Q4_K_M", "Q8_0"
 
 @dataclass(frozen=True, slots=True)
 class FetchedFile:
-    """One fetched file."""
-
     path: Path
     bytes: Count
     sha256: Annotated[str, Facts(pattern="^[0-9a-f]{64}$")]
@@ -59,13 +57,13 @@ def fetch(config: FetchConfig) -> Fetched:
     files: list[FetchedFile] = []
     for name in reversed(names):  # a language model that is there without its mmproj would pass for a text model
         path = Path(_call(api.hf_hub_download, repository, filename=name, revision=info.sha))
-        if (found := sha256(path)) != lfs[name].sha256:
+        if (digest := sha256(path)) != lfs[name].sha256:
             for each in {path, path.resolve()}:
                 each.unlink()
             raise ModelError(
-                f"{name}: has SHA-256 {found}, the hub says {lfs[name].sha256}; it was deleted, fetch again"
+                f"{name}: has SHA-256 {digest}, the hub says {lfs[name].sha256}; it was deleted, fetch again"
             )
-        files.insert(0, FetchedFile(path, path.stat().st_size, found))
+        files.insert(0, FetchedFile(path, path.stat().st_size, digest))
     return Fetched(api.endpoint, repository, info.sha, tuple(files))
 
 
@@ -87,7 +85,7 @@ def chosen(repository: str, file: str, config: FetchConfig, listed: Collection[s
         wanted = [str(models[0]), config.mmproj or str(mmproj or "")]
     known = {name.lower(): name for name in listed} | {name: name for name in listed}
     names = {name: known.get(name, known.get(name.lower(), "")) for name in wanted if name}
-    if missing := [name for name, found in names.items() if not found]:
+    if missing := [name for name, listed_as in names.items() if not listed_as]:
         raise ModelError(f"{repository}: has no {missing[0]}; it has {there}")
     return [*names.values()]
 

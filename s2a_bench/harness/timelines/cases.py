@@ -61,7 +61,6 @@ class PlanCase:
 
     @property
     def tokens(self) -> int:
-        """Return the number of tokens of a plan."""
         return self.setting.n_skills * self.setting.tokens_per_skill
 
 

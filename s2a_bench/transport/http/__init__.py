@@ -34,8 +34,8 @@ THINKING_MS = Fact("thinking_ms", "ms", "first thinking to the first token")
 
 def found_llama_server() -> Path | None:
     """Find llama.cpp's server: on PATH, else in the wheel, which needs the extra for models; None without either."""
-    if found := shutil.which("llama-server"):
-        return Path(found)
+    if program := shutil.which("llama-server"):
+        return Path(program)
     return WHEEL if extras.installed(str(WHEEL)) and extras.installed("gguf") else None
 
 

@@ -128,8 +128,8 @@ class TopicExchange(RosExchange):
         whole_number("max_tokens", int(message.max_tokens), 1, limits.answer_tokens, 0)
         pictures = (*message.images, *message.compressed_images)
         images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
-        settings = message.max_tokens, message.grammar, message.seed
-        return Request(wire.plain(message.id), message.prompt, images, *settings, state=state_of(message.state))
+        name, state = wire.plain(message.id), state_of(message.state)
+        return Request(name, message.prompt, images, message.max_tokens, message.grammar, message.seed, state=state)
 
     def piece(self, piece: Piece) -> bool:
         self._source.send(*self._client, piece, [])
