@@ -204,8 +204,7 @@ class Session:
         self._small.get_ready()
         frames, kind = self._small.capture(trace), self.cell.capabilities.answer_kinds[0]
         prompt = f"{CLOCK_PROMPT}{kind} {system}".rstrip()
-        for _ in self.client.request(Request("clock", prompt, frames, 1, state=(0.0,) * plan.state), trace):
-            pass
+        list(self.client.request(Request("clock", prompt, frames, 1, state=(0.0,) * plan.state), trace))
         return trace
 
     def _pieces(self, request: Request, trace: Trace, context: RequestContext) -> Iterator[Seen]:

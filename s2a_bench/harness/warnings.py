@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -86,28 +86,21 @@ class Counters(NamedTuple):
             realtime_offset_ns(),
         )
 
-    def warnings_since(self, before: Counters, against_loss: str = "") -> list[RunWarning]:
+    def warnings_since(self, before: Counters, against_loss: str = "") -> Iterator[RunWarning]:
         """Compare with an earlier reading; ``against_loss`` is the transports' advice about lost packets."""
         rises = [0 if old is None or new is None else new - old for old, new in zip(before, self, strict=True)]
         dropped, throttles, suspended_ns, set_ns = rises
-        late = "for want of receive buffer: DDS had to send them again, 200 ms later"
-        findings = (
-            (
-                dropped > 0,
-                "udp-receive-buffer",
-                f"the kernel dropped {dropped} UDP packets {late}",
-                against_loss or f"sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}",
-            ),
-            (throttles > 0, "cpu-throttling", "the CPU was throttled during the run", "cool it, and run again"),
-            (abs(suspended_ns) > CLOCK_STEP_NS, "suspended", "the machine was suspended during the run", "run again"),
-            (
-                abs(set_ns) > CLOCK_STEP_NS,
-                "clock-jump",
-                "the wall clock was set during the run; latencies are unaffected, ROS time stamps are not",
-                "let NTP settle, and run again",
-            ),
-        )
-        return [RunWarning(*warning) for happened, *warning in findings if happened]
+        if dropped > 0:
+            late = "for want of receive buffer: DDS had to send them again, 200 ms later"
+            advice = against_loss or f"sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}"
+            yield RunWarning("udp-receive-buffer", f"the kernel dropped {dropped} UDP packets {late}", advice)
+        if throttles > 0:
+            yield RunWarning("cpu-throttling", "the CPU was throttled during the run", "cool it, and run again")
+        if abs(suspended_ns) > CLOCK_STEP_NS:
+            yield RunWarning("suspended", "the machine was suspended during the run", "run again")
+        if abs(set_ns) > CLOCK_STEP_NS:
+            what = "the wall clock was set during the run; latencies are unaffected, ROS time stamps are not"
+            yield RunWarning("clock-jump", what, "let NTP settle, and run again")
 
 
 class Doubt(NamedTuple):

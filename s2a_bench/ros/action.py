@@ -70,9 +70,7 @@ NEXT: dict[Status, frozenset[Status]] = {
     Status.ACCEPTED: frozenset({Status.EXECUTING, Status.CANCELING}),
     Status.EXECUTING: frozenset({Status.CANCELING, Status.SUCCEEDED, Status.ABORTED}),
     Status.CANCELING: frozenset({Status.SUCCEEDED, Status.CANCELED, Status.ABORTED}),
-    Status.SUCCEEDED: frozenset(),
-    Status.CANCELED: frozenset(),
-    Status.ABORTED: frozenset(),
+    **dict.fromkeys((Status.SUCCEEDED, Status.CANCELED, Status.ABORTED), frozenset()),
 }
 """The goal state machine: status -> the statuses that may follow."""
 

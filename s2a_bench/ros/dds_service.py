@@ -81,7 +81,6 @@ class _End:
         return bool((ids[0] & ids[1]) - {None})
 
     def other_dds(self) -> str:
-        """Return the DDS of a peer whose services have another form than `rmw_cyclonedds_cpp`'s, "" without one."""
         return next((name for end in self.ends for endpoint in end.endpoints() if (name := other_dds(endpoint))), "")
 
     def peer_type_hash(self) -> str:
@@ -113,7 +112,6 @@ class DdsServiceClient(_End):
             self.writer.send(packed)
 
     def replies(self) -> Iterator[tuple[bytes, memoryview]]:
-        """Take what has arrived, a bounded number, and yield the replies to requests of ours: (key, CDR)."""
         for packed in self.reader.arrived():
             if len(packed) <= self.body_at:
                 continue

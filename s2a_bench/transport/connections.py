@@ -102,7 +102,7 @@ class Connections:
     def _close(self, wire: Wire) -> None:
         with self._lock:
             self._wires.pop(wire, None)
-        wire.close()
+        wire.socket.close()
 
     def _close_refused(self) -> None:
         while self._refused and (
@@ -198,9 +198,6 @@ class Wire:
     def hang_up(self) -> None:
         with suppress(OSError):
             self.socket.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        self.socket.close()
 
 
 def wait_at_most(connection: socket.socket, seconds: float) -> None:

@@ -133,7 +133,6 @@ class ZenohSubscription:
         return deserialise(packed, self._type_name, self._version)
 
     def announced(self) -> int:
-        """Count the publishers of the type, those of other versions too, which do not reach us."""
         return sum(1 for _ in self._node.peers(names.PUBLISHER, self._seen.entity))
 
     def matched(self) -> int:

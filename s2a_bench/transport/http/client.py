@@ -115,7 +115,6 @@ class HttpClient(Client):
                 client.close()
 
     def _check(self, response: HttpResponse) -> None:
-        """Raise RequestFailed unless the headers announce a good answer."""
         kind = response.headers.get("content-type", "")
         expected = self._dialect.media_type, *((native.BLOCKS,) if self._dialect.name == NATIVE else ())
         if response.status_code != httpx.codes.OK or not kind.startswith(expected):

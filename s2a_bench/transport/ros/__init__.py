@@ -60,14 +60,10 @@ class Ros(Transport[RosOptions]):
         return opened
 
     def measured(self, choice: Choice[RosOptions]) -> Sequence[str]:
-        """Return `action` for an external node, else the default."""
         return (ACTION,) if choice.options.action else super().measured(choice)
 
     def capabilities(self, choice: Choice[RosOptions]) -> Capabilities[RosOptions]:
-        """Return it for the action without actions and state, which llama_msgs has no fields for.
-
-        A goal carries sensor_msgs/Image.
-        """
+        """Return what llama_msgs has fields for: no actions, no state, and in a goal sensor_msgs/Image."""
         can = super().capabilities(choice)
         if choice.variant != ACTION:
             return can
@@ -90,7 +86,6 @@ class Ros(Transport[RosOptions]):
             raise UsageError("`action`: `mode` stream needs our own server, which keeps the camera's newest frame")
 
     def tuned(self, options: RosOptions) -> bool:
-        """Return False for DDS, and processes, as they come."""
         return options.dds_tuning == "tuned"
 
     def datagrams(self, options: RosOptions) -> bool:

@@ -99,7 +99,6 @@ class RosServer:
         return self.middleware.describe()
 
     def _change(self, wanted: Mapping[str, Any]) -> None:
-        """Set options while serving; raises UsageError."""
         self._options = self._options.but(**wanted)
         if self._action is not None:
             self._action.tune(self._options)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from secrets import token_hex
 from typing import Any
 
 from s2a_bench.errors import MessagesLost, RequestFailed, ServerDied
@@ -32,12 +33,11 @@ class TopicClient(RosClient):
         self.wait_until(lambda: all(end.matched() for end in ends), f"no server appeared under {namespace}")
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        """Publish the request, with its frames if it has any, and yield its tokens."""
         images: dict[str, list[Any]] = {ros.IMAGE: [], ros.COMPRESSED_IMAGE: []}
         for frame in request.images:
             type_name, message = picture_message(frame, self._wiring.options.payload, self._offset_ns, trace)
             images[type_name].append(message)
-        name = wire.unguessable(request.id)
+        name = f"{request.id}#{token_hex(16)}"  # no other node can answer before it has heard it
         message = wire.request_message(replace(request, id=name), images[ros.IMAGE], images[ros.COMPRESSED_IMAGE])
         packed = self._publisher.pack(message)
         trace.mark("cdr_pack")
@@ -128,7 +128,7 @@ class TopicExchange(RosExchange):
         whole_number("max_tokens", int(message.max_tokens), 1, limits.answer_tokens, 0)
         pictures = (*message.images, *message.compressed_images)
         images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
-        name, state = wire.plain(message.id), state_of(message.state)
+        name, state = message.id.rpartition("#")[0] or message.id, state_of(message.state)
         return Request(name, message.prompt, images, message.max_tokens, message.grammar, message.seed, state=state)
 
     def piece(self, piece: Piece) -> bool:
