@@ -111,7 +111,6 @@ class Task:
     drive: Callable[[RunningLaunch], None] = in_blocks
     """Makes the requests of a launch."""
     clients: int = 1
-    """Of each cell."""
     tables: Sequence[Table[Any]] = ()
     """Tables whose files exist from the start, besides those of requests."""
     source: Callable[[FeedPlan], FrameSource] | None = None

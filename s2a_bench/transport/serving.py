@@ -66,13 +66,19 @@ class Turn:
     def has_started(self) -> bool:
         return self.ready is None or self.ready.is_set()
 
-    def wait(self, disconnected: Callable[[], bool] = lambda: False) -> bool:
-        """Wait on this thread; return False if the client is ``disconnected`` before the turn. Raises Overdue."""
-        while self.ready is not None and not self.ready.wait(POLL_S):
+    def wait(self, trace: Trace, disconnected: Callable[[], bool] = lambda: False) -> bool:
+        """Wait on this thread, as `queue`; return False if the client is ``disconnected`` before. Raises Overdue."""
+        if self.ready is None:
+            return not disconnected()
+        trace.mark(RESIDUAL)
+        while not self.ready.wait(POLL_S):
             if disconnected():
                 return False
             self.check(now_ns())
-        return not disconnected()
+        if disconnected():
+            return False
+        trace.mark("queue")
+        return True
 
     def alive(self, at_ns: int) -> None:
         self.alive_ns = at_ns
@@ -167,10 +173,7 @@ class Queued:
     def __call__(self, request: Request, trace: Trace) -> Generator[Piece, None, None]:
         turn = self.turns.join()
         try:
-            if turn.ready is not None:
-                trace.mark(RESIDUAL)
-                turn.wait()
-                trace.mark("queue")
+            turn.wait(trace)
             yield from self.answer(request, trace, turn)
         finally:
             turn.leave()
@@ -336,14 +339,9 @@ class Core:
         return True
 
     def _answer(self, exchange: Exchange, request: Request, turn: Turn) -> None:
-        waits = turn.ready is not None
-        if waits:
-            exchange.trace.mark(RESIDUAL)
-        if not turn.wait(exchange.disconnected):
+        if not turn.wait(exchange.trace, exchange.disconnected):
             exchange.abandon()
             return
-        if waits:
-            exchange.trace.mark("queue")
         wanted = exchange.begin(request)
         if wanted is None:
             return
