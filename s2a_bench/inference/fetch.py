@@ -74,7 +74,7 @@ def chosen(repository: str, file: str, config: FetchConfig, listed: Collection[s
     """
     ggufs = sorted(Path(name) for name in listed if name.endswith(".gguf"))
     there = ", ".join(map(str, ggufs)) or "no GGUF file"
-    models, mmproj = pair(ggufs, *((config.quant,) if config.quant else QUANTS))
+    models, mmproj = pair(ggufs, [config.quant] if config.quant else QUANTS)
     wanted = [file, config.mmproj or ""]
     if not file:
         if len(models) != 1 or (config.quant or "").lower() not in models[0].name.lower():

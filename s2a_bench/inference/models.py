@@ -56,7 +56,7 @@ def hub_address(name: str, flag: str) -> tuple[str, str]:
     return repository, file
 
 
-def pair(files: Iterable[Path], *quants: str) -> tuple[list[Path], Path | None]:
+def pair(files: Iterable[Path], quants: Iterable[str] = ()) -> tuple[list[Path], Path | None]:
     """Return the language models of the first of ``quants`` that there is, else all of them; and the mmproj."""
     paths = sorted(files)
     mmprojs = [path for path in paths if "mmproj" in path.name.lower()]

@@ -164,18 +164,17 @@ class LogOnce:
 
 
 class Calling:
-    def __init__(self, name: str, client: ClientEnd, waiter: Waits) -> None:
-        self._name, self._client, self._waiter = name, client, waiter
-        self._calls = 0
+    def __init__(self, client: ClientEnd, waiter: Waits) -> None:
+        self._client, self._waiter, self._calls = client, waiter, 0
 
     def call(self, request: Any, timeout_s: float) -> Any:
-        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        deadline_ns, name = now_ns() + int(timeout_s * 1e9), self._client.spec.name
         if not appeared(self._client.matched, timeout_s):
-            raise TransportError(f"no server of the service {self._name} appeared in {timeout_s:g} s")
+            raise TransportError(f"no server of the service {name} appeared in {timeout_s:g} s")
         self._calls += 1
         key = self._calls.to_bytes(8, "big")
         self._client.call(self._client.pack(request), key)
-        silent = f"the service {self._name} did not answer in {timeout_s:g} s"
+        silent = f"the service {name} did not answer in {timeout_s:g} s"
         while True:
             for answered, packed in self._client.replies():
                 if answered == key:
@@ -259,7 +258,7 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
 
     def service_client(self, name: str, type_name: str) -> Calling:
         waiter = self.waiter()
-        return Calling(name, self.client_end(ServiceSpec(name, type_name), waiter), waiter)
+        return Calling(self.client_end(ServiceSpec(name, type_name), waiter), waiter)
 
     def close(self) -> None:
         if not self._closed:

@@ -111,10 +111,11 @@ class HttpClient(Client):
 
     def _check(self, response: HttpResponse) -> None:
         kind = response.headers.get("content-type", "")
-        expected = self._dialect.media_type, *((native.BLOCKS,) if self._dialect.name == NATIVE else ())
-        if response.status_code != httpx.codes.OK or not kind.startswith(expected):
+        expected = self._dialect.media_type
+        good = (expected, native.BLOCKS) if self._dialect.name == NATIVE else (expected,)
+        if response.status_code != httpx.codes.OK or not kind.startswith(good):
             text = body_of(response, ERROR_LIMIT, self._wiring.timeout_s)
-            raise refusal(self._url, response, text, self._options, self._dialect.media_type)
+            raise refusal(self._url, response, text, self._options, expected)
         if (coding := response.headers.get("content-encoding", "identity")) != "identity":
             raise RequestFailed(f"{self._url} compressed its answer ({coding}) without being asked to")
 

@@ -104,7 +104,8 @@ class RosServer:
             self._action.tune(self._options)
 
     def _findings(self) -> Iterator[PartHealth]:
-        return self._shared.activity.findings(*self._cache.seen(), self._cache.silence, self._options.max_frame_age)
+        frames, frame_ns = self._cache.seen()
+        return self._shared.activity.findings(frames, frame_ns, self._cache.silence, self._options.max_frame_age)
 
     def _take(self, source: RequestSource) -> Callable[[], object] | None:
         """Wait for a request and give it its place in the queue; return what answers it."""

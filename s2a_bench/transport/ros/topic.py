@@ -120,7 +120,7 @@ class TopicExchange(RosExchange):
     def __init__(self, source: TopicSource, message: Any, shared: Shared, trace: Trace) -> None:
         super().__init__(shared, trace)
         self._source, self._message = source, message
-        self._client = str(message.id), source.sender()
+        self._id, self._sender = str(message.id), source.sender()
         self._sent = 0
 
     def request(self) -> Request:
@@ -132,10 +132,10 @@ class TopicExchange(RosExchange):
         return Request(name, message.prompt, images, message.max_tokens, message.grammar, message.seed, state=state)
 
     def piece(self, piece: Piece) -> bool:
-        self._source.send(*self._client, piece, [])
+        self._source.send(self._id, self._sender, piece, [])
         self._sent += 1
         return True
 
     def finish(self, error: str) -> None:
-        marks = wire.marks_message(self._client[0], self.trace.to_remote())
-        self._source.send(*self._client, Token(self._sent, "", -1), [marks], error)
+        marks = wire.marks_message(self._id, self.trace.to_remote())
+        self._source.send(self._id, self._sender, Token(self._sent, "", -1), [marks], error)
