@@ -290,7 +290,7 @@ def compressed_image_message(data: Pixels, stamp_ns: int, frame_id: str, coding:
     return message(COMPRESSED_IMAGE, header=header(stamp_ns, frame_id), format=format_, data=data)
 
 
-def frame_of_image(image: Any) -> Frame:
+def frame_of_image(image: Any, index: int = -1) -> Frame:
     """Unwrap a sensor_msgs/Image; the pixels stay a view of the message. Raises TransportError."""
     encoding = ALSO.get(image.encoding, image.encoding)
     refuse_depth(encoding)
@@ -306,7 +306,7 @@ def frame_of_image(image: Any) -> Frame:
     pixels = rows.reshape((height, image.width) if channels == 1 else (height, image.width, channels))
     if encoding in get_args(Deep) and bool(image.is_bigendian) != (sys.byteorder == "big"):
         pixels = pixels.reshape(*pixels.shape[:2], -1, 2)[..., ::-1].reshape(pixels.shape)
-    return Frame(-1, nanoseconds(image.header.stamp), image.width, image.height, encoding, pixels)
+    return Frame(index, nanoseconds(image.header.stamp), image.width, image.height, encoding, pixels)
 
 
 def refuse_depth(encoding: str) -> None:
