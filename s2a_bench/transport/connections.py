@@ -36,9 +36,7 @@ _log = logging.getLogger(__name__)
 class Connections:
     """Handles up to ``most`` connections of a socket at once, each on a thread; others receive ``refusal``."""
 
-    def __init__(
-        self, listener: socket.socket, handle: Callable[[Wire], None], most: int, refusal: bytes = b""
-    ) -> None:
+    def __init__(self, listener: socket.socket, handle: Callable[[Wire], None], most: int, refusal: bytes) -> None:
         self._listener, self._handle, self._most, self._refusal = listener, handle, most, refusal
         self._lock = Lock()
         self._wires: dict[Wire, Thread] = {}
