@@ -41,7 +41,7 @@ from s2a_bench.machine.resources.sampler import ResourceSampler
 from s2a_bench.provenance import NOT_SENT, UNKNOWN, Provenance
 from s2a_bench.secrets import struck_pieces
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
-from s2a_bench.trace import STAGES, Mark, Trace
+from s2a_bench.trace import STAGES, Trace
 from s2a_bench.transport import LOSSLESS, Client
 from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.transport.serving import CLOCK_PROMPT
@@ -343,11 +343,8 @@ class Session:
 
 def inference_start_ns(trace: Trace) -> int | None:
     """Return when the engine got the request: the mark before the first of `inference`'s group."""
-    chain: list[Mark] = trace.chain()
-    for (_, before_ns), (stage, _) in pairwise(chain):
-        if STAGES.get(stage) == "inference":
-            return before_ns
-    return None
+    steps = pairwise(trace.chain())
+    return next((before_ns for (_, before_ns), (stage, _) in steps if STAGES.get(stage) == "inference"), None)
 
 
 def _whole(value: float | None) -> int | None:
