@@ -11,7 +11,7 @@ from functools import cache
 from math import inf
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar, cast
 
 from s2a_bench import extras
 from s2a_bench import options as base
@@ -291,13 +291,11 @@ class Transport(Generic[O]):
 
     def client(self, wiring: Wiring[O], alive: Callable[[], bool]) -> Client:
         self.check_machine()
-        opened: Client = resolve_name(self.client_class)(wiring, alive)
-        return opened
+        return cast("Client", resolve_name(self.client_class)(wiring, alive))
 
     def server(self, wiring: Wiring[O], handler: Handler) -> Server:
         self.check_machine()
-        bound: Server = resolve_name(self.server_class)(wiring, handler)
-        return bound
+        return cast("Server", resolve_name(self.server_class)(wiring, handler))
 
     def check_machine(self) -> None:
         """Raise MissingExtra, or UsageError for a system that it cannot run on."""

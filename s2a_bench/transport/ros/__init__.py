@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import chain, count
 from pkgutil import resolve_name
 from secrets import token_hex
+from typing import cast
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
@@ -56,8 +57,7 @@ class Ros(Transport[RosOptions]):
 
     def client(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> Client:
         kind = "action:GenerateClient" if wiring.variant == ACTION else "topic:TopicClient"
-        opened: Client = resolve_name(f"s2a_bench.transport.ros.{kind}")(wiring, alive)
-        return opened
+        return cast("Client", resolve_name(f"s2a_bench.transport.ros.{kind}")(wiring, alive))
 
     def measured(self, choice: Choice[RosOptions]) -> Sequence[str]:
         return (ACTION,) if choice.options.action else super().measured(choice)
