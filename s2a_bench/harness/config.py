@@ -342,6 +342,4 @@ class RequestsConfig(Surrounded):
 
 
 class FirstVariants(RequestsConfig):
-    """The settings of a run in which a transport named without a variant stands for its first variant."""
-
     EVERY_VARIANT: ClassVar[bool] = False

@@ -22,6 +22,8 @@ QUANTS = "Q4_K_M", "Q8_0"
 
 @dataclass(frozen=True, slots=True)
 class FetchedFile:
+    """One fetched file."""
+
     path: Path
     bytes: Count
     sha256: Annotated[str, Facts(pattern="^[0-9a-f]{64}$")]

@@ -197,8 +197,6 @@ def _services(name: str, type_name: str, version: str) -> Iterator[ServiceSpec]:
 
 
 class ClientAction:
-    """Events are taken on the consuming thread; sending and cancelling may happen on any."""
-
     def __init__(self, node: ServiceNode[Any, Any], name: str, type_name: str, version: str) -> None:
         self._type, self._version = type_name, version
         prefix, waiter = name + "/_action/", node.waiter()

@@ -26,8 +26,6 @@ UNREADABLE_N = Fact(
 
 
 class Ros(Transport[RosOptions]):
-    """Messages of sensor_msgs and s2a_msgs over a middleware, or the action of llama_ros."""
-
     name = "ros"
     options = RosOptions
     variants = VARIANTS

@@ -23,8 +23,6 @@ from s2a_bench.types import Piece, Request, Token
 
 
 class TopicClient(RosClient):
-    """Publishes requests and collects the tokens that carry their id."""
-
     def _meet_server(self, namespace: str) -> None:
         # announced first: a server that knows the requests' writer should know the tokens' reader as well
         self._subscription = self.middleware.subscription(namespace + "/token", ros.TOKEN, READER_QOS)
@@ -78,8 +76,6 @@ class TopicClient(RosClient):
 
 
 class TopicSource:
-    """The server's side of the variant: receives requests and turns each into a job for the engine's thread."""
-
     def __init__(self, middleware: Middleware, namespace: str, limits: Limits) -> None:
         self.limits = limits
         self._requests = middleware.subscription(namespace + "/request", ros.REQUEST, READER_QOS)
