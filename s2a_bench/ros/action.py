@@ -334,8 +334,6 @@ class ServedGoal(Generic[Caller]):
 
 
 class ServedAction(Generic[Caller]):
-    """Goals are taken on the consuming thread; a service thread answers cancels and results, and expires them."""
-
     def __init__(
         self, node: ServiceNode[Caller, Any], name: str, type_name: str, result_timeout_s: float, version: str
     ) -> None:
