@@ -27,7 +27,6 @@ class Following:
     shape: PlanShape
     made: dict[str, Policy]
     tracked: dict[str, TrackedPolicy] = field(default_factory=dict)
-    """The trackers of lambda."""
     calibrations: dict[str, Calibration] = field(default_factory=dict)
 
     @property
