@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import cache, cached_property, partial
-from types import NoneType
-from typing import TYPE_CHECKING, Any, Final, Generic, Literal, TypeAlias, TypeVar, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, Final, Generic, Literal, TypeAlias, TypeVar, get_type_hints
 
 from s2a_bench.stats import Summary, summary_of
-from s2a_bench.store.schema import PROVENANCE, Row
+from s2a_bench.store.schema import PROVENANCE, Row, kinds_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from s2a_bench.stats import Floats
     from s2a_bench.stats.batches import Rows
     from s2a_bench.store.run import StoredRun
-    from s2a_bench.store.schema import Table
+    from s2a_bench.store.schema import Kind, Table
     from s2a_bench.writers.csv_text import CsvTable
     from s2a_bench.writers.tables import TextTable
 
@@ -53,13 +52,13 @@ class Metric:
         facts = {"description": self.about or None, "minimum": self.bounds[0], "maximum": self.bounds[1]}
         return schema_of(core) | {key: value for key, value in facts.items() if value is not None}
 
-    def of_column(self, column: str, type_of_values: type) -> Self:
+    def of_column(self, column: str, stored: Kind) -> Self:
         """Return the metric with what follows from its column."""
-        if type_of_values is int and column.endswith("_ns"):
+        if stored == "int64" and column.endswith("_ns"):
             return replace(self, column=column, kind=TIME, unit="s", name=f"{column.removesuffix('_ns')}_s")
-        if type_of_values is bool:
+        if stored == "bool":
             return replace(self, column=column, kind=FLAG, name=f"p_{column}")
-        return replace(self, column=column, kind=COUNT if type_of_values is int else self.kind, name=column)
+        return replace(self, column=column, kind=COUNT if stored == "int64" else self.kind, name=column)
 
     def read(self, row: object) -> float | None:
         """Return its value in a row, times in s; None for a missing one."""
@@ -81,7 +80,7 @@ def by_name(metrics: Iterable[AnyMetric]) -> dict[str, AnyMetric]:
 
 @dataclass(frozen=True, slots=True)
 class JsonKey:
-    """An annotation of a column of text: its key in ``--json``, where an empty text is null."""
+    """An annotation of a column: its key in ``--json``, where an empty text is null."""
 
     name: str
 
@@ -92,10 +91,9 @@ HIDDEN = JsonKey("")
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column as the class of the rows declares it; an empty ``key``: ``--json`` lacks it."""
+    """A column as the class of the rows declares it."""
 
     name: str
-    hint: Any
     metric: Metric | None
     json_key: JsonKey | None
     as_stored: bool
@@ -103,6 +101,7 @@ class Column:
 
     @property
     def key(self) -> str:
+        """Its key in ``--json``; empty if that lacks it."""
         if self.json_key:
             return self.json_key.name
         return self.metric.name if self.metric and not self.as_stored else self.name
@@ -112,33 +111,18 @@ class Column:
         """Whether ``--json`` has its values, stored in ns, in s."""
         return self.metric is not None and self.metric.kind == TIME and not self.as_stored
 
-    def json(self, row: object) -> Any:
-        """Return its value in a row as ``--json`` has it."""
-        value = getattr(row, self.name)
-        return value / 1e9 if self.in_s and value is not None else value
-
 
 @cache
 def columns_of(row: type) -> tuple[Column, ...]:
     """Return the columns that a dataclass of rows declares."""
-    hints = get_type_hints(row, include_extras=True)
-    return tuple(_column(row, field.name, hints[field.name]) for field in fields(row))
-
-
-def _column(row: type, name: str, hint: Any) -> Column:
-    marks = getattr(hint, "__metadata__", ())
-    metric = next((mark for mark in marks if isinstance(mark, Metric)), None)
-    key = next((mark for mark in marks if isinstance(mark, JsonKey)), None)
-    metric = metric and metric.of_column(name, type_of_values(hint))
-    return Column(name, hint, metric, key, getattr(row, "as_stored", False))
-
-
-def type_of_values(hint: Any) -> type:
-    """Return the type behind an annotation, without None."""
-    if hasattr(hint, "__metadata__"):
-        return type_of_values(hint.__origin__)
-    plain: type = next((each for each in get_args(hint) if each is not NoneType), hint)
-    return plain
+    hints, as_stored = get_type_hints(row, include_extras=True), getattr(row, "as_stored", False)
+    columns = []
+    for name, kind in kinds_of(row).items():
+        marks = getattr(hints[name], "__metadata__", ())
+        metric = next((mark.of_column(name, kind) for mark in marks if isinstance(mark, Metric)), None)
+        key = next((mark for mark in marks if isinstance(mark, JsonKey)), None)
+        columns.append(Column(name, metric, key, as_stored))
+    return tuple(columns)
 
 
 def metrics_of(row: type) -> dict[str, Metric]:
@@ -150,9 +134,10 @@ def json_of(row: Any) -> dict[str, Any]:
     """Return a row as an object of ``--json``; a missing value is an absent key."""
     values: dict[str, Any] = {}
     for column in columns_of(row.__class__):
-        value = column.json(row)
+        value = getattr(row, column.name)
         if column.key and value is not None:
-            values[column.key] = None if column.json_key and not value else value
+            empty = column.json_key and value == ""
+            values[column.key] = None if empty else value / 1e9 if column.in_s else value
     return values
 
 
@@ -199,10 +184,6 @@ class Cells(Generic[Row]):
         groups = self.frame.groupby(column, sort=False, dropna=False)
         return {value: replace(self, frame=frame) for value, frame in groups}
 
-    def about(self, column: str) -> Any:
-        """Return a value that all rows share; None if it is missing."""
-        return getattr(self.first, column)
-
     def values(self, metric: str) -> Floats:
         """Return a metric's values, times in s, without the missing ones."""
         declared = self.metrics[metric]
@@ -218,12 +199,11 @@ class Cells(Generic[Row]):
 
     def json(self) -> list[dict[str, Any]]:
         """Return an object of ``--json`` a cell: its name, ``n``, and a summary of each metric."""
-        found = []
+        cells = []
         for name, cell in self.split().items():
-            summaries = {metric: cell.summary(metric) for metric in self.metrics}
-            there = {metric: asdict(summary) for metric, summary in summaries.items() if summary}
-            found.append({"cell": name, "n": len(cell), **there})
-        return found
+            summaries = {metric: asdict(summary) for metric in self.metrics if (summary := cell.summary(metric))}
+            cells.append({"cell": name, "n": len(cell), **summaries})
+        return cells
 
     def csv(self, columns: Sequence[str] = ()) -> CsvTable:
         """Return the rows, or some of their columns, each with its provenance."""
@@ -247,7 +227,7 @@ class Cells(Generic[Row]):
     def subjects(self, setting: Sequence[str] = (), *, exact: bool = False) -> list[Subject]:
         """Return what is compared, a subject a cell; the columns of ``setting`` must be equal on both sides."""
         return [
-            Subject(name, {column: str(cell.about(column)) for column in setting}, len(cell), 0, cell.rows_of, exact)
+            Subject(name, {column: str(getattr(cell.first, column)) for column in setting}, len(cell), 0, cell.rows_of, exact)
             for name, cell in self.split().items()
         ]
 
@@ -299,10 +279,3 @@ class Comparable:
     def of(cls, table: Table[Any], shown: tuple[str, ...], setting: Sequence[str] = ()) -> Self:
         """Return what compares the rows of a table, cell by cell."""
         return cls(metrics_of(table.row), lambda run: Cells.of(run, table).subjects(setting), shown)
-
-
-def plain_rows(run: StoredRun, table: Table[Any]) -> list[dict[str, Any]]:
-    """Return the rows of a table without their provenance, None for a missing value."""
-    found = run.table(table).drop(columns=PROVENANCE)
-    rows = found.astype(object).where(found.notna(), None).to_dict("records")
-    return [{str(name): value for name, value in row.items()} for row in rows]

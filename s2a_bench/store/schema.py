@@ -45,16 +45,15 @@ class Table(Generic[Row]):
     @cached_property
     def columns(self) -> dict[str, Kind]:
         """The columns in order: the row's fields, the derived ones, the provenance."""
-        hints = get_type_hints(self.row)
-        return {name: _kind(hints[name]) for name in self._fields} | self.derived | {PROVENANCE: "string"}
+        return self._kinds | self.derived | {PROVENANCE: "string"}
 
     @cached_property
-    def _fields(self) -> tuple[str, ...]:
-        return tuple(item.name for item in fields(self.row) if item.name != PROVENANCE)  # type: ignore[arg-type]  # a row is a dataclass
+    def _kinds(self) -> dict[str, Kind]:
+        return kinds_of(self.row)
 
     def values(self, row: Row, provenance: str = "") -> Iterator[Value]:
         """Yield one value a column; lists and dicts become JSON text."""
-        for name in self._fields:
+        for name in self._kinds:
             yield _stored(getattr(row, name))
         derived = self.derive(row) if self.derive else {}
         for name in self.derived:
@@ -82,6 +81,12 @@ def _sound(value: Any) -> Any:
     if isinstance(value, int) and not isinstance(value, bool):
         return value if value in INT64 else None
     return struck(value, short=False) if isinstance(value, str) else value
+
+
+def kinds_of(row: type) -> dict[str, Kind]:
+    """Return the type of each column that a dataclass of rows declares, without that of the provenance."""
+    hints = get_type_hints(row)
+    return {item.name: _kind(hints[item.name]) for item in fields(row) if item.name != PROVENANCE}
 
 
 def _kind(hint: Any) -> Kind:
