@@ -61,31 +61,33 @@ class HouseForm(GenerateJsonSchema):
     def default_schema(self, schema: core_schema.WithDefaultSchema) -> dict[str, Any]:
         """Return the schema of a field where it is there: without null, if that says that it is absent."""
         made = self.generate_inner(schema["schema"])
-        if schema.get("default", ...) is not None:
-            return made
-        *kinds, _null = made.pop("anyOf")
-        return made | (kinds[0] if len(kinds) == 1 else {"anyOf": kinds})
+        return _without_null(made) if schema.get("default", ...) is None else made
+
+
+def _without_null(schema: dict[str, Any]) -> dict[str, Any]:
+    kinds = [kind for kind in schema.get("anyOf", ()) if kind != {"type": "null"}]
+    kind = kinds[0] if len(kinds) == 1 else {"anyOf": kinds}
+    return {**kind, **{key: value for key, value in schema.items() if key != "anyOf"}} if kinds else schema
 
 
 def _keys(cls: type, made: dict[str, Any]) -> dict[str, Any]:
-    """Return properties and required keys of a class, of rows as `json_of` writes them."""
+    """Return properties and required keys of a class of rows, as `json_of` writes them; nothing for another class."""
     columns = columns_of(cls)
     if not any(column.metric or column.json_key for column in columns):
         return {}
     properties, required = {}, []
     for column in columns:
-        schema = made["properties"][column.name]
-        *others, last = schema.get("anyOf", [{}])
-        if last == {"type": "null"}:  # absent
-            schema = {**others[0], **{key: value for key, value in schema.items() if key != "anyOf"}}
-        elif column.key and column.name in made["required"]:
-            required.append(column.key)
+        if not column.key:
+            continue
+        stored = made["properties"][column.name]
+        schema = dict(_without_null(stored))
         if column.in_s or (column.metric and getattr(cls, "means", False)):
-            schema = {**schema, "type": "number"}
-        if column.json_key:
-            schema = {**schema, "type": ["string", "null"]} if schema["type"] == "string" else schema
-        if column.key:
-            properties[column.key] = schema
+            schema["type"] = "number"
+        if column.json_key and schema["type"] == "string":
+            schema["type"] = ["string", "null"]
+        if column.name in made["required"] and {"type": "null"} not in stored.get("anyOf", ()):
+            required.append(column.key)
+        properties[column.key] = schema
     return {"properties": properties, "required": required}
 
 
