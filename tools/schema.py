@@ -18,6 +18,7 @@ from pydantic.alias_generators import to_snake
 from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
+from s2a_bench.bounds import Count, Facts, Fraction, Many, about
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.ccrb.view.tables import ORDERINGS
 from s2a_bench.experiments.cells import columns_of
@@ -29,7 +30,6 @@ from s2a_bench.plan.skillset import GAPS
 from s2a_bench.provenance import Origins
 from s2a_bench.report.compare.shown import CompareJson
 from s2a_bench.store.manifest import RunWarning
-from s2a_bench.store.schema import Count, Facts, Fraction, Many, about
 from s2a_bench.sweep.json import PlannedCell, SweptCell
 from s2a_bench.writers.json import RatioJson
 

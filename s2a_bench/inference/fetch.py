@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from s2a_bench import extras
+from s2a_bench.bounds import Count, Facts
 from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import FetchConfig
 from s2a_bench.inference.models import hub_address, pair, sha256
-from s2a_bench.store.schema import Count, Facts
 
 QUANTS = "Q4_K_M", "Q8_0"
 """The default quantisations of a language model, in this order."""

@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from s2a_bench.bounds import Count, about
 from s2a_bench.errors import MissingExtra, ModelError
 from s2a_bench.inference.gguf_file import read_header
 from s2a_bench.inference.models import HUB, HUB_MODELS, cache_folder, cached, pair
-from s2a_bench.store.schema import Count, about
 
 _TOKENS = "Prompt tokens of one 640x480 picture as MTMD counts them, with the text tokens around its slices."
 

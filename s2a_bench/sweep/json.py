@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
+from s2a_bench.bounds import Facts, Many, NonNegative, about
 from s2a_bench.store.manifest import plain
-from s2a_bench.store.schema import SCHEMA, Facts, Many, NonNegative, about
+from s2a_bench.store.schema import SCHEMA
 from s2a_bench.store.sweep import Sweep
 from s2a_bench.sweep import SweepCell
 from s2a_bench.writers.json import frame

@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, get_type_hints
 
+from s2a_bench.bounds import Many, NonNegative
 from s2a_bench.stats import Floats, Ratio, SummaryEnds, summarise, summary_of
 from s2a_bench.store.manifest import present
-from s2a_bench.store.schema import SCHEMA, Many, NonNegative, with_fields
+from s2a_bench.store.schema import SCHEMA, with_fields
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun

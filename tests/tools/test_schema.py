@@ -13,7 +13,7 @@ import jsonschema
 import pytest
 from pydantic import TypeAdapter
 
-from s2a_bench.store.schema import Fraction, about
+from s2a_bench.bounds import Fraction, about
 
 ROOT = Path(__file__).parent.parent.parent
 spec = importlib.util.spec_from_file_location("s2a_schema", ROOT / "tools/schema.py")

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Final, Literal, TypeAlias
 
+from s2a_bench.bounds import Fraction, Many, Positive, about
 from s2a_bench.experiments.cells import JsonKey
-from s2a_bench.store.schema import Fraction, Many, Positive, Table, about
+from s2a_bench.store.schema import Table
 
 Duration: TypeAlias = Literal["t_nom", "t_min"]
 

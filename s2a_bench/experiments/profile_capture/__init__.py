@@ -8,13 +8,13 @@ from typing import Annotated, Any, Final, Literal
 
 from s2a_bench.boards.gaps import FAMILIES, to_table
 from s2a_bench.boards.profile import Profile
+from s2a_bench.bounds import Count, Facts, NonNegative, Positive, about
 from s2a_bench.errors import UsageError
 from s2a_bench.frames import SOURCES
 from s2a_bench.harness.config import DEFAULT_PROMPT
 from s2a_bench.inference import OF_MODEL, EngineConfig
 from s2a_bench.options import Options, Size, TextOrFile, group, option
 from s2a_bench.store.manifest import present
-from s2a_bench.store.schema import Count, Facts, NonNegative, Positive, about
 
 LEAST_GAPS: Final = 40
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Final
 
+from s2a_bench.bounds import Many, NonNegative, Positive, about
 from s2a_bench.experiments.cells import ANY, HIDDEN, SHARE, TO_ONE, JsonKey, Metric, mean, metrics_of, share
-from s2a_bench.store.schema import Many, NonNegative, Positive, Table, about
+from s2a_bench.store.schema import Table
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,6 +12,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
+from s2a_bench.bounds import Facts, Fraction, Many, NonNegative, about
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments.cells import Better
 from s2a_bench.report.compare.agreement import Difference
@@ -19,7 +20,6 @@ from s2a_bench.report.compare.comparison import LEVEL, SAME, TOO_FEW, UNCLEAR, C
 from s2a_bench.stats.batches import BATCHES
 from s2a_bench.stats.change import POWER
 from s2a_bench.store.manifest import RunWarning, plain
-from s2a_bench.store.schema import Facts, Fraction, Many, NonNegative, about
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import markdown_caption, marked, name_rows, new_figure, write_beside
 from s2a_bench.writers.latex import to_latex

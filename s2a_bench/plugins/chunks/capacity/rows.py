@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Final, Literal
 
+from s2a_bench.bounds import Count, Many, NonNegative, about
 from s2a_bench.plugins.chunks.capacity.metrics import FleetMetrics
-from s2a_bench.store.schema import Count, Many, NonNegative, Table, about
+from s2a_bench.store.schema import Table
 
 TWIN: Final = ", instant"
 """After the name of a pipeline: its instant server."""

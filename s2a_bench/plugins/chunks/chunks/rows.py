@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Annotated, Final
 
+from s2a_bench.bounds import Count, Many, NonNegative, Positive, about
 from s2a_bench.experiments.cells import mean, metrics_of, share
-from s2a_bench.store.schema import Count, Many, NonNegative, Positive, Table, about
+from s2a_bench.store.schema import Table
 
 _ticks = partial(mean, unit="ticks")
 
