@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
 from s2a_bench.experiments import Shown
 from s2a_bench.experiments.cells import Cells, json_of
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, ChunkRow
-from s2a_bench.plugins.chunks.chunks.view.figures import COLOURS, CellTicks, chunk_figures, lanes_of, runs_of
+from s2a_bench.plugins.chunks.chunks.view.figures import COLOURS, CellTicks, chunk_figures, colour_of, lanes_of
 from s2a_bench.plugins.chunks.chunks.view.tables import ChunkCells, chunk_tables, entry
 from s2a_bench.writers.json import frame
 from s2a_bench.writers.lanes import Lane, LaneBar, LanePanel, Lanes
@@ -91,7 +89,7 @@ def page_lanes(cells: Sequence[CellTicks]) -> Lanes:
 
 def _lane(cell: CellTicks) -> Lane:
     bars = tuple(_bars(cell))
-    stalled = int(cell.ticks["stalled"].sum())
+    stalled = sum(tick.stalled for tick in cell.ticks)
     begin = next((bar.start_s for bar in bars), 0.0)
     summary = f"{stalled} of the first {len(cell.ticks)} ticks stall" if stalled else "no stall"
     return Lane(cell.title, COLOURS[0], bars, begin, summary)
@@ -99,20 +97,17 @@ def _lane(cell: CellTicks) -> Lane:
 
 def _bars(cell: CellTicks) -> Iterator[LaneBar]:
     """Yield a bar for every stretch of actions of one chunk, and for every stall."""
-    chunk = cell.ticks["chunk"].fillna(-1).to_numpy(dtype="int64")
-    index = cell.ticks["index"].fillna(-1).to_numpy(dtype="int64")
-    age = cell.ticks["age_ticks"].fillna(-1).to_numpy(dtype="int64")
-    stalled = cell.ticks["stalled"].to_numpy(dtype="bool")
-    unused = dict(zip(cell.requests["request"], cell.requests["thrown_away"], strict=True))
-    for first, last in runs_of(np.where(stalled, -2, chunk)):
-        span = f"ticks {first} to {last - 1}"
-        start_s, width_s = first * cell.period_s, (last - first) * cell.period_s
-        if stalled[first]:
-            yield LaneBar("stall", start_s, width_s, f"{cell.title}: stall of {last - first} ticks, {span}")
-        elif chunk[first] >= 0:
-            text = (
-                f"{cell.title}: chunk {chunk[first]}, actions {index[first]} to {index[last - 1]}, {span}, "
-                f"observation {age[first]} to {age[last - 1]} ticks old"
-            )
-            away = f", {unused[chunk[first]]} actions thrown away" if unused.get(chunk[first]) else ""
-            yield LaneBar("skill", start_s, width_s, text + away, COLOURS[chunk[first] % len(COLOURS)])
+    unused = {request.request: request.thrown_away for request in cell.requests}
+    for stretch in cell.stretches():
+        first, last = stretch[0], stretch[-1]
+        span = f"ticks {first.tick} to {last.tick}"
+        start_s, width_s = first.tick * cell.period_s, len(stretch) * cell.period_s
+        if first.chunk is None:
+            yield LaneBar("stall", start_s, width_s, f"{cell.title}: stall of {len(stretch)} ticks, {span}")
+            continue
+        text = (
+            f"{cell.title}: chunk {first.chunk}, actions {first.index} to {last.index}, {span}, "
+            f"observation {first.age_ticks} to {last.age_ticks} ticks old"
+        )
+        away = f", {unused[first.chunk]} actions thrown away" if unused.get(first.chunk) else ""
+        yield LaneBar("skill", start_s, width_s, text + away, colour_of(first.chunk))

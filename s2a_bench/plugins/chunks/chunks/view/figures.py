@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import groupby
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.plugins.chunks.chunks.rows import MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS, ChunkRow
+from s2a_bench.experiments.cells import Cells
+from s2a_bench.plugins.chunks.chunks.rows import (
+    MEANS,
+    REACTIONS,
+    REQUESTS,
+    TICKS,
+    TRIGGERS,
+    ChunkRow,
+    RequestRow,
+    TickRow,
+    TriggerRow,
+)
 from s2a_bench.plugins.chunks.chunks.view.tables import ChunkCells
 from s2a_bench.writers.figures import LINE_CHARS, new_figure
 from s2a_bench.writers.style import STALL_STYLE, WIDE_IN, ink_on
@@ -43,21 +54,28 @@ class CellTicks:
 
     title: str
     source: str
-    ticks: pd.DataFrame
-    requests: pd.DataFrame
+    ticks: list[TickRow]
+    requests: list[RequestRow]
     period_s: float
+
+    def stretches(self) -> Iterator[list[TickRow]]:
+        """Yield the ticks with actions of one chunk, and those of one stall, in their order."""
+        for (stalled, chunk), ticks in groupby(self.ticks, lambda tick: (tick.stalled, tick.chunk)):
+            if stalled or chunk is not None:
+                yield list(ticks)
 
 
 def lanes_of(run: StoredRun, cells: ChunkCells) -> list[CellTicks]:
     """Return the lanes of a run: the modes as given, and the calibrated trigger."""
-    ticks, requests = run.table(TICKS), run.table(REQUESTS)
+    ticks, requests = Cells.of(run, TICKS), Cells.of(run, REQUESTS)
     shown = int(cells.settings["shown_ticks"])
-    ticks, requests = ticks[ticks["tick"] < shown], requests[requests["request_tick"] < shown]
+    ticks = replace(ticks, frame=ticks.frame[ticks.frame["tick"] < shown])
+    requests = replace(requests, frame=requests.frame[requests.frame["request_tick"] < shown])
     lanes = []
     for row in filter(_drawn, cells.rows):
-        mine, sent = ticks[ticks["cell"] == row.cell], requests[requests["cell"] == row.cell]
+        mine, sent = ticks.where(cell=row.cell), requests.where(cell=row.cell)
         if len(mine):
-            lanes.append(CellTicks(_line_name(row), row.latency, mine, sent, row.delta_t_s))
+            lanes.append(CellTicks(_line_name(row), row.latency, mine.rows, sent.rows, row.delta_t_s))
     return lanes[:MOST_LANES]
 
 
@@ -70,7 +88,7 @@ def build_lanes(lanes: Sequence[CellTicks], setting: str) -> Figure:
     caption = (f"What each control tick executes{source}, {setting}",)
     figure = new_figure(0.85 + 0.55 * len(lanes), caption, WIDE_IN)
     axes = figure.subplots()
-    oldest = max(int(lane.ticks["age_ticks"].fillna(0).max()) for lane in lanes) or 1
+    oldest = max(tick.age_ticks or 0 for lane in lanes for tick in lane.ticks) or 1
     for place, lane in enumerate(lanes):
         _draw_lane(axes, lane, place, oldest)
     axes.set_yticks(range(len(lanes)), [_label(lane, several=several) for lane in lanes])
@@ -97,24 +115,18 @@ def build_lanes(lanes: Sequence[CellTicks], setting: str) -> Figure:
 def _draw_lane(axes: Axes, lane: CellTicks, place: int, oldest: int) -> None:
     """Draw one lane around y = ``place``; the curve of ages below it reaches the next lane at age ``oldest``."""
     top = place - _BAR / 2
-    chunk = lane.ticks["chunk"].fillna(-1).to_numpy(dtype="int64")
-    stalled = lane.ticks["stalled"].to_numpy(dtype="bool")
-    for first, last in runs_of(np.where(stalled, -2, chunk)):
-        width = last - first
-        if stalled[first]:
-            axes.broken_barh([(first, width)], (top, _BAR), **STALL_STYLE)
-        elif chunk[first] >= 0:
-            axes.broken_barh([(first, width)], (top, _BAR), color=COLOURS[chunk[first] % len(COLOURS)], linewidth=0)
-    for row in lane.requests.to_dict("records"):
-        leaves, usable = row["request_tick"], row["request_tick"] + row["delay_ticks"]
+    for stretch in lane.stretches():
+        colours = STALL_STYLE if stretch[0].stalled else {"color": colour_of(stretch[0].chunk), "linewidth": 0}
+        axes.broken_barh([(stretch[0].tick, len(stretch))], (top, _BAR), **colours)
+    for request in lane.requests:
+        leaves, usable = request.request_tick, request.request_tick + request.delay_ticks
         axes.hlines(top - 0.07, leaves, usable, "#666666", linewidth=0.7)
         axes.plot([leaves], [top - 0.07], "|", color="#666666", markersize=3, markeredgewidth=0.7)
-        if row["thrown_away"] and row["executed"] and row["start_tick"] + row["executed"] < len(chunk):
-            end = row["start_tick"] + row["executed"]
-            ink = ink_on(COLOURS[chunk[end - 1] % len(COLOURS)])
-            text = f"\N{MINUS SIGN}{row['thrown_away']}"
+        end = (request.start_tick or 0) + request.executed
+        if request.thrown_away and request.executed and end < len(lane.ticks):
+            ink, text = ink_on(colour_of(request.request)), f"\N{MINUS SIGN}{request.thrown_away}"
             axes.annotate(text, (end, place), ha="right", va="center", fontsize=5, color=ink)
-    age = lane.ticks["age_ticks"].to_numpy(dtype="float64", na_value=np.nan)
+    age = np.array([tick.age_ticks for tick in lane.ticks], dtype="float64")
     axes.step(
         np.arange(age.size + 1),
         _age_at(place, np.append(age, age[-1]) / oldest),
@@ -128,11 +140,8 @@ def _age_at(place: float, share: Any) -> Any:
     return place + _BAR / 2 + 0.03 + _AGE * share
 
 
-def runs_of(values: np.ndarray) -> list[tuple[int, int]]:
-    """Return the half-open ranges of equal values."""
-    edges = np.flatnonzero(np.diff(values)) + 1
-    bounds = [0, *edges.tolist(), values.size]
-    return list(pairwise(bounds))
+def colour_of(chunk: int | None) -> str:
+    return COLOURS[(chunk or 0) % len(COLOURS)]
 
 
 def _label(lane: CellTicks, *, several: bool) -> str:
@@ -159,7 +168,7 @@ def _legend() -> dict[str, Any]:
 
 
 def chunk_figures(run: StoredRun, cells: ChunkCells, lanes: Sequence[CellTicks]) -> dict[str, Callable[[], Figure]]:
-    means, triggers, reactions = run.table(MEANS), run.table(TRIGGERS), run.table(REACTIONS)
+    means, triggers, reactions = run.table(MEANS), Cells.of(run, TRIGGERS).rows, run.table(REACTIONS)
     settings = cells.settings
     setting = f"H = {settings['horizon']}, {settings['control_hz']:g} Hz, d by {settings['rounding']}"
     figures: dict[str, Callable[[], Figure]] = {}
@@ -167,7 +176,7 @@ def chunk_figures(run: StoredRun, cells: ChunkCells, lanes: Sequence[CellTicks])
         figures["lanes"] = partial(build_lanes, lanes, setting)
     if len(means):
         figures["stability"] = partial(build_over_means, means, f"Stalled share of the ticks, {setting}", STALLS)
-    if len(triggers):
+    if triggers:
         figures["triggers"] = partial(build_triggers, triggers, cells.sources, float(settings["epsilon"]), setting)
     if len(reactions):
         figures["reactions"] = partial(build_reactions, reactions, cells.sources, setting)
@@ -203,7 +212,7 @@ def build_over_means(rows: pd.DataFrame, title: str, shown: Mapping[str, str]) -
 
 
 def build_triggers(
-    rows: pd.DataFrame, sources: Mapping[str, Sequence[ChunkRow]], epsilon: float, setting: str
+    rows: Sequence[TriggerRow], sources: Mapping[str, Sequence[ChunkRow]], epsilon: float, setting: str
 ) -> Figure:
     """Draw P(stall) over the trigger with its closed form, a line a source, and the trigger of each rule."""
     groups = list(sources.items())[:_MOST_PANELS]
@@ -214,22 +223,20 @@ def build_triggers(
     axes = figure.subplots()
     lines: list[Any] = []
     rules: list[Any] = []
-    floor = min(epsilon, 1 / max(int(rows["boundaries"].max()), 1)) / 2
+    floor = min(epsilon, 1 / max(row.boundaries for row in rows)) / 2
     for place, (name, cells) in enumerate(groups):
         colour = LINE_COLOURS[place % len(LINE_COLOURS)]
-        mine = rows[rows["latency"] == name]
-        with_form = mine[mine["p_stall_closed"].notna()]
-        closed = np.maximum(with_form["p_stall_closed"].to_numpy(dtype="float64"), floor)
-        axes.plot(with_form["trigger"].to_numpy(dtype="float64"), closed, color=colour, linewidth=0.9)
-        label = short(name, LINE_CHARS - 8)
-        lines += axes.plot([], [], color=colour, label=label)
-        share = mine["p_stall_cycle"].to_numpy(dtype="float64")
-        above = share - mine["p_stall_low"].to_numpy(dtype="float64")
-        below = mine["p_stall_high"].to_numpy(dtype="float64") - share
+        mine = [row for row in rows if row.latency == name]
+        closed = [(row.trigger, max(row.p_stall_closed, floor)) for row in mine if row.p_stall_closed is not None]
+        axes.plot(*np.array(closed).reshape(-1, 2).T, color=colour, linewidth=0.9)
+        lines += axes.plot([], [], color=colour, label=short(name, LINE_CHARS - 8))
         axes.errorbar(
-            mine["trigger"].to_numpy(dtype="float64"),
-            np.maximum(share, floor),
-            [np.maximum(above, 0), np.maximum(below, 0)],
+            [row.trigger for row in mine],
+            [max(row.p_stall_cycle, floor) for row in mine],
+            [
+                [max(row.p_stall_cycle - row.p_stall_low, 0) for row in mine],
+                [max(row.p_stall_high - row.p_stall_cycle, 0) for row in mine],
+            ],
             fmt=".",
             color=colour,
             markersize=3,
