@@ -15,7 +15,8 @@ from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.boundary.run import NaiveTrial, rows, run_boundary
-from s2a_bench.experiments.boundary.view import board_table, build_boundary, disagreements, line_table
+from s2a_bench.experiments.boundary.view import disagreements, show
+from s2a_bench.experiments.cells import Cells
 from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.conformal import ANY_STALL_S
 from s2a_bench.policy.metrics import measure
@@ -42,7 +43,7 @@ def jittery(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
 
 def drawn(run: StoredRun) -> Figure:
     with paper_column():
-        return build_boundary(run)
+        return show(run).figures["boundary"]()
 
 
 @settings(max_examples=40)
@@ -103,7 +104,7 @@ def test_with_jitter_the_line_is_a_slope(jittery: StoredRun) -> None:
     assert share[0] == 1
     assert share[-1] == 0
     assert ((share > 0) & (share < 1)).sum() >= 2
-    assert disagreements(jittery) > 0
+    assert disagreements(Cells.of(jittery, BOUNDARY)) > 0
 
 
 def test_the_figure_draws_both_lines_every_trial_and_every_board(even: StoredRun) -> None:
@@ -139,11 +140,11 @@ def test_with_jitter_the_share_is_shaded_and_has_a_scale(jittery: StoredRun) -> 
 
 
 def test_tables_give_the_formula_and_the_first_rate_that_passed(even: StoredRun) -> None:
-    table = line_table(even)
+    table = show(even).tables["boundary"]
     assert [row[1] for row in table.rows][:4] == ["1.00", "2.00", "3.00", "4.00"]
     for row in table.rows:
         assert float(row[1]) <= float(row[2]) <= float(row[1]) * 1.26
         assert float(row[3]) <= float(row[4]) <= float(row[3]) * 1.26
-    verdicts = {row[1:3]: row[4:] for row in board_table(even).rows}
+    verdicts = {row[1:3]: row[4:] for row in show(even).tables["boards"].rows}
     assert verdicts["4", "0.833"] == ("stall-free", "stalls")
-    assert any("agree at 424 of 424 points" in note for note in board_table(even).notes)
+    assert any("agree at 424 of 424 points" in note for note in show(even).tables["boards"].notes)

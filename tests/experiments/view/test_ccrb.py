@@ -18,9 +18,8 @@ from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbComputed, CcrbLiveLoop, DrivingRequests
 from s2a_bench.experiments.ccrb.loop import ClosedLoop
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.ccrb.view.figures import build_scenario
-from s2a_bench.experiments.ccrb.view.outcomes import token_times_s
-from s2a_bench.experiments.ccrb.view.tables import ccrb_json, show
+from s2a_bench.experiments.ccrb.view.outcomes import Rollouts
+from s2a_bench.experiments.ccrb.view.tables import show
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Options
 from s2a_bench.scenario.ccrb.options import CcrbOptions
@@ -87,7 +86,7 @@ def test_a_closed_loop_is_followed_by_its_roll_out(virtual: StoredRun) -> None:
         ("  roll-out", "no impact", "3.55", "0"),
     ]
     assert [row[-2] for row in table.rows] == ["1.00", "\N{EN DASH}"] * 3
-    printed = ccrb_json(virtual)
+    printed = show(virtual).json()
     jsonschema.validate(printed, SCHEMA)
     assert [(cell["policy"], cell["outcome"]) for cell in printed["rollouts"]] == [
         ("naive", "rear"),
@@ -102,9 +101,9 @@ def test_a_run_without_closed_loops_has_no_roll_outs_beside_it(tmp_path: Path) -
     table = show(made).tables["outcomes"]
     assert [row[0] for row in table.rows] == list(POLICIES)
     assert "real-time factor" not in table.header
-    assert "rollouts" not in ccrb_json(made)
+    assert "rollouts" not in show(made).json()
     assert not any("loop" in note for note in table.notes)
-    assert [axes.get_title("left") for axes in build_scenario(made).axes[:3]] == [
+    assert [axes.get_title("left") for axes in show(made).figures["scenario"]().axes[:3]] == [
         "naive: hit from behind",
         "wait-then-act: hits the lead",
         "stream-to-act: no impact",
@@ -131,7 +130,7 @@ def test_a_world_slower_than_the_clock_is_told_with_its_factor(
     slow = [note for note in show(made).tables["outcomes"].notes if "slower than the clock" in note]
     assert [told in note for note in slow] == [True] * bool(told)
     assert [note.labels for note in slow] == [("world slower than the clock",)] * bool(told)  # type: ignore[attr-defined]
-    assert ("slower than the clock" in " ".join(caption_of(build_scenario(made)))) is bool(told)
+    assert ("slower than the clock" in " ".join(caption_of(show(made).figures["scenario"]()))) is bool(told)
 
 
 def test_each_policys_request_has_its_stages_and_they_add_up(virtual: StoredRun, live: Live) -> None:
@@ -154,7 +153,7 @@ def test_each_policys_request_has_its_stages_and_they_add_up(virtual: StoredRun,
 
 
 def test_the_figure_names_the_roll_out_and_marks_the_first_token(virtual: StoredRun) -> None:
-    figure = build_scenario(virtual)
+    figure = show(virtual).figures["scenario"]()
     assert [axes.get_title("left") for axes in figure.axes[:3]] == [
         "naive: hit from behind\nroll-out: hit from behind",
         "wait-then-act: hits the lead\nroll-out: hits the lead",
@@ -164,12 +163,12 @@ def test_the_figure_names_the_roll_out_and_marks_the_first_token(virtual: Stored
     for place, axes in enumerate(figure.axes):
         marks = [line for line in axes.lines if line.get_linestyle() == "-."]
         firsts = [float(np.asarray(line.get_xdata())[0]) for line in marks]
-        assert firsts == [token_times_s(virtual, cells[place % 3])[0]]
+        assert firsts == [Rollouts.of(virtual).token_s(cells[place % 3])[0]]
     assert "CCRB with a car behind (longitudinal simulator, closed loop)" in caption_of(figure)[0]
 
 
 def test_no_skill_is_drawn_beyond_what_was_driven(virtual: StoredRun) -> None:
-    axes = build_scenario(virtual).axes[1]
+    axes = show(virtual).figures["scenario"]().axes[1]
     driven_s = max(float(np.max(line.get_xdata())) for line in axes.lines if len(np.asarray(line.get_xdata())) > 50)
     ends_s = [patch.get_x() + patch.get_width() for patch in axes.patches]  # type: ignore[attr-defined]
     assert max(ends_s) == pytest.approx(driven_s)
@@ -182,14 +181,14 @@ def slow(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
 
 
 def test_tokens_that_come_after_the_crash_are_not_drawn(slow: StoredRun) -> None:
-    figure = build_scenario(slow)
+    figure = show(slow).figures["scenario"]()
     figure.canvas.draw()  # a layout without room would warn
     (marks,) = (line for line in figure.axes[0].lines if line.get_marker() == "|")
     assert marks.get_clip_on()
 
 
 def test_tracking_is_absent_where_no_skill_ran_before_the_crash(slow: StoredRun) -> None:
-    (cell,) = ccrb_json(slow)["cells"]
+    (cell,) = show(slow).json()["cells"]
     assert cell["outcome"] == "front"
     assert cell["real_time_factor"] == pytest.approx(1.0)
     assert "tracking_rms_mps" not in cell
