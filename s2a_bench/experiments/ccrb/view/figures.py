@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 
@@ -20,19 +20,25 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-CAR_STYLES: Final[dict[str, tuple[str, Literal["-", "--", ":"]]]] = {
-    "lead": ("#0072B2", "--"),
-    "ego": ("#000000", "-"),
-    "rear": ("#D55E00", ":"),
+Style: TypeAlias = dict[str, Any]
+_CARS: Final[dict[str, Style]] = {
+    "lead": {"color": "#0072B2", "linestyle": "--", "label": "lead; gap to it"},
+    "ego": {"color": "#000000", "linestyle": "-", "label": "ego"},
+    "rear": {"color": "#D55E00", "linestyle": ":", "label": "car behind; gap to it"},
 }
-_SIDES: Final = {"front": ("#0072B2", "--"), "rear": ("#D55E00", ":")}
-_PHASES: Final[dict[str, dict[str, Any]]] = {
-    "waiting": {"facecolor": "#EEEEEE", "linewidth": 0},
-    "acting": {"facecolor": "#BFE3D5", "edgecolor": "white", "linewidth": 0.6},
-    "gap": {"facecolor": "white", "edgecolor": "#999999", "hatch": "//////", "linewidth": 0},
+_SIDES: Final = {"front": "lead", "rear": "rear"}
+"""The car at each side of the ego."""
+_TOKEN: Final[Style] = {"color": "#555555", "marker": "|", "linestyle": "", "label": "a token arrives"}
+_FIRST: Final[Style] = {"color": "#555555", "linestyle": "-.", "linewidth": 0.6, "label": "the first token"}
+_WAITING: Final[Style] = {"facecolor": "#EEEEEE", "linewidth": 0, "label": "no skill yet"}
+_ACTING: Final[Style] = {"facecolor": "#BFE3D5", "edgecolor": "white", "linewidth": 0.6, "label": "a skill runs"}
+_STALL: Final[Style] = {
+    "facecolor": "white",
+    "edgecolor": "#999999",
+    "hatch": "//////",
+    "linewidth": 0,
+    "label": "stall: no skill is valid",
 }
-_FIRST: Final[dict[str, Any]] = {"color": "#555555", "linestyle": "-.", "linewidth": 0.6}
-_CAPTIONS: Final = {"waiting": "no skill yet", "acting": "a skill runs", "gap": "stall: no skill is valid"}
 _REST_MPS: Final = 0.1
 _AFTER_S: Final = 1.0
 REGIONS: Final = {
@@ -45,12 +51,13 @@ REGIONS: Final = {
     "mine": ("stream-to-act has an impact, another does not", "#CC79A7"),
 }
 
-_POINT: Final[dict[str, Any]] = {
+_POINT: Final[Style] = {
     "color": "white",
     "linestyle": "",
     "marker": "*",
     "markeredgecolor": "black",
     "markersize": 9,
+    "label": "operating point",
 }
 
 
@@ -104,8 +111,8 @@ def build_scenario(caption: Sequence[str], plans: Sequence[DrivenPlan]) -> Figur
             axes.set_xlim(0, until_s)
         _draw_cars(above, plan.path, "position_m")
         edge = above.get_xaxis_transform()  # the lower edge, whatever the positions
-        above.plot(plan.token_s, [0.04] * len(plan.token_s), "|", color="#555555", markersize=5, transform=edge)
-        _draw_cars(middle, plan.path, "speed_kmh")
+        above.plot(plan.token_s, [0.04] * len(plan.token_s), markersize=5, transform=edge, **_TOKEN)
+        _draw_cars(middle, plan.path, "speed_mps", 3.6)
         _draw_gaps(below, plan.path, plan.impacts)
         below.set_xlabel("time from the request (s)")
     for axes, label in zip(grid[:, 0], ("position (m)", "speed (km/h)", "gap (m)"), strict=True):
@@ -116,42 +123,41 @@ def build_scenario(caption: Sequence[str], plans: Sequence[DrivenPlan]) -> Figur
 
 
 def path_of(trajectory: pd.DataFrame, *, hit_from_behind: bool) -> pd.DataFrame:
-    """Return a trajectory until the cars rest, the car behind until its impact: times in s, speeds in km/h, gaps."""
+    """Return a trajectory until the cars rest, the car behind until its impact, with times in s, and gaps."""
     path = trajectory.assign(
         time_s=trajectory["at_ns"] / 1e9,
         front_gap_m=trajectory["lead_position_m"] - trajectory["ego_position_m"],
         rear_gap_m=trajectory["ego_position_m"] - trajectory["rear_position_m"],
-        **{f"{car}_speed_kmh": trajectory[f"{car}_speed_mps"] * 3.6 for car in CAR_STYLES},
     )
-    moving = path[[f"{car}_speed_mps" for car in CAR_STYLES]].max(axis=1) > _REST_MPS
+    moving = (path[[f"{car}_speed_mps" for car in _CARS]] > _REST_MPS).any(axis=1)
     rest_s = float(path["time_s"][moving].max()) if moving.any() else 0.0
     path = path[path["time_s"] <= rest_s + _AFTER_S].reset_index(drop=True)
-    if hit_from_behind and (path["rear_gap_m"] <= 0).any():
-        impact = int((path["rear_gap_m"] <= 0).argmax())
-        path.loc[impact + 1 :, [name for name in path.columns if name.startswith("rear_")]] = float("nan")
+    touched = path.index[path["rear_gap_m"] <= 0]
+    if hit_from_behind and len(touched):
+        path.loc[touched[0] + 1 :, ["rear_position_m", "rear_speed_mps", "rear_gap_m"]] = float("nan")
     return path
 
 
 def _shade(axes: Axes, path: pd.DataFrame, skills: pd.DataFrame) -> None:
     first, last = float(skills["start_ns"].iloc[0]) / 1e9, float(path["time_s"].iloc[-1])
-    axes.axvspan(0, min(first, last), zorder=0, **_PHASES["waiting"])
+    axes.axvspan(0, min(first, last), zorder=0, **_WAITING)
     for skill in skills.to_dict("records"):
         start, end, stall = (skill[f"{name}_ns"] / 1e9 for name in ("start", "end", "stall"))
         if start < last:
-            axes.axvspan(start, min(end, last), zorder=0, **_PHASES["acting"])
+            axes.axvspan(start, min(end, last), zorder=0, **_ACTING)
         if stall > 0 and start - stall < last:
-            axes.axvspan(start - stall, min(start, last), zorder=0, **_PHASES["gap"])
+            axes.axvspan(start - stall, min(start, last), zorder=0, **_STALL)
 
 
-def _draw_cars(axes: Axes, path: pd.DataFrame, what: str) -> None:
-    for car, (colour, style) in CAR_STYLES.items():
-        axes.plot(path["time_s"], path[f"{car}_{what}"], style, color=colour, linewidth=1.2)
+def _draw_cars(axes: Axes, path: pd.DataFrame, column: str, scale: float = 1.0) -> None:
+    for car, style in _CARS.items():
+        axes.plot(path["time_s"], path[f"{car}_{column}"] * scale, linewidth=1.2, **style)
 
 
 def _draw_gaps(axes: Axes, path: pd.DataFrame, impacts: Mapping[str, float]) -> None:
-    for side, (colour, style) in _SIDES.items():
-        gap = path[f"{side}_gap_m"]
-        axes.plot(path["time_s"], gap.clip(lower=0), style, color=colour, linewidth=1.2)
+    for side, car in _SIDES.items():
+        gap, colour = path[f"{side}_gap_m"], _CARS[car]["color"]
+        axes.plot(path["time_s"], gap.clip(lower=0), linewidth=1.2, **_CARS[car])
         if side in impacts:
             # The last moment before contact is what the record has.
             at_s = float(path["time_s"].iloc[int(gap.argmin())])
@@ -164,28 +170,17 @@ def _legend() -> list[object]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    names = {"lead": "lead; gap to it", "ego": "ego", "rear": "car behind; gap to it"}
-    lines: list[object] = [
-        Line2D([], [], color=colour, linestyle=style, label=names[car]) for car, (colour, style) in CAR_STYLES.items()
-    ]
-    lines.append(Line2D([], [], color="#555555", marker="|", linestyle="", label="a token arrives"))
-    lines.append(Line2D([], [], label="the first token", **_FIRST))
-    return lines + [Patch(label=_CAPTIONS[name], **style) for name, style in _PHASES.items()]
+    lines = [Line2D([], [], **style) for style in (*_CARS.values(), _TOKEN, _FIRST)]
+    return [*lines, *(Patch(**style) for style in (_WAITING, _ACTING, _STALL))]
 
 
 def region_of(scenes: pd.DataFrame) -> list[str]:
     """Return the region of each scenario, a key of `REGIONS`."""
     naive, wait, stream = (scenes[policy] != "none" for policy in PAPER)
-    regions = {
-        "paper": scenes["paper"],
-        "all": naive & wait & stream,
-        "mine": stream,
-        "others": naive & wait,
-        NAIVE: naive,
-        "wait": wait,
-    }
-    named: list[str] = np.select([*regions.values()], [*regions], "nobody").tolist()
-    return named
+    cases = {"paper": scenes["paper"], "all": naive & wait & stream, "mine": stream, "others": naive & wait}
+    cases |= {NAIVE: naive, "wait": wait}
+    regions: list[str] = np.select([*cases.values()], [*cases], "nobody").tolist()
+    return regions
 
 
 def _phase_caption(diagram: Mapping[str, pd.DataFrame], settings: Mapping[str, Any]) -> tuple[str, ...]:
@@ -225,7 +220,7 @@ def build_phase(caption: Sequence[str], diagram: Mapping[str, pd.DataFrame], at:
         for name, (label, colour) in REGIONS.items()
         if name in seen
     ]
-    handles.append(Line2D([], [], label="operating point", **_POINT))
+    handles.append(Line2D([], [], **_POINT))
     figure.legend(handles=handles, loc="outside lower center", ncols=3)
     return figure
 
