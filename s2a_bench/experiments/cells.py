@@ -12,13 +12,12 @@ from s2a_bench.stats import Summary, summary_of
 from s2a_bench.store.schema import PROVENANCE, Row
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
-    from numpy.typing import NDArray
     from typing_extensions import Self
 
     from s2a_bench.provenance import Origins
     from s2a_bench.stats import Floats
+    from s2a_bench.stats.batches import Rows
     from s2a_bench.store.run import StoredRun
     from s2a_bench.store.schema import Table
     from s2a_bench.writers.csv_text import CsvTable
@@ -26,8 +25,6 @@ if TYPE_CHECKING:
 
 TIME, COUNT, FLAG, SHARE, NUMBER = "time", "count", "flag", "share", "number"
 Better: TypeAlias = Literal["lower", "higher", "neither"]
-Rows: TypeAlias = "list[NDArray[np.float64]]"
-"""The values of a metric: one array a request or plan, in the order in which they were made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,24 +98,39 @@ class Column:
     hint: Any
     metric: Metric | None
     json_key: JsonKey | None
+    as_stored: bool
+    """Whether ``--json`` has metrics by their columns, times in ns: the class variable of this name."""
 
     @property
     def key(self) -> str:
         if self.json_key:
             return self.json_key.name
-        return self.metric.name if self.metric else self.name
+        return self.metric.name if self.metric and not self.as_stored else self.name
+
+    @property
+    def in_s(self) -> bool:
+        """Whether ``--json`` has its values, stored in ns, in s."""
+        return self.metric is not None and self.metric.kind == TIME and not self.as_stored
+
+    def json(self, row: object) -> Any:
+        """Return its value in a row as ``--json`` has it."""
+        value = getattr(row, self.name)
+        return value / 1e9 if self.in_s and value is not None else value
 
 
 @cache
 def columns_of(row: type) -> tuple[Column, ...]:
-    return tuple(_column(name, hint) for name, hint in get_type_hints(row, include_extras=True).items())
+    """Return the columns that a dataclass of rows declares."""
+    hints = get_type_hints(row, include_extras=True)
+    return tuple(_column(row, field.name, hints[field.name]) for field in fields(row))
 
 
-def _column(name: str, hint: Any) -> Column:
+def _column(row: type, name: str, hint: Any) -> Column:
     marks = getattr(hint, "__metadata__", ())
     metric = next((mark for mark in marks if isinstance(mark, Metric)), None)
     key = next((mark for mark in marks if isinstance(mark, JsonKey)), None)
-    return Column(name, hint, metric and metric.of_column(name, type_of_values(hint)), key)
+    metric = metric and metric.of_column(name, type_of_values(hint))
+    return Column(name, hint, metric, key, getattr(row, "as_stored", False))
 
 
 def type_of_values(hint: Any) -> type:
@@ -135,10 +147,10 @@ def metrics_of(row: type) -> dict[str, Metric]:
 
 
 def json_of(row: Any) -> dict[str, Any]:
-    """Return a row as an object of ``--json``, times in s; a missing value is an absent key."""
+    """Return a row as an object of ``--json``; a missing value is an absent key."""
     values: dict[str, Any] = {}
-    for column in columns_of(type(row)):
-        value = column.metric.read(row) if column.metric else getattr(row, column.name)
+    for column in columns_of(row.__class__):
+        value = column.json(row)
         if column.key and value is not None:
             values[column.key] = None if column.json_key and not value else value
     return values
@@ -166,6 +178,11 @@ class Cells(Generic[Row]):
         records = frame.astype(object).where(frame.notna(), None).to_dict("records")
         return [self.row(**{str(name): value for name, value in record.items()}) for record in records]
 
+    @cached_property
+    def first(self) -> Row:
+        """The first row, for what all rows of a cell share."""
+        return replace(self, frame=self.frame[:1]).rows[0]
+
     @property
     def metrics(self) -> dict[str, Metric]:
         return metrics_of(self.row)
@@ -184,7 +201,7 @@ class Cells(Generic[Row]):
 
     def about(self, column: str) -> Any:
         """Return a value that all rows share; None if it is missing."""
-        return getattr(replace(self, frame=self.frame.iloc[:1]).rows[0], column)
+        return getattr(self.first, column)
 
     def values(self, metric: str) -> Floats:
         """Return a metric's values, times in s, without the missing ones."""
@@ -236,7 +253,9 @@ class Cells(Generic[Row]):
 
     def rows_of(self, metric: str) -> Rows:
         """Return a metric's values, a row each; none for a metric that the rows lack."""
-        return list(self.values(metric)[:, None]) if metric in self.metrics else []
+        from s2a_bench.stats.batches import Rows
+
+        return Rows(self.values(metric)) if metric in self.metrics else Rows.of([])
 
 
 @dataclass(frozen=True, slots=True)

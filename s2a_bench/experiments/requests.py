@@ -15,7 +15,7 @@ from functools import cached_property
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
-from s2a_bench.experiments.cells import Comparable, Metric, Rows, Subject, by_name
+from s2a_bench.experiments.cells import Comparable, Metric, Subject, by_name
 from s2a_bench.facts import (
     END_N,
     FIRST_DECODE_MS,
@@ -47,6 +47,7 @@ from s2a_bench.writers.tables import DUMMY, EMULATED, PAPERS, Note
 if TYPE_CHECKING:
     import pandas as pd
 
+    from s2a_bench.stats.batches import Blocks, Rows
     from s2a_bench.store.run import StoredRun
 
 Of: TypeAlias = "Callable[[RequestCell], pd.Series[Any]]"
@@ -169,14 +170,20 @@ class RequestCell:
         return Ends(_numbers(self.sums_ms(group, "_lo")), _numbers(self.sums_ms(group, "_hi")))
 
     def rows(self, metric: RequestMetric | str) -> Rows:
-        """Return a metric's values, an array for each request that has any."""
+        """Return a metric's values, a row for each request that has any."""
+        import numpy as np
+        import pandas as pd
+
+        from s2a_bench.stats.batches import Rows
+
         column = self.column(metric).dropna()
         if column.index.name != "request_id":
-            return list(_numbers(column)[:, None])
-        found = {str(request): _numbers(values) for request, values in column.groupby(level=0, sort=False)}
-        return [found[request] for request in self.good["request_id"] if request in found]
+            return Rows(_numbers(column))
+        requests = pd.Index(self.good["request_id"]).get_indexer(column.index)
+        sizes = np.unique(requests, return_counts=True)[1]
+        return Rows(_numbers(column)[np.argsort(requests, kind="stable")], sizes)
 
-    def by_launch(self, metric: str) -> dict[int, dict[int, list[float]]]:
+    def by_launch(self, metric: str) -> dict[int, Blocks]:
         """Return the values of a metric by launch and block, times in ms."""
         values = self.column(metric).dropna()
         return by_launch(self.good[["launch", "block"]].loc[values.index], values)
@@ -338,12 +345,12 @@ TOKEN_METRICS: Final = (
 OF_ANSWERS: Final = by_name((*ANSWER_METRICS, *TOKEN_METRICS))
 
 
-def by_launch(places: pd.DataFrame, values: Iterable[Any]) -> dict[int, dict[int, list[float]]]:
+def by_launch(places: pd.DataFrame, values: pd.Series[Any]) -> dict[int, Blocks]:
     """Return values by the columns ``launch`` and ``block`` of their ``places``."""
-    found: dict[int, dict[int, list[float]]] = {}
-    for launch, block, value in zip(places["launch"], places["block"], values, strict=True):
-        found.setdefault(int(launch), {}).setdefault(int(block), []).append(float(value))
-    return found
+    from s2a_bench.stats.batches import Blocks
+
+    launch, block = (places[name].to_numpy(dtype="int64") for name in ("launch", "block"))
+    return Blocks.by_launch(values.to_numpy(dtype="float64"), launch, block)
 
 
 def numbers_ms(column: pd.Series[Any]) -> Floats:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
-from annotated_types import Ge  # comes with pydantic
+from s2a_bench.bounds import Many, NonNegative
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,10 +19,10 @@ Floats: TypeAlias = "NDArray[np.float64]"
 class Summary:
     """Summary of n values; ``sd`` is the sample standard deviation (n - 1), None for a single value."""
 
-    n: Annotated[int, Ge(1)]
+    n: Many
     median: float
     mean: float
-    sd: Annotated[float, Ge(0)] | None
+    sd: NonNegative | None
     p90: float
     p99: float
 
@@ -57,11 +57,11 @@ class Ratio:
         return None if self.low is None or self.high is None else (self.low, self.high)
 
 
-def summarise(values: Iterable[float]) -> Summary:
+def summarise(values: Floats | Sequence[float]) -> Summary:
     """Summarise values; percentiles interpolate linearly (Hyndman and Fan, type 7). Raises ValueError for none."""
     import numpy as np
 
-    array = np.asarray(list(values), dtype=np.float64)
+    array = np.asarray(values, dtype=np.float64)
     if not array.size:
         raise ValueError("there is no summary of no values")
     median, p90, p99 = np.percentile(array, (50, 90, 99))

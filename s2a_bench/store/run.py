@@ -221,7 +221,8 @@ class StoredRun:
     def table(self, table: Table[Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
         """Return a table with all its columns, empty if the run has none; raises StoreError for a damaged file.
 
-        With ``columns`` only these are read and nothing is kept; texts are categoricals, in order of appearance.
+        With ``columns`` only these are read and nothing is kept; texts but JSON are then categoricals, in order of
+        appearance.
         """
         if columns is not None:
             return self._some(table, columns)
@@ -230,21 +231,22 @@ class StoredRun:
         return self.tables[table.name]
 
     def _some(self, table: Table[Any], columns: Sequence[str]) -> pd.DataFrame:
-        kinds = {name: table.columns[name] for name in columns}
+        texts = [name for name in columns if table.columns[name] == "string"]
         if table.name not in self.tables:
-            return self._read(table.name, kinds, categories=True)
+            return self._read(
+                table.name, {name: table.columns[name] for name in columns} | dict.fromkeys(texts, "category")
+            )
         import pandas as pd
 
         rows = self.tables[table.name][[*columns]]
-        texts = [name for name, kind in kinds.items() if kind == "string"]
         return rows.astype({name: pd.CategoricalDtype([*rows[name].dropna().unique()]) for name in texts})
 
-    def _read(self, name: str, columns: dict[str, Kind], *, categories: bool = False) -> pd.DataFrame:
+    def _read(self, name: str, columns: dict[str, Kind]) -> pd.DataFrame:
         """Read columns of a table, from its CSV if the run has not ended."""
         csv = self.path / f"{name}.csv"
         parquet = csv.with_suffix(".parquet")
-        read, path = (files.read_parquet, parquet) if parquet.exists() else (files.read_csv, csv)
-        rows = files.to_pandas(read(path, columns, categories=categories))
+        whole = parquet.exists()
+        rows = files.read_parquet(parquet, columns) if whole else files.to_pandas(files.read_csv(csv, columns))
         rows.attrs[PROVENANCE] = self.origins.line
         return rows
 

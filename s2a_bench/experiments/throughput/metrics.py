@@ -27,6 +27,7 @@ from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 from s2a_bench.writers.json import frame, ratio_entry
 
 if TYPE_CHECKING:
+    from s2a_bench.stats.batches import Blocks
     from s2a_bench.store.run import StoredRun
 
 
@@ -113,7 +114,7 @@ def rates_by_position(cell: RequestCell) -> dict[tuple[int, int], Floats]:
     return {(place * BIN, place * BIN + BIN - 1): rates[places == place] for place in sorted(set(places.tolist()))}
 
 
-def reference_by_launch(run: StoredRun) -> dict[int, dict[int, list[float]]]:
+def reference_by_launch(run: StoredRun) -> dict[int, Blocks]:
     """Return llama-bench's tokens/s by launch and block, without warm-ups."""
     rows = run.table(REFERENCE)
     counted = rows[~rows["warmup"]]
@@ -122,8 +123,7 @@ def reference_by_launch(run: StoredRun) -> dict[int, dict[int, list[float]]]:
 
 def reference_values(run: StoredRun) -> list[float]:
     """Return llama-bench's tokens/s in the order of the blocks."""
-    launches = sorted(reference_by_launch(run).items())
-    return [value for _, blocks in launches for _, values in sorted(blocks.items()) for value in values]
+    return [value for blocks in reference_by_launch(run).values() for value in blocks.values.tolist()]
 
 
 def reference_depths(run: StoredRun) -> list[int]:

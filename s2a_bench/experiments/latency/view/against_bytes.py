@@ -16,7 +16,8 @@ import numpy as np
 from s2a_bench.experiments import Tables
 from s2a_bench.experiments.requests import RequestCell, Split, payloads_of, stand_ins
 from s2a_bench.stats import Ratio
-from s2a_bench.stats.change import FEWEST_LAUNCHES, Blocks, ratio_of_launches
+from s2a_bench.stats.batches import Blocks
+from s2a_bench.stats.change import FEWEST_LAUNCHES, ratio_of_launches
 from s2a_bench.stats.line import Estimate, Line, fit_line
 from s2a_bench.transport import declared_transport, payload_order
 from s2a_bench.writers.figures import new_figure
@@ -100,7 +101,7 @@ def _pipeline(name: str, payload: str, cells: Sequence[tuple[int, int, RequestCe
     for run, pixels, cell in cells:
         for launch, blocks in cell.by_launch(METRIC).items():
             sizes.setdefault(pixels / MB, {})[run, launch] = blocks
-            medians.append((pixels / MB, float(np.median(np.concatenate([*blocks.values()])))))
+            medians.append((pixels / MB, float(np.median(blocks.values))))
     bounds = sorted(
         (pixels / MB, float(np.median(of))) for _, pixels, cell in cells if (of := cell.values_ms("bound")).size
     )

@@ -17,7 +17,8 @@ from s2a_bench.plugins.paper.claims import Need, RunPart
 from s2a_bench.policy import Floats
 from s2a_bench.provenance import NONE, UNKNOWN, Provenance
 from s2a_bench.stats import Ratio, summarise, summary_of
-from s2a_bench.stats.change import FEWEST_LAUNCHES, Blocks, Change, change_between, ratio_of_launches
+from s2a_bench.stats.batches import Blocks, Rows
+from s2a_bench.stats.change import FEWEST_LAUNCHES, Change, change_between, ratio_of_launches
 from s2a_bench.store.run import StoredRun
 from s2a_bench.transport import EXTERNAL, PROGRAM, declared_transport
 from s2a_bench.writers.tables import interval, mean_sd
@@ -107,7 +108,7 @@ def exact(value: float) -> Ratio:
 
 def change(over: Floats, base: Floats, seed: int, *, paired: bool = False, exact: bool = False) -> Change:
     """Compare the means of two sides in order of time; ``paired`` if rows i of both belong together."""
-    return change_between([[*base[:, None]]], [[*over[:, None]]], "mean", seed=seed, paired=paired, exact=exact)
+    return change_between([Rows(base)], [Rows(over)], "mean", seed=seed, paired=paired, exact=exact)
 
 
 def pairs(run: StoredRun) -> Iterator[RunPart]:
@@ -249,10 +250,11 @@ def _metric(pair: Sequence[RequestCell]) -> str:
 
 
 def _blocks(pair: Sequence[RequestCell]) -> tuple[Mapping[int, Blocks], Mapping[int, Blocks]]:
-    sides = [cell.by_launch(_metric(pair)) for cell in pair]
-    both = {launch: sides[0][launch].keys() & sides[1][launch].keys() for launch in sides[0].keys() & sides[1].keys()}
-    http, ros = ({launch: {block: side[launch][block] for block in both[launch]} for launch in both} for side in sides)
-    return http, ros
+    http, ros = (cell.by_launch(_metric(pair)) for cell in pair)
+    both = [(launch, http[launch], ros[launch]) for launch in http if launch in ros]
+    return {launch: one.shared(other) for launch, one, other in both}, {
+        launch: other.shared(one) for launch, one, other in both
+    }
 
 
 def speeds(run: StoredRun) -> Iterator[RunPart]:
