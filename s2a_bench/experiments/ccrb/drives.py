@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, replace
-from typing import Any, Final, TypeAlias
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -26,11 +26,6 @@ from s2a_bench.scenario.ccrb.outcome import Outcomes
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.schema import Table
 
-OF_CARS: Final = (
-    *("impact_speed_mps", "front_impact_mps", "rear_impact_mps", "min_front_gap_m", "min_rear_gap_m"),
-    *("min_front_ttc_s", "min_rear_ttc_s", "required_decel_mps2"),
-)
-"""The metrics that `Outcomes` have."""
 TableRows: TypeAlias = tuple[Table[Any], Iterable[Any]]
 """A table and rows for it."""
 
@@ -135,9 +130,10 @@ def metrics_of_drives(schedule: Schedule, outcomes: Outcomes) -> Iterator[dict[s
     """Yield the metrics of each of M roll-outs, as columns of their rows; None for an undefined one."""
     stall_s = stalls(schedule)
     end_s = schedule.start_s[-1] + schedule.duration_s[-1]
-    of_cars = {name: getattr(outcomes, name).tolist() for name in OF_CARS}
+    of_cars = {item.name: getattr(outcomes, item.name) for item in fields(outcomes) if item.name != "code"}
+    of_cars["impact_speed_mps"] = outcomes.impact_speed_mps
     for place in range(len(outcomes.code)):
-        values = {name: column[place] for name, column in of_cars.items()}
+        values = {name: float(column[place]) for name, column in of_cars.items()}
         yield {
             "start_ns": to_ns(schedule.start_s[0, place]),
             "end_ns": to_ns(end_s[place]),

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jsonschema
 import numpy as np
+import pandas as pd
 import pytest
 from rosbags.highlevel import AnyReader
 
@@ -18,10 +19,12 @@ from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbComputed, CcrbLiveLoop, DrivingRequests
 from s2a_bench.experiments.ccrb.loop import ClosedLoop
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
+from s2a_bench.experiments.ccrb.view.figures import DrivenPlan, build_phase, build_scenario, path_of
 from s2a_bench.experiments.ccrb.view.outcomes import Rollouts
 from s2a_bench.experiments.ccrb.view.tables import show
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Options
+from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
@@ -172,6 +175,41 @@ def test_no_skill_is_drawn_beyond_what_was_driven(virtual: StoredRun) -> None:
     driven_s = max(float(np.max(line.get_xdata())) for line in axes.lines if len(np.asarray(line.get_xdata())) > 50)
     ends_s = [patch.get_x() + patch.get_width() for patch in axes.patches]  # type: ignore[attr-defined]
     assert max(ends_s) == pytest.approx(driven_s)
+
+
+def trajectory() -> pd.DataFrame:
+    """Return five seconds of a lead 30 m ahead and a rear car that closes 10 m; all stop after two seconds."""
+    at_s = np.arange(0, 5, 0.5)
+    speed, gap = np.where(at_s < 2.5, 10.0, 0.0), np.linspace(6.0, -12.0, len(at_s))
+    columns = {"at_ns": at_s * 1e9, "lead_position_m": at_s + 30, "ego_position_m": at_s, "rear_position_m": at_s - gap}
+    return pd.DataFrame({**columns, **{f"{car}_speed_mps": speed for car in ("lead", "ego", "rear")}})
+
+
+def test_a_path_ends_a_second_after_the_cars_rest_and_the_rear_car_at_its_impact() -> None:
+    path = path_of(trajectory(), hit_from_behind=True)
+    assert path["time_s"].max() == 3.0
+    assert path["rear_gap_m"].isna().tolist() == [False] * 4 + [True] * 3
+    assert path["ego_speed_mps"].notna().all()
+    assert path_of(trajectory(), hit_from_behind=False)["rear_gap_m"].notna().all()
+
+
+def test_a_scenario_is_drawn_from_a_path_skills_and_tokens() -> None:
+    skills = pd.DataFrame({"start_ns": [1e9, 3e9], "end_ns": [2e9, 4e9], "stall_ns": [0.0, 1e9]})
+    plan = DrivenPlan("naive", path_of(trajectory(), hit_from_behind=True), skills, [0.5, 0.7], {"rear": 4.0})
+    figure = build_scenario(("A title",), [plan])
+    assert [text.get_text() for axes in figure.axes for text in axes.texts] == ["4.0 m/s"]
+    spans = [(patch.get_x(), patch.get_width()) for patch in figure.axes[0].patches]  # type: ignore[attr-defined]
+    assert spans == [(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)]  # waiting, a skill, a stall; the second skill is not driven
+
+
+def test_a_phase_diagram_is_drawn_from_scenarios() -> None:
+    outcomes = {"naive": ["rear", "none"] * 2, "wait-then-act": ["front"] * 4, "stream-to-act": ["none"] * 4}
+    plane = {"tokens_per_s": [2.0, 4.0] * 2, "rear_gap_m": [6.0, 6.0, 9.0, 9.0], "paper": [True, False] * 2}
+    figure = build_phase(("A title",), dict.fromkeys(GAPS, pd.DataFrame({**plane, **outcomes})), (2.0, 8.0))
+    assert figure.axes[0].get_title("left") == "stop: the paper's ordering 50.0%, at 8 m: R 2.0\N{EN DASH}2.0"
+    (legend,) = figure.legends
+    labels = ["the paper's ordering", "only wait-then-act has an impact", "operating point"]
+    assert [text.get_text() for text in legend.get_texts()] == labels
 
 
 @pytest.fixture(scope="module")
