@@ -17,7 +17,7 @@ from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import skill_rows, to_ns
 from s2a_bench.policy import TOLERANCE_S, Plans, Policy, Schedule
 from s2a_bench.policy.metrics import peak_jerk, rms_jerk, sparc, stalls
-from s2a_bench.scenario import EGO, ROLES, Simulator, open_simulator
+from s2a_bench.scenario import EGO, LEAD, REAR, Simulator, open_simulator
 from s2a_bench.scenario.ccrb.cars import TTC, ttc_aware
 from s2a_bench.scenario.ccrb.drive import Driven, Trajectory, drive
 from s2a_bench.scenario.ccrb.ego import PHASES
@@ -154,17 +154,23 @@ def motion_of(path: Trajectory) -> dict[str, Any]:
 
 
 def trajectory_rows(cell: str, path: Trajectory) -> Iterator[TrajectoryRow]:
-    cars: dict[str, Any] = {
-        f"{role}_{what}": getattr(path, what)[:, place, 0].tolist()
-        for what in ("position_m", "speed_mps", "acceleration_mps2")
-        for place, role in enumerate(ROLES)
-    }
+    position_m, speed_mps, acceleration_mps2 = (
+        values[:, :, 0].tolist() for values in (path.position_m, path.speed_mps, path.acceleration_mps2)
+    )
     for step, at_s in enumerate(path.time_s):
         yield TrajectoryRow(
             cell=cell,
             at_ns=to_ns(at_s),
             phase=PHASES[int(path.phase[step, 0])],
             skill=int(path.skill[step, 0]),
+            lead_position_m=position_m[step][LEAD],
+            ego_position_m=position_m[step][EGO],
+            rear_position_m=position_m[step][REAR],
             ego_lateral_m=float(path.lateral_m[step, EGO, 0]),
-            **{name: values[step] for name, values in cars.items()},
+            lead_speed_mps=speed_mps[step][LEAD],
+            ego_speed_mps=speed_mps[step][EGO],
+            rear_speed_mps=speed_mps[step][REAR],
+            lead_acceleration_mps2=acceleration_mps2[step][LEAD],
+            ego_acceleration_mps2=acceleration_mps2[step][EGO],
+            rear_acceleration_mps2=acceleration_mps2[step][REAR],
         )

@@ -164,7 +164,8 @@ def tokens_line(run: StoredRun) -> Note:
     line = f"{kind} tokens over {live['transport']}"
     line += f", paced to {pace:g} tokens/s (the rate is set)" if pace else ""
     line += f", {unseen}" if unseen else ""
-    return Note(f"{line}; car simulated.", *([EMULATED] if live["emulated"] else []), *([unseen] if unseen else []))
+    labels = [label for label, holds in ((EMULATED, live["emulated"]), (unseen, unseen)) if holds]
+    return Note(f"{line}; car simulated.", *labels)
 
 
 def _live_notes(rollouts: Rollouts, live: dict[str, Any]) -> list[str]:
