@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, Final, Generic, Literal, TypeAlias, TypeVar, get_type_hints
 
@@ -159,7 +159,7 @@ class Cells(Generic[Row]):
     @cached_property
     def rows(self) -> list[Row]:
         """The rows as objects of their class, None for a missing value."""
-        names = [field.name for field in fields(self.row)]  # type: ignore[arg-type]  # a row is a dataclass
+        names = [*kinds_of(self.row)]
         columns = [_plain(self.frame[name]) for name in names]
         return [self.row(**dict(zip(names, values, strict=True))) for values in zip(*columns, strict=True)]
 
@@ -226,10 +226,11 @@ class Cells(Generic[Row]):
 
     def subjects(self, setting: Sequence[str] = (), *, exact: bool = False) -> list[Subject]:
         """Return what is compared, a subject a cell; the columns of ``setting`` must be equal on both sides."""
-        return [
-            Subject(name, {column: str(getattr(cell.first, column)) for column in setting}, len(cell), 0, cell.rows_of, exact)
-            for name, cell in self.split().items()
-        ]
+        subjects = []
+        for name, cell in self.split().items():
+            shared = {column: str(getattr(cell.first, column)) for column in setting}
+            subjects.append(Subject(name, shared, len(cell), 0, cell.rows_of, exact))
+        return subjects
 
     def rows_of(self, metric: str) -> Rows:
         """Return a metric's values, a row each; none for a metric that the rows lack."""
