@@ -39,12 +39,12 @@ class AboutFleet:
 class FleetRow(FleetMetrics, AboutFleet):
     """N robots on one server."""
 
-    as_stored: ClassVar = True
+    as_stored: ClassVar[bool] = True
 
 
 @dataclass(frozen=True, kw_only=True)
 class AboutRobot:
-    """The columns of a row of `ROBOTS` besides the metrics."""
+    """Whose row it is, of `ROBOTS` or `REQUESTS`."""
 
     cell: str
     source: str
@@ -57,14 +57,10 @@ class RobotRow(FleetMetrics, AboutRobot):
     """One robot of a fleet in an episode."""
 
 
-@dataclass(frozen=True, slots=True)
-class RequestRow:
+@dataclass(frozen=True, kw_only=True)
+class RequestRow(AboutRobot):
     """One request of a robot: its intended time after its first tick, and its latency, null without an answer."""
 
-    cell: str
-    source: str
-    robots: int
-    robot: int
     intended_ns: int
     latency_ns: int | None
     settling: bool
