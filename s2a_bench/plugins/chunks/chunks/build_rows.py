@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -25,12 +25,12 @@ from s2a_bench.plugins.chunks.chunks.rows import (
     TriggerRow,
 )
 from s2a_bench.plugins.chunks.modes.closed import beta, closed
-from s2a_bench.plugins.chunks.modes.metrics import margin_ticks, measure, reaction_ticks
+from s2a_bench.plugins.chunks.modes.metrics import greatest, margin_ticks, mean, measure, p99, reaction_ticks
 from s2a_bench.policy.conformal import upper_bound
 from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
-    from s2a_bench.plugins.chunks.chunks.cells import ChunkCell, LatencyDraw
+    from s2a_bench.plugins.chunks.chunks.cells import ActingCell, LatencyDraw
     from s2a_bench.plugins.chunks.chunks.smooth import TrackingPlant
     from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ints, Mode, Ticks
     from s2a_bench.plugins.chunks.options import ControlPlan
@@ -55,7 +55,7 @@ _SIDE: Final = 0.975
 class ActedCell:
     """What a cell did: by its cycles and by its ticks."""
 
-    cell: ChunkCell
+    cell: ActingCell
     setting: ControlSetting
     """With actions as slow as the cell's."""
     cycles: Cycles
@@ -117,14 +117,14 @@ def metrics_of(acted: ActedCell, reaction_s: Floats) -> dict[str, float | None]:
         "stall_ticks_per_s": found["stall_ticks"] / length / period_s,
         "p_stall_closed": expected.p_stall,
         "age_ticks_blended": _blended(cell, cycles),
-        "reaction_s_mean": float(reaction_s.mean()) if reaction_s.size else None,
-        "reaction_s_p99": float(np.quantile(reaction_s, 0.99)) if reaction_s.size else None,
+        "reaction_s_mean": mean(reaction_s),
+        "reaction_s_p99": p99(reaction_s),
         "reaction_s_closed": None if mean_reaction is None else mean_reaction * period_s,
         "first_action_s": (found["first_action_tick"] + later) * period_s if found["age_ticks_mean"] >= 0 else None,
         "control_rate_hz": (found["ticks"] - found["stall_ticks"]) / length / period_s,
-        "delay_ticks_mean": float(delay.mean()),
-        "delay_ticks_p99": float(np.quantile(delay, 0.99)),
-        "delay_ticks_max": float(delay.max()),
+        "delay_ticks_mean": mean(delay),
+        "delay_ticks_p99": p99(delay),
+        "delay_ticks_max": greatest(delay),
         "delay_assumed_ticks": _mean(cell.triggers, cell.mode.assumed_ticks),
         "p_delay_above": None if assumed is None else float(np.mean(delay[1:] > assumed)),
         "margin_ticks": margin_ticks(cell.acting, latency_ns, setting) if len(cell.triggers) < 2 else None,  # noqa: PLR2004 - the rule would answer
@@ -185,19 +185,22 @@ def _tick_rows(acted: ActedCell, shown: int) -> Iterator[TickRow]:
 
 def _request_rows(acted: ActedCell, shown: int) -> Iterator[RequestRow]:
     cycles, latency_ns = acted.cycles, acted.latency_ns
-    count = min(latency_ns.size, int(np.searchsorted(cycles.request_tick, shown)))
-    kept = [each.name for each in fields(RequestRow)]
-    columns = {name: getattr(cycles, name)[:count].tolist() for name in kept if hasattr(cycles, name)}
-    for request in range(count):
-        row = {name: values[request] for name, values in columns.items()}
-        if not row["executed"]:
-            row |= dict.fromkeys(("start_tick", "first_index", "jump"))
+    delay_ticks, thrown_away = cycles.delay_ticks, cycles.thrown_away
+    for request in range(min(latency_ns.size, int(np.searchsorted(cycles.request_tick, shown)))):
+        executed = int(cycles.executed[request])
         yield RequestRow(
             cell=acted.cell.cell,
             request=request,
+            request_tick=int(cycles.request_tick[request]),
             latency_ns=int(latency_ns[request]),
+            delay_ticks=int(delay_ticks[request]),
+            start_tick=int(cycles.start_tick[request]) if executed else None,
+            first_index=int(cycles.first_index[request]) if executed else None,
+            executed=executed,
+            thrown_away=int(thrown_away[request]),
+            stall_ticks=int(cycles.stall_ticks[request]),
+            jump=int(cycles.jump[request]) if executed else None,
             request_id=acted.names.get(request),
-            **row,
         )
 
 
@@ -205,7 +208,7 @@ def _mean(triggers: tuple[int, ...], given: int | None) -> float | None:
     return float(np.mean(triggers)) if triggers else None if given is None else float(given)
 
 
-def _blended(cell: ChunkCell, cycles: Cycles) -> float | None:
+def _blended(cell: ActingCell, cycles: Cycles) -> float | None:
     age = cell.mode.blended_age(cycles)
     return None if age is None or not np.isfinite(age).any() else float(np.nanmean(age))
 

@@ -48,7 +48,7 @@ class LatencyDraw:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ChunkCell:
+class ActingCell:
     """One mode under one source; ``triggers`` are a rule's, one a request."""
 
     mode: Mode
@@ -75,11 +75,11 @@ class ChunkCell:
         rule = "" if self.rule == GIVEN else f", {self.rule}"
         return f"{self.name}{rule} @ {self.drawn.source.name}"
 
-    def chosen(self, triggers: tuple[int, ...]) -> ChunkCell:
+    def chosen(self, triggers: tuple[int, ...]) -> ActingCell:
         """Return the cell with the triggers that its rule chose; none: as it is."""
         return replace(self, triggers=triggers, begin=None) if triggers else self
 
-    def followed(self, setting: ControlSetting) -> ChunkCell:
+    def followed(self, setting: ControlSetting) -> ActingCell:
         """Return the cell with the triggers that its rule chooses if it learns the judged latencies."""
         if self.begin is None:
             return self
@@ -97,10 +97,10 @@ def draw(source: Source, cycles: int | None, learnt: int, seed: int) -> LatencyD
     return LatencyDraw(source, source.draw(rng, cycles or CYCLES), source.draw(rules_rng, count))
 
 
-def cells(control: ControlPlan, rules: RulesPlan, drawn: LatencyDraw) -> Iterator[ChunkCell]:
+def cells(control: ControlPlan, rules: RulesPlan, drawn: LatencyDraw) -> Iterator[ActingCell]:
     """Yield the cells of one source; a live one has no judged latencies yet."""
     for name, given in control.modes.items():
-        yield ChunkCell(given, name, GIVEN, drawn)
+        yield ActingCell(given, name, GIVEN, drawn)
     mode, setting = rules.mode, control.setting
     if mode is None:
         return
@@ -110,9 +110,9 @@ def cells(control: ControlPlan, rules: RulesPlan, drawn: LatencyDraw) -> Iterato
             known = calibrate(drawn.learnt, rules.epsilon, rules.guarantee) if rule == "calibrated" else None
             limit_ns = known.caution if known else _oracle_ns(drawn.source, rules.epsilon, control.seed)
             fixed = trigger(limit_ns, setting, greatest_trigger(mode, setting))
-            yield ChunkCell(mode, name, rule, drawn, (fixed.ticks,), min(fixed.beta, rules.slowest), calibration=known)
+            yield ActingCell(mode, name, rule, drawn, (fixed.ticks,), min(fixed.beta, rules.slowest), calibration=known)
         else:
-            yield ChunkCell(mode, name, rule, drawn, begin=partial(_learner, rule, drawn, rules.epsilon))
+            yield ActingCell(mode, name, rule, drawn, begin=partial(_learner, rule, drawn, rules.epsilon))
 
 
 def changes(setting: ControlSetting, name: str, drawn: LatencyDraw) -> list[RunWarning]:

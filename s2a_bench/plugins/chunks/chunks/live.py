@@ -22,7 +22,7 @@ from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_reque
 from s2a_bench.harness.session import Session
 from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, stall_metrics, stalls_of
-from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes
+from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes
 from s2a_bench.plugins.chunks.chunks.config import PROMISING
 from s2a_bench.plugins.chunks.chunks.smooth import MOST_TICKS, smoothness
 from s2a_bench.plugins.chunks.control import ENDLESS, Acted, ControlLoop, RobotTicks, Send
@@ -61,7 +61,7 @@ class ActingPlan:
 class LiveResult:
     """The actions of a mode over a pipeline; ``triggers`` are those that its rule chose."""
 
-    cell: ChunkCell
+    cell: ActingCell
     setting: ControlSetting
     acted: Acted
     requester: ChunkRequester
@@ -152,7 +152,7 @@ def run_live(config: ChunksLive, output: Path, progress: Progress) -> Path:
 
 def _drive(plan: ActingPlan, launch: RunningLaunch) -> None:
     blocks, control = count(), plan.control
-    tried: list[tuple[ChunkCell, list[Session], int]] = []
+    tried: list[tuple[ActingCell, list[Session], int]] = []
     launch.progress.stage("warming up")
     for name, of_cell in groupby(launch.sessions, lambda session: session.cell.name):
         sessions = list(of_cell)

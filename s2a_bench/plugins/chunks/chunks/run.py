@@ -11,7 +11,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, mean_rows, trigger_rows
-from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes, draw
+from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes, draw
 from s2a_bench.plugins.chunks.chunks.config import PROMISING, RulesPlan
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
 from s2a_bench.plugins.chunks.chunks.smooth import TrackingPlant, follower
@@ -38,7 +38,7 @@ class VirtualPlan:
     rules: RulesPlan
     drawn: Sequence[LatencyDraw]
     """Of each source."""
-    cells: Sequence[ChunkCell]
+    cells: Sequence[ActingCell]
     follows: TrackingPlant | None
     """The robot and its target; None without a robot, or with actions slowed down."""
     shown_ticks: int
@@ -110,7 +110,7 @@ def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path
         return writer.path
 
 
-def _acted(cell: ChunkCell, setting: ControlSetting, follows: TrackingPlant | None) -> ActedCell:
+def _acted(cell: ActingCell, setting: ControlSetting, follows: TrackingPlant | None) -> ActedCell:
     mode, latency_ns = cell.acting, cell.drawn.judged
     cycles, ticks = mode.cycles(latency_ns, setting), mode.ticks(latency_ns, setting)
     smooth = follows.measure(cell.mode, cycles, ticks) if follows and cell.slower == 1 else {}

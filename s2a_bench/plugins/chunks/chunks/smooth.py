@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import nan
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from s2a_bench.plugins.chunks.modes.metrics import mean
+from s2a_bench.plugins.chunks.modes.metrics import mean, p99
 from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
@@ -121,7 +120,7 @@ def smoothness(motion: Motion, actions: Floats, chunk: Ints, reference: Floats |
     found = {
         "jerk_rms": _rms(motion.jerk),
         "boundary_jump_mean": mean(jump),
-        "boundary_jump_p99": float(np.quantile(jump, 0.99)) if jump.size else nan,
+        "boundary_jump_p99": p99(jump),
         "action_step_mean": mean(step[~other]),
     }
     return found if reference is None else {"tracking_rms": _rms(motion.position[:, 0] - reference), **found}

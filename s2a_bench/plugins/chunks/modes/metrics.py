@@ -57,11 +57,11 @@ def measure(mode: Mode, cycles: Cycles, ticks: Ticks) -> ChunkMetrics:
         longest_stall_ticks=int((np.flatnonzero(edges < 0) - np.flatnonzero(edges > 0)).max(initial=0)),
         p_stall_cycle=mean(cycles.stall_ticks[settled] > 0),
         age_ticks_mean=mean(age),
-        age_ticks_p99=float(np.quantile(age, 0.99)) if age.size else np.nan,
-        age_ticks_max=float(age.max()) if age.size else np.nan,
+        age_ticks_p99=p99(age),
+        age_ticks_max=greatest(age),
         thrown_away_share=mean(cycles.thrown_away[:last]) / cycles.horizon,
         jump_mean=mean(jump),
-        jump_max=float(jump.max()) if jump.size else np.nan,
+        jump_max=greatest(jump),
         blocked_ticks=(stall_ticks + first) if mode.blocks else 0,
     )
 
@@ -90,4 +90,12 @@ def margin_ticks(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> int:
 
 
 def mean(values: NDArray[Any]) -> float:
-    return float(values.mean()) if values.size else float("nan")
+    return float(values.mean()) if values.size else np.nan
+
+
+def p99(values: NDArray[Any]) -> float:
+    return float(np.quantile(values, 0.99)) if values.size else np.nan
+
+
+def greatest(values: NDArray[Any]) -> float:
+    return float(values.max()) if values.size else np.nan
