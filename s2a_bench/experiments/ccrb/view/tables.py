@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.experiments import TIME, Metric, Shown, requests
@@ -121,14 +120,17 @@ def _outcome_table(run: StoredRun) -> TextTable:
 
 
 def _stage_table(run: StoredRun) -> TextTable:
-    (cell,) = requests.cells_of(run)
-    groups, whole = requests.groups_present([cell]), ("residual", "ttft", "e2e")
+    cells = requests.cells_of(run)
+    (cell,) = cells
+    metrics = (*(f"{requests.GROUP}{group}" for group in cells.groups), "residual", "ttft", "e2e")
     rows = []
     for policy in cells_of(run):
-        mine = replace(cell, good=cell.good[cell.good["request_id"] == request_of(run, policy["cell"])])
-        values = (*map(mine.group_ms, groups), *map(mine.values_ms, whole))
-        rows.append((policy["policy"], *(entries(each, "median")[0] for each in values)))
-    title, header = "Each policy's request in ms, to its first token", ("policy", *groups, "residual", "TTFT", "e2e")
+        mine = cell.of_requests(cell.counted[cell.ids == request_of(run, policy["cell"])])
+        rows.append((policy["policy"], *(entries(mine.values(metric), "median")[0] for metric in metrics)))
+    title, header = (
+        "Each policy's request in ms, to its first token",
+        ("policy", *cells.groups, "residual", "TTFT", "e2e"),
+    )
     return TextTable(title, header, rows, 1, notes=(tokens_line(run), "TTFT: from the prompt; e2e: with the capture."))
 
 

@@ -17,7 +17,8 @@ from s2a_bench.plugins.paper.claims import Need, RunPart
 from s2a_bench.policy import Floats
 from s2a_bench.provenance import NONE, UNKNOWN, Provenance
 from s2a_bench.stats import Ratio, summarise, summary_of
-from s2a_bench.stats.change import FEWEST_LAUNCHES, Blocks, Change, change_between, ratio_of_launches
+from s2a_bench.stats.batches import Blocks, Rows
+from s2a_bench.stats.change import FEWEST_LAUNCHES, Change, change_between, ratio_of_launches
 from s2a_bench.store.run import StoredRun
 from s2a_bench.transport import EXTERNAL, PROGRAM, declared_transport
 from s2a_bench.writers.tables import interval, mean_sd
@@ -107,7 +108,7 @@ def exact(value: float) -> Ratio:
 
 def change(over: Floats, base: Floats, seed: int, *, paired: bool = False, exact: bool = False) -> Change:
     """Compare the means of two sides in order of time; ``paired`` if rows i of both belong together."""
-    return change_between([[*base[:, None]]], [[*over[:, None]]], "mean", seed=seed, paired=paired, exact=exact)
+    return change_between([Rows(base)], [Rows(over)], "mean", seed=seed, paired=paired, exact=exact)
 
 
 def pairs(run: StoredRun) -> Iterator[RunPart]:
@@ -121,14 +122,14 @@ def pairs(run: StoredRun) -> Iterator[RunPart]:
             "launches": sum(map(bool, _blocks(pair)[0].values())),
             "stages": "".join(f"hidden by {cell.name}" for cell in pair if cell.has_ingest) or "seen",
         }
-        found = [(cell.name, summary_of(cell.values_ms(_metric(pair)))) for cell in pair]
+        found = [(cell.name, summary_of(cell.values(_metric(pair)))) for cell in pair]
         times = ", ".join(f"{name} {mean_sd(each)} ms" for name, each in found if each)
         yield _pair(run, pair, facts, f"{times} (mean ± sd, n = {pair[0].n}).")
 
 
 def bodies(run: StoredRun) -> Iterator[RunPart]:
     """Yield pairs of HTTP with Base64 and without, of the same payload and size."""
-    cells = [cell for cell in cells_of(run) if cell.good["payload_bytes"].notna().any()]
+    cells = [cell for cell in cells_of(run) if cell.values("payload_bytes").size]
     coded, plain = ([cell for cell in cells if "/".join(cell.path) == path] for path in (_HTTP, _BINARY))
     for pair in product(coded, plain):
         if all(pair[0].about[name] == pair[1].about[name] for name in ("payload", "size")):
@@ -143,7 +144,7 @@ def _pair(run: StoredRun, pair: tuple[RequestCell, RequestCell], facts: dict[str
 
 
 def _launches(*cells: RequestCell) -> int:
-    return min(int(cell.good["launch"].nunique()) for cell in cells)
+    return min(len(np.unique(cell.column("launch"))) for cell in cells)
 
 
 def _unlike(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> list[str]:
@@ -220,7 +221,7 @@ def shares(
     Without groups the whole is the time without inference.
     """
     cell: RequestCell = part.cells[side]
-    whole, seed = cell.values_ms(_METRIC), part.run.bootstrap_seed
+    whole, seed = cell.values(_METRIC), part.run.bootstrap_seed
     spent = {stage: _spent(cell, [stage]).sum() for stage, of in cell.stages.items() if of != "inference"}
     found = []
     for stages, within in groups.values():
@@ -233,14 +234,15 @@ def shares(
 
 def _spent(cell: RequestCell, stages: Sequence[str]) -> Floats:
     """Return the sum of stages in ms, for each sample that has the metric."""
-    good = cell.good[cell.good[f"{_METRIC}_ns"].notna()]
-    names = [f"{stage}_ns" for stage in stages if f"{stage}_ns" in good]
-    spent: Floats = good[names].fillna(0).sum(axis=1).to_numpy(dtype="float64") / 1e6
-    return spent
+    there = ~np.isnan(cell.column(_METRIC))
+    return (
+        np.sum([np.zeros(cell.n), *(np.nan_to_num(cell.column(f"{stage}_ns")) for stage in stages)], axis=0)[there]
+        / 1e6
+    )
 
 
 def _bytes(cell: RequestCell) -> float:
-    return float(cell.good["payload_bytes"].dropna().mean())
+    return float(cell.values("payload_bytes").mean())
 
 
 def _metric(pair: Sequence[RequestCell]) -> str:
@@ -249,10 +251,18 @@ def _metric(pair: Sequence[RequestCell]) -> str:
 
 
 def _blocks(pair: Sequence[RequestCell]) -> tuple[Mapping[int, Blocks], Mapping[int, Blocks]]:
-    sides = [cell.by_launch(_metric(pair)) for cell in pair]
-    both = {launch: sides[0][launch].keys() & sides[1][launch].keys() for launch in sides[0].keys() & sides[1].keys()}
-    http, ros = ({launch: {block: side[launch][block] for block in both[launch]} for launch in both} for side in sides)
-    return http, ros
+    """Return the values of both sides by launch, of the blocks that both have."""
+    http, ros = (cell.by_launch(_metric(pair)) for cell in pair)
+    both = http.keys() & ros.keys()
+    return (
+        {launch: _within(http[launch], ros[launch]) for launch in both},
+        {launch: _within(ros[launch], http[launch]) for launch in both},
+    )
+
+
+def _within(side: Blocks, other: Blocks) -> Blocks:
+    common = np.isin(side.block, other.block)
+    return Blocks(side.values[common], side.block[common])
 
 
 def speeds(run: StoredRun) -> Iterator[RunPart]:
