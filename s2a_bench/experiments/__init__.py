@@ -17,110 +17,30 @@ packages offer experiments as entry points of the group ``s2a_bench.experiments`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.registry import Registry
-from s2a_bench.store.schema import PROVENANCE, Facts
 
 if TYPE_CHECKING:
-    import numpy as np
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
+    from s2a_bench.experiments.cells import Comparable
     from s2a_bench.options import Options
     from s2a_bench.progress import Progress
     from s2a_bench.store.run import StoredRun
-    from s2a_bench.store.schema import Table
     from s2a_bench.writers.csv_text import CsvTable
     from s2a_bench.writers.lanes import Lanes
     from s2a_bench.writers.tables import TextTable
 
-TIME, COUNT, FLAG, SHARE, NUMBER = "time", "count", "flag", "share", "number"
-Better: TypeAlias = Literal["lower", "higher", "neither"]
-Rows: TypeAlias = "list[NDArray[np.float64]]"
-"""The values of a metric: one array a request or plan, in the order in which they were made."""
 Tables: TypeAlias = "dict[str, Callable[[], TextTable | None]]"
 """What builds the tables of a run, by their names; None is no table."""
-
-
-@dataclass(frozen=True, slots=True)
-class Metric:
-    """A number that cells of runs have; rows, JSON, CSV, tables and comparison follow from it.
-
-    ``title`` is the heading of its columns, ``statistic`` median or mean, ``about`` its description in the schema,
-    ``bounds`` its least and greatest value. ``kind`` is `TIME` (in s, stored in whole nanoseconds), `COUNT`, `FLAG`
-    (its mean is the share of the plans), `SHARE` (shown in percent) or `NUMBER`; rows may lack an ``optional`` metric.
-    """
-
-    name: str
-    unit: str = ""
-    better: Better = "lower"
-    title: str = ""
-    statistic: str = "median"
-    about: str = ""
-    bounds: tuple[float | None, float | None] = (None, None)
-    kind: str = NUMBER
-    optional: bool = False
-
-    @property
-    def column(self) -> str:
-        """Name of its column in the rows of a run folder."""
-        if self.kind == TIME:
-            return f"{self.name.removesuffix('_s')}_ns"
-        return self.name.removeprefix("p_") if self.kind == FLAG else self.name
-
-    @property
-    def column_type(self) -> Any:
-        types: dict[str, Any] = {TIME: int, COUNT: int, FLAG: bool}
-        return types.get(self.kind, float)
-
-    @property
-    def schema(self) -> dict[str, Any]:
-        facts = {"description": self.about or None, "minimum": self.bounds[0], "maximum": self.bounds[1]}
-        return {key: value for key, value in facts.items() if value is not None}
-
-
-AnyMetric = TypeVar("AnyMetric", bound=Metric)
-
-
-def number(name: str, unit: str, title: str, about: str, better: Better = "lower", **more: Any) -> Metric:
-    """Return a metric of means, of 0 or more unless ``more`` says otherwise; rows may lack it."""
-    return Metric(name, unit, better, title, "mean", about, **{"bounds": (0, None), "optional": True, **more})
-
-
-def share(name: str, title: str, about: str, better: Better = "lower") -> Metric:
-    return number(name, "", title, about, better, bounds=(0, 1), kind=SHARE)
-
-
-def columns(metrics: Iterable[Metric]) -> dict[str, Any]:
-    """Return column -> annotated type, for the dataclass of a row."""
-    kinds = {metric: metric.column_type | None if metric.optional else metric.column_type for metric in metrics}
-    return {metric.column: Annotated[kind, Facts(metric.schema)] for metric, kind in kinds.items()}
-
-
-@dataclass(frozen=True, slots=True)
-class Subject:
-    """One cell of one run as it is compared.
-
-    Besides the name, ``setting`` must be equal on both sides. ``rows`` returns a metric's values, one row a request or
-    plan in time order, none for a missing metric. ``exact`` values are computed without chance. ``launch`` counts the
-    launches of a run; each of them has every cell.
-    """
-
-    name: str
-    setting: Mapping[str, str]
-    n: int
-    errors: int
-    rows: Callable[[str], Rows]
-    exact: bool = False
-    launch: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,32 +82,6 @@ class Shown:
                 found[name] = build()
         texts = {name: table for name in tables if (table := found.pop(f"table {name}", None))}
         return replace(shown, tables=texts, main=[name for name in main if name in texts], **found)
-
-
-@dataclass(frozen=True, slots=True)
-class Comparable:
-    """The metrics and cells that runs of an experiment are compared by.
-
-    ``origin`` names what stood in for a model; ``shown`` are the metrics that are compared by default.
-    ``run_metrics`` returns the metrics of one run alone, such as the stages of a plug-in's transport.
-    """
-
-    metrics: Mapping[str, Metric]
-    subjects: Callable[[StoredRun], list[Subject]]
-    origin: Callable[[StoredRun], Sequence[str]]
-    shown: tuple[str, ...]
-    run_metrics: Callable[[StoredRun], Iterable[Metric]] = lambda _: ()
-
-
-def plain_rows(run: StoredRun, table: Table[Any]) -> list[dict[str, Any]]:
-    """Return the rows of a table without their provenance, None for a missing value."""
-    found = run.table(table).drop(columns=PROVENANCE)
-    rows = found.astype(object).where(found.notna(), None).to_dict("records")
-    return [{str(name): value for name, value in row.items()} for row in rows]
-
-
-def by_name(metrics: Iterable[AnyMetric]) -> dict[str, AnyMetric]:
-    return {metric.name: metric for metric in metrics}
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, Ty
 import numpy as np
 from numpy.typing import NDArray
 
-from s2a_bench.experiments import Comparable, Metric, Subject, by_name
+from s2a_bench.experiments.cells import Comparable, Metric, Subject, by_name
 from s2a_bench.experiments.columns import NS_PER_MS, Places, RequestColumns, known
 from s2a_bench.facts import (
     END_N,
@@ -39,7 +39,7 @@ from s2a_bench.stats import Floats, Ratio, Summary, SummaryEnds, summary_of
 from s2a_bench.stats.batches import Blocks, Rows
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import ONE_WAY
-from s2a_bench.store.schema import Count, about, with_fields
+from s2a_bench.store.schema import Count, Facts, about, with_fields
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport, payload_order
 from s2a_bench.transport.pipeline import without
@@ -291,7 +291,7 @@ def _engine_rate(cell: RequestCell) -> Floats:
 
 
 def in_ms(name: str, title: str = "", about: str = "", of: Of | None = None, **more: Any) -> RequestMetric:
-    return RequestMetric(name, "ms", title=title, about=about, of=of, **more)
+    return RequestMetric(title, about, "ms", name=name, of=of, **more)
 
 
 def _of_fact(fact: Fact, title: str, about: str) -> RequestMetric:
@@ -299,7 +299,7 @@ def _of_fact(fact: Fact, title: str, about: str) -> RequestMetric:
 
 
 def _rate(name: str, unit: str, title: str, about: str, of: Of) -> RequestMetric:
-    return RequestMetric(name, unit, "higher", title, about=about, of=of)
+    return RequestMetric(title, about, unit, "higher", name=name, of=of)
 
 
 ANSWER_METRICS: Final = (
@@ -329,8 +329,8 @@ ANSWER_METRICS: Final = (
         FIRST_DECODE_MS, "1st decode", "The first token to the second in the engine: the first step after the prompt."
     ),
     RequestMetric(
-        *("prompt_tokens", "tokens", "neither", "tokens"),
-        about="Prompt tokens evaluated, pictures included.",
+        *("tokens", "Prompt tokens evaluated, pictures included.", "tokens", "neither"),
+        name="prompt_tokens",
         of=lambda cell: _some(cell.fact(PROMPT_N)),
     ),
     _rate(
@@ -551,7 +551,7 @@ class RequestsCell:
     connection: str
     engine: str
     mode: Literal["request", "stream"]
-    size: Annotated[str, {"pattern": "^[0-9]+x[0-9]+$"}]
+    size: Annotated[str, Facts(pattern="^[0-9]+x[0-9]+$")]
     observation: Annotated[
         str, about("What each request brings: sizes, number of pictures, scaling, numbers of the robot's state.")
     ]
@@ -636,7 +636,7 @@ def compared_by(metrics: Iterable[RequestMetric], shown: tuple[str, ...], **more
     def subjects(run: StoredRun) -> list[Subject]:
         return [subject(cell, launch) for launch, cells in cells_of(run).launches().items() for cell in cells]
 
-    return Comparable(named, subjects, lambda run: stand_ins([cells_of(run)]), shown, **more)
+    return Comparable(named, subjects, shown, lambda run: stand_ins([cells_of(run)]), **more)
 
 
 def launches_note(ratios: Iterable[Ratio]) -> tuple[str, ...]:

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
+from annotated_types import Ge  # comes with pydantic
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -17,10 +19,10 @@ Floats: TypeAlias = "NDArray[np.float64]"
 class Summary:
     """Summary of n values; ``sd`` is the sample standard deviation (n - 1), None for a single value."""
 
-    n: Annotated[int, {"minimum": 1}]
+    n: Annotated[int, Ge(1)]
     median: float
     mean: float
-    sd: Annotated[float | None, {"minimum": 0}]
+    sd: Annotated[float, Ge(0)] | None
     p90: float
     p99: float
 

@@ -83,9 +83,9 @@ class _SweepManifest(_Manifest):
 class RunWarning:
     """One warning, with advice."""
 
-    code: Annotated[str, {"pattern": "^[a-z0-9-]+$"}]
-    message: Annotated[str, {"minLength": 1}]
-    advice: Annotated[str, {"minLength": 1}]
+    code: Annotated[str, Field(pattern="^[a-z0-9-]+$")]
+    message: Annotated[str, Field(min_length=1)]
+    advice: Annotated[str, Field(min_length=1)]
 
     def to_manifest(self) -> dict[str, str]:
         return {"code": self.code, "message": self.message, "advice": self.advice}

@@ -93,6 +93,9 @@ class Facts(dict[str, Any]):
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(tuple(self))
 
+    def __get_pydantic_json_schema__(self, core: Any, schema_of: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
+        return schema_of(core) | self
+
 
 Count = Annotated[int, Facts(minimum=0)]
 Many = Annotated[int, Facts(minimum=1)]

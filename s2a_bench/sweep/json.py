@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 from s2a_bench.store.manifest import plain
-from s2a_bench.store.schema import SCHEMA
+from s2a_bench.store.schema import SCHEMA, Facts, Many, NonNegative, about
 from s2a_bench.store.sweep import Sweep
 from s2a_bench.sweep import SweepCell
 from s2a_bench.writers.json import frame
@@ -16,13 +16,13 @@ from s2a_bench.writers.json import frame
 
 @dataclass(frozen=True, kw_only=True)
 class _Setting:
-    cell: Annotated[str, {"pattern": "^[0-9]{4,}$"}]
-    repeat: Annotated[int, {"minimum": 1}]
-    virtual: Annotated[bool, {"description": "True where it is computed, not measured."}]
-    board: Annotated[str | None, {"description": "The machine that the cell needs.", "minLength": 1}]
-    settings: Annotated[dict[str, Any], {"description": "By flag, without the dashes."}]
-    argv: Annotated[list[str], {"minItems": 1}]
-    config_hash: Annotated[str, {"pattern": "^[0-9a-f]{16}$"}]
+    cell: Annotated[str, Facts(pattern="^[0-9]{4,}$")]
+    repeat: Many
+    virtual: Annotated[bool, about("True where it is computed, not measured.")]
+    board: Annotated[str | None, Facts(description="The machine that the cell needs.", minLength=1)]
+    settings: Annotated[dict[str, Any], about("By flag, without the dashes.")]
+    argv: Annotated[list[str], Facts(minItems=1)]
+    config_hash: Annotated[str, Facts(pattern="^[0-9a-f]{16}$")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,13 +36,13 @@ class PlannedCell(_Setting):
 class SweptCell(_Setting):
     """The latest attempt at one repeat of one setting."""
 
-    attempt: Annotated[int, {"minimum": 1}]
+    attempt: Many
     state: Literal["finished", "failed"]
-    error: Annotated[str | None, {"minLength": 1}]
+    error: Annotated[str | None, Facts(minLength=1)]
     host: str
-    run: Annotated[str | None, {"description": "The cell's run folder; null if it has none.", "minLength": 1}]
+    run: Annotated[str | None, Facts(description="The cell's run folder; null if it has none.", minLength=1)]
     started: str
-    wall_s: Annotated[float, {"minimum": 0}]
+    wall_s: NonNegative
 
 
 def plan_json(cells: Sequence[SweepCell], environment: dict[str, Any]) -> dict[str, Any]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 from s2a_bench.stats import Floats, Ratio, SummaryEnds, summarise, summary_of
 from s2a_bench.store.manifest import present
-from s2a_bench.store.schema import SCHEMA, with_fields
+from s2a_bench.store.schema import SCHEMA, Many, NonNegative, with_fields
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
@@ -28,8 +28,8 @@ class RatioJson:
     to: str
     value: float | None
     ci95: tuple[float, float] | None
-    launches: Annotated[int, {"minimum": 1}] = 1
-    launch_sd: Annotated[float | None, {"minimum": 0}] = None
+    launches: Many = 1
+    launch_sd: NonNegative | None = None
 
 
 def frame(

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import UnlikeRuns, UsageError
-from s2a_bench.experiments import Metric
+from s2a_bench.experiments.cells import Metric
 from s2a_bench.experiments.latency import metrics as latency
 from s2a_bench.experiments.throughput import metrics as throughput
 from s2a_bench.experiments.timeline.view import cells as timeline
@@ -129,7 +129,7 @@ def test_what_is_better_depends_on_the_metric() -> None:
 
 
 def test_metrics_that_only_one_run_has_can_be_named(launch: Launch, monkeypatch: pytest.MonkeyPatch) -> None:
-    own = replace(latency.COMPARED, run_metrics=lambda run: [Metric(f"squash{run.manifest['more']}", "ms")])
+    own = replace(latency.COMPARED, run_metrics=lambda run: [Metric(unit="ms", name=f"squash{run.manifest['more']}")])
     monkeypatch.setattr(latency, "COMPARED", own)
     both = opened(*(launch(seed, n=6, manifest={**MANIFEST, "more": seed}) for seed in (1, 2)))
     assert list(both.metrics)[-2:] == ["squash1", "squash2"]

@@ -8,6 +8,6 @@ EXPERIMENT = Experiment(
     config="s2a_bench.experiments.boundary.config:BoundaryConfig",
     run="s2a_bench.experiments.boundary.run:run_boundary",
     view="s2a_bench.experiments.boundary.view:show",
-    cell="s2a_bench.experiments.boundary.view:BoundaryCell",
+    cell="s2a_bench.experiments.boundary.rows:BoundaryCell",
     unit="points",
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ import numpy as np
 from s2a_bench.boards.profile import load_profile
 from s2a_bench.boards.tokens import gaps_of
 from s2a_bench.experiments.boundary.config import BoundaryConfig
-from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
+from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow, Duration
 from s2a_bench.machine import environment
 from s2a_bench.policy import Schedule
 from s2a_bench.policy.arrivals import fragments, tokens
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 class NaiveTrial:
     """The plans that naive execution runs at every point: how long and how many their skills are, how tokens come."""
 
-    duration: str
+    duration: Duration
     duration_s: float
     n_skills: int
     jitter: str
@@ -58,7 +58,8 @@ def run_boundary(config: BoundaryConfig, output: Path, progress: Progress) -> Pa
     with RunWriter.create(output, "boundary", manifest, (BOUNDARY,)) as writer:
         progress.opened(writer.path)
         progress.stage("trying every point")
-        for name, duration_s in (("t_nom", config.t_nom_s), ("t_min", config.t_min * config.t_nom_s)):
+        durations_s: Mapping[Duration, float] = {"t_nom": config.t_nom_s, "t_min": config.t_min * config.t_nom_s}
+        for name, duration_s in durations_s.items():
             trial = NaiveTrial(name, duration_s, config.n_skills, config.jitter, config.plans_a_point, config.seed)
             writer.append(BOUNDARY, rows(trial, lengths, rates))
             for board in boards:

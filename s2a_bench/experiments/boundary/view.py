@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict
 from functools import partial
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments import Shown, plain_rows
+from s2a_bench.experiments import Shown
 from s2a_bench.experiments.boundary.rows import BOUNDARY, BoundaryRow
-from s2a_bench.store.schema import PROVENANCE, Positive, about
+from s2a_bench.experiments.cells import Cells, json_of
+from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import new_figure, shade_plane, write_beside
-from s2a_bench.writers.json import cell_of_row, frame
+from s2a_bench.writers.json import frame
 from s2a_bench.writers.tables import ABSENT, EMULATED, PAPERS, Note, TextTable, number
 
 if TYPE_CHECKING:
@@ -42,23 +41,8 @@ def show(run: StoredRun, **_: Any) -> Shown:
         main=["boards"],
         csvs=lambda: {"boundary.csv": CsvTable.of_frame(run.table(BOUNDARY)[[*_CSV, PROVENANCE]])},
         figures=lambda: {"boundary": partial(build_boundary, run)},
-        json=lambda: frame(run, list(_cells(run)), []),
+        json=lambda: frame(run, [_json(row) for row in Cells.of(run, BOUNDARY).rows], []),
     )
-
-
-BoundaryCell = cell_of_row(
-    "BoundaryCell",
-    "A point of the grid, or a board on it.",
-    BoundaryRow,
-    without=("duration", "tokens_per_s", "board"),
-    own={
-        "duration": Literal["t_nom", "t_min"],
-        "rate_tokens_per_s": Positive,
-        "profile": Annotated[str | None, about("The board that has this rate; null for a point of the grid.")],
-        "emulated": Literal[True],
-        "rho": Annotated[Positive, about("L / R over the duration: stall-free up to 1.")],
-    },
-)
 
 
 def grid_of(run: StoredRun, duration: str) -> pd.DataFrame:
@@ -130,11 +114,9 @@ def disagreements(run: StoredRun) -> int:
     return int(((rows["p_stall"] == 0) != rows["stall_free"]).sum())
 
 
-def _cells(run: StoredRun) -> Iterator[dict[str, Any]]:
-    for row in plain_rows(run, BOUNDARY):
-        rate, board = row.pop("tokens_per_s"), row.pop("board")
-        rho = row["tokens_per_skill"] / rate / row["duration_s"]
-        yield asdict(BoundaryCell(**row, rate_tokens_per_s=rate, profile=board or None, rho=rho, emulated=True))
+def _json(row: BoundaryRow) -> dict[str, Any]:
+    rho = row.tokens_per_skill / row.tokens_per_s / row.duration_s
+    return {**json_of(row), "rho": rho, "emulated": True}
 
 
 def _verdict(point: dict[Any, Any], *, random: bool) -> str:

@@ -6,21 +6,13 @@ import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 
 from s2a_bench.act.record import executed
 from s2a_bench.experiments.ccrb.loop import Looped
-from s2a_bench.experiments.ccrb.rows import (
-    IMPACTS,
-    MARGINS,
-    ROLLOUTS,
-    TRAJECTORIES,
-    AboutRollout,
-    RolloutRow,
-    TrajectoryRow,
-)
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES, RolloutRow, TrajectoryRow
 from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import skill_rows, to_ns
 from s2a_bench.policy import TOLERANCE_S, Plans, Policy, Schedule
@@ -34,6 +26,11 @@ from s2a_bench.scenario.ccrb.outcome import Outcomes
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.schema import Table
 
+OF_CARS: Final = (
+    *("impact_speed_mps", "front_impact_mps", "rear_impact_mps", "min_front_gap_m", "min_rear_gap_m"),
+    *("min_front_ttc_s", "min_rear_ttc_s", "required_decel_mps2"),
+)
+"""The metrics that `Outcomes` have."""
 TableRows: TypeAlias = tuple[Table[Any], Iterable[Any]]
 """A table and rows for it."""
 
@@ -121,13 +118,13 @@ def _about(ready: Prepared, simulator: str, name: str) -> dict[str, Any]:
 
 def rollout_rows(
     about: Mapping[str, Any], schedule: Schedule, outcomes: Outcomes, *, motion: Mapping[str, Any] | None = None
-) -> Iterator[AboutRollout]:
+) -> Iterator[RolloutRow]:
     """Yield the rows of M roll-outs; a value of ``about`` is common to all, or an array of M."""
     stall_s = stalls(schedule)
     end_s = schedule.start_s[-1] + schedule.duration_s[-1]
     shared = {name: value for name, value in about.items() if not isinstance(value, np.ndarray)}
     each = {name: value for name, value in about.items() if isinstance(value, np.ndarray)}
-    found = {metric.name: getattr(outcomes, metric.name) for metric in (*IMPACTS, *MARGINS)}
+    found = {name: getattr(outcomes, name) for name in OF_CARS}
     for place in range(len(outcomes.code)):
         metrics: dict[str, Any] = {name: float(values[place]) for name, values in found.items()}
         yield RolloutRow(

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Final, Literal
 
-from s2a_bench.experiments import COUNT, TIME, Better, Metric, columns
+from s2a_bench.experiments.cells import ANY, HIDDEN, JsonKey, Metric, metrics_of
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
-from s2a_bench.store.schema import Many, NonNegative, Positive, Table, about, with_fields
+from s2a_bench.store.schema import Facts, Many, NonNegative, Positive, Table, about
 
 _DEADLINE: Final = (
     "S_front: the latest start of the planned braking that keeps 2 m to the lead; negative: too late at the request."
@@ -18,49 +18,9 @@ _IMPACT: Final = (LEAST_IMPACT_MPS, None)
 MPS2, MPS3 = "m/s\N{SUPERSCRIPT TWO}", "m/s\N{SUPERSCRIPT THREE}"
 
 
-def _metric(name: str, unit: str, title: str = "", better: Better = "lower", **more: Any) -> Metric:
-    """Return a metric of 0 or more; only times and counts (with a ``kind``) are never absent."""
-    return Metric(name, unit, better, title, **{"bounds": (0, None), "optional": "kind" not in more, **more})
-
-
-TIMES: Final = (
-    _metric("start_s", "s", "start", kind=TIME),
-    _metric("end_s", "s", kind=TIME),
-    _metric("stalls", "", "stalls", kind=COUNT),
-    _metric("stall_s", "s", "stalled", kind=TIME),
-    _metric("deadline_s", "s", kind=TIME, bounds=(None, None), about=_DEADLINE),
-)
-IMPACTS: Final = (
-    _metric("impact_speed_mps", "m/s", "impact", bounds=_IMPACT, about="Of the harder impact; absent without one."),
-    _metric("front_impact_mps", "m/s", bounds=_IMPACT),
-    _metric("rear_impact_mps", "m/s", bounds=_IMPACT),
-    _metric("min_front_gap_m", "m", "front gap", "higher", optional=False),
-    _metric("min_rear_gap_m", "m", "rear gap", "higher"),
-)
-MARGINS: Final = (
-    _metric("min_front_ttc_s", "s", "TTC front", "higher", about="Absent where the cars never closed in."),
-    _metric("min_rear_ttc_s", "s", "TTC rear", "higher"),
-    _metric(
-        *("required_decel_mps2", MPS2, "DRAC"),
-        about="Greatest closing speed^2 / (2 gap) towards the lead; absent with a front impact.",
-    ),
-)
-MOTION: Final = (
-    _metric("rms_jerk", MPS3, "RMS jerk"),
-    _metric("peak_jerk", MPS3, "peak jerk"),
-    _metric("sparc", "", "SPARC", "higher", bounds=(None, 0)),
-)
-LOOP: Final = (
-    _metric("real_time_factor", "", "real-time factor", "higher", about="Simulated over elapsed time: 1 is in time."),
-    _metric("tracking_rms_mps", "m/s", "tracking", about="RMS of set-point minus speed in skills, if one ran."),
-)
-"""Metrics of closed loops alone."""
-METRICS: Final = (*TIMES, *IMPACTS, *MARGINS, *MOTION, *LOOP)
-
-
-@dataclass(frozen=True, slots=True)
-class AboutRollout:
-    """The columns of a row of `ROLLOUTS` besides the metrics: what was tried. SI units.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RolloutRow:
+    """One roll-out of the driving scenario: what was tried, and what became of the cars. SI units.
 
     ``study`` is point, rollout (beside a closed loop, on the arrivals of its plan), phase or random; ``draw`` counts
     its scenarios. ``title`` names the board. ``late``: s2a-ttc could not keep the deadline ``deadline_ns`` (S_front)
@@ -70,19 +30,19 @@ class AboutRollout:
     of a live model.
     """
 
-    cell: Annotated[str, {"minLength": 1}]
+    cell: Annotated[str, Facts(minLength=1)]
     study: str
-    draw: int
-    policy: Annotated[str, {"minLength": 1}]
-    board: str
-    title: str
+    draw: Annotated[int, HIDDEN]
+    policy: Annotated[str, Facts(minLength=1)]
+    board: Annotated[str, JsonKey("profile")]
+    title: Annotated[str, HIDDEN]
     emulated: Annotated[bool, about("True where no model answered.")]
-    simulator: Annotated[str, {"minLength": 1}]
-    follower: Annotated[str, {"enum": list(FOLLOWERS)}]
-    gap_behaviour: Annotated[str, {"enum": list(GAPS)}]
+    simulator: Annotated[str, Facts(minLength=1)]
+    follower: Annotated[str, Facts(enum=list(FOLLOWERS))]
+    gap_behaviour: Annotated[str, Facts(enum=list(GAPS))]
     reflex: bool
     lane_change: bool
-    tokens_per_s: float
+    tokens_per_s: Annotated[Positive, JsonKey("rate_tokens_per_s")]
     prompt_s: Annotated[NonNegative | None, about("c; absent with --live.")]
     tokens_per_skill: Many
     n_skills: Annotated[Many, about("A lane change included.")]
@@ -97,19 +57,40 @@ class AboutRollout:
         bool | None,
         about("Whether the car behind avoids an ego with immediate tokens; if not, a rear impact proves nothing."),
     ]
+    start_ns: Annotated[int, Metric("start")]
+    end_ns: Annotated[int, Metric()]
+    stalls: Annotated[int, Metric("stalls")]
+    stall_ns: Annotated[int, Metric("stalled")]
+    deadline_ns: Annotated[int, Metric(about=_DEADLINE, bounds=ANY)]
+    late: Annotated[bool | None, about("s2a-ttc only: no stall-free start keeps the deadline.")] = None
+    outcome: Literal["none", "front", "rear", "both"]
+    impact_speed_mps: Annotated[
+        float | None, Metric("impact", "Of the harder impact; absent without one.", unit="m/s", bounds=_IMPACT)
+    ] = None
+    front_impact_mps: Annotated[float | None, Metric(unit="m/s", bounds=_IMPACT)] = None
+    rear_impact_mps: Annotated[float | None, Metric(unit="m/s", bounds=_IMPACT)] = None
+    min_front_gap_m: Annotated[float, Metric("front gap", unit="m", better="higher")]
+    min_rear_gap_m: Annotated[float | None, Metric("rear gap", unit="m", better="higher")] = None
+    min_front_ttc_s: Annotated[
+        float | None, Metric("TTC front", "Absent where the cars never closed in.", unit="s", better="higher")
+    ] = None
+    min_rear_ttc_s: Annotated[float | None, Metric("TTC rear", unit="s", better="higher")] = None
+    required_decel_mps2: Annotated[
+        float | None,
+        Metric("DRAC", "Greatest closing speed^2 / (2 gap) towards the lead; absent with a front impact.", unit=MPS2),
+    ] = None
+    rms_jerk: Annotated[float | None, Metric("RMS jerk", unit=MPS3)] = None
+    peak_jerk: Annotated[float | None, Metric("peak jerk", unit=MPS3)] = None
+    sparc: Annotated[float | None, Metric("SPARC", better="higher", bounds=(None, 0))] = None
+    real_time_factor: Annotated[
+        float | None, Metric("real-time factor", "Simulated over elapsed time: 1 is in time.", better="higher")
+    ] = None
+    tracking_rms_mps: Annotated[
+        float | None, Metric("tracking", "RMS of set-point minus speed in skills, if one ran.", unit="m/s")
+    ] = None
 
 
-RolloutRow: Final = with_fields(
-    "RolloutRow",
-    "One roll-out of the driving scenario: what was tried, and what became of the cars.",
-    AboutRollout,
-    {
-        **columns(TIMES),
-        "late": Annotated[bool | None, about("s2a-ttc only: no stall-free start keeps the deadline.")],
-        "outcome": Annotated[str, {"enum": ["none", "front", "rear", "both"]}],
-        **columns((*IMPACTS, *MARGINS, *MOTION, *LOOP)),
-    },
-)
+METRICS: Final = metrics_of(RolloutRow)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,5 +116,5 @@ class TrajectoryRow:
     rear_acceleration_mps2: float
 
 
-ROLLOUTS: Final[Table[AboutRollout]] = Table("rollouts", RolloutRow)
+ROLLOUTS: Final[Table[RolloutRow]] = Table("rollouts", RolloutRow)
 TRAJECTORIES: Final[Table[TrajectoryRow]] = Table("trajectories", TrajectoryRow)

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 
 from s2a_bench.experiments.ccrb.drives import rollout_rows
-from s2a_bench.experiments.ccrb.rows import AboutRollout
+from s2a_bench.experiments.ccrb.rows import RolloutRow
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.policy import COMPARED, Plans, Schedule, policy
 from s2a_bench.policy.arrivals import uniform
@@ -27,7 +27,7 @@ SCENES: Final = 1366
 """Scenarios of a block, driven in lock step: about 8,000 roll-outs."""
 
 
-def drive_block(scenario: CcrbOptions, study: str, scenes: Scenes) -> tuple[int, list[AboutRollout]]:
+def drive_block(scenario: CcrbOptions, study: str, scenes: Scenes) -> tuple[int, list[RolloutRow]]:
     """Drive every scenario with every gap behaviour and policy; return the number of roll-outs, and the rows.
 
     The check on the car behind is one more roll-out a scenario. A policy that never stalls is driven once, with a row

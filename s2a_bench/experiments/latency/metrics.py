@@ -20,7 +20,7 @@ from s2a_bench.experiments.requests import (
     summarised,
 )
 from s2a_bench.stats import Summary, SummaryEnds, summary_of
-from s2a_bench.store.schema import Count, about
+from s2a_bench.store.schema import Count, Facts, about
 from s2a_bench.trace import GROUPS
 from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
@@ -50,7 +50,7 @@ METRICS: Final = (
     *AROUND,
     *TOKEN_METRICS,
     in_ms("residual", "residual", "The time between the stages."),
-    RequestMetric("residual_share", about="The residual as a share of e2e without inference."),
+    RequestMetric(name="residual_share", about="The residual as a share of e2e without inference."),
 )
 
 
@@ -65,8 +65,8 @@ LatencyCell: Final = cell_class(
     "One pipeline, stage by stage; a value that no sample has is an absent key.",
     METRICS,
     residual_flagged=Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")],
-    stages_ms=Annotated[dict[str, Summary | SummaryEnds], {"propertyNames": {"pattern": "^[a-z][a-z0-9_]*$"}}],
-    groups_ms=Annotated[dict[str, Summary | SummaryEnds], {"propertyNames": {"enum": list(GROUPS)}}],
+    stages_ms=Annotated[dict[str, Summary | SummaryEnds], Facts(propertyNames={"pattern": "^[a-z][a-z0-9_]*$"})],
+    groups_ms=Annotated[dict[str, Summary | SummaryEnds], Facts(propertyNames={"enum": list(GROUPS)})],
 )
 
 

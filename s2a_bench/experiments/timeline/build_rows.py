@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.timeline.rows import METRICS, PlanRow, TimelineRow
+from s2a_bench.experiments.cells import COUNT, FLAG, TIME, Metric
+from s2a_bench.experiments.timeline.rows import METRICS, TimelineRow
 from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import KEPT_PLANS
 from s2a_bench.policy import Plans, Schedule
@@ -39,7 +40,7 @@ def timeline_rows(
     requested_ns: Sequence[int] | None = None,
     caution: float | Sequence[float | None] | None = None,
     tolerance_s: float = ANY_STALL_S,
-) -> list[PlanRow]:
+) -> list[TimelineRow]:
     """Return the rows of M timelines; gaps up to ``tolerance_s`` are no stall for ``any_stall``.
 
     ``caution`` is one lambda, or one a plan. Motion is computed for plans below `KEPT_PLANS`.
@@ -59,7 +60,7 @@ def timeline_rows(
                 request_id=request_id,
                 requested_ns=requested_ns[place] if requested_ns else 0,
                 caution=caution[place] if isinstance(caution, Sequence) else caution,
-                **{METRICS[name].column: METRICS[name].stored(values[place]) for name, values in found.items()},
+                **{METRICS[name].column: _stored(METRICS[name], values[place]) for name, values in found.items()},
                 **motion,
             )
         )
@@ -80,6 +81,17 @@ def metrics_of(plans: Plans, schedule: Schedule, *, tolerance_s: float) -> dict[
         "least_end_s": least_end(arrival_s, least_s),
         "p_any_stall": found.longest_stall_s > tolerance_s,
     }
+
+
+def _stored(metric: Metric, value: float) -> int | float | bool:
+    if metric.kind == TIME:
+        return round(float(value) * 1e9)
+    if metric.kind == COUNT:
+        return int(value)
+    if metric.kind == FLAG:
+        return bool(value)
+    # Times are exact to a nanosecond: smaller shares are rounding errors; adding 0.0 turns -0.0 into 0.0.
+    return round(float(value), 9) + 0.0
 
 
 def _motion(schedule: Schedule, nominal_s: Floats, place: int) -> dict[str, float]:

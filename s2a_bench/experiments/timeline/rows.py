@@ -1,145 +1,82 @@
-"""The rows of a timeline run, and its metric table, from which columns, JSON, CSV, tables and comparison follow.
+"""The rows of a timeline run; their annotations are the metrics: columns, JSON, CSV, tables and comparison follow.
 
-A new metric is a row of the table, and an array of one number a plan under its name in `build_rows.metrics_of`.
+A new metric is a column, and an array of one number a plan under its name in `build_rows.metrics_of`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Final
 
-from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Better, Metric, by_name, columns
-from s2a_bench.store.schema import Table, with_fields
-
-
-@dataclass(frozen=True, slots=True)
-class TimelineMetric(Metric):
-    """A metric of plans, with values of 0 or more by default."""
-
-    bounds: tuple[float | None, float | None] = (0, None)
-
-    def stored(self, value: float) -> int | float | bool:
-        if self.kind == TIME:
-            return round(float(value) * 1e9)
-        # Times are exact to a nanosecond: smaller shares are rounding errors; adding 0.0 turns -0.0 into 0.0.
-        plain: int | float | bool = self.column_type(value)
-        return round(plain, 9) + 0.0 if isinstance(plain, float) else plain
+from s2a_bench.experiments.cells import ANY, HIDDEN, SHARE, TO_ONE, JsonKey, Metric, mean, metrics_of, share
+from s2a_bench.store.schema import Many, NonNegative, Positive, Table, about
 
 
-def _time(name: str, title: str = "", about: str = "", statistic: str = "median") -> TimelineMetric:
-    return TimelineMetric(name, "s", title=title, statistic=statistic, kind=TIME, about=about)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimelineRow:
+    """One plan under one policy. Motion is null for plans whose skills are not kept.
 
-
-def _mean(name: str, title: str = "", about: str = "", better: Better = "lower", **more: Any) -> TimelineMetric:
-    return TimelineMetric(name, "", better, title, "mean", about=about, **more)
-
-
-_UNBOUND: Final = (None, None)
-_SHARE: Final = (0, 1)
-
-METRICS: Final[Mapping[str, TimelineMetric]] = by_name(
-    (
-        _time("start_s", "start", "Time to first action, s_1."),
-        _time("end_s", "end", "Completion, e_N."),
-        _time("safe_start_s", about="S0."),
-        _time("last_arrival_s", about="t_N."),
-        _time("safe_end_s", about="S0 + P_N."),
-        _time("least_end_s", about="E_lo."),
-        _mean("stalls", "stalls", "Stalls longer than 20 ms a plan.", kind=COUNT),
-        _mean("p_any_stall", "P(stall)", "Share of the plans that stall at all.", kind=FLAG, bounds=_SHARE),
-        _time("stall_s", "stalled", "All stalls of a plan together.", "mean"),
-        _time("longest_stall_s", "longest", statistic="mean"),
-        _mean(
-            "stall_ratio",
-            "stall ratio",
-            "Stalled share of the time from first action to completion.",
-            kind=SHARE,
-            bounds=_SHARE,
-        ),
-        _mean("start_regret", "late start", "max(0, s_1 - S0) / S0.", kind=SHARE, optional=True),
-        _mean(
-            "start_regret_elastic",
-            "over S_lo",
-            "max(0, s_1 - S_lo) / S_lo, over the least start that T_max allows.",
-            kind=SHARE,
-            optional=True,
-        ),
-        _mean("signed_start_regret", about="(s_1 - S0) / S0.", bounds=_UNBOUND, optional=True),
-        _mean(
-            "start_regret_of_wait",
-            "of wait",
-            "max(0, s_1 - S0) / (t_N - S0); absent where t_N = S0.",
-            kind=SHARE,
-            optional=True,
-        ),
-        _mean("end_regret", "late end", "(e_N - E) / E with E = S0 + P_N.", kind=SHARE, bounds=_UNBOUND),
-        _mean(
-            "end_regret_of_wait", about="(e_N - E) / (t_N - S0); absent where t_N = S0.", bounds=_UNBOUND, optional=True
-        ),
-        _mean(
-            "end_regret_elastic",
-            "over E_lo",
-            "(e_N - E_lo) / E_lo, over the least end that T_min allows.",
-            kind=SHARE,
-            bounds=_UNBOUND,
-        ),
-        _time("mean_queue_wait_s", "queued", "s_i - t_i.", "mean"),
-        _time("longest_queue_wait_s", "longest", statistic="mean"),
-        _time("mean_action_age_s", "age", "s_i - the time of the picture."),
-        _time("oldest_action_s", "oldest"),
-        _mean("speed_distortion", "distortion", "Durations over nominal ones."),
-        _mean("fluidity", "fluidity", "Share of deadlines met (Etalon).", "higher", bounds=_SHARE),
-        _mean(
-            "rms_jerk",
-            "RMS jerk",
-            "Of a model: 1 / s^2 at unit speed; mean over the plans whose skills are kept.",
-            optional=True,
-        ),
-        _mean("peak_jerk", "peak jerk", optional=True),
-        _mean(
-            "sparc",
-            "SPARC",
-            "Spectral arc length: closer to 0 is smoother.",
-            "higher",
-            bounds=(None, 0),
-            optional=True,
-        ),
-    )
-)
-
-
-@dataclass(frozen=True, slots=True)
-class PlanRow:
-    """The columns of a row of `TIMELINES` besides the metrics.
-
-    ``board`` is a profile's name, empty for a given rate. ``mode`` is ``virtual`` (computed), or the clock;
-    ``emulated`` is true if no model answered. All times count from ``requested_ns``, 0 in virtual time.
+    ``board`` is a profile's name, empty for a given rate. All times count from ``requested_ns``, 0 in virtual time.
     """
 
     cell: str
     policy: str
-    board: str
-    title: str
-    mode: str
-    emulated: bool
-    tokens_per_s: float
-    prompt_s: float | None
-    tokens_per_skill: int
-    n_skills: int
-    t_nom_s: float
-    plan: int
-    request_id: str
-    requested_ns: int
-    caution: float | None
+    board: Annotated[str, JsonKey("profile"), about("Null if a rate was given, or a model answered.")]
+    title: Annotated[str, HIDDEN]
+    mode: Annotated[str, about("virtual: computed; else the clock that it was executed on.")]
+    emulated: Annotated[bool, about("True where no model answered.")]
+    tokens_per_s: Annotated[Positive, JsonKey("rate_tokens_per_s")]
+    prompt_s: Annotated[
+        NonNegative | None, about("c: from the request to the start of decoding; absent if a model answered.")
+    ]
+    tokens_per_skill: Annotated[Many, about("L, the delimiter included.")]
+    n_skills: Many
+    t_nom_s: Positive
+    plan: Annotated[int, HIDDEN]
+    request_id: Annotated[str, HIDDEN]
+    requested_ns: Annotated[int, HIDDEN]
+    caution: Annotated[NonNegative | None, about("lambda; absent if the policy has none, or waits for the whole plan.")]
+    start_ns: Annotated[int, Metric("start", "Time to first action, s_1.")]
+    end_ns: Annotated[int, Metric("end", "Completion, e_N.")]
+    safe_start_ns: Annotated[int, Metric(about="S0.")]
+    last_arrival_ns: Annotated[int, Metric(about="t_N.")]
+    safe_end_ns: Annotated[int, Metric(about="S0 + P_N.")]
+    least_end_ns: Annotated[int, Metric(about="E_lo.")]
+    stalls: Annotated[int, mean("stalls", "Stalls longer than 20 ms a plan.")]
+    any_stall: Annotated[bool, mean("P(stall)", "Share of the plans that stall at all.", bounds=TO_ONE)]
+    stall_ns: Annotated[int, mean("stalled", "All stalls of a plan together.")]
+    longest_stall_ns: Annotated[int, mean("longest")]
+    stall_ratio: Annotated[float, share("stall ratio", "Stalled share of the time from first action to completion.")]
+    start_regret: Annotated[float | None, mean("late start", "max(0, s_1 - S0) / S0.", kind=SHARE)] = None
+    start_regret_elastic: Annotated[
+        float | None,
+        mean("over S_lo", "max(0, s_1 - S_lo) / S_lo, over the least start that T_max allows.", kind=SHARE),
+    ] = None
+    signed_start_regret: Annotated[float | None, mean(about="(s_1 - S0) / S0.", bounds=ANY)] = None
+    start_regret_of_wait: Annotated[
+        float | None, mean("of wait", "max(0, s_1 - S0) / (t_N - S0); absent where t_N = S0.", kind=SHARE)
+    ] = None
+    end_regret: Annotated[float, mean("late end", "(e_N - E) / E with E = S0 + P_N.", kind=SHARE, bounds=ANY)]
+    end_regret_of_wait: Annotated[
+        float | None, mean(about="(e_N - E) / (t_N - S0); absent where t_N = S0.", bounds=ANY)
+    ] = None
+    end_regret_elastic: Annotated[
+        float, mean("over E_lo", "(e_N - E_lo) / E_lo, over the least end that T_min allows.", kind=SHARE, bounds=ANY)
+    ]
+    mean_queue_wait_ns: Annotated[int, mean("queued", "s_i - t_i.")]
+    longest_queue_wait_ns: Annotated[int, mean("longest")]
+    mean_action_age_ns: Annotated[int, Metric("age", "s_i - the time of the picture.")]
+    oldest_action_ns: Annotated[int, Metric("oldest")]
+    speed_distortion: Annotated[float, mean("distortion", "Durations over nominal ones.")]
+    fluidity: Annotated[float, mean("fluidity", "Share of deadlines met (Etalon).", better="higher", bounds=TO_ONE)]
+    rms_jerk: Annotated[
+        float | None, mean("RMS jerk", "Of a model: 1 / s^2 at unit speed; mean over the plans whose skills are kept.")
+    ] = None
+    peak_jerk: Annotated[float | None, mean("peak jerk")] = None
+    sparc: Annotated[
+        float | None, mean("SPARC", "Spectral arc length: closer to 0 is smoother.", better="higher", bounds=(None, 0))
+    ] = None
 
 
-TimelineRow: Final = with_fields(
-    "TimelineRow",
-    "One plan under one policy, with a column a metric. Motion is null for plans whose skills are not kept.",
-    PlanRow,
-    columns(METRICS.values()),
-)
-
-
-TIMELINES: Final[Table[PlanRow]] = Table("timelines", TimelineRow)
+METRICS: Final = metrics_of(TimelineRow)
+TIMELINES: Final[Table[TimelineRow]] = Table("timelines", TimelineRow)

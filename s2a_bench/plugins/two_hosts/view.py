@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 METRICS: Final = (
     RequestMetric(
         "bound",
+        "The least time on the run's emulated link: the payload up at its rate, and both delays.",
         "ms",
-        "neither",
-        title="bound",
-        about="The least time on the run's emulated link: the payload up at its rate, and both delays.",
+        better="neither",
+        name="bound",
     ),
     RequestMetric(
-        "bound_ratio",
-        title="measured / bound",
-        about="e2e without inference over the bound: what a better transport could still win.",
+        "measured / bound",
+        "e2e without inference over the bound: what a better transport could still win.",
+        name="bound_ratio",
         of=lambda cell: cell.column("e2e_without_inference") / cell.column("bound"),
     ),
 )

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Final
 
 from s2a_bench.errors import UnlikeRuns, UsageError
-from s2a_bench.experiments import EXPERIMENTS, Comparable, Metric, Rows, Subject, by_name, experiment_of
+from s2a_bench.experiments import EXPERIMENTS, experiment_of
+from s2a_bench.experiments.cells import Comparable, Metric, Rows, Subject, by_name
 from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.compare.agreement import Difference, as_line, differences
 from s2a_bench.stats.batches import STATISTICS

@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 from typing import Final
 
 from s2a_bench.errors import UsageError
-from s2a_bench.experiments import Metric
+from s2a_bench.experiments.cells import Metric
 from s2a_bench.report.compare.comparison import IN_TURN, LEVEL, CellComparison, ComparedRuns, detectable, metric_of
 from s2a_bench.stats.change import FEWEST_LAUNCHES
 

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
 
 from s2a_bench.errors import StoreError
-from s2a_bench.experiments import Better
+from s2a_bench.experiments.cells import Better
 from s2a_bench.report.compare.agreement import Difference
 from s2a_bench.report.compare.comparison import LEVEL, SAME, TOO_FEW, UNCLEAR, CellComparison, ComparedRuns
 from s2a_bench.stats.batches import BATCHES
 from s2a_bench.stats.change import POWER
 from s2a_bench.store.manifest import RunWarning, plain
+from s2a_bench.store.schema import Facts, Fraction, Many, NonNegative, about
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import markdown_caption, marked, name_rows, new_figure, write_beside
 from s2a_bench.writers.latex import to_latex
@@ -116,13 +117,11 @@ def _p(value: float | None) -> str:
 
 
 Interval: TypeAlias = tuple[float, float] | None
-Probability: TypeAlias = Annotated[float | None, {"minimum": 0, "maximum": 1}]
+Probability: TypeAlias = Fraction | None
 Detectable: TypeAlias = Annotated[
-    float | None,
-    {"minimum": 0, "description": "The smallest change, as a share, that the test finds; null: unknown."},
+    NonNegative | None, about("The smallest change, as a share, that the test finds; null: unknown.")
 ]
-Folders: TypeAlias = Annotated[list[str], {"minItems": 1}]
-Count: TypeAlias = Annotated[int, {"minimum": 1}]
+Folders: TypeAlias = Annotated[list[str], Facts(minItems=1)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,8 +145,8 @@ class Test:
     batches: int | None
     correction: Literal["Holm"]
     level: float
-    least_change: Annotated[float, {"minimum": 0}]
-    power: Annotated[float, {"description": "The share of repeats that find a change of the size `detectable`."}]
+    least_change: NonNegative
+    power: Annotated[float, about("The share of repeats that find a change of the size `detectable`.")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,14 +159,14 @@ class Row:
     statistic: Literal["median", "mean", "p90", "p99"]
     unit: str
     better: Better
-    n_baseline: Annotated[Count, {"description": "Requests (timeline: plans) that have the metric."}]
-    n_other: Count
-    baseline: Annotated[float, {"description": "The statistic of A; of several launches their geometric mean."}]
+    n_baseline: Annotated[Many, about("Requests (timeline: plans) that have the metric.")]
+    n_other: Many
+    baseline: Annotated[float, about("The statistic of A; of several launches their geometric mean.")]
     other: float
-    change: Annotated[Effect, {"description": "(other - baseline) / baseline; null where the baseline is 0."}]
+    change: Annotated[Effect, about("(other - baseline) / baseline; null where the baseline is 0.")]
     ratio: Effect
     difference: Effect
-    superiority: Annotated[Effect, {"description": "Probability that a value of B is above one of A, ties half."}]
+    superiority: Annotated[Effect, about("Probability that a value of B is above one of A, ties half.")]
     p: Probability
     p_holm: Probability
     detectable: Detectable
@@ -209,7 +208,7 @@ class Gated:
     p_holm: Probability
     detectable: Detectable
     outcome: Literal["passed", "tripped", "undecided"]
-    reason: Annotated[str, {"description": "Why the gate is undecided, and the way out; else empty."}]
+    reason: Annotated[str, about("Why the gate is undecided, and the way out; else empty.")]
 
     @classmethod
     def of(cls, one: Judgement) -> Gated:
@@ -229,9 +228,9 @@ class CompareJson:
 
     schema: Literal["s2a-bench-compare/1"]
     command: Literal["compare"]
-    compared: Annotated[str, {"description": "The command whose runs these are."}]
-    baseline: Annotated[Folders, {"description": "Run folders of A; several are repeated launches."}]
-    other: Annotated[Folders, {"description": "Run folders of B."}]
+    compared: Annotated[str, about("The command whose runs these are.")]
+    baseline: Annotated[Folders, about("Run folders of A; several are repeated launches.")]
+    other: Annotated[Folders, about("Run folders of B.")]
     test: Test
     comparisons: list[Row]
     only_in_baseline: list[str]

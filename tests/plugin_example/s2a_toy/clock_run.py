@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from s2a_bench.clock import now_ns
+from s2a_bench.experiments.cells import Metric
 from s2a_bench.machine import environment
 from s2a_bench.options import Options, option
 from s2a_bench.progress import Progress
@@ -21,10 +23,10 @@ class ClockConfig(Options):
 
 @dataclass(frozen=True, slots=True)
 class ReadingRow:
-    """One pair of readings."""
+    """One pair of readings; the annotation of a column makes it a metric."""
 
     cell: str
-    cost_ns: int
+    cost: Annotated[float, Metric("cost of a reading", unit="ns")]
 
 
 READINGS: Table[ReadingRow] = Table("readings", ReadingRow)
@@ -36,5 +38,5 @@ def run_clock(config: ClockConfig, output: Path, progress: Progress) -> Path:
     with RunWriter.create(output, "toy-clock", manifest, (READINGS,)) as writer:
         progress.opened(writer.path)
         progress.stage("reading the clock")
-        writer.append(READINGS, [ReadingRow("monotonic", -now_ns() + now_ns()) for _ in range(config.readings)])
+        writer.append(READINGS, [ReadingRow("monotonic", float(-now_ns() + now_ns())) for _ in range(config.readings)])
         return writer.path

@@ -1,42 +1,27 @@
-"""How a run of `toy-clock` is shown: its one metric, as a table, as JSON, in comparisons, and lanes on the page."""
+"""How a run of `toy-clock` is shown: its metric, as a table, as JSON, in comparisons, and lanes on the page."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from s2a_bench.experiments import Comparable, Metric, Shown, Subject
-from s2a_bench.stats import summary_of
+from s2a_bench.experiments import Shown
+from s2a_bench.experiments.cells import Cells, Comparable
 from s2a_bench.store.run import StoredRun
-from s2a_bench.writers.json import frame, summaries
+from s2a_bench.writers.json import frame
 from s2a_bench.writers.lanes import Lane, LaneBar, LanePanel, Lanes
-from s2a_bench.writers.tables import ABSENT, TextTable, number
 from s2a_toy.clock_run import READINGS
 
-COST = Metric("cost", "ns", title="cost of a reading")
-
-
-def subjects(run: StoredRun) -> list[Subject]:
-    """Return the one cell of a run."""
-    rows = run.table(READINGS)
-    values = rows["cost_ns"].to_numpy(dtype="float64")[:, None]
-    return [Subject("monotonic", {}, len(rows), 0, lambda _name: list(values))]
-
-
-COMPARED = Comparable({"cost": COST}, subjects, lambda _run: (), ("cost",))
+COMPARED = Comparable.of(READINGS, ("cost",))
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
     """Return a table of one row, and the same as JSON."""
-    costs = run.table(READINGS)["cost_ns"].to_numpy(dtype="float64")
-    found = summary_of(costs)
-    header = ("cell", "n", f"{COST.title} ({COST.unit}), median")
-    row = ("monotonic", str(len(costs)), number(found.median) if found else ABSENT)
-    cell = {"cell": "monotonic", "n": len(costs), **summaries([("cost", costs)])}
-    return Shown(
-        tables={"readings": TextTable("toy-clock", header, [row], 1)},
+    cells = Cells.of(run, READINGS)
+    return Shown.build(
+        tables={"readings": lambda: cells.table("toy-clock")},
         main=["readings"],
-        json=lambda: frame(run, [cell], []),
-        lanes=lanes(costs[:20] / 1e9),
+        json=lambda: frame(run, cells.json(), []),
+        lanes=lambda: lanes(cells.values("cost")[:20] / 1e9),
     )
 
 

@@ -13,7 +13,7 @@ from s2a_bench.options import Options, option
 from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.transport.surroundings import Around, Surroundings
 
-METRICS = (RequestMetric("toy_walk", "ms", about="What sound takes through the room."),)
+METRICS = (RequestMetric(about="What sound takes through the room.", unit="ms", name="toy_walk"),)
 SOUND_M_PER_S = 343.0
 
 

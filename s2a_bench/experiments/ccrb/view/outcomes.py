@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import pandas as pd
 
-from s2a_bench.experiments import TIME
 from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
+from s2a_bench.experiments.cells import TIME
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
 from s2a_bench.scenario.ccrb.labels import NAIVE, PAPER, STREAM_TO_ACT, WAIT, follower_check, law
 from s2a_bench.store.requests import SKILLS, TOKENS
@@ -126,7 +126,7 @@ def _cell(row: dict[Any, Any]) -> dict[str, Any]:
     plain = {str(name): value for name, value in row.items() if not pd.isna(value)}
     for name in ("draw", "title", PROVENANCE):
         plain.pop(name, None)
-    plain |= {metric.name: plain.pop(metric.column) / 1e9 for metric in METRICS if metric.kind == TIME}
+    plain |= {metric.name: plain.pop(metric.column) / 1e9 for metric in METRICS.values() if metric.kind == TIME}
     plain["rate_tokens_per_s"] = plain.pop("tokens_per_s")
     plain["profile"] = plain.pop("board") or None
     return plain

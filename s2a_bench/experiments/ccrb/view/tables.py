@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.experiments import TIME, Metric, Shown, requests
-from s2a_bench.experiments.ccrb.rows import IMPACTS, LOOP, MARGINS, METRICS, MOTION, TIMES, RolloutRow
+from s2a_bench.experiments import Shown, requests
+from s2a_bench.experiments.ccrb.rows import METRICS, RolloutRow
 from s2a_bench.experiments.ccrb.view.figures import ccrb_figures
 from s2a_bench.experiments.ccrb.view.outcomes import (
     Share,
@@ -20,9 +20,10 @@ from s2a_bench.experiments.ccrb.view.outcomes import (
     share_of,
     tokens_line,
 )
+from s2a_bench.experiments.cells import TIME, Metric
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.labels import NO_SCORE, ORDERING, law, operating_point, outcome_label
-from s2a_bench.store.schema import Facts, Positive
+from s2a_bench.store.schema import Positive
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.json import cell_of_row, frame
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, entries, number
@@ -75,6 +76,12 @@ def finding(run: StoredRun, gap: str) -> str:
     return f"{sentence}, for R = {span[0]:.1f} to {span[1]:.1f} tokens/s; {where}."
 
 
+TIMES: Final = ("start_s", "stalls", "stall_s")
+IMPACTS: Final = ("impact_speed_mps", "min_front_gap_m", "min_rear_gap_m")
+MARGINS: Final = ("min_front_ttc_s", "min_rear_ttc_s", "required_decel_mps2")
+MOTION: Final = ("rms_jerk", "peak_jerk", "sparc")
+LOOP: Final = ("real_time_factor", "tracking_rms_mps")
+
 ORDERINGS: Final = {
     "paper": "the paper's ordering",
     "wait_worse": "wait worse than stream",
@@ -91,7 +98,7 @@ _ORDERING_NOTES: Final = (
     "Where the follower hits even an ego with immediate tokens, a rear impact says nothing about the policy.",
 )
 
-_TIMES: Final = [metric for metric in METRICS if metric.kind == TIME]
+_TIMES: Final = [metric for metric in METRICS.values() if metric.kind == TIME]
 CcrbCell = cell_of_row(
     "CcrbCell",
     "A policy at the operating point.",
@@ -100,13 +107,14 @@ CcrbCell = cell_of_row(
     own={
         "profile": str | None,
         "rate_tokens_per_s": Positive,
-        **{metric.name: Annotated[float, Facts(metric.schema)] for metric in _TIMES},
+        **{metric.name: float for metric in _TIMES},
     },
 )
 
 
 def _outcome_table(run: StoredRun) -> TextTable:
-    rows, shown = [], [metric for metric in (*TIMES, *IMPACTS, *(LOOP if has(run, "rollout") else ())) if metric.title]
+    names = (*TIMES, *IMPACTS, *(LOOP if has(run, "rollout") else ()))
+    rows, shown = [], [METRICS[name] for name in names]
     for cell in cells_of(run, ("point", "rollout")):
         outcome = outcome_label(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
         name = cell["policy"] if cell["study"] == "point" else "  roll-out"
@@ -135,12 +143,14 @@ def _stage_table(run: StoredRun) -> TextTable:
 
 
 def _margin_table(run: StoredRun) -> TextTable:
-    rows = [(cell["policy"], *(_entry(cell, metric) for metric in (*MARGINS, *MOTION))) for cell in cells_of(run)]
+    rows = [(cell["policy"], *(_entry(cell, METRICS[name]) for name in (*MARGINS, *MOTION))) for cell in cells_of(run)]
     notes = (
         "TTC: least time to collision. DRAC: greatest deceleration required towards the lead, closing^2 / (2 gap).",
         "Motion: the ego's simulated speed until it rests (with the jolt then) or hits the lead: a crash looks smooth.",
     )
-    return TextTable("Margins and motion", ("policy", *map(_title, (*MARGINS, *MOTION))), rows, 1, notes=notes)
+    return TextTable(
+        "Margins and motion", ("policy", *(_title(METRICS[name]) for name in (*MARGINS, *MOTION))), rows, 1, notes=notes
+    )
 
 
 def _phase_table(run: StoredRun) -> TextTable:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from types import NoneType
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_args
 
 import pandas as pd
 
-from s2a_bench.experiments import TIME, Comparable, Subject
-from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES
+from s2a_bench.experiments.cells import TIME, Comparable, Subject, columns_of
+from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES, TimelineRow
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import SKILLS, TOKENS
-from s2a_bench.store.schema import Facts, Many, NonNegative, Positive, about, with_fields
+from s2a_bench.store.schema import Many, NonNegative, Positive, about, with_fields
 from s2a_bench.writers.json import frame
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
@@ -175,8 +176,11 @@ TimelineCell = with_fields(
     "A policy in one setting: means over its plans.",
     _About,
     {
-        name: Annotated[float | None if metric.optional else float, Facts(metric.schema)]
-        for name, metric in METRICS.items()
+        column.metric.name: Annotated[
+            float | None if NoneType in get_args(column.hint.__origin__) else float, about(column.metric.about)
+        ]
+        for column in columns_of(TimelineRow)
+        if column.metric
     },
 )
 

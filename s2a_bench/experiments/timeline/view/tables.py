@@ -6,9 +6,10 @@ from collections.abc import Iterable, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
-from s2a_bench.experiments import COUNT, FLAG, SHARE, TIME, Shown
+from s2a_bench.experiments import Shown
+from s2a_bench.experiments.cells import COUNT, FLAG, SHARE, TIME, Metric
 from s2a_bench.experiments.requests import span_of
-from s2a_bench.experiments.timeline.rows import METRICS, TimelineMetric
+from s2a_bench.experiments.timeline.rows import METRICS
 from s2a_bench.experiments.timeline.view.cells import (
     Timelines,
     jitter_notes,
@@ -156,7 +157,7 @@ def _table(cells: Sequence[Timelines], title: str, metrics: Sequence[str], notes
     return TextTable.grouped(title, header, boards.values(), 3, notes, once=1, cells=chain(*names.values()))
 
 
-def _entry(cell: Timelines, metric: TimelineMetric) -> str:
+def _entry(cell: Timelines, metric: Metric) -> str:
     value = cell.mean(metric.name)
     if value is None:
         return ABSENT

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments import TIME, Metric, by_name, number, share
+from s2a_bench.experiments.cells import TIME, Metric, mean, metrics_of, share
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -25,34 +25,50 @@ LEAST: Final = 1 / 16
 """Of a cycle of all robots, the least size of an event that was not seen: one tick of each chunk of 16."""
 
 
-def _time(name: str, title: str, about: str) -> Metric:
-    return Metric(f"{name}_s", "s", title=title, about=about, bounds=(0, None), kind=TIME, optional=True)
+@dataclass(frozen=True, kw_only=True)
+class FleetMetrics:
+    """The metrics of a fleet, or of one robot of it."""
+
+    requests_per_s: Annotated[
+        float | None, mean("req/s", "Complete answers a second, of all robots.", unit="1/s", better="higher")
+    ]
+    latency_mean_ns: Annotated[
+        int | None, Metric("latency", "From the intended time of a request to its complete answer, the mean.")
+    ]
+    latency_p50_ns: Annotated[int | None, Metric("p50", "Its median.")]
+    latency_p99_ns: Annotated[int | None, Metric("p99", "Its 99th percentile.")]
+    ttft_p50_ns: Annotated[
+        int | None, Metric("TTFT p50", "From the intended time of a request to the first piece of its answer.")
+    ]
+    ttft_p99_ns: Annotated[int | None, Metric("TTFT p99", "Its 99th percentile.")]
+    in_time: Annotated[
+        float | None,
+        share("in time, %", "Share of the answers that came before the robot had to wait.", better="higher"),
+    ]
+    stalled: Annotated[
+        float | None, share("stalled, %", "Share of the due ticks without an action; of the plans, those that stall.")
+    ]
+    stalled_low: Annotated[float | None, share("from", "Its interval, over robots and blocks of time; the lower end.")]
+    stalled_high: Annotated[float | None, share("to", "The upper end.")]
+    stalled_alone: Annotated[float | None, share("alone", "The share of one robot alone.", better="neither")]
+    stalled_worst: Annotated[float | None, share("worst", "The greatest share of a robot.")]
+    age_p50_ns: Annotated[int | None, Metric("age p50", "Of the observation behind an executed action, the median.")]
+    age_p99_ns: Annotated[int | None, Metric("p99", "Its 99th percentile.")]
+    unfair: Annotated[float | None, mean("worst/mean", "The greatest mean latency of a robot over that of all.")]
+    late_p99_ns: Annotated[
+        int | None, Metric("late", "Measured: lateness of the generator's own ticks, 99th percentile.")
+    ]
+    generator_cpu: Annotated[
+        float | None, mean("generator", "Measured: CPU time of the generator a second.", unit="cores", better="neither")
+    ]
+    server_cpu: Annotated[
+        float | None, mean("server", "Measured: CPU time of the server a second.", unit="cores", better="neither")
+    ]
+    gpu: Annotated[float | None, share("GPU, %", "Measured: utilisation.", better="neither")]
+    watts: Annotated[float | None, mean("W", "Measured: power.", unit="W", better="neither")]
 
 
-METRICS: Final[Mapping[str, Metric]] = by_name(
-    (
-        number("requests_per_s", "1/s", "req/s", "Complete answers a second, of all robots.", "higher"),
-        _time("latency_mean", "latency", "From the intended time of a request to its complete answer, the mean."),
-        _time("latency_p50", "p50", "Its median."),
-        _time("latency_p99", "p99", "Its 99th percentile."),
-        _time("ttft_p50", "TTFT p50", "From the intended time of a request to the first piece of its answer."),
-        _time("ttft_p99", "TTFT p99", "Its 99th percentile."),
-        share("in_time", "in time, %", "Share of the answers that came before the robot had to wait.", "higher"),
-        share("stalled", "stalled, %", "Share of the due ticks without an action; of the plans, those that stall."),
-        share("stalled_low", "from", "Its interval, over robots and blocks of time; the lower end."),
-        share("stalled_high", "to", "The upper end."),
-        share("stalled_alone", "alone", "The share of one robot alone.", "neither"),
-        share("stalled_worst", "worst", "The greatest share of a robot."),
-        _time("age_p50", "age p50", "Of the observation behind an executed action, the median."),
-        _time("age_p99", "p99", "Its 99th percentile."),
-        number("unfair", "", "worst/mean", "The greatest mean latency of a robot over that of all."),
-        _time("late_p99", "late", "Measured: lateness of the generator's own ticks, 99th percentile."),
-        number("generator_cpu", "cores", "generator", "Measured: CPU time of the generator a second.", "neither"),
-        number("server_cpu", "cores", "server", "Measured: CPU time of the server a second.", "neither"),
-        share("gpu", "GPU, %", "Measured: utilisation.", "neither"),
-        number("watts", "W", "W", "Measured: power.", "neither"),
-    )
-)
+METRICS: Final = metrics_of(FleetMetrics)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +135,7 @@ def measures(
     }
     values = {metric: found.get(metric.column) for metric in METRICS.values()}
     return {
-        metric.column: round(value) if value is not None and metric.column_type is int else value
+        metric.column: round(value) if value is not None and metric.kind == TIME else value
         for metric, value in values.items()
     }
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Final, Literal
 
-from s2a_bench.experiments import columns
-from s2a_bench.plugins.chunks.capacity.metrics import METRICS
-from s2a_bench.store.schema import Count, Many, NonNegative, Table, about, with_fields
+from s2a_bench.plugins.chunks.capacity.metrics import FleetMetrics
+from s2a_bench.store.schema import Count, Many, NonNegative, Table, about
 
 TWIN: Final = ", instant"
 """After the name of a pipeline: its instant server."""
@@ -15,7 +14,7 @@ Source = Literal["measured", "predicted", "twin"]
 Verdict = Literal["below", "above", "undecided", "none"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class AboutFleet:
     """The columns of a row of `FLEETS` besides the metrics."""
 
@@ -35,12 +34,12 @@ class AboutFleet:
     ]
 
 
-FleetRow: Final[Any] = with_fields(
-    "FleetRow", "N robots on one server, with a column a metric.", AboutFleet, columns(METRICS.values())
-)
+@dataclass(frozen=True, kw_only=True)
+class FleetRow(FleetMetrics, AboutFleet):
+    """N robots on one server."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class AboutRobot:
     """The columns of a row of `ROBOTS` besides the metrics."""
 
@@ -50,9 +49,9 @@ class AboutRobot:
     robot: int
 
 
-RobotRow: Final[Any] = with_fields(
-    "RobotRow", "One robot of a fleet in an episode, with a column a metric.", AboutRobot, columns(METRICS.values())
-)
+@dataclass(frozen=True, kw_only=True)
+class RobotRow(FleetMetrics, AboutRobot):
+    """One robot of a fleet in an episode."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +85,7 @@ class KneeRow:
     driven: int | None
 
 
-FLEETS: Final[Table[AboutFleet]] = Table("capacity", FleetRow)
-ROBOTS: Final[Table[AboutRobot]] = Table("capacity_robots", RobotRow)
+FLEETS: Final[Table[FleetRow]] = Table("capacity", FleetRow)
+ROBOTS: Final[Table[RobotRow]] = Table("capacity_robots", RobotRow)
 REQUESTS: Final[Table[RequestRow]] = Table("capacity_requests", RequestRow)
 KNEES: Final[Table[KneeRow]] = Table("capacity_knees", KneeRow)

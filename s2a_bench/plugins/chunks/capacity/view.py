@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments import SHARE, TIME, Comparable, Metric, Shown, Subject, plain_rows
+from s2a_bench.experiments import Shown
+from s2a_bench.experiments.cells import SHARE, TIME, Comparable, Metric, Subject, mean, plain_rows
 from s2a_bench.plugins.chunks.capacity.metrics import METRICS
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, KNEES, ROBOTS, TWIN, FleetRow
 from s2a_bench.store.manifest import present
@@ -32,7 +33,7 @@ PREDICTED: Final = "predicted"
 LATE: Final = (
     "late: no measurement, as the generator missed its ticks, or exceeds the limit even with an instant server"
 )
-KNEE: Final = Metric("knee", "robots", "higher", "knee", "mean", "The largest fleet within the limit.")
+KNEE: Final = mean("knee", "The largest fleet within the limit.", "robots", "higher", name="knee")
 
 CapacityCell = cell_of_row("CapacityCell", "N robots on one server.", FleetRow, without=())
 
@@ -235,7 +236,6 @@ def _subjects(run: StoredRun) -> list[Subject]:
 COMPARED: Final = Comparable(
     metrics={KNEE.name: KNEE, **METRICS},
     subjects=_subjects,
-    origin=lambda run: (run.origins.line,),
     shown=(KNEE.name, "stalled", "latency_p50_s", "age_p99_s"),
 )
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments import COUNT
+from s2a_bench.experiments.cells import COUNT
 from s2a_bench.plugins.chunks.chunks.cells import without_trigger
 from s2a_bench.plugins.chunks.chunks.rows import (
     CHUNKS,

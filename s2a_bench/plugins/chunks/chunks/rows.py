@@ -1,102 +1,26 @@
-"""The rows of a run of chunks, and its metric table, from which columns, JSON, schema, CSV and tables follow.
+"""The rows of a run of chunks; their annotations are the metrics: JSON, schema, CSV and tables follow.
 
-A new metric is a row of the table, and a value under its name in `build_rows.metrics_of`.
+A new metric is a column, and a value under its name in `build_rows.metrics_of`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from functools import partial
+from typing import Annotated, Final
 
-from s2a_bench.experiments import COUNT, Better, Metric, by_name, columns, number, share
-from s2a_bench.store.schema import Count, Many, NonNegative, Positive, Table, about, with_fields
+from s2a_bench.experiments.cells import mean, metrics_of, share
+from s2a_bench.store.schema import Count, Many, NonNegative, Positive, Table, about
 
-
-def _ticks(name: str, title: str, about: str, **more: Any) -> Metric:
-    return number(name, "ticks", title, about, **more)
-
-
-def _plant(name: str, unit: str, title: str, about: str, better: Better = "lower") -> Metric:
-    units = "u: the actions' unit, in virtual time the target's standard deviation."
-    return number(name, unit, title, f"{about} {units}", better)
-
-
-METRICS: Final[Mapping[str, Metric]] = by_name(
-    (
-        _ticks("ticks", "ticks", "Control ticks from the first action on.", better="neither", kind=COUNT),
-        _ticks("stall_ticks", "stalled", "Those without an action.", kind=COUNT),
-        number("stall_ticks_per_s", "1/s", "stalls/s", "Stalled ticks a second, from the first action on."),
-        share("stall_share", "stalled", "Share of the ticks that stall."),
-        _ticks("longest_stall_ticks", "longest", "The longest stall.", kind=COUNT),
-        number("boundaries", "", "cycles", "From one executed chunk to the next.", "neither", kind=COUNT),
-        number("stalled_cycles", "", "stalled cycles", "Boundaries with a stall.", kind=COUNT),
-        share("p_stall_cycle", "P(stall), %", "Share of the boundaries with a stall."),
-        share("p_stall_low", "from", "Its two-sided 95 % interval (Clopper and Pearson), the lower end."),
-        share("p_stall_high", "to", "The upper end."),
-        share("p_stall_closed", "form", "What the closed form says of the same delays, where it holds."),
-        _ticks("age_ticks_mean", "age", "Of the observation behind an executed action."),
-        _ticks("age_ticks_p99", "p99", "Its 99th percentile."),
-        _ticks("age_ticks_max", "max", "The greatest."),
-        _ticks("age_ticks_blended", "blended", "Its mean with blended actions: ages weighted as the actions are."),
-        number("reaction_s_mean", "s", "react (ms)", "From an event to the start of the first tick that knows of it."),
-        number("reaction_s_p99", "s", "p99", "Its 99th percentile."),
-        number("reaction_s_closed", "s", "form", "Its mean by the closed form of the same delays, where it holds."),
-        number("first_action_s", "s", "first action", "From the first observation until an action leaves."),
-        number("control_rate_hz", "Hz", "Hz", "Executed actions a second, from the first on.", "higher"),
-        _ticks("delay_ticks_mean", "d", "Realised d, by the row's convention.", better="neither"),
-        _ticks("delay_ticks_p99", "p99", "Its 99th percentile.", better="neither"),
-        _ticks("delay_ticks_max", "max", "The greatest.", better="neither"),
-        _ticks("delay_assumed_ticks", "assumed", "The d that the mode is ready for: trigger, or `assumed`."),
-        share("p_delay_above", "above, %", "Share of the requests whose d is above the assumed one."),
-        _ticks(
-            "margin_ticks",
-            "margin",
-            "The stability margin: all latencies may be longer by this without a stall; -1 where some stall already.",
-            better="higher",
-            bounds=(-1, None),
-            kind=COUNT,
-        ),
-        number(
-            "slow_down",
-            "",
-            "beta",
-            "The least slow-down of actions at which at most a share epsilon of the cycles stalls, at the greatest m.",
-            bounds=(1, None),
-        ),
-        number(
-            "slower",
-            "",
-            "slower",
-            "By how many times slower than `control_hz` actions were executed.",
-            bounds=(1, None),
-        ),
-        share("thrown_away_share", "unused, %", "Actions never executed, of all."),
-        number("jump_mean", "actions", "jump", "By how many actions the robot is thrown at a boundary."),
-        number("jump_max", "actions", "max", "The greatest."),
-        _plant("tracking_rms", "u", "tracking", "Position of the plant less the target's, root mean square."),
-        _plant("tracking_rms_ideal", "u", "ideal", "The same, with a request in every tick and no latency.", "neither"),
-        _plant("jerk_rms", "u/s^3", "jerk", "Change of acceleration over a control period, by it; root mean square."),
-        _plant("jerk_rms_ideal", "u/s^3", "ideal", "The same, with a request in every tick and no latency.", "neither"),
-        _plant("boundary_jump_mean", "u", "jump", "From a chunk's last executed action to the next one's first."),
-        _plant("boundary_jump_p99", "u", "p99", "Its 99th percentile."),
-        _plant("action_step_mean", "u", "step", "From one action to the next within a chunk.", "neither"),
-        _ticks("blocked_ticks", "blocked", "Ticks in which the control loop waits for an answer.", kind=COUNT),
-        share("agreement", "alike, %", "Live: share of the ticks as the mode's arrays have them.", "higher"),
-        number("jitter_s_p50", "s", "jitter (ms)", "Live: delay of an action after its due time, the median."),
-        number("jitter_s_p99", "s", "p99", "Its 99th percentile."),
-        number("jitter_s_max", "s", "max", "The greatest."),
-        _ticks("late_ticks", "late", "Live: ticks whose action left a whole tick late or more.", kind=COUNT),
-        number("blocked_s_p99", "s", "busy (ms)", "Live: time of requests and sending in a tick, 99th percentile."),
-        number("blocked_s_max", "s", "max", "The greatest."),
-        number("bytes_up_per_s", "bytes/s", "MB/s up", "Live: bytes of pictures sent in a second."),
-    )
-)
+_ticks = partial(mean, unit="ticks")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AboutCell:
-    """The columns of a row of `CHUNKS` besides the metrics."""
+class ChunkRow:
+    """A mode and rule under a source of latencies.
+
+    u is the actions' unit, in virtual time the target's standard deviation.
+    """
 
     cell: str
     mode: Annotated[str, about("With the parameters that are not at their defaults.")]
@@ -112,14 +36,117 @@ class AboutCell:
     trigger: Annotated[
         NonNegative | None, about("m, actions left at the next request; its mean where a rule moves it.")
     ] = None
+    ticks: Annotated[int | None, _ticks("ticks", "Control ticks from the first action on.", better="neither")]
+    stall_ticks: Annotated[int | None, _ticks("stalled", "Those without an action.")]
+    stall_ticks_per_s: Annotated[
+        float | None, mean("stalls/s", "Stalled ticks a second, from the first action on.", unit="1/s")
+    ]
+    stall_share: Annotated[float | None, share("stalled", "Share of the ticks that stall.")]
+    longest_stall_ticks: Annotated[int | None, _ticks("longest", "The longest stall.")]
+    boundaries: Annotated[int | None, mean("cycles", "From one executed chunk to the next.", better="neither")]
+    stalled_cycles: Annotated[int | None, mean("stalled cycles", "Boundaries with a stall.")]
+    p_stall_cycle: Annotated[float | None, share("P(stall), %", "Share of the boundaries with a stall.")]
+    p_stall_low: Annotated[
+        float | None, share("from", "Its two-sided 95 % interval (Clopper and Pearson), the lower end.")
+    ]
+    p_stall_high: Annotated[float | None, share("to", "The upper end.")]
+    p_stall_closed: Annotated[
+        float | None, share("form", "What the closed form says of the same delays, where it holds.")
+    ]
+    age_ticks_mean: Annotated[float | None, _ticks("age", "Of the observation behind an executed action.")]
+    age_ticks_p99: Annotated[float | None, _ticks("p99", "Its 99th percentile.")]
+    age_ticks_max: Annotated[float | None, _ticks("max", "The greatest.")]
+    age_ticks_blended: Annotated[
+        float | None, _ticks("blended", "Its mean with blended actions: ages weighted as the actions are.")
+    ]
+    reaction_s_mean: Annotated[
+        float | None, mean("react (ms)", "From an event to the start of the first tick that knows of it.", unit="s")
+    ]
+    reaction_s_p99: Annotated[float | None, mean("p99", "Its 99th percentile.", unit="s")]
+    reaction_s_closed: Annotated[
+        float | None, mean("form", "Its mean by the closed form of the same delays, where it holds.", unit="s")
+    ]
+    first_action_s: Annotated[
+        float | None, mean("first action", "From the first observation until an action leaves.", unit="s")
+    ]
+    control_rate_hz: Annotated[
+        float | None, mean("Hz", "Executed actions a second, from the first on.", unit="Hz", better="higher")
+    ]
+    delay_ticks_mean: Annotated[float | None, _ticks("d", "Realised d, by the row's convention.", better="neither")]
+    delay_ticks_p99: Annotated[float | None, _ticks("p99", "Its 99th percentile.", better="neither")]
+    delay_ticks_max: Annotated[float | None, _ticks("max", "The greatest.", better="neither")]
+    delay_assumed_ticks: Annotated[
+        float | None, _ticks("assumed", "The d that the mode is ready for: trigger, or `assumed`.")
+    ]
+    p_delay_above: Annotated[float | None, share("above, %", "Share of the requests whose d is above the assumed one.")]
+    margin_ticks: Annotated[
+        int | None,
+        _ticks(
+            "margin",
+            "The stability margin: all latencies may be longer by this without a stall; -1 where some stall already.",
+            better="higher",
+            bounds=(-1, None),
+        ),
+    ]
+    slow_down: Annotated[
+        float | None,
+        mean(
+            "beta",
+            "The least slow-down of actions at which at most a share epsilon of the cycles stalls, at the greatest m.",
+            bounds=(1, None),
+        ),
+    ]
+    slower: Annotated[
+        float | None,
+        mean("slower", "By how many times slower than `control_hz` actions were executed.", bounds=(1, None)),
+    ]
+    thrown_away_share: Annotated[float | None, share("unused, %", "Actions never executed, of all.")]
+    jump_mean: Annotated[
+        float | None, mean("jump", "By how many actions the robot is thrown at a boundary.", unit="actions")
+    ]
+    jump_max: Annotated[float | None, mean("max", "The greatest.", unit="actions")]
+    tracking_rms: Annotated[
+        float | None, mean("tracking", "Position of the plant less the target's, root mean square.", unit="u")
+    ]
+    tracking_rms_ideal: Annotated[
+        float | None,
+        mean("ideal", "The same, with a request in every tick and no latency.", unit="u", better="neither"),
+    ]
+    jerk_rms: Annotated[
+        float | None,
+        mean("jerk", "Change of acceleration over a control period, by it; root mean square.", unit="u/s^3"),
+    ]
+    jerk_rms_ideal: Annotated[
+        float | None,
+        mean("ideal", "The same, with a request in every tick and no latency.", unit="u/s^3", better="neither"),
+    ]
+    boundary_jump_mean: Annotated[
+        float | None, mean("jump", "From a chunk's last executed action to the next one's first.", unit="u")
+    ]
+    boundary_jump_p99: Annotated[float | None, mean("p99", "Its 99th percentile.", unit="u")]
+    action_step_mean: Annotated[
+        float | None, mean("step", "From one action to the next within a chunk.", unit="u", better="neither")
+    ]
+    blocked_ticks: Annotated[int | None, _ticks("blocked", "Ticks in which the control loop waits for an answer.")]
+    agreement: Annotated[
+        float | None, share("alike, %", "Live: share of the ticks as the mode's arrays have them.", better="higher")
+    ]
+    jitter_s_p50: Annotated[
+        float | None, mean("jitter (ms)", "Live: delay of an action after its due time, the median.", unit="s")
+    ]
+    jitter_s_p99: Annotated[float | None, mean("p99", "Its 99th percentile.", unit="s")]
+    jitter_s_max: Annotated[float | None, mean("max", "The greatest.", unit="s")]
+    late_ticks: Annotated[int | None, _ticks("late", "Live: ticks whose action left a whole tick late or more.")]
+    blocked_s_p99: Annotated[
+        float | None, mean("busy (ms)", "Live: time of requests and sending in a tick, 99th percentile.", unit="s")
+    ]
+    blocked_s_max: Annotated[float | None, mean("max", "The greatest.", unit="s")]
+    bytes_up_per_s: Annotated[
+        float | None, mean("MB/s up", "Live: bytes of pictures sent in a second.", unit="bytes/s")
+    ]
 
 
-ChunkRow: Final = with_fields(
-    "ChunkRow",
-    "A mode and rule under a source of latencies, with a column a metric.",
-    AboutCell,
-    columns(METRICS.values()),
-)
+METRICS: Final = metrics_of(ChunkRow)
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +229,7 @@ class MeanRow:
     jerk_rms_ideal: float | None
 
 
-CHUNKS: Final[Table[AboutCell]] = Table("chunks", ChunkRow)
+CHUNKS: Final[Table[ChunkRow]] = Table("chunks", ChunkRow)
 TICKS: Final[Table[TickRow]] = Table("chunk_ticks", TickRow)
 REQUESTS: Final[Table[RequestRow]] = Table("chunk_requests", RequestRow)
 TRIGGERS: Final[Table[TriggerRow]] = Table("chunk_triggers", TriggerRow)

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from s2a_bench.experiments import SHARE, Tables, plain_rows
+from s2a_bench.experiments import Tables
+from s2a_bench.experiments.cells import SHARE, plain_rows
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, METRICS, ChunkRow
 from s2a_bench.policy.conformal import promise
 from s2a_bench.store.manifest import present
