@@ -17,7 +17,7 @@ from scipy.signal import lfilter
 
 from s2a_bench.report.compare.comparison import LEVEL
 from s2a_bench.stats import Ratio
-from s2a_bench.stats.batches import RowCorrelation
+from s2a_bench.stats.batches import Blocks, RowCorrelation
 from s2a_bench.stats.change import Noise, ratio_of_launches
 
 RATIO = 6.0
@@ -46,10 +46,7 @@ def _remembering(rng: np.random.Generator, shape: tuple[int, int], correlation: 
 
 def interval(cells: list[np.ndarray], seed: int) -> Ratio:
     """Return the ratio as `latency` computes it."""
-    above, below = (
-        {launch: {block: [float(value)] for block, value in enumerate(row)} for launch, row in enumerate(cell)}
-        for cell in cells
-    )
+    above, below = ({launch: Blocks(row, np.arange(len(row))) for launch, row in enumerate(cell)} for cell in cells)
     found = ratio_of_launches(above, below, seed)
     assert found is not None  # noqa: S101 - every launch has values
     return found

@@ -29,8 +29,10 @@ from threading import Event, Lock, Thread
 from typing import Any
 
 import httpx
+import numpy as np
 
 from s2a_bench.errors import RequestFailed, S2AError
+from s2a_bench.stats.batches import Blocks
 from s2a_bench.stats.change import ratio_of_blocks
 from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.transport import Client, Wiring, open_client
@@ -288,20 +290,17 @@ class Load:
             self.attacks[case.name] += 1
 
 
-Blocks = dict[int, list[float]]
-
-
 def idle(client: Client, twin: Client, blocks: int, of: int) -> tuple[list[float], Blocks]:
     """Return the latencies in ms of interleaved blocks, and by block those relative to the twin's median."""
     plain: list[float] = []
-    relative: Blocks = {}
+    relative: list[float] = []
     for block in range(blocks):
         taken: dict[bool, list[float]] = {}
         for loaded in (True, False) if block % 2 else (False, True):
             taken[loaded] = [latency_ms(client if loaded else twin) for _ in range(of)]
         plain += taken[True]
-        relative[block] = [value / median(taken[False]) for value in taken[True]]
-    return plain, relative
+        relative += [value / median(taken[False]) for value in taken[True]]
+    return plain, Blocks(np.array(relative), np.repeat(np.arange(blocks), of))
 
 
 def latency_ms(client: Client, tries: int = 5) -> float:
@@ -360,7 +359,7 @@ def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = B
         result.peak_mib, result.attacks = usage(pid).peak_mib, load.attacks.total()
         result.not_met = sorted({case.name for case in load.cases} - {*load.attacks})
         result.idle_ms_before, result.idle_ms_after = median(plain_before), median(plain_after)
-        later = {block + blocks: values for block, values in relative_after.items()}
+        later = Blocks(relative_after.values, relative_after.block + blocks)
         if (ratio := ratio_of_blocks(later, relative_before, 1)) is not None:
             result.slower, result.slower_low, result.slower_high = ratio.value, ratio.low, ratio.high
         began = time.monotonic()

@@ -23,6 +23,7 @@ from s2a_bench.plugins.chunks.modes.metrics import measure
 from s2a_bench.plugins.chunks.modes.trigger import Maximum, TrackedLatency, calibrate, follow, trigger
 from s2a_bench.policy.conformal import GUARANTEE, Guarantee
 from s2a_bench.provenance import Origins, Provenance
+from s2a_bench.stats.batches import Rows
 from s2a_bench.stats.change import change_of_ranks
 from s2a_bench.stats.seeds import generator
 from s2a_bench.store.run import RunWriter
@@ -115,7 +116,7 @@ def rows(config: DelaysConfig, process: str, seed: int) -> Iterator[DelayRow]:
     known = calibrate(learnt, config.epsilon, config.guarantee)
     maximum = Maximum(float(learnt.max()))
     hindsight = int(np.sort(judged)[-1 - int(config.epsilon * judged.size)])
-    ticks = [list(SETTING.delay_ticks(each).astype(float)[:, None]) for each in (learnt, judged)]
+    ticks = [Rows(SETTING.delay_ticks(each).astype(float)) for each in (learnt, judged)]
     change = change_of_ranks(*ticks, seed=0)
     chosen: dict[str, Ints] = {
         "calibrated": np.array([trigger(known.caution, SETTING, MOST).ticks]),

@@ -12,13 +12,12 @@ from s2a_bench.stats import Summary, summary_of
 from s2a_bench.store.schema import PROVENANCE, Row
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
-    from numpy.typing import NDArray
     from typing_extensions import Self
 
     from s2a_bench.provenance import Origins
     from s2a_bench.stats import Floats
+    from s2a_bench.stats.batches import Rows
     from s2a_bench.store.run import StoredRun
     from s2a_bench.store.schema import Table
     from s2a_bench.writers.csv_text import CsvTable
@@ -26,8 +25,6 @@ if TYPE_CHECKING:
 
 TIME, COUNT, FLAG, SHARE, NUMBER = "time", "count", "flag", "share", "number"
 Better: TypeAlias = Literal["lower", "higher", "neither"]
-Rows: TypeAlias = "list[NDArray[np.float64]]"
-"""The values of a metric: one array a request or plan, in the order in which they were made."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,7 +233,9 @@ class Cells(Generic[Row]):
 
     def rows_of(self, metric: str) -> Rows:
         """Return a metric's values, a row each; none for a metric that the rows lack."""
-        return list(self.values(metric)[:, None]) if metric in self.metrics else []
+        from s2a_bench.stats.batches import Rows
+
+        return Rows(self.values(metric)) if metric in self.metrics else Rows.of([])
 
 
 @dataclass(frozen=True, slots=True)

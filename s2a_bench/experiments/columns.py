@@ -79,7 +79,7 @@ class RequestColumns:
         return self._samples[name].to_numpy(dtype="int64")
 
     def text(self, name: str, request: int) -> str:
-        return str(self._samples[name].iat[request])
+        return str(self._samples[name].iloc[request])
 
     def texts(self, name: str, requests: Places) -> NDArray[np.str_]:
         return self._samples[name].iloc[requests].to_numpy(dtype="str")
@@ -165,7 +165,7 @@ class Answers:
         """Return the tokens of requests, one request after another."""
         counts = self.counts[requests]
         before = np.cumsum(counts) - counts
-        return np.arange(counts.sum()) + np.repeat(self.starts[requests] - before, counts)
+        return np.repeat(self.starts[requests] - before, counts) + np.arange(int(counts.sum()))
 
 
 def known(values: Floats) -> Floats:
@@ -178,8 +178,9 @@ def _requests_of(ids: pd.Series[str], requests: pd.Series[str]) -> Places:
     places = np.full(len(requests.cat.categories) + 1, -1)
     places[requests.cat.codes] = np.arange(len(requests))
     codes = np.append(requests.cat.categories.get_indexer(ids.cat.categories), -1)
-    return places[codes[ids.cat.codes]]
+    of_ids: Places = places[codes[ids.cat.codes]]
+    return of_ids
 
 
 def _floats(column: pd.Series[float]) -> Floats:
-    return column.to_numpy(dtype="float64", na_value=np.nan)
+    return column.to_numpy(dtype=np.float64, na_value=np.nan)

@@ -85,11 +85,11 @@ class Ends(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RequestMetric(Metric):
-    """A metric of requests, times in ms; without ``of`` and ``token`` it is the column of its name."""
+    """A metric of requests, times in ms; without ``of`` and ``of_tokens`` it is the column of its name."""
 
     of: Of | None = None
     """Its values, one a request that counts; NaN where one is missing."""
-    of_token: str = ""
+    of_tokens: str = ""
     """Of a metric of tokens: their time, a key of `Answers.times_ns`."""
     ends: bool = False
     """Whether it may begin on one host and end on another: then it has intervals."""
@@ -183,19 +183,19 @@ class RequestCell:
 
     def values(self, metric: RequestMetric | str) -> Floats:
         """Return a metric's values: one a request or token that has it."""
-        token = _declared(metric).of_token
+        token = _declared(metric).of_tokens
         return known(self._of_tokens(token, self.by_id) if token else self.column(metric))
 
     def ends(self, metric: RequestMetric | str) -> Ends:
         """Return the intervals of a metric; none if it is exact, or absent."""
         declared, ends = _declared(metric), ("_lo", "_hi")
-        if declared.of_token:
-            return Ends(*(known(self._of_tokens(declared.of_token + end, self.by_id)) for end in ends))
+        if declared.of_tokens:
+            return Ends(*(known(self._of_tokens(declared.of_tokens + end, self.by_id)) for end in ends))
         return Ends(*(known(self._numbers(declared.name, end)) for end in ends))
 
     def rows(self, metric: RequestMetric | str) -> Rows:
         """Return a metric's values, a row for each request that has any."""
-        if not (token := _declared(metric).of_token):
+        if not (token := _declared(metric).of_tokens):
             return Rows(known(self.column(metric)))
         values = self._of_tokens(token, self.counted)
         request = np.repeat(np.arange(self.n), self.columns.answers.counts[self.counted])
@@ -348,12 +348,12 @@ ANSWER_METRICS: Final = (
 TOKEN_METRICS: Final = (
     in_ms(
         *("itl", "gap", "Every gap between a token and the next, as the client saw them."),
-        of_token="gap",
+        of_tokens="gap",
         shown=("median", "p99"),
     ),
     in_ms(
         *("token_delay", "delay", "From a token's leaving the engine to the client's seeing it."),
-        of_token="delay",
+        of_tokens="delay",
         ends=True,
         shown=("median", "p90", "p99"),
     ),

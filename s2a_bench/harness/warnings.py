@@ -55,7 +55,7 @@ def change_warnings(name: str, learned: Rows, seen: Rows, unit: str, advice: str
     change = change_of_ranks(learned, seen, seed=0)
     if change.p is None or change.p >= LEVEL:
         return []
-    before, now = (float(np.median(np.concatenate(rows))) for rows in (learned, seen))
+    before, now = (float(np.median(rows.values)) for rows in (learned, seen))
     what = (
         f"{name}: delays changed since the calibration, in the median from {before:.4g} to {now:.4g} {unit} "
         f"(P(a later one is longer) = {change.superiority.value:.2f})"

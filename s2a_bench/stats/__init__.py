@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, TypeAlias
 
@@ -57,11 +57,11 @@ class Ratio:
         return None if self.low is None or self.high is None else (self.low, self.high)
 
 
-def summarise(values: Iterable[float]) -> Summary:
+def summarise(values: Floats | Sequence[float]) -> Summary:
     """Summarise values; percentiles interpolate linearly (Hyndman and Fan, type 7). Raises ValueError for none."""
     import numpy as np
 
-    array = np.asarray(list(values), dtype=np.float64)
+    array = np.asarray(values, dtype=np.float64)
     if not array.size:
         raise ValueError("there is no summary of no values")
     median, p90, p99 = np.percentile(array, (50, 90, 99))

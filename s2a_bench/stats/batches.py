@@ -5,15 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, TypeAlias, final
+from typing import Final, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench.stats import Floats
-
-Rows: TypeAlias = Sequence[Floats]
-"""The values of one launch in order of time: one array per request (its value, or the gaps of its tokens)."""
 
 STATISTICS: Final[Mapping[str, float | None]] = {"median": 0.5, "mean": None, "p90": 0.9, "p99": 0.99}
 """Statistic -> quantile; None for the mean."""
@@ -34,22 +31,81 @@ _RESAMPLES: Final = 1000
 _ROUNDING: Final = 1e-9
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """The values of one launch in order of time, a row a request: its value, or the gaps of its tokens."""
+
+    values: Floats
+    sizes: NDArray[np.int64] | None = None
+    """The number of values of each row, at least 1; None if every row is one value."""
+
+    @classmethod
+    def of(cls, rows: Sequence[Floats]) -> Rows:
+        """Join rows of one array each, without the empty ones."""
+        sizes = np.array([len(row) for row in rows if len(row)], dtype=np.int64)
+        return cls(np.concatenate([np.empty(0), *rows]), sizes)
+
+    def __len__(self) -> int:
+        return len(self.values if self.sizes is None else self.sizes)
+
+    @property
+    def levels(self) -> Floats:
+        """Return the median of each row."""
+        if self.sizes is None:
+            return self.values
+        levels = np.empty(len(self.sizes))
+        starts = np.cumsum(self.sizes) - self.sizes
+        for size in np.unique(self.sizes):
+            alike = self.sizes == size
+            levels[alike] = np.median(self.values[starts[alike, None] + np.arange(size)], axis=1)
+        return levels
+
+    def cut(self, n: int) -> list[Floats]:
+        """Cut the values into n batches of about as many whole rows."""
+        if self.sizes is None:
+            return np.array_split(self.values, n)
+        ends = [int(batch[-1]) for batch in np.array_split(np.cumsum(self.sizes), n)]
+        return np.split(self.values, ends[:-1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Blocks:
+    """The values of a cell in one launch, and the block of each, in ascending order."""
+
+    values: Floats
+    block: NDArray[np.int64]
+
+    @classmethod
+    def by_launch(cls, values: Floats, launch: NDArray[np.int64], block: NDArray[np.int64]) -> dict[int, Blocks]:
+        """Sort values by launch and block; those of a block keep their order."""
+        order = np.argsort(block, kind="stable")
+        values, launch, block = values[order], launch[order], block[order]
+        return {int(each): cls(values[launch == each], block[launch == each]) for each in np.unique(launch)}
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def shared(self, other: Blocks) -> Blocks:
+        """Return the values of the blocks that ``other`` has too."""
+        both = np.isin(self.block, other.block)
+        return Blocks(self.values[both], self.block[both])
+
+    @property
+    def rows(self) -> Rows:
+        """Return a row a block."""
+        return Rows(self.values, np.unique(self.block, return_counts=True)[1])
+
+
 @final
 class LaunchValues:
     """The values of one launch in up to `BATCHES` batches of rows, none empty; percentiles are found by sorted rank."""
 
     def __init__(self, rows: Rows) -> None:
         self.n_rows = len(rows)
-        self.batches = [
-            np.concatenate([rows[row] for row in batch])
-            for batch in np.array_split(np.arange(len(rows)), min(BATCHES, len(rows)))
-        ]
-        values = np.concatenate(self.batches)
-        order = np.argsort(values, kind="stable")
-        owners = np.repeat(np.arange(len(self.batches)), [len(batch) for batch in self.batches])[order]
-        self.values: Floats = values[order]
-        self.counts = np.cumsum(owners[:, None] == np.arange(len(self.batches)), axis=0)
-        self.levels = np.array([row[0] if len(row) == 1 else np.median(row) for row in rows])
+        self.levels = rows.levels
+        self.batches = rows.cut(min(BATCHES, len(rows)))
+        self.ordered = [np.sort(batch) for batch in self.batches]
+        self.values: Floats = np.sort(rows.values)
 
     def allows(self, statistic: str) -> bool:
         quantile = STATISTICS[statistic] or 0.0
@@ -67,23 +123,37 @@ class LaunchValues:
 
     def replicate(self, name: str, drawn: NDArray[np.int64]) -> Floats:
         quantile = STATISTICS[name]
-        sizes = drawn @ self.counts[-1]
+        sizes = drawn @ np.array([len(batch) for batch in self.batches])
         if quantile is None:
             sums = np.array([batch.sum() for batch in self.batches])
             return np.asarray(drawn @ sums / sizes)
-        place = quantile * (sizes - 1)
-        low = self._ranked(drawn, np.floor(place))
-        return np.asarray(low + (place % 1) * (self._ranked(drawn, np.ceil(place)) - low))
+        window, counts = self._window(quantile)
 
-    def _ranked(self, drawn: NDArray[np.int64], ranks: Floats) -> Floats:
-        """Return the value of a rank, from 0, in every resample, by bisection of the sorted values."""
-        low = np.zeros(len(drawn), dtype=np.int64)
-        high = np.full(len(drawn), len(self.values) - 1)
-        while (low < high).any():
-            middle = (low + high) // 2
-            reached = (self.counts[middle] * drawn).sum(axis=1) > ranks
-            low, high = np.where(reached, low, middle + 1), np.where(reached, middle, high)
-        return self.values[low]
+        def ranked(ranks: Floats) -> Floats:
+            """Return the value of a rank, from 0, in every resample, by bisection."""
+            low, high = np.zeros(len(drawn), dtype=np.int64), np.full(len(drawn), len(window) - 1)
+            while (low < high).any():
+                middle = (low + high) // 2
+                reached = (counts[middle] * drawn).sum(axis=1) > ranks
+                low, high = np.where(reached, low, middle + 1), np.where(reached, middle, high)
+            return window[low]
+
+        place = quantile * (sizes - 1)
+        low = ranked(np.floor(place))
+        return np.asarray(low + (place % 1) * (ranked(np.ceil(place)) - low))
+
+    def _window(self, quantile: float) -> tuple[Floats, NDArray[np.int32]]:
+        """Return the sorted values that may be a resample's quantile, and how many of each batch are up to each.
+
+        A quantile of several batches together lies between the least and the greatest of their own.
+        """
+        places = [(batch, quantile * (len(batch) - 1)) for batch in self.ordered]
+        least = min(batch[math.floor(place)] for batch, place in places)
+        greatest = max(batch[math.ceil(place)] for batch, place in places)
+        first, end = np.searchsorted(self.values, least), np.searchsorted(self.values, greatest, "right")
+        window = self.values[first:end]
+        counts = [np.searchsorted(batch, window, "right").astype(np.int32) for batch in self.ordered]
+        return window, np.stack(counts, axis=1)
 
 
 def lag_one(values: Floats) -> float:

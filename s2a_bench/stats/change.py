@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench.stats import Floats, Ratio
-from s2a_bench.stats.batches import FEWEST_ROWS, LaunchValues, RowCorrelation, Rows
+from s2a_bench.stats.batches import FEWEST_ROWS, Blocks, LaunchValues, RowCorrelation, Rows
 
 Middle: TypeAlias = Literal["median", "mean"]
-
-Blocks: TypeAlias = Mapping[int, Sequence[float]]
-"""The values of a cell in one launch, by block."""
 
 _Launch = TypeVar("_Launch")
 
@@ -144,9 +142,9 @@ def change_of_ranks(baseline: Rows, other: Rows, *, seed: int) -> Change:
     """Compare the ranks of two launches' values: the rank test of Wilcoxon, with the batches of `change_between`."""
     from scipy import stats
 
-    values = np.concatenate([*baseline, *other])
-    ranks = np.split(stats.rankdata(values), np.cumsum([len(row) for row in (*baseline, *other)])[:-1])
-    return change_between([ranks[: len(baseline)]], [ranks[len(baseline) :]], "mean", seed=seed)
+    ranks = stats.rankdata(np.concatenate([baseline.values, other.values]))
+    below, above = np.split(ranks, [len(baseline.values)])
+    return change_between([Rows(below, baseline.sizes)], [Rows(above, other.sizes)], "mean", seed=seed)
 
 
 def ratio_of_launches(
@@ -163,9 +161,7 @@ def ratio_of_launches(
     if len(both) <= 1:
         return ratio_of_blocks(above[both[0]], below[both[0]], seed, statistic) if both else None
     middle = np.median if statistic == "median" else np.mean
-    middles = np.array(
-        [[middle(np.concatenate([*cell[launch].values()])) for launch in both] for cell in (above, below)]
-    )
+    middles = np.array([[middle(cell[launch].values) for launch in both] for cell in (above, below)])
     n = len(both)
     if not (middles > 0).all():
         over = float(middles[1].mean())
@@ -177,14 +173,14 @@ def ratio_of_launches(
 
 
 def ratio_of_blocks(above: Blocks, below: Blocks, seed: int, statistic: Middle = "median") -> Ratio | None:
-    """Divide the medians (or means) of two cells of one launch, given by block; paired if both have the same blocks.
+    """Divide the medians (or means) of two cells of one launch; paired if both have the same blocks.
 
     None if a cell has no values.
     """
     if not above or not below:
         return None
-    rows = [[np.asarray(cell[block], dtype=np.float64) for block in sorted(cell)] for cell in (below, above)]
-    return change_between(rows[:1], rows[1:], statistic, seed=seed, paired=above.keys() == below.keys()).ratio
+    paired = np.array_equal(np.unique(above.block), np.unique(below.block))
+    return change_between([below.rows], [above.rows], statistic, seed=seed, paired=paired).ratio
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -198,7 +194,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
     return corrected
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class _Side:
     """A statistic of one side: of each launch; of every resample, and of every row, if there is only one launch."""
 
@@ -241,7 +237,11 @@ class _Side:
 
     @property
     def dependent(self) -> bool:
-        return len(self.points) == 1 and RowCorrelation.of(self.levels).dependent
+        return len(self.points) == 1 and self.memory.dependent
+
+    @cached_property
+    def memory(self) -> RowCorrelation:
+        return RowCorrelation.of(self.levels)
 
     @property
     def variance(self) -> tuple[float, int] | None:
@@ -252,11 +252,10 @@ class _Side:
         if self.copies is None:
             return None
         # Drawing k batches with replacement shows (k - 1) / k of the variance.
-        memory = RowCorrelation.of(self.levels)
-        k = memory.k
+        k = self.memory.k
         # Equal values have no variance, despite rounding.
         varies = self.copies.max() > self.copies.min()
-        return (float(self.copies.var()) * k / (k - 1) * memory.hidden if varies else 0.0), k - 1
+        return (float(self.copies.var()) * k / (k - 1) * self.memory.hidden if varies else 0.0), k - 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,7 +283,7 @@ class _Test:
         sides = [above.less(below)] if paired else [below, above]
         dependent = any(side.dependent for side in sides)
         shift = above.mean - below.mean
-        known = [side.variance for side in sides if side.variance is not None]
+        known = [variance for side in sides if (variance := side.variance) is not None]
         if len(known) < len(sides):
             return cls(shift, None, None, None, dependent)
         total = sum(variance for variance, _ in known)
@@ -301,18 +300,27 @@ def _superiority(
     sides: Sequence[Sequence[LaunchValues]], draws: Sequence[NDArray[np.int64] | None], confidence: float
 ) -> Ratio:
     """Return P(other > baseline) + P(equal) / 2, with a percentile interval over the batches of two single launches."""
-    below, above = ([batch for launch in side for batch in launch.batches] for side in sides)
-    wins = np.array([[_wins(one, np.sort(two)) for two in below] for one in above])
-    pairs = np.outer([len(one) for one in above], [len(two) for two in below])
-    value = float(wins.sum() / pairs.sum())
+    below, above = (np.sort(np.concatenate([launch.values for launch in side])) for side in sides)
+    value = float(_wins([above], [below])[0, 0]) / (len(above) * len(below))
     first, second = draws
     if first is None or second is None or any(side[0].n_rows < FEWEST_ROWS for side in sides):
         return Ratio(value, None, None)
-    found = ((second @ wins) * first).sum(axis=1) / ((second @ pairs) * first).sum(axis=1)
+    one, two = (side[0].ordered for side in sides)
+    wins = _wins(two, one)
+    pairs = np.outer([len(batch) for batch in two], [len(batch) for batch in one])
+    resampled = ((second @ wins) * first).sum(axis=1) / ((second @ pairs) * first).sum(axis=1)
     tail = (1 - confidence) / 2
-    low, high = np.quantile(found, (tail, 1 - tail))
+    low, high = np.quantile(resampled, (tail, 1 - tail))
     return Ratio(value, float(low), float(high))
 
 
-def _wins(values: Floats, ordered: Floats) -> float:
-    return float(sum(np.searchsorted(ordered, values, side).sum() for side in ("left", "right"))) / 2
+def _wins(above: Sequence[Floats], below: Sequence[Floats]) -> Floats:
+    """Count, for each pair of sorted batches, the pairs of values of which the one above is larger, ties half."""
+    every = np.sort(np.concatenate(below))
+    places = [[np.searchsorted(every, batch, side) for side in ("left", "right")] for batch in above]
+    wins = np.empty((len(above), len(below)))
+    for column, batch in enumerate(below):
+        # Element n is how many of the n smallest of all values below are of this batch.
+        smaller = np.cumsum(np.bincount(np.searchsorted(every, batch) + 1, minlength=len(every) + 1))
+        wins[:, column] = [sum(smaller[place].sum() for place in pair) / 2 for pair in places]
+    return wins

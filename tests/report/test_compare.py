@@ -36,7 +36,7 @@ from s2a_bench.report.compare.shown import (
     percent,
     write_comparison,
 )
-from s2a_bench.stats.batches import STATISTICS
+from s2a_bench.stats.batches import STATISTICS, Rows
 from s2a_bench.stats.change import Noise, change_between
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
@@ -422,7 +422,7 @@ def test_a_drift_is_no_change_where_the_sides_take_turns(launch: Launch) -> None
             drift, text = np.cumsum(rng.standard_normal(20)), order()
             values = np.exp(0.08 * (rng.standard_normal(20) + (drift - drift.mean()) / 1.8))
             first, second = (
-                [[one] for one, of in zip(values[:, None], text, strict=True) if of == side] for side in "AB"
+                [Rows(one) for one, of in zip(values[:, None], text, strict=True) if of == side] for side in "AB"
             )
             alarms += (change_between(first, second, "median", seed=0).p or 1) < 0.05
         return alarms / 300

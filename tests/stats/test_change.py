@@ -22,7 +22,7 @@ REPEATS = 100
 
 
 def rows_of(values: object) -> Rows:
-    return list(np.asarray(values, dtype=np.float64)[:, None])
+    return Rows(np.asarray(values, dtype=np.float64))
 
 
 def launch(rng: np.random.Generator, n: int, correlation: float, spread: float = 0.15, trend: float = 0.0) -> Floats:
@@ -164,7 +164,7 @@ def test_the_interval_of_superiority_is_that_of_resampled_batches_written_out() 
 def test_a_resample_has_the_statistic_of_its_values_written_out(
     rows: list[list[float]], statistic: str, seed: int
 ) -> None:
-    cut = LaunchValues([np.array(row) for row in rows])
+    cut = LaunchValues(Rows.of([np.array(row) for row in rows]))
     assert cut.levels.tolist() == [np.median(row) for row in rows]
     drawn = cut.draw(np.random.default_rng(seed))[:20]
     quick = cut.replicate(statistic, drawn)

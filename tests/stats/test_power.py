@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from benchmarks.ratio_coverage import power
+from s2a_bench.stats.batches import Rows
 from s2a_bench.stats.change import Noise, change_between
 
 
@@ -47,9 +48,9 @@ def test_power_is_that_of_a_share_where_there_is_no_logarithm() -> None:
 
 def test_the_noise_of_a_change_is_that_of_its_test() -> None:
     rng = np.random.default_rng(2)
-    sides = [[list(rng.lognormal(0, 0.1, (20, 1))) for _ in range(5)] for _ in range(2)]
+    sides = [[Rows(rng.lognormal(0, 0.1, 20)) for _ in range(5)] for _ in range(2)]
     change = change_between(*sides, "median", seed=0)
     reach = float(stats.t.ppf(0.975, change.noise.freedom)) * change.noise.error
     assert math.log(change.ratio.value / change.ratio.low) == pytest.approx(reach)
-    few = [[list(rng.lognormal(0, 0.1, (3, 1)))] for _ in range(2)]
+    few = [[Rows(rng.lognormal(0, 0.1, 3))] for _ in range(2)]
     assert change_between(*few, "median", seed=0).noise is None

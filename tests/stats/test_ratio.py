@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TypeAlias
 
@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from s2a_bench.stats import Ratio
+from s2a_bench.stats.batches import Blocks
 from s2a_bench.stats.change import ratio_of_blocks, ratio_of_launches
 
 Floats: TypeAlias = NDArray[np.float64]
 
 
-def blocks_of(values: Sequence[float] | Floats) -> Mapping[int, list[float]]:
-    return {block: [float(value)] for block, value in enumerate(values)}
+def blocks_of(values: Sequence[float] | Floats) -> Blocks:
+    return Blocks(np.asarray(values, dtype=np.float64), np.arange(len(values)))
 
 
 def ratio(above: Sequence[float] | Floats, below: Sequence[float] | Floats, seed: int = 1) -> Ratio:
@@ -78,7 +79,8 @@ def test_samples_of_one_block_stay_together() -> None:
     # Values do not differ inside of blocks: ten samples a block add no certainty.
     levels = [1.0, 3.0, 2.0, 1.5, 2.5, 1.2] * 4
     single = ratio(levels, np.ones(24))
-    many = ratio_of_blocks({block: [value] * 10 for block, value in enumerate(levels)}, blocks_of(np.ones(24)), 1)
+    tenfold = Blocks(np.repeat(levels, 10), np.repeat(np.arange(24), 10))
+    many = ratio_of_blocks(tenfold, blocks_of(np.ones(24)), 1)
     assert width(many) == pytest.approx(width(single), rel=0.1)
 
 
@@ -102,15 +104,13 @@ def test_what_allows_no_interval_has_none_and_is_strict_json(
 
 
 def test_a_cell_without_values_has_no_ratio() -> None:
-    assert ratio_of_blocks({}, blocks_of([1.0]), 0) is None
-    assert ratio_of_blocks(blocks_of([1.0]), {}, 0) is None
+    assert ratio_of_blocks(blocks_of([]), blocks_of([1.0]), 0) is None
+    assert ratio_of_blocks(blocks_of([1.0]), blocks_of([]), 0) is None
 
 
-def launches(
-    rng: np.random.Generator, n: int, spread: float, runs: int = 15
-) -> list[dict[int, Mapping[int, list[float]]]]:
+def launches(rng: np.random.Generator, n: int, spread: float, runs: int = 15) -> list[dict[int, Blocks]]:
     """Draw two cells whose ratio, 6, differs from launch to launch by ``spread``."""
-    cells: list[dict[int, Mapping[int, list[float]]]] = [{}, {}]
+    cells: list[dict[int, Blocks]] = [{}, {}]
     for launch in range(n):
         load = remembering(rng, runs, 0.4)
         shift = spread * rng.standard_normal()

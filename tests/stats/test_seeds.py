@@ -15,6 +15,7 @@ from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
 from s2a_bench.policy import PlanShape, Timing
+from s2a_bench.stats.batches import Rows
 from s2a_bench.stats.change import change_between
 from s2a_bench.stats.seeds import generator
 from s2a_bench.sweep.file import rounds
@@ -63,6 +64,6 @@ def test_an_engine_that_replays_says_the_same_for_a_seed() -> None:
 
 
 def test_intervals_are_the_same_each_time() -> None:
-    rows = [np.array([value]) for value in np.random.default_rng(0).normal(1, 0.1, 60)]
-    ratio = change_between([rows], [[row * 1.1 for row in rows[::-1]]], "median", seed=0).ratio
+    values = np.random.default_rng(0).normal(1, 0.1, 60)
+    ratio = change_between([Rows(values)], [Rows(values[::-1] * 1.1)], "median", seed=0).ratio
     assert (ratio.low, ratio.high) == pytest.approx((1.0398277347860516, 1.1636542857254737))

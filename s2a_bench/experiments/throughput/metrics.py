@@ -109,7 +109,7 @@ class ThroughputCells(RequestCells):
     @property
     def reference_values(self) -> Floats:
         """llama-bench's tokens/s in the order of the blocks."""
-        return np.concatenate([np.empty(0), *(blocks.values for blocks in self.reference.values())])
+        return np.array([rate for blocks in self.reference.values() for rate in blocks.values.tolist()])
 
     @property
     def reference_depths(self) -> list[int]:

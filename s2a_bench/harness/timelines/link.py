@@ -25,6 +25,7 @@ from s2a_bench.policy import Floats, PlanShape, Timing
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.progress import Progress
 from s2a_bench.provenance import Origins
+from s2a_bench.stats.batches import Rows
 from s2a_bench.store.manifest import RunWarning
 
 TOKENS_A_SKILL: Final = 16
@@ -149,7 +150,7 @@ class ModelLink:
             measured = self.request(self.first, 0, None)
             arrivals_ns.append([token.client_ns for token in measured.tokens])
             progress.advance()
-        self.learned_ms += filter(np.size, (np.diff(times) / 1e6 for times in arrivals_ns))
+        self.learned_ms += [np.diff(times) / 1e6 for times in arrivals_ns]
         prior = prior_of(arrivals_ns, self.rate)
         if prior is not None:
             self.rate = self.rate or 1 / prior.mean_s
@@ -201,6 +202,5 @@ class ModelLink:
     def compare(self) -> None:
         """Warn if the plans' tokens came at other gaps than those of the warm-ups."""
         advice = "policies learned from the warm-ups: take more, --warmup, or follow the change, --track"
-        self.launch.warnings.extend(
-            change_warnings(self.cell.name, self.learned_ms, self.seen_ms, "ms a token", advice)
-        )
+        learned, seen = Rows.of(self.learned_ms), Rows.of(self.seen_ms)
+        self.launch.warnings.extend(change_warnings(self.cell.name, learned, seen, "ms a token", advice))

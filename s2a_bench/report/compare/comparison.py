@@ -10,10 +10,10 @@ from typing import Final
 
 from s2a_bench.errors import UnlikeRuns, UsageError
 from s2a_bench.experiments import EXPERIMENTS, experiment_of
-from s2a_bench.experiments.cells import Comparable, Metric, Rows, Subject, by_name
+from s2a_bench.experiments.cells import Comparable, Metric, Subject, by_name
 from s2a_bench.provenance import Origins, joined
 from s2a_bench.report.compare.agreement import Difference, as_line, differences
-from s2a_bench.stats.batches import STATISTICS
+from s2a_bench.stats.batches import STATISTICS, Rows
 from s2a_bench.stats.change import Change, change_between, holm
 from s2a_bench.store.manifest import RunWarning
 from s2a_bench.store.run import StoredRun, fits, read_run

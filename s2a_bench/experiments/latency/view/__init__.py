@@ -121,8 +121,9 @@ def stage_table(cells: RequestCells, *, full: bool = True) -> TextTable:
             rows.append(("" if group == last else group, stage, *(_entry(cell, stage, full=full) for cell in cells)))
             last = group
     below = len(rows)
-    for metric in _foot(cells):
-        rows.append(("", metric.replace("_", " "), *(_entry(cell, metric, full=full) for cell in cells)))
+    rows += [
+        ("", metric.replace("_", " "), *(_entry(cell, metric, full=full) for cell in cells)) for metric in _foot(cells)
+    ]
     title = "Stages in ms: median (mean ± sd)" if full else "Stages in ms: medians"
     header = ("group", "stage", *cells.titles)
     brief = None
@@ -172,8 +173,7 @@ def summary_table(cells: RequestCells, metric: str = "e2e_without_inference") ->
     for cell in cells:
         texts = []
         for each in bases.values():
-            base = next((base for base in each if cell.is_compared_with(base)), None)
-            ratio = ratios.get((cell.name, base.name)) if base else None
+            ratio = next((ratios.get((cell.name, base.name)) for base in each if cell.is_compared_with(base)), None)
             over += [ratio] if ratio else []
             texts.append("1" if cell in each else interval(ratio))
         limits = (entries(cell.values(each), "median")[0] for each in bounds)

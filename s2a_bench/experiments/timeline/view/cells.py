@@ -11,6 +11,7 @@ import pandas as pd
 
 from s2a_bench.experiments.cells import TIME, Comparable, Subject, columns_of
 from s2a_bench.experiments.timeline.rows import METRICS, TIMELINES, TimelineRow
+from s2a_bench.stats.batches import Rows
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import SKILLS, TOKENS
 from s2a_bench.store.schema import Many, NonNegative, Positive, about, with_fields
@@ -208,7 +209,7 @@ def _subjects(run: StoredRun) -> list[Subject]:
             {name: str(cell.about(name)) for name in ("policy", "board", *_SETTING)},
             cell.n,
             0,
-            lambda metric, cell=cell: list(cell.values(metric)[:, None]),  # type: ignore[misc]
+            lambda metric, cell=cell: Rows(cell.values(metric)),  # type: ignore[misc]
             exact=even and cell.about("mode") == "virtual",
         )
         for cell in timelines_of(run)

@@ -13,6 +13,7 @@ from s2a_bench.experiments import Shown
 from s2a_bench.experiments.cells import SHARE, TIME, Comparable, Metric, Subject, mean, plain_rows
 from s2a_bench.plugins.chunks.capacity.metrics import METRICS
 from s2a_bench.plugins.chunks.capacity.rows import FLEETS, KNEES, ROBOTS, TWIN, FleetRow
+from s2a_bench.stats.batches import Rows
 from s2a_bench.store.manifest import present
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import new_figure
@@ -210,7 +211,7 @@ def _subjects(run: StoredRun) -> list[Subject]:
             settings,
             1,
             0,
-            lambda name, robots=knee["robots"]: [np.array([float(robots)])] if name == KNEE.name else [],  # type: ignore[misc]
+            lambda name, robots=knee["robots"]: Rows(np.array([float(robots)] if name == KNEE.name else [])),  # type: ignore[misc]
             exact=knee["source"] == PREDICTED,
         )
         for knee in plain_rows(run, KNEES)
@@ -220,12 +221,12 @@ def _subjects(run: StoredRun) -> list[Subject]:
     drawn = [each in clean for each in zip(robots["cell"], robots["robots"], strict=True)]
     measured = robots[np.array(drawn, bool)]
 
-    def values(table: Any, name: str) -> list[np.ndarray]:
+    def values(table: Any, name: str) -> Rows:
         if name not in METRICS:
-            return []
+            return Rows.of([])
         metric = METRICS[name]
         found = table[metric.column].dropna().to_numpy(dtype="float64")
-        return list((found / 1e9 if metric.kind == TIME else found)[:, None])
+        return Rows(found / 1e9 if metric.kind == TIME else found)
 
     return knees + [
         Subject(f"{cell}, {number} robots", settings, len(table), 0, partial(values, table))

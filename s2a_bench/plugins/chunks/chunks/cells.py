@@ -23,6 +23,7 @@ from s2a_bench.plugins.chunks.modes.trigger import (
     trigger,
 )
 from s2a_bench.policy.parameters import canonical
+from s2a_bench.stats.batches import Rows
 from s2a_bench.stats.seeds import generator
 
 if TYPE_CHECKING:
@@ -116,7 +117,7 @@ def cells(control: ControlPlan, rules: RulesPlan, drawn: LatencyDraw) -> Iterato
 
 def changes(setting: ControlSetting, name: str, drawn: LatencyDraw) -> list[RunWarning]:
     """Return whether the delays of judged latencies, in ticks, differ from those that a rule learned from."""
-    learned, seen = (list(setting.delay_ticks(each).astype(float)[:, None]) for each in (drawn.learnt, drawn.judged))
+    learned, seen = (Rows(setting.delay_ticks(each).astype(float)) for each in (drawn.learnt, drawn.judged))
     return change_warnings(name, learned, seen, "control ticks", f"calibrate anew, or {FOLLOW}")
 
 

@@ -234,11 +234,10 @@ def shares(
 
 def _spent(cell: RequestCell, stages: Sequence[str]) -> Floats:
     """Return the sum of stages in ms, for each sample that has the metric."""
-    there = ~np.isnan(cell.column(_METRIC))
-    return (
-        np.sum([np.zeros(cell.n), *(np.nan_to_num(cell.column(f"{stage}_ns")) for stage in stages)], axis=0)[there]
-        / 1e6
-    )
+    spent_ns = np.zeros(cell.n)
+    for stage in stages:
+        spent_ns += np.nan_to_num(cell.column(f"{stage}_ns"))
+    return spent_ns[~np.isnan(cell.column(_METRIC))] / 1e6
 
 
 def _bytes(cell: RequestCell) -> float:
@@ -253,16 +252,10 @@ def _metric(pair: Sequence[RequestCell]) -> str:
 def _blocks(pair: Sequence[RequestCell]) -> tuple[Mapping[int, Blocks], Mapping[int, Blocks]]:
     """Return the values of both sides by launch, of the blocks that both have."""
     http, ros = (cell.by_launch(_metric(pair)) for cell in pair)
-    both = http.keys() & ros.keys()
-    return (
-        {launch: _within(http[launch], ros[launch]) for launch in both},
-        {launch: _within(ros[launch], http[launch]) for launch in both},
-    )
-
-
-def _within(side: Blocks, other: Blocks) -> Blocks:
-    common = np.isin(side.block, other.block)
-    return Blocks(side.values[common], side.block[common])
+    both = [(launch, http[launch], ros[launch]) for launch in http if launch in ros]
+    return {launch: one.shared(other) for launch, one, other in both}, {
+        launch: other.shared(one) for launch, one, other in both
+    }
 
 
 def speeds(run: StoredRun) -> Iterator[RunPart]:
