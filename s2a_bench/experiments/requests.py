@@ -267,7 +267,7 @@ class RequestCell:
 
 
 def _declared(metric: RequestMetric | str) -> RequestMetric:
-    return metric if isinstance(metric, RequestMetric) else OF_ANSWERS.get(metric) or RequestMetric(metric)
+    return metric if isinstance(metric, RequestMetric) else OF_ANSWERS.get(metric) or RequestMetric(name=metric)
 
 
 def _some(values: Floats) -> Floats:
