@@ -1,10 +1,11 @@
-"""The requests of a run as arrays: samples, facts and tokens, each column read once. NaN is a missing number."""
+"""The requests of a run as arrays: samples, facts and tokens, each column read when it is needed; NaN is missing."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, TypeAlias
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,7 @@ from s2a_bench.facts import (
 from s2a_bench.machine.resources import ENERGY_J
 from s2a_bench.stats import Floats
 from s2a_bench.store.requests import TOKENS, samples_table
-from s2a_bench.store.schema import PROVENANCE
-from s2a_bench.transport.surroundings import shown
+from s2a_bench.transport.surroundings import SURROUNDINGS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
 Places: TypeAlias = NDArray[np.int64]
 """Rows of requests in the samples of their run, or of tokens among its tokens."""
 NS_PER_MS: Final = 1e6
+ABOUT: Final = ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")
+"""Columns of the samples that a cell has one value of."""
 _OF_METRICS: Final = (
     *(END_N, FIRST_DECODE_MS, PREDICTED_MS, PREDICTED_N, PREDICTED_STEPS, PREPROCESS_MS),
     *(PROMPT_EVAL_MS, PROMPT_MS, PROMPT_N, VISION_ENCODE_MS, ENERGY_J),
 )
-_TEXTS: Final = ("marks", "facts", PROVENANCE)
-"""Long texts: no number is read from the first and the last, facts are read on their own."""
 
 
 class RequestColumns:
@@ -49,52 +49,82 @@ class RequestColumns:
     def __init__(self, run: StoredRun) -> None:
         self._run = run
         self._table = samples_table(run.stages)
-        samples = run.table(self._table, [name for name in self._table.columns if name not in _TEXTS])
-        for with_columns in shown("columns"):
-            samples = with_columns(run, samples)
-        self._samples = samples
         self._numbers: dict[str, Floats] = {}
 
+    @cached_property
     def cells(self) -> dict[str, Places]:
-        """Return the requests of each cell."""
-        cells = self._samples["cell"].cat
+        """The requests of each cell."""
+        cells = self._read("cell").cat
         codes = cells.codes.to_numpy()
         places = {str(name): np.flatnonzero(codes == code) for code, name in enumerate(cells.categories)}
         return {name: of_cell for name, of_cell in places.items() if of_cell.size}
 
-    def numbers(self, name: str) -> Floats:
-        """Return a column; one of times is named without ``_ns``, with or without ``_ms``, and is in ms."""
-        if name not in self._numbers:
-            in_ns = f"{name.removesuffix('_ms')}_ns"
-            if name in self._samples:
-                self._numbers[name] = _floats(self._samples[name])
-            elif in_ns in self._samples:
-                self._numbers[name] = _floats(self._samples[in_ns]) / NS_PER_MS
-            else:
-                self._numbers[name] = np.full(len(self._samples), np.nan)
-        return self._numbers[name]
-
-    def integers(self, name: str) -> NDArray[np.int64]:
-        """Return a column that every request has."""
-        return self._samples[name].to_numpy(dtype="int64")
-
-    def text(self, name: str, request: int) -> str:
-        return str(self._samples[name].iloc[request])
-
-    def texts(self, name: str, requests: Places) -> NDArray[np.str_]:
-        return self._samples[name].iloc[requests].to_numpy(dtype="str")
+    @cached_property
+    def counts(self) -> NDArray[np.bool_]:
+        """Whether each request counts: no warm-up, no failure."""
+        return ~(self.warmup | self.failed)
 
     @cached_property
     def warmup(self) -> NDArray[np.bool_]:
-        return self._samples["warmup"].to_numpy(dtype="bool")
+        return self._read("warmup").to_numpy(dtype="bool")
 
     @cached_property
     def failed(self) -> NDArray[np.bool_]:
-        return (self._samples["error"] != "").to_numpy(dtype="bool")
+        return (self._read("error") != "").to_numpy(dtype="bool")
+
+    @cached_property
+    def launch(self) -> NDArray[np.int64]:
+        return self._read("launch").to_numpy(dtype="int64")
+
+    @cached_property
+    def block(self) -> NDArray[np.int64]:
+        return self._read("block").to_numpy(dtype="int64")
+
+    @cached_property
+    def ids(self) -> pd.Series[str]:
+        return self._read("request_id")
+
+    @cached_property
+    def about(self) -> pd.DataFrame:
+        """The columns that a cell has one value of."""
+        return self._run.table(self._table, ABOUT)
+
+    def numbers(self, name: str) -> Floats:
+        """Return a column; one of times is named without ``_ns``, with or without ``_ms``, and is in ms."""
+        if name not in self._numbers:
+            self._numbers[name] = self._missing
+            for column, unit in ((f"{name.removesuffix('_ms')}_ns", NS_PER_MS), (name, 1)):
+                if column in self._table.columns or column in self._added:
+                    values = self._added.get(column)
+                    numbers = _floats(self._read(column) if values is None else values)
+                    self._numbers[name] = self._missing if np.isnan(numbers).all() else numbers / unit
+        return self._numbers[name]
 
     def fact(self, name: str) -> Floats:
         """Return a fact; NaN where a request lacks it."""
-        return self._facts.get(name, np.full(len(self._samples), np.nan))
+        return self._facts.get(name, self._missing)
+
+    @cached_property
+    def answers(self) -> Answers:
+        return Answers.of(self._run, self.ids, bounded=not np.isnan(self.numbers("clock_error")).all())
+
+    def _read(self, name: str) -> pd.Series[Any]:
+        return self._run.table(self._table, [name])[name]
+
+    @cached_property
+    def _missing(self) -> Floats:
+        return np.full(len(self.warmup), np.nan)
+
+    @cached_property
+    def _added(self) -> dict[str, pd.Series[Any]]:
+        """The columns that surroundings add."""
+        added: dict[str, pd.Series[Any]] = {}
+        for _, kind in SURROUNDINGS.loaded():
+            if kind.columns:
+                samples = self._run.table(self._table, kind.reads or [*self._table.columns])
+                more = resolve_name(kind.columns)(self._run, samples)
+                added |= {name: more[name] for name in more if name not in samples}
+        return added
 
     @cached_property
     def _facts(self) -> dict[str, Floats]:
@@ -102,23 +132,17 @@ class RequestColumns:
         import pyarrow as pa
         from pyarrow import compute, json
 
-        texts = self._run.table(self._table, ["facts"])["facts"].cat
+        texts = self._read("facts").cat
         if texts.categories.empty:
             return {}
-        names = {*_OF_METRICS, *self._run.facts}
         nothing, line_feed = (pa.scalar(text, pa.large_string()) for text in ("", "\n"))
         lines = compute.binary_join_element_wise(pa.array(texts.categories, pa.large_string()), nothing, line_feed)
+        names = {*_OF_METRICS, *self._run.facts}
         schema = pa.schema([(name, pa.float64()) for name in names])
         options = json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore")
         parsed = json.read_json(pa.BufferReader(lines.buffers()[2]), parse_options=options)
-        return {name: parsed[name].to_numpy()[texts.codes] for name in names}
-
-    @cached_property
-    def answers(self) -> Answers:
-        """The tokens; the ends of what crosses two clocks are read where a request has some."""
-        ends = [] if np.isnan(self.numbers("clock_error")).all() else ["engine_lo_ns", "engine_hi_ns"]
-        tokens = self._run.table(TOKENS, ["request_id", "index", "client_ns", "engine_ns", *ends])
-        return Answers.of(tokens, _requests_of(tokens["request_id"], self._samples["request_id"]), len(self._samples))
+        there = [name for name in names if parsed[name].null_count < len(parsed)]
+        return {name: parsed[name].to_numpy()[texts.codes] for name in there}
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,35 +155,47 @@ class Answers:
     """The tokens of each request as they arrived, which may be several at once."""
     spans_ns: NDArray[np.int64]
     """From the first to the last token of each request, as the client saw them."""
-    index: NDArray[np.int64]
+    index: NDArray[np.int32]
     """The place of each token in its answer."""
     times_ns: dict[str, Floats]
     """Of each token: its ``gap`` to the previous one, which the first lacks, and its ``delay``, or that one's ends."""
 
     @classmethod
-    def of(cls, tokens: pd.DataFrame, requests: Places, n_requests: int) -> Answers:
-        """Put tokens in order; ``requests`` are those that they belong to, -1 for none."""
-        index = tokens["index"].to_numpy(dtype="int64")
-        first = np.diff(requests, prepend=-2) != 0
-        belongs = requests[first] >= 0
-        if (np.diff(index, prepend=0) < 0)[~first].any() or np.bincount(requests[first][belongs]).max(initial=0) > 1:
+    def of(cls, run: StoredRun, ids: pd.Series[str], *, bounded: bool) -> Answers:
+        """Read the tokens of the requests with these ids; ``bounded``: the engine's times may have ends."""
+
+        def read(name: str) -> pd.Series[Any]:
+            column = run.table(TOKENS, [name])[name]
+            return column if order is None else column.iloc[order]
+
+        order: Places | None = None
+        requests = _requests_of(read("request_id"), ids)
+        index = read("index").to_numpy(dtype="int32")
+        if not _in_order(requests, index):
             order = np.lexsort((index, requests))
-            return cls.of(tokens.iloc[order], requests[order], n_requests)
-        begins = np.flatnonzero(first)
-        client_ns = tokens["client_ns"].to_numpy(dtype="int64")
-        starts, counts, spans_ns = np.zeros((3, n_requests), dtype=np.int64)
-        if begins.size:
-            mine = requests[first][belongs]
-            starts[mine] = begins[belongs]
-            counts[mine] = np.diff(begins, append=len(requests))[belongs]
-            spans_ns[mine] = (np.maximum.reduceat(client_ns, begins) - np.minimum.reduceat(client_ns, begins))[belongs]
+            requests, index = requests[order], index[order]
+        client_ns = read("client_ns").to_numpy(dtype="int64")
+        first = np.diff(requests, prepend=-2) != 0
         gaps = np.diff(client_ns, prepend=0).astype(np.float64)
         gaps[first] = np.nan
-        stamps = {"delay": "engine_ns", "delay_lo": "engine_hi_ns", "delay_hi": "engine_lo_ns"}
-        delays = {
-            name: _floats(tokens["client_ns"] - tokens[stamp]) for name, stamp in stamps.items() if stamp in tokens
-        }
-        return cls(starts, counts, spans_ns, index, {"gap": gaps, **delays})
+        times = {"gap": gaps}
+        stamps = {"delay": "engine_ns", **({"delay_lo": "engine_hi_ns", "delay_hi": "engine_lo_ns"} if bounded else {})}
+        for name, stamp in stamps.items():
+            engine = read(stamp)
+            left_ns = engine.to_numpy(dtype="int64", na_value=0)
+            times[name] = np.where(engine.isna(), np.nan, client_ns - left_ns)
+        starts, counts, spans_ns = np.zeros((3, len(ids)), dtype=np.int64)
+        begins = np.flatnonzero(first)
+        if begins.size:
+            mine, belongs = requests[begins], requests[begins] >= 0
+            spans = np.maximum.reduceat(client_ns, begins) - np.minimum.reduceat(client_ns, begins)
+            for column, values in (
+                (starts, begins),
+                (counts, np.diff(begins, append=len(requests))),
+                (spans_ns, spans),
+            ):
+                column[mine[belongs]] = values[belongs]
+        return cls(starts, counts, spans_ns, index, times)
 
     def tokens_of(self, requests: Places) -> Places:
         """Return the tokens of requests, one request after another."""
@@ -173,6 +209,14 @@ def known(values: Floats) -> Floats:
     return values[~np.isnan(values)]
 
 
+def _in_order(requests: Places, index: NDArray[np.int32]) -> bool:
+    """Return True if the tokens of each request are neighbours, by their index; those of none do not matter."""
+    first = np.diff(requests, prepend=-2) != 0
+    mine = requests[first]
+    apart = np.bincount(mine[mine >= 0]).max(initial=0) > 1
+    return not apart and not (np.diff(index, prepend=0) < 0)[~first].any()
+
+
 def _requests_of(ids: pd.Series[str], requests: pd.Series[str]) -> Places:
     """Return the request of each id, -1 for an unknown one; of two with one id it is the last."""
     places = np.full(len(requests.cat.categories) + 1, -1)
@@ -182,5 +226,6 @@ def _requests_of(ids: pd.Series[str], requests: pd.Series[str]) -> Places:
     return of_ids
 
 
-def _floats(column: pd.Series[float]) -> Floats:
-    return column.to_numpy(dtype=np.float64, na_value=np.nan)
+def _floats(column: pd.Series[Any]) -> Floats:
+    numbers: Floats = column.to_numpy(dtype="float64", na_value=np.nan)
+    return numbers

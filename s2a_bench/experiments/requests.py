@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench.experiments.cells import Comparable, Metric, Subject, by_name
-from s2a_bench.experiments.columns import NS_PER_MS, Places, RequestColumns, known
+from s2a_bench.experiments.columns import ABOUT, NS_PER_MS, Places, RequestColumns, known
 from s2a_bench.facts import (
     END_N,
     FIRST_DECODE_MS,
@@ -55,8 +55,6 @@ if TYPE_CHECKING:
 Of: TypeAlias = "Callable[[RequestCell], Floats]"
 RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
 """What cells are compared by: columns of the samples without their unit."""
-ABOUT = ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")
-"""Columns of the samples that a cell has one value of."""
 GROUP: Final = "group."
 """Before the name of a group of stages: the metric of their sum."""
 
@@ -117,13 +115,13 @@ class RequestCell:
 
     @cached_property
     def about(self) -> dict[str, str]:
-        last = self.requests[-1]  # the engine may be unknown before the first answer
-        return {name: self.columns.text(name, last) for name in ABOUT}
+        last = self.columns.about.iloc[self.requests[-1]]  # the engine may be unknown before the first answer
+        return {name: str(last[name]) for name in ABOUT}
 
     @cached_property
     def counted(self) -> Places:
         """The samples that count."""
-        return self.requests[~(self.columns.warmup | self.columns.failed)[self.requests]]
+        return self.requests[self.columns.counts[self.requests]]
 
     @property
     def n(self) -> int:
@@ -206,8 +204,7 @@ class RequestCell:
         """Return the values of a metric of requests by launch."""
         values = self.column(metric)
         there = self.counted[~np.isnan(values)]
-        launch, block = (self.columns.integers(name)[there] for name in ("launch", "block"))
-        return Blocks.by_launch(known(values), launch, block)
+        return Blocks.by_launch(known(values), self.columns.launch[there], self.columns.block[there])
 
     def _numbers(self, name: str, end: str = "") -> Floats:
         """Return a column, or the sums of a group, or one ``end`` of their intervals."""
@@ -233,7 +230,7 @@ class RequestCell:
 
     @property
     def ids(self) -> NDArray[np.str_]:
-        return self.columns.texts("request_id", self.counted)
+        return self.columns.ids.iloc[self.counted].to_numpy(dtype="str")
 
     @cached_property
     def by_id(self) -> Places:
@@ -386,7 +383,7 @@ class RequestCells(Sequence[RequestCell]):
         """Return the cells of each launch, in the order of time."""
         if not self:
             return {}
-        launch = self[0].columns.integers("launch")
+        launch = self[0].columns.launch
         every, first = np.unique(launch, return_index=True)
         return {
             int(number): self.only(
@@ -497,7 +494,7 @@ def cells_of(run: StoredRun) -> RequestCells:
     mixed = any("payload=" in name for name in run.manifest["configuration"].get("transports", ()))
     cells = [
         RequestCell(name, columns, requests, stages, run.origins.of(name), mixed)
-        for name, requests in columns.cells().items()
+        for name, requests in columns.cells.items()
     ]
     return RequestCells(run, tuple(sorted(cells, key=_place)))
 

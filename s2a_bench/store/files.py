@@ -117,13 +117,13 @@ def whole_records(data: bytes) -> bytes:
     return data[:end]
 
 
-def read_csv(path: Path, columns: dict[str, Kind], *, categories: bool = False) -> Any:
+def read_csv(path: Path, columns: dict[str, Kind]) -> Any:
     """Read a CSV as a ``pyarrow.Table``, without its torn end; an absent file is an empty table.
 
-    An absent column is null: schema 1 may gain columns. With ``categories`` texts are of a dictionary type.
+    An absent column is null: schema 1 may gain columns.
     """
     pa, csv, _ = _arrow(path)
-    schema = _schema(pa, columns, categories=categories)
+    schema = _schema(pa, columns)
     data = whole_records(path.read_bytes()) if path.exists() else b""
     if not data:
         return schema.empty_table()
@@ -162,7 +162,10 @@ def write_parquet(path: Path, table: Any) -> None:
 
 
 def read_parquet(path: Path, columns: dict[str, Kind], *, categories: bool = False) -> Any:
-    """Read these columns of a Parquet file as `read_csv` does; raises StoreError for a damaged one."""
+    """Read these columns of a Parquet file as `read_csv` does; raises StoreError for a damaged one.
+
+    With ``categories`` texts are of a dictionary type.
+    """
     pa, _, parquet = _arrow(path)
     schema = _schema(pa, columns, categories=categories)
     texts = [name for name, kind in columns.items() if kind == "string" and categories]
@@ -200,7 +203,7 @@ def to_pandas(table: Any) -> pd.DataFrame:
     return frame
 
 
-def _schema(pa: Any, columns: dict[str, Kind], *, categories: bool) -> Any:
+def _schema(pa: Any, columns: dict[str, Kind], *, categories: bool = False) -> Any:
     text = pa.dictionary(pa.int32(), pa.string()) if categories else pa.string()
     types = {"string": text, "int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_()}
     return pa.schema([(name, types[kind]) for name, kind in columns.items()])

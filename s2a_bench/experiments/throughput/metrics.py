@@ -109,7 +109,7 @@ class ThroughputCells(RequestCells):
     @property
     def reference_values(self) -> Floats:
         """llama-bench's tokens/s in the order of the blocks."""
-        return np.array([rate for blocks in self.reference.values() for rate in blocks.values.tolist()])
+        return np.array([rate for launch in self.reference.values() for rate in launch.values.tolist()])  # noqa: PD011
 
     @property
     def reference_depths(self) -> list[int]:
