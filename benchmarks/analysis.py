@@ -158,7 +158,9 @@ class _Files:
         from pyarrow.csv import CSVWriter, WriteOptions
         from pyarrow.parquet import ParquetWriter
 
-        self._schema = pa.schema([(name, pa.type_for_alias(kind)) for name, kind in table.columns.items()])
+        self._schema = pa.schema(
+            [(name, pa.type_for_alias({"json": "string"}.get(kind, kind))) for name, kind in table.columns.items()]
+        )
         self._writers = [files.enter_context(ParquetWriter(folder / f"{table.name}.parquet", self._schema))]
         if csv:
             file = files.enter_context((folder / f"{table.name}.csv").open("wb"))

@@ -70,7 +70,7 @@ def run_study(config: StudyConfig, output: Path, progress: Progress) -> Path:
         "environment": environment.collect(),
         "seeds": {"study": config.seed},
         "provenance": Origins(Provenance.computed()).to_manifest(),
-        "warnings": [warning.to_manifest() for warning in config.warnings()],
+        "warnings": config.warnings(),
     }
     with RunWriter.create(output, f"study-{config.name}", manifest, (STUDY_CELLS,)) as writer:
         progress.opened(writer.path)

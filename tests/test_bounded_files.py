@@ -51,7 +51,7 @@ def test_values_are_counted_by_the_footer(tmp_path: Path, monkeypatch: pytest.Mo
     path = tmp_path / "samples.parquet"
     parquet.write_table(pa.table({"n": pa.array([0] * 101)}), path)
     monkeypatch.setattr(files, "VALUES", 201)
-    assert files.read_parquet(path, {"n": "int64"}).num_rows == 101
+    assert len(files.read_parquet(path, {"n": "int64"})) == 101
     monkeypatch.setattr(parquet.ParquetFile, "read", lambda *_: pytest.fail("it was read"))
     with pytest.raises(StoreError, match="has 101 rows of 2 columns; at most 201 values are read"):
         files.read_parquet(path, {"n": "int64", "m": "int64"})

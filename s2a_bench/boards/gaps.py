@@ -12,7 +12,7 @@ from dataclasses import fields
 from statistics import fmean
 from typing import TYPE_CHECKING, Annotated, Any, Final, Protocol, TypeAlias
 
-from pydantic import ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass
 
 from s2a_bench.errors import UsageError
@@ -242,10 +242,9 @@ def read_family(written: str, field: str) -> dict[str, str | int | float]:
 
 def to_table(gaps: Gaps) -> dict[str, Any]:
     """Return the table that `from_table` reads, which has no mean."""
-    family: Any = type(gaps)
-    name = next(name for name, each in FAMILIES.items() if each is family)
-    values = {field.name: getattr(gaps, field.name) for field in fields(family) if field.name != "mean_s"}
-    return {"family": name} | {key: list(each) if isinstance(each, tuple) else each for key, each in values.items()}
+    name = next(name for name, family in FAMILIES.items() if family is type(gaps))
+    values: dict[str, Any] = TypeAdapter(type(gaps)).dump_python(gaps, mode="json", exclude={"mean_s"})
+    return {"family": name} | values
 
 
 def _lognormal(rng: np.random.Generator, mean_s: float, cv: float, shape: tuple[int, int]) -> Floats:

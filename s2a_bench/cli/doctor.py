@@ -64,5 +64,5 @@ def _as_json(findings: list[Finding]) -> dict[str, Any]:
         "environment": environment.collect(packages),
         "worst": worst(findings),
         "checks": [asdict(finding) for finding in findings],
-        "warnings": [warning.to_manifest() for warning in warnings_of(findings)],
+        "warnings": [asdict(warning) for warning in warnings_of(findings)],
     }

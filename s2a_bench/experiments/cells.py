@@ -163,6 +163,11 @@ class Cells(Generic[Row]):
         records = frame.astype(object).where(frame.notna(), None).to_dict("records")
         return [self.row(**{str(name): value for name, value in record.items()}) for record in records]
 
+    @cached_property
+    def first(self) -> Row:
+        """The first row, for what all rows of a cell share."""
+        return replace(self, frame=self.frame[:1]).rows[0]
+
     @property
     def metrics(self) -> dict[str, Metric]:
         return metrics_of(self.row)
@@ -181,7 +186,7 @@ class Cells(Generic[Row]):
 
     def about(self, column: str) -> Any:
         """Return a value that all rows share; None if it is missing."""
-        return getattr(replace(self, frame=self.frame.iloc[:1]).rows[0], column)
+        return getattr(self.first, column)
 
     def values(self, metric: str) -> Floats:
         """Return a metric's values, times in s, without the missing ones."""

@@ -128,21 +128,20 @@ class RequestColumns:
 
     @cached_property
     def _facts(self) -> dict[str, Floats]:
-        """The facts that metrics, or the run's manifest, name; a text that several requests have is parsed once."""
+        """The facts that metrics, or the run's manifest, name."""
         import pyarrow as pa
         from pyarrow import compute, json
 
-        texts = self._read("facts").cat
-        if texts.categories.empty:
+        texts = self._read("facts")
+        if texts.empty:
             return {}
         nothing, line_feed = (pa.scalar(text, pa.large_string()) for text in ("", "\n"))
-        lines = compute.binary_join_element_wise(pa.array(texts.categories, pa.large_string()), nothing, line_feed)
+        lines = compute.binary_join_element_wise(pa.array(texts, pa.large_string()), nothing, line_feed)
         names = {*_OF_METRICS, *self._run.facts}
         schema = pa.schema([(name, pa.float64()) for name in names])
         options = json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore")
         parsed = json.read_json(pa.BufferReader(lines.buffers()[2]), parse_options=options)
-        there = [name for name in names if parsed[name].null_count < len(parsed)]
-        return {name: parsed[name].to_numpy()[texts.codes] for name in there}
+        return {name: parsed[name].to_numpy() for name in names if parsed[name].null_count < len(parsed)}
 
 
 @dataclass(frozen=True, eq=False)

@@ -201,7 +201,7 @@ class _Run:
             advice = "start the server again between runs, and compare these, to see how its own launches differ"
             warnings.append(RunWarning("same-server", what, advice))
         before = Counters.read(watches_udp=watches_udp)
-        self.writer.update(warnings=[warning.to_manifest() for warning in warnings])
+        self.writer.update(warnings=warnings)
         try:
             for number in range(plan.blocks.launches):
                 with ExitStack() as stack:
@@ -210,7 +210,7 @@ class _Run:
             advice = self.guard.advice(cell.name for cell in plan.cells if cell.transport.udp_checks)
             warnings += self.guard.warnings()
             warnings += Counters.read(watches_udp=watches_udp).warnings_since(before, advice)
-            self.writer.update(warnings=[warning.to_manifest() for warning in warnings])
+            self.writer.update(warnings=warnings)
 
     def _launch(self, number: int, stack: ExitStack) -> None:
         writer = self.writer

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
-from annotated_types import Ge  # comes with pydantic
+from s2a_bench.bounds import Many, NonNegative
 
 if TYPE_CHECKING:
     import numpy as np
@@ -19,10 +19,10 @@ Floats: TypeAlias = "NDArray[np.float64]"
 class Summary:
     """Summary of n values; ``sd`` is the sample standard deviation (n - 1), None for a single value."""
 
-    n: Annotated[int, Ge(1)]
+    n: Many
     median: float
     mean: float
-    sd: Annotated[float, Ge(0)] | None
+    sd: NonNegative | None
     p90: float
     p99: float
 

@@ -161,24 +161,30 @@ def write_parquet(path: Path, table: Any) -> None:
         raise StoreError(f"cannot write {path}: {why(whole, path)}; the CSV files are complete") from error
 
 
-def read_parquet(path: Path, columns: dict[str, Kind], *, categories: bool = False) -> Any:
+def read_parquet(path: Path, columns: dict[str, Kind]) -> pd.DataFrame:
     """Read these columns of a Parquet file as `read_csv` does; raises StoreError for a damaged one.
 
-    With ``categories`` texts are of a dictionary type.
+    They are read one by one, so that no second copy of the whole is held.
     """
+    import pandas as pd
+
     pa, _, parquet = _arrow(path)
-    schema = _schema(pa, columns, categories=categories)
-    texts = [name for name, kind in columns.items() if kind == "string" and categories]
-    with _undamaged(path, pa), parquet.ParquetFile(path, read_dictionary=texts) as file:
+    schema = _schema(pa, columns)
+    categories = [name for name, kind in columns.items() if kind == "category"]
+    with _undamaged(path, pa), parquet.ParquetFile(path, read_dictionary=categories) as file:
         if (rows := file.metadata.num_rows) * len(columns) > VALUES:
             raise StoreError(
                 f"{path} has {rows} rows of {len(columns)} columns; at most {VALUES} values are read; "
                 "remove it to read the CSV"
             )
-        table = file.read(list(columns))
-        for name in columns.keys() - set(table.column_names):  # schema 1 may gain columns
-            table = table.append_column(name, pa.nulls(len(table), schema.field(name).type))
-        return table.select(list(columns)).cast(schema)
+
+        def read(column: Any) -> pd.DataFrame:
+            table = file.read([column.name])
+            if not table.column_names:  # schema 1 may gain columns
+                table = pa.table([pa.nulls(rows)], [column.name])
+            return to_pandas(table.cast(pa.schema([column])))
+
+        return pd.concat(map(read, schema), axis=1)
 
 
 @contextmanager
@@ -200,12 +206,19 @@ def to_pandas(table: Any) -> pd.DataFrame:
 
     dtypes = {pa.int64(): pd.Int64Dtype(), pa.float64(): pd.Float64Dtype(), pa.string(): pd.StringDtype()}
     frame: pd.DataFrame = table.to_pandas(types_mapper=dtypes.get, split_blocks=True, self_destruct=True)
+    pa.default_memory_pool().release_unused()
     return frame
 
 
-def _schema(pa: Any, columns: dict[str, Kind], *, categories: bool = False) -> Any:
-    text = pa.dictionary(pa.int32(), pa.string()) if categories else pa.string()
-    types = {"string": text, "int64": pa.int64(), "float64": pa.float64(), "bool": pa.bool_()}
+def _schema(pa: Any, columns: dict[str, Kind]) -> Any:
+    types = {
+        "string": pa.string(),
+        "json": pa.string(),
+        "category": pa.dictionary(pa.int32(), pa.string()),
+        "int64": pa.int64(),
+        "float64": pa.float64(),
+        "bool": pa.bool_(),
+    }
     return pa.schema([(name, types[kind]) for name, kind in columns.items()])
 
 

@@ -87,9 +87,6 @@ class RunWarning:
     message: Annotated[str, Field(min_length=1)]
     advice: Annotated[str, Field(min_length=1)]
 
-    def to_manifest(self) -> dict[str, str]:
-        return {"code": self.code, "message": self.message, "advice": self.advice}
-
 
 def utc_now() -> str:
     """Return the time in UTC as text; durations are never computed from it."""

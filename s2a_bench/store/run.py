@@ -21,7 +21,7 @@ from s2a_bench.provenance import Origins
 from s2a_bench.store import files
 from s2a_bench.store import manifest as manifests
 from s2a_bench.store.requests import TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
-from s2a_bench.store.schema import PROVENANCE, SCHEMA, Row, Table
+from s2a_bench.store.schema import PROVENANCE, SCHEMA, Kind, Row, Table
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -219,25 +219,30 @@ class StoredRun:
     def table(self, table: Table[Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
         """Return a table with all its columns, empty if the run has none; raises StoreError for a damaged file.
 
-        With ``columns`` it has only these, of which texts are categoricals in order of appearance; they are read alone
-        from the Parquet file of a run that has ended, and not kept.
+        With ``columns`` it has only these, of which texts but JSON are categoricals in order of appearance; they are
+        read alone from the Parquet file of a run that has ended, and not kept.
         """
-        parquet = self.path / f"{table.name}.parquet"
-        if columns is not None and parquet.exists() and table.name not in self.tables:
-            kinds = {name: table.columns[name] for name in columns}
-            return self._framed(files.read_parquet(parquet, kinds, categories=True))
-        if table.name not in self.tables:
-            read, path = (
-                (files.read_parquet, parquet) if parquet.exists() else (files.read_csv, parquet.with_suffix(".csv"))
-            )
-            self.tables[table.name] = self._framed(read(path, table.columns))
-        rows = self.tables[table.name]
-        return rows if columns is None else _with_categories(rows[[*columns]], table)
+        if columns is None:
+            if table.name not in self.tables:
+                self.tables[table.name] = self._read(table.name, table.columns)
+            return self.tables[table.name]
+        texts = [name for name in columns if table.columns[name] == "string"]
+        if table.name not in self.tables and (self.path / f"{table.name}.parquet").exists():
+            kinds = {name: table.columns[name] for name in columns} | dict.fromkeys(texts, "category")
+            return self._read(table.name, kinds)
+        import pandas as pd
 
-    def _framed(self, rows: Any) -> pd.DataFrame:
-        frame = files.to_pandas(rows)
-        frame.attrs[PROVENANCE] = self.origins.line
-        return frame
+        rows = self.table(table)[[*columns]]
+        return rows.astype({name: pd.CategoricalDtype([*rows[name].dropna().unique()]) for name in texts})
+
+    def _read(self, name: str, columns: dict[str, Kind]) -> pd.DataFrame:
+        """Read columns of a table, from its CSV if the run has not ended."""
+        csv = self.path / f"{name}.csv"
+        parquet = csv.with_suffix(".parquet")
+        whole = parquet.exists()
+        rows = files.read_parquet(parquet, columns) if whole else files.to_pandas(files.read_csv(csv, columns))
+        rows.attrs[PROVENANCE] = self.origins.line
+        return rows
 
     @property
     def origins(self) -> Origins:
@@ -274,13 +279,6 @@ class StoredRun:
     @property
     def frames(self) -> pd.DataFrame:
         return self.table(frames_table(self.stages))
-
-
-def _with_categories(rows: pd.DataFrame, table: Table[Any]) -> pd.DataFrame:
-    import pandas as pd
-
-    texts = [name for name in rows if table.columns[str(name)] == "string"]
-    return rows.astype({name: pd.CategoricalDtype([*rows[name].dropna().unique()]) for name in texts})
 
 
 def read_run(path: Path) -> StoredRun:

@@ -14,12 +14,16 @@ from functools import cached_property
 from types import NoneType
 from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
 
+from s2a_bench.bounds import Count, Facts, Fraction, Many, NonNegative, Positive, about
 from s2a_bench.secrets import struck
+
+__all__ = ["PROVENANCE", "SCHEMA", "Count", "Facts", "Fraction", "Many", "NonNegative", "Positive", "about"]
 
 SCHEMA: Final = "s2a-bench/1"
 """The version of folder, columns and ``--json``; it changes if a column changes its meaning or is removed."""
 
-Kind: TypeAlias = Literal["string", "int64", "float64", "bool"]
+Kind: TypeAlias = Literal["string", "json", "category", "int64", "float64", "bool"]
+"""Of a column: JSON is another text in most rows; a category is a text that many rows share."""
 
 Value: TypeAlias = str | int | float | bool | None
 
@@ -81,32 +85,10 @@ def _sound(value: Any) -> Any:
 
 
 def _kind(hint: Any) -> Kind:
-    """Return the column type of an annotation: text unless it is a plain number or a bool."""
+    """Return the column type of an annotation: JSON of a list or dict, text unless it is a plain number or a bool."""
     plain = next((arg for arg in get_args(hint) if arg is not NoneType), hint) if NoneType in get_args(hint) else hint
-    kinds: dict[Any, Kind] = {int: "int64", float: "float64", bool: "bool"}
-    return kinds.get(plain, "string")
-
-
-class Facts(dict[str, Any]):
-    """An annotation of a field in terms of JSON Schema; hashable, so that ``| None`` may follow."""
-
-    def __hash__(self) -> int:  # type: ignore[override]
-        return hash(tuple(self))
-
-    def __get_pydantic_json_schema__(self, core: Any, schema_of: Callable[[Any], dict[str, Any]]) -> dict[str, Any]:
-        return schema_of(core) | self
-
-
-Count = Annotated[int, Facts(minimum=0)]
-Many = Annotated[int, Facts(minimum=1)]
-NonNegative = Annotated[float, Facts(minimum=0)]
-Positive = Annotated[float, Facts(exclusiveMinimum=0)]
-Fraction = Annotated[float, Facts(minimum=0, maximum=1)]
-
-
-def about(description: str) -> Facts:
-    """Return an annotation that describes a field."""
-    return Facts(description=description)
+    kinds: dict[Any, Kind] = {int: "int64", float: "float64", bool: "bool", list: "json", dict: "json"}
+    return kinds.get(get_origin(plain) or plain, "string")
 
 
 def with_fields(

@@ -19,7 +19,7 @@ from pyarrow import parquet
 
 from s2a_bench.errors import MissingExtra, StoreError
 from s2a_bench.store import manifest as manifests
-from s2a_bench.store.files import RESERVE, RESERVE_BYTES, read_csv, read_parquet, why
+from s2a_bench.store.files import RESERVE, RESERVE_BYTES, read_csv, read_parquet, to_pandas, why
 from s2a_bench.store.requests import TOKENS, FrameRow, SampleRow, TokenRow, frames_table, samples_table
 from s2a_bench.store.run import RunWriter, StoredRun, fits, read_run
 from s2a_bench.store.schema import PROVENANCE
@@ -171,8 +171,8 @@ def test_csv_and_parquet_hold_the_same_columns_and_values(tmp_path: Path) -> Non
     for table in (samples_table(STAGES), TOKENS, frames_table(STAGES)):
         csv = read_csv(run.path / f"{table.name}.csv", table.columns)
         parquet = read_parquet(run.path / f"{table.name}.parquet", table.columns)
-        assert csv.column_names == parquet.column_names == list(table.columns)
-        assert csv.equals(parquet)
+        assert csv.column_names == [*parquet] == list(table.columns)
+        pd.testing.assert_frame_equal(to_pandas(csv), parquet)
     read = read_run(run.path)
     assert read.tokens["text"].tolist() == texts
     assert read.tokens["engine_ns"].isna().tolist() == [index % 2 == 1 for index in range(len(texts))]
@@ -389,7 +389,9 @@ def test_columns_are_read_alone_and_their_texts_are_categories_in_order_of_appea
     assert whole.dtypes[["text", "index"]].tolist() == ["string", "Int64"]
     for same in (running, read.table(TOKENS, columns)):
         pd.testing.assert_frame_equal(same, some)
-    assert read_run(run.path).table(samples_table(STAGES), ["cell", "warmup"]).empty
+    samples = read_run(run.path).table(samples_table(STAGES), ["cell", "warmup", "facts"])
+    assert samples.empty
+    assert samples.dtypes.tolist() == ["category", "bool", "string"]
 
 
 @pytest.mark.parametrize(

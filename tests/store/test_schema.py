@@ -44,7 +44,7 @@ ROWS = Table("rows", Row, {"twice": "int64", "none": "float64"}, lambda row: {"t
 
 def test_a_table_has_the_fields_then_what_is_derived_then_the_provenance() -> None:
     assert list(ROWS.columns.items()) == [
-        *(("whole", "int64"), ("real", "float64"), ("yes", "bool"), ("text", "string"), ("items", "string")),
+        *(("whole", "int64"), ("real", "float64"), ("yes", "bool"), ("text", "string"), ("items", "json")),
         *(("twice", "int64"), ("none", "float64"), ("provenance", "string")),
     ]
     assert list(ROWS.values(Row(3, 0.5, True, "x", [1, {"a": 2.5}]), "real")) == [

@@ -93,8 +93,7 @@ def run_timeline(config: TimelineComputed, output: Path, progress: Progress) -> 
             calibrations |= following.facts(case.setting)
             if plan.learning.random:
                 progress.advance()
-        warnings = calibration_warnings(calibrations)
-        writer.update(calibrations=calibrations, warnings=[warning.to_manifest() for warning in warnings])
+        writer.update(calibrations=calibrations, warnings=calibration_warnings(calibrations))
         return writer.path
 
 
@@ -141,11 +140,10 @@ def run_real_time(config: TimelineRealTime, output: Path, progress: Progress) ->
             for case in plan.cases:
                 run.play(case)
         finally:
-            warnings = [*run.warnings, *calibration_warnings(run.calibrations)]
             writer.update(
                 calibrations=run.calibrations,
                 start_jitter=jitter_facts(run.records),
-                warnings=[warning.to_manifest() for warning in warnings],
+                warnings=[*run.warnings, *calibration_warnings(run.calibrations)],
             )
         return writer.path
 

@@ -68,7 +68,7 @@ def resolve(config: ChunksVirtual) -> VirtualPlan:
         "environment": environment.collect(),
         "seeds": {"latencies": config.seed},
         "calibrations": calibrations,
-        "warnings": [warning.to_manifest() for warning in warnings],
+        "warnings": warnings,
         "provenance": Origins(
             Provenance.computed(), {cell.cell: cell.drawn.source.provenance for cell in tried}
         ).to_manifest(),
