@@ -136,7 +136,9 @@ class RequestColumns:
         if texts.empty:
             return {}
         nothing, line_feed = (pa.scalar(text, pa.large_string()) for text in ("", "\n"))
-        lines = compute.binary_join_element_wise(pa.array(texts, pa.large_string()), nothing, line_feed)
+        lines = compute.binary_join_element_wise(
+            pa.array(texts, pa.large_string()), nothing, line_feed, null_handling="replace", null_replacement="{}"
+        )
         names = {*_OF_METRICS, *self._run.facts}
         schema = pa.schema([(name, pa.float64()) for name in names])
         options = json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore")
