@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
@@ -37,6 +36,9 @@ Places: TypeAlias = NDArray[np.int64]
 NS_PER_MS: Final = 1e6
 ABOUT: Final = ("pipeline", "variant", "payload", "connection", "engine", "mode", "size")
 """Columns of the samples that a cell has one value of."""
+_STAMPS: Final = {"delay": "engine_ns", "delay_lo": "engine_hi_ns", "delay_hi": "engine_lo_ns"}
+_PART: Final = 100_000
+"""Requests whose facts are parsed at once."""
 _OF_METRICS: Final = (
     *(END_N, FIRST_DECODE_MS, PREDICTED_MS, PREDICTED_N, PREDICTED_STEPS, PREPROCESS_MS),
     *(PROMPT_EVAL_MS, PROMPT_MS, PROMPT_N, VISION_ENCODE_MS, ENERGY_J),
@@ -105,8 +107,13 @@ class RequestColumns:
         return self._facts.get(name, self._missing)
 
     @cached_property
+    def bounded(self) -> bool:
+        """Whether a request has times that are intervals, between two clocks."""
+        return not np.isnan(self.numbers("clock_error")).all()
+
+    @cached_property
     def answers(self) -> Answers:
-        return Answers.of(self._run, self.ids, bounded=not np.isnan(self.numbers("clock_error")).all())
+        return Answers(self._run, self.ids)
 
     def _read(self, name: str) -> pd.Series[Any]:
         return self._run.table(self._table, [name])[name]
@@ -128,75 +135,67 @@ class RequestColumns:
 
     @cached_property
     def _facts(self) -> dict[str, Floats]:
-        """The facts that metrics, or the run's manifest, name."""
+        """The facts that metrics, or the run's manifest, name; parsed in parts, as texts take much memory."""
         import pyarrow as pa
-        from pyarrow import compute, json
+        from pyarrow import json
 
-        texts = self._read("facts")
-        if texts.empty:
-            return {}
-        nothing, line_feed = (pa.scalar(text, pa.large_string()) for text in ("", "\n"))
-        lines = compute.binary_join_element_wise(
-            pa.array(texts, pa.large_string()), nothing, line_feed, null_handling="replace", null_replacement="{}"
-        )
-        names = {*_OF_METRICS, *self._run.facts}
+        names = sorted({*_OF_METRICS, *self._run.facts})
         schema = pa.schema([(name, pa.float64()) for name in names])
         options = json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore")
-        parsed = json.read_json(pa.BufferReader(lines.buffers()[2]), parse_options=options)
-        return {name: parsed[name].to_numpy() for name in names if parsed[name].null_count < len(parsed)}
+        texts = self._read("facts").fillna("{}")
+        facts: dict[str, Floats] = {}
+        for start in range(0, len(texts), _PART):
+            part = slice(start, start + _PART)
+            lines = "\n".join(texts.iloc[part]).encode()
+            parsed = json.read_json(pa.BufferReader(lines), parse_options=options)
+            for name in names:
+                if parsed[name].null_count < len(parsed):
+                    facts.setdefault(name, np.full(len(texts), np.nan))[part] = parsed[name].to_numpy()
+        return facts
 
 
-@dataclass(frozen=True, eq=False)
 class Answers:
-    """The tokens of a run: those of a request are neighbours, in their order."""
+    """The tokens of a run, those of a request one after another."""
 
     starts: Places
     """The first token of each request."""
     counts: NDArray[np.int64]
     """The tokens of each request as they arrived, which may be several at once."""
-    spans_ns: NDArray[np.int64]
-    """From the first to the last token of each request, as the client saw them."""
-    index: NDArray[np.int32]
-    """The place of each token in its answer."""
-    times_ns: dict[str, Floats]
-    """Of each token: its ``gap`` to the previous one, which the first lacks, and its ``delay``, or that one's ends."""
 
-    @classmethod
-    def of(cls, run: StoredRun, ids: pd.Series[str], *, bounded: bool) -> Answers:
-        """Read the tokens of the requests with these ids; ``bounded``: the engine's times may have ends."""
-
-        def read(name: str) -> pd.Series[Any]:
-            column = run.table(TOKENS, [name])[name]
-            return column if order is None else column.iloc[order]
-
-        order: Places | None = None
-        requests = _requests_of(read("request_id"), ids)
-        index = read("index").to_numpy(dtype="int32")
+    def __init__(self, run: StoredRun, ids: pd.Series[str]) -> None:
+        """Find the tokens of the requests with these ids."""
+        self._run = run
+        self._order: Places | None = None
+        self._times: dict[str, Floats] = {}
+        requests, index = _requests_of(self._read("request_id"), ids), self.index()
         if not _in_order(requests, index):
-            order = np.lexsort((index, requests))
-            requests, index = requests[order], index[order]
-        client_ns = read("client_ns").to_numpy(dtype="int64")
-        first = np.diff(requests, prepend=-2) != 0
-        gaps = np.diff(client_ns, prepend=0).astype(np.float64)
-        gaps[first] = np.nan
-        times = {"gap": gaps}
-        stamps = {"delay": "engine_ns", **({"delay_lo": "engine_hi_ns", "delay_hi": "engine_lo_ns"} if bounded else {})}
-        for name, stamp in stamps.items():
-            engine = read(stamp)
-            left_ns = engine.to_numpy(dtype="int64", na_value=0)
-            times[name] = np.where(engine.isna(), np.nan, client_ns - left_ns)
-        starts, counts, spans_ns = np.zeros((3, len(ids)), dtype=np.int64)
-        begins = np.flatnonzero(first)
-        if begins.size:
-            mine, belongs = requests[begins], requests[begins] >= 0
-            spans = np.maximum.reduceat(client_ns, begins) - np.minimum.reduceat(client_ns, begins)
-            for column, values in (
-                (starts, begins),
-                (counts, np.diff(begins, append=len(requests))),
-                (spans_ns, spans),
-            ):
-                column[mine[belongs]] = values[belongs]
-        return cls(starts, counts, spans_ns, index, times)
+            self._order = np.lexsort((index, requests))
+            requests = requests[self._order]
+        self._first = np.flatnonzero(np.diff(requests, prepend=-2))
+        self._requests = requests[self._first]
+        self._n = len(ids)
+        self.starts = self._by_request(self._first)
+        self.counts = self._by_request(np.diff(self._first, append=len(requests)))
+
+    def index(self) -> NDArray[np.int64]:
+        """Return the place of each token in its answer."""
+        return self._read("index").to_numpy(dtype="int64")
+
+    @cached_property
+    def spans_ns(self) -> NDArray[np.int64]:
+        """From the first to the last token of each request, as the client saw them."""
+        client_ns = self._client_ns()
+        if not client_ns.size:
+            return self._by_request(client_ns)
+        return self._by_request(
+            np.maximum.reduceat(client_ns, self._first) - np.minimum.reduceat(client_ns, self._first)
+        )
+
+    def times_ns(self, name: str) -> Floats:
+        """Return the ``gap`` before each token, which a request's first lacks, its ``delay``, or an end of that."""
+        if name not in self._times:
+            self._times[name] = self._gaps_ns() if name == "gap" else self._delays_ns(_STAMPS[name])
+        return self._times[name]
 
     def tokens_of(self, requests: Places) -> Places:
         """Return the tokens of requests, one request after another."""
@@ -204,26 +203,56 @@ class Answers:
         before = np.cumsum(counts) - counts
         return np.repeat(self.starts[requests] - before, counts) + np.arange(int(counts.sum()))
 
+    def _gaps_ns(self) -> Floats:
+        client_ns = self._client_ns()
+        gaps = np.full(len(client_ns), np.nan)
+        np.subtract(client_ns[1:], client_ns[:-1], out=gaps[1:])
+        gaps[self._first] = np.nan
+        return gaps
+
+    def _delays_ns(self, stamp: str) -> Floats:
+        left = self._read(stamp)
+        delays = np.empty(len(left))
+        np.subtract(self._client_ns(), left.to_numpy(dtype="int64", na_value=0), out=delays)
+        delays[left.isna()] = np.nan
+        return delays
+
+    def _client_ns(self) -> NDArray[np.int64]:
+        return self._read("client_ns").to_numpy(dtype="int64")
+
+    def _read(self, name: str) -> pd.Series[Any]:
+        column = self._run.table(TOKENS, [name])[name]
+        return column if self._order is None else column.iloc[self._order]
+
+    def _by_request(self, values: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return values of first tokens by their requests, 0 for a request without tokens."""
+        there = self._requests >= 0
+        by_request = np.zeros(self._n, dtype=np.int64)
+        by_request[self._requests[there]] = values[there]
+        return by_request
+
 
 def known(values: Floats) -> Floats:
     """Return the values that are not missing."""
     return values[~np.isnan(values)]
 
 
-def _in_order(requests: Places, index: NDArray[np.int32]) -> bool:
+def _in_order(requests: NDArray[np.int32], index: NDArray[np.int64]) -> bool:
     """Return True if the tokens of each request are neighbours, by their index; those of none do not matter."""
-    first = np.diff(requests, prepend=-2) != 0
+    first = np.flatnonzero(np.diff(requests, prepend=-2))
     mine = requests[first]
     apart = np.bincount(mine[mine >= 0]).max(initial=0) > 1
-    return not apart and not (np.diff(index, prepend=0) < 0)[~first].any()
+    falls = np.flatnonzero(index[1:] < index[:-1]) + 1
+    return not apart and bool(np.isin(falls, first).all())
 
 
-def _requests_of(ids: pd.Series[str], requests: pd.Series[str]) -> Places:
+def _requests_of(ids: pd.Series[str], requests: pd.Series[str]) -> NDArray[np.int32]:
     """Return the request of each id, -1 for an unknown one; of two with one id it is the last."""
-    places = np.full(len(requests.cat.categories) + 1, -1)
+    places = np.full(len(requests.cat.categories) + 1, -1, dtype=np.int32)
     places[requests.cat.codes] = np.arange(len(requests))
-    codes = np.append(requests.cat.categories.get_indexer(ids.cat.categories), -1)
-    of_ids: Places = places[codes[ids.cat.codes]]
+    of_category = places[requests.cat.categories.get_indexer(ids.cat.categories)]
+    codes = ids.cat.codes.to_numpy()
+    of_ids: NDArray[np.int32] = np.append(of_category, np.int32(-1))[codes]
     return of_ids
 
 

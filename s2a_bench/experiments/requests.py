@@ -55,6 +55,7 @@ if TYPE_CHECKING:
 Of: TypeAlias = "Callable[[RequestCell], Floats]"
 RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
 """What cells are compared by: columns of the samples without their unit."""
+_ENDS: Final = ("_lo", "_hi")
 GROUP: Final = "group."
 """Before the name of a group of stages: the metric of their sum."""
 
@@ -68,7 +69,7 @@ class Ends(NamedTuple):
     @property
     def named(self) -> dict[str, Floats]:
         """Return both ends by what follows the name of a stage or metric."""
-        return {"_lo": self.lo, "_hi": self.hi}
+        return dict(zip(_ENDS, self, strict=True))
 
     @property
     def middle(self) -> float:
@@ -186,10 +187,12 @@ class RequestCell:
 
     def ends(self, metric: RequestMetric | str) -> Ends:
         """Return the intervals of a metric; none if it is exact, or absent."""
-        declared, ends = _declared(metric), ("_lo", "_hi")
+        declared = _declared(metric)
+        if not self.columns.bounded or (declared.of_tokens and not declared.ends):
+            return Ends(np.empty(0), np.empty(0))
         if declared.of_tokens:
-            return Ends(*(known(self._of_tokens(declared.of_tokens + end, self.by_id)) for end in ends))
-        return Ends(*(known(self._numbers(declared.name, end)) for end in ends))
+            return Ends(*(known(self._of_tokens(f"{declared.of_tokens}{end}", self.by_id)) for end in _ENDS))
+        return Ends(*(known(self._numbers(declared.name, end)) for end in _ENDS))
 
     def rows(self, metric: RequestMetric | str) -> Rows:
         """Return a metric's values, a row for each request that has any."""
@@ -224,9 +227,7 @@ class RequestCell:
 
     def _of_tokens(self, time: str, requests: Places) -> Floats:
         answers = self.columns.answers
-        if time not in answers.times_ns:
-            return np.empty(0)
-        return answers.times_ns[time][answers.tokens_of(requests)] / NS_PER_MS
+        return answers.times_ns(time)[answers.tokens_of(requests)] / NS_PER_MS
 
     @property
     def ids(self) -> NDArray[np.str_]:

@@ -42,10 +42,10 @@ def test_tokens_are_put_in_order_and_none_is_between_two_requests(run: StoredRun
     assert answers.spans_ns.tolist() == [12, 11, 49, 23]
     for request, gaps in enumerate(GAPS_NS):
         mine = answers.tokens_of(np.array([request]))
-        assert answers.index[mine].tolist() == list(range(len(gaps) + 1))
-        first, *others = answers.times_ns["gap"][mine].tolist()
+        assert answers.index()[mine].tolist() == list(range(len(gaps) + 1))
+        first, *others = answers.times_ns("gap")[mine].tolist()
         assert (np.isnan(first), tuple(others)) == (True, gaps)
-        assert answers.times_ns["delay"][mine][1:].tolist() == [3.0] * len(gaps)
+        assert answers.times_ns("delay")[mine][1:].tolist() == [3.0] * len(gaps)
 
 
 def test_rows_of_tokens_are_in_time_order_and_values_by_id(run: StoredRun) -> None:

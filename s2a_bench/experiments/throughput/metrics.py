@@ -148,7 +148,7 @@ def rates_by_position(cell: RequestCell) -> dict[tuple[int, int], Floats]:
     answers = cell.columns.answers
     tokens = answers.tokens_of(cell.by_id)
     request = np.repeat(np.arange(cell.n), answers.counts[cell.by_id])
-    place, gap_ns = answers.index[tokens] // BIN, answers.times_ns["gap"][tokens]
+    place, gap_ns = answers.index()[tokens] // BIN, answers.times_ns("gap")[tokens]
     bins = int(place.max(initial=-1)) + 1
     counted = ~np.isnan(gap_ns)
     spent_ns, gaps = (
