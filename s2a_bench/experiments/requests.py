@@ -10,14 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
-from s2a_bench.experiments.cells import Comparable, Metric, Subject, by_name
+from s2a_bench.experiments.cells import ANY, Comparable, Metric, Subject, by_name, metrics_of
 from s2a_bench.experiments.columns import ABOUT, NS_PER_MS, Places, RequestColumns, known
 from s2a_bench.facts import (
     END_N,
@@ -39,7 +39,7 @@ from s2a_bench.stats import Floats, Ratio, Summary, SummaryEnds, summary_of
 from s2a_bench.stats.batches import Blocks, Rows
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import ONE_WAY
-from s2a_bench.store.schema import Count, Facts, about, with_fields
+from s2a_bench.store.schema import Count, Facts, about
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport, payload_order
 from s2a_bench.transport.pipeline import without
@@ -84,8 +84,12 @@ class Ends(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RequestMetric(Metric):
-    """A metric of requests, times in ms; without ``of`` and ``of_tokens`` it is the column of its name."""
+    """A metric of requests, as the annotation of its summary in a cell of ``--json``; times in ms.
 
+    Without ``of`` and ``of_tokens`` it is the column of its name.
+    """
+
+    bounds: tuple[float | None, float | None] = ANY
     of: Of | None = None
     """Its values, one a request that counts; NaN where one is missing."""
     of_tokens: str = ""
@@ -93,6 +97,12 @@ class RequestMetric(Metric):
     ends: bool = False
     """Whether it may begin on one host and end on another: then it has intervals."""
     shown: tuple[str, ...] = ()
+
+    def of_column(self, column: str, type_of_values: type) -> Self:
+        """Return the metric with what follows from its key."""
+        del type_of_values
+        unit = "ms" if column.endswith("_ms") else self.unit
+        return replace(self, column=column, unit=unit, name=self.name or column.removesuffix("_ms"))
 
     @property
     def key(self) -> str:
@@ -293,71 +303,152 @@ def in_ms(name: str, title: str = "", about: str = "", of: Of | None = None, **m
 
 
 def _of_fact(fact: Fact, title: str, about: str) -> RequestMetric:
-    return in_ms(str(fact), title, about, lambda cell: cell.fact(fact))
+    return RequestMetric(title, about, name=str(fact), of=lambda cell: cell.fact(fact))
 
 
-def _rate(name: str, unit: str, title: str, about: str, of: Of) -> RequestMetric:
-    return RequestMetric(title, about, unit, "higher", name=name, of=of)
+def _image_ms(cell: RequestCell) -> Floats:
+    return cell.fact(PROMPT_MS) - cell.fact(PROMPT_EVAL_MS)
 
 
-ANSWER_METRICS: Final = (
-    _rate(
-        *("tokens_per_s", "tokens/s", "N / T_eval"),
-        "The paper's: N_tokens / T_eval, in the engine: from the end of the prompt to the last token.",
-        _engine_rate,
-    ),
-    _rate(
-        *("decode_tokens_per_s", "tokens/s", "decode"),
-        "(n - 1) / (t_last - t_first), as the client saw the tokens.",
-        decode_rate,
-    ),
-    in_ms("ttft_ms", "TTFT", "From the prompt: e2e without capture."),
-    _of_fact(PROMPT_MS, "all", "Picture and prompt in the engine, up to the first token's logits."),
-    _of_fact(
-        PREPROCESS_MS, "preprocess", "The part of prompt_ms before the model: template, slicing, resizing, tokenising."
-    ),
-    _of_fact(VISION_ENCODE_MS, "vision encode", "The vision tower's part of prompt_ms, over all slices."),
-    in_ms(
-        *("image_ms", ""),
-        "The part of prompt_ms outside the language model: slicing, vision tower, tokenising.",
-        lambda cell: cell.fact(PROMPT_MS) - cell.fact(PROMPT_EVAL_MS),
-    ),
-    _of_fact(PROMPT_EVAL_MS, "prefill", "The language model's part of prompt_ms."),
-    _of_fact(
-        FIRST_DECODE_MS, "1st decode", "The first token to the second in the engine: the first step after the prompt."
-    ),
-    RequestMetric(
-        *("tokens", "Prompt tokens evaluated, pictures included.", "tokens", "neither"),
-        name="prompt_tokens",
-        of=lambda cell: _some(cell.fact(PROMPT_N)),
-    ),
-    _rate(
-        *("prefill_tokens_per_s", "tokens/s", "tokens/s"),
-        "prompt_tokens / prompt_ms.",
-        lambda cell: _some(cell.fact(PROMPT_N)) / _some(cell.fact(PROMPT_MS)) * 1e3,
-    ),
-    _rate(
-        *("tokens_per_joule", "tokens/J", "tokens/J"),
-        "Tokens of the answer per joule of the whole request, where power can be read.",
-        lambda cell: cell.n_tokens / _some(cell.fact(ENERGY_J)),
-    ),
+def _prompt_tokens(cell: RequestCell) -> Floats:
+    return _some(cell.fact(PROMPT_N))
+
+
+def _prefill_rate(cell: RequestCell) -> Floats:
+    return _prompt_tokens(cell) / _some(cell.fact(PROMPT_MS)) * 1e3
+
+
+def _tokens_per_joule(cell: RequestCell) -> Floats:
+    return cell.n_tokens / _some(cell.fact(ENERGY_J))
+
+
+_rate = partial(RequestMetric, better="higher")
+ITL: Final = RequestMetric(
+    "gap",
+    "Every gap between a token and the next, as the client saw them.",
+    of_tokens="gap",
+    shown=("median", "p99"),
+)
+TOKEN_DELAY: Final = RequestMetric(
+    "delay",
+    "From a token's leaving the engine to the client's seeing it.",
+    of_tokens="delay",
+    ends=True,
+    shown=("median", "p90", "p99"),
 )
 
-TOKEN_METRICS: Final = (
-    in_ms(
-        *("itl", "gap", "Every gap between a token and the next, as the client saw them."),
-        of_tokens="gap",
-        shown=("median", "p99"),
-    ),
-    in_ms(
-        *("token_delay", "delay", "From a token's leaving the engine to the client's seeing it."),
-        of_tokens="delay",
-        ends=True,
-        shown=("median", "p90", "p99"),
-    ),
-)
 
-OF_ANSWERS: Final = by_name((*ANSWER_METRICS, *TOKEN_METRICS))
+@dataclass(frozen=True, kw_only=True)
+class RequestsCell:
+    """The fields that cells of all runs of requests have."""
+
+    cell: Annotated[str, about("The name that ratios use.")]
+    pipeline: str
+    variant: str
+    payload: str
+    connection: str
+    engine: str
+    mode: Literal["request", "stream"]
+    size: Annotated[str, Facts(pattern="^[0-9]+x[0-9]+$")]
+    observation: Annotated[
+        str, about("What each request brings: sizes, number of pictures, scaling, numbers of the robot's state.")
+    ]
+    answer: Annotated[Literal["tokens", "actions"], about("What answers are made of.")]
+    profile: str | None
+    emulated: Annotated[
+        bool, about("True where a profile was replayed, or latencies were given: such numbers are not measured.")
+    ]
+    dummy: Annotated[
+        bool | None, about("Whether the model's weights are dummies, random: its times are real, its words are not.")
+    ] = None
+    n: Annotated[Count, about("Samples that count: no warm-ups, no failures.")]
+    errors: Count
+    warmups: Count
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnswersCell(RequestsCell):
+    """The metrics of answers that cells have; an absent key is a metric that no request has."""
+
+    tokens_per_s: Annotated[
+        Summary | None,
+        _rate(
+            "N / T_eval",
+            "The paper's: N_tokens / T_eval, in the engine: from the end of the prompt to the last token.",
+            "tokens/s",
+            of=_engine_rate,
+        ),
+    ] = None
+    decode_tokens_per_s: Annotated[
+        Summary | None,
+        _rate("decode", "(n - 1) / (t_last - t_first), as the client saw the tokens.", "tokens/s", of=decode_rate),
+    ] = None
+    ttft_ms: Annotated[
+        Summary | None, RequestMetric("TTFT", "From the prompt: e2e without capture.", name="ttft_ms")
+    ] = None
+    prompt_ms: Annotated[
+        Summary | None, _of_fact(PROMPT_MS, "all", "Picture and prompt in the engine, up to the first token's logits.")
+    ] = None
+    preprocess_ms: Annotated[
+        Summary | None,
+        _of_fact(
+            PREPROCESS_MS,
+            "preprocess",
+            "The part of prompt_ms before the model: template, slicing, resizing, tokenising.",
+        ),
+    ] = None
+    vision_encode_ms: Annotated[
+        Summary | None,
+        _of_fact(VISION_ENCODE_MS, "vision encode", "The vision tower's part of prompt_ms, over all slices."),
+    ] = None
+    image_ms: Annotated[
+        Summary | None,
+        RequestMetric(
+            "",
+            "The part of prompt_ms outside the language model: slicing, vision tower, tokenising.",
+            name="image_ms",
+            of=_image_ms,
+        ),
+    ] = None
+    prompt_eval_ms: Annotated[
+        Summary | None, _of_fact(PROMPT_EVAL_MS, "prefill", "The language model's part of prompt_ms.")
+    ] = None
+    first_decode_ms: Annotated[
+        Summary | None,
+        _of_fact(
+            FIRST_DECODE_MS,
+            "1st decode",
+            "The first token to the second in the engine: the first step after the prompt.",
+        ),
+    ] = None
+    prompt_tokens: Annotated[
+        Summary | None,
+        RequestMetric(
+            "tokens", "Prompt tokens evaluated, pictures included.", "tokens", better="neither", of=_prompt_tokens
+        ),
+    ] = None
+    prefill_tokens_per_s: Annotated[
+        Summary | None, _rate("tokens/s", "prompt_tokens / prompt_ms.", "tokens/s", of=_prefill_rate)
+    ] = None
+    tokens_per_joule: Annotated[
+        Summary | None,
+        _rate(
+            "tokens/J",
+            "Tokens of the answer per joule of the whole request, where power can be read.",
+            "tokens/J",
+            of=_tokens_per_joule,
+        ),
+    ] = None
+    itl_ms: Annotated[Summary | None, ITL] = None
+    token_delay_ms: Annotated[Summary | SummaryEnds | None, TOKEN_DELAY] = None
+
+
+def summarised_by(cls: type) -> dict[str, RequestMetric]:
+    """Return name -> metric of the summaries that a class of cells declares."""
+    return {name: metric for name, metric in metrics_of(cls).items() if isinstance(metric, RequestMetric)}
+
+
+OF_ANSWERS: Final = summarised_by(AnswersCell)
 
 
 @dataclass(frozen=True, eq=False)
@@ -538,47 +629,7 @@ def _emulated(model: dict[str, Any]) -> Note:
     return Note(f"{note} ({', '.join(remarks)})" if remarks else note, EMULATED, *labels)
 
 
-@dataclass(frozen=True, kw_only=True)
-class RequestsCell:
-    """The fields that cells of all runs of requests have."""
-
-    cell: Annotated[str, about("The name that ratios use.")]
-    pipeline: str
-    variant: str
-    payload: str
-    connection: str
-    engine: str
-    mode: Literal["request", "stream"]
-    size: Annotated[str, Facts(pattern="^[0-9]+x[0-9]+$")]
-    observation: Annotated[
-        str, about("What each request brings: sizes, number of pictures, scaling, numbers of the robot's state.")
-    ]
-    answer: Annotated[Literal["tokens", "actions"], about("What answers are made of.")]
-    profile: str | None
-    emulated: Annotated[
-        bool, about("True where a profile was replayed, or latencies were given: such numbers are not measured.")
-    ]
-    dummy: Annotated[
-        bool | None, about("Whether the model's weights are dummies, random: its times are real, its words are not.")
-    ] = None
-    n: Annotated[Count, about("Samples that count: no warm-ups, no failures.")]
-    errors: Count
-    warmups: Count
-
-
-def cell_class(name: str, meaning: str, metrics: Iterable[RequestMetric], **fields: Any) -> type:
-    """Return the class of a cell of ``--json``: ``fields``, and a summary of each metric."""
-    hints = {
-        each.key: Annotated[
-            Summary | SummaryEnds | None if each.ends else Summary | None, about(each.about) if each.about else {}
-        ]
-        for each in metrics
-    }
-    made: type = with_fields(name, meaning, RequestsCell, {**fields, **hints})
-    return made
-
-
-def cell_json(cls: type, cells: RequestCells, metrics: Iterable[RequestMetric], **fields: Any) -> dict[str, Any]:
+def cell_json(cls: type, cells: RequestCells, **fields: Any) -> dict[str, Any]:
     """Return one cell as JSON; a metric that no sample has is absent, and so is an unknown ``dummy``."""
     (cell,) = cells
     origin = cell.origin
@@ -592,7 +643,7 @@ def cell_json(cls: type, cells: RequestCells, metrics: Iterable[RequestMetric], 
             dummy={"real": False, "dummy": True, NONE: not declared_engine(origin.engine).plays}.get(origin.weights),
             **{name: getattr(cell, name) for name in ("emulated", "n", "errors", "warmups")},
             **fields,
-            **summaries_of(cell, {each.key: each for each in metrics}),
+            **summaries_of(cell, {each.key: each for each in summarised_by(cls).values()}),
         )
     )
 

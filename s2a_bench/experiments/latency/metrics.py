@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.experiments.requests import (
     GROUP,
-    TOKEN_METRICS,
+    ITL,
+    TOKEN_DELAY,
     RequestCells,
     RequestMetric,
-    cell_class,
+    RequestsCell,
     cell_json,
     compared_by,
     in_ms,
     ratio_table,
     summaries_of,
     summarised,
+    summarised_by,
 )
 from s2a_bench.stats import Summary, SummaryEnds, summary_of
 from s2a_bench.store.schema import Count, Facts, about
@@ -30,44 +33,54 @@ if TYPE_CHECKING:
     from s2a_bench.stats import Ratio
 
 AROUND: Final[tuple[RequestMetric, ...]] = tuple(chain.from_iterable(shown("metrics")))
-"""What is known of a request by what surrounds its run, beside e2e without inference."""
-METRICS: Final = (
-    in_ms("e2e_without_inference", "e2e w/o infer.", "Absent if the server does not report its inference time."),
-    in_ms(
-        "e2e_without_model",
-        "e2e w/o model",
-        "e2e less the model's time up to the first token; preprocessing is included. Of a llama-server: "
-        "e2e less the prompt_ms it reports.",
-    ),
-    in_ms("e2e", "e2e"),
-    in_ms("ttft", about="From the prompt: e2e without capture."),
-    in_ms(
-        "round_trip",
-        "round trip",
-        "network and return together: exact, where a server on another host has them as intervals.",
-    ),
-    in_ms("frame_age", about="Age of the frame when inference starts.", ends=True),
-    *AROUND,
-    *TOKEN_METRICS,
-    in_ms("residual", "residual", "The time between the stages."),
-    RequestMetric(name="residual_share", about="The residual as a share of e2e without inference."),
-)
+"""What is known of a request by what surrounds its run, after the metrics of `LatencyCell`."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class LatencyCell(RequestsCell):
+    """One pipeline, stage by stage; a value that no sample has is an absent key."""
+
+    residual_flagged: Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")]
+    stages_ms: Annotated[dict[str, Summary | SummaryEnds], Facts(propertyNames={"pattern": "^[a-z][a-z0-9_]*$"})]
+    groups_ms: Annotated[dict[str, Summary | SummaryEnds], Facts(propertyNames={"enum": list(GROUPS)})]
+    e2e_without_inference_ms: Annotated[
+        Summary | None, RequestMetric("e2e w/o infer.", "Absent if the server does not report its inference time.")
+    ] = None
+    e2e_without_model_ms: Annotated[
+        Summary | None,
+        RequestMetric(
+            "e2e w/o model",
+            "e2e less the model's time up to the first token; preprocessing is included. Of a llama-server: "
+            "e2e less the prompt_ms it reports.",
+        ),
+    ] = None
+    e2e_ms: Annotated[Summary | None, RequestMetric("e2e")] = None
+    ttft_ms: Annotated[Summary | None, RequestMetric(about="From the prompt: e2e without capture.")] = None
+    round_trip_ms: Annotated[
+        Summary | None,
+        RequestMetric(
+            "round trip",
+            "network and return together: exact, where a server on another host has them as intervals.",
+        ),
+    ] = None
+    frame_age_ms: Annotated[
+        Summary | SummaryEnds | None, RequestMetric(about="Age of the frame when inference starts.", ends=True)
+    ] = None
+    itl_ms: Annotated[Summary | None, ITL] = None
+    token_delay_ms: Annotated[Summary | SummaryEnds | None, TOKEN_DELAY] = None
+    residual_ms: Annotated[Summary | None, RequestMetric("residual", "The time between the stages.")] = None
+    residual_share: Annotated[
+        Summary | None, RequestMetric(about="The residual as a share of e2e without inference.")
+    ] = None
+
+
+METRICS: Final = (*summarised_by(LatencyCell).values(), *AROUND)
 COMPARED: Final = compared_by(
     (*METRICS, *(in_ms(f"{GROUP}{name}") for name in GROUPS)),
     ("e2e_without_inference", "e2e", "itl"),
     run_metrics=lambda run: map(in_ms, run.stages),
 )
 """What latency runs are compared by: metrics, groups of stages, and each run's stages."""
-LatencyCell: Final = cell_class(
-    "LatencyCell",
-    "One pipeline, stage by stage; a value that no sample has is an absent key.",
-    METRICS,
-    residual_flagged=Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")],
-    stages_ms=Annotated[dict[str, Summary | SummaryEnds], Facts(propertyNames={"pattern": "^[a-z][a-z0-9_]*$"})],
-    groups_ms=Annotated[dict[str, Summary | SummaryEnds], Facts(propertyNames={"enum": list(GROUPS)})],
-)
 
 
 def latency_json(cells: RequestCells) -> dict[str, Any]:
@@ -75,11 +88,11 @@ def latency_json(cells: RequestCells) -> dict[str, Any]:
         cell_json(
             LatencyCell,
             cells.only([cell]),
-            METRICS,
             residual_flagged=cell.flagged(),
             stages_ms=summaries_of(cell, {stage: stage for stage in cell.stages}),
             groups_ms=summaries_of(cell, {group: f"{GROUP}{group}" for group in GROUPS}),
         )
+        | summaries_of(cell, {metric.key: metric for metric in AROUND})
         for cell in cells
     ]
     return frame(cells.run, each, [ratio_entry(*ratio) for ratio in _ratios(cells)])

@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import numpy as np
 
 from s2a_bench.experiments.requests import (
-    ANSWER_METRICS,
-    TOKEN_METRICS,
+    OF_ANSWERS,
+    AnswersCell,
     RequestCell,
     RequestCells,
-    cell_class,
     cell_json,
     cells_of,
     compared_by,
@@ -60,7 +59,7 @@ ENGINE_METRIC: Final = "tokens_per_s"
 LLAMA_BENCH: Final = "llama-bench"
 BIN: Final = 32
 
-METRICS: Final = (*ANSWER_METRICS, *TOKEN_METRICS)
+METRICS: Final = (*OF_ANSWERS.values(),)
 COMPARED: Final = compared_by(METRICS, (ENGINE_METRIC, RATIO_METRIC, "ttft_ms", "prefill_tokens_per_s", "itl"))
 
 
@@ -73,16 +72,15 @@ class Position:
     decode_tokens_per_s: Summary
 
 
-ThroughputCell: Final = cell_class(
-    "ThroughputCell",
-    "One pipeline in tokens a second; a value that no request has is an absent key.",
-    METRICS,
-    t_eval=Annotated[
+@dataclass(frozen=True, kw_only=True)
+class ThroughputCell(AnswersCell):
+    """One pipeline in tokens a second; a value that no request has is an absent key."""
+
+    t_eval: Annotated[
         Literal["engine", "client"],
         about("Source of T_eval: the engine; or the client, where tokens_per_s is decode_tokens_per_s."),
-    ],
-    positions=Annotated[list[Position], about("Decode rate by the place in the answer.")],
-)
+    ]
+    positions: Annotated[list[Position], about("Decode rate by the place in the answer.")]
 
 
 @dataclass(frozen=True)
@@ -184,7 +182,6 @@ def throughput_json(cells: ThroughputCells) -> dict[str, Any]:
         cell_json(
             ThroughputCell,
             cells.only([cell]),
-            METRICS,
             t_eval="engine" if cell.has_engine_time else "client",
             positions=[Position(*place, summarise(rates)) for place, rates in rates_by_position(cell).items()],
         )
