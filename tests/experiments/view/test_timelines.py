@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
-from s2a_bench.experiments.timeline.rows import TIMELINES
-from s2a_bench.experiments.timeline.view.cells import timelines_json, timelines_of
+from s2a_bench.experiments.timeline.rows import TIMELINES, TimelineRow
+from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, timelines_json, timelines_of
 from s2a_bench.experiments.timeline.view.figures import build_timelines
 from s2a_bench.experiments.timeline.view.tables import (
     execution_table,
@@ -25,6 +26,7 @@ from s2a_bench.harness.timelines.rows import skill_rows, token_rows
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
+from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.requests import SKILLS, TOKENS, TokenRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.writers.figures import caption_of
@@ -86,7 +88,8 @@ def live(tmp_path: Path) -> StoredRun:
 
 def drawn(run: StoredRun) -> Figure:
     with paper_column():
-        return build_timelines(run, timelines_of(run))
+        cells = timelines_of(run)
+        return build_timelines(cells, origin_notes(run.manifest, cells))
 
 
 def bars(axes: Any, *, hatched: bool) -> list[Rectangle]:
@@ -132,12 +135,23 @@ def test_requests_of_their_own_have_their_tokens_in_their_lanes(live: StoredRun)
     )
 
 
+def test_a_figure_is_of_rows_and_needs_no_run() -> None:
+    plans, setting = plans_of(6), PlanSetting("orin", "Orin", 4.8, 0.5, 6, 8, 1.0)
+    schedule = Schedule(work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[0]), plans.nominal_s)
+    rows, skills = timeline_rows(setting, "naive", plans, schedule, ["a"]), skill_rows("a", plans, schedule, ["a"])
+    cell = Timelines(pd.DataFrame(rows), TimelineRow, Origins(Provenance()), skills, uniform(0.5, 1, 4.8, 48)[:, 0])
+    with paper_column():
+        figure = build_timelines([cell], ["A note."])
+    assert len(bars(figure.axes[0], hatched=False)) == 8
+    assert caption_of(figure) == ("Execution timelines: N = 8 skills, T_nom = 1 s", "A note.")
+
+
 def column(table: TextTable, name: str) -> list[str]:
     return [row[table.header.index(name)] for row in table.rows]
 
 
 def test_the_table_groups_rows_by_board_and_granularity(computed: StoredRun) -> None:
-    table = execution_table(computed)
+    table = execution_table(timelines_of(computed), computed.manifest)
     assert column(table, "board") == ["Orin", "", "", "", "", ""]
     assert column(table, "L") == ["6", "", "", "4", "", ""]
     assert column(table, "start") == ["1.75", "10.50", "3.50", "1.33", "7.17", "1.33"]
@@ -153,14 +167,14 @@ def test_the_skill_table_names_calls_and_stalls(live: StoredRun) -> None:
 
 
 def test_csv_keeps_every_digit_and_leaves_out_what_is_absent(computed: StoredRun) -> None:
-    lines = timeline_csv(computed)["timelines.csv"].text(computed.origins).splitlines()
+    lines = timeline_csv(timelines_of(computed))["timelines.csv"].text(computed.origins).splitlines()
     assert f"orin/L6/N8/T1/naive,stall_s,1,1.75,1.75,,1.75,1.75,{computed.origins.code}" in lines
     (share,) = [line for line in lines if line.startswith("orin/L6/N8/T1/naive,p_any_stall")]
     assert share == f"orin/L6/N8/T1/naive,p_any_stall,1,,1.0,,,,{computed.origins.code}"
 
 
 def test_json_has_no_key_for_what_a_live_run_does_not_know(live: StoredRun) -> None:
-    cells = timelines_json(live)["cells"]
+    cells = timelines_json(live, timelines_of(live))["cells"]
     assert all("prompt_s" not in cell and "caution" not in cell for cell in cells)
     assert [cell["emulated"] for cell in cells] == [False] * 3
     assert [cell["mode"] for cell in cells] == ["live"] * 3
