@@ -9,18 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from s2a_bench.facts import (
-    END_N,
-    FIRST_DECODE_MS,
-    PREDICTED_MS,
-    PREDICTED_N,
-    PREDICTED_STEPS,
-    PREPROCESS_MS,
-    PROMPT_EVAL_MS,
-    PROMPT_MS,
-    PROMPT_N,
-    VISION_ENCODE_MS,
-)
+from s2a_bench import facts
 from s2a_bench.machine.resources import ENERGY_J
 from s2a_bench.stats import Floats
 from s2a_bench.store.requests import TOKENS, samples_table
@@ -39,10 +28,6 @@ ABOUT: Final = ("pipeline", "variant", "payload", "connection", "engine", "mode"
 _STAMPS: Final = {"delay": "engine_ns", "delay_lo": "engine_hi_ns", "delay_hi": "engine_lo_ns"}
 _PART: Final = 100_000
 """Requests whose facts are parsed at once."""
-_OF_METRICS: Final = (
-    *(END_N, FIRST_DECODE_MS, PREDICTED_MS, PREDICTED_N, PREDICTED_STEPS, PREPROCESS_MS),
-    *(PROMPT_EVAL_MS, PROMPT_MS, PROMPT_N, VISION_ENCODE_MS, ENERGY_J),
-)
 
 
 class RequestColumns:
@@ -139,19 +124,20 @@ class RequestColumns:
         import pyarrow as pa
         from pyarrow import json
 
-        names = sorted({*_OF_METRICS, *self._run.facts})
+        shared = (each for each in (*vars(facts).values(), ENERGY_J) if isinstance(each, facts.Fact))
+        names = sorted({*map(str, shared), *self._run.facts})
         schema = pa.schema([(name, pa.float64()) for name in names])
         options = json.ParseOptions(explicit_schema=schema, unexpected_field_behavior="ignore")
         texts = self._read("facts").fillna("{}")
-        facts: dict[str, Floats] = {}
+        values: dict[str, Floats] = {}
         for start in range(0, len(texts), _PART):
             part = slice(start, start + _PART)
             lines = "\n".join(texts.iloc[part]).encode()
             parsed = json.read_json(pa.BufferReader(lines), parse_options=options)
             for name in names:
                 if parsed[name].null_count < len(parsed):
-                    facts.setdefault(name, np.full(len(texts), np.nan))[part] = parsed[name].to_numpy()
-        return facts
+                    values.setdefault(name, np.full(len(texts), np.nan))[part] = parsed[name].to_numpy()
+        return values
 
 
 class Answers:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property, partial
 from statistics import median
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias, overload
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -452,7 +452,7 @@ OF_ANSWERS: Final = summarised_by(AnswersCell)
 
 
 @dataclass(frozen=True, eq=False)
-class RequestCells(Sequence[RequestCell]):
+class RequestCells:
     """The cells of a run, or some of them, and what they share."""
 
     run: StoredRun
@@ -461,12 +461,8 @@ class RequestCells(Sequence[RequestCell]):
     def __len__(self) -> int:
         return len(self.each)
 
-    @overload
-    def __getitem__(self, place: int) -> RequestCell: ...
-    @overload
-    def __getitem__(self, place: slice) -> Sequence[RequestCell]: ...
-    def __getitem__(self, place: int | slice) -> RequestCell | Sequence[RequestCell]:
-        return self.each[place]
+    def __iter__(self) -> Iterator[RequestCell]:
+        return iter(self.each)
 
     def only(self, cells: Iterable[RequestCell]) -> Self:
         return replace(self, each=tuple(cells))
@@ -475,7 +471,7 @@ class RequestCells(Sequence[RequestCell]):
         """Return the cells of each launch, in the order of time."""
         if not self:
             return {}
-        launch = self[0].columns.launch
+        launch = self.each[0].columns.launch
         every, first = np.unique(launch, return_index=True)
         return {
             int(number): self.only(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -213,7 +213,7 @@ def throughput_csv(cells: ThroughputCells) -> dict[str, CsvTable]:
     }
 
 
-def _base(cell: RequestCell, cells: Sequence[RequestCell]) -> RequestCell | None:
+def _base(cell: RequestCell, cells: ThroughputCells) -> RequestCell | None:
     """Return the in-process cell with the same engine settings (the end of its name), or the first; None for itself."""
     local = [each for each in cells if declared_transport(each.pipeline).in_process]
     matching = [each for each in local if each is not cell and cell.name.endswith(each.name.partition("?")[2])]
