@@ -464,6 +464,9 @@ class RequestCells:
     def __iter__(self) -> Iterator[RequestCell]:
         return iter(self.each)
 
+    def __getitem__(self, place: int) -> RequestCell:
+        return self.each[place]
+
     def only(self, cells: Iterable[RequestCell]) -> Self:
         return replace(self, each=tuple(cells))
 
@@ -471,7 +474,7 @@ class RequestCells:
         """Return the cells of each launch, in the order of time."""
         if not self:
             return {}
-        launch = self.each[0].columns.launch
+        launch = self[0].columns.launch
         every, first = np.unique(launch, return_index=True)
         return {
             int(number): self.only(

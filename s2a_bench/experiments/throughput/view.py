@@ -233,6 +233,6 @@ def _styles(cells: ThroughputCells) -> dict[str, tuple[str, str]]:
 
 
 def _caption(cells: ThroughputCells, what: str, *notes: str) -> tuple[str, ...]:
-    tokens = summary_of(known(cells.each[0].n_tokens))
+    tokens = summary_of(known(cells[0].n_tokens))
     facts = [f"{tokens.median:.0f} tokens an answer"] if tokens else []
     return cells.caption(what, [*facts, *sorted({cell.about["size"] for cell in cells})], notes)

@@ -60,7 +60,7 @@ def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
 def _latency_sentences(cells: RequestCells) -> list[str]:
     if not cells:
         return []
-    mode = cells.each[0].about["mode"]
+    mode = cells[0].about["mode"]
     names = ", ".join(dict.fromkeys(cell.label for cell in cells))
     requests = span_of((cell.n for cell in cells), "request")
     pictures = " ".join((" and ".join(cells.payloads), "frames")).lstrip()
