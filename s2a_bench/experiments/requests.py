@@ -367,8 +367,8 @@ class RequestsCell:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AnswersCell(RequestsCell):
-    """The metrics of answers that cells have; an absent key is a metric that no request has."""
+class AnswersCell:
+    """The metrics of answers that a cell has; an absent key is a metric that no request has."""
 
     tokens_per_s: Annotated[
         Summary | None,

@@ -14,6 +14,7 @@ from s2a_bench.experiments.requests import (
     AnswersCell,
     RequestCell,
     RequestCells,
+    RequestsCell,
     cell_json,
     cells_of,
     compared_by,
@@ -73,14 +74,19 @@ class Position:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ThroughputCell(AnswersCell):
-    """One pipeline in tokens a second; a value that no request has is an absent key."""
+class PositionsCell(RequestsCell):
+    """The fields that come before the metrics."""
 
     t_eval: Annotated[
         Literal["engine", "client"],
         about("Source of T_eval: the engine; or the client, where tokens_per_s is decode_tokens_per_s."),
     ]
     positions: Annotated[list[Position], about("Decode rate by the place in the answer.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ThroughputCell(AnswersCell, PositionsCell):
+    """One pipeline in tokens a second; a value that no request has is an absent key."""
 
 
 @dataclass(frozen=True)
