@@ -10,7 +10,8 @@ from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
 from s2a_bench.scenario.ccrb.labels import outcome_label
-from s2a_bench.store.schema import Facts, Many, NonNegative, Positive, Table, about
+from s2a_bench.bounds import Facts, Many, NonNegative, Positive, about
+from s2a_bench.store.schema import Table
 
 _DEADLINE: Final = (
     "S_front: the latest start of the planned braking that keeps 2 m to the lead; negative: too late at the request."

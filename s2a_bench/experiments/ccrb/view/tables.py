@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -107,13 +106,14 @@ def _stage_table(rollouts: Rollouts) -> TextTable | None:
     """Return the stages of each closed loop's request to a model; None without such requests."""
     if not (rollouts.live and rollouts.beside):
         return None
-    (cell,) = requests.cells_of(rollouts.run)
-    groups, whole, rows = requests.groups_present([cell]), ("residual", "ttft", "e2e"), []
+    cells = requests.cells_of(rollouts.run)
+    (cell,) = cells
+    metrics, rows = (*(f"{requests.GROUP}{group}" for group in cells.groups), "residual", "ttft", "e2e"), []
     for policy in rollouts.point:
-        mine = replace(cell, good=cell.good[cell.good["request_id"] == rollouts.request_of(policy.cell)])
-        values = (*map(mine.group_ms, groups), *map(mine.values_ms, whole))
-        rows.append((policy.policy, *(entries(each, "median")[0] for each in values)))
-    title, header = "Each policy's request in ms, to its first token", ("policy", *groups, "residual", "TTFT", "e2e")
+        mine = cell.of_requests(cell.counted[cell.ids == rollouts.request_of(policy.cell)])
+        rows.append((policy.policy, *(entries(mine.values(metric), "median")[0] for metric in metrics)))
+    title = "Each policy's request in ms, to its first token"
+    header = ("policy", *cells.groups, "residual", "TTFT", "e2e")
     notes = (tokens_line(rollouts.run), "TTFT: from the prompt; e2e: with the capture.")
     return TextTable(title, header, rows, 1, notes=notes)
 
