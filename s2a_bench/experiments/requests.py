@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, Ty
 import numpy as np
 from numpy.typing import NDArray
 
+from s2a_bench.bounds import Count, Facts, about
 from s2a_bench.experiments.cells import ANY, Comparable, Metric, Subject, by_name, metrics_of
 from s2a_bench.experiments.columns import ABOUT, NS_PER_MS, Places, RequestColumns, known
 from s2a_bench.facts import (
@@ -39,7 +40,6 @@ from s2a_bench.stats import Floats, Ratio, Summary, SummaryEnds, summary_of
 from s2a_bench.stats.batches import Blocks, Rows
 from s2a_bench.store.manifest import present
 from s2a_bench.store.requests import ONE_WAY
-from s2a_bench.store.schema import Count, Facts, about
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport, payload_order
 from s2a_bench.transport.pipeline import without
@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from s2a_bench.store.run import StoredRun
+    from s2a_bench.store.schema import Kind
 
 Of: TypeAlias = "Callable[[RequestCell], Floats]"
 RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
@@ -98,9 +99,8 @@ class RequestMetric(Metric):
     """Whether it may begin on one host and end on another: then it has intervals."""
     shown: tuple[str, ...] = ()
 
-    def of_column(self, column: str, type_of_values: type) -> Self:
+    def of_column(self, column: str, stored: Kind) -> Self:  # noqa: ARG002 - the key says it
         """Return the metric with what follows from its key."""
-        del type_of_values
         unit = "ms" if column.endswith("_ms") else self.unit
         return replace(self, column=column, unit=unit, name=self.name or column.removesuffix("_ms"))
 

@@ -14,10 +14,7 @@ from functools import cached_property
 from types import NoneType
 from typing import Any, Final, Generic, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
 
-from s2a_bench.bounds import Count, Facts, Fraction, Many, NonNegative, Positive, about
 from s2a_bench.secrets import struck
-
-__all__ = ["PROVENANCE", "SCHEMA", "Count", "Facts", "Fraction", "Many", "NonNegative", "Positive", "about"]
 
 SCHEMA: Final = "s2a-bench/1"
 """The version of folder, columns and ``--json``; it changes if a column changes its meaning or is removed."""

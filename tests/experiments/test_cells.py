@@ -8,6 +8,7 @@ from typing import Annotated, ClassVar
 import pandas as pd
 import pytest
 
+from s2a_bench.bounds import NonNegative
 from s2a_bench.experiments.cells import (
     ANY,
     HIDDEN,
@@ -21,7 +22,6 @@ from s2a_bench.experiments.cells import (
     share,
 )
 from s2a_bench.provenance import Origins, Provenance
-from s2a_bench.store.schema import NonNegative
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
+from s2a_bench.bounds import Count, Facts, about
 from s2a_bench.experiments.requests import (
     GROUP,
     ITL,
@@ -23,7 +24,6 @@ from s2a_bench.experiments.requests import (
     summarised_by,
 )
 from s2a_bench.stats import Summary, SummaryEnds, summary_of
-from s2a_bench.store.schema import Count, Facts, about
 from s2a_bench.trace import GROUPS
 from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values

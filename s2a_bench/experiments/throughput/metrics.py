@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 import numpy as np
 
+from s2a_bench.bounds import Count, about
 from s2a_bench.experiments.requests import (
     OF_ANSWERS,
     AnswersCell,
@@ -25,7 +26,7 @@ from s2a_bench.stats import Floats, Ratio, Summary, summarise
 from s2a_bench.stats.batches import Blocks
 from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.store.manifest import present
-from s2a_bench.store.schema import Count, Table, about
+from s2a_bench.store.schema import Table
 from s2a_bench.transport import declared_transport
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 from s2a_bench.writers.json import frame, ratio_entry
