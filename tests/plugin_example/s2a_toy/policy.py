@@ -9,7 +9,7 @@ from typing import ClassVar
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import CAUTION, PlanShape, Policy, Start, Stepper, Timing
 from s2a_bench.policy.estimator import VAGUE, GapPrior
-from s2a_bench.policy.naive import NominalQueue
+from s2a_bench.policy.nominal import NominalQueue
 
 
 @dataclass(frozen=True, slots=True)

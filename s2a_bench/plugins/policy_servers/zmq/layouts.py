@@ -95,13 +95,13 @@ def modalities_in(answer: Any) -> dict[str, tuple[list[str], int]]:
     try:
         configs = {name: answer[name]["as_json"] for name in ("video", "state", "language")}
         configs = {name: json.loads(each) if isinstance(each, str) else each for name, each in configs.items()}
-        found = {
+        keys_of = {
             name: ([*map(str, each["modality_keys"])], len(each["delta_indices"])) for name, each in configs.items()
         }
     except (LookupError, TypeError, ValueError, RecursionError):
         return {}
-    plain = all(key != EXTENSION and not key.endswith("?") for keys, _ in found.values() for key in keys)
-    return found if plain and sum(len(keys) * steps for keys, steps in found.values()) <= VALUES else {}
+    plain = all(key != EXTENSION and not key.endswith("?") for keys, _ in keys_of.values() for key in keys)
+    return keys_of if plain and sum(len(keys) * steps for keys, steps in keys_of.values()) <= VALUES else {}
 
 
 def template_of(layout: str, keys_of: Mapping[str, tuple[Sequence[str], int]], state: int) -> Template:
