@@ -99,7 +99,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
                 with suppress(Broken):
                     return self._exchanged(self._link, body, cameras, trace)
             trace.facts[RECONNECTS] = 1.0
-            self._link.close()
+            self._abandon()
         link = self._connected(bounds)
         trace.mark("connect")
         return self._exchanged(link, body, cameras, trace)
@@ -111,10 +111,10 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             if self._server.greets:
                 self._greeted(link)
             if self._server.reset is not None:
-                link.send(packb(self._server.reset))
+                link.send_in_time(packb(self._server.reset))
                 self._ready(link.receive())
         except BaseException:
-            link.close()
+            link.close_socket()
             raise
         self._link = link
         return link
@@ -126,7 +126,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
                 name = self._template.name
                 raise UsageError(f"`template` {name}: the server ignores '{path}', it reads {known}; {cure}")
         packed_ns = trace.marks[-1][1]
-        link.send(body)
+        link.send_in_time(body)
         return self._message(link), packed_ns
 
     def _greeted(self, link: BoundedConnection) -> None:
@@ -211,16 +211,21 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             self._connected(self._wiring.bounds(self._url, 1))
         return {**super().describe(), **self._metadata}
 
+    def _abandon(self) -> None:
+        if self._link is not None:
+            self._link.close_socket()
+            self._link = None
+
     def close(self) -> None:
         if self._link is not None:
-            self._link.close(orderly=True)
-            self._link = None
+            self._link.close()
+        self._abandon()
 
 
 def examine(parts: SplitResult) -> Iterator[Finding | str]:
     """Shake hands without a key, and at templates' paths if that is refused; no request is sent."""
     servers = {name: template_of(name).server for name in names()}
-    given, why, extensions = parts.path or "/", "", None
+    given, why, compresses = parts.path or "/", "", None
     for path in (given, *sorted({each.path or "/" for each in servers.values()} - {given})):
         url = urlunsplit(parts._replace(path=path))
         bounds, offered = Bounds(url, PATIENCE_S, 0), [ClientPerMessageDeflateFactory()]
@@ -228,7 +233,7 @@ def examine(parts: SplitResult) -> Iterator[Finding | str]:
             with closing(BoundedConnection(url, {}, bounds, PATIENCE_S, extensions=offered)) as link:
                 with suppress(RequestFailed):  # as of servers that wait for their client's first message
                     link.receive()
-                extensions = link.headers().get("Sec-WebSocket-Extensions", "")
+                compresses = bool(link.protocol.extensions)
                 break
         except ServerDied as error:
             raise OSError(str(error).rpartition(": ")[2]) from error
@@ -236,12 +241,12 @@ def examine(parts: SplitResult) -> Iterator[Finding | str]:
             why = str(error) if REFUSED not in str(error) else why or str(error)
             if REFUSED not in why:
                 break
-    if extensions is None:
+    if compresses is None:
         yield Finding("server", "state", f"it answers, and refuses a client without a key: {why}")
         return
     if why:
         yield Finding("path", "advice", f"{why}; it lets clients in at {path}", f"name {url}")
-    if "permessage-deflate" in extensions:
+    if compresses:
         what = "it compresses for clients that offer it, as libraries do by default: each observation is deflated first"
         cure = "connect with compression=None, as the clients of openpi and s2a-bench do, or turn it off in the server"
         yield Finding("compression", "advice", what, cure)
