@@ -116,26 +116,19 @@ def change_between(
     if paired:
         draws[1] = draws[0]
     below, above = (_Side.of(side, statistic, drawn, exact) for side, drawn in zip(launches, draws, strict=True))
-    plain = _Test.of(below, above, confidence, paired)
-    if below.positive and above.positive:
+    test = plain = _Test.of(below, above, confidence, paired)
+    ratio = Ratio(above.mean / below.mean if below.mean > 0 else None, None, None)
+    logarithmic = below.positive and above.positive
+    if logarithmic:
         test = _Test.of(below.log(), above.log(), confidence, paired)
-        low, high = (None if bound is None else math.exp(bound) for bound in (test.low, test.high))
+        low, high = (None if bound is None else math.exp(bound) for bound in (test.shift.low, test.shift.high))
         ratio = Ratio(above.level / below.level, low, high)
-        noise = test.noise(1.0, logarithmic=True)
-    else:
-        test = plain
-        noise = test.noise(abs(below.level), logarithmic=False)
-        ratio = Ratio(above.mean / below.mean if below.mean > 0 else None, None, None)
-    return Change(
-        below.level,
-        above.level,
-        ratio,
-        Ratio(plain.shift, plain.low, plain.high),
-        _superiority(launches, draws, confidence),
-        test.p,
-        test.dependent,
-        noise,
-    )
+    unit = 1.0 if logarithmic else abs(below.level)
+    noise = None
+    if test.p is not None and (unit or not test.error):
+        noise = Noise(test.error / unit if test.error else 0.0, test.freedom, logarithmic)
+    superiority = _superiority(launches, draws, confidence)
+    return Change(below.level, above.level, ratio, plain.shift, superiority, test.p, test.dependent, noise)
 
 
 def change_of_ranks(baseline: Rows, other: Rows, *, seed: int) -> Change:
@@ -150,14 +143,19 @@ def ratio_of_launches(
 ) -> Ratio | None:
     """Divide the medians (or means) of two cells, given by launch and block; None if no launch has values of both.
 
-    One launch: `ratio_of_blocks`. Several: the geometric mean of their ratios, with the interval of Student's t on the
-    logarithms, which includes differences between launches.
+    One launch: `change_between` of its blocks, paired if both cells have the same. Several: the geometric mean of their
+    ratios, with the interval of Student's t on the logarithms, which includes differences between launches.
     """
     from scipy import special
 
     both = [launch for launch in above if above[launch] and below.get(launch)]
-    if len(both) <= 1:
-        return ratio_of_blocks(above[both[0]], below[both[0]], seed, statistic) if both else None
+    if not both:
+        return None
+    if len(both) == 1:
+        cells = [below[both[0]], above[both[0]]]
+        blocks, sizes = zip(*(np.unique(cell.block, return_counts=True) for cell in cells), strict=True)
+        first, second = map(Rows, (cell.values for cell in cells), sizes)
+        return change_between([first], [second], statistic, seed=seed, paired=np.array_equal(*blocks)).ratio
     middle = np.median if statistic == "median" else np.mean
     middles = np.array([[middle(cell[launch].values) for launch in both] for cell in (above, below)])
     n = len(both)
@@ -168,17 +166,6 @@ def ratio_of_launches(
     centre, sd = float(logs.mean()), float(logs.std(ddof=1))
     reach = float(special.stdtrit(n - 1, 0.975)) * sd / math.sqrt(n)
     return Ratio(math.exp(centre), math.exp(centre - reach), math.exp(centre + reach), n, sd)
-
-
-def ratio_of_blocks(above: Blocks, below: Blocks, seed: int, statistic: Middle = "median") -> Ratio | None:
-    """Divide the medians (or means) of two cells of one launch; paired if both have the same blocks.
-
-    None if a cell has no values.
-    """
-    if not above or not below:
-        return None
-    paired = np.array_equal(np.unique(above.block), np.unique(below.block))
-    return change_between([below.rows], [above.rows], statistic, seed=seed, paired=paired).ratio
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -260,19 +247,11 @@ class _Side:
 class _Test:
     """Welch's t of two means, Student's of paired ones; no interval and no p if a side's variance is unknown."""
 
-    shift: float
-    low: float | None
-    high: float | None
+    shift: Ratio
     p: float | None
     dependent: bool
     error: float = 0.0
     freedom: float = math.inf
-
-    def noise(self, unit: float, *, logarithmic: bool) -> Noise | None:
-        """Return the standard error of the shift in ``unit``; None if it is unknown, or the unit is 0."""
-        if self.p is None or (self.error and not unit):
-            return None
-        return Noise(self.error / unit if self.error else 0.0, self.freedom, logarithmic)
 
     @classmethod
     def of(cls, below: _Side, above: _Side, confidence: float, paired: bool) -> _Test:
@@ -283,15 +262,15 @@ class _Test:
         shift = above.mean - below.mean
         known = [variance for side in sides if (variance := side.variance) is not None]
         if len(known) < len(sides):
-            return cls(shift, None, None, None, dependent)
+            return cls(Ratio(shift, None, None), None, dependent)
         total = sum(variance for variance, _ in known)
         if total == 0:  # no variance: every difference is certain
-            return cls(shift, shift, shift, 0.0 if shift else 1.0, dependent)
+            return cls(Ratio(shift, shift, shift), 0.0 if shift else 1.0, dependent)
         freedom = total**2 / sum(variance**2 / df for variance, df in known)
         error = math.sqrt(total)
         reach = float(special.stdtrit(freedom, (1 + confidence) / 2)) * error
         p = float(2 * special.stdtr(freedom, -abs(shift) / error))
-        return cls(shift, shift - reach, shift + reach, p, dependent, error, freedom)
+        return cls(Ratio(shift, shift - reach, shift + reach), p, dependent, error, freedom)
 
 
 def _superiority(
