@@ -1,20 +1,10 @@
 """Observation templates: a TOML or JSON file that describes the observation of a policy server, with placeholders.
 
-It holds the nested dictionary that the policy expects. These texts in it are placeholders:
-
-- ``"{image}"``, ``"{image:1}"``: the first, the second picture, uint8 (H, W, 3) RGB. ``"{image:0|CHW}"`` is
-  (3, H, W), ``"{image:0|bytes}"`` the bytes of its file, if pictures are sent as JPEG or PNG.
-- ``"{state}"``, ``"{state:0:7}"``, ``"{state:7:}"``: the robot's state, float32 (D,), or a slice of it.
-- ``"{images}"``: all pictures of the request, as a list.
-- ``{prompt}``, also within a text: ``"Task: {prompt}"``; ``{session}``, an identifier that every client draws once. Any
-  other brace is written twice.
-
-A list of arrays becomes one array with one more axis in front: ``[["{image}"]]`` is (1, 1, H, W, 3) and
-``["{image:0}", "{image:1}"]`` is (2, H, W, 3), while ``[["{prompt}"]]`` stays a list of lists of text. A key that ends
-with ``?`` is optional: it is left out if the request lacks the picture or the numbers of its value. A key of
-``"{images}"`` that ends with ``*`` stands for one key a picture, with the names that the server's greeting lists. All
-other values are constants. The table `EXTENSION` is no part of the observation: it describes the server, as
-`ExternalServer` reads it. The files in ``templates`` beside this module are known by name.
+It holds the nested dictionary that the policy expects; docs/policy-servers.md lists the texts in it that are
+placeholders. Pictures are uint8 (H, W, 3) RGB, the state is float32 (D,). A list of arrays becomes one array with one
+more axis in front: ``["{image:0}", "{image:1}"]`` is (2, H, W, 3), while ``[["{prompt}"]]`` stays a list of lists of
+text. The table `EXTENSION` is no part of the observation: it describes the server, as `ExternalServer` reads it. The
+files in ``templates`` beside this module are known by name.
 """
 
 from __future__ import annotations

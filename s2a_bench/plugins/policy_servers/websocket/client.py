@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from io import BytesIO
-from math import isfinite
 from typing import Any
 from urllib.parse import SplitResult, urlsplit, urlunsplit
 
@@ -190,7 +189,8 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
                 break
             message = self._message(self._link)
         if isinstance(answer, dict) and isinstance(timing := answer.get(codec.TIMING), dict):
-            trace.learn({TIMING[name]: _plain(value) for name, value in timing.items() if name in TIMING})
+            plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in timing.items()}
+            trace.learn({fact: plain[name] for name, fact in TIMING.items() if name in plain})
         if self._native:
             trace.receive(observed.remote_of(unpackb(self._message(self._link))))
         self._mark(trace, packed_ns, first_ns)
@@ -259,9 +259,3 @@ def examine(parts: SplitResult) -> Iterator[Finding | str]:
 def _kind(answer: Any) -> str:
     kind = answer.get(codec.TYPE) if isinstance(answer, dict) else None
     return kind if isinstance(kind, str) else ""
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        value = value.item()
-    return float(value) if type(value) in {int, float} and isfinite(value) else value
