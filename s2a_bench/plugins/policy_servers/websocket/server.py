@@ -12,8 +12,8 @@ import socket
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from http import HTTPStatus
-from queue import SimpleQueue
-from threading import RLock, Semaphore, Thread
+from queue import Queue
+from threading import RLock, Thread
 from typing import Any, Final, cast
 
 import numpy as np
@@ -82,8 +82,7 @@ class PolicyConnection:
         self._lock = RLock()  # of the protocol, and of what is sent
         self._message = bytearray()
         self._timed = False
-        self._requests: SimpleQueue[WebsocketExchange | None] = SimpleQueue()
-        self._room = Semaphore(2)
+        self._requests: Queue[WebsocketExchange | None] = Queue(1)
         self._held = ExitStack()
         self._count()
 
@@ -214,7 +213,6 @@ class PolicyConnection:
             if not frame.fin:
                 return
             message, self._message = bytes(self._message), bytearray()
-        self._room.acquire()
         self._requests.put(WebsocketExchange(self, message, self._held.pop_all()))
         self._count()
 
@@ -227,12 +225,9 @@ class PolicyConnection:
 
     def _answer_all(self) -> None:
         while (exchange := self._requests.get()) is not None:
-            try:
-                with exchange.held:
-                    if self._open and not self.core.answer(exchange):
-                        self.wire.hang_up()
-            finally:
-                self._room.release()
+            with exchange.held:
+                if self._open and not self.core.answer(exchange):
+                    self.wire.hang_up()
             del exchange  # nothing of a request is kept while the next is waited for
 
     def flush(self, left_s: float) -> None:
