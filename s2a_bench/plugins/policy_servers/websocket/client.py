@@ -40,7 +40,6 @@ from s2a_bench.types import Action, Frame, Piece, Request
 
 class WebsocketClient(PolicyClient[WebsocketOptions]):
     def __init__(self, wiring: Wiring[WebsocketOptions], alive: Callable[[], bool]) -> None:
-        """Prepare to ask the server at ``wiring.address``; the first request, or `describe`, connects."""
         super().__init__(wiring, alive)
         self._streams = wiring.variant == STREAM
         self._server = ExternalServer() if self._native else self._template.server
@@ -72,7 +71,6 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             raise RequestFailed(str(error), starting=error.starting) from error
 
     def _pack(self, request: Request, trace: Trace) -> bytes:
-        """Fill the template and write it as MessagePack, marking each stage."""
         observation = self._observation(request, trace)
         if self._native:
             observation[EXTENSION] = observed.extension_of(request)

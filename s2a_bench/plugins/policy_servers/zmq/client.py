@@ -94,7 +94,6 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         return self._link
 
     def _pack(self, request: Request, trace: Trace) -> memoryview:
-        """Fill the template and write it as MessagePack, marking each stage."""
         if self._modalities:
             self._template = layouts.template_of(self._layout, self._modalities, len(request.state))
             self._modalities = {}
@@ -140,7 +139,6 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         return answer
 
     def describe(self) -> dict[str, str]:
-        """Return where the server is, and how requests for it are packed, for the manifest."""
         template = {"template": layouts.MODALITIES} if self._modalities else {}
         return {**super().describe(), **template, "layout": self._layout}
 
@@ -230,6 +228,5 @@ class ReqSocket:
                 raise RequestFailed(f"{self._url} was silent for too long: {self._timeout_s:g} s", starting=True)
 
     def close(self) -> None:
-        """Close the connection, whatever is on its way."""
         self._watch.close()
         self._context.destroy(0)

@@ -277,7 +277,6 @@ class Marks:
         self._promises: OrderedDict[tuple[bytes, str], Promise] = OrderedDict()
 
     def promise(self, request: tuple[bytes, str]) -> Promise:
-        """Return the promise of a client's request, given by its name and the request's id."""
         promised = Promise(Future(), Event())
         with self._lock:
             self._promises[request] = promised
