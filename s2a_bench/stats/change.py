@@ -6,15 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Literal, TypeAlias, TypeVar
+from typing import Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench.stats import Floats, Ratio
 from s2a_bench.stats.batches import FEWEST_ROWS, Blocks, LaunchValues, RowCorrelation, Rows, ranks_of
-
-Middle: TypeAlias = Literal["median", "mean"]
 
 _Launch = TypeVar("_Launch")
 
@@ -139,7 +137,10 @@ def change_of_ranks(baseline: Rows, other: Rows, *, seed: int) -> Change:
 
 
 def ratio_of_launches(
-    above: Mapping[_Launch, Blocks], below: Mapping[_Launch, Blocks], seed: int, statistic: Middle = "median"
+    above: Mapping[_Launch, Blocks],
+    below: Mapping[_Launch, Blocks],
+    seed: int,
+    statistic: Literal["median", "mean"] = "median",
 ) -> Ratio | None:
     """Divide the medians (or means) of two cells, given by launch and block; None if no launch has values of both.
 
@@ -277,27 +278,22 @@ def _superiority(
     sides: Sequence[Sequence[LaunchValues]], draws: Sequence[NDArray[np.int64] | None], confidence: float
 ) -> Ratio:
     """Return P(other > baseline) + P(equal) / 2, with a percentile interval over the batches of two single launches."""
-    below, above = (np.sort(np.concatenate([launch.values for launch in side])) for side in sides)
-    value = float(_wins([above], [below])[0, 0]) / (len(above) * len(below))
+    below, above = (
+        side[0].ordered if len(side) == 1 else [np.sort(np.concatenate([launch.values for launch in side]))]
+        for side in sides
+    )
+    wins = np.array([[_wins(one, two) for two in below] for one in above])
+    pairs = np.outer([len(one) for one in above], [len(two) for two in below])
+    value = float(wins.sum() / pairs.sum())
     first, second = draws
     if first is None or second is None or any(side[0].n_rows < FEWEST_ROWS for side in sides):
         return Ratio(value, None, None)
-    one, two = (side[0].ordered for side in sides)
-    wins = _wins(two, one)
-    pairs = np.outer([len(batch) for batch in two], [len(batch) for batch in one])
     resampled = ((second @ wins) * first).sum(axis=1) / ((second @ pairs) * first).sum(axis=1)
     tail = (1 - confidence) / 2
     low, high = np.quantile(resampled, (tail, 1 - tail))
     return Ratio(value, float(low), float(high))
 
 
-def _wins(above: Sequence[Floats], below: Sequence[Floats]) -> Floats:
-    """Count, for each pair of sorted batches, the pairs of values of which the one above is larger, ties half."""
-    every = np.sort(np.concatenate(below))
-    places = [[np.searchsorted(every, batch, side) for side in ("left", "right")] for batch in above]
-    wins = np.empty((len(above), len(below)))
-    for column, batch in enumerate(below):
-        # Element n is how many of the n smallest of all values below are of this batch.
-        smaller = np.cumsum(np.bincount(np.searchsorted(every, batch) + 1, minlength=len(every) + 1))
-        wins[:, column] = [sum(smaller[place].sum() for place in pair) / 2 for pair in places]
-    return wins
+def _wins(above: Floats, below: Floats) -> float:
+    """Count the pairs of values, which are sorted, of which the one above is larger; ties count half."""
+    return float(sum(np.searchsorted(below, above, side).sum() for side in ("left", "right"))) / 2
