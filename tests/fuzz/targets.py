@@ -300,7 +300,7 @@ def gr00ts() -> list[bytes]:
         {"endpoint": "get_action", "data": {"observation": nested, "options": None}},
         [{"a": np.zeros((1, 4, 2)), "b": np.zeros((1, 4, 1))}, {}],
         {"action.a": np.zeros((4, 2), np.float32)},
-        observed.remote_message(Trace().to_remote()),
+        observed.ActionsExchange().marks(),
     ]
     return [bytes(gr00t.pack(message, maps=maps)) for message in messages for maps in (False, True)]
 
@@ -330,7 +330,7 @@ TARGETS = {
     "yaml": Target(read_yaml, lambda: [METADATA]),
     "observation": Target(read_observation, observations),
     "marks": Target(
-        lambda data: observed.remote_of(unpackb(data)), lambda: [packb(observed.remote_message(Trace().to_remote()))]
+        lambda data: observed.remote_of(unpackb(data)), lambda: [packb(observed.ActionsExchange().marks())]
     ),
     "gr00t": Target(read_gr00t, gr00ts),
     "template": Target(
