@@ -24,7 +24,6 @@ from s2a_bench.machine.cluster import connect
 from s2a_bench.machine.environment import collect
 from s2a_bench.machine.tuning import end_with_parent
 from s2a_bench.store import manifest as manifests
-from s2a_bench.store.manifest import utc_now
 from s2a_bench.sweep import CellWorkers, Outcome, SweepCell
 from s2a_bench.sweep.plan import SweepPlan
 
@@ -39,7 +38,7 @@ def perform(cell: SweepCell, folder: Path, entry: str) -> Outcome:
     """Run a cell with ``--output`` at a new folder; ``entry`` is the command line as "module:function"."""
     folder.mkdir(parents=True)
     argv = [*cell.argv, f"--output={folder}"]
-    started, before_ns = utc_now(), now_ns()
+    started, before_ns = manifests.utc_now(), now_ns()
     error = _inside(argv, entry) if cell.virtual else _outside(argv, folder / "stderr.txt")
     wall_s = (now_ns() - before_ns) / 1e9
     path = run_folder(folder)
@@ -113,7 +112,7 @@ class LocalWorkers(CellWorkers):
         try:
             return future.result()
         except BrokenProcessPool:
-            return Outcome("the worker process died under it (out of memory?)", 0.0, utc_now(), collect())
+            return Outcome("the worker process died under it (out of memory?)", 0.0, manifests.utc_now(), collect())
 
     def _pool(self, virtual: bool) -> ProcessPoolExecutor:
         if virtual not in self._pools:
@@ -172,7 +171,7 @@ class RayWorkers(CellWorkers):
         try:
             outcome, data = future.result()
         except self._ray.exceptions.RayError as error:
-            return Outcome(f"Ray gave up: {str(error).splitlines()[0]}", 0.0, utc_now(), collect())
+            return Outcome(f"Ray gave up: {str(error).splitlines()[0]}", 0.0, manifests.utc_now(), collect())
         with tarfile.open(fileobj=io.BytesIO(data)) as archive:
             archive.extractall(folder, filter="data")
         return outcome

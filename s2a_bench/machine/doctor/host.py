@@ -88,7 +88,9 @@ def compiler(machine: Machine) -> Finding:
 
 def cpus(machine: Machine) -> Finding | None:
     """Compare the CPUs this process may use with the online ones: affinity, and the cgroup's quota."""
-    online = len(_listed(machine.read(f"{CPU}/online"))) or len(machine.cpus)
+    parts = (part.partition("-") for part in (machine.read(f"{CPU}/online") or "").split(","))
+    counts = (int(last or first) + 1 - int(first) for first, _, last in parts if first.isdecimal())  # of 0-3,7
+    online = sum(counts) or len(machine.cpus)
     message = f"{len(machine.cpus)} of {online} CPUs may be used"
     if (quota := cgroup_quota(machine)) is not None and quota < len(machine.cpus):
         message += f", but the cgroup stops this process after {quota:g} CPUs' worth of time: jumps of up to 100 ms"
@@ -189,15 +191,6 @@ def clock_source(machine: Machine) -> Finding | None:
     better = next((name for name in GOOD_CLOCKS if name in available), None)
     fix = f"echo {better} | sudo tee /{folder}/current_clocksource" if better else "dmesg | grep tsc shows the reason"
     return Finding("clock-source", "warning", f"{source}: reading the time is slow, and every mark does it", fix)
-
-
-def _listed(text: str | None) -> list[int]:
-    numbers: list[int] = []
-    for part in (text or "").split(","):
-        first, _, last = part.partition("-")
-        if first.isdecimal():
-            numbers += range(int(first), int(last or first) + 1)
-    return numbers
 
 
 def memory(machine: Machine) -> Finding | None:

@@ -104,7 +104,8 @@ def template_of(layout: str, keys_of: Mapping[str, tuple[Sequence[str], int]], s
     kinds = [part.rpartition(".")[2].replace("left_", "").replace("right_", "") for part in parts]
     unknown = [kind for kind in kinds if kind not in WIDTHS]
     each, over = divmod(state - sum(WIDTHS.get(kind, 0) for kind in kinds), len(unknown) or 1)
-    if len({*unknown}) > 1 or over or (each < 1 if unknown else each):
+    off = each < 1 if unknown else each != 0
+    if len({*unknown}) > 1 or over or off:
         widths = ", ".join(f"{part} ({WIDTHS.get(kind, '?')})" for part, kind in zip(parts, kinds, strict=True))
         cure = "give `template`" if len({*unknown}) > 1 else "change `state`, or give `template`"
         raise RequestFailed(f"the server's state is {widths}, not {state} numbers; {cure}")
