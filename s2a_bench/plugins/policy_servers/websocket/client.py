@@ -62,9 +62,9 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
                 self._connected(bounds)
                 trace.mark("connect")
             body = self._pack(request, trace)
-            message, packed_ns = self._sent(body, len(request.images), bounds, trace)
+            message = self._sent(body, len(request.images), bounds, trace)
             trace.provenance = self._provenance
-            yield from self._actions(message, packed_ns, trace)
+            yield from self._actions(message, trace)
         except Broken as error:
             if not self._alive():
                 raise ServerDied(f"the server has ended: {error}") from error
@@ -89,17 +89,17 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         trace.mark("image_encode")
         return {"__image__": True, "format": payload, "data": file.getvalue(), "shape": rgb.shape}
 
-    def _sent(self, body: bytes, cameras: int, bounds: Bounds, trace: Trace) -> tuple[bytes, int]:
+    def _sent(self, body: bytes, cameras: int, bounds: Bounds, trace: Trace) -> bytes:
         """Send, once more if the server had just closed the kept connection; return the answer's first message."""
         if self._link is not None:
             if self._link.alive(bounds):
                 with suppress(Broken):
-                    return self._exchanged(self._link, body, cameras, trace)
+                    return self._exchanged(self._link, body, cameras)
             trace.facts[RECONNECTS] = 1.0
             self._abandon()
         link = self._connected(bounds)
         trace.mark("connect")
-        return self._exchanged(link, body, cameras, trace)
+        return self._exchanged(link, body, cameras)
 
     def _connected(self, bounds: Bounds) -> BoundedConnection:
         self._link = None
@@ -116,15 +116,14 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         self._link = link
         return link
 
-    def _exchanged(self, link: BoundedConnection, body: bytes, cameras: int, trace: Trace) -> tuple[bytes, int]:
+    def _exchanged(self, link: BoundedConnection, body: bytes, cameras: int) -> bytes:
         for index, path in self._ignored:
             if index < cameras:
                 known, cure = ", ".join(map(repr, self._listed)), "take a template with these keys, or write one"
                 name = self._template.name
                 raise UsageError(f"`template` {name}: the server ignores '{path}', it reads {known}; {cure}")
-        packed_ns = trace.marks[-1][1]
         link.send_in_time(body)
-        return self._message(link), packed_ns
+        return self._message(link)
 
     def _greeted(self, link: BoundedConnection) -> None:
         metadata = unpackb(self._message(link))
@@ -165,7 +164,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             if isinstance(answer, str):
                 raise self._failed(answer)
 
-    def _actions(self, message: bytes, packed_ns: int, trace: Trace) -> Iterator[Action]:
+    def _actions(self, message: bytes, trace: Trace) -> Iterator[Action]:
         """Yield the actions of an answer; after the last, complete the trace."""
         assert self._link  # noqa: S101 - for mypy
         count, first_ns = 0, 0
@@ -191,14 +190,10 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             trace.learn({fact: plain[name] for name, fact in TIMING.items() if name in plain})
         if self._native:
             trace.receive(observed.remote_of(unpackb(self._message(self._link))))
-        self._mark(trace, packed_ns, first_ns)
-
-    def _mark(self, trace: Trace, packed_ns: int, first_ns: int) -> None:
+        infer_ns = round(trace.facts.get(INFER_MS, 0) * 1e6)
         if trace.remote is not None:
             trace.marks.append(("return", first_ns))
-            return
-        infer_ns = round(trace.facts.get(INFER_MS, 0) * 1e6)
-        if 0 < infer_ns < first_ns - packed_ns and not self._streams:
+        elif 0 < infer_ns < first_ns - trace.marks[-1][1] and not self._streams:
             trace.marks += [("server", first_ns - infer_ns), ("inference", first_ns)]
         else:
             trace.marks.append(("server", first_ns))
