@@ -16,6 +16,7 @@ from s2a_bench.stats.batches import FEWEST_ROWS, Blocks, LaunchValues, RowCorrel
 
 _Launch = TypeVar("_Launch")
 
+CONFIDENCE: Final = 0.95
 POWER: Final = 0.8
 """Probability of finding the smallest detectable change (Cohen 1988)."""
 
@@ -34,14 +35,14 @@ class Noise:
     freedom: float
     logarithmic: bool = True
 
-    def detectable(self, level: float, *, falls: bool = False, power: float = POWER) -> float:
-        """Return the smallest rise (or fall), over the baseline, that a two-sided t test finds with ``power``."""
+    def detectable(self, level: float, *, falls: bool = False) -> float:
+        """Return the smallest rise (or fall), over the baseline, that a two-sided t test finds with `POWER`."""
         from scipy import special
 
         if not self.error:
             return 0.0
         critical = -float(special.stdtrit(self.freedom, level / 2))
-        shift = float(special.nctdtrinc(self.freedom, 1 - power, critical)) * self.error
+        shift = float(special.nctdtrinc(self.freedom, 1 - POWER, critical)) * self.error
         if not self.logarithmic:
             return shift
         return -math.expm1(-shift) if falls else math.expm1(min(shift, _MOST))
@@ -91,7 +92,6 @@ def change_between(
     statistic: str,
     *,
     seed: int,
-    confidence: float = 0.95,
     exact: bool = False,
     paired: bool = False,
 ) -> Change:
@@ -114,26 +114,26 @@ def change_between(
     if paired:
         draws[1] = draws[0]
     below, above = (_Side.of(side, statistic, drawn, exact) for side, drawn in zip(launches, draws, strict=True))
-    test = plain = _Test.of(below, above, confidence, paired)
+    test = plain = _Test.of(below, above, paired)
     ratio = Ratio(above.mean / below.mean if below.mean > 0 else None, None, None)
     logarithmic = below.positive and above.positive
     if logarithmic:
-        test = _Test.of(below.log(), above.log(), confidence, paired)
+        test = _Test.of(below.log(), above.log(), paired)
         low, high = (None if bound is None else math.exp(bound) for bound in (test.shift.low, test.shift.high))
         ratio = Ratio(above.level / below.level, low, high)
     unit = 1.0 if logarithmic else abs(below.level)
     noise = None
     if test.p is not None and (unit or not test.error):
         noise = Noise(test.error / unit if test.error else 0.0, test.freedom, logarithmic)
-    superiority = _superiority(launches, draws, confidence)
+    superiority = _superiority(launches, draws)
     return Change(below.level, above.level, ratio, plain.shift, superiority, test.p, test.dependent, noise)
 
 
-def change_of_ranks(baseline: Rows, other: Rows, *, seed: int) -> Change:
+def change_of_ranks(baseline: Rows, other: Rows) -> Change:
     """Compare the ranks of two launches' values: the rank test of Wilcoxon, with the batches of `change_between`."""
     ranks = ranks_of(np.concatenate([baseline.values, other.values]))
     below, above = np.split(ranks, [len(baseline.values)])
-    return change_between([Rows(below, baseline.sizes)], [Rows(above, other.sizes)], "mean", seed=seed)
+    return change_between([Rows(below, baseline.sizes)], [Rows(above, other.sizes)], "mean", seed=0)
 
 
 def ratio_of_launches(
@@ -255,7 +255,7 @@ class _Test:
     freedom: float = math.inf
 
     @classmethod
-    def of(cls, below: _Side, above: _Side, confidence: float, paired: bool) -> _Test:
+    def of(cls, below: _Side, above: _Side, paired: bool) -> _Test:
         from scipy import special
 
         sides = [above.less(below)] if paired else [below, above]
@@ -269,14 +269,12 @@ class _Test:
             return cls(Ratio(shift, shift, shift), 0.0 if shift else 1.0, dependent)
         freedom = total**2 / sum(variance**2 / df for variance, df in known)
         error = math.sqrt(total)
-        reach = float(special.stdtrit(freedom, (1 + confidence) / 2)) * error
+        reach = float(special.stdtrit(freedom, (1 + CONFIDENCE) / 2)) * error
         p = float(2 * special.stdtr(freedom, -abs(shift) / error))
         return cls(Ratio(shift, shift - reach, shift + reach), p, dependent, error, freedom)
 
 
-def _superiority(
-    sides: Sequence[Sequence[LaunchValues]], draws: Sequence[NDArray[np.int64] | None], confidence: float
-) -> Ratio:
+def _superiority(sides: Sequence[Sequence[LaunchValues]], draws: Sequence[NDArray[np.int64] | None]) -> Ratio:
     """Return P(other > baseline) + P(equal) / 2, with a percentile interval over the batches of two single launches."""
     below, above = (
         side[0].ordered if len(side) == 1 else [np.sort(np.concatenate([launch.values for launch in side]))]
@@ -289,7 +287,7 @@ def _superiority(
     if first is None or second is None or any(side[0].n_rows < FEWEST_ROWS for side in sides):
         return Ratio(value, None, None)
     resampled = ((second @ wins) * first).sum(axis=1) / ((second @ pairs) * first).sum(axis=1)
-    tail = (1 - confidence) / 2
+    tail = (1 - CONFIDENCE) / 2
     low, high = np.quantile(resampled, (tail, 1 - tail))
     return Ratio(value, float(low), float(high))
 
