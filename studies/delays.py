@@ -117,7 +117,7 @@ def rows(config: DelaysConfig, process: str, seed: int) -> Iterator[DelayRow]:
     maximum = Maximum(float(learnt.max()))
     hindsight = int(np.sort(judged)[-1 - int(config.epsilon * judged.size)])
     ticks = [Rows(SETTING.delay_ticks(each).astype(float)) for each in (learnt, judged)]
-    change = change_of_ranks(*ticks, seed=0)
+    change = change_of_ranks(*ticks)
     chosen: dict[str, Ints] = {
         "calibrated": np.array([trigger(known.caution, SETTING, MOST).ticks]),
         "tracked": follow(TrackedLatency.begin(learnt.tolist(), config.epsilon), judged, SETTING, MOST),
