@@ -42,14 +42,14 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
     from s2a_bench.report.compare import comparison, gates, shown
 
     conditions = [gates.read_gate(text) for text in config.fail_if]
-    sides = comparison.read_side(config.baseline, "A"), comparison.read_side(config.other, "B")
-    compared = comparison.open_comparison(*sides, unlike=config.unlike, least=config.min_effect / 100)
+    baseline, other = comparison.read_side(config.baseline, "A"), comparison.read_side(config.other, "B")
+    compared = comparison.open_comparison(baseline, other, unlike=config.unlike, least=config.min_effect / 100)
     wanted = comparison.metrics_of(compared, [name for text in config.metric for name in listed(text)])
     compared = comparison.compare(compared, [*wanted, *gates.concerned(compared, conditions)])
     judgements = gates.judge(compared, conditions, strict=config.strict, one_launch=config.one_launch)
-    found = comparison.warnings_of(compared)
-    whole = shown.compare_json(compared, judgements, found)
-    for warning in found:
+    warnings = comparison.warnings_of(compared)
+    whole = shown.compare_json(compared, judgements, warnings)
+    for warning in warnings:
         print_error(f"note [{warning.code}]: {warning.message}; {warning.advice}")
     written = shown.write_comparison(config.output, compared, whole) if config.output else []
     if json_:
@@ -65,7 +65,8 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
         line += "" if one.detectable is None else f", sees {shown.detectable_text(one.detectable)}"
         print_error(f"{line}; {one.reason}" if one.reason else line)
     outcomes = {one.outcome for one in judgements}  # a tripped gate comes before an undecided one
-    raise typer.Exit(TRIPPED if gates.TRIPPED in outcomes else UNDECIDED if gates.UNDECIDED in outcomes else 0)
+    undecided = UNDECIDED if gates.UNDECIDED in outcomes else 0
+    raise typer.Exit(TRIPPED if gates.TRIPPED in outcomes else undecided)
 
 
 compare = command(_compare, CompareConfig)
@@ -75,20 +76,20 @@ def _report(config: ReportConfig) -> None:
     from s2a_bench.report.page.chapters import read_chapters
     from s2a_bench.report.page.files import make_report, write_report
 
-    found = make_report(read_chapters(config.runs, against=config.against), against=config.against)
-    written = write_report(found, config)
-    of_chapters = (f"{chapter.title}: {caveat}" for chapter in found.chapters for caveat in chapter.every_caveat)
-    for caveat in (*found.caveats, *of_chapters):
+    page = make_report(read_chapters(config.runs, against=config.against), against=config.against)
+    written = write_report(page, config)
+    of_chapters = (f"{chapter.title}: {caveat}" for chapter in page.chapters for caveat in chapter.every_caveat)
+    for caveat in (*page.caveats, *of_chapters):
         print_error(f"warning: {caveat}")
-    if found.judged:
-        print_line(f"{found.judged.of.title}'s claims: {found.judged.tally}")
+    if page.judged:
+        print_line(f"{page.judged.of.title}'s claims: {page.judged.tally}")
     outputs = {"page": config.page, "Markdown": config.markdown, "LaTeX": config.latex, "CSV": config.csv}
     for what, path in outputs.items():
         if path is not None:
             inside = sum(path in (each, *each.parents) for each in written)
             count = f", {inside} files" if inside > 1 else ""
             print_line(f"{what}: {path}{count}")
-    whole = [chapter for chapter in found.chapters if chapter.manifest.get("state") == "finished"]
+    whole = [chapter for chapter in page.chapters if chapter.manifest.get("state") == "finished"]
     print_failures(*((chapter.run.path, chapter.content.failures) for chapter in whole))
 
 

@@ -29,7 +29,7 @@ from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
 from s2a_bench.policy import Plans
-from s2a_bench.policy.tracking import TrackedPolicy
+from s2a_bench.policy.conformal import TrackedPolicy
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.trace import Trace
