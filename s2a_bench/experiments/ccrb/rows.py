@@ -7,8 +7,7 @@ from typing import Annotated, Any, Final
 
 from s2a_bench.experiments import COUNT, TIME, Better, Metric, columns
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.scenario.ccrb import FOLLOWERS
-from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
+from s2a_bench.scenario.ccrb.cars import FOLLOWERS, LEAST_IMPACT_MPS
 from s2a_bench.store.schema import Many, NonNegative, Positive, Table, about, with_fields
 
 _DEADLINE: Final = (
