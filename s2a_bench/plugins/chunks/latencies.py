@@ -69,7 +69,7 @@ def sources(written: str, tokens: int) -> Iterator[Source]:
     A run folder has a source a cell, FOLDER#CELL is one of them. ``tokens`` are those of a chunk, for a profile.
     """
     if (read := read_latency(written)) is not None:
-        yield Source(written, read.gaps, read.recorded_ns)
+        yield Source(written, recorded_ns=read) if isinstance(read, np.ndarray) else Source(written, read)
     elif Path(folder := written.partition("#")[0]).is_dir():
         yield from measured(Path(folder), written.partition("#")[2])
     else:
