@@ -46,10 +46,10 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
     compared = comparison.open_comparison(*sides, unlike=config.unlike, least=config.min_effect / 100)
     wanted = comparison.metrics_of(compared, [name for text in config.metric for name in listed(text)])
     compared = comparison.compare(compared, [*wanted, *gates.concerned(compared, conditions)])
-    judgements = gates.judge(compared, conditions, strict=config.strict, one_launch=config.one_launch)
-    found = comparison.warnings_of(compared)
-    whole = shown.compare_json(compared, judgements, found)
-    for warning in found:
+    gated = gates.judge(compared, conditions, strict=config.strict, one_launch=config.one_launch)
+    warnings = comparison.warnings_of(compared)
+    whole = shown.compare_json(compared, gated, warnings)
+    for warning in warnings:
         print_error(f"note [{warning.code}]: {warning.message}; {warning.advice}")
     written = shown.write_comparison(config.output, compared, whole) if config.output else []
     if json_:
@@ -59,13 +59,15 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
         print_table(table)
         for line in (*table.notes, *(f"written: {path}" for path in written)):
             print_line(line)
-    for one in judgements:
-        line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {shown.change_text(one.comparison)}"
-        line += "" if one.comparison.p_holm is None else f", p = {one.comparison.p_holm:.2g}"
+    for one in gated:
+        line = f"gate {one.gate} {one.outcome} in {one.cell}: {shown.change_text(one.change, one.ci95)}"
+        line += "" if one.p_holm is None else f", p = {one.p_holm:.2g}"
         line += "" if one.detectable is None else f", sees {shown.detectable_text(one.detectable)}"
         print_error(f"{line}; {one.reason}" if one.reason else line)
-    outcomes = {one.outcome for one in judgements}  # a tripped gate comes before an undecided one
-    raise typer.Exit(TRIPPED if gates.TRIPPED in outcomes else UNDECIDED if gates.UNDECIDED in outcomes else 0)
+    outcomes = {one.outcome for one in gated}
+    if "tripped" in outcomes:  # comes before an undecided one
+        raise typer.Exit(TRIPPED)
+    raise typer.Exit(UNDECIDED if "undecided" in outcomes else 0)
 
 
 compare = command(_compare, CompareConfig)
@@ -75,20 +77,20 @@ def _report(config: ReportConfig) -> None:
     from s2a_bench.report.page.chapters import read_chapters
     from s2a_bench.report.page.files import make_report, write_report
 
-    found = make_report(read_chapters(config.runs, against=config.against), against=config.against)
-    written = write_report(found, config)
-    of_chapters = (f"{chapter.title}: {caveat}" for chapter in found.chapters for caveat in chapter.every_caveat)
-    for caveat in (*found.caveats, *of_chapters):
+    made = make_report(read_chapters(config.runs, against=config.against), against=config.against)
+    written = write_report(made, config)
+    of_chapters = (f"{chapter.title}: {caveat}" for chapter in made.chapters for caveat in chapter.every_caveat)
+    for caveat in (*made.caveats, *of_chapters):
         print_error(f"warning: {caveat}")
-    if found.judged:
-        print_line(f"{found.judged.of.title}'s claims: {found.judged.tally}")
+    if made.judged:
+        print_line(f"{made.judged.of.title}'s claims: {made.judged.tally}")
     outputs = {"page": config.page, "Markdown": config.markdown, "LaTeX": config.latex, "CSV": config.csv}
     for what, path in outputs.items():
         if path is not None:
             inside = sum(path in (each, *each.parents) for each in written)
             count = f", {inside} files" if inside > 1 else ""
             print_line(f"{what}: {path}{count}")
-    whole = [chapter for chapter in found.chapters if chapter.manifest.get("state") == "finished"]
+    whole = [chapter for chapter in made.chapters if chapter.manifest.get("state") == "finished"]
     print_failures(*((chapter.run.path, chapter.content.failures) for chapter in whole))
 
 

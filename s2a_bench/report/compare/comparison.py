@@ -131,19 +131,19 @@ def open_comparison(
     experiment = experiment_of(commands[0])
     by = experiment.compared_by() if experiment else None
     if by is None:
-        known = ", ".join(sorted(name for name, found in EXPERIMENTS.loaded() if found.compared))
+        known = ", ".join(sorted(name for name, each in EXPERIMENTS.loaded() if each.compared))
         raise UsageError(f"runs of {commands[0]} cannot be compared, only those of {known}")
     with fits(*runs):
         dated = [[each for run in side for each in _launches(run, by.subjects(run))] for side in (baseline, other)]
         sides = [[launch for _, launch in side] for side in dated]
-        found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
+        differ = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
         metrics = {**by.metrics, **by_name(metric for run in runs for metric in by.run_metrics(run))}
     if (len(sides[0]) > 1) != (len(sides[1]) > 1):
         raise UsageError(
             "name several launches on both sides, or one on each: the test uses launches or requests; "
             "`launches` measures several in one run"
         )
-    fatal = [difference for difference in found if difference.fatal]
+    fatal = [difference for difference in differ if difference.fatal]
     if fatal and not unlike:
         raise UnlikeRuns(f"the runs are unlike: {as_line(fatal)}; `unlike` compares them anyway")
     pairs, only, settings = _match(*sides)
@@ -152,18 +152,19 @@ def open_comparison(
     if not pairs:
         raise UnlikeRuns(f"no cell is in every run: {', '.join(only[0])} against {', '.join(only[1])}")
     started = tuple(tuple(when for when, _ in side) for side in dated)
-    differ = (*settings, *found)
-    return ComparedRuns(tuple(baseline), tuple(other), by, metrics, differ, tuple(pairs), only, least, started)
+    return ComparedRuns(
+        tuple(baseline), tuple(other), by, metrics, (*settings, *differ), tuple(pairs), only, least, started
+    )
 
 
 def _launches(run: StoredRun, subjects: Iterable[Subject]) -> list[tuple[str, dict[str, Subject]]]:
     """Return when a run started and name -> cell, for each launch; raises UnlikeRuns if it has none."""
-    found: dict[int, dict[str, Subject]] = {}
+    launches: dict[int, dict[str, Subject]] = {}
     for subject in subjects:
-        found.setdefault(subject.launch, {})[subject.name] = subject
-    if not found:
+        launches.setdefault(subject.launch, {})[subject.name] = subject
+    if not launches:
         raise UnlikeRuns(f"{run.path} has no complete cell, its state is {run.manifest['state']}: measure it again")
-    return [(str(run.manifest.get("started") or ""), launch) for launch in found.values()]
+    return [(str(run.manifest.get("started") or ""), launch) for launch in launches.values()]
 
 
 def _match(
@@ -181,8 +182,8 @@ def _match(
         first = pair.baseline[0]
         for subject in (*pair.baseline[1:], *pair.other):
             for key, value in first.setting.items():
-                if (found := subject.setting.get(key)) != value:
-                    settings[Difference(f"{pair.name} {key}", value, str(found), fatal=True)] = None
+                if (other_value := subject.setting.get(key)) != value:
+                    settings[Difference(f"{pair.name} {key}", value, str(other_value), fatal=True)] = None
     return pairs, (left[0], left[1]), list(settings)
 
 
@@ -202,18 +203,18 @@ def metrics_of(compared: ComparedRuns, names: Sequence[str]) -> list[tuple[Metri
 def metric_of(compared: ComparedRuns, name: str, flag: str) -> tuple[Metric, str]:
     """Parse NAME or NAME.STATISTIC; raises UsageError for an unknown metric, or if no cell has it."""
     metrics = compared.metrics
-    metric, dot, statistic = name.rpartition(".")
+    stem, dot, statistic = name.rpartition(".")
     if name in metrics:
-        found, statistic = metrics[name], metrics[name].statistic
-    elif dot and metric in metrics and statistic in STATISTICS:
-        found = metrics[metric]
+        metric, statistic = metrics[name], metrics[name].statistic
+    elif dot and stem in metrics and statistic in STATISTICS:
+        metric = metrics[stem]
     else:
         has = [one for one in metrics if any(_rows(pair, one) for pair in compared.pairs)]
-        known = f"the statistics are {', '.join(STATISTICS)}" if metric in metrics else f"there are {', '.join(has)}"
+        known = f"the statistics are {', '.join(STATISTICS)}" if stem in metrics else f"there are {', '.join(has)}"
         raise UsageError(f"{flag}: '{name}' is no metric of these {compared.command} runs; {known}")
-    if not any(_rows(pair, found.name) for pair in compared.pairs):
-        raise UsageError(f"{flag}: no cell has {found.name} on both sides")
-    return found, statistic
+    if not any(_rows(pair, metric.name) for pair in compared.pairs):
+        raise UsageError(f"{flag}: no cell has {metric.name} on both sides")
+    return metric, statistic
 
 
 def compare(compared: ComparedRuns, wanted: Sequence[tuple[Metric, str]]) -> ComparedRuns:
@@ -222,16 +223,16 @@ def compare(compared: ComparedRuns, wanted: Sequence[tuple[Metric, str]]) -> Com
     The detectable change is that of the first step of Holm's correction, which has the strictest level.
     """
     with fits(*compared.baseline, *compared.other):
-        found = [found for metric, statistic in dict.fromkeys(wanted) for found in changes(compared, metric, statistic)]
-    corrected = holm([comparison.change.p for comparison in found])
+        every = [one for metric, statistic in dict.fromkeys(wanted) for one in changes(compared, metric, statistic)]
+    corrected = holm([one.change.p for one in every])
     judged = [
         replace(
             one,
             p_holm=p,
             verdict=verdict(one.change, p, one.metric, compared.least),
-            detectable=detectable(one.change, len(found)),
+            detectable=detectable(one.change, len(every)),
         )
-        for one, p in zip(found, corrected, strict=True)
+        for one, p in zip(every, corrected, strict=True)
     ]
     return replace(compared, comparisons=tuple(judged))
 
