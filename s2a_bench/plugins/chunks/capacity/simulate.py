@@ -131,11 +131,10 @@ def _paced(pace: Pace, mode: Mode, setting: ControlSetting, most: int) -> Genera
     while tick < most:
         latency_ns = yield tick
         latencies.append(min(latency_ns, (most + 1 - tick) * setting.period_ns))  # no matter how long after the end
-        known = -(-latency_ns // setting.period_ns)
-        tick, _ = pace.send((latency_ns // setting.period_ns if setting.rounding == "floor" else known, known))
+        tick, _ = pace.send((setting.delay(latency_ns), -(-latency_ns // setting.period_ns)))
     done = mode.ticks(np.array(latencies, np.int64), setting)
-    chunk, index, age = (each[:most].copy() for each in (done.chunk, done.index, done.age))
-    return (Ticks(chunk, index, age, done.stalled[:most].copy()),)
+    kept = slice(most)
+    return (Ticks(done.chunk[kept].copy(), done.index[kept].copy(), done.age[kept].copy(), done.stalled[kept].copy()),)
 
 
 def _requesting(robot: int, every_ns: int, think_ns: int, start_ns: int, end_ns: int) -> Robot:

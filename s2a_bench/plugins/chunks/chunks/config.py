@@ -150,15 +150,13 @@ class ChunksVirtual(ChunksOptions):
     def too_few(self) -> str:
         """The source with too few latencies for a rule that keeps to `epsilon`, as text; else empty."""
         needed = fewest(self.epsilon)
-        return next(
-            (
-                f"{each.name} has {count} latencies to learn from (of a recording the first half); "
-                f"a stall in {self.epsilon:.2%} of the cycles takes {needed}"
-                for each in self.sources
-                if (count := each.learnable(self.calibration_cycles)) < needed
-            ),
-            "",
-        )
+        for source in self.sources:
+            if (count := source.learnable(self.calibration_cycles)) < needed:
+                return (
+                    f"{source.name} has {count} latencies to learn from (of a recording the first half); "
+                    f"a stall in {self.epsilon:.2%} of the cycles takes {needed}"
+                )
+        return ""
 
     @property
     def learnt(self) -> int:

@@ -12,7 +12,7 @@ from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, mean_rows, trigger_rows
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ChunkCell, LatencyDraw, cells, changes, draw
-from s2a_bench.plugins.chunks.chunks.config import PROMISING, RulesPlan
+from s2a_bench.plugins.chunks.chunks.config import PROMISING
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
 from s2a_bench.plugins.chunks.chunks.smooth import TrackingPlant, follower
 from s2a_bench.plugins.chunks.latencies import delay_rows, write_delays
@@ -23,7 +23,6 @@ from s2a_bench.store.run import RunWriter
 if TYPE_CHECKING:
     from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
     from s2a_bench.plugins.chunks.modes import ControlSetting
-    from s2a_bench.plugins.chunks.options import ControlPlan
     from s2a_bench.progress import Progress
 
 MOST_TICKS: Final = 100_000_000
@@ -34,15 +33,11 @@ MOST_TICKS: Final = 100_000_000
 class VirtualPlan:
     """A run in virtual time."""
 
-    control: ControlPlan
-    rules: RulesPlan
     drawn: Sequence[LatencyDraw]
     """Of each source."""
     cells: Sequence[ChunkCell]
     follows: TrackingPlant | None
     """The robot and its target; None without a robot, or with actions slowed down."""
-    shown_ticks: int
-    export_delays: Path | None
     manifest: dict[str, Any]
 
 
@@ -75,7 +70,7 @@ def resolve(config: ChunksVirtual) -> VirtualPlan:
     }
     plant = config.robot_kind if config.slow_down == 1 else None
     follows = None if plant is None else follower(plant, control)
-    return VirtualPlan(control, rules, drawn, tried, follows, config.shown_ticks, config.export_delays, manifest)
+    return VirtualPlan(drawn, tried, follows, manifest)
 
 
 def _check_memory(drawn: LatencyDraw, setting: ControlSetting) -> None:
@@ -90,23 +85,23 @@ def _check_memory(drawn: LatencyDraw, setting: ControlSetting) -> None:
 
 def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path:
     """Act in virtual time and return the run folder; raises S2AError."""
-    plan = resolve(config)
-    setting, mode, first = plan.control.setting, plan.rules.mode, plan.drawn[0]
+    plan, control, rules = resolve(config), config.control, config.rules_plan
+    setting, first = control.setting, plan.drawn[0]
     with RunWriter.create(output, "chunks", plan.manifest, (CHUNKS, REACTIONS, TICKS, REQUESTS)) as writer:
         progress.opened(writer.path)
         progress.stage("acting in virtual time")
         progress.expect(len(plan.cells))
         for cell in plan.cells:
             acted = _acted(cell, setting.slowed(cell.slower), plan.follows)
-            for table, rows in cell_rows(acted, plan.shown_ticks, plan.rules.epsilon, plan.control.seed).items():
+            for table, rows in cell_rows(acted, config.shown_ticks, rules.epsilon, control.seed).items():
                 writer.append(table, rows)
             progress.advance()
-        if mode is not None:
+        if rules.mode is not None:
             for drawn in plan.drawn:
-                writer.append(TRIGGERS, trigger_rows(mode, setting, drawn))
-        writer.append(MEANS, mean_rows(plan.control, first, plan.follows))
-        if plan.export_delays is not None:
-            write_delays(plan.export_delays, delay_rows(first.source, first.judged, plan.cells[0].mode, setting))
+                writer.append(TRIGGERS, trigger_rows(rules.mode, setting, drawn))
+        writer.append(MEANS, mean_rows(control, first, plan.follows))
+        if config.export_delays is not None:
+            write_delays(config.export_delays, delay_rows(first.source, first.judged, plan.cells[0].mode, setting))
         return writer.path
 
 
