@@ -59,7 +59,7 @@ def _fleet(mode: str, robots: int, seconds: float, times_ns: Iterator[int], seed
 
 
 def _stalled(found: list[RobotTrace]) -> float:
-    return float(measures(found, CONFIG.setting, CONFIG.settle_ns)["stalled"])
+    return float(measures(found, CONFIG.setting, CONFIG.settle_ns).stalled)
 
 
 def truth(pool: Executor, service: str, mode: str, robots: int) -> float:
@@ -74,7 +74,7 @@ def _long(service: str, mode: str, robots: int, run: int) -> float:
 def interval(service: str, mode: str, robots: int, seconds: float, seed: int) -> tuple[float, float]:
     """Return the 95 % interval of the stalled share of one run."""
     row = measures(traces(service, mode, robots, seconds, seed), CONFIG.setting, CONFIG.settle_ns)
-    return row["stalled_low"], row["stalled_high"]
+    return row.stalled_low, row.stalled_high
 
 
 def wrong(service: str, shares: Mapping[int, float], seed: int) -> bool:

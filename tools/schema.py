@@ -20,7 +20,7 @@ from pydantic_core import core_schema
 
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.ccrb.view.tables import ORDERINGS
-from s2a_bench.experiments.cells import TIME, columns_of
+from s2a_bench.experiments.cells import columns_of
 from s2a_bench.experiments.profile_capture import ProfileJson
 from s2a_bench.experiments.throughput.metrics import Reference
 from s2a_bench.inference.fetch import FetchedFile
@@ -80,7 +80,7 @@ def _keys(cls: type, made: dict[str, Any]) -> dict[str, Any]:
             schema = {**others[0], **{key: value for key, value in schema.items() if key != "anyOf"}}
         elif column.key and column.name in made["required"]:
             required.append(column.key)
-        if column.metric and (column.metric.kind == TIME or getattr(cls, "means", False)):
+        if column.in_s or (column.metric and getattr(cls, "means", False)):
             schema = {**schema, "type": "number"}
         if column.json_key:
             schema = {**schema, "type": ["string", "null"]} if schema["type"] == "string" else schema

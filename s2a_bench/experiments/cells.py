@@ -98,24 +98,39 @@ class Column:
     hint: Any
     metric: Metric | None
     json_key: JsonKey | None
+    as_stored: bool
+    """Whether ``--json`` has metrics by their columns, times in ns: the class variable of this name."""
 
     @property
     def key(self) -> str:
         if self.json_key:
             return self.json_key.name
-        return self.metric.name if self.metric else self.name
+        return self.metric.name if self.metric and not self.as_stored else self.name
+
+    @property
+    def in_s(self) -> bool:
+        """Whether ``--json`` has its values, stored in ns, in s."""
+        return self.metric is not None and self.metric.kind == TIME and not self.as_stored
+
+    def json(self, row: object) -> Any:
+        """Return its value in a row as ``--json`` has it."""
+        value = getattr(row, self.name)
+        return value / 1e9 if self.in_s and value is not None else value
 
 
 @cache
 def columns_of(row: type) -> tuple[Column, ...]:
-    return tuple(_column(name, hint) for name, hint in get_type_hints(row, include_extras=True).items())
+    """Return the columns that a dataclass of rows declares."""
+    hints = get_type_hints(row, include_extras=True)
+    return tuple(_column(row, field.name, hints[field.name]) for field in fields(row))
 
 
-def _column(name: str, hint: Any) -> Column:
+def _column(row: type, name: str, hint: Any) -> Column:
     marks = getattr(hint, "__metadata__", ())
     metric = next((mark for mark in marks if isinstance(mark, Metric)), None)
     key = next((mark for mark in marks if isinstance(mark, JsonKey)), None)
-    return Column(name, hint, metric and metric.of_column(name, type_of_values(hint)), key)
+    metric = metric and metric.of_column(name, type_of_values(hint))
+    return Column(name, hint, metric, key, getattr(row, "as_stored", False))
 
 
 def type_of_values(hint: Any) -> type:
@@ -132,10 +147,10 @@ def metrics_of(row: type) -> dict[str, Metric]:
 
 
 def json_of(row: Any) -> dict[str, Any]:
-    """Return a row as an object of ``--json``, times in s; a missing value is an absent key."""
+    """Return a row as an object of ``--json``; a missing value is an absent key."""
     values: dict[str, Any] = {}
-    for column in columns_of(type(row)):
-        value = column.metric.read(row) if column.metric else getattr(row, column.name)
+    for column in columns_of(row.__class__):
+        value = column.json(row)
         if column.key and value is not None:
             values[column.key] = None if column.json_key and not value else value
     return values

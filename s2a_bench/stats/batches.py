@@ -164,6 +164,17 @@ def lag_one(values: Floats) -> float:
     return float(around[1:] @ around[:-1]) / float(around @ around)
 
 
+def ranks_of(values: Floats) -> Floats:
+    """Return the rank of each value from 1; equal ones share their mean rank."""
+    order = np.argsort(values, kind="stable")
+    ordered = values[order]
+    begins = np.flatnonzero(np.diff(ordered, prepend=np.nan))
+    ends = np.append(begins[1:], len(values))
+    ranks = np.empty(len(values))
+    ranks[order] = np.repeat((begins + 1 + ends) / 2, ends - begins)
+    return ranks
+
+
 @dataclass(frozen=True, slots=True)
 class RowCorrelation:
     """Correlation of neighbours in a series of ``n`` rows, which is cut into ``k`` batches.
@@ -177,9 +188,7 @@ class RowCorrelation:
 
     @classmethod
     def of(cls, levels: Floats) -> RowCorrelation:
-        from scipy import stats
-
-        r = min(0.95, max(0.0, lag_one(stats.rankdata(levels))))
+        r = min(0.95, max(0.0, lag_one(ranks_of(levels))))
         return cls(r, len(levels), min(BATCHES, len(levels)))
 
     @property

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench.stats import Floats, Ratio
-from s2a_bench.stats.batches import FEWEST_ROWS, Blocks, LaunchValues, RowCorrelation, Rows
+from s2a_bench.stats.batches import FEWEST_ROWS, Blocks, LaunchValues, RowCorrelation, Rows, ranks_of
 
 Middle: TypeAlias = Literal["median", "mean"]
 
@@ -38,11 +38,11 @@ class Noise:
 
     def detectable(self, level: float, *, falls: bool = False, power: float = POWER) -> float:
         """Return the smallest rise (or fall), over the baseline, that a two-sided t test finds with ``power``."""
-        from scipy import special, stats
+        from scipy import special
 
         if not self.error:
             return 0.0
-        critical = float(stats.t.isf(level / 2, self.freedom))
+        critical = -float(special.stdtrit(self.freedom, level / 2))
         shift = float(special.nctdtrinc(self.freedom, 1 - power, critical)) * self.error
         if not self.logarithmic:
             return shift
@@ -140,9 +140,7 @@ def change_between(
 
 def change_of_ranks(baseline: Rows, other: Rows, *, seed: int) -> Change:
     """Compare the ranks of two launches' values: the rank test of Wilcoxon, with the batches of `change_between`."""
-    from scipy import stats
-
-    ranks = stats.rankdata(np.concatenate([baseline.values, other.values]))
+    ranks = ranks_of(np.concatenate([baseline.values, other.values]))
     below, above = np.split(ranks, [len(baseline.values)])
     return change_between([Rows(below, baseline.sizes)], [Rows(above, other.sizes)], "mean", seed=seed)
 
@@ -155,7 +153,7 @@ def ratio_of_launches(
     One launch: `ratio_of_blocks`. Several: the geometric mean of their ratios, with the interval of Student's t on the
     logarithms, which includes differences between launches.
     """
-    from scipy import stats
+    from scipy import special
 
     both = [launch for launch in above if above[launch] and below.get(launch)]
     if len(both) <= 1:
@@ -168,7 +166,7 @@ def ratio_of_launches(
         return Ratio(float(middles[0].mean()) / over if over > 0 else None, None, None, n)
     logs = np.log(middles[0] / middles[1])
     centre, sd = float(logs.mean()), float(logs.std(ddof=1))
-    reach = float(stats.t.ppf(0.975, n - 1)) * sd / math.sqrt(n)
+    reach = float(special.stdtrit(n - 1, 0.975)) * sd / math.sqrt(n)
     return Ratio(math.exp(centre), math.exp(centre - reach), math.exp(centre + reach), n, sd)
 
 
@@ -278,7 +276,7 @@ class _Test:
 
     @classmethod
     def of(cls, below: _Side, above: _Side, confidence: float, paired: bool) -> _Test:
-        from scipy import stats
+        from scipy import special
 
         sides = [above.less(below)] if paired else [below, above]
         dependent = any(side.dependent for side in sides)
@@ -291,8 +289,8 @@ class _Test:
             return cls(shift, shift, shift, 0.0 if shift else 1.0, dependent)
         freedom = total**2 / sum(variance**2 / df for variance, df in known)
         error = math.sqrt(total)
-        reach = float(stats.t.ppf((1 + confidence) / 2, freedom)) * error
-        p = float(2 * stats.t.sf(abs(shift) / error, freedom))
+        reach = float(special.stdtrit(freedom, (1 + confidence) / 2)) * error
+        p = float(2 * special.stdtr(freedom, -abs(shift) / error))
         return cls(shift, shift - reach, shift + reach, p, dependent, error, freedom)
 
 

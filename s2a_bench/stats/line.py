@@ -50,7 +50,7 @@ class Line:
 
 def fit_line(launches: Iterable[tuple[float, float]]) -> Line | None:
     """Fit a line through (x, y above 0) of launches; None for fewer than two different x."""
-    from scipy import stats
+    from scipy import special
 
     found: dict[float, list[float]] = {}
     for x, y in launches:
@@ -68,9 +68,9 @@ def fit_line(launches: Iterable[tuple[float, float]]) -> Line | None:
         value = float(values[place])
         if not freedom:
             return Estimate(value, None)
-        reach = float(stats.t.ppf(0.975, freedom) * np.sqrt(covariance[place, place] * squares / freedom))
+        reach = float(special.stdtrit(freedom, 0.975) * np.sqrt(covariance[place, place] * squares / freedom))
         return Estimate(value, (value - reach, value + reach))
 
-    spread = float(stats.t.ppf(0.975, freedom) * np.sqrt(squares / freedom)) if freedom else None
+    spread = float(special.stdtrit(freedom, 0.975) * np.sqrt(squares / freedom)) if freedom else None
     of = (float(covariance[0, 0]), float(covariance[0, 1]), float(covariance[1, 1]))
     return Line(estimate(0), estimate(1), float(np.sqrt(squares / len(points))), spread, of)

@@ -182,7 +182,8 @@ def read_parquet(path: Path, columns: dict[str, Kind]) -> pd.DataFrame:
             table = file.read([column.name])
             if not table.column_names:  # schema 1 may gain columns
                 table = pa.table([pa.nulls(rows)], [column.name])
-            return to_pandas(table.cast(pa.schema([column])))
+            table = table.cast(pa.schema([column]))
+            return to_pandas(table)
 
         return pd.concat(map(read, schema), axis=1)
 
@@ -197,9 +198,9 @@ def _undamaged(path: Path, pa: Any) -> Iterator[None]:
 
 
 def to_pandas(table: Any) -> pd.DataFrame:
-    """Convert a ``pyarrow.Table``, which nobody uses any more, to a DataFrame with nullable types.
+    """Convert a ``pyarrow.Table`` to a DataFrame with nullable types: integers stay integers, nulls stay nulls.
 
-    Integers stay integers, nulls stay nulls.
+    The table is used up, and its memory given back to the system.
     """
     import pandas as pd
     import pyarrow as pa

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.signal import lfilter
 
-from s2a_bench.stats.batches import LaunchValues, RowCorrelation, Rows
+from s2a_bench.stats.batches import LaunchValues, RowCorrelation, Rows, ranks_of
 from s2a_bench.stats.change import Noise, change_between, change_of_ranks, holm
 
 Floats: TypeAlias = NDArray[np.float64]
@@ -234,6 +234,11 @@ def test_rows_remember_about_one_plus_r_over_one_minus_r_rows(rows: int, depende
 @pytest.mark.parametrize(("r", "dependent"), [(0.63, False), (0.64, True)])
 def test_neighbours_that_are_alike_by_chance_are_not_dependent(r: float, dependent: bool) -> None:
     assert RowCorrelation(r, n=10, k=5).dependent is dependent  # 2 / sqrt(10) = .632
+
+
+@pytest.mark.parametrize("values", [[], [5.0], [3.0, 1, 2], [2.0, 2, 2], [1.0, -math.inf, 1, 7, -0.0, 0.0, 7, 7]])
+def test_equal_values_share_their_mean_rank(values: list[float]) -> None:
+    assert ranks_of(np.array(values)).tolist() == stats.rankdata(values).tolist()
 
 
 def test_a_series_remembers_from_nothing_to_almost_all() -> None:

@@ -11,7 +11,7 @@ EXPERIMENT = Experiment(
     mode="measured",
     modes=(RunMode("predicted", f"{HERE}.config:CapacityPredicted", f"{HERE}.predict:run_predicted", {"predict": ""}),),
     view=f"{HERE}.view:show",
-    cell=f"{HERE}.view:CapacityCell",
+    cell=f"{HERE}.rows:FleetRow",
     compared=f"{HERE}.view:COMPARED",
     unit="fleets",
 )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import numpy as np
 
-from s2a_bench.experiments.cells import TIME, Metric, mean, metrics_of, share
+from s2a_bench.experiments.cells import Metric, mean, metrics_of, share
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -101,8 +101,8 @@ class RobotTrace:
 
 def measures(
     traces: Sequence[RobotTrace], setting: ControlSetting, settle_ns: int = 0, *, confidence: float = 0.95
-) -> dict[str, Any]:
-    """Return the metrics of a fleet by column, None for none; each trace counts from ``settle_ns`` after its start.
+) -> FleetMetrics:
+    """Return the metrics of a fleet; each trace counts from ``settle_ns`` after its start.
 
     Every due tick without an action is stalled, before the first action too: a robot without an answer stands still.
     """
@@ -122,7 +122,7 @@ def measures(
         if trace.late_ns is not None
     )
     age = _joined(trace.ticks.age[skipped:] for trace in traces if trace.ticks is not None)
-    found: dict[str, Any] = {
+    values: dict[str, float | None] = {
         "requests_per_s": _rate(traces, settle_ns),
         "latency_mean_ns": _mean(latency_ns[answered]),
         **_quantiles("latency", latency_ns[answered]),
@@ -133,11 +133,9 @@ def measures(
         "unfair": float(means.max() / latency_ns[answered].mean()) if means.any() else None,
         **_quantiles("late", late_ns[late_ns >= 0]),
     }
-    values = {metric: found.get(metric.column) for metric in METRICS.values()}
-    return {
-        metric.column: round(value) if value is not None and metric.kind == TIME else value
-        for metric, value in values.items()
-    }
+    columns: dict[str, Any] = {metric.column: values.get(metric.column) for metric in METRICS.values()}
+    whole = {column: round(value) for column, value in columns.items() if column.endswith("_ns") and value is not None}
+    return FleetMetrics(**columns | whole)
 
 
 def _rate(traces: Sequence[RobotTrace], settle_ns: int) -> float | None:

@@ -6,11 +6,11 @@ import csv
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain, repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -142,7 +142,7 @@ class Prediction:
     cell: str
     service: Service
     progress: Progress
-    rows: list[Any] = field(default_factory=list)
+    rows: list[FleetRow] = field(default_factory=list)
     """The fleets of the first seed."""
 
     def write(self, writer: RunWriter) -> None:
@@ -176,12 +176,22 @@ class Prediction:
         times = service.times(generator(seed, "capacity service", str(robots)))
         rng = generator(seed, "capacity phases")
         traces = simulate(load, span_ns, robots, times, rng, service.servers, service.slower)
-        row = measures(traces, load.setting, load.settle_ns)
-        verdict, within = judge(row, traces, first=robots == 1)
+        metrics = measures(traces, load.setting, load.settle_ns)
+        verdict, within = judge(metrics, traces, first=robots == 1)
         if seed == load.seed:
-            about = {"cell": self.cell, "source": "predicted", "robots": robots, "seconds": look_ns / 1e9}
-            self.rows.append(FleetRow(**about, looks=1, verdict=verdict, within=within, clean=True, **row))
-        if judge.limit and row[judge.limit.column] is not None:  # what is computed is taken as sure
+            fleet = FleetRow(
+                cell=self.cell,
+                source="predicted",
+                robots=robots,
+                seconds=look_ns / 1e9,
+                looks=1,
+                verdict=verdict,
+                within=within,
+                clean=True,
+                **vars(replace(metrics, stalled_alone=judge.alone)),
+            )
+            self.rows.append(fleet)
+        if judge.limit and getattr(metrics, judge.limit.column) is not None:  # what is computed is taken as sure
             verdict = "below" if within else "above"
         return Tried(robots, verdict, within)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 from s2a_bench.plugins.chunks.capacity.metrics import FleetMetrics
 from s2a_bench.store.schema import Count, Many, NonNegative, Table, about
@@ -37,6 +37,8 @@ class AboutFleet:
 @dataclass(frozen=True, kw_only=True)
 class FleetRow(FleetMetrics, AboutFleet):
     """N robots on one server."""
+
+    as_stored: ClassVar = True
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -28,6 +28,7 @@ from s2a_bench.plugins.chunks.capacity.rows import (
     REQUESTS,
     ROBOTS,
     TWIN,
+    AboutRobot,
     FleetRow,
     KneeRow,
     RequestRow,
@@ -44,7 +45,6 @@ from s2a_bench.transport.pipeline import Pipeline, pipelines
 if TYPE_CHECKING:
     from s2a_bench.plugins.chunks.capacity.config import CapacityMeasured
     from s2a_bench.progress import Progress
-    from s2a_bench.store.run import RunWriter
 
 ECHO: Final = (("name", STAND_IN), ("latency", ""), ("pace", None), ("profile", ""), ("gaps", ""))
 ECHO_OF_MODEL: Final = (("model", None), ("mmproj", None), ("chat_template", ""), ("gpu_layers", 0))
@@ -153,34 +153,46 @@ class _Cell:
         launch.progress.stage(f"{robots.name}: {number} robot{'s' * (number > 1)}")
         first = source == "measured" and number == 1
         for looks, (traces, used) in enumerate(robots.looks(number), 1):  # noqa: B007 - their number is kept
-            row = measures(traces, load.setting, load.settle_ns, confidence=confidence) | used
-            verdict, within = self.judge(row, traces, first=first)
+            metrics = replace(measures(traces, load.setting, load.settle_ns, confidence=confidence), **used)
+            verdict, within = self.judge(metrics, traces, first=first)
             if source == "twin" or (verdict != "undecided" and not (first and self.judge.beyond)):
                 break  # one robot alone has all looks where the others are judged by it
         robots.stop()
-        if first and not self.service and row["latency_p50_ns"] and not self.tried:
+        if first and not self.service and metrics.latency_p50_ns and not self.tried:
             self.service = Service.read(f"{launch.writer.path}#{self.session.cell.name}")
-        tick_ns = row["latency_p50_ns"] if load.mode is None else load.setting.period_ns
-        clean = source == "twin" or tick_ns is None or (row["late_p99_ns"] or 0) <= LATEST * tick_ns
+        tick_ns = metrics.latency_p50_ns if load.mode is None else load.setting.period_ns
+        clean = source == "twin" or tick_ns is None or (metrics.late_p99_ns or 0) <= LATEST * tick_ns
         seconds = sum(max(0, each.end_ns - each.start_ns - load.settle_ns) for each in traces) / number / 1e9
-        about = {"cell": robots.name, "source": source, "robots": number}
-        fleet = FleetRow(**about, seconds=seconds, looks=looks, verdict=verdict, within=within, clean=clean, **row)
+        fleet = FleetRow(
+            cell=robots.name,
+            source=source,
+            robots=number,
+            seconds=seconds,
+            looks=looks,
+            verdict=verdict,
+            within=within,
+            clean=clean,
+            **vars(replace(metrics, stalled_alone=self.judge.alone)),
+        )
         keep_origin(launch.writer, robots.name, robots.session.origin)
         launch.writer.append(FLEETS, [fleet])
         for trace in traces:
-            self._write(launch.writer, {**about, "robot": trace.robot}, trace)
+            about = AboutRobot(cell=robots.name, source=source, robots=number, robot=trace.robot)
+            self._write(about, trace)
         if source == "measured":
             launch.progress.advance()
         return Tried(number, verdict, within, clean)
 
-    def _write(self, writer: RunWriter, about: Mapping[str, Any], trace: RobotTrace) -> None:
+    def _write(self, about: AboutRobot, trace: RobotTrace) -> None:
         """Write what one robot did, in one episode."""
-        settle_ns = self.load.settle_ns
-        writer.append(ROBOTS, [RobotRow(**about, **measures([trace], self.load.setting, settle_ns))])
+        settle_ns, writer = self.load.settle_ns, self.launch.writer
+        writer.append(ROBOTS, [RobotRow(**vars(about), **vars(measures([trace], self.load.setting, settle_ns)))])
         since_ns = (trace.request_ns - trace.start_ns).tolist()
         latency_ns = [each if each >= 0 else None for each in trace.arrival_ns.tolist()]
         times = zip(since_ns, latency_ns, strict=True)
-        rows = (RequestRow(**about, intended_ns=at, latency_ns=each, settling=at < settle_ns) for at, each in times)
+        rows = (
+            RequestRow(**vars(about), intended_ns=at, latency_ns=each, settling=at < settle_ns) for at, each in times
+        )
         writer.append(REQUESTS, rows)
 
     def _conclude(self) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from s2a_bench.plugins.chunks.capacity.metrics import RobotTrace, cycle_ns, share_interval
+from s2a_bench.plugins.chunks.capacity.metrics import FleetMetrics, RobotTrace, cycle_ns, share_interval
 
 if TYPE_CHECKING:
     from s2a_bench.plugins.chunks.capacity.config import Limit
@@ -92,20 +92,20 @@ class Judge:
     """Share of stalled ticks of one robot alone, taken as known."""
 
     def __call__(
-        self, row: dict[str, Any], traces: Sequence[RobotTrace], *, first: bool = False
+        self, fleet: FleetMetrics, traces: Sequence[RobotTrace], *, first: bool = False
     ) -> tuple[Verdict, bool]:
         """Return where a fleet's interval lies against the limit, and whether its value keeps to it.
 
         The ``first`` is one robot alone. It stalls no more than itself, but may leave no room for the limit.
         """
+        limit = self.limit
         if first:
-            self.alone = row["stalled"]
-        row["stalled_alone"], limit = self.alone, self.limit
+            self.alone = fleet.stalled
         if limit is None:
             return "none", True
         if limit.column == "stalled":
-            share, low, high = row["stalled"], row["stalled_low"], row["stalled_high"]
-            if share is None:
+            share, low, high = fleet.stalled, fleet.stalled_low, fleet.stalled_high
+            if share is None or low is None or high is None:
                 return "undecided", False
             if self.beyond and first:
                 return ("below", True) if limit.share + share < 1 else ("above", False)

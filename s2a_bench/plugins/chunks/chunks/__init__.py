@@ -12,6 +12,6 @@ EXPERIMENT = Experiment(
     mode="virtual",
     modes=(RunMode("live", f"{HERE}.config:ChunksLive", f"{HERE}.live:run_live", LIVE),),
     view=f"{HERE}.view:show",
-    cell=f"{HERE}.view.tables:ChunkCell",
+    cell=f"{HERE}.rows:ChunkCell",
     unit="cells",
 )

@@ -91,7 +91,7 @@ def cell_rows(acted: ActedCell, shown: int, epsilon: float, seed: int) -> dict[T
         execution_horizon=cell.mode.execution_horizon(setting),
         requests=int(latency_ns.size),
         trigger=_mean(cell.triggers, cell.mode.trigger),
-        **{name: _plain(values.get(name), whole=metric.kind == COUNT) for name, metric in METRICS.items()},
+        **_plain(values),
     )
     return {
         CHUNKS: [row],
@@ -210,10 +210,14 @@ def _blended(cell: ChunkCell, cycles: Cycles) -> float | None:
     return None if age is None or not np.isfinite(age).any() else float(np.nanmean(age))
 
 
-def _plain(value: float | None, *, whole: bool) -> float | int | None:
-    if value is None or math.isnan(value):
-        return None
-    return int(value) if whole else float(value)
+def _plain(values: Mapping[str, float | None]) -> dict[str, Any]:
+    """Return the value of every metric as its column has it, None for NaN."""
+    plain: dict[str, Any] = dict.fromkeys(METRICS)
+    for name, metric in METRICS.items():
+        value = values.get(name)
+        if value is not None and not math.isnan(value):
+            plain[name] = int(value) if metric.kind == COUNT else float(value)
+    return plain
 
 
 def trigger_rows(mode: Mode, setting: ControlSetting, drawn: LatencyDraw) -> Iterator[TriggerRow]:

@@ -149,6 +149,13 @@ class ChunkRow:
 METRICS: Final = metrics_of(ChunkRow)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChunkCell(ChunkRow):
+    """A mode of acting on chunks under one source of latencies, in ``--json``."""
+
+    emulated: Annotated[bool, about("Whether latencies were given or drawn, in virtual time or by the server.")]
+
+
 @dataclass(frozen=True, slots=True)
 class TickRow:
     """One control tick: the request of the action's chunk, its index there, and the age of the observation.

@@ -32,29 +32,29 @@ def test_a_fleet_by_hand() -> None:
     first_ns = np.array([5, 10, -1]) * MS
     slow = trace(1, arrival_ms=(45, 90, -1), chunk=[-1, -1, -1, 0, 0, 0, 1, 1])
     found = measures([trace(first_ns=first_ns, late_ns=late_ns), slow], SETTING)
-    assert found["requests_per_s"] == pytest.approx(4 / 0.16)
-    assert found["latency_mean_ns"] == 45 * MS
-    assert found["latency_p50_ns"] == 37.5 * MS
-    assert found["unfair"] == pytest.approx(67.5 / 45)
-    assert found["stalled"] == 5 / 16, "before the first action, too"
-    assert found["stalled_worst"] == 3 / 8
-    assert found["in_time"] == 2 / 3, "of three chunks that took over from another, one came late"
-    assert found["late_p99_ns"] == round(np.quantile(late_ns, 0.99))
-    assert found["age_p99_ns"] == 40 * MS
+    assert found.requests_per_s == pytest.approx(4 / 0.16)
+    assert found.latency_mean_ns == 45 * MS
+    assert found.latency_p50_ns == 37.5 * MS
+    assert found.unfair == pytest.approx(67.5 / 45)
+    assert found.stalled == 5 / 16, "before the first action, too"
+    assert found.stalled_worst == 3 / 8
+    assert found.in_time == 2 / 3, "of three chunks that took over from another, one came late"
+    assert found.late_p99_ns == round(np.quantile(late_ns, 0.99))
+    assert found.age_p99_ns == 40 * MS
 
 
 def test_what_comes_before_a_fleet_has_settled_is_left_out() -> None:
     found = measures([trace(), trace(1)], SETTING, settle_ns=80 * MS)
-    assert found["stalled"] == 0
-    assert found["in_time"] == 0.5, "the chunk that ends a stall came late"
-    assert found["latency_mean_ns"] is None
-    assert found["requests_per_s"] == pytest.approx(2 / 0.08), "asked before, answered after"
+    assert found.stalled == 0
+    assert found.in_time == 0.5, "the chunk that ends a stall came late"
+    assert found.latency_mean_ns is None
+    assert found.requests_per_s == pytest.approx(2 / 0.08), "asked before, answered after"
 
 
 def test_requests_before_a_fleet_has_settled_or_never_made_say_nothing_of_the_generator() -> None:
     request_ns, late_ns = np.arange(10) * 100 * MS, np.array([50, 50, 1, 1, 1, 1, 1, -1, -1, -1]) * MS
     plain = RobotTrace(0, 0, 10**9, request_ns, np.full(10, 60 * MS), late_ns=late_ns)
-    assert measures([plain], SETTING, settle_ns=200 * MS)["late_p99_ns"] == MS
+    assert measures([plain], SETTING, settle_ns=200 * MS).late_p99_ns == MS
 
 
 def test_a_fleet_is_the_same_whenever_it_starts_and_its_robots_in_any_order() -> None:
@@ -67,35 +67,35 @@ def test_a_fleet_is_the_same_whenever_it_starts_and_its_robots_in_any_order() ->
     for settle_ns in (0, 50 * MS, 80 * MS):
         found = measures(fleet, SETTING, settle_ns)
         moved = [each.shifted(12_345_678_901) for each in (fleet[2], fleet[0], fleet[1])]
-        assert measures(moved, SETTING, settle_ns) == pytest.approx(found, nan_ok=True)
+        assert vars(measures(moved, SETTING, settle_ns)) == pytest.approx(vars(found), nan_ok=True)
 
 
 def test_robots_without_an_action_are_neither_in_time_nor_late() -> None:
     idle = trace(0, chunk=[-1] * 8, arrival_ms=())
     found = measures([idle], SETTING)
-    assert (found["stalled"], found["in_time"], found["age_p50_ns"], found["latency_p50_ns"]) == (1, None, None, None)
-    assert measures([idle, trace(1)], SETTING)["in_time"] == measures([trace(1)], SETTING)["in_time"]
+    assert (found.stalled, found.in_time, found.age_p50_ns, found.latency_p50_ns) == (1, None, None, None)
+    assert measures([idle, trace(1)], SETTING).in_time == measures([trace(1)], SETTING).in_time
 
 
 def test_every_episode_has_its_own_start() -> None:
     episodes = [trace(robot, start_ns) for start_ns in (0, 10**9) for robot in (0, 1)]
-    assert measures(episodes, SETTING)["requests_per_s"] == pytest.approx(8 / 0.32)
-    assert measures(episodes, SETTING, settle_ns=80 * MS)["stalled"] == 0
+    assert measures(episodes, SETTING).requests_per_s == pytest.approx(8 / 0.32)
+    assert measures(episodes, SETTING, settle_ns=80 * MS).stalled == 0
 
 
 def test_answers_a_second_are_those_while_all_robots_act() -> None:
     """From 80 ms, the start of the second, to 160 ms, the end of the first: at 90 and 95 ms, of 15, 90, 95 and 170."""
-    assert measures([trace(), trace(1, 80 * MS)], SETTING)["requests_per_s"] == pytest.approx(2 / 0.08)
+    assert measures([trace(), trace(1, 80 * MS)], SETTING).requests_per_s == pytest.approx(2 / 0.08)
 
 
 def test_robots_without_a_clock_have_neither_ticks_nor_ages() -> None:
     request_ns = np.arange(10) * 100 * MS
     plain = RobotTrace(0, 0, 10**9, request_ns, np.full(10, 60 * MS))
     found = measures([plain], SETTING)
-    assert (found["requests_per_s"], found["latency_p99_ns"], found["unfair"]) == (10, 60 * MS, 1)
-    assert (found["stalled"], found["age_p50_ns"], found["in_time"], found["ttft_p99_ns"]) == (None,) * 4
+    assert (found.requests_per_s, found.latency_p99_ns, found.unfair) == (10, 60 * MS, 1)
+    assert (found.stalled, found.age_p50_ns, found.in_time, found.ttft_p99_ns) == (None,) * 4
     plans = RobotTrace(0, 0, 10**9, request_ns, np.full(10, 60 * MS), plan_stalled=np.arange(10) < 3)
-    assert measures([plans], SETTING)["stalled"] == 0.3
+    assert measures([plans], SETTING).stalled == 0.3
 
 
 def interval(stalled: Any, robots: int = 1, cycle: float = 1, confidence: float = 0.95) -> tuple[float, float]:

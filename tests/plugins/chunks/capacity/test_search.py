@@ -126,7 +126,7 @@ def test_one_long_stall_is_one_event() -> None:
         trace(robot, np.arange(1000) // 40 == 12 if robot == 3 else [False] * 1000, [50] * 100) for robot in range(8)
     ]
     row = measures(traces, SETTING)
-    assert row["stalled"] == 0.005
+    assert row.stalled == 0.005
     assert Judge(Limit.read("stalled=1%"), False, 0, 0.95)(row, traces)[0] == "undecided"
 
 
@@ -145,7 +145,7 @@ def test_one_robot_alone_has_no_stalls_beyond_its_own_but_may_leave_no_room(stal
 
 
 def test_without_values_nothing_is_decided() -> None:
-    row = {"stalled": None, "stalled_low": None, "stalled_high": None}
+    row = measures([], SETTING)
     assert Judge(Limit.read("stalled=1%"), False, 0, 0.95)(row, []) == ("undecided", False)
     assert Judge(Limit.read("ttft_p99=1s"), False, 0, 0.95)(row, []) == ("undecided", False)
     assert Judge(None, False, 0, 0.95)(row, []) == ("none", True)

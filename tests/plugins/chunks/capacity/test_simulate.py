@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.plugins.chunks.capacity.config import RobotLoad
-from s2a_bench.plugins.chunks.capacity.metrics import measures
+from s2a_bench.plugins.chunks.capacity.metrics import FleetMetrics, measures
 from s2a_bench.plugins.chunks.capacity.simulate import ServiceTime, robot_of, serve, simulate
 from s2a_bench.plugins.chunks.modes import ControlSetting, Mode, mode
 
@@ -44,7 +44,7 @@ def measured(
     settle_s: float = 30,
     servers: int = 1,
     batch: Any = PLAIN,
-) -> dict[str, Any]:
+) -> FleetMetrics:
     traces = simulate(*fleet, robots, times, np.random.default_rng(1), servers, batch)
     return measures(traces, fleet[0].setting, round(settle_s * 1e9))
 
@@ -131,16 +131,16 @@ def test_a_closed_loop_has_the_throughput_of_its_bottleneck(robots: int, think_m
     service_s, think_s = 0.1, think_ms / 1e3
     found = measured(fleet(think_ns=think_ms * MS), robots, constant(100 * MS), servers=servers)
     rate = min(servers / service_s, robots / (think_s + service_s))
-    assert found["requests_per_s"] == pytest.approx(rate, rel=0.01)
-    assert found["latency_mean_ns"] / 1e9 == pytest.approx(robots / rate - think_s, rel=0.01)
+    assert found.requests_per_s == pytest.approx(rate, rel=0.01)
+    assert found.latency_mean_ns / 1e9 == pytest.approx(robots / rate - think_s, rel=0.01)
 
 
 def test_the_clients_of_vllm_omni_6567() -> None:
     table = {1: (6.56, 152), 2: (6.68, 297), 4: (6.71, 589), 8: (6.77, 1165)}
     for robots, (rate, latency_ms) in table.items():
         found = measured(fleet(), robots, constant(148 * MS))
-        assert found["requests_per_s"] == pytest.approx(rate, rel=0.05)
-        assert found["latency_mean_ns"] / MS == pytest.approx(latency_ms, rel=0.05)
+        assert found.requests_per_s == pytest.approx(rate, rel=0.05)
+        assert found.latency_mean_ns / MS == pytest.approx(latency_ms, rel=0.05)
 
 
 def test_of_robots_that_start_together_the_last_one_waits_for_all_others_in_every_episode() -> None:
@@ -162,11 +162,11 @@ def test_of_robots_that_start_together_the_last_one_waits_for_all_others_in_ever
 def test_one_robot_alone_stalls_as_the_closed_forms_say(service_ms: int, rounding: Any) -> None:
     delay = -(-service_ms // 20) if rounding == "ceil" else service_ms // 20
     alone = measured(fleet("sync", rounding=rounding), 1, constant(service_ms * MS))
-    assert alone["stalled"] == pytest.approx(delay / (16 + delay), abs=2e-3)
+    assert alone.stalled == pytest.approx(delay / (16 + delay), abs=2e-3)
     for trigger in (1, 4, 8):
         late = max(0, delay - trigger)
         found = measured(fleet(f"queue?trigger={trigger}", rounding=rounding), 1, constant(service_ms * MS))
-        assert found["stalled"] == pytest.approx(late / (16 + late), abs=2e-3)
+        assert found.stalled == pytest.approx(late / (16 + late), abs=2e-3)
 
 
 @pytest.mark.parametrize("service_ms", [20, 33, 47])
@@ -178,15 +178,15 @@ def test_a_queue_with_an_early_trigger_carries_as_many_robots_as_the_server_has_
     knee = int(16 * 20 / (0.99 * service_ms))
     for robots in (1, knee - 1, knee, knee + 1, 2 * knee):
         found = measured(fleet(f"queue?trigger={trigger}", rounding=rounding), robots, constant(service_ms * MS))
-        assert found["stalled"] == pytest.approx(max(0, 1 - 16 * 20 / (robots * service_ms)), abs=2e-3)
-        assert (found["stalled"] <= 0.01) is (robots <= knee)
+        assert found.stalled == pytest.approx(max(0, 1 - 16 * 20 / (robots * service_ms)), abs=2e-3)
+        assert (found.stalled <= 0.01) is (robots <= knee)
 
 
 @pytest.mark.parametrize("written", ["sync", "queue?trigger=1"])
 def test_other_modes_stall_no_less_than_the_server_s_time_and_one_robot_alone(written: str) -> None:
-    alone = measured(fleet(written, rounding="ceil"), 1, constant(27 * MS))["stalled"]
+    alone = measured(fleet(written, rounding="ceil"), 1, constant(27 * MS)).stalled
     for robots in (2, 6, 9, 11, 12, 14, 24):
-        found = measured(fleet(written, rounding="ceil"), robots, constant(27 * MS))["stalled"]
+        found = measured(fleet(written, rounding="ceil"), robots, constant(27 * MS)).stalled
         assert found >= max(alone, 1 - 16 * 20 / (robots * 27)) - 2e-3
     assert found == pytest.approx(1 - 16 * 20 / (24 * 27), abs=0.01)
 
@@ -204,9 +204,9 @@ def test_near_the_knee_requests_wait_for_ticks(
         starts = np.random.default_rng(seed).integers(0, DT, robots).tolist()  # all within one tick
         clients = [robot_of(load, *each, span_ns) for each in enumerate(starts)]
         traces = serve(clients, constant(service_ms * MS))
-        shares.append(measures(traces, load.setting, 30 * 10**9)["stalled"])
+        shares.append(measures(traces, load.setting, 30 * 10**9).stalled)
     assert np.mean(shares) == pytest.approx(stalled, abs=2e-3)
-    assert measured((load, span_ns), 1, constant(service_ms * MS))["stalled"] == pytest.approx(alone, abs=1e-3)
+    assert measured((load, span_ns), 1, constant(service_ms * MS)).stalled == pytest.approx(alone, abs=1e-3)
 
 
 def mean_value_analysis(robots: int, service_s: float, think_s: float) -> tuple[float, float]:
@@ -228,8 +228,8 @@ def test_exponential_service_times_have_their_mean_value_analysis(robots: int, a
     }[acting]
     found = measured(chosen, robots, exponential(40 * MS))
     latency_s, rate = mean_value_analysis(robots, 0.04, 0.16 if acting == "closed" else 0.162)
-    assert found["requests_per_s"] == pytest.approx(rate, rel=0.02)
-    assert found["latency_mean_ns"] / 1e9 == pytest.approx(latency_s, rel=0.03)
+    assert found.requests_per_s == pytest.approx(rate, rel=0.02)
+    assert found.latency_mean_ns / 1e9 == pytest.approx(latency_s, rel=0.03)
 
 
 def test_a_batching_server_reaches_its_rate_with_a_full_batch_waiting() -> None:
@@ -239,7 +239,7 @@ def test_a_batching_server_reaches_its_rate_with_a_full_batch_waiting() -> None:
     for robots in (1, 4, 8, 16, 32):
         clients = [robot_of(load, number, number * MS, span_ns) for number in range(robots)]
         traces = serve(clients, constant(58_500_000), 1, slower)
-        rates[robots] = measures(traces, load.setting, 30 * 10**9)["requests_per_s"]
+        rates[robots] = measures(traces, load.setting, 30 * 10**9).requests_per_s
     assert rates[1] == pytest.approx(17.1, rel=0.01)
     for robots in (4, 8, 16):  # one is served while the others wait, and they while it waits
         expected = robots / (0.0585 * (1 + slower[robots - 2]))
@@ -251,22 +251,22 @@ def test_a_batching_server_reaches_its_rate_with_a_full_batch_waiting() -> None:
 def test_what_is_spent_beside_the_server_delays_answers_and_occupies_none() -> None:
     times = repeat(ServiceTime(10 * MS, 40 * MS, 60 * MS))
     found = measured(fleet(), 5, times)
-    assert found["requests_per_s"] == pytest.approx(25, rel=0.01)
-    assert found["ttft_p50_ns"] == found["latency_p50_ns"] - 30 * MS
-    assert measured(fleet(), 1, times)["latency_mean_ns"] == 100 * MS
+    assert found.requests_per_s == pytest.approx(25, rel=0.01)
+    assert found.ttft_p50_ns == found.latency_p50_ns - 30 * MS
+    assert measured(fleet(), 1, times).latency_mean_ns == 100 * MS
 
 
 def test_plans_stall_when_the_server_falls_behind() -> None:
-    def stalled(robots: int) -> dict[str, Any]:
+    def stalled(robots: int) -> FleetMetrics:
         return measured(fleet(every_ns=10**9), robots, constant(250 * MS))
 
-    assert stalled(4)["stalled"] == 0
-    assert stalled(4)["requests_per_s"] == pytest.approx(4, rel=0.01)
-    assert stalled(5)["stalled"] == 1
-    assert stalled(5)["latency_p50_ns"] > 3 * 10**9, "from when it is due, not from when the one before it has come"
+    assert stalled(4).stalled == 0
+    assert stalled(4).requests_per_s == pytest.approx(4, rel=0.01)
+    assert stalled(5).stalled == 1
+    assert stalled(5).latency_p50_ns > 3 * 10**9, "from when it is due, not from when the one before it has come"
 
 
 def test_thousands_of_robots_are_served_by_hundreds_of_servers() -> None:
     found = measured(fleet("queue?trigger=8", 6), 2000, constant(100 * MS), settle_s=3, servers=640)
-    assert found["requests_per_s"] == pytest.approx(2000 / 0.32, rel=0.02)
-    assert found["stalled"] < 0.01
+    assert found.requests_per_s == pytest.approx(2000 / 0.32, rel=0.02)
+    assert found.stalled < 0.01

@@ -19,7 +19,7 @@ from s2a_bench.plugins.chunks.chunks.cells import cells, draw
 from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, METRICS, REQUESTS, TICKS
 from s2a_bench.plugins.chunks.chunks.run import run_virtual
-from s2a_bench.plugins.chunks.chunks.view import chunk_sentences, show
+from s2a_bench.plugins.chunks.chunks.view import show
 from s2a_bench.plugins.chunks.modes import ControlSetting, mode
 from s2a_bench.plugins.chunks.modes.closed import Closed, closed
 from s2a_bench.store.run import StoredRun, read_run
@@ -173,7 +173,7 @@ def test_what_is_promised_of_a_recording_depends_on_its_order(
     assert known["plans"] == 600
     notes = " ".join(show(found).tables["chunks"].notes)
     assert ("lets at most" in notes) == (why is None)
-    assert "<=" not in notes + " ".join(chunk_sentences(found))
+    assert "<=" not in notes + " ".join(show(found).sentences)
     assert f"No promise about stalls, because the delays are not exchangeable: {file} {why}" in notes or why is None
 
 

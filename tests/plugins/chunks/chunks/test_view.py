@@ -11,14 +11,9 @@ from matplotlib.figure import Figure
 from s2a_bench.plugins.chunks.chunks import EXPERIMENT
 from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.run import run_virtual
-from s2a_bench.plugins.chunks.chunks.view import chunk_sentences, page_lanes, show
-from s2a_bench.plugins.chunks.chunks.view.figures import (
-    COLOURS,
-    build_lanes,
-    build_reactions,
-    chunk_figures,
-    lanes_of,
-)
+from s2a_bench.plugins.chunks.chunks.view import page_lanes, show
+from s2a_bench.plugins.chunks.chunks.view.figures import COLOURS, lanes_of
+from s2a_bench.plugins.chunks.chunks.view.tables import ChunkCells
 from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import read_chapters
 from s2a_bench.report.page.files import make_report, write_report
@@ -33,10 +28,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
     return read_run(run_virtual(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
 
 
-def drawn(run: StoredRun, build: object) -> Figure:
+def drawn(run: StoredRun, name: str) -> Figure:
     with paper_column():
-        figure: Figure = build(run)  # type: ignore[operator]
-        return figure
+        return show(run).figures[name]()
 
 
 def test_tables_number_the_sources_and_name_the_convention(run: StoredRun) -> None:
@@ -60,7 +54,7 @@ def test_tables_number_the_sources_and_name_the_convention(run: StoredRun) -> No
 
 
 def test_sentences_say_what_each_rule_costs(run: StoredRun) -> None:
-    constant, random = chunk_sentences(run)
+    constant, random = show(run).sentences
     assert constant.startswith("Stalled cycles of queue @ 60, epsilon 0.01: calibrated 0.00% at age 10.5")
     assert "mean 3" in random
 
@@ -72,21 +66,21 @@ def test_csv_has_every_row_with_its_provenance(run: StoredRun) -> None:
 
 
 def test_lanes_show_the_modes_and_the_calibrated_trigger(run: StoredRun) -> None:
-    assert [lane.title for lane in lanes_of(run)[:5]] == [
+    assert [lane.title for lane in lanes_of(run, ChunkCells.of(run))[:5]] == [
         "sync",
         "queue?trigger=6",
         "replace",
         "aggregate?trigger=6",
         "queue, calibrated",
     ]
-    axes = drawn(run, build_lanes).axes[0]
+    axes = drawn(run, "lanes").axes[0]
     (ages,) = axes.child_axes
     curve, at = next(line for line in axes.lines if len(line.get_xdata()) > 2), ages.get_yticks()
     assert at[0] <= np.nanmin(curve.get_ydata()) <= np.nanmax(curve.get_ydata()) <= at[1]
 
 
 def test_stalls_are_a_line_a_mode_over_mean_latency(run: StoredRun) -> None:
-    (axes,) = drawn(run, lambda run: chunk_figures(run)["stability"]()).axes
+    (axes,) = drawn(run, "stability").axes
     assert [line.get_label() for line in axes.lines] == ["sync", "queue?trigger=6", "replace", "aggregate?trigger=6"]
     share = {line.get_label(): np.asarray(line.get_ydata()) for line in axes.lines}
     ms = np.asarray(axes.lines[0].get_xdata())
@@ -96,7 +90,7 @@ def test_stalls_are_a_line_a_mode_over_mean_latency(run: StoredRun) -> None:
 
 
 def test_reactions_have_the_closed_form_drawn_over_them(run: StoredRun) -> None:
-    upper, lower = drawn(run, build_reactions).axes
+    upper, lower = drawn(run, "reactions").axes
     dotted = [line for line in upper.lines if line.get_linestyle() == ":"]
     assert len(dotted) == 5
     simulated = [line for line in lower.lines if line.get_drawstyle() == "steps-post"]
@@ -129,8 +123,8 @@ def test_few_lanes_have_room_for_their_labels(tmp_path: Path, modes: str) -> Non
     few = read_run(
         run_virtual(ChunksVirtual(latency="60", modes=modes, rules="", cycles=100), tmp_path, NullProgress())
     )
-    assert len(lanes_of(few)) == modes.count(",") + 1
-    drawn(few, build_lanes).savefig(tmp_path / "lanes.png")  # a warning where they have none
+    assert len(lanes_of(few, ChunkCells.of(few))) == modes.count(",") + 1
+    drawn(few, "lanes").savefig(tmp_path / "lanes.png")  # a warning where they have none
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +134,7 @@ def lanes_run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
 
 
 def test_a_panel_is_a_source_and_a_bar_a_chunk_or_a_stall(lanes_run: StoredRun) -> None:
-    first, second = page_lanes(lanes_of(lanes_run)).panels
+    first, second = page_lanes(lanes_of(lanes_run, ChunkCells.of(lanes_run))).panels
     assert (first.title, second.title) == ("Latency 60", "Latency 100")
     assert first.end_s == pytest.approx(60 * 0.02)
     sync, replace = first.lanes

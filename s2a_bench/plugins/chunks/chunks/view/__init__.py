@@ -8,54 +8,55 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.experiments import Shown
+from s2a_bench.experiments.cells import Cells, json_of
+from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, ChunkRow
 from s2a_bench.plugins.chunks.chunks.view.figures import COLOURS, CellTicks, chunk_figures, lanes_of, runs_of
-from s2a_bench.plugins.chunks.chunks.view.tables import (
-    Row,
-    chunk_csv,
-    chunk_json,
-    chunk_tables,
-    entry,
-    live,
-    rows_of,
-    sources_of,
-)
+from s2a_bench.plugins.chunks.chunks.view.tables import ChunkCells, chunk_tables, entry
+from s2a_bench.writers.json import frame
 from s2a_bench.writers.lanes import Lane, LaneBar, LanePanel, Lanes
 from s2a_bench.writers.tables import number
 
 if TYPE_CHECKING:
+    from s2a_bench.provenance import Origins
     from s2a_bench.store.run import StoredRun
 
 BARS: Final = "Bars are actions, a colour a chunk; dashed boxes are stalls. Time counts from the first request."
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
+    cells = ChunkCells.of(run)
+    lanes = lanes_of(run, cells)
     return Shown.build(
-        sentences=lambda: chunk_sentences(run),
-        tables=chunk_tables(run),
+        sentences=lambda: chunk_sentences(cells),
+        tables=chunk_tables(cells),
         main=["chunks", "loop"],
-        csvs=lambda: chunk_csv(run),
-        figures=lambda: chunk_figures(run),
-        json=lambda: chunk_json(run),
-        lanes=lambda: page_lanes(lanes_of(run)),
+        csvs=lambda: {"chunks.csv": Cells.of(run, CHUNKS).csv()},
+        figures=lambda: chunk_figures(run, cells, lanes),
+        json=lambda: frame(run, [_json(row, run.origins) for row in cells.rows], []),
+        lanes=lambda: page_lanes(lanes),
     )
 
 
-def chunk_sentences(run: StoredRun) -> list[str]:
+def _json(row: ChunkRow, origins: Origins) -> dict[str, Any]:
+    return {**json_of(row), "emulated": origins.of(row.cell).emulated}
+
+
+def chunk_sentences(cells: ChunkCells) -> list[str]:
     """Return each rule's stalled cycles, a live loop's agreement and jitter, and the slow-down that queue needs."""
     sentences = []
-    epsilon = float(run.manifest["configuration"]["epsilon"])
-    for name, rows in sources_of(rows_of(run)):
-        by_rule = {row["rule"]: row for row in rows if row["p_stall_cycle"] is not None}
+    epsilon = float(cells.settings["epsilon"])
+    for name, rows in cells.sources.items():
+        by_rule = {row.rule: row for row in rows if row.p_stall_cycle is not None}
         stalls = [
-            f"{rule} {row['p_stall_cycle']:.2%} at age {entry(row['age_ticks_mean'])}"
+            f"{rule} {row.p_stall_cycle:.2%} at age {entry(row.age_ticks_mean)}"
             for rule, row in by_rule.items()
             if rule != "given"
         ]
         if stalls:
             sentences.append(f"Stalled cycles of queue @ {name}, epsilon {epsilon:g}: {', '.join(stalls)} ticks.")
-        if live(run):
+        if cells.live:
             sentences.append(f"Control loop @ {name}: {'; '.join(_loop(rows))}.")
-        slower = max((row["slow_down"] or 1 for row in rows if row["mode"].startswith("queue")), default=1)
+        slower = max((row.slow_down or 1 for row in rows if row.mode.startswith("queue")), default=1)
         if slower > 1:
             sentences.append(
                 f"@ {name} no trigger of queue is enough: actions would have to be {slower:.2f} times slower."
@@ -63,18 +64,19 @@ def chunk_sentences(run: StoredRun) -> list[str]:
     return sentences
 
 
-def _loop(rows: list[Row]) -> Iterator[str]:
+def _loop(rows: Sequence[ChunkRow]) -> Iterator[str]:
     """Yield what the ticks of a live loop were checked against, what was not checked, and the jitter."""
-    checked = [row["agreement"] for row in rows if row["agreement"] is not None]
+    checked = [row.agreement for row in rows if row.agreement is not None]
     if checked:
-        rules = " and the triggers of their rules" if any(row["rule"] != "given" for row in rows) else ""
+        rules = " and the triggers of their rules" if any(row.rule != "given" for row in rows) else ""
         yield (
             f"at least {min(checked):.2%} of the ticks have the chunk, the action and the age that the modes' arrays "
             f"give for the measured delays{rules}"
         )
-    if unchecked := dict.fromkeys(row["mode"] for row in rows if row["agreement"] is None):
+    if unchecked := dict.fromkeys(row.mode for row in rows if row.agreement is None):
         yield f"not checked, as arrays do not cover its arrivals: {', '.join(unchecked)}"
-    yield f"p99 of the jitter at most {number(max(row['jitter_s_p99'] for row in rows) * 1e3)} ms"
+    jitter_s = max(row.jitter_s_p99 for row in rows if row.jitter_s_p99 is not None)
+    yield f"p99 of the jitter at most {number(jitter_s * 1e3)} ms"
 
 
 def page_lanes(cells: Sequence[CellTicks]) -> Lanes:

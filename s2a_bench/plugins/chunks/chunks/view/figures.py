@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from s2a_bench.plugins.chunks.chunks.rows import MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
-from s2a_bench.plugins.chunks.chunks.view.tables import rows_of, sources_of
+from s2a_bench.plugins.chunks.chunks.rows import MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS, ChunkRow
+from s2a_bench.plugins.chunks.chunks.view.tables import ChunkCells
 from s2a_bench.writers.figures import LINE_CHARS, new_figure
 from s2a_bench.writers.style import STALL_STYLE, WIDE_IN, ink_on
 
@@ -48,28 +48,26 @@ class CellTicks:
     period_s: float
 
 
-def lanes_of(run: StoredRun) -> list[CellTicks]:
+def lanes_of(run: StoredRun, cells: ChunkCells) -> list[CellTicks]:
     """Return the lanes of a run: the modes as given, and the calibrated trigger."""
     ticks, requests = run.table(TICKS), run.table(REQUESTS)
-    shown = int(run.manifest["configuration"]["shown_ticks"])
+    shown = int(cells.settings["shown_ticks"])
     ticks, requests = ticks[ticks["tick"] < shown], requests[requests["request_tick"] < shown]
-    found = []
-    for row in rows_of(run):
-        mine = ticks[ticks["cell"] == row["cell"]]
-        if len(mine) and _drawn(row):
-            sent = requests[requests["cell"] == row["cell"]]
-            found.append(CellTicks(_line_name(row), row["latency"], mine, sent, row["delta_t_s"]))
-    return found[:MOST_LANES]
+    lanes = []
+    for row in filter(_drawn, cells.rows):
+        mine, sent = ticks[ticks["cell"] == row.cell], requests[requests["cell"] == row.cell]
+        if len(mine):
+            lanes.append(CellTicks(_line_name(row), row.latency, mine, sent, row.delta_t_s))
+    return lanes[:MOST_LANES]
 
 
-def build_lanes(run: StoredRun) -> Figure:
+def build_lanes(lanes: Sequence[CellTicks], setting: str) -> Figure:
     """Draw the lanes below one another: actions coloured by chunk, stalls hatched, requests above, ages below."""
     from matplotlib.legend_handler import HandlerTuple
 
-    lanes = lanes_of(run)
     several = len({lane.source for lane in lanes}) > 1
     source = "" if several else f" @ {lanes[0].source}"
-    caption = _caption(run, f"What each control tick executes{source}")
+    caption = (f"What each control tick executes{source}, {setting}",)
     figure = new_figure(0.85 + 0.55 * len(lanes), caption, WIDE_IN)
     axes = figure.subplots()
     oldest = max(int(lane.ticks["age_ticks"].fillna(0).max()) for lane in lanes) or 1
@@ -160,28 +158,30 @@ def _legend() -> dict[str, Any]:
     }
 
 
-def chunk_figures(run: StoredRun) -> dict[str, Callable[[], Figure]]:
-    found: dict[str, Callable[[], Figure]] = {}
-    if lanes_of(run):
-        found["lanes"] = partial(build_lanes, run)
-    if len(means := run.table(MEANS)):
-        found["stability"] = partial(build_over_means, run, "Stalled share of the ticks", STALLS)
-    if len(run.table(TRIGGERS)):
-        found["triggers"] = partial(build_triggers, run)
-    if len(run.table(REACTIONS)):
-        found["reactions"] = partial(build_reactions, run)
+def chunk_figures(run: StoredRun, cells: ChunkCells, lanes: Sequence[CellTicks]) -> dict[str, Callable[[], Figure]]:
+    means, triggers, reactions = run.table(MEANS), run.table(TRIGGERS), run.table(REACTIONS)
+    settings = cells.settings
+    setting = f"H = {settings['horizon']}, {settings['control_hz']:g} Hz, d by {settings['rounding']}"
+    figures: dict[str, Callable[[], Figure]] = {}
+    if lanes:
+        figures["lanes"] = partial(build_lanes, lanes, setting)
+    if len(means):
+        figures["stability"] = partial(build_over_means, means, f"Stalled share of the ticks, {setting}", STALLS)
+    if len(triggers):
+        figures["triggers"] = partial(build_triggers, triggers, cells.sources, float(settings["epsilon"]), setting)
+    if len(reactions):
+        figures["reactions"] = partial(build_reactions, reactions, cells.sources, setting)
     if means["tracking_rms"].notna().any():
-        found["smoothness"] = partial(build_over_means, run, "Following a target", SMOOTHNESS)
-    return found
+        figures["smoothness"] = partial(build_over_means, means, f"Following a target, {setting}", SMOOTHNESS)
+    return figures
 
 
-def build_over_means(run: StoredRun, what: str, shown: Mapping[str, str]) -> Figure:
+def build_over_means(rows: pd.DataFrame, title: str, shown: Mapping[str, str]) -> Figure:
     """Draw columns over mean latency, a panel each, a line a mode; dashed: a request in every tick, no latency."""
-    rows = run.table(MEANS)
     modes = [str(mode) for mode in rows["mode"].unique()][: len(LINE_COLOURS)]
     columns = 2 if max(map(len, modes)) <= LINE_CHARS // 3 else 1
     foot_in = 0.17 * -(-(len(modes) + 1) // columns)
-    caption = _caption(run, what, f"Latencies are those of {rows['latency'].iloc[0]}, all scaled by one factor.")
+    caption = (title, f"Latencies are those of {rows['latency'].iloc[0]}, all scaled by one factor.")
     figure = new_figure(0.8 + 1.3 * len(shown) + foot_in, caption)
     panels = figure.subplots(len(shown), 1, sharex=True, squeeze=False)[:, 0]
     latency_ms = rows["latency_s"].to_numpy(dtype="float64") * 1e3
@@ -202,17 +202,17 @@ def build_over_means(run: StoredRun, what: str, shown: Mapping[str, str]) -> Fig
     return figure
 
 
-def build_triggers(run: StoredRun) -> Figure:
+def build_triggers(
+    rows: pd.DataFrame, sources: Mapping[str, Sequence[ChunkRow]], epsilon: float, setting: str
+) -> Figure:
     """Draw P(stall) over the trigger with its closed form, a line a source, and the trigger of each rule."""
-    rows = run.table(TRIGGERS)
-    epsilon = float(run.manifest["configuration"]["epsilon"])
-    groups = sources_of(rows_of(run))[:_MOST_PANELS]
+    groups = list(sources.items())[:_MOST_PANELS]
     more = (
         "Line: closed form of the same sample of latencies; dots: simulated, with 95 % intervals; 0 lies at the bottom."
     )
-    figure = new_figure(2.5 + 0.16 * len(groups), _caption(run, "P(stall) against the trigger of queue", more))
+    figure = new_figure(2.5 + 0.16 * len(groups), (f"P(stall) against the trigger of queue, {setting}", more))
     axes = figure.subplots()
-    sources: list[Any] = []
+    lines: list[Any] = []
     rules: list[Any] = []
     floor = min(epsilon, 1 / max(int(rows["boundaries"].max()), 1)) / 2
     for place, (name, cells) in enumerate(groups):
@@ -222,7 +222,7 @@ def build_triggers(run: StoredRun) -> Figure:
         closed = np.maximum(with_form["p_stall_closed"].to_numpy(dtype="float64"), floor)
         axes.plot(with_form["trigger"].to_numpy(dtype="float64"), closed, color=colour, linewidth=0.9)
         label = short(name, LINE_CHARS - 8)
-        sources += axes.plot([], [], color=colour, label=label)
+        lines += axes.plot([], [], color=colour, label=label)
         share = mine["p_stall_cycle"].to_numpy(dtype="float64")
         above = share - mine["p_stall_low"].to_numpy(dtype="float64")
         below = mine["p_stall_high"].to_numpy(dtype="float64") - share
@@ -237,11 +237,11 @@ def build_triggers(run: StoredRun) -> Figure:
         )
         for rule, marker in _RULES.items():
             for cell in cells:
-                if cell["rule"] == rule and cell["trigger"] is not None:
-                    at = max(cell["p_stall_cycle"] or 0.0, floor)
-                    axes.plot(cell["trigger"], at, marker, color=colour, markerfacecolor="none", markersize=7)
+                if cell.rule == rule and cell.trigger is not None:
+                    at = max(cell.p_stall_cycle or 0.0, floor)
+                    axes.plot(cell.trigger, at, marker, color=colour, markerfacecolor="none", markersize=7)
     for rule, marker in _RULES.items():
-        if any(cell["rule"] == rule for _, cells in groups for cell in cells):
+        if any(cell.rule == rule for _, cells in groups for cell in cells):
             style: dict[str, Any] = {"markerfacecolor": "none", "markersize": 6, "linestyle": "none"}
             rules += axes.plot([], [], marker, color=_INK, label=rule, **style)
     axes.axhline(epsilon, color=_INK, linestyle=":", linewidth=0.8)
@@ -251,29 +251,28 @@ def build_triggers(run: StoredRun) -> Figure:
     axes.set_xlabel("trigger, m (actions left at the request)")
     axes.set_ylabel("P(stall) a cycle")
     axes.legend(handles=rules, loc="upper right", ncols=2, columnspacing=1.0)
-    figure.legend(handles=sources, loc="outside lower center")
+    figure.legend(handles=lines, loc="outside lower center")
     return figure
 
 
-def build_reactions(run: StoredRun) -> Figure:
+def build_reactions(rows: pd.DataFrame, sources: Mapping[str, Sequence[ChunkRow]], setting: str) -> Figure:
     """Draw the distribution of reaction times, a panel a source and a line a mode; dotted: the closed form."""
-    rows = run.table(REACTIONS)
-    groups = sources_of(rows_of(run))[:_MOST_PANELS]
+    groups = list(sources.items())[:_MOST_PANELS]
     names = list(dict.fromkeys(_line_name(cell) for _, cells in groups for cell in cells if _drawn(cell)))
     what = "From an event to the first tick that knows of it; the last 0.25 % of the slowest mode are beyond the axis."
     foot_in = 0.17 * -(-(len(names) + 1) // 2)
-    figure = new_figure(0.5 + foot_in + 1.6 * len(groups), _caption(run, "Reaction times", what))
+    figure = new_figure(0.5 + foot_in + 1.6 * len(groups), (f"Reaction times, {setting}", what))
     panels = figure.subplots(len(groups), 1, squeeze=False)[:, 0]
     for axes, (source, cells) in zip(panels, groups, strict=True):
         for cell in filter(_drawn, cells):
-            mine = rows[rows["cell"] == cell["cell"]]
+            mine = rows[rows["cell"] == cell.cell]
             with_form = mine[mine["closed_s"].notna()]
             colour = LINE_COLOURS[names.index(_line_name(cell)) % len(LINE_COLOURS)]
             axes.step(mine["reaction_s"] * 1e3, mine["share"], where="post", color=colour)
             axes.plot(with_form["closed_s"] * 1e3, with_form["share"], ":", color="black", linewidth=0.8)
         axes.set_title(short(source, LINE_CHARS), loc="left", pad=2)
         axes.set_ylim(0, 1)
-        shown = rows[rows["cell"].isin([cell["cell"] for cell in cells if _drawn(cell)]) & (rows["share"] <= _BULK)]
+        shown = rows[rows["cell"].isin([cell.cell for cell in cells if _drawn(cell)]) & (rows["share"] <= _BULK)]
         axes.set_xlim(0, float(shown["reaction_s"].max()) * 1e3)
         axes.set_ylabel("share")
     panels[-1].set_xlabel("reaction time (ms)")
@@ -286,15 +285,9 @@ def build_reactions(run: StoredRun) -> Figure:
     return figure
 
 
-def _drawn(cell: dict[str, Any]) -> bool:
-    return cell["rule"] in {"given", "calibrated"}
+def _drawn(row: ChunkRow) -> bool:
+    return row.rule in {"given", "calibrated"}
 
 
-def _line_name(cell: dict[str, Any]) -> str:
-    return str(cell["mode"]) if cell["rule"] == "given" else f"{cell['mode']}, {cell['rule']}"
-
-
-def _caption(run: StoredRun, what: str, *notes: str) -> tuple[str, ...]:
-    settings = run.manifest["configuration"]
-    setting = f"H = {settings['horizon']}, {settings['control_hz']:g} Hz, d by {settings['rounding']}"
-    return (f"{what}, {setting}", *notes)
+def _line_name(row: ChunkRow) -> str:
+    return row.mode if row.rule == "given" else f"{row.mode}, {row.rule}"
