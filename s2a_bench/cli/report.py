@@ -42,8 +42,8 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
     from s2a_bench.report.compare import comparison, gates, shown
 
     conditions = [gates.read_gate(text) for text in config.fail_if]
-    sides = comparison.read_side(config.baseline, "A"), comparison.read_side(config.other, "B")
-    compared = comparison.open_comparison(*sides, unlike=config.unlike, least=config.min_effect / 100)
+    baseline, other = comparison.read_side(config.baseline, "A"), comparison.read_side(config.other, "B")
+    compared = comparison.open_comparison(baseline, other, unlike=config.unlike, least=config.min_effect / 100)
     wanted = comparison.metrics_of(compared, [name for text in config.metric for name in listed(text)])
     compared = comparison.compare(compared, [*wanted, *gates.concerned(compared, conditions)])
     gated = gates.judge(compared, conditions, strict=config.strict, one_launch=config.one_launch)

@@ -170,7 +170,9 @@ def lay_out(table: TextTable, width: int) -> RenderableType:
     from rich.console import Group
     from rich.text import Text
 
-    blocks = [item for each in _blocks(table, width) for item in (_block(table, *each), Text())]
+    blocks = [
+        item for columns, wide, gap in _blocks(table, width) for item in (_block(table, columns, wide, gap), Text())
+    ]
     return Group(Text(one_line(table.title), "bold"), *blocks)
 
 

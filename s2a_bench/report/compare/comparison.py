@@ -146,7 +146,7 @@ def open_comparison(
     fatal = [difference for difference in differ if difference.fatal]
     if fatal and not unlike:
         raise UnlikeRuns(f"the runs are unlike: {as_line(fatal)}; `unlike` compares them anyway")
-    pairs, only, settings = _match(*sides)
+    pairs, only, settings = _match(sides[0], sides[1])
     if settings and not unlike:
         raise UnlikeRuns(f"cells of one name differ: {as_line(settings)}; `unlike` compares them anyway")
     if not pairs:
@@ -247,7 +247,7 @@ def changes(compared: ComparedRuns, metric: Metric, statistic: str) -> Iterator[
     for pair in compared.pairs:
         if rows := _rows(pair, metric.name):
             exact = all(subject.exact for subject in (*pair.baseline, *pair.other))
-            change = change_between(*rows, statistic, seed=compared.baseline[0].bootstrap_seed, exact=exact)
+            change = change_between(rows[0], rows[1], statistic, seed=compared.baseline[0].bootstrap_seed, exact=exact)
             n = [sum(len(launch) for launch in side) for side in rows]
             yield CellComparison(pair, metric, statistic, (n[0], n[1]), change)
 
@@ -287,37 +287,39 @@ def read_side(text: str, flag: str) -> list[StoredRun]:
 
 def warnings_of(compared: ComparedRuns) -> list[RunWarning]:
     """Return the warnings about a comparison, the most important first."""
-    return [RunWarning(*each) for each in (*_of_runs(compared), *_of_cells(compared))]
+    return [*_of_runs(compared), *_of_cells(compared)]
 
 
-def _of_runs(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
+def _of_runs(compared: ComparedRuns) -> Iterator[RunWarning]:
     if fatal := [one for one in compared.differences if one.fatal]:
-        yield "unlike", f"the runs are unlike: {as_line(fatal)}", "a change may come from any of them"
+        yield RunWarning("unlike", f"the runs are unlike: {as_line(fatal)}", "a change may come from any of them")
     for run in (*compared.baseline, *compared.other):
         if (state := run.manifest["state"]) != "finished":
-            yield "state", f"{run.path} is {state}, not finished", "its samples so far count; run it again"
+            yield RunWarning("state", f"{run.path} is {state}, not finished", "its samples so far count; run it again")
         if codes := sorted({warning["code"] for warning in run.manifest.get("warnings", [])}):
-            yield "warnings", f"{run.path} has warnings: {', '.join(codes)}", "read them in its manifest"
+            yield RunWarning("warnings", f"{run.path} has warnings: {', '.join(codes)}", "read them in its manifest")
     if compared.launches_below(2):
-        yield "one-launch", "one launch a side: the intervals do not include the variation between launches", IN_TURN
+        within = "one launch a side: the intervals do not include the variation between launches"
+        yield RunWarning("one-launch", within, IN_TURN)
     if out_of_turn := compared.out_of_turn:
-        yield "turns", out_of_turn, IN_TURN
+        yield RunWarning("turns", out_of_turn, IN_TURN)
 
 
-def _of_cells(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
+def _of_cells(compared: ComparedRuns) -> Iterator[RunWarning]:
     if names := sorted({one.pair.name for one in compared.comparisons if one.change.dependent}):
-        yield (
+        yield RunWarning(
             "dependent",
             f"neighbouring requests are correlated, and the intervals too narrow ({', '.join(names)})",
             "measure longer, or repeat the launches",
         )
     for side, cells in zip(("A", "B"), compared.only, strict=True):
         if cells:
-            yield "only", f"only in {side}: {', '.join(cells)}", "they are not compared"
+            yield RunWarning("only", f"only in {side}: {', '.join(cells)}", "they are not compared")
     for pair in compared.pairs:
         for side, subjects in (("A", pair.baseline), ("B", pair.other)):
             if failed := sum(subject.errors for subject in subjects):
                 total = failed + sum(subject.n for subject in subjects)
-                yield "errors", f"{pair.name}: {failed} of {total} requests failed in {side}", "see samples.csv"
+                message = f"{pair.name}: {failed} of {total} requests failed in {side}"
+                yield RunWarning("errors", message, "see samples.csv")
     if harmless := [one for one in compared.differences if not one.fatal]:
-        yield "differs", as_line(harmless), "this may be what you compare"
+        yield RunWarning("differs", as_line(harmless), "this may be what you compare")

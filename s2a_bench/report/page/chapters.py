@@ -85,7 +85,6 @@ def when(manifest: Mapping[str, Any]) -> str:
 
 
 def repeat_command(manifest: Mapping[str, Any]) -> str:
-    """Return the command line of a run, quoted for a shell."""
     return shlex.join(["s2a-bench", *map(str, manifest.get("argv", [])[1:])])
 
 

@@ -202,7 +202,6 @@ class CapacityOptions(ControlOptions):
 
     @property
     def answer(self) -> str:
-        """What the server answers with."""
         return ACTIONS if self.plan_every_s is None else TOKENS
 
     @cached_property
@@ -217,7 +216,6 @@ class CapacityOptions(ControlOptions):
         return round((self.plan_every_s or PLAN_EVERY_S) * 1e9)
 
     def check(self) -> None:
-        """Refuse what makes no sense together; raises UsageError naming the fields."""
         super().check()
         if self.numbers[-1] > self.MOST_ROBOTS:
             raise UsageError(f"`robots`: {self.numbers[-1]} are more than {self.MOST_ROBOTS}")

@@ -164,7 +164,6 @@ class ChunksVirtual(ChunksOptions):
         return self.calibration_cycles if self.rules_plan.mode is not None and self.rules_plan.tried else 0
 
     def check(self) -> None:
-        """Refuse what makes no sense together; raises UsageError naming the fields."""
         super().check()
         if not self.latency:
             raise UsageError("`latency`: name at least one")
@@ -192,7 +191,6 @@ class ChunksLive(ChunksOptions, ServedOptions):
     seconds: float = option(20.0, "how long each mode acts", gt=0, le=86_400)
 
     def check(self) -> None:
-        """Refuse what makes no sense together; raises UsageError naming the fields."""
         super().check()
         if self.seconds * 1e9 < 2 * self.setting.period_ns:
             raise UsageError(

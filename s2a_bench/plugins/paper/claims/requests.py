@@ -203,7 +203,8 @@ LARGE: Final = Need("bytes a picture", f"{_SMALL} or more, by a larger --size", 
 
 def times_as_long(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure the ratio of the mean times of HTTP and ROS, launch by launch and block by block."""
-    ratio = ratio_of_launches(*_blocks(part.cells), part.run.bootstrap_seed, "mean") or Ratio(None, None, None)
+    http, ros = _blocks(part.cells)
+    ratio = ratio_of_launches(http, ros, part.run.bootstrap_seed, "mean") or Ratio(None, None, None)
     return [ratio], interval(ratio)
 
 
@@ -251,10 +252,11 @@ def _metric(pair: Sequence[RequestCell]) -> str:
 
 def _blocks(pair: Sequence[RequestCell]) -> tuple[Mapping[int, Blocks], Mapping[int, Blocks]]:
     http, ros = (cell.by_launch(_metric(pair)) for cell in pair)
-    both = [(launch, http[launch], ros[launch]) for launch in http if launch in ros]
-    return {launch: one.shared(other) for launch, one, other in both}, {
-        launch: other.shared(one) for launch, one, other in both
-    }
+    both = [launch for launch in http if launch in ros]
+    return (
+        {launch: http[launch].shared(ros[launch]) for launch in both},
+        {launch: ros[launch].shared(http[launch]) for launch in both},
+    )
 
 
 def speeds(run: StoredRun) -> Iterator[RunPart]:
