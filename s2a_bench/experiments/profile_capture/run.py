@@ -78,11 +78,11 @@ def answers(engine: Engine, config: CaptureConfig) -> Generator[TimedAnswer, Non
 def capture(config: CaptureConfig, progress: Progress) -> dict[str, Any]:
     """Measure, and return the profile as the tables of its file; raises EngineError for short answers."""
     need_engine(config.engine)
+    from s2a_bench.inference.llama_cpp import LlamaCppEngine
+
     limit_threads()
     progress.expect(config.warmup + config.requests)
     warnings = before_run()
-    from s2a_bench.inference.llama_cpp import LlamaCppEngine
-
     model, mmproj = resolve(config.engine)
     progress.stage("loading the model")
     # on this thread: another one would hand tokens over late, and several at once

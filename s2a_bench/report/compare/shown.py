@@ -38,10 +38,11 @@ _LARGEST_DETECTABLE = 10
 
 def compare_table(compared: ComparedRuns) -> TextTable:
     """Make a table with a row a comparison, below the name of its metric."""
-    groups = [
-        [(_title(same[0]), *[""] * (len(_HEADER) - 1)), *((one.pair.name, *_row(one)) for one in same)]
-        for same in (list(group) for _, group in groupby(compared.comparisons, lambda one: one.name))
-    ]
+    groups = []
+    for _, group in groupby(compared.comparisons, lambda one: one.name):
+        same = list(group)
+        heading = (_title(same[0]), *("" for _ in _HEADER[1:]))
+        groups.append([heading, *map(_row, same)])
     table = TextTable.grouped(f"{compared.command}: B against A", _HEADER, groups, 1, notes(compared))
     return replace(table, provenance=compared.origins.line)
 
@@ -100,6 +101,7 @@ def _row(one: CellComparison) -> tuple[str, ...]:
     change = one.change
     superiority = ABSENT if change.superiority.value is None else f"{change.superiority.value:.2f}"
     return (
+        one.pair.name,
         n,
         number(change.baseline),
         number(change.other),

@@ -117,8 +117,10 @@ class Judge:
                 return "undecided", False
             low, high = share_interval(above, at_ns, robots, cycle_ns(traces), self.confidence)
             share = float(above.mean())
-        verdict: Verdict = "below" if high <= limit.share else "above" if low > limit.share else "undecided"
-        return verdict, share <= limit.share
+        within = share <= limit.share
+        if high <= limit.share:
+            return "below", within
+        return "above" if low > limit.share else "undecided", within
 
 
 def above_limit(limit: Limit, traces: Sequence[RobotTrace], settle_ns: int) -> tuple[Ints, Ints, Any]:

@@ -157,7 +157,7 @@ def figure_5(board: Published, *policies: str) -> Trial:
     measured = on_board(board.name), *PAPERS_MODEL, like
     either = f"{emulated(profile, rate)}; or {', '.join(f'{need.name} {need.wanted}' for need in measured)}"
     source = _Or("source", either, emulated(profile, rate).__eq__, measured)
-    needs = source, listed("L", *_LENGTHS), listed("policies", *policies), SETTINGS
+    needs = (source, listed("L", *_LENGTHS), listed("policies", *policies), SETTINGS)
     return Trial(f"s2a-bench timeline --profile {profile}", timelines, needs)
 
 
