@@ -26,8 +26,8 @@ def __getattr__(name: str) -> Any:
         raise AttributeError(f"module 's2a_bench' has no attribute '{name}'")
     from s2a_bench import library
 
-    found = globals()[name] = getattr(library, name) if name in _LIBRARY else library.command(name)
-    return found
+    member = globals()[name] = getattr(library, name) if name in _LIBRARY else library.command(name)
+    return member
 
 
 def __dir__() -> list[str]:

@@ -18,7 +18,6 @@ SWITCH_S: Final = 0.0005
 """Longest time that another thread of this process delays one that is due (Python's default: 5 ms)."""
 
 now_ns = time.monotonic_ns
-"""Read CLOCK_MONOTONIC, in nanoseconds."""
 
 
 @cache

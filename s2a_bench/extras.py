@@ -30,7 +30,6 @@ _NOTED: ContextVar[dict[str, None] | None] = ContextVar("extras that are missing
 
 
 def purposes() -> dict[str, str]:
-    """Return what each extra is for."""
     return {**_CORE, **dict(_OFFERED.loaded())}
 
 

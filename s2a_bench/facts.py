@@ -25,7 +25,6 @@ class Fact(str):
 
 
 def facts_json(facts: Iterable[Fact]) -> dict[str, dict[str, str]]:
-    """Return declared facts as plain data, for the manifest."""
     return {str(fact): {"unit": fact.unit, "about": fact.about} for fact in facts}
 
 

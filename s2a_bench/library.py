@@ -40,10 +40,7 @@ SHOWN_DPI: Final = 150
 
 
 class Run:
-    """One run, read from its folder: its rows, tables and figures. A notebook shows its main tables.
-
-    Raises StoreError if the folder is no run.
-    """
+    """One run, read from its folder; raises StoreError if it is none. A notebook shows its main tables."""
 
     def __init__(self, path: str | Path) -> None:
         self._run = store.read_run(Path(path))
@@ -150,15 +147,17 @@ class Comparison:
 
         return _read_csv(compare_csv(self._compared), self._compared.origins)
 
-    def __str__(self) -> str:
+    @cached_property
+    def _shown(self) -> TextTable:
         from s2a_bench.report.compare.shown import compare_table
 
-        return to_markdown(compare_table(self._compared))
+        return compare_table(self._compared)
+
+    def __str__(self) -> str:
+        return to_markdown(self._shown)
 
     def _repr_html_(self) -> str:
-        from s2a_bench.report.compare.shown import compare_table
-
-        return _html(compare_table(self._compared))
+        return _html(self._shown)
 
 
 def run(

@@ -141,7 +141,7 @@ def places(options: type[Options]) -> dict[str, list[Place]]:
 
     The options of a group that are flags keep their names; sibling groups share the names that both have.
     """
-    found: dict[str, list[Place]] = {}
+    paths_of: dict[str, list[Place]] = {}
     for name, field in options.model_fields.items():
         if inner := group_of(field):
             only = extra_of(field).get("only")
@@ -149,13 +149,13 @@ def places(options: type[Options]) -> dict[str, list[Place]]:
                 new = [(name, *path) for path in paths if not only or path[0] in only]
                 if not new:
                     continue
-                known = found.setdefault(each, new)
+                known = paths_of.setdefault(each, new)
                 if known is not new and beside(known[0], new[0]):
                     known += new
     for name, field in options.model_fields.items():
         if group_of(field) is None:
-            found |= {name: [(name,)], str(extra_of(field).get("flag") or name).replace("-", "_"): [(name,)]}
-    return found
+            paths_of |= {name: [(name,)], str(extra_of(field).get("flag") or name).replace("-", "_"): [(name,)]}
+    return paths_of
 
 
 def placed(options: type[Options], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -171,13 +171,13 @@ def placed(options: type[Options], given: Mapping[str, Any]) -> dict[str, Any]:
 
 def nested(values: Iterable[tuple[tuple[str, ...], Any]]) -> dict[str, Any]:
     """Return values, each with the path to its field, as arguments of a class of options: groups as dictionaries."""
-    found: dict[str, Any] = {}
+    tree: dict[str, Any] = {}
     for (*groups, last), value in values:
-        inner = found
+        inner = tree
         for each in groups:
             inner = inner.setdefault(each, {})
         inner[last] = value
-    return found
+    return tree
 
 
 def _line(error: ErrorDetails, options: type[Options]) -> str:
@@ -226,8 +226,8 @@ def completions(field: FieldInfo) -> Callable[[], Iterable[str]] | None:
     checks: Iterable[Any] = (getattr(each, "func", None) for each in field.metadata)
     kinds = (field.annotation, *get_args(field.annotation))
     literal = next((get_args(each) for each in kinds if get_origin(each) is Literal), ())
-    found = next((each.args[0] for each in checks if getattr(each, "func", None) is _one_of), None)
-    return found or extra_of(field).get("names") or ((lambda: literal) if literal else None)
+    checked = next((each.args[0] for each in checks if getattr(each, "func", None) is _one_of), None)
+    return checked or extra_of(field).get("names") or ((lambda: literal) if literal else None)
 
 
 def _size(value: Any) -> Any:
@@ -240,7 +240,7 @@ def _size(value: Any) -> Any:
 
 
 def _square(value: Any) -> Any:
-    return (int(value),) * 2 if isinstance(value, str) and value.isdecimal() else _size(value)
+    return (int(value), int(value)) if isinstance(value, str) and value.isdecimal() else _size(value)
 
 
 def _text(value: Any) -> Any:

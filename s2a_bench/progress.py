@@ -9,8 +9,6 @@ from typing import Any, Protocol
 
 
 class Progress(Protocol):
-    """Receives the progress of a run."""
-
     def opened(self, folder: Path) -> None:
         """Show the run folder, before the first result."""
 
@@ -50,8 +48,6 @@ class NullProgress:
 
 
 class LiveView(Protocol):
-    """A view that changes during a run."""
-
     def draw(self, width: int) -> Any:
         """Return the present view as a renderable of rich, ``width`` columns wide."""
 

@@ -15,7 +15,6 @@ UNKNOWN: Final = "unknown"
 NONE: Final = "none"
 NOT_SENT: Final = "not seen or sent"
 ORIGIN: Final = "Provenance: "
-"""The beginning of a line of provenance."""
 
 LABELS: Final = {
     ("weights", "dummy"): "dummy weights",
@@ -64,7 +63,7 @@ class Provenance:
         weights = {True: "dummy", False: "real"}.get(facts.get("dummy", ""), UNKNOWN)
         if not facts.get("engine"):
             return cls(link=link, weights=weights)
-        emulated, paced = bool(facts.get("emulated")), "paced_tokens_per_s" in facts
+        tokens = "paced" if "paced_tokens_per_s" in facts else "measured"
         no_model = facts.get("model") == NONE
         return cls(
             engine=_text(facts["engine"]),
@@ -72,7 +71,7 @@ class Provenance:
             model_sha256=_text(facts.get("model_sha256")),
             quantisation=_text(facts.get("quantisation")),
             weights=NONE if no_model else weights,
-            tokens="emulated" if emulated else "paced" if paced else "measured",
+            tokens="emulated" if facts.get("emulated") else tokens,
             profile=_text(facts.get("profile")) or _latencies(_text(facts.get("latency"))),
             link=link,
             pictures=_text(facts.get("pictures")),
@@ -109,9 +108,9 @@ class Provenance:
     @property
     def labels(self) -> tuple[str, ...]:
         """Return the labels of everything except a real, measured model that sees its pictures."""
-        found = tuple(label for (name, value), label in LABELS.items() if getattr(self, name) == value)
+        labels = tuple(label for (name, value), label in LABELS.items() if getattr(self, name) == value)
         no_model = self.weights == NONE and self.engine not in {NONE, UNKNOWN}
-        return (*found, f"{self.engine} engine") if no_model else found
+        return (*labels, f"{self.engine} engine") if no_model else labels
 
     @property
     def code(self) -> str:
@@ -172,7 +171,6 @@ class Origins:
 
     @property
     def every(self) -> tuple[Provenance, ...]:
-        """Return each provenance once, the cells' first."""
         return tuple(dict.fromkeys(self.cells.values())) or (self.run,)
 
     @property
@@ -197,15 +195,14 @@ class Origins:
 
     def _grouped(self, name: str, kind: Callable[[Provenance], Provenance]) -> str:
         """Return a line for each kind of provenance, with all values of one field in that kind."""
-        found: dict[Provenance, dict[str, None]] = {}
+        by_kind: dict[Provenance, dict[str, None]] = {}
         for each in self.every:
-            found.setdefault(kind(each), {})[getattr(each, name)] = None
-        lines = (replace(each, **{name: ", ".join(filter(None, values))}).line for each, values in found.items())
+            by_kind.setdefault(kind(each), {})[getattr(each, name)] = None
+        lines = (replace(each, **{name: ", ".join(filter(None, values))}).line for each, values in by_kind.items())
         return "; ".join(dict.fromkeys(lines))
 
     @property
     def code(self) -> str:
-        """Return the codes of all cells, each once."""
         return " ".join(dict.fromkeys(each.code for each in self.every))
 
 
@@ -217,12 +214,13 @@ def joined(origins: Iterable[Origins]) -> Origins:
     for name, each in (item for one in origins for item in one.cells.items()):
         named.setdefault(name, set()).add(each)
     cells = {str(place): each for place, each in enumerate(every)}
-    cells |= {name: found.pop() for name, found in named.items() if len(found) == 1}
+    cells |= {name: distinct.pop() for name, distinct in named.items() if len(distinct) == 1}
     return Origins(next(iter(every), Provenance()), cells)
 
 
 def _latencies(written: str) -> str:
-    return f"latencies {written}{' ms' if written[-1].isdigit() and ':' not in written else ''}" if written else ""
+    number = written[-1:].isdigit() and ":" not in written
+    return f"latencies {written}{' ms' if number else ''}" if written else ""
 
 
 def _text(value: Any) -> str:

@@ -41,8 +41,8 @@ class Registry(Mapping[str, T], Generic[T]):
         """
         known = installed_points().select(group=self.group)
         points = sorted(known, key=lambda each: (not each.value.startswith(OURS), each.value))
-        found = {point.name: point for point in reversed(points)}
-        return {name: point for name, point in sorted(found.items()) if name not in self._builtins}
+        by_name = {point.name: point for point in reversed(points)}
+        return {name: point for name, point in sorted(by_name.items()) if name not in self._builtins}
 
     def __getitem__(self, name: str) -> T:
         """Load an implementation; raises UsageError for an unknown name, and for a package that does not load."""

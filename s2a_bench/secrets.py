@@ -13,9 +13,7 @@ from itertools import islice
 from typing import Any, Final
 
 LONG: Final = 8
-"""A secret of fewer letters is removed from servers' messages only, and only as a separate word: a placeholder such as
-`ollama` would otherwise disappear from settings."""
-
+"""A shorter secret, as the placeholder `ollama`, is removed from servers' messages only, as a separate word."""
 STRUCK: Final = "***"
 
 _long: dict[str, str] = {}
@@ -39,8 +37,8 @@ def secrets_in(value: Any, name: str = "", *, inside: bool = False) -> Iterator[
     """Yield name and text of every value of a JSON object under a secret's name, at any depth."""
     if isinstance(value, dict):
         for key, item in value.items():
-            found = inside or is_secret(key)
-            yield from secrets_in(item, name if inside else key, inside=found)
+            secret = inside or is_secret(key)
+            yield from secrets_in(item, name if inside else key, inside=secret)
     elif isinstance(value, list):
         for item in value:
             yield from secrets_in(item, name, inside=inside)
@@ -65,12 +63,12 @@ def struck(text: str, *, short: bool = True) -> str:
 def struck_pieces(texts: Sequence[str]) -> list[str]:
     """Return the pieces of one text without the secrets, which may span several pieces."""
     whole, patterns = "".join(texts), [*_long.values(), *_short.values()]
-    found = list(re.finditer("|".join(patterns), whole, re.IGNORECASE)) if patterns else []
-    if not found:
+    matches = list(re.finditer("|".join(patterns), whole, re.IGNORECASE)) if patterns else []
+    if not matches:
         return list(texts)
     letters = list(whole)
-    for match in found:
-        letters[match.start() : match.end()] = [STRUCK, *[""] * (match.end() - match.start() - 1)]
+    for match in matches:
+        letters[match.start() : match.end()] = [STRUCK] + [""] * (len(match[0]) - 1)
     rest = iter(letters)
     return ["".join(islice(rest, len(text))) for text in texts]
 

@@ -28,7 +28,7 @@ def read_text(path: str | Path, most: int = FILE_LETTERS) -> str:
 
 def visible(text: str) -> str:
     r"""Return a text with hidden letters escaped, as ``\u001b``; tabs and line feeds stay."""
-    return _HIDDEN.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    return _HIDDEN.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
 def one_line(text: str) -> str:

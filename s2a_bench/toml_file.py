@@ -1,7 +1,4 @@
-"""TOML files of users, read strictly, so that a typing error does not become a number in a figure.
-
-Every error is one line that names the file and the key.
-"""
+"""TOML files of users, read strictly: an error is one line that names file and key, never a number in a figure."""
 
 from __future__ import annotations
 

@@ -175,9 +175,10 @@ class Trace:
     def to_remote(self) -> Remote:
         self.facts |= {name: find() for name, find in self.later.items()}
         self.later = {}
-        frame = self.frame_stamp_ns, self.frame_marks
         facts = {str(name): value for name, value in self.facts.items()}  # not every serialiser takes a subclass of str
-        return Remote(clock_id(), self.marks, self.token_ns, *frame, facts, self.provenance)
+        return Remote(
+            clock_id(), self.marks, self.token_ns, self.frame_stamp_ns, self.frame_marks, facts, self.provenance
+        )
 
     def chain(self) -> list[Mark]:
         """Join both sides' marks in order of time; of another clock's all up to the answer is the stage `server`."""
@@ -228,9 +229,7 @@ def budget(chain: Iterable[Mark]) -> Budget:
 
 
 def mark_cost_ns(repeats: int = 20_000) -> float:
-    """Measure the cost of one mark on this machine, in ns."""
-    trace = Trace()
-    mark = trace.mark
+    mark = Trace().mark
     start = now_ns()
     for _ in range(repeats):
         mark("capture")

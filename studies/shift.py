@@ -16,11 +16,10 @@ import numpy as np
 
 from s2a_bench.boards.gaps import Gaps, Lognormal, Markov
 from s2a_bench.policy import Plans
-from s2a_bench.policy.conformal import ANY_STALL_S, Tracker, choose, scores
+from s2a_bench.policy.conformal import ANY_STALL_S, TrackedPolicy, Tracker, choose, scores
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.metrics import measure
 from s2a_bench.policy.stream_to_act import StreamToAct
-from s2a_bench.policy.tracking import TrackedPolicy
 from s2a_bench.stats.seeds import generator
 from studies.config import Cell, StudyConfig
 from studies.rows import StudyRow, row_of

@@ -14,8 +14,8 @@ from itertools import product
 from typing import TYPE_CHECKING, Final
 
 from s2a_bench.policy.conformal import upper_bound
+from s2a_bench.policy.nominal import WaitThenAct
 from s2a_bench.policy.stream_to_act import MeanStart
-from s2a_bench.policy.wait_then_act import WaitThenAct
 from studies.config import Cell, StudyConfig
 from studies.rows import StudyRow, study_row
 from studies.worlds import HARD, QuantileStart, World, calibrated

@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 from s2a_bench import extras
 from s2a_bench.errors import MissingExtra
 from s2a_bench.inference import EngineConfig
-from s2a_bench.machine.doctor import Machine, software
+from s2a_bench.machine.doctor import Machine, host
 from s2a_bench.machine.resources import Unreadable
 from s2a_bench.machine.resources.nvidia import Nvml
 from tests.cli.program import refused
@@ -211,9 +211,9 @@ def test_the_doctor_knows_which_extras_are_there(
             raise PackageNotFoundError(name)
         return there[name]
 
-    monkeypatch.setattr(software, "requires", lambda _name: stated)
-    monkeypatch.setattr(software, "version", version)
-    found = software.packages(Machine())
+    monkeypatch.setattr(host, "requires", lambda _name: stated)
+    monkeypatch.setattr(host, "version", version)
+    found = host.packages(Machine())
     assert (found.level, found.message, found.fix) == (level, message, fix)
 
 

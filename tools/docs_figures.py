@@ -82,7 +82,7 @@ def safe_start_figure() -> Figure:
     safe_s = float(safe_start(arrival_s, nominal_s)[0])
     naive_s = work_conserving(arrival_s, nominal_s, arrival_s[0])
     skills = np.arange(1, 9)
-    colours = policy_colours([])
+    colours = policy_colours()
     figure = new_figure(2.5, ("When skill i starts, and when it has arrived",))
     figure.suptitle("computed: L = 6, R = 4.8 tokens/s, T = 1 s, c = 0.5 s", x=0.01, ha="left", color="#444444")
     axes = figure.subplots()

@@ -88,10 +88,7 @@ class ActionRobot(Protocol):
 
 
 class RobotKind:
-    """A kind of robot; its parameters are the fields of a frozen dataclass, all with defaults.
-
-    It derives from `SkillKind`, `ActionKind`, or both.
-    """
+    """A kind of robot, a `SkillKind`, an `ActionKind` or both: a frozen dataclass whose fields all have defaults."""
 
     risk: ClassVar[str] = ""
     """``program`` if a parameter names code to run: a file from another person should not choose it."""

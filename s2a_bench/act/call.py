@@ -37,8 +37,7 @@ class PythonCall(SkillKind, ActionKind):
     def open_skills(self, skills: SkillSet) -> CallableRobot:
         return CallableRobot(skills, dict.fromkeys((skill.name for skill in skills.skills), self._imported()))
 
-    def open_actions(self, dims: int, period_ns: int) -> CallableActions:
-        del dims, period_ns
+    def open_actions(self, dims: int, period_ns: int) -> CallableActions:  # noqa: ARG002 - any action
         return CallableActions(self.function, self._imported())
 
     def _imported(self) -> Callable[..., object]:
@@ -60,8 +59,7 @@ class CallableActions(ActionRobot):
     def __init__(self, name: str, function: Callable[[Vector], object]) -> None:
         self._name, self._function = name, function
 
-    def send(self, action: Vector | None, at_ns: int) -> None:
-        del at_ns
+    def send(self, action: Vector | None, at_ns: int) -> None:  # noqa: ARG002 - at once
         if action is None:
             return
         try:

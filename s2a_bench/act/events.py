@@ -124,13 +124,13 @@ class LiveInbox:
         self._events.put(event)
 
     def wait(self, until_ns: int | None) -> list[Event]:
-        found: list[Event] = []
-        while not found and (until_ns is None or now_ns() < until_ns):
+        events: list[Event] = []
+        while not events and (until_ns is None or now_ns() < until_ns):
             with suppress(Empty):  # a timeout may be early by the system's time unit
-                found.append(self._events.get(timeout=None if until_ns is None else max(until_ns - now_ns(), 0) / 1e9))
+                events.append(self._events.get(timeout=None if until_ns is None else max(until_ns - now_ns(), 0) / 1e9))
         while not self._events.empty():  # this is the only reader
-            found.append(self._events.get())
-        return found
+            events.append(self._events.get())
+        return events
 
 
 class VirtualInbox:
@@ -148,11 +148,11 @@ class VirtualInbox:
 
     def wait(self, until_ns: int | None) -> list[Event]:
         """Jump to the next event, or to ``until_ns``; raises RuntimeError without either."""
-        times_ns = [each for each in (until_ns, *(event[0] for event in self._events[:1])) if each is not None]
-        if not times_ns:
+        next_ns = self._events[0][0] if self._events else until_ns
+        if next_ns is None:
             raise RuntimeError("nothing will ever happen: the executor would wait for ever")
-        self._clock.sleep_until_ns(min(times_ns))
-        found = []
+        self._clock.sleep_until_ns(next_ns if until_ns is None else min(next_ns, until_ns))
+        events = []
         while self._events and self._events[0][0] <= self._clock.now_ns():
-            found.append(heapq.heappop(self._events)[2])
-        return found
+            events.append(heapq.heappop(self._events)[2])
+        return events

@@ -19,19 +19,7 @@ import sys
 from collections.abc import Callable
 from typing import Final, TypeVar
 
-from s2a_bench.act import Running, SkillRobot
-from s2a_bench.act.events import (
-    AbortRequested,
-    Event,
-    EventQueue,
-    Fault,
-    Requested,
-    SkillArrived,
-    SkillOver,
-    StreamBroke,
-    StreamEnded,
-    TokenArrived,
-)
+from s2a_bench.act import Running, SkillRobot, events
 from s2a_bench.act.record import Outcome, Record, RobotCommand, SkillRun, What
 from s2a_bench.clock import Clock
 from s2a_bench.plan import Gap
@@ -55,7 +43,7 @@ class Executor:
         policy: Policy,
         shape: PlanShape,
         robot: SkillRobot,
-        inbox: EventQueue,
+        inbox: events.EventQueue,
         clock: Clock,
         *,
         gap: Gap = "hold",
@@ -63,10 +51,7 @@ class Executor:
         patience_s: float = PATIENCE_S,
         name: str = "",
     ) -> None:
-        """Follow the stream in ``inbox``, on ``clock``; ``gap`` is the gap behaviour before the first skill.
-
-        ``name`` replaces the policy's name in the record.
-        """
+        """Follow the stream in ``inbox``; ``gap`` fills the time before the first skill; ``name`` is the record's."""
         self.record = Record(name or policy.name)
         self._stepper = policy.stepper(shape)
         self._announced = shape.n_skills
@@ -84,34 +69,34 @@ class Executor:
         """Follow the plan to its end and return the record; errors of stream and robot are outcomes, not exceptions."""
         due_ns = self._clock.now_ns()
         while (wake_ns := self._act(due_ns)) is not None:
-            events = self._inbox.wait(None if wake_ns == NEVER else wake_ns)
-            for event in events:
+            received = self._inbox.wait(None if wake_ns == NEVER else wake_ns)
+            for event in received:
                 self._receive(event)
             # Of several events the first: they queued because this thread was late, which is jitter too.
-            due_ns = min([wake_ns, *(event.at_ns for event in events)])
+            due_ns = min([wake_ns, *(event.at_ns for event in received)])
         return self.record
 
-    def _receive(self, event: Event) -> None:
+    def _receive(self, event: events.Event) -> None:
         record = self.record
         match event:
-            case Requested(at_ns):
+            case events.Requested(at_ns):
                 record.requested_ns = self._last_token_ns = at_ns
-            case TokenArrived(at_ns) if self._open:
+            case events.TokenArrived(at_ns) if self._open:
                 record.token_ns.append(at_ns)
                 self._last_token_ns = at_ns
                 self._stepper.token(self._policy_time_s(at_ns))
-            case SkillArrived(at_ns, call) if self._open and not self._whole:
+            case events.SkillArrived(at_ns, call) if self._open and not self._whole:
                 record.arrivals.append((at_ns, call))
                 self._stepper.fragment(self._policy_time_s(at_ns), call.skill.durations)
-            case SkillArrived() if self._open:
+            case events.SkillArrived() if self._open:
                 record.extra += 1
-            case StreamEnded(at_ns):
+            case events.StreamEnded(at_ns):
                 self._close(at_ns)
-            case StreamBroke(at_ns, fault, why):
+            case events.StreamBroke(at_ns, fault, why):
                 self._break(at_ns, fault, why)
-            case SkillOver(at_ns, index, error):
+            case events.SkillOver(at_ns, index, error):
                 self._over(at_ns, index, error)
-            case AbortRequested(at_ns, why):
+            case events.AbortRequested(at_ns, why):
                 self._failure = ("aborted", why)
                 self._close(at_ns)
 
@@ -129,7 +114,7 @@ class Executor:
             self.record.ended_ns = at_ns
             self._stepper.end(self._policy_time_s(at_ns))
 
-    def _break(self, at_ns: int, fault: Fault, why: str) -> None:
+    def _break(self, at_ns: int, fault: events.Fault, why: str) -> None:
         if self._open and not self._whole:
             self._fail(fault, why)
         self._close(at_ns)
@@ -163,7 +148,8 @@ class Executor:
     def _decide(self, now_ns: int, due_ns: int) -> int:
         started, requested_ns = len(self.record.skills), self.record.requested_ns
         if self._failure is not None:
-            return self._settle(now_ns, *self._failure)
+            outcome, why = self._failure
+            return self._settle(now_ns, outcome, why)
         if started == self._announced:
             return self._settle(now_ns, "completed")
         answer = math.inf if requested_ns is None else self._stepper.decide(self._policy_time_s(now_ns))
@@ -206,7 +192,7 @@ class Executor:
         duration_ns, latest_ns = round(answer.duration_s * 1e9), round(answer.latest_s * 1e9)
 
         def report(error: str = "") -> None:
-            self._inbox.put(SkillOver(self._clock.now_ns(), index, error))
+            self._inbox.put(events.SkillOver(self._clock.now_ns(), index, error))
 
         ordered_ns = self._clock.now_ns()
         until_ns = ordered_ns + duration_ns

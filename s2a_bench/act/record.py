@@ -86,15 +86,15 @@ def observed(record: Record, shape: PlanShape) -> Plans | None:
     zero_ns, arrivals = record.requested_ns, record.arrivals[: shape.n_skills]
     if zero_ns is None or len(arrivals) < shape.n_skills or not record.token_ns:
         return None
-    return _plans(zero_ns, arrivals, token_s=_column(_since(zero_ns, record.token_ns)), shape=shape)
+    return _plans(zero_ns, arrivals, token_s=_since(zero_ns, record.token_ns), shape=shape)
 
 
 def executed(record: Record) -> tuple[Plans, Schedule, Floats]:
     """Return the skills that ran, and when they were due: columns of shape (N, 1), in s from the request."""
     zero_ns, ran = record.requested_ns or 0, record.ran
-    start_s = _column(_since(zero_ns, [skill.start_ns for skill in ran]))
+    start_s = _since(zero_ns, [skill.start_ns for skill in ran])
     duration_s = _column([((skill.end_ns or 0) - skill.start_ns) / 1e9 for skill in ran])
-    due_s = _column(_since(zero_ns, [skill.due_ns for skill in ran]))
+    due_s = _since(zero_ns, [skill.due_ns for skill in ran])
     plans = _plans(zero_ns, [(skill.arrival_ns, skill.call) for skill in ran])
     return plans, Schedule(start_s, duration_s), due_s
 
@@ -102,7 +102,7 @@ def executed(record: Record) -> tuple[Plans, Schedule, Floats]:
 def _plans(zero_ns: int, arrivals: Sequence[tuple[int, Call]], **more: Any) -> Plans:
     times = [call.skill.durations for _, call in arrivals]
     return Plans(
-        arrival_s=_column(_since(zero_ns, [at_ns for at_ns, _ in arrivals])),
+        arrival_s=_since(zero_ns, [at_ns for at_ns, _ in arrivals]),
         nominal_s=_column([time.nominal_s for time in times]),
         least_s=_column([time.least_s for time in times]),
         most_s=_column([time.most_s for time in times]),
@@ -110,8 +110,8 @@ def _plans(zero_ns: int, arrivals: Sequence[tuple[int, Call]], **more: Any) -> P
     )
 
 
-def _since(zero_ns: int, times_ns: Sequence[int]) -> list[float]:
-    return [(at_ns - zero_ns) / 1e9 for at_ns in times_ns]
+def _since(zero_ns: int, times_ns: Sequence[int]) -> Floats:
+    return _column([(at_ns - zero_ns) / 1e9 for at_ns in times_ns])
 
 
 def _column(values: Sequence[float]) -> Floats:

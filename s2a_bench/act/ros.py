@@ -69,8 +69,7 @@ class RosRobot(RosParameters, SkillKind, ActionKind):
     def names(self) -> list[str]:
         return self.joints.split(":") if self.joints else []
 
-    def open_skills(self, skills: SkillSet) -> RosSkills:
-        del skills
+    def open_skills(self, skills: SkillSet) -> RosSkills:  # noqa: ARG002 - any skill
         self._refuse(FOR_ACTIONS, "actions, not skills")
         return self.join("/s2a_bench/executor", lambda node: RosSkills(node, self.namespace, self.wait_s))
 
@@ -103,8 +102,7 @@ class RosActions(ActionRobot):
                 "controller first, with the same ROS_DOMAIN_ID, or publish without a subscription with wait_s=0"
             )
 
-    def send(self, action: Vector | None, at_ns: int) -> None:
-        del at_ns
+    def send(self, action: Vector | None, at_ns: int) -> None:  # noqa: ARG002 - at once
         if action is not None:
             self._publisher.send(self._publisher.pack(self._message(action)))
 

@@ -13,8 +13,7 @@ class Timed(SkillKind):
 
     several: ClassVar[bool] = True
 
-    def open_skills(self, skills: SkillSet) -> TimedRobot:
-        del skills
+    def open_skills(self, skills: SkillSet) -> TimedRobot:  # noqa: ARG002 - any skill
         return TimedRobot()
 
 

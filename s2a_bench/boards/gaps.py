@@ -113,7 +113,6 @@ class Bursty:
     cv: Number
     """Of the long gaps, and of the short ones."""
     burst_tokens: Annotated[int, Field(ge=1)]
-    """Tokens a burst."""
     within: Annotated[float, Field(ge=0, le=1)]
     """Mean gap inside a burst / mean of all gaps."""
 

@@ -27,7 +27,6 @@ Ints: TypeAlias = NDArray[np.int64]
 
 EXAMPLE: Final = "lognormal:mean_ms=80,cv=0.5"
 UNITS_NS: Final = {"latency_ns": 1, "latency_ms": 1_000_000, "latency_s": 1_000_000_000}
-"""Column -> ns in its unit."""
 LONGEST_MS: Final = 3_600_000.0
 SEED: Final = 0
 """Of every sequence of latencies, so that the option determines all of them."""
@@ -58,15 +57,13 @@ def read_latency(written: str) -> Latencies | None:
 
 
 def draw_ns(gaps: Gaps, rng: np.random.Generator, count: int) -> Ints:
-    """Draw successive latencies in ns, shape (count,)."""
     return whole_ns(gaps.sample(rng, count, 1)[:, 0])
 
 
 def sequence_ns(latencies: Latencies) -> Iterator[int]:
     """Return the endless latencies of requests 0, 1, ... in ns, the same in every call.
 
-    A recording is played in its order and starts again after its end. A family with memory keeps it for `STRETCH`
-    latencies.
+    A recording is played in its order, again and again. A family with memory keeps it for `STRETCH` latencies.
     """
     if latencies.recorded_ns is not None:
         return cycle(latencies.recorded_ns.tolist())
@@ -103,16 +100,15 @@ def read_delays(path: Path) -> Ints:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
             latency_of = _reader(reader.fieldnames or (), path)
-            found = [_latency(row, latency_of, f"`latency`: {path}, line {reader.line_num}") for row in reader]
+            latencies_ns = [_latency(row, latency_of, f"`latency`: {path}, line {reader.line_num}") for row in reader]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise UsageError(f"`latency`: cannot read {path}: {error}") from error
-    if not found:
+    if not latencies_ns:
         raise UsageError(f"`latency`: {path} has no rows")
-    return np.array(found, np.int64)
+    return np.array(latencies_ns, np.int64)
 
 
 def _reader(names: Sequence[str], path: Path) -> Callable[[Mapping[str, str]], float]:
-    """Return the function from a row to its latency in ns."""
     for column, unit_ns in UNITS_NS.items():
         if column in names:
             return lambda row: float(row[column]) * unit_ns

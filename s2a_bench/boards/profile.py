@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain
 from pathlib import Path
@@ -37,10 +37,7 @@ Value = Literal["tokens_per_s", "prompt_s", "prompt_cv", "rate_cv", "gaps", "tra
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """One board running one model.
-
-    A timeline's time to first token is ``prompt_s + 1 / tokens_per_s`` (POLICY section 1, where ``prompt_s`` is c).
-    """
+    """One board running one model; the first token comes ``prompt_s + 1 / tokens_per_s`` after the request."""
 
     name: str
     title: str
@@ -67,7 +64,6 @@ class Profile:
 
     @property
     def provenance(self) -> Provenance:
-        """Of numbers that are computed from it."""
         pictures = str(self.facts.get("model", {}).get("pictures", ""))
         return Provenance.computed(self.name, "dummy" if self.dummy else "real", pictures)
 
@@ -166,13 +162,13 @@ def search_path() -> list[Path]:
     return [Path("profiles"), config / "s2a-bench" / "profiles", SHIPPED, *(folder for _, folder in OFFERED.loaded())]
 
 
+def toml_files(folders: Sequence[Path]) -> dict[str, Path]:
+    """Return name -> file, sorted; of two files with one name, that in the first folder."""
+    return dict(sorted({path.stem: path for folder in reversed(folders) for path in folder.glob("*.toml")}.items()))
+
+
 def profile_files() -> dict[str, Path]:
-    """Return name -> file of every profile, sorted; the first folder with a name wins."""
-    found: dict[str, Path] = {}
-    for folder in search_path():
-        for path in sorted(folder.glob("*.toml")):
-            found.setdefault(path.stem, path)
-    return dict(sorted(found.items()))
+    return toml_files(search_path())
 
 
 def find_profile(name: str) -> Path:

@@ -33,8 +33,6 @@ HELP_ALL = "help_all"
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """One option of a command."""
-
     name: str
     """Without dashes: max-tokens."""
     path: tuple[str, ...]
@@ -58,15 +56,12 @@ class Flag:
     def parameter(self) -> inspect.Parameter:
         """Return a parameter of the function that typer reads; None means that it was not given."""
         default, about = inspect.Parameter.empty if self.needed else None, with_flags(self.prefix + self.about)
-        declared: Any = (
-            typer.Argument(
-                metavar=self.spelled + "..." * (get_origin(self.kind) is list), help=about, show_default=False
-            )
-            if self.argument
-            else typer.Option(
-                self.spelled, help=about, show_default=False, hidden=self.hidden, rich_help_panel=self.panel or None
-            )
-        )
+        shown: dict[str, Any] = {"help": about, "show_default": False}
+        if self.argument:
+            several = "..." if get_origin(self.kind) is list else ""
+            declared: Any = typer.Argument(metavar=f"{self.spelled}{several}", **shown)
+        else:
+            declared = typer.Option(self.spelled, hidden=self.hidden, rich_help_panel=self.panel or None, **shown)
         if self.names:
             declared.autocompletion = _completion(self.names)
         kind: Any = self.kind if self.needed else Union[self.kind, None]  # noqa: UP007 - made at run time
@@ -85,11 +80,11 @@ def _flags_of_modes(experiment: Experiment) -> Iterator[Flag]:
     for flag, about in (pair for mode in modes for pair in mode.flags.items()):
         if about:
             yield Flag(flag.replace("_", "-"), (flag,), bool, about, panel="Modes", first=True)
-    found: dict[str, dict[RunMode, Flag]] = {}
+    by_name: dict[str, dict[RunMode, Flag]] = {}
     for mode in modes:
         for each in distinct([*flags_of(mode.options)]):
-            found.setdefault(each.name, {})[mode] = each
-    for of_mode in found.values():
+            by_name.setdefault(each.name, {})[mode] = each
+    for of_mode in by_name.values():
         first = next(iter(of_mode.values()))
         panel = f"{first.panel or 'Options'}{_with(modes, of_mode)}"
         about = _with_defaults({mode.name: each.about for mode, each in of_mode.items()})

@@ -33,7 +33,6 @@ doctor = command(_doctor, DoctorConfig)
 
 
 def all_checks() -> dict[str, str]:
-    """Return the checks of the machine, of the engines and of the transports, by code."""
     checks = {**CHECKS, **OF_ENGINES}
     for _, transport in TRANSPORTS.loaded():
         checks |= transport.checks

@@ -52,7 +52,6 @@ class Commands(TyperGroup):
         return parsed
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Find a command; the error for an unknown name suggests a similar one."""
         known = self.list_commands(ctx)
         if args[0] not in known and not args[0].startswith("-") and not ctx.resilient_parsing:
             ctx.fail(f"No such command '{args[0]}'{like(args[0], known)}")
@@ -79,10 +78,9 @@ def _click(name: str, made: Any, about: str | None = None) -> Any:
     if not isinstance(made, typer.Typer):
         group = typer.Typer(**PLAIN)
         group.command(name, help=about, cls=Flagged)(made)
-    found: Any = typer.main.get_command(group)
-    found.name = name
-    found.rest = getattr(made, "rest", ())
-    return found
+    click: Any = typer.main.get_command(group)
+    click.name, click.rest = name, getattr(made, "rest", ())
+    return click
 
 
 class Flagged(TyperCommand):

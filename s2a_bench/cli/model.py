@@ -97,8 +97,7 @@ def _dummy(config: DummyConfig) -> None:
     typer.echo(files.mmproj)
 
 
-for _name, _function, _config, _about in (
-    ("fetch", _fetch, FetchConfig, "Fetch a model from the hub, and check it against the hub's SHA-256."),
-    ("dummy", _dummy, DummyConfig, "Write random weights in the shapes of a model, to measure speed."),
-):
-    app.command(_name)(command(_function, _config, about=_about))
+_ABOUT_FETCH = "Fetch a model from the hub, and check it against the hub's SHA-256."
+app.command("fetch")(command(_fetch, FetchConfig, about=_ABOUT_FETCH))
+_ABOUT_DUMMY = "Write random weights in the shapes of a model, to measure speed."
+app.command("dummy")(command(_dummy, DummyConfig, about=_ABOUT_DUMMY))

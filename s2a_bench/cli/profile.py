@@ -25,12 +25,12 @@ SCHEMA = "s2a-bench-profile/1"
 @app.command("list")
 def list_(json_: Json = False) -> None:
     """List the profiles that have a name; an unreadable file is named on standard error."""
-    found = _readable()
+    profiles = _readable()
     if json_:
-        _print_profiles("list", [profile_json(profile, path) for profile, path in found])
+        _print_profiles("list", [profile_json(profile, path) for profile, path in profiles])
         return
     rows: list[tuple[str, ...]] = []
-    for profile, _ in found:
+    for profile, _ in profiles:
         ttft = f"{ttft_s(profile):.3g}" + (" (assumed)" if "prompt_s" in profile.assumed else "")
         origin = _origin(profile).replace(" weights", "")
         gaps, rate = _gaps(profile, full=False), f"{profile.tokens_per_s:.3g}"
@@ -67,30 +67,30 @@ def show(
 def match(json_: Json = False) -> None:
     """List the profiles of boards of this kind; exit with 1 if there is none."""
     board = board_facts()
-    found = [(profile, path) for profile, path in _readable() if matches(profile, board)]
+    profiles = [(profile, path) for profile, path in _readable() if matches(profile, board)]
     if json_:
-        same = [profile_json(profile, path, state_changes(profile, board)) for profile, path in found]
+        same = [profile_json(profile, path, state_changes(profile, board)) for profile, path in profiles]
         _print_profiles("match", same, board=board)
     else:
         kind = ", ".join(str(board[key]) for key in ("model", "gpu", "cpu") if key in board)
         typer.echo(f"this board: {kind}, {board['cores']} cores")
-        for profile, _ in found:
+        for profile, _ in profiles:
             typer.echo(line_of(profile) + "".join(f"; {change}" for change in state_changes(profile, board)))
-        if not found:
+        if not profiles:
             typer.echo("no profile is of this board; 's2a-bench profile capture NAME' measures one")
-    if not found:
+    if not profiles:
         raise typer.Exit(1)
 
 
 def _readable() -> list[tuple[Profile, Path]]:
     """Read the profiles that have a name; print the error of each unreadable one."""
-    found = []
+    profiles = []
     for path in profile_files().values():
         try:
-            found.append((read_profile(path), path))
+            profiles.append((read_profile(path), path))
         except UsageError as error:
             typer.echo(f"left out: {with_flags(str(error))}", err=True)
-    return found
+    return profiles
 
 
 def _gaps(profile: Profile, *, full: bool = True) -> str:

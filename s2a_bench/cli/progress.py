@@ -38,7 +38,7 @@ class RunProgress:
             disable=not self.console.is_terminal,
         )
         self._task = self._bar.add_task("starting", total=None)
-        self._total, self._done, self._started_ns = 0, 0, now_ns()
+        self._started_ns = now_ns()
         self._stage = ""
 
     def __enter__(self) -> RunProgress:  # noqa: PYI034 - Self is typing's since 3.11
@@ -80,14 +80,12 @@ class RunProgress:
         self._stage = text
 
     def expect(self, samples: int) -> None:
-        self._total = samples
         self._started_ns = now_ns()
         self._bar.update(self._task, total=samples)
 
     def advance(self) -> None:
-        self._done += 1
         self._bar.advance(self._task)
-        step = max(1, self._total // PLAIN_STEPS)
-        if self._bar.disable and self._done % step == 0:
-            left_s = (now_ns() - self._started_ns) / 1e9 / self._done * (self._total - self._done)
-            self.say(f"  {self._done} of {self._total} {self._unit}, about {left_s:.0f} s left")
+        done, total = (int(count or 0) for count in (self._bar.tasks[0].completed, self._bar.tasks[0].total))
+        if self._bar.disable and done % max(1, total // PLAIN_STEPS) == 0:
+            left_s = (now_ns() - self._started_ns) / 1e9 / done * (total - done)
+            self.say(f"  {done} of {total} {self._unit}, about {left_s:.0f} s left")

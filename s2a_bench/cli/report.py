@@ -77,20 +77,20 @@ def _report(config: ReportConfig) -> None:
     from s2a_bench.report.page.chapters import read_chapters
     from s2a_bench.report.page.files import make_report, write_report
 
-    made = make_report(read_chapters(config.runs, against=config.against), against=config.against)
-    written = write_report(made, config)
-    of_chapters = (f"{chapter.title}: {caveat}" for chapter in made.chapters for caveat in chapter.every_caveat)
-    for caveat in (*made.caveats, *of_chapters):
+    page = make_report(read_chapters(config.runs, against=config.against), against=config.against)
+    written = write_report(page, config)
+    of_chapters = (f"{chapter.title}: {caveat}" for chapter in page.chapters for caveat in chapter.every_caveat)
+    for caveat in (*page.caveats, *of_chapters):
         print_error(f"warning: {caveat}")
-    if made.judged:
-        print_line(f"{made.judged.of.title}'s claims: {made.judged.tally}")
+    if page.judged:
+        print_line(f"{page.judged.of.title}'s claims: {page.judged.tally}")
     outputs = {"page": config.page, "Markdown": config.markdown, "LaTeX": config.latex, "CSV": config.csv}
     for what, path in outputs.items():
         if path is not None:
             inside = sum(path in (each, *each.parents) for each in written)
             count = f", {inside} files" if inside > 1 else ""
             print_line(f"{what}: {path}{count}")
-    whole = [chapter for chapter in made.chapters if chapter.manifest.get("state") == "finished"]
+    whole = [chapter for chapter in page.chapters if chapter.manifest.get("state") == "finished"]
     print_failures(*((chapter.run.path, chapter.content.failures) for chapter in whole))
 
 

@@ -66,27 +66,28 @@ def read(text: str, known: Sequence[str], node: Mapping[str, str]) -> Read:
 
     Raises UsageError for an unknown argument, and for a parameter that the node does not have.
     """
-    found = Read()
+    result = Read()
     given = list(_given(shlex.split(text)))
     rules = [rule for kind, value in given if kind == "remap" if (rule := _pair(value, "-r", node["node_name"]))]
     renamed = {"__ns": "namespace", "__node": "node_name", "__name": "node_name"}
-    found.options = {renamed[source]: target for source, target in rules if source in renamed}
+    result.options = {renamed[source]: target for source, target in rules if source in renamed}
     if remaps := [f"{source}:={target}" for source, target in rules if source not in renamed]:
-        found.options["remap"] = remaps
-    name = "{namespace}/{node_name}".format_map({**node, **found.options})
+        result.options["remap"] = remaps
+    named = {**node, **result.options}
+    name = f"{named['namespace']}/{named['node_name']}"
     for kind, value in given:
         if kind == "param":
             if pair := _pair(value, "-p", node["node_name"]):
-                _take(found, {pair[0]: _yaml(pair[1], f"-p {value}")}, known, "-p")
+                _take(result, {pair[0]: _yaml(pair[1], f"-p {value}")}, known, "-p")
         elif kind == "params_file":
-            _read_file(found, Path(value), known, name)
+            _read_file(result, Path(value), known, name)
         elif kind == "log_level":
-            found.options["log_level"] = value.rpartition(":=")[2].lower()
+            result.options["log_level"] = value.rpartition(":=")[2].lower()
         elif kind == "enclave":
-            found.environ[ENCLAVE] = value
+            result.environ[ENCLAVE] = value
         elif kind == "log_config_file":
-            found.notes.append(f"--log-config-file {value} is left out: the log goes to /rosout and to stderr")
-    return found
+            result.notes.append(f"--log-config-file {value} is left out: the log goes to /rosout and to stderr")
+    return result
 
 
 def _given(arguments: Sequence[str]) -> Iterator[tuple[str, str]]:
@@ -111,20 +112,20 @@ def _pair(text: str, flag: str, node_name: str) -> tuple[str, str] | None:
     return None if separated and of_node != node_name else (name, right)
 
 
-def _take(found: Read, values: Mapping[str, Any], known: Sequence[str], where: str, *, shared: bool = False) -> None:
+def _take(result: Read, values: Mapping[str, Any], known: Sequence[str], where: str, *, shared: bool = False) -> None:
     """Store parameters; raises UsageError for an unknown one unless the section is ``shared`` with other nodes."""
     for name, value in values.items():
         if name in known:
-            found.options[name] = value
+            result.options[name] = value
         elif name == OF_EVERY_NODE:
             continue
         elif shared:
-            found.notes.append(f"{where}: {name} is no parameter of this node and left out")
+            result.notes.append(f"{where}: {name} is no parameter of this node and left out")
         else:
             raise UsageError(f"`ros_args` {where}: {none_of(name, known)}")
 
 
-def _read_file(found: Read, path: Path, known: Sequence[str], node_name: str) -> None:
+def _read_file(result: Read, path: Path, known: Sequence[str], node_name: str) -> None:
     from s2a_bench.toml_file import read as read_file
 
     whole = _yaml(read_file(path, "params_file"), f"--params-file {path}")
@@ -134,10 +135,10 @@ def _read_file(found: Read, path: Path, known: Sequence[str], node_name: str) ->
     matching = [(pattern, values) for pattern, values in sections if _matches(pattern, node_name)]
     for pattern, values in matching:
         parameters = dict(dotted(values)) if isinstance(values, dict) else {}
-        _take(found, parameters, known, f"--params-file {path}, {pattern}", shared="*" in pattern)
+        _take(result, parameters, known, f"--params-file {path}, {pattern}", shared="*" in pattern)
     if not matching:
         listed = ", ".join(pattern for pattern, _ in sections)
-        found.notes.append(f"--params-file {path} has nothing for {node_name}, only for {listed}")
+        result.notes.append(f"--params-file {path} has nothing for {node_name}, only for {listed}")
 
 
 def _sections(tree: Any, path: str) -> Iterator[tuple[str, Any]]:

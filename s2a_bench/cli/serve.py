@@ -103,11 +103,11 @@ def _ros_args(text: str, chosen: Transport[Any], given: Mapping[str, Any]) -> So
     if "node_name" not in served_options(chosen):
         raise UsageError(f"`ros_args` are for ROS 2 nodes, not for serve {chosen.name}")
     node = {name: given.get(name, getattr(_as_served(chosen)(), name)) for name in ("namespace", "node_name")}
-    found = read_ros_args(text, _known(chosen), node)
-    os.environ.update(found.environ)
-    for note in found.notes:
+    arguments = read_ros_args(text, _known(chosen), node)
+    os.environ.update(arguments.environ)
+    for note in arguments.notes:
         typer.echo(f"--ros-args: {note}", err=True)
-    return _sorted(found.options, "`ros_args`", chosen)
+    return _sorted(arguments.options, "`ros_args`", chosen)
 
 
 def _known(chosen: Transport[Any]) -> list[str]:

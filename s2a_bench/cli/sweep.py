@@ -24,7 +24,7 @@ from s2a_bench.store.sweep import CELLS, Sweep, read_sweep
 from s2a_bench.sweep import CellWorkers, SweepCell, SweepCommand, SweepConfig
 from s2a_bench.sweep.file import read_sweep_file
 from s2a_bench.sweep.json import plan_json, sweep_json
-from s2a_bench.sweep.perform import LocalWorkers
+from s2a_bench.sweep.perform import LocalWorkers, RayWorkers
 from s2a_bench.sweep.plan import SweepPlan, plan_sweep
 from s2a_bench.sweep.run import SweepRun, check_resume, only_one, pending, start_sweep
 from s2a_bench.text import none_of, visible
@@ -49,8 +49,6 @@ def _sweep(config: SweepConfig, *, json_: Json = False) -> None:
         raise MissingExtra(_lacking(source, missing))
     with RunProgress("cells") as progress, ExitStack() as stack:
         if config.ray:
-            from s2a_bench.sweep.on_ray import RayWorkers
-
             workers: CellWorkers = RayWorkers(ENTRY, config.ray, plan, config.width)
         else:
             workers = LocalWorkers(ENTRY, config.width)
@@ -140,8 +138,9 @@ def command_of(name: str, key: str = "command", *, trusted: bool = False) -> Swe
             flags[parameter.name] = "argument"
         else:
             long = next(flag for flag in parameter.opts if flag.startswith("--"))
-            value = "hidden" if parameter.hidden else "value"
-            kind = value if not parameter.is_flag else "toggle" if parameter.secondary_opts else "switch"
+            kind = "hidden" if parameter.hidden else "value"
+            if parameter.is_flag:
+                kind = "toggle" if parameter.secondary_opts else "switch"
             flags[long.removeprefix("--")] = kind
     return SweepCommand(name, flags, lambda argv: _check(name, argv, trusted=trusted))
 

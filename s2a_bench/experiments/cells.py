@@ -174,9 +174,9 @@ class Cells(Generic[Row]):
     @cached_property
     def rows(self) -> list[Row]:
         """The rows as objects of their class, None for a missing value."""
-        frame = self.frame[[field.name for field in fields(self.row)]]  # type: ignore[arg-type]  # a row is a dataclass
-        records = frame.astype(object).where(frame.notna(), None).to_dict("records")
-        return [self.row(**{str(name): value for name, value in record.items()}) for record in records]
+        names = [field.name for field in fields(self.row)]  # type: ignore[arg-type]  # a row is a dataclass
+        columns = [_plain(self.frame[name]) for name in names]
+        return [self.row(**dict(zip(names, values, strict=True))) for values in zip(*columns, strict=True)]
 
     @cached_property
     def first(self) -> Row:
@@ -256,6 +256,11 @@ class Cells(Generic[Row]):
         from s2a_bench.stats.batches import Rows
 
         return Rows(self.values(metric)) if metric in self.metrics else Rows.of([])
+
+
+def _plain(values: pd.Series[Any]) -> list[Any]:
+    """Return the values of a column as Python's, None for a missing one."""
+    return [None if missing else value for value, missing in zip(values.tolist(), values.isna(), strict=True)]
 
 
 @dataclass(frozen=True, slots=True)

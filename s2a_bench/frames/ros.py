@@ -75,12 +75,12 @@ class TopicCamera(ImageMessages):
         """Wait for publishers of the topic and return those of pictures, of one type."""
         middleware = self._middleware
         there = appeared(lambda: any(offer.topic == self._topic for offer in middleware.offers()), self._wait_s)
-        found = middleware.offers()
+        offered = middleware.offers()
         for type_name in TYPES:
-            if offers := [offer for offer in found if (offer.topic, offer.type_name) == (self._topic, type_name)]:
+            if offers := [offer for offer in offered if (offer.topic, offer.type_name) == (self._topic, type_name)]:
                 return offers
-        others = sorted({offer.topic for offer in found if offer.type_name in TYPES})
-        types = sorted({offer.type_name for offer in found if offer.topic == self._topic})
+        others = sorted({offer.topic for offer in offered if offer.type_name in TYPES})
+        types = sorted({offer.type_name for offer in offered if offer.topic == self._topic})
         listed = f"topics of pictures here: {', '.join(others[:10]) or 'none'}"
         if there:
             raise TransportError(f"{self._topic} is of type {', '.join(types)}; {listed}")
@@ -113,7 +113,7 @@ class TopicCamera(ImageMessages):
             raise newest
         if newest is None:
             count = self._subscription.matched()
-            what = f"no picture for {self._wait_s:g} s of {count} publisher{'s' * (count != 1)}"
+            what = f"no picture for {self._wait_s:g} s of {count} publisher{'' if count == 1 else 's'}"
             if not count:
                 raise TransportError(f"{what}: start it again, or one with the QoS and the type of ROS 2")
             raise TransportError(

@@ -42,7 +42,7 @@ class Stamped:
         if frame.encoding == "yuv422_yuy2":
             corner[..., 0], corner[..., 1] = luma, GREY
         else:
-            corner[...] = luma.reshape(height, width, *(1,) * (corner.ndim - 2))
+            corner[...] = luma if corner.ndim == luma.ndim else luma[..., np.newaxis]
         return frame
 
     def close(self) -> None:

@@ -11,7 +11,6 @@ from pydantic import create_model
 
 from s2a_bench.errors import UsageError
 from s2a_bench.frames import SOURCES
-from s2a_bench.harness import RECORD
 from s2a_bench.inference import EngineConfig, acting, check_engine, computing
 from s2a_bench.options import Grammar, Names, Options, Size, Square, TextOrFile, group, option
 from s2a_bench.transport import (
@@ -158,7 +157,7 @@ class RequestsConfig(Surrounded):
         le=86_400,
     )
     sample_resources_hz: float = sampling(10.0)
-    record: Path | None = RECORD
+    record: Path | None = option(None, "also record frames, requests and tokens, as run.mcap (rosbag2)")
     quick: bool = option(False, "fewer samples: a first look", first=True)
 
     def __init__(self, **given: Any) -> None:
@@ -343,6 +342,4 @@ class RequestsConfig(Surrounded):
 
 
 class FirstVariants(RequestsConfig):
-    """The settings of a run in which a transport named without a variant stands for its first variant."""
-
     EVERY_VARIANT: ClassVar[bool] = False

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from random import Random
 from threading import Condition, Thread
 from typing import TypeAlias
@@ -18,21 +18,20 @@ from s2a_bench.transport.pictures import JPEG_QUALITY, bgr_of
 from s2a_bench.types import Frame
 
 
+@dataclass(slots=True)
 class RequestFeed:
-    """Captures frames for each request; with ``preencoded`` the camera is one that delivers JPEG."""
+    """Captures ``cameras`` frames for each request, scaled to ``size`` (width, height) if given."""
 
-    def __init__(
-        self, source: FrameSource, *, preencoded: bool, cameras: int = 1, size: tuple[int, int] | None = None
-    ) -> None:
-        """Take ``cameras`` frames a request from ``source``, scaled to ``size`` (width, height) if given."""
-        self._source = source
-        self._preencoded = preencoded
-        self._cameras = cameras
-        self._size = size
-        self._ready: tuple[Frame, ...] = ()
+    source: FrameSource
+    _: KW_ONLY
+    preencoded: bool
+    """Whether the camera is one that delivers JPEG."""
+    cameras: int = 1
+    size: tuple[int, int] | None = None
+    _ready: tuple[Frame, ...] = ()
 
     def get_ready(self) -> None:
-        if self._preencoded:
+        if self.preencoded:
             self._ready = tuple(
                 replace(frame, encoding="jpeg", data=encode_jpeg(to_bgr(frame), JPEG_QUALITY)) for frame in self._read()
             )
@@ -41,16 +40,16 @@ class RequestFeed:
         trace.mark(RESIDUAL)
         frames = self._ready or self._read()
         trace.mark("capture")
-        return tuple(self._scaled(frame, trace) for frame in frames) if self._size else frames
+        return tuple(_scaled(frame, *self.size, trace) for frame in frames) if self.size else frames
 
     def _read(self) -> tuple[Frame, ...]:
-        return tuple(self._source.read() for _ in range(self._cameras))
+        return tuple(self.source.read() for _ in range(self.cameras))
 
-    def _scaled(self, frame: Frame, trace: Trace) -> Frame:
-        width, height = self._size or (frame.width, frame.height)
-        pixels = resize(bgr_of(frame, trace).data, width, height)
-        trace.mark("resize")
-        return replace(frame, width=width, height=height, encoding="bgr8", data=pixels)
+
+def _scaled(frame: Frame, width: int, height: int, trace: Trace) -> Frame:
+    pixels = resize(bgr_of(frame, trace).data, width, height)
+    trace.mark("resize")
+    return replace(frame, width=width, height=height, encoding="bgr8", data=pixels)
 
 
 @dataclass(slots=True)
@@ -95,7 +94,7 @@ class Camera:
         self._on_frame = on_frame
         self._changed = Condition()
         self._sink: CameraSink | None = None
-        self._newest: tuple[StreamedFrame, Frame] | None = None
+        self.newest: tuple[StreamedFrame, Frame] | None = None
         self._frames: list[StreamedFrame] = []
         self.published = 0
         self._stopped = False
@@ -114,21 +113,17 @@ class Camera:
         """Give every frame to ``sink``; None: keep the newest, converted to BGR."""
         with self._changed:
             if self._sink is not sink:
-                self._sink, self._newest, self._frames = sink, None, []
+                self._sink, self.newest, self._frames = sink, None, []
 
     def next_frame(self, after: int, timeout_s: float = 10.0) -> int:
         """Wait for a frame with an index above ``after`` and return its index; raises what the source raised."""
         with self._changed:
-            self._changed.wait_for(lambda: self._failure or (self._newest and self._newest[0].index > after), timeout_s)
+            self._changed.wait_for(lambda: self._failure or (self.newest and self.newest[0].index > after), timeout_s)
             if self._failure is not None:
                 raise self._failure
-            if self._newest is None or self._newest[0].index <= after:
+            if self.newest is None or self.newest[0].index <= after:
                 raise SourceError(f"`source`: the camera delivered nothing for {timeout_s:.0f} s")
-            return self._newest[0].index
-
-    def newest(self) -> tuple[StreamedFrame, Frame] | None:
-        with self._changed:
-            return self._newest
+            return self.newest[0].index
 
     def drain(self) -> list[StreamedFrame]:
         with self._changed:
@@ -168,7 +163,7 @@ class Camera:
         with self._changed:
             if sink is self._sink:
                 self._frames += [record] if sink is None else []
-                self._newest = record, frame
+                self.newest = record, frame
                 self._changed.notify_all()
         if self._on_frame is not None:
             self._on_frame(captured)
@@ -190,7 +185,7 @@ class StreamFeed:
     def get_ready(self) -> None:
         """Wait for two new frames, so that the server has one, then for a random part of the period."""
         self.camera.use(self.sink)
-        newest = self.camera.newest()
+        newest = self.camera.newest
         first = self.camera.next_frame(newest[0].index if newest else -1)
         self.camera.next_frame(first)
         clock = SystemClock()
@@ -198,7 +193,7 @@ class StreamFeed:
 
     def capture(self, trace: Trace) -> tuple[Frame, ...]:
         """Start the prompt's clock and take the newest frame; none if the server has it."""
-        newest = self.camera.newest()
+        newest = self.camera.newest
         trace.mark(RESIDUAL)
         if newest is None:
             return ()

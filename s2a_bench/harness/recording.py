@@ -24,8 +24,8 @@ from s2a_bench.types import Frame, Piece, Request
 
 def namespace_of(options: Options) -> str:
     """Return the namespace of the recorded topics: that of ``ros`` among the options of transports."""
-    found: str = getattr(options, ROS.name).namespace
-    return found or NAMESPACE
+    namespace: str = getattr(options, ROS.name).namespace
+    return namespace or NAMESPACE
 
 
 class RunRecorder(BagRecorder):

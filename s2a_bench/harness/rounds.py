@@ -111,7 +111,6 @@ class Task:
     drive: Callable[[RunningLaunch], None] = in_blocks
     """Makes the requests of a launch."""
     clients: int = 1
-    """Clients of a cell."""
     tables: Sequence[Table[Any]] = ()
     """Tables whose files exist from the start, besides those of requests."""
     source: Callable[[FeedPlan], FrameSource] | None = None
@@ -303,8 +302,7 @@ class _Run:
                 user = f"{cell.name} {place}" if place else cell.name
                 source = self.sources.of(user, user if cell.black_box or place else "")
                 feed = RequestFeed(source, preencoded=cell.preencoded, cameras=plan.cameras, size=plan.resize)
-            about = self.plan.request, recorder, sampler, servers.origin(cell), clocks
-            made.append(Session(cell, client, feed, *about))
+            made.append(Session(cell, client, feed, self.plan.request, recorder, sampler, servers.origin(cell), clocks))
             yield made[0]
 
 

@@ -20,7 +20,7 @@ from s2a_bench.clock import SystemClock, now_ns
 from s2a_bench.errors import S2AError
 from s2a_bench.facts import PREPROCESS_MS
 from s2a_bench.harness.pixels import RGB_ENGINE, fingerprint, together
-from s2a_bench.inference import Engine, EngineConfig, open_engine
+from s2a_bench.inference import Engine, EngineConfig, cancel, open_engine
 from s2a_bench.machine.tuning import allowed, keep_large_blocks, limit_threads
 from s2a_bench.provenance import Provenance
 from s2a_bench.trace import Trace
@@ -56,8 +56,7 @@ def engine_handler(engine: Engine, *, pixels: bool = True, limits: Limits = LIMI
                 yield token
             trace.facts.update(engine.facts)
         finally:
-            if isinstance(tokens, Generator):
-                tokens.close()
+            cancel(tokens)
             turn.leave()
         if pixels and request.images:
             trace.later[RGB_ENGINE] = lambda: float(together(fingerprint(image.data) for image in request.images))

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import InitVar, asdict, dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise, repeat
 from typing import Any, TypeAlias
 
 from s2a_bench.act.events import PlanFeed
@@ -41,7 +41,7 @@ from s2a_bench.machine.resources.sampler import ResourceSampler
 from s2a_bench.provenance import NOT_SENT, UNKNOWN, Provenance
 from s2a_bench.secrets import struck_pieces
 from s2a_bench.store.requests import FrameRow, SampleRow, TokenRow
-from s2a_bench.trace import STAGES, Mark, Trace
+from s2a_bench.trace import STAGES, Trace
 from s2a_bench.transport import LOSSLESS, Client
 from s2a_bench.transport.pipeline import Pipeline
 from s2a_bench.transport.serving import CLOCK_PROMPT
@@ -204,8 +204,7 @@ class Session:
         self._small.get_ready()
         frames, kind = self._small.capture(trace), self.cell.capabilities.answer_kinds[0]
         prompt = f"{CLOCK_PROMPT}{kind} {system}".rstrip()
-        for _ in self.client.request(Request("clock", prompt, frames, 1, state=(0.0,) * plan.state), trace):
-            pass
+        list(self.client.request(Request("clock", prompt, frames, 1, state=(0.0,) * plan.state), trace))
         return trace
 
     def _pieces(self, request: Request, trace: Trace, context: RequestContext) -> Iterator[Seen]:
@@ -289,7 +288,7 @@ class Session:
             frame_age_lo_ns=max(0, age_ns - joined.error_ns) if joined and age_ns is not None else None,
             frame_age_hi_ns=age_ns + joined.error_ns if joined and age_ns is not None else None,
         )
-        engine_ns = dict(enumerate(trace.remote.token_ns if trace.remote and trace.remote.clock == clock_id() else []))
+        engine_ns = trace.remote.token_ns if trace.remote and trace.remote.clock == clock_id() else []
         tokens = [
             TokenRow(
                 request_id=request_id,
@@ -302,8 +301,7 @@ class Session:
                 engine_lo_ns=left_ns - joined.early_ns if joined and left_ns else None,
                 engine_hi_ns=min(left_ns + joined.late_ns, client_ns) if joined and left_ns else None,
             )
-            for position, (token, client_ns) in enumerate(seen)
-            for left_ns in (engine_ns.get(position),)
+            for (token, client_ns), left_ns in zip(seen, chain(engine_ns, repeat(None)), strict=False)
         ]
         return Measured(sample, tokens, picture, apart, odd=frozenset(trace.odd))
 
@@ -338,18 +336,15 @@ class Session:
         rows = []
         while len(self._frames) > keep:
             frame = self._frames.pop(next(iter(self._frames)))
-            about = frame.marks, frame.used_by, frame.clock_error_ns
-            rows.append(FrameRow(self.cell.name, frame.index, frame.intended_ns, *about))
+            used_by, error_ns = frame.used_by, frame.clock_error_ns
+            rows.append(FrameRow(self.cell.name, frame.index, frame.intended_ns, frame.marks, used_by, error_ns))
         return rows
 
 
 def inference_start_ns(trace: Trace) -> int | None:
     """Return when the engine got the request: the mark before the first of `inference`'s group."""
-    chain: list[Mark] = trace.chain()
-    for (_, before_ns), (stage, _) in pairwise(chain):
-        if STAGES.get(stage) == "inference":
-            return before_ns
-    return None
+    steps = pairwise(trace.chain())
+    return next((before_ns for (_, before_ns), (stage, _) in steps if STAGES.get(stage) == "inference"), None)
 
 
 def _whole(value: float | None) -> int | None:

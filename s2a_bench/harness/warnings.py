@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -86,28 +86,21 @@ class Counters(NamedTuple):
             realtime_offset_ns(),
         )
 
-    def warnings_since(self, before: Counters, against_loss: str = "") -> list[RunWarning]:
+    def warnings_since(self, before: Counters, against_loss: str = "") -> Iterator[RunWarning]:
         """Compare with an earlier reading; ``against_loss`` is the transports' advice about lost packets."""
         rises = [0 if old is None or new is None else new - old for old, new in zip(before, self, strict=True)]
         dropped, throttles, suspended_ns, set_ns = rises
-        late = "for want of receive buffer: DDS had to send them again, 200 ms later"
-        findings = (
-            (
-                dropped > 0,
-                "udp-receive-buffer",
-                f"the kernel dropped {dropped} UDP packets {late}",
-                against_loss or f"sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}",
-            ),
-            (throttles > 0, "cpu-throttling", "the CPU was throttled during the run", "cool it, and run again"),
-            (abs(suspended_ns) > CLOCK_STEP_NS, "suspended", "the machine was suspended during the run", "run again"),
-            (
-                abs(set_ns) > CLOCK_STEP_NS,
-                "clock-jump",
-                "the wall clock was set during the run; latencies are unaffected, ROS time stamps are not",
-                "let NTP settle, and run again",
-            ),
-        )
-        return [RunWarning(*warning) for happened, *warning in findings if happened]
+        if dropped > 0:
+            late = "for want of receive buffer: DDS had to send them again, 200 ms later"
+            advice = against_loss or f"sudo sysctl -w net.core.rmem_max={4 * RMEM_WANTED}"
+            yield RunWarning("udp-receive-buffer", f"the kernel dropped {dropped} UDP packets {late}", advice)
+        if throttles > 0:
+            yield RunWarning("cpu-throttling", "the CPU was throttled during the run", "cool it, and run again")
+        if abs(suspended_ns) > CLOCK_STEP_NS:
+            yield RunWarning("suspended", "the machine was suspended during the run", "run again")
+        if abs(set_ns) > CLOCK_STEP_NS:
+            what = "the wall clock was set during the run; latencies are unaffected, ROS time stamps are not"
+            yield RunWarning("clock-jump", what, "let NTP settle, and run again")
 
 
 class Doubt(NamedTuple):
@@ -192,7 +185,6 @@ class SampleGuard:
         self.in_a_row: defaultdict[str, Counter[int]] = defaultdict(Counter)
         """Failures of each client since the last success of any, by cell."""
         self.last_error: dict[str, str] = {}
-        """The last error, by cell."""
         self._cells = {cell.name: cell for cell in cells}
         self._sleeps = {name: sleep for name, cell in self._cells.items() if (sleep := cell.transport.sleep)}
         self._waits = {cell: sleep.fact for cell, sleep in self._sleeps.items()}
@@ -243,7 +235,7 @@ class SampleGuard:
         self._counts[HITS] += Counter({name: round(after[name] - before.get(name, 0.0)) for name in after})
 
     def warnings(self) -> list[RunWarning]:
-        found = []
+        warnings = []
         for cell, sleep in self._sleeps.items():
             waits_ms = self._waits_ms[cell] or [0.0]
             after_ms = np.array(waits_ms) - min(waits_ms)
@@ -254,12 +246,12 @@ class SampleGuard:
                 self._counts.setdefault(doubt, Counter())[cell] = pile
         for doubt, counts in self._counts.items():
             if doubt is FAILED:
-                found += self._odd_facts()
+                warnings += self._odd_facts()
             if cells := {cell: count for cell, count in counts.items() if count > doubt.share * self.succeeded[cell]}:
                 where = ", ".join(f"{cell}: {count}" for cell, count in cells.items())
                 what = doubt.what.format(cached_share=self._cached_share)
-                found.append(RunWarning(doubt.code, f"{what} ({where})", doubt.advice or self.advice(cells)))
-        return [*found, *(self._correlated() if len(self._launches) == 1 else ())]
+                warnings.append(RunWarning(doubt.code, f"{what} ({where})", doubt.advice or self.advice(cells)))
+        return warnings + self._correlated() if len(self._launches) == 1 else warnings
 
     def _odd_facts(self) -> list[RunWarning]:
         where = "; ".join(f"{cell}: {', '.join(sorted(odd))}" for cell, odd in self._odd.items() if odd)
@@ -275,9 +267,9 @@ class SampleGuard:
         """Check whether neighbouring samples are correlated; intervals over several launches do not depend on it."""
         correlations = {cell: RowCorrelation.of(np.array(times, np.float64)) for cell, times in self._times_ns.items()}
         where = ", ".join(
-            f"{cell}: {found.n} samples are worth {found.effective:.0f}"
-            for cell, found in correlations.items()
-            if found.dependent
+            f"{cell}: {correlation.n} samples are worth {correlation.effective:.0f}"
+            for cell, correlation in correlations.items()
+            if correlation.dependent
         )
         what = f"neighbouring samples are correlated: intervals of this launch may be too narrow ({where})"
         advice = "measure several launches, --launches 5, or more --requests"

@@ -59,13 +59,13 @@ def fetch(config: FetchConfig) -> Fetched:
     files: list[FetchedFile] = []
     for name in reversed(names):  # a language model that is there without its mmproj would pass for a text model
         path = Path(_call(api.hf_hub_download, repository, filename=name, revision=info.sha))
-        if (found := sha256(path)) != lfs[name].sha256:
+        if (digest := sha256(path)) != lfs[name].sha256:
             for each in {path, path.resolve()}:
                 each.unlink()
             raise ModelError(
-                f"{name}: has SHA-256 {found}, the hub says {lfs[name].sha256}; it was deleted, fetch again"
+                f"{name}: has SHA-256 {digest}, the hub says {lfs[name].sha256}; it was deleted, fetch again"
             )
-        files.insert(0, FetchedFile(path, path.stat().st_size, found))
+        files.insert(0, FetchedFile(path, path.stat().st_size, digest))
     return Fetched(api.endpoint, repository, info.sha, tuple(files))
 
 
@@ -76,7 +76,7 @@ def chosen(repository: str, file: str, config: FetchConfig, listed: Collection[s
     """
     ggufs = sorted(Path(name) for name in listed if name.endswith(".gguf"))
     there = ", ".join(map(str, ggufs)) or "no GGUF file"
-    models, mmproj = pair(ggufs, *((config.quant,) if config.quant else QUANTS))
+    models, mmproj = pair(ggufs, [config.quant] if config.quant else QUANTS)
     wanted = [file, config.mmproj or ""]
     if not file:
         if len(models) != 1 or (config.quant or "").lower() not in models[0].name.lower():
@@ -87,7 +87,7 @@ def chosen(repository: str, file: str, config: FetchConfig, listed: Collection[s
         wanted = [str(models[0]), config.mmproj or str(mmproj or "")]
     known = {name.lower(): name for name in listed} | {name: name for name in listed}
     names = {name: known.get(name, known.get(name.lower(), "")) for name in wanted if name}
-    if missing := [name for name, found in names.items() if not found]:
+    if missing := [name for name, listed_as in names.items() if not listed_as]:
         raise ModelError(f"{repository}: has no {missing[0]}; it has {there}")
     return [*names.values()]
 

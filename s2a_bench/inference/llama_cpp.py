@@ -46,7 +46,7 @@ from s2a_bench.inference.llama_decode import (
     grammar_error,
 )
 from s2a_bench.inference.llama_prompt import ChatTemplate, TooLong, VisionTower, evaluate_text
-from s2a_bench.inference.models import ModelFiles, load_headers
+from s2a_bench.inference.models import load_headers
 from s2a_bench.types import Frame, Request, Token
 
 llama_cpp = extras.require("llama_cpp", "llama")
@@ -115,14 +115,13 @@ class LlamaCppEngine(Engine):
         self._config = config
         self._threads = config.threads or len(os.sched_getaffinity(0))
         self._turn = 0
-        self._llama: _Prefilled | None = None
         llama_log.silence()
         llama_log.reason()
-        self._llama = self._load(self._files)
+        self._llama: _Prefilled | None = self._load()
         self._batch = TokenBatch()
 
-    def _load(self, files: ModelFiles) -> _Prefilled:
-        config, kv_type = self._config, KV_TYPES[self._config.kv_type]
+    def _load(self) -> _Prefilled:
+        config, files, kv_type = self._config, self._files, KV_TYPES[self._config.kv_type]
         try:
             llama = _Prefilled(
                 str(files.model.path),
@@ -268,4 +267,3 @@ class LlamaCppEngine(Engine):
         if self._llama is not None:
             self._llama.close()
             self._llama = None
-            self._batch.close()

@@ -50,8 +50,8 @@ class TokenBytes(dict[int, bytes]):
 
     def __missing__(self, token: int) -> bytes:
         size = llama_cpp.llama_token_to_piece(self._vocab, token, self._piece, _PIECE_BYTES, 0, False)
-        self[token] = found = self._piece.raw[: max(0, size)]
-        return found
+        self[token] = piece = self._piece.raw[: max(0, size)]
+        return piece
 
 
 class TokenBatch:
@@ -59,6 +59,7 @@ class TokenBatch:
 
     def __init__(self) -> None:
         self._batch = llama_cpp.llama_batch_init(1, 0, 1)
+        weakref.finalize(self, llama_cpp.llama_batch_free, self._batch)
         self._batch.n_tokens = 1
         self._batch.n_seq_id[0] = 1
         self._batch.seq_id[0][0] = 0
@@ -79,11 +80,6 @@ class TokenBatch:
             if code := decode(handle, batch):
                 raise RuntimeError(f"llama_decode returned {code}")
             position += 1
-
-    def close(self) -> None:
-        if self._batch is not None:
-            llama_cpp.llama_batch_free(self._batch)
-            self._batch = None
 
 
 class GrammarSampler:

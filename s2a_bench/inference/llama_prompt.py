@@ -56,10 +56,10 @@ class ChatTemplate:
 
     def _reads_parts(self) -> bool:
         try:
-            found = self._rendered([{"type": "text", "text": _PROBE}])
+            prompt = self._rendered([{"type": "text", "text": _PROBE}])
         except Exception:  # noqa: BLE001 - MiniCPM's adds a list to a text
             return False
-        return _PROBE in found and "'text'" not in found
+        return _PROBE in prompt and "'text'" not in prompt
 
 
 def evaluate_text(llama: Any, prompt: str, _frames: tuple[Frame, ...], room: int) -> tuple[int, int]:
@@ -124,19 +124,17 @@ class VisionTower:
 
     def _evaluate_slice(self, llama: Any, chunk: Any) -> int:
         """Evaluate a slice here, then in the language model, and wait for each; return the time of the former in ns."""
-        started_ns, past = now_ns(), llama_cpp.llama_pos(0)
+        started_ns, past = now_ns(), llama.n_tokens
         code = mtmd_cpp.mtmd_encode_chunk(self._mtmd, chunk)
-        encode_ns = now_ns() - started_ns
+        encode_ns, reached = now_ns() - started_ns, llama_cpp.llama_pos(0)
         if not code:
             embedding = mtmd_cpp.mtmd_get_output_embd(self._mtmd)
-            where = llama.n_tokens, 0, llama.n_batch, ctypes.byref(past)
-            code = mtmd_cpp.mtmd_helper_decode_image_chunk(
-                self._mtmd, llama.ctx, chunk, embedding, *where, _NO_CALLBACK, None
-            )
+            decode, end = mtmd_cpp.mtmd_helper_decode_image_chunk, ctypes.byref(reached)
+            code = decode(self._mtmd, llama.ctx, chunk, embedding, past, 0, llama.n_batch, end, _NO_CALLBACK, None)
             llama_cpp.llama_synchronize(llama.ctx)
         if code:
             raise ValueError(f"Failed to evaluate chunk: error code {code}")
-        llama.n_tokens = past.value
+        llama.n_tokens = reached.value
         return encode_ns
 
 

@@ -31,9 +31,9 @@ class ListedModel:
 
 def listed() -> Iterator[ListedModel]:
     """Yield a row for each known model, then for each other one in the hub's cache, then for the dummies."""
-    known, found = {repository: name for name, repository in HUB_MODELS.items()}, cached()
-    for repository in dict.fromkeys((*known, *sorted(found))):
-        models, mmproj = pair(found.get(repository, ()))
+    known, fetched = {repository: name for name, repository in HUB_MODELS.items()}, cached()
+    for repository in dict.fromkeys((*known, *sorted(fetched))):
+        models, mmproj = pair(fetched.get(repository, ()))
         name = known.get(repository, f"{HUB}{repository}")
         if not models and repository in known:
             yield ListedModel(name, "not here", {})

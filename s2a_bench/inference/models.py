@@ -56,7 +56,7 @@ def hub_address(name: str, flag: str) -> tuple[str, str]:
     return repository, file
 
 
-def pair(files: Iterable[Path], *quants: str) -> tuple[list[Path], Path | None]:
+def pair(files: Iterable[Path], quants: Iterable[str] = ()) -> tuple[list[Path], Path | None]:
     """Return the language models of the first of ``quants`` that there is, else all of them; and the mmproj."""
     paths = sorted(files)
     mmprojs = [path for path in paths if "mmproj" in path.name.lower()]
@@ -66,7 +66,8 @@ def pair(files: Iterable[Path], *quants: str) -> tuple[list[Path], Path | None]:
 
 def _of_quant(paths: list[Path], quants: Iterable[str]) -> list[Path]:
     endings = (re.compile(rf"(.*[-._])?{re.escape(quant)}\.gguf", re.IGNORECASE) for quant in quants)
-    return next((found for ending in endings if (found := [p for p in paths if ending.fullmatch(p.name)])), paths)
+    chosen = ([path for path in paths if ending.fullmatch(path.name)] for ending in endings)
+    return next(filter(None, chosen), paths)
 
 
 def cached() -> dict[str, list[Path]]:
@@ -114,11 +115,11 @@ class ModelFiles:
 
     def describe(self) -> dict[str, str | bool]:
         """Return what a manifest tells of the files; the first call hashes them, which takes seconds for gigabytes."""
-        found: dict[str, str | bool] = {"dummy": self.dummy, "name": str(self.model.fields.get("general.name", ""))}
+        facts: dict[str, str | bool] = {"dummy": self.dummy, "name": str(self.model.fields.get("general.name", ""))}
         for kind, header in (("model", self.model), ("mmproj", self.mmproj)):
             if header:
-                found |= {kind: str(header.path), f"{kind}_sha256": sha256(header.path)}
-        return found
+                facts |= {kind: str(header.path), f"{kind}_sha256": sha256(header.path)}
+        return facts
 
 
 def cache_folder() -> Path:
@@ -186,21 +187,22 @@ def load_headers(config: EngineConfig) -> ModelFiles:
 def chat_template(config: EngineConfig) -> str:
     """Return the chosen chat template, a Jinja text; empty: the model's own; raises ModelError."""
     chosen = config.chat_template
+    if chosen in {"", NO_TEMPLATE}:
+        return RAW_PROMPT if chosen else ""
     try:
-        template = RAW_PROMPT if chosen == NO_TEMPLATE else read_text(Path(chosen), TEMPLATE_BYTES) if chosen else ""
-        if chosen and not template:
-            raise ValueError("it is empty")
-        return template  # noqa: TRY300
+        if template := read_text(Path(chosen), TEMPLATE_BYTES):
+            return template
+        raise ValueError("it is empty")
     except (OSError, ValueError) as error:
         raise ModelError(f"`chat_template` {chosen}: cannot be read ({error})") from error
 
 
 def _mmproj_beside(model: Path) -> Path | None:
-    found = sorted(model.parent.glob("mmproj*.gguf"))
-    if len(found) > 1:
-        names = ", ".join(path.name for path in found)
+    beside = sorted(model.parent.glob("mmproj*.gguf"))
+    if len(beside) > 1:
+        names = ", ".join(path.name for path in beside)
         raise ModelError(f"`model` {model}: several mmproj files lie beside it ({names}); choose one with `mmproj`")
-    return found[0] if found else None
+    return beside[0] if beside else None
 
 
 def sha256(path: Path) -> str:

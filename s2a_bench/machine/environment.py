@@ -13,7 +13,7 @@ from s2a_bench.boards.profile import Profile
 from s2a_bench.clock import clock_id
 from s2a_bench.machine.doctor import Machine
 from s2a_bench.machine.doctor.gpu import current_power_mode, identity, nvml
-from s2a_bench.machine.doctor.software import installed
+from s2a_bench.machine.doctor.host import installed
 
 PACKAGES = ("huggingface-hub", "llama-cpp-python", "numpy", "nvidia-ml-py", "opencv-python-headless", "pydantic")
 """The packages that matter to every result; transports add theirs."""
@@ -58,7 +58,7 @@ def collect(packages: Iterable[str] = ()) -> dict[str, Any]:
         "affinity": sorted(os.sched_getaffinity(0)),
         "load": [round(value, 2) for value in os.getloadavg()],
         "memory_bytes": os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"),
-        "packages": {name: found for name in sorted({*PACKAGES, *packages}) if (found := installed(name))},
+        "packages": {name: release for name in sorted({*PACKAGES, *packages}) if (release := installed(name))},
         "ros": {name: os.environ[name] for name in ROS_VARIABLES if name in os.environ},
         "gpus": gpus,
         "power_mode": (current_power_mode(machine) or ("",))[0],
@@ -97,9 +97,9 @@ def state_changes(profile: Profile, board: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _same(key: str, wanted: Any, found: Any) -> bool:
+def _same(key: str, wanted: Any, have: Any) -> bool:
     """Compare one fact; a device tree may append "Developer Kit" to a board's name, a GPU's name must be equal."""
-    if not isinstance(wanted, str) or not isinstance(found, str):
-        return bool(wanted == found)
-    expected, name = (re.sub(r"^nvidia\s+", "", text.lower()).split() for text in (wanted, found))
+    if not isinstance(wanted, str) or not isinstance(have, str):
+        return bool(wanted == have)
+    expected, name = (re.sub(r"^nvidia\s+", "", text.lower()).split() for text in (wanted, have))
     return expected == (name[: len(expected)] if key == "model" else name)

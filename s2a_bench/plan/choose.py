@@ -9,8 +9,7 @@ from dataclasses import replace
 from itertools import product
 
 from s2a_bench.errors import UsageError
-from s2a_bench.plan.formats import Format, Tokenize, spelled
-from s2a_bench.plan.labels import CallLabels, Codes, Letters, Words
+from s2a_bench.plan.formats import CallLabels, Codes, Format, Letters, Tokenize, Words, spelled
 from s2a_bench.plan.skillset import SkillSet
 
 _FILLERS = ("-", "~", "_", ".")
@@ -39,16 +38,16 @@ def choose_format(skills: SkillSet, tokens_per_skill: int, tokenize: Tokenize, n
     for plain in _plain_formats(skills, tokenize):
         most = max(plain.counts(tokenize, (1, n_skills)))
         shortest = min(shortest or most, most)
-        found = _pad(plain, tokens_per_skill, tokenize, n_skills) if most <= tokens_per_skill else None
-        if found:
-            fitting.append(found)
+        padded = _pad(plain, tokens_per_skill, tokenize, n_skills) if most <= tokens_per_skill else None
+        if padded:
+            fitting.append(padded)
     if not fitting:
         raise UsageError(
             f"`tokens_per_skill` {tokens_per_skill}: no way found to write each of the {len(skills.calls)} calls of "
             f"'{skills.name}' in exactly that many tokens of this model; the shortest lines cost up to {shortest}. "
             "Choose another number, or a smaller skill set"
         )
-    return min(fitting, key=lambda found: (found[1].labels.terse, found[0]))[1]
+    return min(fitting, key=lambda entry: (entry[1].labels.terse, entry[0]))[1]
 
 
 def _stream(skills: SkillSet, tokenize: Tokenize) -> Format:
@@ -85,8 +84,8 @@ def _pad(plain: Format, target: int, tokenize: Tokenize, n_skills: int) -> tuple
     glued = [plain.labels.glue + filler for filler in _FILLERS]
     same = [_filled(plain, [filler], target, tokenize, n_skills) for filler in glued]
     mixed = [*glued, *(f" {filler}" for filler in _FILLERS)]
-    found = same if any(same) else [_filled(plain, mixed, target, tokenize, n_skills)]
-    sized = [(sum(map(len, format_.texts)) - sum(map(len, plain.texts)), format_) for format_ in found if format_]
+    filled = same if any(same) else [_filled(plain, mixed, target, tokenize, n_skills)]
+    sized = [(sum(map(len, format_.texts)) - sum(map(len, plain.texts)), format_) for format_ in filled if format_]
     return min(sized, key=lambda entry: entry[0], default=None)
 
 
@@ -127,9 +126,9 @@ def _holds(chosen: Format, target: int, tokenize: Tokenize, n_skills: int) -> bo
 def line_codes(count: int, tokenize: Tokenize) -> list[str] | None:
     """Return ``count`` texts that cost two tokens with the end of a line; None if there are fewer."""
     for length in (1, 2):
-        found = [text for text in _candidates(length) if len(tokenize(f"{text}\n")) == 2]  # noqa: PLR2004
-        if len(found) >= count:
-            return found[:count]
+        codes = [text for text in _candidates(length) if len(tokenize(f"{text}\n")) == 2]  # noqa: PLR2004
+        if len(codes) >= count:
+            return codes[:count]
     return None
 
 
@@ -142,28 +141,28 @@ def stream_codes(count: int, tokenize: Tokenize) -> list[str]:
     """
     best: list[str] = []
     for blank, length in product((" ", ""), (1, 2)):
-        found = _apart(count, tokenize, (blank + text for text in _candidates(length)))
-        if len(found) == count:
-            return found
-        best = max(best, found, key=len)
+        codes = _apart(count, tokenize, (blank + text for text in _candidates(length)))
+        if len(codes) == count:
+            return codes
+        best = max(best, codes, key=len)
     return best
 
 
 def _apart(count: int, tokenize: Tokenize, candidates: Iterator[str]) -> list[str]:
-    found: dict[str, int] = {}
+    codes: dict[str, int] = {}
     for text in candidates:
         tokens = tokenize(text)
-        if len(tokens) != 1 or tokens[0] in found.values():
+        if len(tokens) != 1 or tokens[0] in codes.values():
             continue
         row, ids = [text, text], [*tokens, *tokens]
-        for other, token in found.items():
+        for other, token in codes.items():
             row += [other, text]
             ids += [token, *tokens]
         if tokenize("".join(row)) == ids:
-            found[text] = tokens[0]
-        if len(found) == count:
+            codes[text] = tokens[0]
+        if len(codes) == count:
             break
-    return list(found)
+    return list(codes)
 
 
 def _candidates(length: int) -> Iterator[str]:

@@ -18,8 +18,7 @@ import codecs
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-from s2a_bench.plan.formats import Format
-from s2a_bench.plan.labels import normalise
+from s2a_bench.plan.formats import Format, normalise
 from s2a_bench.plan.skillset import Call
 
 Problem: TypeAlias = Literal["unknown-skill", "bad-argument", "malformed", "too-long", "incomplete"]
@@ -85,15 +84,16 @@ class Parser:
         self._feeds += 1
         return self._events(self._reader.read(self._decoder.decode(b"", final=True)) + self._reader.end())
 
-    def _events(self, found: list[_Found]) -> list[Event]:
+    def _events(self, results: list[_Found]) -> list[Event]:
         events: list[Event] = []
-        for result in found:
+        for result in results:
             if isinstance(result, int):
                 call = self._format.skills.calls[result]
                 events.append(SkillParsed(self._skills, call, self._lines, self._feeds))
                 self._skills += 1
             else:
-                events.append(BadLine(*result, self._lines, self._feeds))
+                problem, text, why = result
+                events.append(BadLine(problem, text, why, self._lines, self._feeds))
             self._lines += 1
         return events
 
@@ -113,14 +113,14 @@ class _Lines:
         self._skipping = False
 
     def read(self, text: str) -> list[_Found]:
-        found: list[_Found] = []
+        results: list[_Found] = []
         start = 0
         while True:
             end = text.find(self._format.delimiter, start)
-            found += self._collect(text, start, len(text) if end < 0 else end)
+            results += self._collect(text, start, len(text) if end < 0 else end)
             if end < 0:
-                return found
-            found += self._finish()
+                return results
+            results += self._finish()
             start = end + len(self._format.delimiter)
 
     def end(self) -> list[_Found]:
@@ -157,15 +157,15 @@ class _Codes:
         self._skipping = self._after_code = False
 
     def read(self, text: str) -> list[_Found]:
-        found: list[_Found] = []
+        results: list[_Found] = []
         for char in text:
             if char.isspace():
                 if self._code:
-                    found.append(_look_up(self._code, self._format))
+                    results.append(_look_up(self._code, self._format))
                 self._code, self._skipping, self._after_code = "", False, False
             elif not self._skipping:
-                found += self._take(char)
-        return found
+                results += self._take(char)
+        return results
 
     def _take(self, char: str) -> list[_Found]:
         if self._after_code and self._apart:

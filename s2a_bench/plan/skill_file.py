@@ -145,10 +145,7 @@ def load_skills(choice: str) -> SkillSet:
 
 
 def parse_skills(text: str, origin: str) -> SkillSet:
-    """Read a skill set from TOML text; docs/plans.md has the keys.
-
-    Raises UsageError that names ``origin``, the file's path for the user, and the key.
-    """
+    """Read a skill set from TOML text (docs/plans.md has the keys); raises UsageError naming ``origin`` and the key."""
     where = f"`skills` {origin}"
     file = parse(_SkillFile, text, where, Decimal)
     try:

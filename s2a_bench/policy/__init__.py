@@ -57,12 +57,7 @@ class PlanShape:
     @property
     def key(self) -> Verbatim:
         """Return the text that seeds the draws for such plans."""
-        of = self.expected
-        return Verbatim(
-            f"PlanShape(n_skills={self.n_skills!r}, tokens_per_skill={self.tokens_per_skill!r}, "
-            f"expected=Timing(nominal_s={of.nominal_s!r}, least_s={of.least_s!r}, most_s={of.most_s!r}), "
-            f"expected_cv={self.expected_cv!r}, safe_start_s={self.safe_start_s!r})"
-        )
+        return Verbatim(repr(self))
 
 
 class Stepper(Protocol):
@@ -158,9 +153,9 @@ class Policy(Protocol):
         """Decide with each lambda: arrays of shape (N, lambdas, M)."""
         import numpy as np
 
-        found = [self.informed(caution=caution).schedule(plans) for caution in cautions]
+        every = [self.informed(caution=caution).schedule(plans) for caution in cautions]
         return Schedule(
-            np.stack([each.start_s for each in found], axis=1), np.stack([each.duration_s for each in found], axis=1)
+            np.stack([each.start_s for each in every], axis=1), np.stack([each.duration_s for each in every], axis=1)
         )
 
 
@@ -168,11 +163,11 @@ POLICIES: Final[Registry[Callable[..., Policy]]] = Registry(
     "policies",
     "policy",
     {
-        "naive": "s2a_bench.policy.naive:Naive",
-        "wait-then-act": "s2a_bench.policy.wait_then_act:WaitThenAct",
+        "naive": "s2a_bench.policy.nominal:Naive",
+        "wait-then-act": "s2a_bench.policy.nominal:WaitThenAct",
         "stream-to-act": "s2a_bench.policy.stream_to_act:StreamToAct",
         "stream-to-act-early": "s2a_bench.policy.stream_to_act:EarlyStart",
-        "s2a-clairvoyant": "s2a_bench.policy.wait_then_act:Clairvoyant",
+        "s2a-clairvoyant": "s2a_bench.policy.nominal:Clairvoyant",
         "s2a-mean": "s2a_bench.policy.stream_to_act:MeanStart",
     },
 )

@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
 from s2a_bench.errors import UsageError
 from s2a_bench.options import option
-from s2a_bench.policy import Floats, Plans, Policy
+from s2a_bench.policy import Floats, Plans, Policy, Schedule
 
 if TYPE_CHECKING:
     import numpy as np
@@ -49,6 +49,9 @@ CONFIDENCE: Final = 0.999
 """... with this confidence."""
 GRID: Final = (*(i / 4 for i in range(17)), 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0, 16.0, 24.0, 32.0)
 """Values of lambda that are tried; beyond them the robot waits for the whole plan."""
+CAUTIONS: Final = (*GRID, math.inf)
+AT_ONCE: Final = 512
+"""Plans decided at every lambda in one pass, limited by memory."""
 Guarantee: TypeAlias = Literal["high-confidence", "expected"]
 """What epsilon bounds; see the module docstring."""
 GUARANTEE: Final[Any] = option(
@@ -102,7 +105,7 @@ def promise(calibrations: Mapping[str, Mapping[str, Any]], what: str, unit: str)
 
     Calibrations are plain data; one whose scores are not exchangeable promises nothing, and the sentence says so.
     """
-    kept = [each for each in (Calibration(**found) for found in calibrations.values()) if each.exchangeable]
+    kept = [each for each in (Calibration(**facts) for facts in calibrations.values()) if each.exchangeable]
     if not kept:
         return no_promise(calibrations)
     worst = max(kept, key=lambda each: each.expected_risk)
@@ -120,7 +123,7 @@ def no_promise(calibrations: Mapping[str, Mapping[str, Any]]) -> str:
     """Return which calibrations promise nothing, as their scores are not exchangeable; empty for none."""
     broken = ", ".join(
         f"{name} ({'changed since the calibration' if each.changed else each.lag_one})"
-        for name, each in ((name, Calibration(**found)) for name, found in calibrations.items())
+        for name, each in ((name, Calibration(**facts)) for name, facts in calibrations.items())
         if not each.exchangeable
     )
     return f"No promise about stalls, because the delays are not exchangeable: {broken}." if broken else ""
@@ -135,7 +138,7 @@ def scores(policy: Policy, plans: Plans) -> Floats:
     left = np.arange(count)
     above = math.inf
     for caution in reversed(GRID):  # a plan that has stalled needs no lower caution
-        stalls = stalled(policy.informed(caution=caution), take(plans, left))
+        stalls = stalled(policy.informed(caution=caution).schedule(take(plans, left)))
         score[left[stalls]] = above
         left, above = left[~stalls], caution
         if not left.size:
@@ -242,6 +245,61 @@ class Tracker:
         del self._sorted[bisect_left(self._sorted, self._scores.popleft())]
 
 
+@dataclass(slots=True)
+class TrackedPolicy:
+    """Lambda tracked from plan to plan: a robot keeps one as long as its machine stays the same.
+
+    Before each plan it takes `policy`; afterwards it passes the recorded arrivals, from which the plan's score follows,
+    and whether the plan stalled. `follow` does the same for arrays of plans.
+    """
+
+    made: Policy
+    """The policy with its prior; its lambda does not matter."""
+    tracker: Tracker
+
+    @staticmethod
+    def begin(policy: Policy, plans: Plans, epsilon: float = EPSILON) -> TrackedPolicy:
+        return TrackedPolicy(policy, Tracker(scores(policy, plans), epsilon))
+
+    @property
+    def policy(self) -> Policy:
+        return self.made.informed(caution=self.tracker.caution)
+
+    def learn(self, plan: Plans, *, stalled: bool) -> None:
+        self.tracker.learn(float(scores(self.made, plan)[0]), stalled=stalled)
+
+    def follow(self, plans: Plans) -> tuple[Floats, Schedule]:
+        """Decide plans one after another, learning from each; return each plan's lambda and the schedule.
+
+        Blocks of plans are decided at every lambda in one pass; then lambda is chosen plan by plan.
+        """
+        import numpy as np
+
+        chosen, starts, durations = [], [], []
+        count = plans.arrival_s.shape[1]
+        for places in np.array_split(np.arange(count), -(-count // AT_ONCE)):
+            every = self.made.schedules(take(plans, places), CAUTIONS)
+            stalls = stalled(every)
+            ranks = np.empty(places.size, dtype=np.intp)
+            for place, score in enumerate(_least(stalls)):
+                ranks[place] = CAUTIONS.index(self.tracker.caution)
+                self.tracker.learn(score, stalled=bool(stalls[ranks[place], place]))
+            chosen += [CAUTIONS[rank] for rank in ranks]
+            columns = np.arange(places.size)
+            starts.append(every.start_s[:, ranks, columns])
+            durations.append(every.duration_s[:, ranks, columns])
+        return np.array(chosen), Schedule(np.concatenate(starts, axis=1), np.concatenate(durations, axis=1))
+
+
+def _least(stalls: NDArray[np.bool_]) -> list[float]:
+    """Return each plan's score: the least lambda from which on it does not stall."""
+    import numpy as np
+
+    above = len(CAUTIONS) - np.argmax(stalls[::-1], axis=0)
+    ranks = np.where(stalls.any(axis=0), above, 0)
+    return [CAUTIONS[min(rank, len(CAUTIONS) - 1)] for rank in ranks]
+
+
 def upper_bound(stalled: float, plans: float, confidence: float) -> float:
     """Return the share x with P(Bin(plans, x) <= stalled) = 1 - confidence (Clopper and Pearson, Biometrika 1934).
 
@@ -252,13 +310,13 @@ def upper_bound(stalled: float, plans: float, confidence: float) -> float:
     return 1.0 if stalled == plans else float(stats.beta.ppf(confidence, stalled + 1, plans - stalled))
 
 
-def stalled(policy: Policy, plans: Plans) -> NDArray[np.bool_]:
+def stalled(schedule: Schedule) -> NDArray[np.bool_]:
     """Return a mask of the plans with any stall, shape (M,)."""
     import numpy as np
 
     from s2a_bench.policy.metrics import stalls
 
-    return np.asarray((stalls(policy.schedule(plans)) > ANY_STALL_S).any(axis=0))
+    return np.asarray((stalls(schedule) > ANY_STALL_S).any(axis=0))
 
 
 def take(plans: Plans, columns: NDArray[np.intp]) -> Plans:

@@ -69,10 +69,7 @@ class GapPrior:
         return GapPrior(mean, max(plan, LEAST_CV**2) ** 0.5, max(token, LEAST_CV**2) ** 0.5)
 
     def learned(self, gaps: Number, elapsed_s: Number) -> tuple[Number, Number]:
-        """Return the plan's mean gap in s and its variance relative to the mean squared, v / mu^2.
-
-        ``gaps`` gaps took ``elapsed_s`` together.
-        """
+        """Return the plan's mean gap in s and its relative variance, v / mu^2, after ``gaps`` gaps in ``elapsed_s``."""
         return posterior(self.mean_s, self.plan_cv**2, self.token_cv**2, gaps, elapsed_s)
 
 

@@ -63,10 +63,7 @@ class PlanMetrics:
 
 
 def measure(plans: Plans, schedule: Schedule, *, tolerance_s: float = TOLERANCE_S) -> PlanMetrics:
-    """Compute the metrics of M timelines; stalls longer than ``tolerance_s`` count.
-
-    The picture behind a plan is as old as its request.
-    """
+    """Compute the metrics of M timelines; stalls above ``tolerance_s`` count. A picture is as old as its request."""
     arrival_s, nominal_s, least_s, most_s, start_s, duration_s = align(
         plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s, schedule.start_s, schedule.duration_s
     )
@@ -157,12 +154,10 @@ def jerk(speed_mps: Floats, sample_s: float) -> Floats:
 
 
 def rms_jerk(speed_mps: Floats, sample_s: float) -> float:
-    """Return the root of the mean squared jerk in m/s^3; raises ValueError for fewer than 3 samples."""
     return float(np.sqrt(np.mean(jerk(speed_mps, sample_s) ** 2)))
 
 
 def peak_jerk(speed_mps: Floats, sample_s: float) -> float:
-    """Return the greatest absolute jerk in m/s^3; raises ValueError for fewer than 3 samples."""
     return float(np.abs(jerk(speed_mps, sample_s)).max())
 
 

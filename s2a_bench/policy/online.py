@@ -158,16 +158,18 @@ def _first_start(stream: _Stream, nominal_sum: Floats, most_sum: Floats) -> Floa
         if not rule.elastic:
             return view.cautious_start_s(nominal_s, expected.nominal_s, view.caution)
         budget_s = rule.budget(nominal_s, most_s)
-        found = view.mean_start_s(budget_s, rule.budget(expected.nominal_s, expected.most_s))
+        start_s = view.mean_start_s(budget_s, rule.budget(expected.nominal_s, expected.most_s))
         if rule.spend and rule.within < np.inf:
             whole_s = nominal_s + view.missing * expected.nominal_s
-            found = np.where(found > rule.within * whole_s, view.mean_start_s(nominal_s, expected.nominal_s), found)
+            start_s = np.where(
+                start_s > rule.within * whole_s, view.mean_start_s(nominal_s, expected.nominal_s), start_s
+            )
         # The cheap mean forecast rules out most plans; the cautious one is computed for the rest.
-        near = np.flatnonzero(found < until_s)
+        near = np.flatnonzero(start_s < until_s)
         view = stream.view(live[near], np.full(near.shape, event))
         cautious_s = view.cautious_start_s(most_s[near], expected.most_s, rule.start_caution * view.caution)
-        found[near] = np.maximum(found[near], cautious_s)
-        return found
+        start_s[near] = np.maximum(start_s[near], cautious_s)
+        return start_s
 
     waiting = np.arange(nominal_sum.shape[1])
     return _first(stream, waiting, np.full(waiting.shape, -np.inf), at_s)
@@ -205,9 +207,9 @@ def _first(stream: _Stream, plans: Ints, from_s: Floats, at_s: Callable[[int, In
         live, begins_s, until_s = waiting[ready], begins_s[ready], until_s[ready]
         if not live.size:
             continue
-        found = np.maximum(begins_s, at_s(event, plans[live], until_s))
-        starts = found < until_s
-        start_s[live[starts]] = found[starts]
+        allowed_s = np.maximum(begins_s, at_s(event, plans[live], until_s))
+        starts = allowed_s < until_s
+        start_s[live[starts]] = allowed_s[starts]
         waiting = np.setdiff1d(waiting, live[starts], assume_unique=True)
     return start_s
 

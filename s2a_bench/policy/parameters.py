@@ -33,7 +33,8 @@ def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
     try:
         return made_by(**values)
     except UsageError as error:
-        raise UsageError(f"`{field}`: {name}: {error}" + f"; {known}" * bool(given)) from error
+        hint = f"; {known}" if given else ""
+        raise UsageError(f"`{field}`: {name}: {error}{hint}") from error
 
 
 def canonical(name: str, policy: object) -> str:
@@ -43,7 +44,8 @@ def canonical(name: str, policy: object) -> str:
         value = getattr(policy, field.name)
         if value != field.default:
             given[field.name] = f"{value:.12g}" if isinstance(value, float) else str(value)
-    return name + "?" * bool(given) + "&".join(f"{parameter}={text}" for parameter, text in sorted(given.items()))
+    pairs = "&".join(f"{parameter}={text}" for parameter, text in sorted(given.items()))
+    return f"{name}?{pairs}" if pairs else name
 
 
 def _value(type_: Any, text: str, what: str, known: str) -> Any:
@@ -57,5 +59,5 @@ def _value(type_: Any, text: str, what: str, known: str) -> Any:
 
 
 def _parameters(made_by: Any) -> list[Field[Any]]:
-    found = fields(made_by) if is_dataclass(made_by) else ()
-    return [field for field in found if isinstance(field.default, bool | int | float | str | None)]
+    declared = fields(made_by) if is_dataclass(made_by) else ()
+    return [field for field in declared if isinstance(field.default, bool | int | float | str | None)]

@@ -34,7 +34,7 @@ from pydantic import Field
 
 from s2a_bench.policy import CAUTION, Plans, PlanShape, Policy, Schedule, Start, Stepper, Timing
 from s2a_bench.policy.estimator import VAGUE, GapPrior, Number
-from s2a_bench.policy.wait_then_act import Clairvoyant
+from s2a_bench.policy.nominal import Clairvoyant
 
 if TYPE_CHECKING:
     from s2a_bench.policy.changes import ChangeWatch
@@ -77,7 +77,6 @@ class StreamToAct(Policy):
     caution: Caution | None = None
     """None: calibrated if a run has plans for that, else `CAUTION`."""
     detect: bool = False
-    """Whether changes of the rate within the plan are detected."""
 
     def schedule(self, plans: Plans) -> Schedule:
         from s2a_bench.policy.online import schedule
@@ -92,9 +91,9 @@ class StreamToAct(Policy):
 
         count = plans.arrival_s.shape[1]
         copies = take(plans, np.tile(np.arange(count), len(cautions)))
-        found = schedule(self.prior, np.repeat(cautions, count), copies, self.rule)
+        decided = schedule(self.prior, np.repeat(cautions, count), copies, self.rule)
         shape = (-1, len(cautions), count)
-        return Schedule(found.start_s.reshape(shape), found.duration_s.reshape(shape))
+        return Schedule(decided.start_s.reshape(shape), decided.duration_s.reshape(shape))
 
     def informed(self, prior: GapPrior | None = None, caution: float | None = None) -> StreamToAct:
         return replace(self, prior=prior or self.prior, caution=self.caution if caution is None else caution)
@@ -156,8 +155,6 @@ class MeanStart(StreamToAct):
 
 @dataclass(slots=True)
 class OnlineStepper:
-    """The online rule on one plan."""
-
     prior: GapPrior
     caution: float
     shape: PlanShape

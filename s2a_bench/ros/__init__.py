@@ -376,5 +376,7 @@ def open_middleware(
     except ModuleNotFoundError as error:
         way = f"{way_out(kind)}; of a source, robot or ego with ?middleware="
         raise TransportError(f"middleware {name} is not installed ({error}); {way}") from error
-    more = (place or kind.meeting_place.default, host) if kind.meeting_place else ()
-    return implementation(config.domain_id(os.environ, domain_id), tuning, node_name, *more)
+    domain = config.domain_id(os.environ, domain_id)
+    if kind.meeting_place is None:
+        return implementation(domain, tuning, node_name)
+    return implementation(domain, tuning, node_name, place or kind.meeting_place.default, host)

@@ -32,6 +32,7 @@ from s2a_bench.ros.service import (
     LogOnce,
     ServiceEnd,
     ServiceNode,
+    ServiceSpec,
     Waiter,
     appeared,
     awaited,
@@ -69,9 +70,7 @@ NEXT: dict[Status, frozenset[Status]] = {
     Status.ACCEPTED: frozenset({Status.EXECUTING, Status.CANCELING}),
     Status.EXECUTING: frozenset({Status.CANCELING, Status.SUCCEEDED, Status.ABORTED}),
     Status.CANCELING: frozenset({Status.SUCCEEDED, Status.CANCELED, Status.ABORTED}),
-    Status.SUCCEEDED: frozenset(),
-    Status.CANCELED: frozenset(),
-    Status.ABORTED: frozenset(),
+    **dict.fromkeys((Status.SUCCEEDED, Status.CANCELED, Status.ABORTED), frozenset()),
 }
 """The goal state machine: status -> the statuses that may follow."""
 
@@ -190,9 +189,14 @@ def _goal_info(goal_id: bytes, stamp_ns: int) -> Any:
     return ros.message("action_msgs/msg/GoalInfo", goal_id=ros.uuid(goal_id), stamp=ros.stamp(stamp_ns))
 
 
-class ClientAction:
-    """Events are taken on the consuming thread; sending and cancelling may happen on any."""
+def _services(name: str, type_name: str, version: str) -> Iterator[ServiceSpec]:
+    """Yield the three services of the action ``/name``: send_goal, get_result, cancel_goal."""
+    yield ServiceSpec(name + "/_action/send_goal", type_name + "_SendGoal", version)
+    yield ServiceSpec(name + "/_action/get_result", type_name + "_GetResult", version)
+    yield ServiceSpec(name + "/_action/cancel_goal", CANCEL_GOAL, version)
 
+
+class ClientAction:
     def __init__(self, node: ServiceNode[Any, Any], name: str, type_name: str, version: str) -> None:
         self._type, self._version = type_name, version
         prefix, waiter = name + "/_action/", node.waiter()
@@ -200,9 +204,10 @@ class ClientAction:
         feedback = node.subscription(prefix + "feedback", type_name + "_FeedbackMessage", READER_QOS, version, waiter)
         status = node.subscription(prefix + "status", STATUS_ARRAY, STATUS_QOS)
         """Not read: a goal's status comes with its result. ROS tools expect a client to subscribe."""
-        self._goals = node.client_end(prefix + "send_goal", type_name + "_SendGoal", version, waiter)
-        self._results = node.client_end(prefix + "get_result", type_name + "_GetResult", version, waiter)
-        self._cancels = node.client_end(prefix + "cancel_goal", CANCEL_GOAL, version, waiter)
+        send_goal, get_result, cancel_goal = _services(name, type_name, version)
+        self._goals = node.client_end(send_goal, waiter)
+        self._results = node.client_end(get_result, waiter)
+        self._cancels = node.client_end(cancel_goal, waiter)
         self._body_at = self._goals.body_at
         services = self._goals, self._results, self._cancels
         self._present = feedback.announced, status.announced, *(service.matched for service in services)
@@ -234,7 +239,7 @@ class ClientAction:
 
     def pack(self, goal: Any) -> bytearray:
         """Serialise the whole request; header and goal id are filled in by `send`."""
-        request = ros.typestore(self._version).types[self._goals.request_type]
+        request = ros.typestore(self._version).types[self._goals.spec.request_type]
         return self._goals.pack(request(goal_id=ros.uuid(bytes(16)), goal=goal))
 
     def send(self, packed: bytearray, goal_id: bytes | None = None) -> bytes:
@@ -245,11 +250,11 @@ class ClientAction:
         return goal_id
 
     def cancel(self, goal_id: bytes) -> None:
-        request = ros.default(self._cancels.request_type, self._version, goal_info=_goal_info(goal_id, 0))
+        request = ros.default(self._cancels.spec.request_type, self._version, goal_info=_goal_info(goal_id, 0))
         self._cancels.call(self._cancels.pack(request), goal_id)
 
     def get_result(self, goal_id: bytes) -> None:
-        request = ros.default(self._results.request_type, self._version, goal_id=ros.uuid(goal_id))
+        request = ros.default(self._results.spec.request_type, self._version, goal_id=ros.uuid(goal_id))
         self._results.call(self._results.pack(request), goal_id)
 
     def next_event(self, timeout_s: float) -> ActionEvent | None:
@@ -329,8 +334,6 @@ class ServedGoal(Generic[Caller]):
 
 
 class ServedAction(Generic[Caller]):
-    """Goals are taken on the consuming thread; a service thread answers cancels and results, and expires them."""
-
     def __init__(
         self, node: ServiceNode[Caller, Any], name: str, type_name: str, result_timeout_s: float, version: str
     ) -> None:
@@ -340,10 +343,10 @@ class ServedAction(Generic[Caller]):
         prefix, waiter = name + "/_action/", self._service_waiter
         self._send_feedback = node.publisher(prefix + "feedback", self._feedback_type, FEEDBACK_QOS, version).send
         self._send_status = node.publisher(prefix + "status", STATUS_ARRAY, STATUS_QOS).send
-        self._get_result = node.service_end(prefix + "get_result", type_name + "_GetResult", version, waiter)
-        self._cancel = node.service_end(prefix + "cancel_goal", CANCEL_GOAL, version, waiter)
-        goal_type = type_name + "_SendGoal"
-        self.send_goal = node.service_end(prefix + "send_goal", goal_type, version, self._goal_waiter, pictures=True)
+        send_goal, get_result, cancel_goal = _services(name, type_name, version)
+        self._get_result = node.service_end(get_result, waiter)
+        self._cancel = node.service_end(cancel_goal, waiter)
+        self.send_goal = node.service_end(send_goal, self._goal_waiter, pictures=True)
         self._once = LogOnce(_log)
         self._goals = Goals(int(result_timeout_s * 1e9))
         self._waiting: dict[bytes, list[Caller]] = {}
@@ -430,7 +433,8 @@ class ServedAction(Generic[Caller]):
         if not self.send_goal.reaches(caller):
             _log.warning("%s: the client of goal %s has left", self._name, goal_id.hex())
             return
-        response = ros.default(self.send_goal.reply_type, self.version, accepted=accepted, stamp=ros.stamp(stamp_ns))
+        reply_type = self.send_goal.spec.reply_type
+        response = ros.default(reply_type, self.version, accepted=accepted, stamp=ros.stamp(stamp_ns))
         self.send_goal.respond(self.send_goal.pack(response), caller)
 
     def execute(self, goal_id: bytes) -> bool:
@@ -454,7 +458,7 @@ class ServedAction(Generic[Caller]):
                 self._get_result.respond(packed, caller)
 
     def _pack_result(self, status: Status, result: Any) -> bytearray:
-        response = ros.typestore(self.version).types[self._get_result.reply_type]
+        response = ros.typestore(self.version).types[self._get_result.spec.reply_type]
         return self._get_result.pack(response(status=int(status), result=result))
 
     def _publish_status(self) -> None:
@@ -487,7 +491,7 @@ class ServedAction(Generic[Caller]):
         info = request.goal_info
         code, chosen = self._goals.cancel(info.goal_id.uuid.tobytes(), ros.nanoseconds(info.stamp))
         canceling = [_goal_info(goal.id, goal.stamp_ns) for goal in chosen]
-        reply_type = self._cancel.reply_type
+        reply_type = self._cancel.spec.reply_type
         response = ros.default(reply_type, self.version, return_code=int(code), goals_canceling=canceling)
         self._cancel.respond(self._cancel.pack(response), caller)
         if chosen:

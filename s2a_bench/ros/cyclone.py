@@ -24,7 +24,7 @@ from s2a_bench.ros.dds import DdsWaiter, RawReader, RawWriter, dds_qos, is_descr
 from s2a_bench.ros.dds_service import Caller, DdsServiceClient, DdsServiceServer
 from s2a_bench.ros.messages import DEFAULT_VERSION, deserialise, serialise, type_hash
 from s2a_bench.ros.remap import check_node_name
-from s2a_bench.ros.service import awaited
+from s2a_bench.ros.service import ServiceSpec, awaited
 
 PARTICIPANT_ENTITIES = "rmw_dds_common/msg/ParticipantEntitiesInfo"
 NODE_ENTITIES = "rmw_dds_common/msg/NodeEntitiesInfo"
@@ -167,20 +167,18 @@ class CycloneMiddleware(ActionNode[Caller, DdsWaiter]):
 
     def service_end(
         self,
-        name: str,
-        type_name: str,
-        version: str,
+        spec: ServiceSpec,
         waiter: DdsWaiter,
         qos: QoS | None = None,
         *,
         pictures: bool = False,  # noqa: ARG002 - Cyclone bounds what waits
     ) -> DdsServiceServer:
-        server = DdsServiceServer(self._participant, name, type_name, version, waiter, qos)
+        server = DdsServiceServer(self._participant, spec, waiter, qos)
         self._node.add(*server.ends)
         return server
 
-    def client_end(self, name: str, type_name: str, version: str, waiter: DdsWaiter) -> DdsServiceClient:
-        client = DdsServiceClient(self._participant, name, type_name, version, waiter)
+    def client_end(self, spec: ServiceSpec, waiter: DdsWaiter) -> DdsServiceClient:
+        client = DdsServiceClient(self._participant, spec, waiter)
         self._node.add(*client.ends)
         return client
 

@@ -160,17 +160,6 @@ _reading = Lock()
 """cyclonedds reads every quality of service through one set of buffers, which two threads would overwrite."""
 
 
-def _known(ask: Callable[[int], Any], handle: int) -> Any:
-    """Return what is known of a peer, None if it has left, even while its quality of service was being read."""
-    try:
-        with _reading:
-            return ask(handle)
-    except Exception as error:
-        if str(error).startswith("Callfunc"):  # a bare Exception, of cyclonedds' C extension
-            return None
-        raise
-
-
 def is_described(endpoint: Any, type_name: str) -> bool:
     """Return whether a DcpsEndpoint describes the ROS type otherwise than our own endpoints, which have no fields."""
     raw = _raw_type(type_name).__idl__.get_type_id()  # type: ignore[attr-defined]
@@ -193,8 +182,14 @@ class _Endpoint:
         return len(self.peers())
 
     def endpoint(self, handle: int) -> Any:
-        """Return what is known of one matched peer, a DcpsEndpoint; None if it has left."""
-        return _known(self._known, handle)
+        """Return what is known of one matched peer, a DcpsEndpoint; None if it has left, even while this was read."""
+        try:
+            with _reading:
+                return self._known(handle)
+        except Exception as error:
+            if str(error).startswith("Callfunc"):  # a bare Exception, of cyclonedds' C extension
+                return None
+            raise
 
     def endpoints(self) -> Iterator[Any]:
         return (endpoint for endpoint in map(self.endpoint, self.peers()) if endpoint is not None)

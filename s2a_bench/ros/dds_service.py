@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from itertools import count
 from threading import Lock
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 from cyclonedds.domain import DomainParticipant
 
@@ -21,7 +21,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.ros import SERVICE_QOS, QoS
 from s2a_bench.ros.dds import DdsWaiter, RawReader, RawWriter, dds_qos, other_dds, user_data
 from s2a_bench.ros.messages import deserialise, serialise, type_hash
-from s2a_bench.ros.service import MATCH_POLL_S, REACH_S, READER_QOS, REMEMBERED_CLIENTS, ServiceEnd
+from s2a_bench.ros.service import MATCH_POLL_S, REACH_S, READER_QOS, REMEMBERED_CLIENTS, ServiceEnd, ServiceSpec
 
 HEADER = struct.Struct("<Qq")
 """guid of the client and number of its request, after the 4 bytes of CDR header."""
@@ -49,28 +49,21 @@ class Caller:
 
 class _End:
     body_at = HEADER_AT + HEADER.size
+    serves: ClassVar[bool]
+    """Whether it is the server's side, which takes requests and sends replies."""
 
     def __init__(
-        self,
-        participant: DomainParticipant,
-        name: str,
-        type_name: str,
-        version: str,
-        waiter: DdsWaiter,
-        role: tuple[str, str],
-        qos: QoS | None = None,
+        self, participant: DomainParticipant, spec: ServiceSpec, waiter: DdsWaiter, qos: QoS | None = None
     ) -> None:
-        """Create both endpoints of the service ``/name``; without ``qos`` they have that of an action's."""
-        own, self._peer_key = role
-        self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
-        self.hashed_type = self.request_type
-        self._version = version
+        """Create both endpoints of a service; without ``qos`` they have that of an action's."""
+        self.spec = spec
         identity = endpoint_id(participant.get_guid().bytes[:12], next(_numbers))
-        request, reply = ("rq" + name + "Request", self.request_type), ("rr" + name + "Reply", self.reply_type)
-        sent, received = (request, reply) if own == "clientid" else (reply, request)
+        request, reply = (f"rq{spec.name}Request", spec.request_type), (f"rr{spec.name}Reply", spec.reply_type)
+        sent, received = (reply, request) if self.serves else (request, reply)
+        own, self._peer_key = ("serviceid", "clientid") if self.serves else ("clientid", "serviceid")
 
         def announced(type_name: str) -> str:
-            return f"{own}={identity};typehash={type_hash(type_name, version)};"
+            return f"{own}={identity};typehash={type_hash(type_name, spec.version)};"
 
         writer_qos = qos or (SERVICE_QOS if sent is request else REPLY_QOS)
         self.writer = RawWriter(participant, *sent, dds_qos(writer_qos, announced(sent[1])))
@@ -79,12 +72,15 @@ class _End:
         self.ends = self.writer, self.reader
         self._sent_wire, self._received_wire = sent[1] + "__wire", received[1] + "__wire"
 
+    @property
+    def hashed_type(self) -> str:
+        return self.spec.request_type
+
     def matched(self) -> bool:
         ids = [{announced.get(self._peer_key) for announced in map(user_data, end.endpoints())} for end in self.ends]
         return bool((ids[0] & ids[1]) - {None})
 
     def other_dds(self) -> str:
-        """Return the DDS of a peer whose services have another form than `rmw_cyclonedds_cpp`'s, "" without one."""
         return next((name for end in self.ends for endpoint in end.endpoints() if (name := other_dds(endpoint))), "")
 
     def peer_type_hash(self) -> str:
@@ -92,17 +88,17 @@ class _End:
         return next(filter(None, hashes), "")
 
     def pack(self, body: Any) -> bytearray:
-        return serialise(SimpleNamespace(guid=0, seq=0, body=body), self._sent_wire, self._version)
+        return serialise(SimpleNamespace(guid=0, seq=0, body=body), self._sent_wire, self.spec.version)
 
     def unpack(self, packed: memoryview) -> Any:
-        return deserialise(packed, self._received_wire, self._version).body
+        return deserialise(packed, self._received_wire, self.spec.version).body
 
 
 class DdsServiceClient(_End):
-    def __init__(
-        self, participant: DomainParticipant, name: str, type_name: str, version: str, waiter: DdsWaiter
-    ) -> None:
-        super().__init__(participant, name, type_name, version, waiter, ("clientid", "serviceid"))
+    serves = False
+
+    def __init__(self, participant: DomainParticipant, spec: ServiceSpec, waiter: DdsWaiter) -> None:
+        super().__init__(participant, spec, waiter)
         self._guid = self.writer.entity.get_instance_handle() % 2**64
         self._numbers = count(1)
         self._pending: dict[int, bytes] = {}
@@ -116,7 +112,6 @@ class DdsServiceClient(_End):
             self.writer.send(packed)
 
     def replies(self) -> Iterator[tuple[bytes, memoryview]]:
-        """Take what has arrived, a bounded number, and yield the replies to requests of ours: (key, CDR)."""
         for packed in self.reader.arrived():
             if len(packed) <= self.body_at:
                 continue
@@ -126,16 +121,12 @@ class DdsServiceClient(_End):
 
 
 class DdsServiceServer(_End, ServiceEnd[Caller]):
+    serves = True
+
     def __init__(
-        self,
-        participant: DomainParticipant,
-        name: str,
-        type_name: str,
-        version: str,
-        waiter: DdsWaiter,
-        qos: QoS | None = None,
+        self, participant: DomainParticipant, spec: ServiceSpec, waiter: DdsWaiter, qos: QoS | None = None
     ) -> None:
-        super().__init__(participant, name, type_name, version, waiter, ("serviceid", "clientid"), qos)
+        super().__init__(participant, spec, waiter, qos)
         self._reachable: set[int] = set()
         self._clients: dict[int, tuple[str, str]] = {}
 
@@ -151,16 +142,14 @@ class DdsServiceServer(_End, ServiceEnd[Caller]):
 
     def client(self, caller: Caller) -> tuple[str, str]:
         """Return a client's other DDS and the type hash it announces, "" where unknown; kept, as they never change."""
-        found = self._clients.get(caller.sender)
-        if found is None:
+        if caller.sender not in self._clients:
             endpoint = self.reader.endpoint(caller.sender)
             if endpoint is None:
                 return "", ""
             if len(self._clients) >= REMEMBERED_CLIENTS:
                 self._clients.clear()
-            found = other_dds(endpoint), user_data(endpoint).get("typehash", "")
-            self._clients[caller.sender] = found
-        return found
+            self._clients[caller.sender] = other_dds(endpoint), user_data(endpoint).get("typehash", "")
+        return self._clients[caller.sender]
 
     def reaches(self, caller: Caller) -> bool:
         """Wait, 100 ms at most, until replies reach the client.

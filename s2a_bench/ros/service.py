@@ -7,6 +7,7 @@ import logging
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from threading import Thread
 from typing import Any, Final, Generic, Protocol, TypeVar
 
@@ -62,17 +63,37 @@ def awaited(take: Callable[[], Taken], waiter: Waits, timeout_s: float) -> Taken
     """Return what ``take`` finds, as soon as it finds something; None after the time, or an interrupt."""
     deadline_ns = now_ns() + int(timeout_s * 1e9)
     while not waiter.interrupted:
-        if (found := take()) is not None or not waiter.wait_until(deadline_ns):
-            return found
+        if (taken := take()) is not None or not waiter.wait_until(deadline_ns):
+            return taken
     return None
 
 
+@dataclass(frozen=True, slots=True)
+class ServiceSpec:
+    """The service ``/name`` of ROS type ``pkg/srv/Name``, with ``version`` as in `messages.VERSIONS`."""
+
+    name: str
+    type_name: str
+    version: str = DEFAULT_VERSION
+
+    @property
+    def request_type(self) -> str:
+        return self.type_name + "_Request"
+
+    @property
+    def reply_type(self) -> str:
+        return self.type_name + "_Response"
+
+
 class End(Protocol):
-    request_type: str
-    hashed_type: str
-    """The type whose hash is announced."""
+    spec: ServiceSpec
     body_at: int
     """Where bodies begin in the CDR."""
+
+    @property
+    def hashed_type(self) -> str:
+        """Return the type whose hash is announced."""
+        return self.spec.type_name
 
     def pack(self, body: Any, /) -> bytearray: ...
 
@@ -81,8 +102,6 @@ class End(Protocol):
 
 
 class ServiceEnd(End, Protocol[Caller]):
-    reply_type: str
-
     def arrived(self) -> Iterator[tuple[memoryview, Caller]]:
         """Take the requests that have arrived, a bounded number: CDR and caller."""
 
@@ -145,18 +164,17 @@ class LogOnce:
 
 
 class Calling:
-    def __init__(self, name: str, client: ClientEnd, waiter: Waits) -> None:
-        self._name, self._client, self._waiter = name, client, waiter
-        self._calls = 0
+    def __init__(self, client: ClientEnd, waiter: Waits) -> None:
+        self._client, self._waiter, self._calls = client, waiter, 0
 
     def call(self, request: Any, timeout_s: float) -> Any:
-        deadline_ns = now_ns() + int(timeout_s * 1e9)
+        deadline_ns, name = now_ns() + int(timeout_s * 1e9), self._client.spec.name
         if not appeared(self._client.matched, timeout_s):
-            raise TransportError(f"no server of the service {self._name} appeared in {timeout_s:g} s")
+            raise TransportError(f"no server of the service {name} appeared in {timeout_s:g} s")
         self._calls += 1
         key = self._calls.to_bytes(8, "big")
         self._client.call(self._client.pack(request), key)
-        silent = f"the service {self._name} did not answer in {timeout_s:g} s"
+        silent = f"the service {name} did not answer in {timeout_s:g} s"
         while True:
             for answered, packed in self._client.replies():
                 if answered == key:
@@ -195,19 +213,12 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
 
     @abstractmethod
     def service_end(
-        self,
-        name: str,
-        type_name: str,
-        version: str,
-        waiter: Waiter,
-        qos: QoS | None = None,
-        *,
-        pictures: bool = False,
+        self, spec: ServiceSpec, waiter: Waiter, qos: QoS | None = None, *, pictures: bool = False
     ) -> ServiceEnd[Caller]:
-        """Make the server's side of ``/name``, without ``qos`` as an action's; requests may hold ``pictures``."""
+        """Make the server's side, without ``qos`` as an action's; requests may hold ``pictures``."""
 
     @abstractmethod
-    def client_end(self, name: str, type_name: str, version: str, waiter: Waiter) -> ClientEnd: ...
+    def client_end(self, spec: ServiceSpec, waiter: Waiter) -> ClientEnd: ...
 
     @abstractmethod
     def leave(self) -> None:
@@ -220,7 +231,7 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
             self._requests = self.waiter()
             self._serving = Thread(target=self._serve, name="services", daemon=True)
             self._serving.start()
-        end = self.service_end(name, type_name, DEFAULT_VERSION, self._requests, qos)
+        end = self.service_end(ServiceSpec(name, type_name), self._requests, qos)
         self._offered = {**self._offered, name: (end, answer)}  # while the thread goes through the old ones
 
     def _serve(self) -> None:
@@ -247,7 +258,7 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
 
     def service_client(self, name: str, type_name: str) -> Calling:
         waiter = self.waiter()
-        return Calling(name, self.client_end(name, type_name, DEFAULT_VERSION, waiter), waiter)
+        return Calling(self.client_end(ServiceSpec(name, type_name), waiter), waiter)
 
     def close(self) -> None:
         if not self._closed:

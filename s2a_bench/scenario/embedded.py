@@ -1,7 +1,4 @@
-"""The embedded simulator: highway-env's kinematic bicycles on a straight road, driven by accelerations.
-
-highway-env integrates with explicit Euler steps and steers by its lane controller.
-"""
+"""The embedded simulator: highway-env's kinematic bicycles on a straight road, driven by accelerations; Euler steps."""
 
 from __future__ import annotations
 
@@ -33,7 +30,8 @@ class Embedded(Simulator):
     def __init__(self) -> None:
         extras.need("ccrb", "highway_env")
         self._cars: dict[int, Any] = {}
-        self._shown = (State(*np.zeros((3, 3, 1))), np.zeros((3, 1)))
+        nothing = np.zeros((3, 1))
+        self._shown = (State(nothing, nothing, nothing), nothing)
 
     def place(self, position_m: Floats, speed_mps: Floats) -> State:
         controlled = extras.require("highway_env.vehicle.controller", "ccrb").ControlledVehicle

@@ -21,8 +21,7 @@ from s2a_bench.store.run import read_run
 from s2a_bench.sweep.file import find_sweep, sweep_files
 
 Flag: TypeAlias = Literal["value", "hidden", "switch", "toggle", "argument"]
-"""A switch is given or not; a toggle has an opposite, as --flag and --no-flag; no hint names a hidden
-one."""
+"""A switch is given or not; a toggle has an opposite, as --flag and --no-flag; no hint names a hidden flag."""
 
 
 @dataclass(frozen=True, slots=True)

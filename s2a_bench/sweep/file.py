@@ -11,7 +11,7 @@ from typing import Annotated, Any, TypeAlias, TypeVar
 
 from pydantic import Field
 
-from s2a_bench.boards.profile import search_path
+from s2a_bench.boards.profile import search_path, toml_files
 from s2a_bench.errors import UsageError
 from s2a_bench.text import like, none_of
 from s2a_bench.toml_file import TomlTable, parse, read
@@ -80,9 +80,7 @@ class SweepFile:
 
 
 def sweep_files() -> dict[str, Path]:
-    """Return name -> file, sorted; of two files with one name, that in the first folder of the search path."""
-    folders = [folder / "sweeps" for folder in search_path()]
-    return dict(sorted((path.stem, path) for folder in reversed(folders) for path in folder.glob("*.toml")))
+    return toml_files([folder / "sweeps" for folder in search_path()])
 
 
 def find_sweep(name: str) -> Path:

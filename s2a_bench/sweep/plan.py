@@ -54,9 +54,9 @@ def plan_sweep(file: SweepFile, command: SweepCommand, boards: Collection[str] |
         except UsageError as error:
             label = " ".join(f"{key}={value}" for key, value in setting.items())
             raise UsageError(f"{file.path}: {label}: {error}") from error
-        found = _hash([argv, setting.get(BOARD), [_content(path) for path in _files(setting)]])
+        config_hash = _hash([argv, setting.get(BOARD), [_content(path) for path in _files(setting)]])
         plain = {key: _text(value) if isinstance(value, list) else value for key, value in setting.items()}
-        cells.append(SweepCell(number, repeat, plain, tuple(argv), virtual, setting.get(BOARD, ""), found))
+        cells.append(SweepCell(number, repeat, plain, tuple(argv), virtual, setting.get(BOARD, ""), config_hash))
     return SweepPlan(command.name, tuple(cells), file.rest_s, file.seed, file.repeats)
 
 

@@ -147,12 +147,12 @@ class SweepRun:
         attempt = self._latest.get(cell.key, (0, ""))[0] + 1
         host = str(outcome.machine.get("host", ""))
         error = outcome.error or self._other_machine(cell, outcome)
-        found = run_folder(folder) if folder.exists() else None
+        run = run_folder(folder) if folder.exists() else None
         kept = self._writer.path / "cells" / (cell.label + (f"-{attempt}" if attempt > 1 else ""))
-        if found is not None:
+        if run is not None:
             kept.parent.mkdir(exist_ok=True)
             shutil.rmtree(kept, ignore_errors=True)  # of a sweep killed between move and row
-            found.rename(kept)
+            run.rename(kept)
         shutil.rmtree(folder, ignore_errors=True)
         if host not in self._writer.manifest["machines"]:
             self._writer.update(machines={host: outcome.machine})
@@ -168,10 +168,10 @@ class SweepRun:
             settings=cell.settings,
             argv=list(cell.argv),
             config_hash=cell.config_hash,
-            folder=str(kept.relative_to(self._writer.path)) if found is not None else "",
+            folder=str(kept.relative_to(self._writer.path)) if run is not None else "",
             started=outcome.started,
             wall_s=outcome.wall_s,
-            provenance=read_run(kept).origins.code if found is not None else "",
+            provenance=read_run(kept).origins.code if run is not None else "",
         )
         self._writer.append(CELLS, [row])
         self._latest[cell.key] = attempt, row.state

@@ -11,16 +11,8 @@ fixtures that the suite's docstring names:
         def policy(self):
             return MyPolicy(factor=2.0)
 
-| seam | suite | fixtures |
-|---|---|---|
-| transport | `transport.TransportSuite` | ``wiring``, or the pipeline's ``name`` as an attribute |
-| engine | `engine.EngineSuite` | ``engine``, and ``fresh_engine``, which is closed |
-| frame source | `frame_source.FrameSourceSuite` | ``make_source``: opens it with a width and a height |
-| policy | `policy.PolicySuite` | ``policy`` |
-| simulator | `simulator.SimulatorSuite` | none: the simulator's ``name`` as an attribute, or `open_world` |
-
-`VirtualClock` jumps instead of sleeping; `NullProgress` records a run's messages. The suites need pytest, that of
-policies hypothesis too.
+CONTRIBUTING.md names the suite of each kind; they need pytest, that of policies hypothesis too. `VirtualClock` jumps
+instead of sleeping, `NullProgress` records a run's messages.
 """
 
 from __future__ import annotations

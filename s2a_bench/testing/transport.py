@@ -1,15 +1,4 @@
-"""The conformance suite of transports: subclass `TransportSuite` and name the pipeline.
-
-A package tests its transport like this, once for each of its variants and payloads::
-
-    from s2a_bench.testing.transport import TransportSuite
-
-    class TestToy(TransportSuite):
-        name = "toy"
-
-    class TestToyJpeg(TransportSuite):
-        name = "toy?payload=jpeg"
-"""
+"""The conformance suite of transports: subclass `TransportSuite` for each variant and payload, naming the pipeline."""
 
 from __future__ import annotations
 

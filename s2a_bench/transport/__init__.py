@@ -1,28 +1,6 @@
 """Transports: a Client sends a request and yields tokens or actions, a Server feeds requests to a Handler.
 
-To add a transport, write a package with a module like this and register its instance as an entry point of the group
-``s2a_bench.transports``; nothing in this repository changes::
-
-    from s2a_bench.options import option
-    from s2a_bench.transport import SERVER, Transport, TransportOptions
-
-    class ToyOptions(TransportOptions):
-        port: int = option(0, "port; 0: any free one", ge=0, le=65535, side=SERVER)
-
-    class Toy(Transport[ToyOptions]):
-        name, options = "toy", ToyOptions           # --transport 'toy?port=7000', serve toy
-        payloads = ("raw",)                         # the first is the default where raw is not possible
-        stages = {"frame_length": "pack"}           # marked by its client or server, in addition to trace.STAGES
-        facts = (PAYLOAD_BYTES,)                    # numbers beside the marks; new ones as facts.Fact(...)
-        client_class = "toy.client:ToyClient"       # loaded when it is needed; made of wiring and alive
-        server_class = "toy.server:ToyServer"       # made of wiring and handler; enforces wiring.limits
-
-    TOY = Toy()
-
-    [project.entry-points."s2a_bench.transports"]
-    toy = "toy:TOY"
-
-`s2a_bench.testing.transport` has the conformance suite.
+CONTRIBUTING.md says how a package adds one, and which example there is; `testing.transport` has the conformance suite.
 """
 
 from __future__ import annotations
@@ -33,7 +11,7 @@ from functools import cache
 from math import inf
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Generic, Protocol, TypeAlias, TypeVar, cast
 
 from s2a_bench import extras
 from s2a_bench import options as base
@@ -305,20 +283,19 @@ class Transport(Generic[O]):
     urls: ClassVar[Urls] = Urls()
     sleep: ClassVar[Sleep | None] = None
     client_class: ClassVar[str] = ""
+    """``module:class``, made of a wiring and ``alive``, where `client` is not overridden."""
     server_class: ClassVar[str] = ""
-    """``module:class`` of client and server, where `client` and `server` are not overridden."""
+    """``module:class``, made of a wiring, whose limits it enforces, and a handler, where `server` is not overridden."""
     needs: ClassVar[tuple[str, ...]] = ()
     """The extra of both, and its modules."""
 
     def client(self, wiring: Wiring[O], alive: Callable[[], bool]) -> Client:
         self.check_machine()
-        opened: Client = resolve_name(self.client_class)(wiring, alive)
-        return opened
+        return cast("Client", resolve_name(self.client_class)(wiring, alive))
 
     def server(self, wiring: Wiring[O], handler: Handler) -> Server:
         self.check_machine()
-        bound: Server = resolve_name(self.server_class)(wiring, handler)
-        return bound
+        return cast("Server", resolve_name(self.server_class)(wiring, handler))
 
     def check_machine(self) -> None:
         """Raise MissingExtra, or UsageError for a system that it cannot run on."""

@@ -36,9 +36,7 @@ _log = logging.getLogger(__name__)
 class Connections:
     """Handles up to ``most`` connections of a socket at once, each on a thread; others receive ``refusal``."""
 
-    def __init__(
-        self, listener: socket.socket, handle: Callable[[Wire], None], most: int, refusal: bytes = b""
-    ) -> None:
+    def __init__(self, listener: socket.socket, handle: Callable[[Wire], None], most: int, refusal: bytes) -> None:
         self._listener, self._handle, self._most, self._refusal = listener, handle, most, refusal
         self._lock = Lock()
         self._wires: dict[Wire, Thread] = {}
@@ -102,7 +100,7 @@ class Connections:
     def _close(self, wire: Wire) -> None:
         with self._lock:
             self._wires.pop(wire, None)
-        wire.close()
+        wire.socket.close()
 
     def _close_refused(self) -> None:
         while self._refused and (
@@ -198,9 +196,6 @@ class Wire:
     def hang_up(self) -> None:
         with suppress(OSError):
             self.socket.shutdown(socket.SHUT_RDWR)
-
-    def close(self) -> None:
-        self.socket.close()
 
 
 def wait_at_most(connection: socket.socket, seconds: float) -> None:

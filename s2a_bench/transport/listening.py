@@ -72,8 +72,6 @@ L = TypeVar("L", bound=ListeningOptions)
 
 
 class ListeningTransport(Transport[L]):
-    """Has a server that listens at the host and port of its options."""
-
     def addresses(self, options: L) -> Iterable[str]:
         return f"{options.host}:{options.port}", f"{options.host}:0"
 

@@ -113,31 +113,11 @@ def pipelines(
     that is measured by default, or for the first. ``of_engine`` are options of the engine that names may hold as well.
     """
     given = {name: dict(values) for name, values in (options or {}).items()}
-    found: dict[str, Pipeline] = {}
+    by_name: dict[str, Pipeline] = {}
     for text in names:
-        wanted = _Payloads(tuple(payloads), strict=strict, mode=mode)
-        for pipeline in _standing_for(text, given, wanted, engine, of_engine, every=every):
-            found.setdefault(pipeline.name, pipeline)
-    return list(found.values())
-
-
-@dataclass(frozen=True, slots=True)
-class _Payloads:
-    """The wanted payloads: see `pipelines`."""
-
-    names: tuple[str, ...] = ()
-    strict: bool = False
-    mode: str = ""
-
-    @property
-    def only(self) -> str:
-        """The payload that all pipelines must carry, or nothing."""
-        return self.names[0] if self.strict and len(self.names) == 1 else ""
-
-    def over(self, possible: Sequence[str]) -> Sequence[str]:
-        if not possible:
-            return ("",)
-        return [each for each in self.names if each in possible] or ((self.strict and self.names) or possible)[:1]
+        for pipeline in _standing_for(text, given, payloads, mode, engine, of_engine, strict=strict, every=every):
+            by_name.setdefault(pipeline.name, pipeline)
+    return list(by_name.values())
 
 
 def answer_over(kind: str, compared: Sequence[Pipeline]) -> str:
@@ -160,16 +140,18 @@ def carries_alone(kind: str, compared: Sequence[Pipeline]) -> str:
 
 def one_pipeline(text: str, **options: Any) -> Pipeline:
     """Return one pipeline of a name, with the first variant if it names none; ``options`` are those of flags."""
-    return next(_standing_for(text, {_parse(text)[0]: options}, _Payloads(), every=False))
+    return pipelines([text], {_parse(text)[0]: options}, every=False)[0]
 
 
 def _standing_for(
     text: str,
     flags_of: Mapping[str, Mapping[str, Any]],
-    wanted: _Payloads,
-    engine: str = "",
-    of_engine: Collection[str] = (),
+    wanted: Sequence[str],
+    mode: str,
+    engine: str,
+    of_engine: Collection[str],
     *,
+    strict: bool,
     every: bool,
 ) -> Iterator[Pipeline]:
     name, chosen, written = _parse(text)
@@ -179,15 +161,17 @@ def _standing_for(
     engine_options = tuple(sorted(written.items() - given.items()))
     plain = _checked(transport.options, flags, transport.name)
     options = _checked(transport.options, {**flags, **given}, transport.name)
-    measured = transport.measured(Choice(_filled(options, wanted.only), engine=engine))
-    variants = [chosen] if chosen else measured if every else measured[:1]
+    only = wanted[0] if strict and len(wanted) == 1 else ""
+    measured = transport.measured(Choice(_filled(options, only), engine=engine))
+    variants = [chosen] if chosen else measured[: None if every else 1]
     for variant in variants:
         if variant not in (transport.variants or ("",)):
             known = ", ".join(transport.variants) or "none: it has no variants"
             meant = like(variant, transport.variants)
             raise UsageError(f"`transport`: '{variant}' is none of {transport.name}'s {known}{meant}")
-        can = transport.capabilities(Choice(options, variant, mode=wanted.mode))
-        payloads = wanted.over(can.payloads)
+        can = transport.capabilities(Choice(options, variant, mode=mode))
+        refused = wanted[:1] if strict and can.payloads else ()  # by `require_payload`
+        payloads = [each for each in wanted if each in can.payloads] or refused or can.payloads[:1] or ("",)
         if variant != variants[0] and not options.payload and payloads[0] not in {*can.payloads, ""}:
             continue  # it is not named, and can carry none of them
         default = _filled(plain, payloads[0])

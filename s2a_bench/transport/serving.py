@@ -66,13 +66,19 @@ class Turn:
     def has_started(self) -> bool:
         return self.ready is None or self.ready.is_set()
 
-    def wait(self, disconnected: Callable[[], bool] = lambda: False) -> bool:
-        """Wait on this thread; return False if the client is ``disconnected`` before the turn. Raises Overdue."""
-        while self.ready is not None and not self.ready.wait(POLL_S):
+    def wait(self, trace: Trace, disconnected: Callable[[], bool] = lambda: False) -> bool:
+        """Wait on this thread, as `queue`; return False if the client is ``disconnected`` before. Raises Overdue."""
+        if self.ready is None:
+            return not disconnected()
+        trace.mark(RESIDUAL)
+        while not self.ready.wait(POLL_S):
             if disconnected():
                 return False
             self.check(now_ns())
-        return not disconnected()
+        if disconnected():
+            return False
+        trace.mark("queue")
+        return True
 
     def alive(self, at_ns: int) -> None:
         self.alive_ns = at_ns
@@ -167,10 +173,7 @@ class Queued:
     def __call__(self, request: Request, trace: Trace) -> Generator[Piece, None, None]:
         turn = self.turns.join()
         try:
-            if turn.ready is not None:
-                trace.mark(RESIDUAL)
-                turn.wait()
-                trace.mark("queue")
+            turn.wait(trace)
             yield from self.answer(request, trace, turn)
         finally:
             turn.leave()
@@ -189,8 +192,8 @@ def _stamped(request: Request, trace: Trace, turn: Turn) -> Generator[Piece, Non
     """Answer a client that compares its clock with this host's; at the piece the answer leaves."""
     kind, _, system = request.prompt.removeprefix(CLOCK_PROMPT).partition(" ")
     if system in WALL_CLOCKS:
-        found = WALL_CLOCKS[system]()
-        trace.facts |= {REALTIME_MS: found.offset_ns / 1e6, REALTIME_ERROR_MS: found.error_ns / 1e6}
+        clock = WALL_CLOCKS[system]()
+        trace.facts |= {REALTIME_MS: clock.offset_ns / 1e6, REALTIME_ERROR_MS: clock.error_ns / 1e6}
     trace.mark("inference")
     trace.token_ns.append(trace.marks[-1][1])
     yield Action(0, np.zeros(1, np.float32)) if kind == ACTIONS else Token(0, ".")
@@ -326,20 +329,19 @@ class Core:
         except Disconnected:
             return False
         except Exception as error:  # noqa: BLE001 - every failure is reported to the client
-            return _fail(exchange, client_error(error))
+            exchange.held.close()
+            try:
+                exchange.fail(client_error(error))
+            except Disconnected:
+                return False
         finally:
             exchange.held.close()
         return True
 
     def _answer(self, exchange: Exchange, request: Request, turn: Turn) -> None:
-        waits = turn.ready is not None
-        if waits:
-            exchange.trace.mark(RESIDUAL)
-        if not turn.wait(exchange.disconnected):
+        if not turn.wait(exchange.trace, exchange.disconnected):
             exchange.abandon()
             return
-        if waits:
-            exchange.trace.mark("queue")
         wanted = exchange.begin(request)
         if wanted is None:
             return
@@ -425,12 +427,3 @@ def client_error(error: Exception) -> S2AError:
         return error
     _log.error("a request failed", exc_info=error)
     return EngineError("internal error; the server's log has it")
-
-
-def _fail(exchange: Exchange, error: S2AError) -> bool:
-    exchange.held.close()
-    try:
-        exchange.fail(error)
-    except Disconnected:
-        return False
-    return True

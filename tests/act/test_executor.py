@@ -24,7 +24,7 @@ from s2a_bench.act.record import Record
 from s2a_bench.act.timed import TimedRobot
 from s2a_bench.clock import VirtualClock
 from s2a_bench.policy import Plans, PlanShape, Start, Stepper, policy
-from s2a_bench.policy.naive import Naive, NominalQueue
+from s2a_bench.policy.nominal import Naive, NominalQueue
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.testing.policy import one, seeded
 from tests.act.drive import (

@@ -22,6 +22,7 @@ from s2a_bench.boards.profile import (
 )
 from s2a_bench.errors import UsageError
 from s2a_bench.plugins import paper
+from s2a_bench.sweep.file import sweep_files
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -56,6 +57,14 @@ def put(folder: Path, name: str, **changes: Any) -> Path:
     path = folder / f"{name}.toml"
     path.write_text(to_toml(GOOD | changes))
     return path
+
+
+def test_a_sweep_of_the_user_counts_instead_of_a_shipped_one_of_its_name(elsewhere: Path) -> None:
+    name = next(iter(sweep_files()))
+    own = elsewhere / "config/s2a-bench/profiles/sweeps" / f"{name}.toml"
+    own.parent.mkdir(parents=True)
+    own.touch()
+    assert sweep_files()[name] == own
 
 
 @pytest.mark.usefixtures("elsewhere")

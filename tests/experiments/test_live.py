@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import signal
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, nullcontext
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +31,7 @@ from s2a_bench.harness.timelines.policies import prior_of
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.replay import ReplayEngine
 from s2a_bench.policy import Plans
-from s2a_bench.policy.tracking import TrackedPolicy
+from s2a_bench.policy.conformal import TrackedPolicy
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.trace import Trace
@@ -89,23 +91,23 @@ def check(run: StoredRun, transport: str) -> None:
     assert [found["outcome"] for found in run.manifest["executions"].values()] == ["completed"] * 3
     cells = timelines_of(run)
     assert [cell.policy for cell in cells] == list(THREE)
-    naive, wait, online = cells
-    assert {cell.about("mode") for cell in cells} == {"live"}
-    assert len({cell.about("request_id") for cell in cells}) == 1
+    _, wait, _ = cells
+    assert {cell.first.mode for cell in cells} == {"live"}
+    assert len({cell.first.request_id for cell in cells}) == 1
     for cell in cells:
         assert len(cell.skills) == 8
-        assert (cell.skills["start_ns"] >= cell.skills["arrival_ns"]).all()
-        assert (cell.skills["start_ns"].to_numpy()[1:] >= cell.skills["end_ns"].to_numpy()[:-1]).all()
-        assert (cell.skills["start_jitter_ns"] >= 0).all()
-        assert (cell.skills["end_ns"] > cell.skills["start_ns"]).all()
+        assert all(skill.start_ns >= skill.arrival_ns for skill in cell.skills)
+        assert all(later.start_ns >= skill.end_ns for skill, later in pairwise(cell.skills))
+        assert all(skill.due_ns is not None and skill.start_ns >= skill.due_ns for skill in cell.skills)
+        assert all(skill.end_ns > skill.start_ns for skill in cell.skills)
         assert len(cell.token_s) == 48
-        np.testing.assert_allclose(cell.skills["arrival_ns"] / 1e9, cell.token_s[5::6], rtol=0, atol=1e-9)
-        assert cell.skills["text"].str.fullmatch(r"\w+\(\w+(, \w+)?\)").all()
-    assert wait.skills["start_ns"].iloc[0] >= wait.skills["arrival_ns"].iloc[-1]
-    assert list(naive.skills["text"]) == list(wait.skills["text"]) == list(online.skills["text"])
+        np.testing.assert_allclose(cell.complete_s, cell.token_s[5::6], rtol=0, atol=1e-9)
+        assert all(re.fullmatch(r"\w+\(\w+(, \w+)?\)", skill.text) for skill in cell.skills)
+    assert wait.skills[0].start_ns >= wait.skills[-1].arrival_ns
+    assert len({tuple(skill.text for skill in cell.skills) for cell in cells}) == 1
     assert run.manifest["live"]["transport"] == transport
     assert run.manifest["start_jitter"]["starts"] == 24
-    jsonschema.validate(timelines_json(run), SCHEMA)
+    jsonschema.validate(timelines_json(run, cells), SCHEMA)
 
 
 def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: TimelineLive, tmp_path: Path) -> None:
@@ -113,9 +115,9 @@ def test_a_replay_over_loopback_is_executed_by_three_policies_at_once(config: Ti
     check(run, "loopback")
     assert run.manifest["live"]["emulated"] is True
     assert [len(scene.records) for scene in view.scenes] == [3]
-    (note,) = origin_notes(run, timelines_of(run))
+    (note,) = origin_notes(run.manifest, timelines_of(run))
     assert note.startswith("EMULATED tokens over loopback, parsed and executed as they arrive")
-    assert list(timeline_figures(run)) == ["timeline"]
+    assert list(timeline_figures(timelines_of(run), ())) == ["timeline"]
     assert run.samples["warmup"].tolist() == [True, False]
     warm_ns = run.tokens["client_ns"].iloc[:48]
     assert run.manifest["prior"]["mean_s"] == pytest.approx((warm_ns.iloc[-1] - warm_ns.iloc[0]) / 47e9)
@@ -128,7 +130,7 @@ def test_plans_of_a_profile_whose_model_sees_no_picture_say_so(
         profile.write('\n[model]\npictures = "not seen"\n')
     run, view = live(config, tmp_path)
     assert view.scenes[0].title.endswith(", picture not seen, emulated, replay engine")
-    (note,) = origin_notes(run, timelines_of(run))
+    (note,) = origin_notes(run.manifest, timelines_of(run))
     assert note.endswith("skills only take their time. Picture not seen: the plan is not about it.")
     assert note.labels == ("emulated", "picture not seen")  # type: ignore[attr-defined]
 
@@ -146,7 +148,7 @@ def test_a_function_is_called_with_every_skill(config: TimelineLive, tmp_path: P
     acted.clear()
     run, _ = live(config.but(robot=f"call?function={__name__}:act", policies=("naive",)), tmp_path)
     (cell,) = timelines_of(run)
-    assert acted == list(cell.skills["text"])
+    assert acted == [skill.text for skill in cell.skills]
     assert len(acted) == 8
     assert f"skills are carried out by call?function={__name__}:act" in origin_notes(run, [cell])[0]
 
@@ -166,9 +168,9 @@ def test_a_real_model_is_held_to_its_grammar_and_its_pace(
     live = run.manifest["live"]
     assert (live["engine"], live["emulated"], live["dummy"], live["paced_tokens_per_s"]) == ("llama", False, True, 60.0)
     cells = timelines_of(run)
-    assert {(cell.about("emulated"), cell.about("tokens_per_s"), cell.n) for cell in cells} == {(False, 60.0, 2)}
+    assert {(cell.first.emulated, cell.first.tokens_per_s, len(cell)) for cell in cells} == {(False, 60.0, 2)}
     assert (run.tokens.groupby("request_id").size() == 48).all()
-    (note,) = origin_notes(run, cells)
+    (note,) = origin_notes(run.manifest, cells)
     assert note.startswith("LIVE: real tokens over http/as-deployed, paced to 60 tokens/s (the rate is set)")
     assert note.endswith("Dummy weights: what the plan says means nothing.")
     first, second = (frame["text"].str.cat() for _, frame in run.tokens[48:].groupby("request_id"))
@@ -295,19 +297,19 @@ def test_a_board_is_played_in_real_time(fast_board: str, tmp_path: Path) -> None
     view = Watched()
     run = read_run(run_real_time(played, tmp_path / "runs", view))
     cells = timelines_of(run)
-    assert [(cell.about("tokens_per_skill"), cell.policy) for cell in cells] == [
+    assert [(cell.first.tokens_per_skill, cell.policy) for cell in cells] == [
         (length, name) for length in (6, 2) for name in (*THREE, "s2a-clairvoyant")
     ]
-    assert {(cell.about("mode"), cell.about("emulated")) for cell in cells} == {("real-time", True)}
+    assert {(cell.first.mode, cell.first.emulated) for cell in cells} == {("real-time", True)}
     naive, wait, _, clairvoyant = cells[:4]
     # t_i = .05 + i / 20 s at least: a real clock is never early.
-    assert (naive.skills["arrival_ns"].to_numpy() / 1e9 >= 0.05 + np.arange(1, 9) / 20 - 1e-6).all()
+    assert (naive.complete_s >= 0.05 + np.arange(1, 9) / 20 - 1e-6).all()
     assert clairvoyant.mean("start_s") >= 0.05 + 0.4 - 7 * 0.03 - 1e-6  # type: ignore[operator]
-    assert wait.skills["start_ns"].iloc[0] >= wait.skills["arrival_ns"].iloc[-1]
+    assert wait.skills[0].start_ns >= wait.skills[-1].arrival_ns
     assert run.manifest["configuration"]["time"] == "real-time"
     assert run.manifest["start_jitter"]["starts"] == 64
-    assert any("EMULATED, executed in real time" in note for note in origin_notes(run, cells))
-    jsonschema.validate(timelines_json(run), SCHEMA)
+    assert any("EMULATED, executed in real time" in note for note in origin_notes(run.manifest, cells))
+    jsonschema.validate(timelines_json(run, cells), SCHEMA)
 
 
 @pytest.mark.parametrize(

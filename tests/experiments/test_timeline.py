@@ -262,9 +262,9 @@ def test_lambda_that_nothing_can_promise_is_a_warning(tmp_path: Path, monkeypatc
     (found,) = run.manifest["calibrations"].values()
     assert found["caution"] is None
     online = next(cell for cell in timelines_of(run) if cell.policy == "stream-to-act")
-    assert online.about("caution") is None
+    assert online.first.caution is None
     assert online.p_any_stall == 0
-    assert list(online.rows["start_ns"]) == list(online.rows["last_arrival_ns"])
+    assert all(plan.start_ns == plan.last_arrival_ns for plan in online.rows)
 
 
 def test_each_setting_is_a_cell_a_policy(tmp_path: Path) -> None:
@@ -308,7 +308,7 @@ def test_every_online_rule_is_calibrated_for_itself(tmp_path: Path) -> None:
     (case,) = config.cases
     found = run.manifest["calibrations"]
     assert set(found) == {case.setting.name, f"{case.setting.name}/{early}"}
-    cautions = {cell.policy: cell.about("caution") for cell in timelines_of(run)}
+    cautions = {cell.policy: cell.first.caution for cell in timelines_of(run)}
     assert cautions[early] == found[f"{case.setting.name}/{early}"]["caution"]
     assert cautions[f"{early}?caution=1"] == 1
     starts = {cell.policy: cell.mean("start_s") for cell in timelines_of(run)}

@@ -90,7 +90,7 @@ def test_a_camera_that_stalls_is_an_error_not_an_old_frame() -> None:
 def test_changing_the_sink_forgets_the_frames_of_the_other() -> None:
     camera = run(3)
     camera.use(Sink())
-    assert camera.newest() is None
+    assert camera.newest is None
     assert camera.drain() == []
 
 

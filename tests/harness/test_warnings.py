@@ -199,9 +199,9 @@ def test_failures_in_a_row_of_every_client_end_with_a_success_of_any() -> None:
 
 
 def test_what_cannot_be_read_and_packets_lost_by_others_are_no_warning_about_a_run_without_dds() -> None:
-    assert Counters(None, None).warnings_since(Counters(3, 5)) == []
+    assert not [*Counters(None, None).warnings_since(Counters(3, 5))]
     now = Counters.read()
-    assert now.warnings_since(now) == []
+    assert not [*now.warnings_since(now)]
     assert now.receive_buffer_errors is not None
     assert Counters.read(watches_udp=False).receive_buffer_errors is None
 

@@ -86,7 +86,12 @@ def test_detection_costs_nothing_without_a_change_and_saves_stalls_with_one() ->
         policy = replace(policy, caution=calibrate(policy, calibration).caution)
         starts = measure(calm, policy.schedule(calm)).start_regret.mean()
         gaps_s = stalls(policy.schedule(slow))
-        found[detect] = starts, stalled(policy, calm).mean(), stalled(policy, slow).mean(), (gaps_s > 1e-6).sum() / 400
+        found[detect] = (
+            starts,
+            stalled(policy.schedule(calm)).mean(),
+            stalled(policy.schedule(slow)).mean(),
+            (gaps_s > 1e-6).sum() / 400,
+        )
     assert found[True][0] == pytest.approx(found[False][0], abs=0.02)
     assert found[True][1] <= 0.02
     assert found[True][2] < 0.75 * found[False][2]

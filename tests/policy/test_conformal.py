@@ -28,7 +28,7 @@ from s2a_bench.policy.conformal import (
     upper_bound,
 )
 from s2a_bench.policy.estimator import GapPrior
-from s2a_bench.policy.naive import Naive
+from s2a_bench.policy.nominal import Naive
 from s2a_bench.policy.stream_to_act import StreamToAct
 from studies.worlds import World
 
@@ -51,7 +51,7 @@ def test_cautions_are_quarters_to_4_then_coarser_to_32() -> None:
 def test_a_gap_between_skills_that_is_longer_than_a_microsecond_is_a_stall() -> None:
     arrival_s = np.array([[0.0, 0.0], [1 + 0.5e-6, 1 + 2e-6]])
     column = np.ones((2, 1))
-    assert stalled(Naive(), Plans(arrival_s, column, column, column)).tolist() == [False, True]
+    assert stalled(Naive().schedule(Plans(arrival_s, column, column, column))).tolist() == [False, True]
 
 
 def test_a_plan_s_score_is_the_least_caution_from_which_on_it_never_stalls() -> None:
@@ -62,7 +62,7 @@ def test_a_plan_s_score_is_the_least_caution_from_which_on_it_never_stalls() -> 
         alone = take(plans, np.array([column]))
         least = math.inf
         for caution in reversed(GRID):
-            if stalled(replace(policy, caution=caution), alone)[0]:
+            if stalled(replace(policy, caution=caution).schedule(alone))[0]:
                 break
             least = caution
         assert found[column] == least
@@ -164,7 +164,7 @@ def test_among_exchangeable_plans_no_more_stall_than_promised(gaps: Markov | Non
         policy = fitted(calibration)
         policy = replace(policy, caution=calibrate(policy, calibration).caution)
         plans = world.draw(rng, 1000)
-        stalls, count = stalls + int(stalled(policy, plans).sum()), count + 1000
+        stalls, count = stalls + int(stalled(policy.schedule(plans)).sum()), count + 1000
     assert stats.binomtest(stalls, count, 0.01, alternative="greater").pvalue > 0.01
     assert stalls > 0  # not safe by waiting
 

@@ -13,7 +13,7 @@ from pydantic import Field
 from s2a_bench.cli import with_flags
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import POLICIES, PlanShape, Policy, Stepper, policies, policy
-from s2a_bench.policy.naive import Naive, NominalQueue
+from s2a_bench.policy.nominal import Naive, NominalQueue
 from s2a_bench.policy.stream_to_act import StreamToAct
 
 

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Plans, PlanShape, Policy, Start, Stepper, Timing, policy, stepping
-from s2a_bench.policy.naive import NominalQueue
+from s2a_bench.policy.nominal import NominalQueue
 from s2a_bench.policy.schedule import work_conserving
 from s2a_bench.policy.stepping import Stream, follow
-from s2a_bench.policy.wait_then_act import WaitingStepper
 from s2a_bench.testing.policy import EXACT, draw
 
 SKILL = Timing(1.0, 0.8, 1.5)
@@ -82,7 +81,7 @@ class AfterTwo(Policy):
     name: ClassVar[str] = "after-two"
 
     def stepper(self, shape: PlanShape) -> Stepper:
-        return WaitingStepper(min(2, shape.n_skills))
+        return NominalQueue(min(2, shape.n_skills))
 
 
 def test_a_policy_with_a_stepper_alone_decides_for_many_plans() -> None:

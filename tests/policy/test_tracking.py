@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from s2a_bench.policy import Plans, tracking
-from s2a_bench.policy.conformal import stalled, take
+from s2a_bench.policy import Plans, conformal
+from s2a_bench.policy.conformal import TrackedPolicy, stalled, take
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.stream_to_act import EarlyStart, StreamToAct
-from s2a_bench.policy.tracking import TrackedPolicy
 from s2a_bench.stats.seeds import generator
 from studies.worlds import World
 
@@ -39,14 +38,14 @@ def test_arrays_are_plans_one_after_another(policy: StreamToAct) -> None:
         plan = take(plans, np.array([column]))
         assert alone.policy.caution == caution
         np.testing.assert_array_equal(alone.policy.schedule(plan).start_s[:, 0], schedule.start_s[:, column])
-        alone.learn(plan, stalled=bool(stalled(alone.policy, plan)[0]))
+        alone.learn(plan, stalled=bool(stalled(alone.policy.schedule(plan))[0]))
     assert (together.tracker.level, together.policy) == (alone.tracker.level, alone.policy)
 
 
 def test_plans_that_do_not_fit_the_memory_at_once_are_the_same_plans(monkeypatch: pytest.MonkeyPatch) -> None:
     plans, whole, parts = slow(20), begin(), begin()
     cautions, schedule = whole.follow(plans)
-    monkeypatch.setattr(tracking, "AT_ONCE", 6)
+    monkeypatch.setattr(conformal, "AT_ONCE", 6)
     again, in_parts = parts.follow(plans)
     assert again.tolist() == cautions.tolist()
     np.testing.assert_array_equal(in_parts.start_s, schedule.start_s)

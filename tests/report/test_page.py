@@ -133,7 +133,8 @@ def sweep_of(folder: Path, runs: list[tuple[dict[str, Any], Path]], *, cells: in
 
 def test_the_page_has_the_numbers_of_the_tables(computed: Path) -> None:
     page = Page(page_of(computed))
-    table = execution_table(read_run(computed))
+    run = read_run(computed)
+    table = execution_table(timelines_of(run), run.manifest)
     rows = [text for row in table.rows for text in row]
     start = page.cells.index(rows[0])
     assert page.cells[start : start + len(rows)] == rows
@@ -225,8 +226,10 @@ def test_a_sweep_of_timelines_is_shown_as_the_one_run_that_it_amounts_to(tmp_pat
     folder = sweep_of(tmp_path / "sweeps", cells)
     whole = read_run(timeline(tmp_path, profiles=boards, tokens_per_skill=(6, 1)))
     overview, pooled = read_chapters([folder])
-    assert pooled.content.tables["timelines"] == replace(execution_table(whole), provenance=whole.origins.line)
-    assert pooled.content.csvs == timeline_csv(whole)
+    assert pooled.content.tables["timelines"] == replace(
+        execution_table(timelines_of(whole), whole.manifest), provenance=whole.origins.line
+    )
+    assert pooled.content.csvs == timeline_csv(timelines_of(whole))
     assert pooled.run.origins == whole.origins
     assert pooled.content.lanes == page_lanes(timelines_of(whole))
     assert len(overview.content.tables["cells"].rows) == 12

@@ -159,7 +159,7 @@ def test_replies_to_other_clients_are_ignored(join: Join) -> None:
     goal: Any = receive(action.server)
     service = goal._server.send_goal
     guid, number = HEADER.unpack_from(goal._packed, HEADER_AT)
-    response = ros.default(service.reply_type, accepted=False)
+    response = ros.default(service.spec.reply_type, accepted=False)
     service.respond(service.pack(response), Caller(0, (guid ^ 1, number)))
     service.respond(service.pack(response), Caller(0, (guid, number + 7)))
     goal.accept()

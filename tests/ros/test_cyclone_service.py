@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -52,7 +53,7 @@ def test_garbage_is_dropped_and_logged_once(join: Join, caplog: pytest.LogCaptur
 
 
 def test_a_peer_that_leaves_while_it_is_looked_at_is_nobody() -> None:
-    from s2a_bench.ros.dds import _known
+    from s2a_bench.ros.dds import _Endpoint
 
     def errored(_handle: int) -> None:
         raise Exception("Callfunc cqos errored.")  # noqa: TRY002 - as cyclonedds does
@@ -60,7 +61,8 @@ def test_a_peer_that_leaves_while_it_is_looked_at_is_nobody() -> None:
     def wrong(_handle: int) -> None:
         raise Exception("something else")  # noqa: TRY002
 
-    assert _known(errored, 1) is None
-    assert _known(lambda handle: handle, 7) == 7
+    entity = SimpleNamespace(_ref=0)
+    assert _Endpoint(entity, list, errored).endpoint(1) is None
+    assert _Endpoint(entity, list, lambda handle: handle).endpoint(7) == 7
     with pytest.raises(Exception, match="something else"):
-        _known(wrong, 1)
+        _Endpoint(entity, list, wrong).endpoint(1)

@@ -15,8 +15,8 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from s2a_bench.errors import SourceError, TransportError, UsageError
 from s2a_bench.policy import Plans, Policy
 from s2a_bench.policy.arrivals import uniform
+from s2a_bench.policy.nominal import Clairvoyant, WaitThenAct
 from s2a_bench.policy.parameters import build
-from s2a_bench.policy.wait_then_act import Clairvoyant, WaitThenAct
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros import open_middleware
 from s2a_bench.scenario import LEAD, Simulator

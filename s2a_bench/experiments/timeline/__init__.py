@@ -17,7 +17,7 @@ EXPERIMENT = Experiment(
         RunMode("live", f"{HERE}.config:TimelineLive", f"{HERE}.live:run_live", {"live": ANSWERED}),
     ),
     view=f"{HERE}.view.tables:show",
-    cell=f"{HERE}.view.cells:TimelineCell",
+    cell=f"{HERE}.rows:TimelineCell",
     compared=f"{HERE}.view.cells:COMPARED",
     unit="timelines",
 )

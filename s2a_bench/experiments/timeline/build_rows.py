@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from s2a_bench.experiments.cells import COUNT, FLAG, TIME, Metric
-from s2a_bench.experiments.timeline.rows import METRICS, TimelineRow
+from s2a_bench.experiments.timeline.rows import TimelineRow
 from s2a_bench.harness.timelines.cases import PlanSetting
-from s2a_bench.harness.timelines.rows import KEPT_PLANS
+from s2a_bench.harness.timelines.rows import KEPT_PLANS, to_ns
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.conformal import ANY_STALL_S
 from s2a_bench.policy.metrics import measure, peak_jerk, rms_jerk, sparc, speed_profile
 from s2a_bench.policy.schedule import align, least_end, safe_start
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from s2a_bench.policy import Floats
 
 SAMPLE_S: Final = 0.01
@@ -45,65 +41,81 @@ def timeline_rows(
 
     ``caution`` is one lambda, or one a plan. Motion is computed for plans below `KEPT_PLANS`.
     """
-    found = metrics_of(plans, schedule, tolerance_s=tolerance_s)
-    shared = asdict(setting)
-    rows = []
-    for place, request_id in enumerate(request_ids):
-        plan = first_plan + place
-        motion = _motion(schedule, plans.nominal_s, place) if plan < KEPT_PLANS else {}
-        rows.append(
-            TimelineRow(
-                cell=f"{setting.name}/{policy}",
-                policy=policy,
-                **shared,
-                plan=plan,
-                request_id=request_id,
-                requested_ns=requested_ns[place] if requested_ns else 0,
-                caution=caution[place] if isinstance(caution, Sequence) else caution,
-                **{METRICS[name].column: _stored(METRICS[name], values[place]) for name, values in found.items()},
-                **motion,
-            )
-        )
-    return rows
-
-
-def metrics_of(plans: Plans, schedule: Schedule, *, tolerance_s: float) -> dict[str, NDArray[Any]]:
-    """Return the metrics of M timelines without motion: arrays of shape (M,), times in s."""
     arrival_s, nominal_s, least_s = align(plans.arrival_s, plans.nominal_s, plans.least_s)
-    found = measure(plans, schedule)
     safe_s = safe_start(arrival_s, nominal_s)
-    return {
-        **{name: getattr(found, name) for name in METRICS if hasattr(found, name)},
-        "start_s": found.first_action_s,
-        "safe_start_s": safe_s,
-        "last_arrival_s": arrival_s[-1],
-        "safe_end_s": safe_s + nominal_s.sum(axis=0),
-        "least_end_s": least_end(arrival_s, least_s),
-        "p_any_stall": found.longest_stall_s > tolerance_s,
-    }
+    safe_end_s, least_end_s = safe_s + nominal_s.sum(axis=0), least_end(arrival_s, least_s)
+    of_plan = measure(plans, schedule)
+
+    def row(place: int, request_id: str) -> TimelineRow:
+        plan = first_plan + place
+        motion = _motion(schedule, plans.nominal_s, place) if plan < KEPT_PLANS else _Motion()
+        return TimelineRow(
+            cell=f"{setting.name}/{policy}",
+            policy=policy,
+            board=setting.board,
+            title=setting.title,
+            mode=setting.mode,
+            emulated=setting.emulated,
+            tokens_per_s=setting.tokens_per_s,
+            prompt_s=setting.prompt_s,
+            tokens_per_skill=setting.tokens_per_skill,
+            n_skills=setting.n_skills,
+            t_nom_s=setting.t_nom_s,
+            plan=plan,
+            request_id=request_id,
+            requested_ns=requested_ns[place] if requested_ns else 0,
+            caution=caution[place] if isinstance(caution, Sequence) else caution,
+            start_ns=to_ns(of_plan.first_action_s[place]),
+            end_ns=to_ns(of_plan.end_s[place]),
+            safe_start_ns=to_ns(safe_s[place]),
+            last_arrival_ns=to_ns(arrival_s[-1, place]),
+            safe_end_ns=to_ns(safe_end_s[place]),
+            least_end_ns=to_ns(least_end_s[place]),
+            stalls=int(of_plan.stalls[place]),
+            any_stall=bool(of_plan.longest_stall_s[place] > tolerance_s),
+            stall_ns=to_ns(of_plan.stall_s[place]),
+            longest_stall_ns=to_ns(of_plan.longest_stall_s[place]),
+            stall_ratio=share(of_plan.stall_ratio[place]),
+            start_regret=share(of_plan.start_regret[place]),
+            start_regret_elastic=share(of_plan.start_regret_elastic[place]),
+            signed_start_regret=share(of_plan.signed_start_regret[place]),
+            start_regret_of_wait=share(of_plan.start_regret_of_wait[place]),
+            end_regret=share(of_plan.end_regret[place]),
+            end_regret_of_wait=share(of_plan.end_regret_of_wait[place]),
+            end_regret_elastic=share(of_plan.end_regret_elastic[place]),
+            mean_queue_wait_ns=to_ns(of_plan.mean_queue_wait_s[place]),
+            longest_queue_wait_ns=to_ns(of_plan.longest_queue_wait_s[place]),
+            mean_action_age_ns=to_ns(of_plan.mean_action_age_s[place]),
+            oldest_action_ns=to_ns(of_plan.oldest_action_s[place]),
+            speed_distortion=share(of_plan.speed_distortion[place]),
+            fluidity=share(of_plan.fluidity[place]),
+            rms_jerk=motion.rms_jerk,
+            peak_jerk=motion.peak_jerk,
+            sparc=motion.sparc,
+        )
+
+    return [row(place, request_id) for place, request_id in enumerate(request_ids)]
 
 
-def _stored(metric: Metric, value: float) -> int | float | bool:
-    if metric.kind == TIME:
-        return round(float(value) * 1e9)
-    if metric.kind == COUNT:
-        return int(value)
-    if metric.kind == FLAG:
-        return bool(value)
-    # Times are exact to a nanosecond: smaller shares are rounding errors; adding 0.0 turns -0.0 into 0.0.
+def share(value: float) -> float:
+    """Return a share without rounding errors: times are exact to a nanosecond; adding 0.0 turns -0.0 into 0.0."""
     return round(float(value), 9) + 0.0
 
 
-def _motion(schedule: Schedule, nominal_s: Floats, place: int) -> dict[str, float]:
-    """Return jerk and smoothness of one timeline in the model of `speed_profile`; empty if too long or too short."""
+class _Motion(NamedTuple):
+    """Jerk and smoothness of one timeline in the model of `speed_profile`."""
+
+    rms_jerk: float | None = None
+    peak_jerk: float | None = None
+    sparc: float | None = None
+
+
+def _motion(schedule: Schedule, nominal_s: Floats, place: int) -> _Motion:
+    """Return the motion of one timeline, with no values if it is too long or too short."""
     start_s, duration_s, nominal_s = (
         np.ascontiguousarray(values[:, place]) for values in align(schedule.start_s, schedule.duration_s, nominal_s)
     )
     if not SHORTEST_MOTION_S <= start_s[-1] + duration_s[-1] - start_s[0] <= LONGEST_MOTION_S:
-        return {}
+        return _Motion()
     speed = speed_profile(start_s, duration_s, nominal_s, SAMPLE_S)
-    return {
-        "rms_jerk": rms_jerk(speed, SAMPLE_S),
-        "peak_jerk": peak_jerk(speed, SAMPLE_S),
-        "sparc": sparc(speed, SAMPLE_S),
-    }
+    return _Motion(rms_jerk(speed, SAMPLE_S), peak_jerk(speed, SAMPLE_S), sparc(speed, SAMPLE_S))

@@ -1,12 +1,12 @@
 """The rows of a timeline run; their annotations are the metrics: columns, JSON, CSV, tables and comparison follow.
 
-A new metric is a column, and an array of one number a plan under its name in `build_rows.metrics_of`.
+A new metric is a column, and its value of a plan in `build_rows.timeline_rows`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, ClassVar, Final
 
 from s2a_bench.experiments.cells import ANY, HIDDEN, SHARE, TO_ONE, JsonKey, Metric, mean, metrics_of, share
 from s2a_bench.store.schema import Many, NonNegative, Positive, Table, about
@@ -76,6 +76,14 @@ class TimelineRow:
     sparc: Annotated[
         float | None, mean("SPARC", "Spectral arc length: closer to 0 is smoother.", better="higher", bounds=(None, 0))
     ] = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimelineCell(TimelineRow):
+    """A policy in one setting: means over its plans."""
+
+    means: ClassVar[bool] = True
+    plans: Annotated[Many, about("Number of plans that the means are over.")]
 
 
 METRICS: Final = metrics_of(TimelineRow)

@@ -56,12 +56,12 @@ class PlanCase:
 
     @classmethod
     def of(cls, board: Board, shape: PlanShape, mode: str = "virtual") -> PlanCase:
-        of_board, t_nom_s = (board.name, board.title, board.tokens_per_s, board.prompt_s), shape.expected.nominal_s
-        return cls(PlanSetting(*of_board, int(shape.tokens_per_skill), shape.n_skills, t_nom_s, mode), board, shape)
+        rate, tokens, t_nom_s = board.tokens_per_s, int(shape.tokens_per_skill), shape.expected.nominal_s
+        setting = PlanSetting(board.name, board.title, rate, board.prompt_s, tokens, shape.n_skills, t_nom_s, mode)
+        return cls(setting, board, shape)
 
     @property
     def tokens(self) -> int:
-        """Return the number of tokens of a plan."""
         return self.setting.n_skills * self.setting.tokens_per_skill
 
 

@@ -16,8 +16,6 @@ from s2a_bench.transport.defaults import FOLLOWED
 
 
 class PolicyOptions(Options):
-    """The options of whatever compares policies."""
-
     PANEL: ClassVar[str] = "Policies"
 
     policies: Names = option(

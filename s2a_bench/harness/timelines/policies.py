@@ -15,9 +15,8 @@ from s2a_bench.errors import UsageError
 from s2a_bench.harness.timelines.cases import MOST_CV, LearningPlan, PlanCase, PlanSetting
 from s2a_bench.policy import CAUTION, ONLINE, TOLERANCE_S, Floats, Plans, PlanShape, Policy
 from s2a_bench.policy.arrivals import recorded_plans, with_skills
-from s2a_bench.policy.conformal import PLANS, Calibration, Tracker, choose, scores
+from s2a_bench.policy.conformal import PLANS, Calibration, TrackedPolicy, Tracker, choose, scores
 from s2a_bench.policy.estimator import LEAST_CV, PLAN_CV, GapPrior
-from s2a_bench.policy.tracking import TrackedPolicy
 from s2a_bench.stats.seeds import generator
 
 
@@ -28,7 +27,6 @@ class Following:
     shape: PlanShape
     made: dict[str, Policy]
     tracked: dict[str, TrackedPolicy] = field(default_factory=dict)
-    """The trackers of lambda."""
     calibrations: dict[str, Calibration] = field(default_factory=dict)
 
     @property

@@ -34,22 +34,25 @@ def skill_rows(
         plans.arrival_s, plans.nominal_s, plans.least_s, plans.most_s, schedule.start_s, schedule.duration_s
     )
     stall_s = np.vstack([np.zeros(start_s.shape[1]), stalls(schedule)])
-    times_s = {
-        "arrival_ns": arrival_s,
-        "start_ns": start_s,
-        "end_ns": start_s + duration_s,
-        "stall_ns": stall_s,
-        "nominal_ns": nominal_s,
-        "least_ns": least_s,
-        "most_ns": most_s,
-        **({} if due_s is None else {"due_ns": due_s}),
-    }
     rows = []
     for place, request_id in enumerate(request_ids[: max(KEPT_PLANS - first_plan, 0)]):
         for index in range(len(start_s)):
-            text = texts[place][index] if texts else ""
-            times_ns = {name: to_ns(each[index, place]) for name, each in times_s.items()}
-            rows.append(SkillRow(cell, request_id, first_plan + place, index, text, **times_ns))
+            row = SkillRow(
+                cell=cell,
+                request_id=request_id,
+                plan=first_plan + place,
+                index=index,
+                text=texts[place][index] if texts else "",
+                arrival_ns=to_ns(arrival_s[index, place]),
+                start_ns=to_ns(start_s[index, place]),
+                end_ns=to_ns(start_s[index, place] + duration_s[index, place]),
+                stall_ns=to_ns(stall_s[index, place]),
+                nominal_ns=to_ns(nominal_s[index, place]),
+                least_ns=to_ns(least_s[index, place]),
+                most_ns=to_ns(most_s[index, place]),
+                due_ns=None if due_s is None else to_ns(due_s[index, place]),
+            )
+            rows.append(row)
     return rows
 
 

@@ -101,7 +101,7 @@ def _general_keys(family: Family, size: Size, quant: Quant, content: str) -> dic
 
 
 def _write(path: Path, kind: str, keys: dict[str, Any], tensors: list[Tensor], written: Callable[[int], None]) -> None:
-    """Write one file of llama.cpp's architecture ``kind``; it gets its name once it is complete."""
+    """Write one file of llama.cpp's architecture ``kind``."""
     gguf = extras.require("gguf", "model")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

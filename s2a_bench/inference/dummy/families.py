@@ -190,8 +190,9 @@ def model_tensors(
     blank = [] if family.architecture == "qwen2" else [token for token, text in enumerate(texts) if not text]
     tied, width = family.tied and not blank, shape.width
     kind: Kind = quant
-    # llama-quantize keeps the output matrix of a Q4_0 model in Q6_K, if that has blocks of this width
-    last: Kind = kind if quant != "q4_0" else "q8_0" if width % 256 else "q6_k"
+    last: Kind = quant
+    if quant == "q4_0":  # llama-quantize keeps the output matrix in Q6_K, if that has blocks of this width
+        last = "q8_0" if width % 256 else "q6_k"
     yield Tensor("token_embd.weight", (n_vocab, width), last if tied else kind)
     for layer in range(shape.layers):
         block = f"blk.{layer}"

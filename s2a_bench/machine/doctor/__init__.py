@@ -22,8 +22,7 @@ from s2a_bench.store.manifest import RunWarning
 
 Level: TypeAlias = Literal["state", "advice", "warning", "error"]
 LEVELS: tuple[Level, ...] = ("state", "advice", "warning", "error")
-"""State: correct, or a plain fact. Advice: makes results better or steadier. Warning: distorts results. Error: does not
-work."""
+"""State: a plain fact. Advice: makes results better or steadier. Warning: distorts results. Error: does not work."""
 
 COMMAND_TIMEOUT_S = 5.0
 
@@ -75,16 +74,16 @@ class Machine:
             return None
 
     def read_all(self, pattern: str) -> dict[str, str]:
-        found = (str(path.relative_to(self.root)) for path in sorted(self.root.glob(pattern)))
-        return {name: text for name in found if (text := self.read(name)) is not None}
+        names = (str(path.relative_to(self.root)) for path in sorted(self.root.glob(pattern)))
+        return {name: text for name in names if (text := self.read(name)) is not None}
 
 
 Check: TypeAlias = Callable[[Machine], Finding | None]
 
 CHECKS: dict[str, str] = {
-    "python": "s2a_bench.machine.doctor.software:python",
-    "packages": "s2a_bench.machine.doctor.software:packages",
-    "compiler": "s2a_bench.machine.doctor.software:compiler",
+    "python": "s2a_bench.machine.doctor.host:python",
+    "packages": "s2a_bench.machine.doctor.host:packages",
+    "compiler": "s2a_bench.machine.doctor.host:compiler",
     "board": "s2a_bench.machine.doctor.gpu:board",
     "gpu": "s2a_bench.machine.doctor.gpu:gpu",
     "gpu-throttling": "s2a_bench.machine.doctor.gpu:gpu_throttling",
@@ -109,8 +108,8 @@ BEFORE_RUN = "cpus", "cpu-governor", "jetson-clocks", "load", "temperature", "gp
 
 def examine(machine: Machine, checks: Mapping[str, str] = CHECKS) -> list[Finding]:
     """Run the checks (code -> ``module:function``) and return their findings."""
-    found = (resolve_name(check)(machine) for check in checks.values())
-    return [finding for finding in found if finding is not None]
+    results = (resolve_name(check)(machine) for check in checks.values())
+    return [finding for finding in results if finding is not None]
 
 
 def worst(findings: Iterable[Finding]) -> Level:

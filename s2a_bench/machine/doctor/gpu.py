@@ -108,7 +108,7 @@ def gpu_throttling(machine: Machine) -> Finding | None:  # noqa: ARG001 - NVML k
                 bits.append(lib.nvmlDeviceGetCurrentClocksThrottleReasons(card))
     if not bits:
         return None
-    if reasons := {reason for bit, reason in TOO_HOT.items() for found in bits if found & bit}:
+    if reasons := {reason for bit, reason in TOO_HOT.items() for set_bits in bits if set_bits & bit}:
         fix = "cool it, see nvidia-smi -q -d PERFORMANCE, or lower its limit: sudo nvidia-smi -pl WATTS"
         return Finding("gpu-throttling", "warning", f"the GPU is slowed down: {', '.join(sorted(reasons))}", fix)
     return Finding("gpu-throttling", "state", "the GPU is not slowed down")

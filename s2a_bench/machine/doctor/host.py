@@ -1,12 +1,18 @@
-"""Checks of the computer: its CPUs and their clock, memory, disk, socket buffers, and cameras."""
+"""Checks of the computer: Python, packages, compiler; CPUs and their clock, memory, disk, socket buffers, cameras."""
 
 from __future__ import annotations
 
 import os
+import platform
+import re
 import shutil
+from importlib.metadata import PackageNotFoundError, requires, version
 
+from packaging.requirements import Requirement
+
+from s2a_bench import __version__, extras
 from s2a_bench.machine.doctor import Finding, Machine
-from s2a_bench.machine.doctor.gpu import is_jetson
+from s2a_bench.machine.doctor.gpu import GIB, is_jetson
 
 CPU = "sys/devices/system/cpu"
 HOT_MARGIN_C = 5
@@ -14,7 +20,6 @@ HOT_MARGIN_C = 5
 GOOD_CLOCKS = ("tsc", "arch_sys_counter")
 """Clock sources that are read without a system call."""
 
-GIB = 1 << 30
 FULL_MODEL_BYTES = 6 * GIB
 """MiniCPM-V 2.6 at 4 bits (4.4 GiB), its vision tower (1 GiB), and the cache of a 4096-token context."""
 LEAST_DISK_BYTES = 1 * GIB
@@ -24,9 +29,68 @@ RMEM_WANTED = 4 << 20
 """Bytes of receive buffer for a large picture's fragments while the reader is busy (docs/latency.md)."""
 
 
+def python(machine: Machine) -> Finding:
+    release = re.search(r'^PRETTY_NAME="?([^"\n]+)', machine.read("etc/os-release") or "", re.MULTILINE)
+    system = f"{release[1]}, " if release else ""
+    message = f"s2a-bench {__version__}, Python {platform.python_version()} on {platform.machine()}"
+    return Finding("python", "state", f"{message}; {system}Linux {platform.release()}")
+
+
+def packages(machine: Machine) -> Finding:  # noqa: ARG001 - the packages of this interpreter
+    try:
+        stated = [Requirement(text) for text in requires("s2a-bench") or ()]
+    except PackageNotFoundError:
+        stated = []
+    needed = [each for each in stated if _applies(each)]
+    missing, purposes = [], extras.purposes()
+    for extra in purposes:
+        added = [each for each in stated if _applies(each, extra) and not _applies(each)]
+        if all(installed(each.name) for each in added):
+            needed += added
+        else:
+            missing.append(extra)
+    if wrong := [problem for each in needed if (problem := _problem(each))]:
+        return Finding("packages", "error", "; ".join(wrong), "make setup")
+    message = f"{len(needed)} requirements, all met"
+    if not missing:
+        return Finding("packages", "state", message)
+    message += "; without the extras " + ", ".join(f"{extra} ({purposes[extra]})" for extra in missing)
+    return Finding("packages", "state", message, extras.how_to_install(*missing))
+
+
+def _applies(requirement: Requirement, extra: str = "") -> bool:
+    return requirement.marker is None or requirement.marker.evaluate({"extra": extra})
+
+
+def installed(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return ""
+
+
+def _problem(requirement: Requirement) -> str:
+    if not (release := installed(requirement.name)):
+        return f"{requirement.name} is missing"
+    fits = requirement.specifier.contains(release, prereleases=True)
+    return "" if fits else f"{requirement.name} is {release}, not {requirement.specifier}"
+
+
+def compiler(machine: Machine) -> Finding:
+    name = next((name for name in ("c++", "g++", "clang++") if machine.which(name)), None)
+    if name is None:
+        message = "no C++ compiler: fine while llama-cpp-python stays as it is installed"
+        return Finding("compiler", "advice", message, "sudo apt install build-essential")
+    first = (machine.run([name, "--version"]) or name).splitlines()[0]
+    cuda = re.search(r"release ([\d.]+)", machine.run(["nvcc", "--version"]) or "") if machine.which("nvcc") else None
+    return Finding("compiler", "state", first + (f"; CUDA {cuda[1]}" if cuda else "; no nvcc"))
+
+
 def cpus(machine: Machine) -> Finding | None:
     """Compare the CPUs this process may use with the online ones: affinity, and the cgroup's quota."""
-    online = len(_listed(machine.read(f"{CPU}/online"))) or len(machine.cpus)
+    parts = (part.partition("-") for part in (machine.read(f"{CPU}/online") or "").split(","))
+    counts = (int(last or first) + 1 - int(first) for first, _, last in parts if first.isdecimal())  # of 0-3,7
+    online = sum(counts) or len(machine.cpus)
     message = f"{len(machine.cpus)} of {online} CPUs may be used"
     if (quota := cgroup_quota(machine)) is not None and quota < len(machine.cpus):
         message += f", but the cgroup stops this process after {quota:g} CPUs' worth of time: jumps of up to 100 ms"
@@ -48,15 +112,15 @@ def cgroup_quota(machine: Machine) -> float | None:
 
 
 def governor(machine: Machine) -> Finding | None:
-    found = machine.read_all(f"{CPU}/cpu[0-9]*/cpufreq/scaling_governor")
-    if not found:
+    governors = machine.read_all(f"{CPU}/cpu[0-9]*/cpufreq/scaling_governor")
+    if not governors:
         return None
     if is_jetson(machine):
-        return Finding("cpu-governor", "state", f"{', '.join(sorted(set(found.values())))}; see jetson-clocks")
-    if slow := sorted(set(found.values()) - {"performance"}):
+        return Finding("cpu-governor", "state", f"{', '.join(sorted(set(governors.values())))}; see jetson-clocks")
+    if slow := sorted(set(governors.values()) - {"performance"}):
         message = f"the CPU governor is {', '.join(slow)}: the clock changes while measuring"
         return Finding("cpu-governor", "warning", message, "sudo cpupower frequency-set -g performance")
-    return Finding("cpu-governor", "state", f"performance on {len(found)} CPUs")
+    return Finding("cpu-governor", "state", f"performance on {len(governors)} CPUs")
 
 
 def turbo(machine: Machine) -> Finding | None:
@@ -127,15 +191,6 @@ def clock_source(machine: Machine) -> Finding | None:
     better = next((name for name in GOOD_CLOCKS if name in available), None)
     fix = f"echo {better} | sudo tee /{folder}/current_clocksource" if better else "dmesg | grep tsc shows the reason"
     return Finding("clock-source", "warning", f"{source}: reading the time is slow, and every mark does it", fix)
-
-
-def _listed(text: str | None) -> list[int]:
-    found: list[int] = []
-    for part in (text or "").split(","):
-        first, _, last = part.partition("-")
-        if first.isdecimal():
-            found += range(int(first), int(last or first) + 1)
-    return found
 
 
 def memory(machine: Machine) -> Finding | None:

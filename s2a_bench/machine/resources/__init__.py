@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pkgutil import resolve_name
-from typing import Final, Protocol
+from typing import Annotated, Final, Protocol, get_args, get_origin, get_type_hints
 
 from s2a_bench.errors import S2AError
 from s2a_bench.facts import Fact
@@ -20,27 +20,27 @@ from s2a_bench.store.schema import Table
 class ResourceRow:
     """One reading of one reader; ``cost_ns`` is the time that reading took, ``at_ns`` (CLOCK_MONOTONIC) its middle.
 
-    Columns whose names end in ``_cpu_ns`` or ``_energy_j`` are counters; the others are values of the moment.
-    ``client`` is the harness, ``server`` all servers together; ``*_busy`` are shares from 0 to 1.
+    The others have the unit and the meaning of the fact of that name. Those whose names end in ``_cpu_ns`` or
+    ``_energy_j`` are counters, the rest values of the moment; ``*_busy`` are shares from 0 to 1.
     """
 
     at_ns: int
     reader: str
     cost_ns: int
-    client_cpu_ns: int | None = None
-    server_cpu_ns: int | None = None
-    client_rss_bytes: int | None = None
-    server_rss_bytes: int | None = None
-    memory_available_bytes: int | None = None
-    cpu_busy: float | None = None
-    package_energy_j: float | None = None
-    gpu_busy: float | None = None
-    gpu_memory_bytes: int | None = None
-    gpu_power_w: float | None = None
-    gpu_energy_j: float | None = None
-    gpu_temperature_c: float | None = None
-    gpu_clock_hz: float | None = None
-    board_power_w: float | None = None
+    client_cpu_ns: Annotated[int | None, "ns", "CPU time of the harness"] = None
+    server_cpu_ns: Annotated[int | None, "ns", "CPU time of all servers of ours"] = None
+    client_rss_bytes: Annotated[int | None, "bytes", "memory of the harness, largest value"] = None
+    server_rss_bytes: Annotated[int | None, "bytes", "memory of all servers of ours, largest value"] = None
+    memory_available_bytes: Annotated[int | None, "bytes", "memory that the machine has left, mean"] = None
+    cpu_busy: Annotated[float | None, "", "busy share of all CPUs, mean"] = None
+    package_energy_j: Annotated[float | None, "J", "energy of the CPU packages"] = None
+    gpu_busy: Annotated[float | None, "", "busy share of the GPUs, mean"] = None
+    gpu_memory_bytes: Annotated[int | None, "bytes", "memory in use on the GPUs, largest value"] = None
+    gpu_power_w: Annotated[float | None, "W", "power of the GPUs, mean"] = None
+    gpu_energy_j: Annotated[float | None, "J", "energy of the GPUs"] = None
+    gpu_temperature_c: Annotated[float | None, "°C", "temperature of the GPUs, largest value"] = None
+    gpu_clock_hz: Annotated[float | None, "Hz", "clock of the GPUs, mean"] = None
+    board_power_w: Annotated[float | None, "W", "power at the board's input, mean"] = None
 
 
 RESOURCES: Final[Table[ResourceRow]] = Table("resources", ResourceRow)
@@ -48,21 +48,9 @@ RESOURCES: Final[Table[ResourceRow]] = Table("resources", ResourceRow)
 BOARD_ENERGY_J = Fact("board_energy_j", "J", "energy at the board's input")
 ENERGY_J = Fact("energy_j", "J", "energy of the board, else of the GPUs and CPU packages that can be read")
 POWER_W = Fact("power_w", "W", "`energy_j` over the time of the request")
+_COLUMNS = get_type_hints(ResourceRow, include_extras=True).items()
 SPENT: Final = (
-    Fact("client_cpu_ns", "ns", "CPU time of the harness"),
-    Fact("server_cpu_ns", "ns", "CPU time of all servers of ours"),
-    Fact("client_rss_bytes", "bytes", "memory of the harness, largest value"),
-    Fact("server_rss_bytes", "bytes", "memory of all servers of ours, largest value"),
-    Fact("memory_available_bytes", "bytes", "memory that the machine has left, mean"),
-    Fact("cpu_busy", "", "busy share of all CPUs, mean"),
-    Fact("package_energy_j", "J", "energy of the CPU packages"),
-    Fact("gpu_busy", "", "busy share of the GPUs, mean"),
-    Fact("gpu_memory_bytes", "bytes", "memory in use on the GPUs, largest value"),
-    Fact("gpu_power_w", "W", "power of the GPUs, mean"),
-    Fact("gpu_energy_j", "J", "energy of the GPUs"),
-    Fact("gpu_temperature_c", "°C", "temperature of the GPUs, largest value"),
-    Fact("gpu_clock_hz", "Hz", "clock of the GPUs, mean"),
-    Fact("board_power_w", "W", "power at the board's input, mean"),
+    *(Fact(name, *get_args(hint)[1:]) for name, hint in _COLUMNS if get_origin(hint) is Annotated),
     *(BOARD_ENERGY_J, ENERGY_J, POWER_W),
 )
 """The facts of a request from the readers, by the names of the columns."""

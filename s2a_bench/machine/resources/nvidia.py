@@ -11,7 +11,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 from s2a_bench import extras
@@ -36,14 +36,14 @@ class Nvml(Reader):
     def __init__(self, pids: Sequence[int] = ()) -> None:  # noqa: ARG002 - a GPU's figures are the whole GPU's
         """Load the driver's library and find what every GPU can report; raises Unreadable without library or GPU."""
         try:
-            pynvml = self._nvml = extras.require("pynvml", "nvidia")
+            pynvml = extras.require("pynvml", "nvidia")
         except MissingExtra as error:
             raise Unreadable(str(error)) from error
         self._failed = pynvml.NVMLError
-        self._open = False
+        self._opened = ExitStack()
         try:
             pynvml.nvmlInit()
-            self._open = True
+            self._opened.callback(pynvml.nvmlShutdown)
             self._gpus = [pynvml.nvmlDeviceGetHandleByIndex(place) for place in range(pynvml.nvmlDeviceGetCount())]
             names = [pynvml.nvmlDeviceGetName(gpu) for gpu in self._gpus]
             driver = pynvml.nvmlSystemGetDriverVersion()
@@ -64,10 +64,8 @@ class Nvml(Reader):
         return values
 
     def close(self) -> None:
-        if self._open:
-            self._open = False
-            with suppress(self._failed):
-                self._nvml.nvmlShutdown()
+        with suppress(self._failed):
+            self._opened.close()
 
     def _answers(self, query: Query) -> bool:
         """Return True if there is a GPU and all of them answer; boards measure different things."""
@@ -92,12 +90,12 @@ def _queries(nvml: Any) -> dict[str, tuple[Callable[[list[float]], float], Query
 def parse_tegrastats(line: str) -> dict[str, float]:
     """Parse a line of tegrastats (JetPack 4 to 6); a rail's first figure is the current value, its second a mean."""
     values: dict[str, float] = {}
-    if found := GPU.search(line):
-        values["gpu_busy"] = int(found[1]) / 100
-        if found[2]:
-            values["gpu_clock_hz"] = int(found[2]) * 1e6
-    if found := TEMPERATURE.search(line):
-        values["gpu_temperature_c"] = float(found[1])
+    if match := GPU.search(line):
+        values["gpu_busy"] = int(match[1]) / 100
+        if match[2]:
+            values["gpu_clock_hz"] = int(match[2]) * 1e6
+    if match := TEMPERATURE.search(line):
+        values["gpu_temperature_c"] = float(match[1])
     board_w = board_power({name: int(milliwatts) / 1e3 for name, milliwatts in RAIL.findall(line)})
     return values if board_w is None else {**values, "board_power_w": board_w}
 

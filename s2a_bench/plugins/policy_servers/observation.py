@@ -94,14 +94,14 @@ class ExternalServer(toml_file.TomlTable):
 
     def actions_in(self, answer: Any) -> Any:
         """Return the actions of an answer, as the server has them; raises RequestFailed for an answer without."""
-        found = answer
+        value = answer
         for key in filter(None, self.answer.split(".")):
-            inner = dict(enumerate(found)) if isinstance(found, list) and key.isdecimal() else found
-            place = int(key) if inner is not found else key
-            if not isinstance(inner, dict) or place not in inner:
-                raise RequestFailed(f"an answer without {self.answer}: {_keys(found)}")
-            found = inner[place]
-        return found
+            by_key = dict(enumerate(value)) if isinstance(value, list) and key.isdecimal() else value
+            place = int(key) if by_key is not value else key
+            if not isinstance(by_key, dict) or place not in by_key:
+                raise RequestFailed(f"an answer without {self.answer}: {_keys(value)}")
+            value = by_key[place]
+        return value
 
 
 class Template:
@@ -128,9 +128,8 @@ class Template:
     ) -> dict[str, Any]:
         """Return the observation, if possible without copies of ``pictures``, uint8 (H, W, 3) or (n,).
 
-        ``names`` are those of the pictures that the server reads, in its order.
-
-        Raises RequestFailed for a key without its picture or state, and for a value without a placeholder.
+        ``names`` are those of the pictures that the server reads, in its order. Raises RequestFailed for a key without
+        its picture or state, and for a value without a placeholder.
         """
         if len(pictures) > self.pictures:
             raise RequestFailed(f"`template` {self.name} has places for {self.pictures} pictures, not {len(pictures)}")

@@ -42,8 +42,9 @@ class PolicyTransport(Transport[P]):
 
     def capabilities(self, choice: Choice[P]) -> Capabilities[P]:
         options, template = choice.options, self.template(choice.options)
-        pixels = ("raw", "png", "jpeg")[: 3 if template.server.image_maps else 1] if options.url else self.payloads
-        payloads = self.payloads[1:] if template.encoded else pixels
+        payloads = self.payloads[1:] if template.encoded else self.payloads
+        if options.url and not template.encoded:
+            payloads = ("raw", "png", "jpeg") if template.server.image_maps else ("raw",)
         return Capabilities(options, payloads, self.answer_kinds, template.accepts_state, self.facts)
 
     def require(self, choice: Choice[P]) -> None:

@@ -69,8 +69,6 @@ class _DrainingClient(ActionClient):  # type: ignore[misc]
 
 
 class RclpyActionClient:
-    """Events are taken on the consuming thread; sending and cancelling may happen on any."""
-
     def __init__(self, node: SpinningNode, name: str, type_name: str, version: str) -> None:
         self._node, self._type, self._version = node, type_name, version
         self._action = interface_class(type_name)

@@ -148,7 +148,6 @@ class RclpyMiddleware:
         ]
 
     def service(self, name: str, type_name: str, answer: Callable[[Any], Any], qos: QoS = SERVICE_QOS) -> None:
-        """Create a service; a request for which ``answer`` raises is logged by the node, and not answered."""
         cls = interface_class(type_name)
 
         def callback(request: Any, _response: Any) -> Any:

@@ -160,8 +160,6 @@ class _PullingServer(ActionServer):  # type: ignore[misc]
 
 
 class RclpyActionServer:
-    """Goals are taken, decided and ended on the consuming threads; cancels and results have a thread here."""
-
     def __init__(self, node: SpinningNode, name: str, type_name: str, result_timeout_s: float, version: str) -> None:
         """Create the server of the action ``/name`` in the workspace's version; raises MissingInterface for another."""
         self._node, self._type = node, type_name

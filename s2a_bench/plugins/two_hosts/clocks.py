@@ -72,10 +72,7 @@ class Exchange:
 
     @staticmethod
     def of(trace: Trace) -> Exchange:
-        """Read the exchange that a request is, from its last byte packed to its first piece seen.
-
-        Raises RequestFailed for a report without marks.
-        """
+        """Read a request as an exchange, last byte packed to first piece seen; raises RequestFailed without marks."""
         remote = trace.remote
         if remote is None or not remote.marks:
             raise RequestFailed("the server reported no marks, so that its clock cannot be compared with this host's")
@@ -117,10 +114,7 @@ class Offset:
         self._exchanges.append(exchange)
 
     def over(self, *times_ns: int) -> Interval:
-        """Return an interval that holds the offset at each of these times, and between them.
-
-        Raises ClockMoved if the exchanges around one of them contradict each other.
-        """
+        """Return an interval that holds the offset at these times, and between them; raises ClockMoved if none can."""
         return reduce(Interval.__or__, map(self._at, times_ns))
 
     def _at(self, at_ns: int) -> Interval:
@@ -147,8 +141,8 @@ def interval_at(at_ns: int, exchanges: Sequence[Exchange]) -> Interval:
     pairs = [*pairwise(upper), *pairwise(lower), *product(upper, lower)]
     lines = [(one, (other[1] - one[1]) / (other[0] - one[0])) for one, other in pairs if one[0] != other[0]]
     lines += [(point, rate) for point in (*upper, *lower) for rate in (-RATE, RATE)]
-    found = np.array([(bound - rate * time, rate) for (time, bound), rate in lines if abs(rate) <= RATE])
-    at, rate = found[:, :1], found[:, 1:]
+    corners = np.array([(bound - rate * time, rate) for (time, bound), rate in lines if abs(rate) <= RATE])
+    at, rate = corners[:, :1], corners[:, 1:]
     over, under = at + rate * above[:, 0] - above[:, 1], below[:, 1] - at - rate * below[:, 0]
     beyond = np.maximum(over.max(axis=1), under.max(axis=1))
     if beyond.min() > ROUNDING_NS / 2:
@@ -179,10 +173,8 @@ class RemoteClock:
     def __init__(self, exchange: Callable[[str], Trace], offsets: dict[str, Any] | None, system: str = "") -> None:
         """``exchange`` makes a request for its marks alone; ``offsets``, by clock, are those that others estimate too.
 
-        Without ``offsets`` nothing is exchanged, and the requests alone bound the offset, more widely.
-
-        ``exchange`` raises S2AError; its argument is ``system``, one of `WALL_CLOCKS` or "", where the
-        server's wall clock is wanted.
+        Without ``offsets`` nothing is exchanged: the requests alone bound the offset, more widely. ``exchange`` raises
+        S2AError; its argument is ``system``, one of `WALL_CLOCKS`, where the server's wall clock is wanted, else "".
         """
         self._exchange, self._system = exchange, system
         self._exchanges = offsets is not None

@@ -32,7 +32,6 @@ STEP_S, MEMORY_S, SYNTHETIC_S = 0.1, 1.0, 600.0
 OFF, DELAY_OFF_MS = 0.05, 0.3
 """By how much an emulated link may be off its profile: a share of its rate and delay, and in ms of each delay."""
 KEYS: Final = {"delay": "delay_ms", "jitter": "jitter_ms", "up": "up_mbps", "down": "down_mbps"}
-"""Short names of keys in text."""
 
 Rate = Annotated[float, Field(gt=0, le=1e6)]
 Delay = Annotated[float, Field(ge=0, le=60_000)]
@@ -98,7 +97,6 @@ class LinkProfile(TomlTable):
     queue_ms: Annotated[float, Field(gt=0, le=60_000)] = 1000.0
     """What waits longer than this for the rate is lost, as in a router's full buffer."""
     rate_cv: Annotated[float, Field(ge=0, le=2)] = 0.0
-    """Spread of a synthetic rate."""
     outage_every_s: Annotated[float, Field(ge=0, le=1e6)] = 0.0
     """Mean time between synthetic outages; 0: none."""
     outage_s: Annotated[list[Annotated[float, Field(ge=0, le=60)]], Field(min_length=2, max_length=2)] = Field([1, 1])
@@ -121,7 +119,7 @@ class LinkProfile(TomlTable):
 
     def _direction(self, name: str) -> Direction:
         mbps, mahimahi = getattr(self, f"{name}_mbps"), getattr(self, f"{name}_trace")
-        rate, seed = mbps or math.inf, 2 * self.seed + (name == "down")
+        rate, seed = mbps or math.inf, 2 * self.seed + (1 if name == "down" else 0)
         steps: list[Step] = []
         period_s = 0.0
         if self.trace:
@@ -152,7 +150,6 @@ def bound_s(link: tuple[Direction, Direction], bytes_up: float, bytes_first_down
 
 
 def published() -> dict[str, LinkProfile]:
-    """Return the shipped profiles by name."""
     tables = loads(PUBLISHED.read_text(encoding="utf-8"), str(PUBLISHED))
     return {
         name: checked(LinkProfile, {"name": name} | table, f"{PUBLISHED}: {name}") for name, table in tables.items()
@@ -179,7 +176,8 @@ def load_link(text: str) -> LinkProfile:
         raise UsageError(f"`link`: {none_of(first, known, ', and no file (.toml, .csv) and no KEY=VALUE')}")
     for pair in pairs:
         values |= _pair(pair)
-    return checked(LinkProfile, {"name": text, **values, **({"name": text} if pairs else {})}, "`link`")
+    named = {"name": text} | values
+    return checked(LinkProfile, named | {"name": text} if pairs else named, "`link`")
 
 
 def _pair(text: str) -> dict[str, Any]:

@@ -35,7 +35,6 @@ class HostOptions(Options):
 @dataclass(frozen=True)
 class TwoHosts(Surroundings):
     profile: LinkProfile | None = None
-    """Of the link, if one is emulated."""
     system: str = ""
     """What bounds the wall clocks of both hosts, one of `WALL_CLOCKS`, or nothing."""
 

@@ -25,10 +25,10 @@ LISTEN: Final = "0A"
 
 def endpoint_of(text: str) -> tuple[str, str, int]:
     """Return protocol, host and port of an endpoint as ``tcp/127.0.0.1:7447``; raises UsageError."""
-    found = ENDPOINT.fullmatch(text)
-    if not found or not 0 < int(found[3]) < 2**16:
+    match = ENDPOINT.fullmatch(text)
+    if not match or not 0 < int(match[3]) < 2**16:
         raise UsageError(f"router: '{text[:100]}' should look like {ROUTER}")
-    return found[1], found[2].strip("[]"), int(found[3])
+    return match[1], match[2].strip("[]"), int(match[3])
 
 
 def listens(endpoint: str) -> bool:
@@ -43,17 +43,15 @@ def listens(endpoint: str) -> bool:
     return True
 
 
-def may_host(endpoint: str) -> bool:
-    """Return whether a server of ours may be the router there without authentication: on loopback only."""
-    protocol, host, _ = endpoint_of(endpoint)
-    return protocol == "tcp" and is_loopback(host)
-
-
 def to_host(endpoint: str) -> str:
-    """Return where a new server of ours is the router: at a free port without ``endpoint``, "" if it is a client."""
+    """Return where a new server of ours is the router: at a free port without ``endpoint``, "" if it is a client.
+
+    Without authentication it is so on loopback only.
+    """
     if not endpoint:
         return free_endpoint()
-    return "" if listens(endpoint) or not may_host(endpoint) else endpoint
+    protocol, host, _ = endpoint_of(endpoint)
+    return endpoint if protocol == "tcp" and is_loopback(host) and not listens(endpoint) else ""
 
 
 def free_endpoint() -> str:

@@ -23,7 +23,7 @@ from s2a_bench.plugins.zenoh.node import Bell, Node, SampleQueue, direct, give_w
 from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, Offer, QoS, Tuning
 from s2a_bench.ros.action import ActionNode
 from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, serialise
-from s2a_bench.ros.service import ClientEnd, LogOnce, ServiceEnd, awaited
+from s2a_bench.ros.service import ClientEnd, LogOnce, ServiceEnd, ServiceSpec, awaited
 
 CACHED_AT_MOST: Final = 1000
 """What a latched topic that keeps all keeps."""
@@ -133,7 +133,6 @@ class ZenohSubscription:
         return deserialise(packed, self._type_name, self._version)
 
     def announced(self) -> int:
-        """Count the publishers of the type, those of other versions too, which do not reach us."""
         return sum(1 for _ in self._node.peers(names.PUBLISHER, self._seen.entity))
 
     def matched(self) -> int:
@@ -152,25 +151,14 @@ class QueryOrigin:
 class ZenohServiceServer(ServiceEnd[QueryOrigin]):
     body_at = CDR_HEADER
 
-    def __init__(
-        self,
-        node: Node,
-        name: str,
-        type_name: str,
-        version: str,
-        bell: Bell,
-        qos: QoS,
-        most_bytes: int,
-    ) -> None:
-        """Declare the queryable of ``/name``, then announce it; ``bell`` is rung by what arrives.
+    def __init__(self, node: Node, spec: ServiceSpec, bell: Bell, qos: QoS, most_bytes: int) -> None:
+        """Declare the queryable, then announce it; ``bell`` is rung by what arrives.
 
         Requests of ``most_bytes`` together may wait, with 0 as many as an inbox holds.
         """
-        self.hashed_type = type_name
-        self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
-        self._node, self._name, self._version = node, name, version
-        self._key = node.key(name, type_name, version)
-        self._inbox: SampleQueue[zenoh.Query] = SampleQueue(name, bell, most_bytes=most_bytes)
+        self.spec, self._node = spec, node
+        self._key = node.key(spec.name, spec.type_name, spec.version)
+        self._inbox: SampleQueue[zenoh.Query] = SampleQueue(spec.name, bell, most_bytes=most_bytes)
         self._once = LogOnce(_log)
         held = ref(self._inbox)
 
@@ -179,9 +167,9 @@ class ZenohServiceServer(ServiceEnd[QueryOrigin]):
             if inbox is None or not inbox.put(query, len(query.payload or b"")):
                 query.drop()
 
-        with refusals(name):
+        with refusals(spec.name):
             self._queryable = node.session.declare_queryable(self._key, direct(put), complete=True)
-        self._seen = node.announce(names.SERVICE, name, type_name, version, qos)
+        self._seen = node.announce(names.SERVICE, spec.name, spec.type_name, spec.version, qos)
 
     def arrived(self) -> Iterator[tuple[memoryview, QueryOrigin]]:
         """Take what has arrived, a bounded number; drop queries that are not rmw_zenoh's and log the first."""
@@ -191,7 +179,7 @@ class ZenohServiceServer(ServiceEnd[QueryOrigin]):
                 sequence, _, gid = names.attached(attachment.to_bytes() if attachment else b"")
             except TransportError as error:
                 query.drop()
-                self._once.warning("", "%s: dropped a request: %s", self._name, error)
+                self._once.warning("", "%s: dropped a request: %s", self.spec.name, error)
             else:
                 yield memoryview(payload.to_bytes() if payload else b""), QueryOrigin(query, sequence, gid)
 
@@ -199,10 +187,10 @@ class ZenohServiceServer(ServiceEnd[QueryOrigin]):
         caller.query.drop()
 
     def pack(self, body: Any) -> bytearray:
-        return serialise(body, self.reply_type, self._version, padded=False)
+        return serialise(body, self.spec.reply_type, self.spec.version, padded=False)
 
     def unpack(self, packed: memoryview) -> Any:
-        return deserialise(packed, self.request_type, self._version)
+        return deserialise(packed, self.spec.request_type, self.spec.version)
 
     def unreached(self) -> Iterator[str]:
         own = self._seen.entity
@@ -210,7 +198,7 @@ class ZenohServiceServer(ServiceEnd[QueryOrigin]):
 
     def respond(self, packed: bytearray, caller: QueryOrigin) -> None:
         attachment = names.attachment(caller.sequence, caller.gid)
-        with refusals(self._name):
+        with refusals(self.spec.name):
             try:
                 caller.query.reply(self._key, packed, attachment=attachment, express=True)
             finally:
@@ -221,27 +209,25 @@ class ZenohServiceServer(ServiceEnd[QueryOrigin]):
 class ZenohServiceClient(ClientEnd):
     body_at = CDR_HEADER
 
-    def __init__(self, node: Node, name: str, type_name: str, version: str, bell: Bell) -> None:
-        self.request_type, self.reply_type = type_name + "_Request", type_name + "_Response"
-        self.hashed_type = type_name
-        self._node, self._name, self._version = node, name, version
-        self._inbox: SampleQueue[tuple[bytes, Any]] = SampleQueue(name, bell)
-        with refusals(name):
+    def __init__(self, node: Node, spec: ServiceSpec, bell: Bell) -> None:
+        self.spec, self._node = spec, node
+        self._inbox: SampleQueue[tuple[bytes, Any]] = SampleQueue(spec.name, bell)
+        with refusals(spec.name):
             self._querier = node.session.declare_querier(
-                node.key(name, type_name, version),
+                node.key(spec.name, spec.type_name, spec.version),
                 target=zenoh.QueryTarget.ALL_COMPLETE,
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=ANSWER_S,
                 congestion_control=zenoh.CongestionControl.BLOCK,
                 express=True,
             )
-        self._seen = node.announce(names.CLIENT, name, type_name, version, SERVICE_QOS)
+        self._seen = node.announce(names.CLIENT, spec.name, spec.type_name, spec.version, SERVICE_QOS)
 
     def pack(self, body: Any) -> bytearray:
-        return serialise(body, self.request_type, self._version, padded=False)
+        return serialise(body, self.spec.request_type, self.spec.version, padded=False)
 
     def unpack(self, packed: memoryview) -> Any:
-        return deserialise(packed, self.reply_type, self._version)
+        return deserialise(packed, self.spec.reply_type, self.spec.version)
 
     def call(self, packed: bytearray, goal_id: bytes) -> None:
         """Send a request that concerns ``goal_id``; the first reply to it counts."""
@@ -259,7 +245,7 @@ class ZenohServiceClient(ClientEnd):
             if inbox is not None and not answered:
                 inbox.put((goal_id, None), 0)
 
-        with refusals(self._name):
+        with refusals(self.spec.name):
             handler = zenoh.handlers.Callback(put, end, indirect=False)
             self._querier.get(handler, payload=packed, attachment=self._seen.attachment())
         give_way()
@@ -272,7 +258,7 @@ class ZenohServiceClient(ClientEnd):
         """Return whether a server is there: one of our version that is reached, or only others."""
         hashes = [*self._node.peers(names.SERVICE, self._seen.entity)]
         if self._seen.entity.type_hash in hashes:
-            with refusals(self._name):
+            with refusals(self.spec.name):
                 return bool(self._querier.matching_status.matching)
         return bool(hashes)
 
@@ -312,13 +298,12 @@ class ZenohMiddleware(ActionNode[QueryOrigin, Bell]):
         return self._node.offers()
 
     def service_end(
-        self, name: str, type_name: str, version: str, waiter: Bell, qos: QoS | None = None, *, pictures: bool = False
+        self, spec: ServiceSpec, waiter: Bell, qos: QoS | None = None, *, pictures: bool = False
     ) -> ZenohServiceServer:
-        most_bytes = 0 if pictures else SMALL_BYTES
-        return ZenohServiceServer(self._node, name, type_name, version, waiter, qos or SERVICE_QOS, most_bytes)
+        return ZenohServiceServer(self._node, spec, waiter, qos or SERVICE_QOS, 0 if pictures else SMALL_BYTES)
 
-    def client_end(self, name: str, type_name: str, version: str, waiter: Bell) -> ZenohServiceClient:
-        return ZenohServiceClient(self._node, name, type_name, version, waiter)
+    def client_end(self, spec: ServiceSpec, waiter: Bell) -> ZenohServiceClient:
+        return ZenohServiceClient(self._node, spec, waiter)
 
     def describe(self) -> dict[str, str | int]:
         return {

@@ -60,7 +60,8 @@ def qos_text(qos: QoS) -> str:
     history = f",{qos.depth}" if qos.depth else f"{KEEP_ALL},"
     seconds, nanoseconds = divmod(round(qos.lifespan_s * 1e9), 1_000_000_000)
     lifespan = f"{seconds},{nanoseconds}" if qos.lifespan_s else ","
-    reliability, durability = "" if qos.reliable else BEST_EFFORT, TRANSIENT_LOCAL if qos.latched else ""
+    reliability = "" if qos.reliable else BEST_EFFORT
+    durability = TRANSIENT_LOCAL if qos.latched else ""
     return f"{reliability}:{durability}:{history}:,:{lifespan}:,,"
 
 

@@ -116,7 +116,7 @@ class Node:
         self._numbers = count(1)
         self._known: dict[tuple[str, str], dict[str, names.Entity]] = {}
         """(kind, name) -> token -> what it tells."""
-        self._count, self._full = 0, False
+        self._count, self._once = 0, LogOnce(_log)
         self._lock = Lock()
         with refusals("node"):
             self._liveliness = session.liveliness()
@@ -176,9 +176,8 @@ class Node:
                 of_name.pop(token, None)
             elif self._count < SEEN_AT_MOST:
                 of_name[token] = entity
-            elif not self._full:
-                self._full = True
-                _log.warning("more than %d endpoints are announced: the rest are not counted", SEEN_AT_MOST)
+            else:
+                self._once.warning("", "more than %d endpoints are announced: the rest are not counted", SEEN_AT_MOST)
             self._count += len(of_name) - before
             if not of_name:
                 del self._known[at]

@@ -1,8 +1,4 @@
-"""Car-to-car rear braking (Euro NCAP CCRb) with a car behind: options, laws, studies and labels.
-
-A scenario is `options.CcrbOptions`; `drive.drive` executes a schedule in a simulator and returns its outcomes.
-studies.py has planes of scenarios, and random ones; labels.py has the texts of results.
-"""
+"""Car-to-car rear braking (Euro NCAP CCRb) with a car behind: options, laws, studies and labels."""
 
 from __future__ import annotations
 
@@ -14,4 +10,3 @@ FOLLOWERS: Final[dict[str, str]] = {
     "idm": "s2a_bench.scenario.ccrb.follower:Idm",
     "hybrid": "s2a_bench.scenario.ccrb.follower:Hybrid",
 }
-"""Laws of the car behind, by name."""

@@ -19,11 +19,7 @@ if TYPE_CHECKING:
 KMH: Final = 1 / 3.6
 NCAP_SPEED_MPS: Final = 50 * KMH
 LEAD_JERK_MPS3: Final = 6.0
-EGO_MOST_MPS2, EGO_LEAST_MPS2 = 2.0, -8.0
-EGO_LOOP_S: Final = 0.3
-EGO_JERK_MPS3: Final = 30.0
-STOP_MPS2: Final = 8.0
-"""Deceleration of the gap behaviour *stop*."""
+EGO_LEAST_MPS2: Final = -8.0
 LEAST_IMPACT_MPS: Final = 0.5
 """Slower contacts are no impacts."""
 SAFETY_M: Final = 2.0

@@ -89,8 +89,8 @@ def follower_survives(cars: Cars, plan: DrivingPlan, n_skills: ArrayLike, t_nom_
     schedule = Schedule(np.minimum(skill, count) * nominal_s, np.where(skill < count, nominal_s, 0.0))
     alone = replace(cars, front_gap_m=NO_LEAD_M, reflex=False)
     along = DrivingPlan(plan.set_point_mps, (0,) * len(plan.lane))
-    found = drive(Longitudinal(), alone, along, schedule, resting_mps=LEAST_IMPACT_MPS).outcomes
-    return np.asarray(found.code & 2 == 0)
+    code = drive(Longitudinal(), alone, along, schedule, resting_mps=LEAST_IMPACT_MPS).outcomes.code
+    return np.asarray(code & 2 == 0)
 
 
 def place(simulator: Simulator, cars: Cars, rollouts: int = 1) -> State:

@@ -14,20 +14,14 @@ from numpy.typing import NDArray
 
 from s2a_bench.plan.skillset import Gap
 from s2a_bench.policy import Floats, Schedule
-from s2a_bench.scenario.ccrb.cars import (
-    EGO_JERK_MPS3,
-    EGO_LEAST_MPS2,
-    EGO_LOOP_S,
-    EGO_MOST_MPS2,
-    STOP_MPS2,
-    Cars,
-    DrivingPlan,
-)
+from s2a_bench.scenario.ccrb.cars import EGO_LEAST_MPS2, Cars, DrivingPlan
 from s2a_bench.scenario.ccrb.follower import needed
 from s2a_bench.scenario.longitudinal import LockStep
 
 WAITING, ACTING, GAP, DONE = 0, 1, 2, 3
 PHASES: Final = ("waiting", "acting", "gap", "done")
+MOST_MPS2, STOP_MPS2, JERK_MPS3, LOOP_S = 2.0, 8.0, 30.0, 0.3
+"""Most acceleration, deceleration of the gap behaviour *stop*, limit of the jerk, time constant of the speed loop."""
 REFLEX_MPS2, REFLEX_TTC_S = 4.0, 1.5
 """The reflex brakes fully above this required deceleration, or below this time to collision."""
 
@@ -35,7 +29,7 @@ BETWEEN: dict[Gap, Callable[[Floats, Floats, Floats], Floats]] = {
     "stop": lambda speed, _slope, _first: np.full(speed.shape, -STOP_MPS2),
     "coast": lambda speed, _slope, _first: np.zeros(speed.shape),
     "hold": lambda _speed, slope, _first: slope,
-    "cruise": lambda speed, _slope, first: (first - speed) / EGO_LOOP_S,
+    "cruise": lambda speed, _slope, first: (first - speed) / LOOP_S,
 }
 """Gap behaviour -> acceleration, a function of speed, the last skill's slope, and v0."""
 
@@ -53,8 +47,7 @@ class Ego(LockStep):
         self._gaps = gaps
         self._between = {gap: BETWEEN[gap] for gap in set(gaps.tolist())}
         self._reflex = Reflex(rollouts) if cars.reflex else None
-        self.index = np.full(rollouts, -1)
-        """The current or last skill, from 0 on; -1 before the first."""
+        self.index = np.full(rollouts, -1)  # the current or last skill
         self._next_s = self._start_s[0].copy()
         self._from_s, self._until_s = np.zeros(rollouts), np.full(rollouts, -np.inf)
         self._level, self._slope = self._points[0].copy(), np.zeros(rollouts)
@@ -74,16 +67,16 @@ class Ego(LockStep):
         """Return the ego's acceleration in m/s^2 for the next step, shape (M,)."""
         self._advance(now_s)
         self.lag_mps = self._level + self._slope * (now_s - self._from_s) - speed
-        wish = np.where(self.phase == ACTING, self._slope + self.lag_mps / EGO_LOOP_S, 0.0)
+        wish = np.where(self.phase == ACTING, self._slope + self.lag_mps / LOOP_S, 0.0)
         between = self.phase == GAP
         if between.any():
             for gap, rule in self._between.items():
                 wanted = rule(speed, self._slope, self._points[0])
                 wish = np.where(between & (self._gaps == gap), wanted, wish)
-        wish = np.clip(wish, EGO_LEAST_MPS2, EGO_MOST_MPS2)
+        wish = np.clip(wish, EGO_LEAST_MPS2, MOST_MPS2)
         if self._reflex is not None:
             wish = self._reflex.limit(wish, speed, gap_m, lead_mps, lead_decel)
-        most = EGO_JERK_MPS3 * step_s
+        most = JERK_MPS3 * step_s
         self.acceleration_mps2 = self.acceleration_mps2 + np.clip(wish - self.acceleration_mps2, -most, most)
         return self.acceleration_mps2
 

@@ -30,9 +30,9 @@ class Outcomes:
     required_decel_mps2: Floats
     """Greatest closing speed^2 / (2 gap) to the lead (DRAC); NaN with a front impact."""
 
-    def put(self, rollouts: NDArray[np.int64], found: Outcomes) -> None:
+    def put(self, rollouts: NDArray[np.int64], latest: Outcomes) -> None:
         for item in fields(self):
-            getattr(self, item.name)[rollouts] = getattr(found, item.name)
+            getattr(self, item.name)[rollouts] = getattr(latest, item.name)
 
     def name(self, rollout: int) -> str:
         return OUTCOMES[int(self.code[rollout])]

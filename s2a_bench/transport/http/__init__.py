@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any
+from typing import Any, cast
 
 from pydantic import create_model
 
@@ -34,8 +34,8 @@ THINKING_MS = Fact("thinking_ms", "ms", "first thinking to the first token")
 
 def found_llama_server() -> Path | None:
     """Find llama.cpp's server: on PATH, else in the wheel, which needs the extra for models; None without either."""
-    if found := shutil.which("llama-server"):
-        return Path(found)
+    if program := shutil.which("llama-server"):
+        return Path(program)
     return WHEEL if extras.installed(str(WHEEL)) and extras.installed("gguf") else None
 
 
@@ -80,8 +80,7 @@ class Http(ListeningTransport[HttpOptions]):
 
     def server(self, wiring: Wiring[HttpOptions], handler: Handler) -> Server:
         kind = "fast:FastServer" if wiring.variant in FAST else "server:HttpServer"
-        bound: Server = resolve_name(f"s2a_bench.transport.http.{kind}")(wiring, handler)
-        return bound
+        return cast("Server", resolve_name(f"s2a_bench.transport.http.{kind}")(wiring, handler))
 
     def measured(self, choice: Choice[HttpOptions]) -> Sequence[str]:
         """Return the variants that the server speaks; llama.cpp's server too if it is installed and comparable."""

@@ -11,7 +11,8 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from typing import Any
 
 import httpx
@@ -91,20 +92,14 @@ class HttpClient(Client):
         client.bounds = bounds = self._wiring.bounds(self._wiring.address, request.max_tokens)
         try:
             with self._translated(), ExitStack() as stack:
-
-                def post() -> HttpResponse:
-                    answer: AbstractContextManager[HttpResponse] = client.stream(
-                        "POST", self._url, content=body, headers=headers
-                    )
-                    return stack.enter_context(answer)
-
+                post: Callable[[], Any] = partial(client.stream, "POST", self._url, content=body, headers=headers)
                 try:
-                    response = post()
+                    response: HttpResponse = stack.enter_context(post())
                 except (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
                     if self._options.connection != "keep-alive":
                         raise
                     trace.facts[RECONNECTS] = 1.0
-                    response = post()
+                    response = stack.enter_context(post())
                 headers_ns = now_ns()
                 self._check(response)
                 for token in self._tokens(response, trace, headers_ns, packed_ns):
@@ -115,12 +110,12 @@ class HttpClient(Client):
                 client.close()
 
     def _check(self, response: HttpResponse) -> None:
-        """Raise RequestFailed unless the headers announce a good answer."""
         kind = response.headers.get("content-type", "")
-        expected = self._dialect.media_type, *((native.BLOCKS,) if self._dialect.name == NATIVE else ())
-        if response.status_code != httpx.codes.OK or not kind.startswith(expected):
+        expected = self._dialect.media_type
+        good = (expected, native.BLOCKS) if self._dialect.name == NATIVE else (expected,)
+        if response.status_code != httpx.codes.OK or not kind.startswith(good):
             text = body_of(response, ERROR_LIMIT, self._wiring.timeout_s)
-            raise refusal(self._url, response, text, self._options, self._dialect.media_type)
+            raise refusal(self._url, response, text, self._options, expected)
         if (coding := response.headers.get("content-encoding", "identity")) != "identity":
             raise RequestFailed(f"{self._url} compressed its answer ({coding}) without being asked to")
 

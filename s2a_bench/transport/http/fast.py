@@ -218,7 +218,7 @@ class FastExchange(ChatExchange):
 
     def write(self, data: bytes, kind: str, *, last: bool) -> None:
         if self._head.chunked:
-            data = b"%x\r\n%b\r\n%b" % (len(data), data, b"0\r\n\r\n" * last)
+            data = b"%x\r\n%b\r\n%b" % (len(data), data, b"0\r\n\r\n" if last else b"")
         if kind:
             headers = {"content-type": kind, **({"transfer-encoding": "chunked"} if self._head.chunked else {})}
             data = native.head_of(200, headers, keep=self._head.keep) + data

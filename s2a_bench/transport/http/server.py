@@ -12,7 +12,7 @@ from __future__ import annotations
 import asyncio
 import select
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
+from contextlib import ExitStack, nullcontext, suppress
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -295,13 +295,6 @@ def application(core: Core, *, documented: bool = False) -> FastAPI:
     return app
 
 
-class _Server(uvicorn.Server):
-    """uvicorn without its signal handlers: the process of the server has some."""
-
-    def capture_signals(self) -> AbstractContextManager[None]:  # type: ignore[override]
-        return nullcontext()
-
-
 class HttpServer(WebServer):
     def __init__(self, wiring: Wiring[HttpOptions], handler: Handler) -> None:
         super().__init__(wiring, handler, "http", native.SCHEME)
@@ -322,7 +315,9 @@ class HttpServer(WebServer):
             timeout_graceful_shutdown=1,
             timeout_keep_alive=native.KEEP_ALIVE_S,
         )
-        self._server = _Server(config)
+        self._server = uvicorn.Server(config)
+        # the process of the server has signal handlers of its own
+        self._server.capture_signals = nullcontext  # type: ignore[assignment, method-assign]
 
     def describe(self) -> dict[str, str | int]:
         return {"server": "uvicorn", "version": uvicorn.__version__, "loop": "uvloop", "http": "httptools"}

@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import chain, count
 from pkgutil import resolve_name
 from secrets import token_hex
+from typing import cast
 
 from s2a_bench import extras
 from s2a_bench.errors import UsageError
@@ -25,8 +26,6 @@ UNREADABLE_N = Fact(
 
 
 class Ros(Transport[RosOptions]):
-    """Messages of sensor_msgs and s2a_msgs over a middleware, or the action of llama_ros."""
-
     name = "ros"
     options = RosOptions
     variants = VARIANTS
@@ -56,18 +55,13 @@ class Ros(Transport[RosOptions]):
 
     def client(self, wiring: Wiring[RosOptions], alive: Callable[[], bool]) -> Client:
         kind = "action:GenerateClient" if wiring.variant == ACTION else "topic:TopicClient"
-        opened: Client = resolve_name(f"s2a_bench.transport.ros.{kind}")(wiring, alive)
-        return opened
+        return cast("Client", resolve_name(f"s2a_bench.transport.ros.{kind}")(wiring, alive))
 
     def measured(self, choice: Choice[RosOptions]) -> Sequence[str]:
-        """Return `action` for an external node, else the default."""
         return (ACTION,) if choice.options.action else super().measured(choice)
 
     def capabilities(self, choice: Choice[RosOptions]) -> Capabilities[RosOptions]:
-        """Return it for the action without actions and state, which llama_msgs has no fields for.
-
-        A goal carries sensor_msgs/Image.
-        """
+        """Return what llama_msgs has fields for: no actions, no state, and in a goal sensor_msgs/Image."""
         can = super().capabilities(choice)
         if choice.variant != ACTION:
             return can
@@ -90,7 +84,6 @@ class Ros(Transport[RosOptions]):
             raise UsageError("`action`: `mode` stream needs our own server, which keeps the camera's newest frame")
 
     def tuned(self, options: RosOptions) -> bool:
-        """Return False for DDS, and processes, as they come."""
         return options.dds_tuning == "tuned"
 
     def datagrams(self, options: RosOptions) -> bool:

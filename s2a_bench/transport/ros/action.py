@@ -141,7 +141,6 @@ class GenerateClient(RosClient):
                 self._client.cancel(goal_id)
 
     def _check(self, result: Result, heard: str) -> None:
-        """Raise for a goal that failed, and for feedback that was lost on the way from our own server."""
         response = self._client.unpack_result(result.packed).response
         if result.status not in {Status.SUCCEEDED, Status.CANCELED}:
             text = response.text or f"the goal ended with status {result.status}"

@@ -192,15 +192,16 @@ class CameraCache:
 
     def silence(self) -> str:
         """Return what to look at where no frame comes although the topics have publishers; "" where they have none."""
-        found = self._publishers()
-        present = ", ".join(f"{count} publisher{'s' * (count > 1)} on {topic}" for topic, count in found.items())
+        counts = self._publishers().items()
+        present = ", ".join(f"{count} publisher{'s' if count > 1 else ''} on {topic}" for topic, count in counts)
         if not present:
             return ""
         if self._unused:
             return f"{present}, none of its frames can be used: {self._unused}"
         buffers = ROS.against_loss(self._options).replace("--", "")
-        other = "; a best-effort publisher is received with qos sensor_data" * (self._options.qos == "reliable")
-        return f"{present}, no frame comes: look at the buffers ({buffers}) and at what is published{other}"
+        silence = f"{present}, no frame comes: look at the buffers ({buffers}) and at what is published"
+        strict = self._options.qos == "reliable"
+        return f"{silence}; a best-effort publisher is received with qos sensor_data" if strict else silence
 
     def _publishers(self) -> dict[str, int]:
         """Count the topics' publishers: among all of the domain, which takes a while, only where none is matched."""

@@ -61,12 +61,10 @@ def ros(machine: Machine) -> Finding:
         installed = sorted(path.parent.name for path in machine.root.glob("opt/ros/*/setup.bash"))
         if not installed:
             return Finding("ros", "state", "no ROS 2 installed, and none needed")
-        return Finding(
-            "ros",
-            "advice",
-            f"{', '.join(installed)} is installed and not sourced: Cyclone DDS from PyPI is used, not your ROS's DDS",
-            f"source /opt/ros/{installed[-1]}/setup.bash",
+        state = (
+            f"{', '.join(installed)} is installed and not sourced: Cyclone DDS from PyPI is used, not your ROS's DDS"
         )
+        return Finding("ros", "advice", state, f"source /opt/ros/{installed[-1]}/setup.bash")
     rmw = machine.environ.get("RMW_IMPLEMENTATION", "its default RMW")
     python = ".".join(platform.python_version_tuple()[:2])
     built = sorted(

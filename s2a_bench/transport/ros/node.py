@@ -37,6 +37,7 @@ EVENTS: Final = "/parameter_events"
 LOGGER: Final = "s2a_bench"
 NUMBER: Final = re.compile(r"\d+")
 ARRAY: Final = "diagnostic_msgs/msg/DiagnosticArray"
+KEY_VALUE: Final = "diagnostic_msgs/msg/KeyValue"
 DIAGNOSTICS: Final = "/diagnostics"
 DIAGNOSTICS_QOS: Final = QoS(depth=1)
 """That of ROS's diagnostic_updater."""
@@ -101,52 +102,37 @@ class Activity:
             level, message = Level.WARN, "the queue is full: goals are rejected"
         elif failures:
             level, message = Level.WARN, f"{failures} requests failed"
-        yield PartHealth(
-            "requests",
-            level,
-            message,
-            {
-                "requests_per_s": requests / seconds,
-                "tokens_per_s": tokens / seconds,
-                "waiting": waiting,
-                "requests": self.requests,
-                "failures": self.failures,
-            },
-        )
+        rates = {"requests_per_s": requests / seconds, "tokens_per_s": tokens / seconds}
+        counts = {"waiting": waiting, "requests": self.requests, "failures": self.failures}
+        yield PartHealth("requests", level, message, rates | counts)
         if frame_ns is None:
             why = silence()
             level = Level.WARN if why else Level.OK
             yield PartHealth("camera", level, why or "no camera: no publisher on its topics", {"frames": frames})
             return
         age_s = (now[0] - frame_ns) / 1e9
-        old = age_s > oldest_s
-        message = (
-            ": ".join(filter(None, (f"the newest frame is {age_s:.1f} s old", silence()))) if old else "frames come"
-        )
+        level, message = Level.OK, "frames come"
+        if age_s > oldest_s:
+            level, message = Level.WARN, f"the newest frame is {age_s:.1f} s old"
+            message = f"{message}: {why}" if (why := silence()) else message
         values = {"frames_per_s": came / seconds, "frame_age_s": age_s, "frames": frames}
-        yield PartHealth("camera", Level.WARN if old else Level.OK, message, values)
+        yield PartHealth("camera", level, message, values)
 
 
 def diagnostic_array(node_name: str, findings: Iterable[PartHealth], stamp_ns: int) -> Any:
     """Build the message; ``stamp_ns`` is ROS time, parts are named ``node: part`` as ROS's diagnostic_updater does."""
-    return ros.default(
-        ARRAY,
-        header=ros.header(stamp_ns),
-        status=[
-            ros.default(
-                "diagnostic_msgs/msg/DiagnosticStatus",
-                level=int(finding.level),
-                name=f"{node_name.strip('/')}: {finding.part}",
-                message=finding.message,
-                hardware_id=platform.node(),
-                values=[
-                    ros.default("diagnostic_msgs/msg/KeyValue", key=key, value=f"{value:g}")
-                    for key, value in finding.values.items()
-                ],
-            )
-            for finding in findings
-        ],
-    )
+    status = [
+        ros.default(
+            "diagnostic_msgs/msg/DiagnosticStatus",
+            level=int(finding.level),
+            name=f"{node_name.strip('/')}: {finding.part}",
+            message=finding.message,
+            hardware_id=platform.node(),
+            values=[ros.default(KEY_VALUE, key=key, value=f"{value:g}") for key, value in finding.values.items()],
+        )
+        for finding in findings
+    ]
+    return ros.default(ARRAY, header=ros.header(stamp_ns), status=status)
 
 
 class Rosout(logging.Handler):

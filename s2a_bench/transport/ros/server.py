@@ -99,13 +99,13 @@ class RosServer:
         return self.middleware.describe()
 
     def _change(self, wanted: Mapping[str, Any]) -> None:
-        """Set options while serving; raises UsageError."""
         self._options = self._options.but(**wanted)
         if self._action is not None:
             self._action.tune(self._options)
 
     def _findings(self) -> Iterator[PartHealth]:
-        return self._shared.activity.findings(*self._cache.seen(), self._cache.silence, self._options.max_frame_age)
+        frames, frame_ns = self._cache.seen()
+        return self._shared.activity.findings(frames, frame_ns, self._cache.silence, self._options.max_frame_age)
 
     def _take(self, source: RequestSource) -> Callable[[], object] | None:
         """Wait for a request and give it its place in the queue; return what answers it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from secrets import token_hex
 from typing import Any
 
 from s2a_bench.errors import MessagesLost, RequestFailed, ServerDied
@@ -22,8 +23,6 @@ from s2a_bench.types import Piece, Request, Token
 
 
 class TopicClient(RosClient):
-    """Publishes requests and collects the tokens that carry their id."""
-
     def _meet_server(self, namespace: str) -> None:
         # announced first: a server that knows the requests' writer should know the tokens' reader as well
         self._subscription = self.middleware.subscription(namespace + "/token", ros.TOKEN, READER_QOS)
@@ -32,12 +31,11 @@ class TopicClient(RosClient):
         self.wait_until(lambda: all(end.matched() for end in ends), f"no server appeared under {namespace}")
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
-        """Publish the request, with its frames if it has any, and yield its tokens."""
         images: dict[str, list[Any]] = {ros.IMAGE: [], ros.COMPRESSED_IMAGE: []}
         for frame in request.images:
             type_name, message = picture_message(frame, self._wiring.options.payload, self._offset_ns, trace)
             images[type_name].append(message)
-        name = wire.unguessable(request.id)
+        name = f"{request.id}#{token_hex(16)}"  # no other node can answer before it has heard it
         message = wire.request_message(replace(request, id=name), images[ros.IMAGE], images[ros.COMPRESSED_IMAGE])
         packed = self._publisher.pack(message)
         trace.mark("cdr_pack")
@@ -78,8 +76,6 @@ class TopicClient(RosClient):
 
 
 class TopicSource:
-    """The server's side of the variant: receives requests and turns each into a job for the engine's thread."""
-
     def __init__(self, middleware: Middleware, namespace: str, limits: Limits) -> None:
         self.limits = limits
         self._requests = middleware.subscription(namespace + "/request", ros.REQUEST, READER_QOS)
@@ -120,7 +116,7 @@ class TopicExchange(RosExchange):
     def __init__(self, source: TopicSource, message: Any, shared: Shared, trace: Trace) -> None:
         super().__init__(shared, trace)
         self._source, self._message = source, message
-        self._client = str(message.id), source.sender()
+        self._id, self._sender = str(message.id), source.sender()
         self._sent = 0
 
     def request(self) -> Request:
@@ -128,14 +124,14 @@ class TopicExchange(RosExchange):
         whole_number("max_tokens", int(message.max_tokens), 1, limits.answer_tokens, 0)
         pictures = (*message.images, *message.compressed_images)
         images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
-        settings = message.max_tokens, message.grammar, message.seed
-        return Request(wire.plain(message.id), message.prompt, images, *settings, state=state_of(message.state))
+        name, state = message.id.rpartition("#")[0] or message.id, state_of(message.state)
+        return Request(name, message.prompt, images, message.max_tokens, message.grammar, message.seed, state=state)
 
     def piece(self, piece: Piece) -> bool:
-        self._source.send(*self._client, piece, [])
+        self._source.send(self._id, self._sender, piece, [])
         self._sent += 1
         return True
 
     def finish(self, error: str) -> None:
-        marks = wire.marks_message(self._client[0], self.trace.to_remote())
-        self._source.send(*self._client, Token(self._sent, "", -1), [marks], error)
+        marks = wire.marks_message(self._id, self.trace.to_remote())
+        self._source.send(self._id, self._sender, Token(self._sent, "", -1), [marks], error)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from secrets import token_hex
 from typing import Any, Final
 
 from s2a_bench.errors import RequestFailed, TransportError
@@ -20,16 +19,6 @@ TOKEN_QOS = QoS(depth=1000)
 """Our writers keep the last: one that keeps all blocks for as long as a reader does not read."""
 PROVENANCE_TOPIC: Final = "/provenance"
 """Below the namespace: the server's provenance, latched for late subscribers."""
-
-
-def unguessable(request_id: str) -> str:
-    """Return a name for a request that no other node can answer before it has heard it."""
-    return f"{request_id}#{token_hex(16)}"
-
-
-def plain(name: str) -> str:
-    """Return the id in what `unguessable` returned; any other name is an id."""
-    return name.rpartition("#")[0] or name
 
 
 def readable(subscription: Subscription, packed: Any, trace: Trace) -> Any | None:

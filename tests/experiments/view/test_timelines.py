@@ -12,7 +12,7 @@ from matplotlib.patches import Rectangle
 
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
 from s2a_bench.experiments.timeline.rows import TIMELINES
-from s2a_bench.experiments.timeline.view.cells import timelines_json, timelines_of
+from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_json, timelines_of
 from s2a_bench.experiments.timeline.view.figures import build_timelines
 from s2a_bench.experiments.timeline.view.tables import (
     execution_table,
@@ -86,7 +86,8 @@ def live(tmp_path: Path) -> StoredRun:
 
 def drawn(run: StoredRun) -> Figure:
     with paper_column():
-        return build_timelines(run, timelines_of(run))
+        cells = timelines_of(run)
+        return build_timelines(cells, origin_notes(run.manifest, cells))
 
 
 def bars(axes: Any, *, hatched: bool) -> list[Rectangle]:
@@ -137,7 +138,7 @@ def column(table: TextTable, name: str) -> list[str]:
 
 
 def test_the_table_groups_rows_by_board_and_granularity(computed: StoredRun) -> None:
-    table = execution_table(computed)
+    table = execution_table(timelines_of(computed), computed.manifest)
     assert column(table, "board") == ["Orin", "", "", "", "", ""]
     assert column(table, "L") == ["6", "", "", "4", "", ""]
     assert column(table, "start") == ["1.75", "10.50", "3.50", "1.33", "7.17", "1.33"]
@@ -153,14 +154,14 @@ def test_the_skill_table_names_calls_and_stalls(live: StoredRun) -> None:
 
 
 def test_csv_keeps_every_digit_and_leaves_out_what_is_absent(computed: StoredRun) -> None:
-    lines = timeline_csv(computed)["timelines.csv"].text(computed.origins).splitlines()
+    lines = timeline_csv(timelines_of(computed))["timelines.csv"].text(computed.origins).splitlines()
     assert f"orin/L6/N8/T1/naive,stall_s,1,1.75,1.75,,1.75,1.75,{computed.origins.code}" in lines
     (share,) = [line for line in lines if line.startswith("orin/L6/N8/T1/naive,p_any_stall")]
     assert share == f"orin/L6/N8/T1/naive,p_any_stall,1,,1.0,,,,{computed.origins.code}"
 
 
 def test_json_has_no_key_for_what_a_live_run_does_not_know(live: StoredRun) -> None:
-    cells = timelines_json(live)["cells"]
+    cells = timelines_json(live, timelines_of(live))["cells"]
     assert all("prompt_s" not in cell and "caution" not in cell for cell in cells)
     assert [cell["emulated"] for cell in cells] == [False] * 3
     assert [cell["mode"] for cell in cells] == ["live"] * 3

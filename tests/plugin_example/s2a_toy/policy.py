@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 from s2a_bench.errors import UsageError
-from s2a_bench.policy import CAUTION, PlanShape, Policy, Start, Stepper, Timing
+from s2a_bench.policy import CAUTION, PlanShape, Policy, Stepper
 from s2a_bench.policy.estimator import VAGUE, GapPrior
-from s2a_bench.policy.naive import NominalQueue
+from s2a_bench.policy.nominal import NominalQueue
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class ToyPolicy(Policy):
 
     def stepper(self, shape: PlanShape) -> Stepper:
         """Follow one plan as it arrives."""
-        return ToyStepper(math.ceil(shape.n_skills / self.factor))
+        return NominalQueue(math.ceil(shape.n_skills / self.factor))
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,28 +47,4 @@ class ToyCareful(Policy):
         """Follow one plan as it arrives."""
         caution = CAUTION if self.caution is None else self.caution
         share = 1.0 if math.isinf(caution) else caution / (1 + caution)
-        return ToyStepper(max(1, math.ceil(share * shape.n_skills)))
-
-
-@dataclass(slots=True)
-class ToyStepper:
-    """Count the skills that are missing before the start."""
-
-    missing: int
-    queue: NominalQueue = field(default_factory=NominalQueue)
-
-    def token(self, at_s: float) -> None:
-        """Ignore it."""
-
-    def fragment(self, at_s: float, timing: Timing) -> None:
-        """Queue the skill."""
-        self.missing -= 1
-        self.queue.fragment(at_s, timing)
-
-    def end(self, at_s: float) -> None:  # noqa: ARG002 - whenever it comes
-        """Stop waiting for more."""
-        self.missing = 0
-
-    def decide(self, now_s: float) -> Start | float:
-        """Start the next skill once enough of them are there."""
-        return math.inf if self.missing > 0 else self.queue.decide(now_s)
+        return NominalQueue(max(1, math.ceil(share * shape.n_skills)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from s2a_bench.errors import TransportError, UsageError
-from s2a_bench.plugins.zenoh import endpoint_of, may_host
+from s2a_bench.plugins.zenoh import endpoint_of, to_host
 from s2a_bench.ros import QoS
 
 names = pytest.importorskip(
@@ -93,4 +93,4 @@ def test_what_is_no_endpoint_is_refused(text: str) -> None:
 def test_only_loopback_is_listened_on() -> None:
     hosts = {"tcp/127.0.0.1:1": True, "tcp/[::1]:1": True, "tcp/localhost:1": True, "tcp/0.0.0.0:1": False}
     hosts |= {"tcp/[::]:1": False, "tcp/192.168.1.2:1": False, "tcp/robot:1": False, "udp/127.0.0.1:1": False}
-    assert {endpoint: may_host(endpoint) for endpoint in hosts} == hosts
+    assert {endpoint: bool(to_host(endpoint)) for endpoint in hosts} == hosts

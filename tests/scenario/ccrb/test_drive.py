@@ -13,8 +13,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
-from s2a_bench.policy.naive import Naive
-from s2a_bench.policy.wait_then_act import Clairvoyant, WaitThenAct
+from s2a_bench.policy.nominal import Clairvoyant, Naive, WaitThenAct
 from s2a_bench.scenario import EGO, LEAD, REAR, SIMULATORS
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import Cars, braking_plan

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,6 @@ from s2a_bench.experiments.timeline.view.cells import (
 from s2a_bench.experiments.timeline.view.figures import page_lanes, timeline_figures
 from s2a_bench.policy import ONLINE
 from s2a_bench.policy.conformal import promise, upper_bound
-from s2a_bench.stats import summary_of
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable
 from s2a_bench.writers.tables import ABSENT, TextTable, number
 
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def show(run: StoredRun, **_: Any) -> Shown:
-    cells = timelines_of(run)
+    cells, facts = timelines_of(run), run.manifest
     shape = _common(cells)
     return Shown.build(
         sentences=lambda: _timeline_sentences(cells),
@@ -39,12 +38,12 @@ def show(run: StoredRun, **_: Any) -> Shown:
             "skills": lambda: skill_table(cells),
             "motion": lambda: _table(cells, f"Motion{shape}", _MOTION, _MOTION_NOTES),
             "waiting": lambda: _table(cells, f"Waiting and age{shape}: times in s", _WAITING, _WAITING_NOTES),
-            "timelines": lambda: execution_table(run),
+            "timelines": lambda: execution_table(cells, facts),
         },
         main=["timelines"],
-        csvs=lambda: timeline_csv(run),
-        figures=lambda: timeline_figures(run),
-        json=lambda: timelines_json(run),
+        csvs=lambda: timeline_csv(cells),
+        figures=lambda: timeline_figures(cells, origin_notes(facts, cells)),
+        json=lambda: timelines_json(run, cells),
         lanes=lambda: page_lanes(cells),
     )
 
@@ -54,7 +53,7 @@ def _timeline_sentences(cells: Sequence[Timelines]) -> list[str]:
     for cell in cells:
         by_policy.setdefault(cell.policy, []).append(cell)
     settings = len({cell.setting for cell in cells})
-    plans = span_of((cell.n for cell in cells), "plan")
+    plans = span_of(map(len, cells), "plan")
     sentences = [f"{settings} setting{'s' * (settings != 1)} of board and granularity, {plans} a policy in each."]
     return sentences + [_policy_sentence(policy, mine) for policy, mine in by_policy.items()]
 
@@ -67,14 +66,14 @@ def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
     if not stalling:
         return f"{policy} never stalls; it {moved}."
     worst = max(stalling, key=lambda cell: cell.mean("stall_s") or 0.0)
-    stall_s, (title, tokens, *_) = worst.mean("stall_s") or 0.0, worst.setting
+    stall_s, plans = worst.mean("stall_s") or 0.0, len(worst)
     share = ""
-    if worst.n > 1:
-        stalled = int(worst.rows["any_stall"].sum())
-        high = upper_bound(stalled, worst.n, 0.975)
-        share = f" there {worst.p_any_stall:.1%} of {worst.n} plans stall (95 % interval up to {high:.1%});"
+    if plans > 1:
+        high = upper_bound(int(worst.values("p_any_stall").sum()), plans, 0.975)
+        share = f" there {worst.p_any_stall:.1%} of {plans} plans stall (95 % interval up to {high:.1%});"
     where = f"{len(stalling)} of {len(cells)} settings" if len(cells) > 1 else "the one setting"
-    return f"{policy} stalls in {where}, most on {title} with L = {tokens}: {stall_s:.2f} s a plan;{share} it {moved}."
+    most = f"most on {worst.first.title} with L = {worst.first.tokens_per_skill}: {stall_s:.2f} s a plan"
+    return f"{policy} stalls in {where}, {most};{share} it {moved}."
 
 
 def _span(values: Sequence[float]) -> str:
@@ -104,55 +103,56 @@ _MOTION_NOTES = (
 )
 
 
-def execution_table(run: StoredRun) -> TextTable:
+def execution_table(cells: Sequence[Timelines], manifest: Mapping[str, Any]) -> TextTable:
     """Return the table of starts, ends, stalls and regrets: means over the plans, in s."""
-    cells = timelines_of(run)
-    random = any(cell.n > 1 for cell in cells)
+    random = _is_random(cells)
     title = f"Timelines{_common(cells)}: times in s{', means' if random else ''}"
-    notes = [*origin_notes(run, cells), *_plan_notes(run, cells), *jitter_notes(run)]
+    notes = [*origin_notes(manifest, cells), *_plan_notes(cells, manifest), *jitter_notes(manifest)]
     notes.append("stalls: those above 20 ms. late start, late end: regret over clairvoyant S0 and S0 + P_N.")
-    return _table(cells, title, (*_EXECUTION, *(["p_any_stall"] if random else [])), notes)
+    return _table(cells, title, (*_EXECUTION, "p_any_stall") if random else _EXECUTION, notes)
 
 
 def skill_table(cells: Sequence[Timelines]) -> TextTable:
     groups = []
     for cell in cells:
-        name = (cell.setting[0], str(cell.setting[1]), cell.policy)
+        name = (cell.first.title, str(cell.first.tokens_per_skill), cell.policy)
         rows: list[tuple[str, ...]] = []
-        for skill in cell.skills.to_dict("records"):
-            times = [skill[f"{name}_ns"] / 1e9 for name in ("arrival", "start", "end", "stall", "queue_wait")]
-            text = skill["text"] or str(skill["index"] + 1)
-            rows.append((*name, text, *map(seconds, times), f"{skill['stretch']:.2f}"))
+        for skill in cell.skills:
+            taken_ns, waited_ns = skill.end_ns - skill.start_ns, skill.start_ns - skill.arrival_ns
+            times_ns = (skill.arrival_ns, skill.start_ns, skill.end_ns, skill.stall_ns, waited_ns)
+            times = (seconds(each / 1e9) for each in times_ns)
+            rows.append((*name, skill.text or str(skill.index + 1), *times, f"{taken_ns / skill.nominal_ns:.2f}"))
         groups.append(rows)
-    names = (str(cell.about("cell")) for cell in cells for _ in range(len(cell.skills)))
+    names = (cell.first.cell for cell in cells for _ in cell.skills)
     header = ("board", "L", "policy", "skill", "arrives", "starts", "ends", "stall before", "queue wait", "stretch")
-    plan = "the first plan, times in s" if any(cell.n > 1 for cell in cells) else "times in s"
+    plan = "the first plan, times in s" if _is_random(cells) else "times in s"
     return TextTable.grouped(f"Skills{_common(cells)}: {plan}", header, groups, 4, once=3, cells=names)
 
 
-def timeline_csv(run: StoredRun) -> dict[str, CsvTable]:
+def timeline_csv(cells: Iterable[Timelines]) -> dict[str, CsvTable]:
     """Return file name -> CSV table in long form, unrounded, times in s; absent values have no row."""
-    summaries = []
-    for cell in timelines_of(run):
+    rows = []
+    for cell in cells:
         for name, metric in METRICS.items():
-            if found := summary_of(cell.values(name)):
+            if summary := cell.summary(name):
                 statistics = ("n", "mean") if metric.kind == FLAG else SUMMARY
-                values = (getattr(found, each) if each in statistics else None for each in SUMMARY)
-                summaries.append((cell.about("cell"), name, *values))
-    return {"timelines.csv": CsvTable.of(("cell", "metric", *SUMMARY), summaries)}
+                values = (getattr(summary, each) if each in statistics else None for each in SUMMARY)
+                rows.append((cell.first.cell, name, *values))
+    return {"timelines.csv": CsvTable.of(("cell", "metric", *SUMMARY), rows)}
 
 
 def _table(cells: Sequence[Timelines], title: str, metrics: Sequence[str], notes: Iterable[str]) -> TextTable:
     """Return a table of means, a group of rows a board."""
-    several = len({cell.setting[2:] for cell in cells}) > 1
+    several = len({cell.shape for cell in cells}) > 1
     boards: dict[str, list[tuple[str, ...]]] = {}
     names: dict[str, list[str]] = {}
-    for (name, tokens, n_skills, t_nom_s), group in panels(cells):
-        board = name + (f", N {n_skills}, T {t_nom_s:g}" if several else "")
-        for place, cell in enumerate(group):
+    for panel in panels(cells):
+        title, tokens, n_skills, t_nom_s = panel.cells[0].setting
+        board = title + (f", N {n_skills}, T {t_nom_s:g}" if several else "")
+        for place, cell in enumerate(panel.cells):
             row = (board, "" if place else str(tokens), cell.policy, *(_entry(cell, METRICS[name]) for name in metrics))
             boards.setdefault(board, []).append(row)
-            names.setdefault(board, []).append(str(cell.about("cell")))
+            names.setdefault(board, []).append(cell.first.cell)
     header = ("board", "L", "policy", *(METRICS[name].title for name in metrics))
     return TextTable.grouped(title, header, boards.values(), 3, notes, once=1, cells=chain(*names.values()))
 
@@ -168,35 +168,39 @@ def _entry(cell: Timelines, metric: Metric) -> str:
     if metric.kind == SHARE:
         return f"{value:.0%}" if abs(value) >= 0.0995 or not value else f"{round(value, 3) + 0.0:.1%}"  # noqa: PLR2004 - two digits
     if metric.kind == COUNT:
-        return f"{value:.0f}" if cell.n == 1 else f"{value:.2f}"
+        return f"{value:.0f}" if len(cell) == 1 else f"{value:.2f}"
     return number(value)
 
 
+def _is_random(cells: Iterable[Timelines]) -> bool:
+    """Return whether a cell has several plans."""
+    return any(len(cell) > 1 for cell in cells)
+
+
 def _common(cells: Sequence[Timelines]) -> str:
-    shapes = {cell.setting[2:] for cell in cells}
-    return "" if len(shapes) != 1 else ", N = {}, T_nom = {:g} s".format(*next(iter(shapes)))
+    """Return N and T_nom if all cells share them."""
+    shapes = {cell.shape for cell in cells}
+    return "" if len(shapes) != 1 else ", N = {}, T_nom = {:g} s".format(*shapes.pop())
 
 
-ONLINE_LIVE = (ONLINE, "live")
-
-
-def _plan_notes(run: StoredRun, cells: Sequence[Timelines]) -> tuple[str, ...]:
+def _plan_notes(cells: Sequence[Timelines], manifest: Mapping[str, Any]) -> list[str]:
     """Return the number of plans, and the calibration or prior of stream-to-act."""
     notes = []
-    plans = {cell.n for cell in cells}
-    if max(plans, default=1) > 1:
+    if _is_random(cells):
         moved = max(cell.values("rms_jerk").size for cell in cells)
-        notes.append(f"{max(plans)} plans a cell, the same for every policy; motion: of the first {moved}.")
-    if calibrations := run.manifest.get("calibrations"):
-        cautions = [found["caution"] for found in calibrations.values() if found["caution"] is not None]
+        notes.append(f"{max(map(len, cells))} plans a cell, the same for every policy; motion: of the first {moved}.")
+    ours = [cell.first for cell in cells if cell.policy == ONLINE]
+    if calibrations := manifest.get("calibrations"):
+        cautions = [each["caution"] for each in calibrations.values() if each["caution"] is not None]
         span = " to ".join(f"{end:g}" for end in sorted({min(cautions), max(cautions)})) if cautions else "infinite"
         plans_each = next(iter(calibrations.values()))["plans"]
-        kind = "recorded" if run.manifest["configuration"].get("calibrate") else "other"
+        kind = "recorded" if manifest["configuration"].get("calibrate") else "other"
         notes.append(f"stream-to-act: lambda {span}, calibrated on {plans_each} {kind} plans a setting.")
         notes.append(promise(calibrations, "lambda", "plans"))
-    elif live_cautions := {cell.about("caution") for cell in cells if (cell.policy, cell.about("mode")) == ONLINE_LIVE}:
-        span = ", ".join(f"{caution:g}" for caution in sorted(live_cautions))
+    elif live := [plan for plan in ours if plan.mode == "live"]:
+        known = sorted({plan.caution for plan in live if plan.caution is not None})
+        span = ", ".join(f"{caution:g}" for caution in known) or "infinite"
         notes.append(f"stream-to-act: lambda {span}, not calibrated; its prior is from the warm-ups, or the pace.")
-    elif any((cell.policy, cell.about("mode")) == (ONLINE, "virtual") for cell in cells):
+    elif any(plan.mode == "virtual" for plan in ours):
         notes.append("Nothing varies, and stream-to-act's prior knows it: it starts at S0.")
-    return tuple(notes)
+    return notes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby, pairwise
 from math import inf
 from typing import Any, Final
@@ -36,7 +36,7 @@ from s2a_bench.plugins.paper.claims.requests import (
     on_board,
     one_of,
 )
-from s2a_bench.policy import TOLERANCE_S, Floats, Plans
+from s2a_bench.policy import TOLERANCE_S, Plans
 from s2a_bench.policy.schedule import elastic, safe_start, work_conserving
 from s2a_bench.provenance import UNKNOWN
 from s2a_bench.report.verdicts import Met
@@ -95,48 +95,48 @@ def timelines(run: StoredRun) -> Iterator[RunPart]:
     """Yield the timelines of each source of tokens, N and T_nom: L -> policy -> cell, from long to short skills."""
 
     def setting(cell: Timelines) -> tuple[str, int, float]:
-        title, _, n_skills, t_nom_s = cell.setting
-        return title, n_skills, t_nom_s
+        return cell.first.title, *cell.shape
 
     settings = run.manifest.get("configuration", {})
     spread, jitter = settings.get("t_nom_cv") or 0.0, settings.get("jitter", "none")
     named = {} if jitter == NAMED_JITTER else {"jitter": "none"}
-    for (title, n_skills, t_nom_s), group in groupby(sorted(timelines_of(run), key=setting), key=setting):
-        every = sorted(group, key=lambda cell: -cell.setting[1])
+    for (title, n_skills, t_nom_s), same in groupby(sorted(timelines_of(run), key=setting), key=setting):
+        every = sorted(same, key=lambda cell: -cell.first.tokens_per_skill)
         cells: dict[int, dict[str, Timelines]] = {}
         for cell in every:
-            cells.setdefault(cell.setting[1], {})[cell.policy] = cell
-        origins = [run.origins.of(str(cell.about("cell"))) for cell in every]
+            cells.setdefault(cell.first.tokens_per_skill, {})[cell.policy] = cell
+        origins = [run.origins.of(cell.first.cell) for cell in every]
         shown = _shown(cells)
-        launches = int(any(cell.about("mode") != "virtual" for cell in every))
+        launches = int(any(cell.first.mode != "virtual" for cell in every))
         facts = facts_of(run, origins) | {
-            "tokens/s": float(every[0].about("tokens_per_s")),
+            "tokens/s": every[0].first.tokens_per_s,
             "settings": _unlike({**_UNMODELLED, **settings, "n_skills": n_skills, "t_nom_s": t_nom_s}, PLANS | named),
             "L": ", ".join(map(str, cells)),
             "policies": ", ".join(name for name in cells[max(cells)] if all(name in each for each in cells.values())),
             "stall of naive in s": max([0.0, *(_stall_s(each[NAIVE]) for each in cells.values() if NAIVE in each)]),
             "S0 after the first arrival in s": max(
-                [0.0, *(float(safe_start(arrival, nominal)[0] - arrival[0, 0]) for arrival, nominal, *_ in shown)]
+                [0.0, *(float((safe_start(plan.arrival_s, plan.nominal_s) - plan.arrival_s[0])[0]) for plan in shown)]
             ),
-            "T_max / T_nom": max((float((most / nominal).max()) for _, nominal, _, most in shown), default=1.0),
+            "T_max / T_nom": max((float((plan.most_s / plan.nominal_s).max()) for plan in shown), default=1.0),
             "promised": min(float(settings.get("epsilon") or _PROMISED), _PROMISED),
             "times": EXACT if settings.get("jitter") == "none" and not spread and not launches else VARYING,
         }
-        gaps = "" if jitter == "none" else f", jitter {jitter}, {every[0].n} plans a cell"
+        gaps = "" if jitter == "none" else f", jitter {jitter}, {len(every[0])} plans a cell"
         assumed = "an assumption: the paper gives neither N nor T_nom"
         about = f"{title}, N = {n_skills}, T_nom = {t_nom_s:g} s ({assumed}){gaps}."
         yield RunPart(run, facts, origins, launches, cells, about)
 
 
-def _shown(cells: Mapping[int, Mapping[str, Timelines]]) -> list[tuple[Floats, ...]]:
-    """Return arrivals, nominal, least and most durations of the shown plan of each L, as columns, in s."""
-    columns = ("arrival_ns", "nominal_ns", "least_ns", "most_ns")
-    every = [next(iter(of_length.values())).skills for of_length in cells.values()]
-    return [
-        tuple(skills[name].to_numpy(dtype="float64")[:, None] / 1e9 for name in columns)
-        for skills in every
-        if len(skills) > 1
-    ]
+def _shown(cells: Mapping[int, Mapping[str, Timelines]]) -> list[Plans]:
+    """Return the shown plan of each L that has several skills."""
+    plans = []
+    for of_length in cells.values():
+        skills = next(iter(of_length.values())).skills
+        if len(skills) > 1:
+            times_ns = [(skill.arrival_ns, skill.nominal_ns, skill.least_ns, skill.most_ns) for skill in skills]
+            arrival_s, nominal_s, least_s, most_s = np.array(times_ns).T[:, :, None] / 1e9
+            plans.append(Plans(arrival_s, nominal_s, least_s, most_s))
+    return plans
 
 
 def _stall_s(cell: Timelines) -> float:
@@ -169,13 +169,13 @@ def no_stalls(*policies: str) -> Check:
         cells = [of_length[policy] for of_length in part.cells.values() for policy in policies]
         ratios, stalled = [], []
         for cell in cells:
-            share = Share(round(cell.p_any_stall * cell.n), cell.n)
+            share = Share(round(cell.p_any_stall * len(cell)), len(cell))
             low, high = (share.value, share.value) if even else share.interval
             ratios.append(Ratio(share.value / promised, low / promised, high / promised))
             if share.k or high > promised:
                 spread = "" if even else f" [{low:.1%}, {high:.1%}]"
                 many = f"{share.k} of {share.n} plans stall{spread}, {_stall_s(cell):.2f} s in the mean"
-                stalled.append(f"{cell.policy} at L = {cell.setting[1]}: {many}")
+                stalled.append(f"{cell.policy} at L = {cell.first.tokens_per_skill}: {many}")
         text = "; ".join(stalled) or f"{', '.join(policies)}: no plan stalls"
         regrets = [cell.mean("signed_start_regret") for cell in cells if cell.policy == STREAM]
         starts = [late for late in regrets if late is not None]
@@ -201,7 +201,7 @@ def after(policy: str, than: str, metric: str, least: float = -inf, most: float 
 def stalled_gaps(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure the share of the gaps between skills that are stalls of naive, at every L."""
     cells = [of_length[NAIVE] for of_length in part.cells.values()]
-    shares = [(cell.mean("stalls") or 0.0) / max(cell.setting[2] - 1, 1) for cell in cells]
+    shares = [(cell.mean("stalls") or 0.0) / max(cell.first.n_skills - 1, 1) for cell in cells]
     return list(map(exact, shares)), _at(part, [f"{share:.0%}" for share in shares])
 
 
@@ -216,20 +216,20 @@ def growth(part: RunPart) -> tuple[list[Ratio], str]:
 def early_stalls(part: RunPart) -> tuple[list[Ratio], str]:
     """Start at five times before S0 with T_nom, and measure how far stalls are from S0 - S (theorem T1)."""
     off_s = []
-    for arrival, nominal, *_ in _shown(part.cells):
-        safe_s, first_s = float(safe_start(arrival, nominal)[0]), float(arrival[0, 0])
+    for plan in _shown(part.cells):
+        safe_s, first_s = float(safe_start(plan.arrival_s, plan.nominal_s)[0]), float(plan.arrival_s[0, 0])
         starts = first_s + (safe_s - first_s) * np.array([0, 0.25, 0.5, 0.75, 0.95])
-        begun = work_conserving(np.repeat(arrival, len(starts), axis=1), nominal, starts)
-        off_s += [*np.abs(begun[-1] - begun[0] - nominal[:-1].sum() - (safe_s - starts))]
+        begun = work_conserving(np.repeat(plan.arrival_s, len(starts), axis=1), plan.nominal_s, starts)
+        off_s += [*np.abs(begun[-1] - begun[0] - plan.nominal_s[:-1].sum() - (safe_s - starts))]
     return [exact(float(max(off_s)))], f"{len(off_s)} earlier starts tried, off by {max(off_s):.1e} s"
 
 
 def stretched(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure how long before S0 a plan can start without a stall, with the extension that the paper allows."""
     earlier = []
-    for arrival, nominal, least, most in _shown(part.cells):
-        start_s = float(elastic(Plans(arrival, nominal, np.minimum(least, nominal), most)).start_s[0, 0])
-        safe_s = float(safe_start(arrival, nominal)[0])
+    for plan in _shown(part.cells):
+        as_planned = replace(plan, least_s=np.minimum(plan.least_s, plan.nominal_s))
+        start_s, safe_s = float(elastic(as_planned).start_s[0, 0]), float(safe_start(plan.arrival_s, plan.nominal_s)[0])
         earlier.append((safe_s - start_s, f"{start_s:.2f} s instead of S0 = {safe_s:.2f} s"))
     early_s, text = max(earlier)
     return [exact(early_s)], text

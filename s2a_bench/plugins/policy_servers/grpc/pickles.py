@@ -39,7 +39,6 @@ NEEDED: Final = frozenset(
     }
 )
 SHOWN: Final = 200
-"""Letters of an error that are shown."""
 HEAD: Final = (0x1950A86A20F9469CFC6C, 1001)
 """Magic number and version of torch's legacy format."""
 COUNT: Final = np.dtype("<i8")

@@ -47,10 +47,7 @@ _PLAIN: Final = {"b": (bool,), "i": (int,), "u": (int,), "f": (float, int), "S":
 
 
 def packb(value: Any, *, text_keys: bool = False) -> bytes:
-    """Write a message, the keys of its arrays as bytes or as texts.
-
-    Raises RequestFailed for an array that no policy server takes, or a value that is none.
-    """
+    """Write a message, the keys of its arrays as bytes or texts; raises RequestFailed for what does not travel."""
     try:
         packed: bytes = msgpack.packb(value, default=_text_keyed if text_keys else _packable)
     except (TypeError, ValueError, OverflowError) as error:

@@ -180,8 +180,8 @@ class PolicyConnection:
             self._came(len(data))
         except TimeoutError as error:
             late = HTTPStatus.REQUEST_TIMEOUT if shaking else CloseCode.POLICY_VIOLATION
-            what = ("the handshake", limits.head_s) if shaking else ("a message", limits.body_s)
-            raise _Refused(late, "{} took more than {:g} s".format(*what)) from error
+            what, limit_s = ("the handshake", limits.head_s) if shaking else ("a message", limits.body_s)
+            raise _Refused(late, f"{what} took more than {limit_s:g} s") from error
         except Busy as error:
             busy = HTTPStatus.SERVICE_UNAVAILABLE if shaking else CloseCode.TRY_AGAIN_LATER
             raise _Refused(busy, f"{error}; come again later") from error

@@ -95,13 +95,13 @@ def modalities_in(answer: Any) -> dict[str, tuple[list[str], int]]:
     try:
         configs = {name: answer[name]["as_json"] for name in ("video", "state", "language")}
         configs = {name: json.loads(each) if isinstance(each, str) else each for name, each in configs.items()}
-        found = {
+        keys_of = {
             name: ([*map(str, each["modality_keys"])], len(each["delta_indices"])) for name, each in configs.items()
         }
     except (LookupError, TypeError, ValueError, RecursionError):
         return {}
-    plain = all(key != EXTENSION and not key.endswith("?") for keys, _ in found.values() for key in keys)
-    return found if plain and sum(len(keys) * steps for keys, steps in found.values()) <= VALUES else {}
+    plain = all(key != EXTENSION and not key.endswith("?") for keys, _ in keys_of.values() for key in keys)
+    return keys_of if plain and sum(len(keys) * steps for keys, steps in keys_of.values()) <= VALUES else {}
 
 
 def template_of(layout: str, keys_of: Mapping[str, tuple[Sequence[str], int]], state: int) -> Template:
@@ -110,7 +110,8 @@ def template_of(layout: str, keys_of: Mapping[str, tuple[Sequence[str], int]], s
     kinds = [part.rpartition(".")[2].replace("left_", "").replace("right_", "") for part in parts]
     unknown = [kind for kind in kinds if kind not in WIDTHS]
     each, over = divmod(state - sum(WIDTHS.get(kind, 0) for kind in kinds), len(unknown) or 1)
-    if len({*unknown}) > 1 or over or (each < 1 if unknown else each):
+    off = each < 1 if unknown else each != 0
+    if len({*unknown}) > 1 or over or off:
         widths = ", ".join(f"{part} ({WIDTHS.get(kind, '?')})" for part, kind in zip(parts, kinds, strict=True))
         cure = "give `template`" if len({*unknown}) > 1 else "change `state`, or give `template`"
         raise RequestFailed(f"the server's state is {widths}, not {state} numbers; {cure}")

@@ -128,10 +128,7 @@ def file_of(array: NDArray[Any]) -> bytes:
 
 
 def array_of(data: Any) -> NDArray[Any]:
-    """Return the read-only array in a file, without copying it.
-
-    Raises RequestFailed for what is no such file, for other than numbers, and where the size is not that of the shape.
-    """
+    """Return the read-only array in a file, not copied; raises RequestFailed for other bytes, types and sizes."""
     if not isinstance(data, bytes):
         raise RequestFailed(f"an array whose as_npy is {type(data).__name__}, not bytes")
     start, shape, fortran, dtype = _read_head(_head_in(data))

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from s2a_bench.plugins.two_hosts.links import EmulatedLink
 
 SERVER, CLIENT = "127.0.0.1", "127.0.0.2"
-"""Addresses of the two sides."""
 ATTEMPTS: Final = 3
 RATE_S: Final = 1.0
 OFFERED: Final = 1.15
@@ -70,14 +69,14 @@ def probed(link: EmulatedLink) -> dict[str, Any]:
     while off and attempts < ATTEMPTS:
         attempts += 1
         with ExitStack() as stack:
-            found = list(_Probe(link, stack).measure())
-        off = [str(each) for each in found if each.off]
+            quantities = list(_Probe(link, stack).measure())
+        off = [str(each) for each in quantities if each.off]
     if off:
         raise UsageError(
             f"`link`: this machine does not carry {link.profile.name} within {OFF:.0%}: {'; '.join(off)}; "
             "stop other programs, or choose a slower link"
         )
-    return {"probe": {"attempts": attempts, "quantities": [asdict(each) for each in found]}}
+    return {"probe": {"attempts": attempts, "quantities": [asdict(each) for each in quantities]}}
 
 
 class _Probe:
@@ -108,7 +107,7 @@ class _Probe:
 
     def _round_trips(self, sender: socket.socket, receiver: socket.socket) -> list[float]:
         """Return round trips in ms, each after idle, without those that lost a packet."""
-        clock, found = SystemClock(), []
+        clock, times_ms = SystemClock(), []
         for each in (sender, receiver):
             each.settimeout(self._round_s + SILENT_S)
         for number in range(PINGS):
@@ -119,8 +118,8 @@ class _Probe:
                 _receive(receiver, data)
                 receiver.sendto(data, sender.getsockname())
                 _receive(sender, data)
-                found.append((now_ns() - sent_ns) / 1e6)
-        return found
+                times_ms.append((now_ns() - sent_ns) / 1e6)
+        return times_ms
 
     def _loss(self, name: str, way: Direction, sender: socket.socket, receiver: socket.socket) -> Found:
         mbps = min(way.mbps / 2, COUNTED_PER_S * SMALL_BYTES * 8e-6)
@@ -158,7 +157,8 @@ class _Probe:
             last_ns = now_ns() if sent < count else max([last_ns, *arrivals[-1:]])
             if len(arrivals) == count:
                 break
-            select([receiver], [], [], SILENT_S if sent == count else max(gap_ns / 1e9, 0.0005) * (gap_ns > 0))
+            pause_s = max(gap_ns / 1e9, 0.0005) if gap_ns else 0.0
+            select([receiver], [], [], SILENT_S if sent == count else pause_s)
         return arrivals
 
 

@@ -10,8 +10,6 @@ LIMIT = 4 << 20
 
 
 class Framing(Protocol):
-    """Cuts one body into messages."""
-
     def feed(self, data: bytes) -> Iterator[str | bytes]:
         """Yield the messages that these bytes complete; raises ValueError for one that is too large."""
 
