@@ -202,19 +202,18 @@ def combine(claim: Claim, names: Mapping[ClaimFinding, Iterable[str]]) -> ClaimV
 
 def _findings(claim: Claim, run: StoredRun) -> Iterator[ClaimFinding]:
     """Judge the parts that meet all needs; else measure those of other settings; else yield the nearest's needs."""
-    needed = claim.trial.needs
-    every = [(part, tuple(need.of(part.facts) for need in needed)) for part in claim.trial.parts(run)]
-    fit = [(part, mets) for part, mets in every if all(met for _, met in mets)]
-    free = [
-        (part, mets)
-        for part, mets in every
-        if all(met or need.chosen for need, (_, met) in zip(needed, mets, strict=True))
-    ]
+    every = []
+    for part in claim.trial.parts(run):
+        needs = tuple(need.of(part.facts) for need in claim.trial.needs)
+        unmet = [need for need, (_, met) in zip(claim.trial.needs, needs, strict=True) if not met]
+        every.append((part, needs, unmet))
+    fit = [(part, needs) for part, needs, unmet in every if not unmet]
+    free = [(part, needs) for part, needs, unmet in every if all(need.chosen for need in unmet)]
     for part, needs in fit or free:
         verdict, evidence = claim.judge(part)
         if not fit:
             verdict, evidence = UNDECIDED, f"At your settings, no verdict: {evidence}"
         yield ClaimFinding(verdict, evidence, needs, tuple(part.origins), part.launches)
     if every and not free:
-        part, needs = min(every, key=lambda each: sum(not need.met for need in each[1]))
+        part, needs, _ = min(every, key=lambda each: len(each[2]))
         yield ClaimFinding(UNDECIDED, "Not testable with this run.", needs, tuple(part.origins), part.launches)
