@@ -23,6 +23,6 @@ def test_pandas_and_the_report_agree() -> None:
     lines = [line.split() for line in shown.splitlines() if line.split()[0] in by_name]
     assert len(lines) == len(by_name)
     for name, median, p99 in lines:
-        values = by_name[name].values_ms("e2e_without_inference")
+        values = by_name[name].values("e2e_without_inference")
         assert float(median) == pytest.approx(float(np.median(values)), rel=1e-4)
         assert float(p99) == pytest.approx(float(np.percentile(values, 99)), rel=1e-4)

@@ -21,7 +21,9 @@ from pydantic_core import core_schema
 from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.ccrb.view.tables import ORDERINGS
 from s2a_bench.experiments.cells import columns_of
+from s2a_bench.experiments.latency.metrics import AROUND, LatencyCell
 from s2a_bench.experiments.profile_capture import ProfileJson
+from s2a_bench.experiments.requests import RequestsCell
 from s2a_bench.experiments.throughput.metrics import Reference
 from s2a_bench.inference.fetch import FetchedFile
 from s2a_bench.inference.model_list import ListedModel
@@ -51,6 +53,9 @@ class HouseForm(GenerateJsonSchema):
         """Return the schema of a dataclass, described by its docstring."""
         made = super().dataclass_schema(schema)
         del made["title"]
+        if schema["cls"] is LatencyCell:
+            summary = made["properties"]["e2e_ms"]
+            made["properties"] |= {each.key: summary | {"description": each.about} for each in AROUND}
         text = " ".join(made["description"].replace("``", "`").replace("None", "null").split())
         return made | _keys(schema["cls"], made) | {"description": text, "additionalProperties": False}
 
@@ -70,7 +75,7 @@ class HouseForm(GenerateJsonSchema):
 def _keys(cls: type, made: dict[str, Any]) -> dict[str, Any]:
     """Return properties and required keys of a class, of rows as `json_of` writes them."""
     columns = columns_of(cls)
-    if not any(column.metric or column.json_key for column in columns):
+    if issubclass(cls, RequestsCell) or not any(column.metric or column.json_key for column in columns):
         return {}
     properties, required = {}, []
     for column in columns:

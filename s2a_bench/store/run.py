@@ -215,30 +215,24 @@ class StoredRun:
     manifest: dict[str, Any]
     tables: dict[str, pd.DataFrame] = field(default_factory=dict)
     """The tables read so far, by name."""
-    derived: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
-    """Values that views compute from the tables once, by name."""
 
     def table(self, table: Table[Any], columns: Sequence[str] | None = None) -> pd.DataFrame:
         """Return a table with all its columns, empty if the run has none; raises StoreError for a damaged file.
 
-        With ``columns`` only these are read and nothing is kept; texts but JSON are then categoricals, in order of
-        appearance.
+        With ``columns`` it has only these, of which texts but JSON are categoricals in order of appearance; they are
+        read alone from the Parquet file of a run that has ended, and not kept.
         """
-        if columns is not None:
-            return self._some(table, columns)
-        if table.name not in self.tables:
-            self.tables[table.name] = self._read(table.name, table.columns)
-        return self.tables[table.name]
-
-    def _some(self, table: Table[Any], columns: Sequence[str]) -> pd.DataFrame:
+        if columns is None:
+            if table.name not in self.tables:
+                self.tables[table.name] = self._read(table.name, table.columns)
+            return self.tables[table.name]
         texts = [name for name in columns if table.columns[name] == "string"]
-        if table.name not in self.tables:
-            return self._read(
-                table.name, {name: table.columns[name] for name in columns} | dict.fromkeys(texts, "category")
-            )
+        if table.name not in self.tables and (self.path / f"{table.name}.parquet").exists():
+            kinds = {name: table.columns[name] for name in columns} | dict.fromkeys(texts, "category")
+            return self._read(table.name, kinds)
         import pandas as pd
 
-        rows = self.tables[table.name][[*columns]]
+        rows = self.table(table)[[*columns]]
         return rows.astype({name: pd.CategoricalDtype([*rows[name].dropna().unique()]) for name in texts})
 
     def _read(self, name: str, columns: dict[str, Kind]) -> pd.DataFrame:

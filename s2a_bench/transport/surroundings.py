@@ -77,6 +77,8 @@ class Surroundings:
     """A run's; each names its ``panel``."""
     columns: ClassVar[str] = ""
     """A function of a kept run and its samples, which returns these with further columns; as "module:attribute"."""
+    reads: ClassVar[Sequence[str]] = ()
+    """The columns of the samples that it needs; without any it gets all."""
     metrics: ClassVar[str] = ""
     """The `RequestMetric`s of these columns."""
     figures: ClassVar[str] = ""

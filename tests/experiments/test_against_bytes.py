@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from s2a_bench.experiments.latency.view.against_bytes import against_bytes, order_changes, shown
-from s2a_bench.experiments.requests import split
+from s2a_bench.experiments.requests import RequestCells, cells_of
 from s2a_bench.store.run import StoredRun
 from s2a_bench.transport import TRANSPORTS
 from s2a_bench.writers.figures import caption_of
@@ -21,6 +21,10 @@ A_MB = {"http/binary": 0.3, "ros/topic": 0.9, "loopback": 0.2}
 
 def settings(width: int, height: int, cameras: int, **more: Any) -> dict[str, Any]:
     return {"configuration": {"width": width, "height": height, "cameras": cameras, **more}}
+
+
+def split(runs: list[StoredRun]) -> list[RequestCells]:
+    return [cells_of(run) for run in runs]
 
 
 @pytest.fixture

@@ -7,22 +7,17 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from s2a_bench.cli.progress import RunProgress
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.ccrb.config import CcrbComputed
-from s2a_bench.experiments.ccrb.rows import LOOP, METRICS, ROLLOUTS
+from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
 from s2a_bench.experiments.ccrb.run import run_ccrb
-from s2a_bench.experiments.ccrb.view.figures import build_phase, build_scenario, region_of
-from s2a_bench.experiments.ccrb.view.outcomes import (
-    Share,
-    cells_of,
-    rate_span,
-    scenes_of,
-    share_of,
-)
-from s2a_bench.experiments.ccrb.view.tables import ccrb_json, finding, show
+from s2a_bench.experiments.ccrb.view.figures import region_of
+from s2a_bench.experiments.ccrb.view.outcomes import Rollouts, Share, rate_span, share_of
+from s2a_bench.experiments.ccrb.view.tables import LOOP, finding, show
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.labels import MARK, NO_SCORE
 from s2a_bench.scenario.ccrb.options import CcrbOptions
@@ -41,6 +36,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., StoredRun]:
     return make
 
 
+def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
+    return Rollouts.of(run).studies[study][gap]
+
+
 def test_at_the_operating_point_the_papers_outcome_comes_about(made: Callable[..., StoredRun]) -> None:
     rows = made().table(ROLLOUTS).set_index("policy")
     assert rows["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "none"}
@@ -54,7 +53,7 @@ def test_with_full_braking_in_gaps_the_ordering_holds_for_a_band_of_rates_and_wa
     made: Callable[..., StoredRun],
 ) -> None:
     run = made(**GRID)
-    low, high = rate_span(run, "stop", at_point=True) or (0.0, 0.0)
+    low, high = rate_span(scenes_of(run, "phase", "stop"), 14.0) or (0.0, 0.0)
     assert 4.0 <= low <= 4.8 <= high <= 6.5
     scenes = scenes_of(run, "phase", "stop")
     assert share_of(scenes, "paper").value < 0.15
@@ -70,7 +69,7 @@ def test_acting_at_once_is_better_more_often_and_the_ordering_next_to_nowhere_un
     scenes = scenes_of(run, "phase", gap)
     assert share_of(scenes, "naive_better").k > share_of(scenes, "naive_worse").k
     if gap != "stop":
-        assert rate_span(run, gap, at_point=True) is None
+        assert rate_span(scenes, 14.0) is None
         assert share_of(scenes, "paper").value < 0.02
 
 
@@ -79,7 +78,7 @@ def test_with_the_hybrid_follower_the_operating_point_turns_round(made: Callable
     point = run.table(ROLLOUTS)[run.table(ROLLOUTS)["study"] == "point"].set_index("policy")
     assert point["outcome"].to_dict() == {"naive": "rear", "wait-then-act": "front", "stream-to-act": "rear"}
     assert point["rear_impact_mps"]["stream-to-act"] > point["rear_impact_mps"]["naive"] + 1
-    assert rate_span(run, "stop", at_point=True) is None
+    assert rate_span(scenes_of(run, "phase", "stop"), 14.0) is None
     assert share_of(scenes_of(run, "phase", "stop"), "paper").value < 0.02
 
 
@@ -88,7 +87,7 @@ def test_a_rear_outcome_behind_which_no_ego_is_safe_says_nothing(
     made: Callable[..., StoredRun], follower: str, passes: bool
 ) -> None:
     run = made(scenario=CcrbOptions(follower=follower))
-    assert all(cell["follower_survives"] is passes for cell in cells_of(run))
+    assert all(row.follower_survives is passes for row in Rollouts.of(run).point)
     table = show(run).tables["outcomes"]
     marked = [row[1] for row in table.rows if MARK in row[1]]
     assert marked == ([] if passes else [f"hit from behind {MARK}"] * 2)
@@ -134,10 +133,10 @@ def test_what_never_stalls_comes_out_alike_with_every_gap_behaviour(made: Callab
 
 def test_the_findings_name_every_gap_behaviour(made: Callable[..., StoredRun]) -> None:
     run = made(**GRID)
-    lines = [finding(run, gap) for gap in GAPS]
+    lines = [finding(gap, scenes_of(run, "phase", gap), 14.0) for gap in GAPS]
     assert [line.split(":")[0] for line in lines] == list(GAPS)
     assert "holds nowhere" in lines[GAPS.index("hold")]
-    assert rate_span(run, "hold") is None
+    assert rate_span(scenes_of(run, "phase", "hold")) is None
 
 
 def test_the_regions_of_the_diagram_cover_it_and_the_figures_can_be_drawn(made: Callable[..., StoredRun]) -> None:
@@ -146,8 +145,9 @@ def test_the_regions_of_the_diagram_cover_it_and_the_figures_can_be_drawn(made: 
     named = region_of(scenes)
     assert named.count("paper") == share_of(scenes, "paper").k > 0
     assert {"wait", "nobody", "all"} <= set(named)
-    assert len(build_phase(run).axes) == len(GAPS)
-    assert len(build_scenario(run).axes) == 9
+    figures = show(run).figures
+    assert len(figures["phase"]().axes) == len(GAPS)
+    assert len(figures["scenario"]().axes) == 9
 
 
 def test_the_interval_is_clopper_pearsons() -> None:
@@ -170,8 +170,8 @@ def test_the_deadline_makes_stream_to_act_start_earlier_where_it_must(made: Call
 
 def test_the_metrics_are_keys_of_the_cells_and_columns_of_the_tables(made: Callable[..., StoredRun]) -> None:
     run = made()
-    keys = {key for cell in ccrb_json(run)["cells"] for key in cell}
-    assert {metric.name for metric in METRICS} - keys == {metric.name for metric in LOOP}
+    keys = {key for cell in show(run).json()["cells"] for key in cell}
+    assert METRICS.keys() - keys == set(LOOP)
     tables = show(run).tables
     assert tables["outcomes"].header[2:4] == ("start s", "stalls")
     assert tables["margins"].header[4] == "RMS jerk m/s\N{SUPERSCRIPT THREE}"

@@ -14,8 +14,8 @@ from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.experiments.ccrb.config import CcrbLive, CcrbLiveLoop, DrivingRequests
 from s2a_bench.experiments.ccrb.live import run_live, run_live_loop
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS
-from s2a_bench.experiments.ccrb.view.outcomes import origin_notes, token_times_s
-from s2a_bench.experiments.ccrb.view.tables import ccrb_json
+from s2a_bench.experiments.ccrb.view.outcomes import Rollouts, origin_notes
+from s2a_bench.experiments.ccrb.view.tables import show
 from s2a_bench.inference import EngineConfig
 from s2a_bench.inference.models import tiny_dummy
 from s2a_bench.scenario import SIMULATORS
@@ -52,7 +52,7 @@ def paced(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
 
 
 def test_every_policy_drives_on_the_arrivals_that_the_client_recorded(paced: StoredRun) -> None:
-    token_ns = np.rint(np.array(token_times_s(paced, paced.table(SKILLS)["cell"].iloc[0])) * 1e9).astype(np.int64)
+    token_ns = np.rint(np.array(Rollouts.of(paced).token_s(paced.table(SKILLS)["cell"].iloc[0])) * 1e9).astype(np.int64)
     assert len(token_ns) == N * L
     arrivals_ns = token_ns[L - 1 :: L]
     skills = paced.table(SKILLS)
@@ -80,12 +80,12 @@ def test_each_request_has_a_picture_of_its_own_and_the_warm_up_is_marked(paced: 
 
 
 def test_a_paced_dummy_is_live_and_says_what_is_set_and_what_means_nothing(paced: StoredRun) -> None:
-    notes = " ".join(origin_notes(paced))
+    notes = " ".join(origin_notes(Rollouts.of(paced)))
     assert "LIVE tokens over loopback, paced to 40 tokens/s (the rate is set); car simulated." in notes
     assert "Dummy weights: what the plan says means nothing" in notes
     assert "Open loop: one request at t = 0" in notes
     assert "EMULATED" not in notes
-    printed = ccrb_json(paced)
+    printed = show(paced).json()
     jsonschema.validate(printed, SCHEMA)
     assert {cell["emulated"] for cell in printed["cells"]} == {False}
     assert {cell["rate_tokens_per_s"] for cell in printed["cells"]} == {40.0}
@@ -98,10 +98,10 @@ def test_a_text_model_is_live_and_its_tokens_say_that_the_scene_is_not_seen(tmp_
     model.symlink_to(tiny_dummy()[0])
     engine = EngineConfig(model=model, threads=1)
     run = drive(asked(engine), tmp_path / "runs")
-    first = origin_notes(run)[0]
+    first = origin_notes(Rollouts.of(run))[0]
     assert first.startswith("LIVE tokens over loopback, picture not seen; car simulated.")
     assert first.labels == ("picture not seen",)  # type: ignore[attr-defined]
-    printed = ccrb_json(run)
+    printed = show(run).json()
     jsonschema.validate(printed, SCHEMA)
     assert printed["provenance"]["run"]["pictures"] == "not seen"
 
@@ -109,10 +109,10 @@ def test_a_text_model_is_live_and_its_tokens_say_that_the_scene_is_not_seen(tmp_
 def test_a_replayed_profile_stays_emulated(fast_board: str, tmp_path: Path) -> None:
     run = drive(replayed(fast_board), tmp_path / "runs")
     assert run.table(ROLLOUTS)["emulated"].all()
-    first = origin_notes(run)[0]
+    first = origin_notes(Rollouts.of(run))[0]
     assert first.startswith("EMULATED (replayed) tokens over loopback; car simulated. 1")
     assert first.endswith(" tokens/s arrived.")
-    assert ccrb_json(run)["live"]["emulated"] is True
+    assert show(run).json()["live"]["emulated"] is True
 
 
 def test_a_plan_that_is_not_whole_ends_the_run_and_keeps_what_came(
@@ -155,7 +155,7 @@ def test_the_ego_is_commanded_and_seen_over_ros_while_its_plan_arrives(
     driven = run.table(ROLLOUTS).query("study == 'point'")
     assert list(driven["simulator"]) == ["stand-in"]
     assert run.manifest["configuration"]["ego"] == ego
-    assert f"Ego: commanded and seen over ROS 2 ({ego})." in origin_notes(run)
+    assert f"Ego: commanded and seen over ROS 2 ({ego})." in origin_notes(Rollouts.of(run))
     assert len(run.samples) == 2
     pedals = [(message.throttle, message.brake) for message in world.received]
     assert any(throttle > 0.03 and brake == 0 for throttle, brake in pedals)  # it kept its speed

@@ -72,7 +72,7 @@ def test_on_the_same_arrivals_a_loop_ends_as_its_roll_out(number: int) -> None:
     assert looped.record.outcome == "completed"
     assert looped.driven.outcomes.name(0) == expected.outcomes.name(0)
     assert differ_m(looped.driven, expected) < 0.03
-    assert looped.facts["real_time_factor"] == 1.0
+    assert looped.real_time_factor == 1.0
 
 
 def test_a_board_of_which_the_first_token_takes_minutes_hits_the_lead_as_in_its_roll_out() -> None:

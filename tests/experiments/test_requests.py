@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 
-from s2a_bench.experiments.requests import cells_of, engine_note, groups_present, ratios, stages_present
+from s2a_bench.experiments.requests import cells_of
 from s2a_bench.stats import summary_of
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import StoredRun
@@ -35,28 +35,28 @@ def test_cells_stand_in_a_fixed_order_whatever_the_order_of_the_samples(make_run
     assert [cell.name for cell in cells_of(run)] == expected
 
 
-def test_a_run_is_split_into_its_cells_once_and_again_where_its_samples_are_others(make_run: MakeRun) -> None:
+def test_the_samples_of_a_run_may_be_others_than_those_of_its_files(make_run: MakeRun) -> None:
     run = make_run(HAND, n=4)
-    first, again = cells_of(run), cells_of(run)
-    assert [id(cell) for cell in first] == [id(cell) for cell in again]
     run.tables["samples"] = run.samples[run.samples["cell"] == "ros/topic"]
-    assert [cell.name for cell in cells_of(run)] == ["ros/topic"]
+    (ros,) = cells_of(run)
+    assert (ros.name, ros.n) == ("ros/topic", 4)
 
 
 def test_stages_and_groups_of_a_cell_by_hand(make_run: MakeRun) -> None:
-    http, ros = cells_of(make_run(HAND, n=4, spread=0))
-    assert http.values_ms("convert").tolist() == [2.0] * 4
-    assert http.group_ms("encode").tolist() == [5.0] * 4
-    assert http.group_ms("network").tolist() == [9.0] * 4
-    assert http.values_ms("e2e").tolist() == [124.0] * 4
-    assert http.values_ms("e2e_without_inference").tolist() == [24.0] * 4
-    assert http.values_ms("ttft").tolist() == [123.0] * 4
+    cells = cells_of(make_run(HAND, n=4, spread=0))
+    http, ros = cells
+    assert http.values("convert").tolist() == [2.0] * 4
+    assert http.values("group.encode").tolist() == [5.0] * 4
+    assert http.values("group.network").tolist() == [9.0] * 4
+    assert http.values("e2e").tolist() == [124.0] * 4
+    assert http.values("e2e_without_inference").tolist() == [24.0] * 4
+    assert http.values("ttft").tolist() == [123.0] * 4
     assert http.values("residual_share").tolist() == [1 / 24] * 4
-    assert ros.group_ms("network").tolist() == [3.0] * 4
-    assert ros.group_ms("encode").size == 0
-    assert summary_of(ros.group_ms("encode")) is None
-    assert groups_present([ros]) == ["capture", "pack", "network", "inference", "return"]
-    assert stages_present([ros]) == ["capture", "cdr_pack", "network", "inference", "return"]
+    assert ros.values("group.network").tolist() == [3.0] * 4
+    assert ros.values("group.encode").size == 0
+    assert summary_of(ros.values("group.encode")) is None
+    assert cells.only([ros]).groups == ["capture", "pack", "network", "inference", "return"]
+    assert cells.only([ros]).stages == ["capture", "cdr_pack", "network", "inference", "return"]
 
 
 def test_warm_ups_and_failures_are_counted_and_not_summarised(
@@ -69,7 +69,7 @@ def test_warm_ups_and_failures_are_counted_and_not_summarised(
     )
     (ros,) = cells_of(make_run({"ros/topic": HAND["ros/topic"]}, n=4, spread=0, extra=extra))
     assert (ros.n, ros.errors, ros.warmups) == (4, 1, 7)
-    assert ros.values_ms("e2e").tolist() == [108.0] * 4
+    assert ros.values("e2e").tolist() == [108.0] * 4
 
 
 def test_the_time_between_tokens_is_taken_inside_each_request_only(make_run: MakeRun) -> None:
@@ -86,7 +86,7 @@ def test_a_residual_above_five_per_cent_is_flagged(make_run: MakeRun, make_row: 
 
 
 def test_ratios_are_http_over_ros_and_everything_over_loopback(make_run: MakeRun) -> None:
-    found = [(metric, of.name, to.name) for metric, of, to, _ in ratios(cells_of(make_run(n=3)), seed=0)]
+    found = [(metric, of.name, to.name) for metric, of, to, _ in cells_of(make_run(n=3)).ratios]
     pairs = [
         ("http/as-deployed", "ros/topic"),
         ("http/best-effort", "ros/topic"),
@@ -100,7 +100,7 @@ def test_ratios_are_http_over_ros_and_everything_over_loopback(make_run: MakeRun
 
 
 def test_a_ratio_by_hand_pairs_the_blocks(make_run: MakeRun) -> None:
-    (first, second) = ratios(cells_of(make_run(HAND, n=10, spread=0)), seed=0)
+    first, second = cells_of(make_run(HAND, n=10, spread=0)).ratios
     assert first[0] == "e2e_without_inference"
     assert (first[3].value, first[3].low, first[3].high) == (3.0, pytest.approx(3), pytest.approx(3))  # 24 ms over 8 ms
     assert second[3].value == pytest.approx(124 / 108)
@@ -110,7 +110,7 @@ def test_cells_of_which_one_lacks_a_sample_are_compared_without_pairs(
     make_run: MakeRun, make_row: Callable[..., SampleRow]
 ) -> None:
     extra = (make_row("ros/topic", HAND["ros/topic"], 99),)
-    first, _ = ratios(cells_of(make_run(HAND, n=10, spread=0, extra=extra)), seed=0)
+    first, _ = cells_of(make_run(HAND, n=10, spread=0, extra=extra)).ratios
     assert first[3].value == 3.0
     assert first[3].low == pytest.approx(3)
 
@@ -122,26 +122,25 @@ def test_a_llama_server_and_an_engine_that_tells_no_preprocessing_are_compared_e
     make_run: MakeRun,
 ) -> None:
     cells = cells_of(make_run({"http/as-deployed": LLAMA_SERVER, "ros/topic": HAND["ros/topic"]}, n=3))
-    assert [metric for metric, *_ in ratios(cells, 0)] == ["e2e"]
+    assert [metric for metric, *_ in cells.ratios] == ["e2e"]
 
 
 def test_a_llama_server_is_compared_without_model_where_both_tell_it(make_run: MakeRun) -> None:
     ours = {"capture": 0.4, "cdr_pack": 2.0, "network": 5.0, "preprocess": 20.0, "inference": 80.0, "return": 0.6}
     cells = {"http/llama-server": LLAMA_SERVER, "ros/topic": ours}
     run = make_run(cells, n=3, spread=0, manifest={"stages": path_of([STAGES])}, server_prompt_ms=80.0)
-    found = {metric: ratio.value for metric, _, _, ratio in ratios(cells_of(run), 0)}
+    found = {metric: ratio.value for metric, _, _, ratio in cells_of(run).ratios}
     assert found == {"e2e_without_model": pytest.approx(35.4 / 28), "e2e": pytest.approx(115.4 / 108)}
 
 
 def test_a_black_box_has_no_ratio_without_inference(make_run: MakeRun, black_box: Any) -> None:
     run = make_run({"http/black-box": black_box, "ros/topic": HAND["ros/topic"]}, n=3)
-    assert [metric for metric, *_ in ratios(cells_of(run), seed=0)] == ["e2e"]
+    assert [metric for metric, *_ in cells_of(run).ratios] == ["e2e"]
 
 
 def test_what_did_not_really_answer_is_said(make_run: MakeRun) -> None:
     def note(**facts: Any) -> Note:
-        run = make_run(HAND, n=1, **facts)
-        return engine_note(run, cells_of(run))
+        return cells_of(make_run(HAND, n=1, **facts)).engine_note
 
     assert (note(), note().labels) == ("echo engine", ("echo engine",))
     drawn = {"model": {"engine": "echo", "model": "none", "emulated": True, "latency": "80"}}

@@ -20,6 +20,6 @@ EXPERIMENT = Experiment(
         ),
     ),
     view=f"{HERE}.view.tables:show",
-    cell=f"{HERE}.view.tables:CcrbCell",
+    cell=f"{HERE}.rows:RolloutRow",
     unit="parts",
 )

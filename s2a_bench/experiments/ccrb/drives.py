@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
-from dataclasses import dataclass, replace
-from typing import Any, Final, TypeAlias
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import skill_rows, to_ns
 from s2a_bench.policy import TOLERANCE_S, Plans, Policy, Schedule
 from s2a_bench.policy.metrics import peak_jerk, rms_jerk, sparc, stalls
-from s2a_bench.scenario import EGO, ROLES, Simulator, open_simulator
+from s2a_bench.scenario import EGO, LEAD, REAR, Simulator, open_simulator
 from s2a_bench.scenario.ccrb.cars import TTC, ttc_aware
 from s2a_bench.scenario.ccrb.drive import Driven, Trajectory, drive
 from s2a_bench.scenario.ccrb.ego import PHASES
@@ -26,11 +26,6 @@ from s2a_bench.scenario.ccrb.outcome import Outcomes
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.schema import Table
 
-OF_CARS: Final = (
-    *("impact_speed_mps", "front_impact_mps", "rear_impact_mps", "min_front_gap_m", "min_rear_gap_m"),
-    *("min_front_ttc_s", "min_rear_ttc_s", "required_decel_mps2"),
-)
-"""The metrics that `Outcomes` have."""
 TableRows: TypeAlias = tuple[Table[Any], Iterable[Any]]
 """A table and rows for it."""
 
@@ -71,76 +66,85 @@ def point_rows(ready: Prepared, world: Simulator) -> Iterator[TableRows]:
     scenario = ready.scenario
     for name, schedule in ready.schedules.items():
         driven = drive(world, scenario.cars, scenario.driving, schedule, record=True)
-        yield from _rows(ready, _about(ready, world.name, name), ready.plans, schedule, driven)
+        row = _rollout(ready, world.name, name, schedule, driven.outcomes)
+        yield from _rows(ready, row, ready.plans, schedule, driven)
 
 
 def loop_rows(ready: Prepared, world: Simulator, name: str, looped: Looped) -> Iterator[TableRows]:
     """Yield the rows of a closed loop, and of the roll-out on the arrivals of its plan, ``ready``."""
     scenario, (plans, schedule, _) = ready.scenario, executed(looped.record)
-    yield from _rows(ready, {**_about(ready, world.name, name), **looped.facts}, plans, schedule, looped.driven)
+    row = _rollout(ready, world.name, name, schedule, looped.driven.outcomes)
+    row = replace(row, real_time_factor=looped.real_time_factor, tracking_rms_mps=looped.tracking_rms_mps)
+    yield from _rows(ready, row, plans, schedule, looped.driven)
     with closing(open_simulator("embedded" if scenario.lane_change else "longitudinal")) as exact:
         beside = drive(exact, scenario.cars, scenario.driving, ready.schedules[name])
-        about = {**_about(ready, exact.name, name), "study": "rollout"}
-        yield ROLLOUTS, rollout_rows(about, ready.schedules[name], beside.outcomes)
+        row = _rollout(ready, exact.name, name, ready.schedules[name], beside.outcomes)
+        yield ROLLOUTS, [replace(row, study="rollout")]
 
 
-def _rows(
-    ready: Prepared, about: Mapping[str, Any], plans: Plans, schedule: Schedule, driven: Driven
-) -> Iterator[TableRows]:
-    path, cell = driven.trajectory, about["cell"]
+def _rows(ready: Prepared, row: RolloutRow, plans: Plans, schedule: Schedule, driven: Driven) -> Iterator[TableRows]:
+    path = driven.trajectory
     assert path is not None  # noqa: S101 - recorded
     texts = [[str(call) for call in ready.scenario.calls]]
-    yield ROLLOUTS, rollout_rows(about, schedule, driven.outcomes, motion=motion_of(path))
-    yield SKILLS, skill_rows(cell, plans, schedule, [ready.request_id], texts=texts)
-    yield TRAJECTORIES, trajectory_rows(cell, path)
+    yield ROLLOUTS, [replace(row, **motion_of(path))]
+    yield SKILLS, skill_rows(row.cell, plans, schedule, [ready.request_id], texts=texts)
+    yield TRAJECTORIES, trajectory_rows(row.cell, path)
 
 
-def _about(ready: Prepared, simulator: str, name: str) -> dict[str, Any]:
+def _rollout(ready: Prepared, simulator: str, policy: str, schedule: Schedule, outcomes: Outcomes) -> RolloutRow:
+    """Return the row of a drive at the operating point."""
     setting, scenario = ready.setting, ready.scenario
-    of_setting = ("board", "title", "emulated", "tokens_per_s", "prompt_s", "tokens_per_skill", "n_skills", "t_nom_s")
-    of_scenario = ("follower", "reflex", "lane_change", "front_gap_m", "lead_decel_mps2", "rear_gap_m", "reaction_s")
-    return {
-        "cell": f"{setting.name}/{scenario.gap}/{name}",
-        "policy": name,
-        "late": ready.late if name == TTC else None,
-        "study": "point",
-        "draw": 0,
-        "simulator": simulator,
-        "gap_behaviour": scenario.gap,
-        "speed_mps": float(scenario.driving.set_point_mps[0, 0]),
-        "plan_decel_mps2": scenario.decel_mps2,
-        "follower_survives": scenario.follower_survives,
-        "deadline_ns": to_ns(scenario.deadline_s),
-        **{name: getattr(setting, name) for name in of_setting},
-        **{name: getattr(scenario, name) for name in of_scenario},
-    }
+    (metrics,) = metrics_of_drives(schedule, outcomes)
+    return RolloutRow(
+        cell=f"{setting.name}/{scenario.gap}/{policy}",
+        study="point",
+        draw=0,
+        policy=policy,
+        board=setting.board,
+        title=setting.title,
+        emulated=setting.emulated,
+        simulator=simulator,
+        follower=scenario.follower,
+        gap_behaviour=scenario.gap,
+        reflex=scenario.reflex,
+        lane_change=scenario.lane_change,
+        tokens_per_s=setting.tokens_per_s,
+        prompt_s=setting.prompt_s,
+        tokens_per_skill=setting.tokens_per_skill,
+        n_skills=setting.n_skills,
+        t_nom_s=setting.t_nom_s,
+        speed_mps=float(scenario.driving.set_point_mps[0, 0]),
+        plan_decel_mps2=scenario.decel_mps2,
+        front_gap_m=scenario.front_gap_m,
+        lead_decel_mps2=scenario.lead_decel_mps2,
+        rear_gap_m=scenario.rear_gap_m,
+        reaction_s=scenario.reaction_s,
+        follower_survives=scenario.follower_survives,
+        deadline_ns=to_ns(scenario.deadline_s),
+        late=ready.late if policy == TTC else None,
+        **metrics,
+    )
 
 
-def rollout_rows(
-    about: Mapping[str, Any], schedule: Schedule, outcomes: Outcomes, *, motion: Mapping[str, Any] | None = None
-) -> Iterator[RolloutRow]:
-    """Yield the rows of M roll-outs; a value of ``about`` is common to all, or an array of M."""
+def metrics_of_drives(schedule: Schedule, outcomes: Outcomes) -> Iterator[dict[str, Any]]:
+    """Yield the metrics of each of M roll-outs, as columns of their rows; None for an undefined one."""
     stall_s = stalls(schedule)
     end_s = schedule.start_s[-1] + schedule.duration_s[-1]
-    shared = {name: value for name, value in about.items() if not isinstance(value, np.ndarray)}
-    each = {name: value for name, value in about.items() if isinstance(value, np.ndarray)}
-    found = {name: getattr(outcomes, name) for name in OF_CARS}
+    of_cars = {item.name: getattr(outcomes, item.name) for item in fields(outcomes) if item.name != "code"}
+    of_cars["impact_speed_mps"] = outcomes.impact_speed_mps
     for place in range(len(outcomes.code)):
-        metrics: dict[str, Any] = {name: float(values[place]) for name, values in found.items()}
-        yield RolloutRow(
-            **shared,
-            **{name: value[place].item() for name, value in each.items()},
-            start_ns=to_ns(schedule.start_s[0, place]),
-            end_ns=to_ns(end_s[place]),
-            stalls=int((stall_s[:, place] > TOLERANCE_S).sum()),
-            stall_ns=to_ns(stall_s[:, place].sum()),
-            outcome=outcomes.name(place),
-            **{name: value if math.isfinite(value) else None for name, value in metrics.items()},
-            **(motion or {}),
-        )
+        values = {name: float(column[place]) for name, column in of_cars.items()}
+        yield {
+            "start_ns": to_ns(schedule.start_s[0, place]),
+            "end_ns": to_ns(end_s[place]),
+            "stalls": int((stall_s[:, place] > TOLERANCE_S).sum()),
+            "stall_ns": to_ns(stall_s[:, place].sum()),
+            "outcome": outcomes.name(place),
+            **{name: value if math.isfinite(value) else None for name, value in values.items()},
+        }
 
 
-def motion_of(path: Trajectory) -> dict[str, float]:
+def motion_of(path: Trajectory) -> dict[str, Any]:
     """Return jerk and smoothness of the ego in a single roll-out, from the request to rest or impact."""
     speed = path.speed_mps[:, EGO, 0]
     if len(speed) < 3:  # noqa: PLR2004 - over at once
@@ -150,17 +154,23 @@ def motion_of(path: Trajectory) -> dict[str, float]:
 
 
 def trajectory_rows(cell: str, path: Trajectory) -> Iterator[TrajectoryRow]:
-    cars: dict[str, Any] = {
-        f"{role}_{what}": getattr(path, what)[:, place, 0].tolist()
-        for what in ("position_m", "speed_mps", "acceleration_mps2")
-        for place, role in enumerate(ROLES)
-    }
+    position_m, speed_mps, acceleration_mps2 = (
+        values[:, :, 0].tolist() for values in (path.position_m, path.speed_mps, path.acceleration_mps2)
+    )
     for step, at_s in enumerate(path.time_s):
         yield TrajectoryRow(
             cell=cell,
             at_ns=to_ns(at_s),
             phase=PHASES[int(path.phase[step, 0])],
             skill=int(path.skill[step, 0]),
+            lead_position_m=position_m[step][LEAD],
+            ego_position_m=position_m[step][EGO],
+            rear_position_m=position_m[step][REAR],
             ego_lateral_m=float(path.lateral_m[step, EGO, 0]),
-            **{name: values[step] for name, values in cars.items()},
+            lead_speed_mps=speed_mps[step][LEAD],
+            ego_speed_mps=speed_mps[step][EGO],
+            rear_speed_mps=speed_mps[step][REAR],
+            lead_acceleration_mps2=acceleration_mps2[step][LEAD],
+            ego_acceleration_mps2=acceleration_mps2[step][EGO],
+            rear_acceleration_mps2=acceleration_mps2[step][REAR],
         )

@@ -85,8 +85,9 @@ class Looped:
 
     record: Record
     driven: Driven
-    facts: dict[str, float | None]
-    """The metrics `rows.LOOP`; tracking is None if no skill ran before an impact."""
+    real_time_factor: float
+    tracking_rms_mps: float | None
+    """None if no skill ran before an impact."""
 
 
 class ClosedLoop:
@@ -139,11 +140,9 @@ class ClosedLoop:
                 break
             if not self._drive.ego_moves or self._clock.now_ns() >= self._due_ns:
                 self._step()
-        facts = {
-            "real_time_factor": self.real_time_factor,
-            "tracking_rms_mps": float(np.sqrt(np.mean(self._squares))) if self._squares else None,
-        }
-        return Looped(record, Driven(self._drive.outcomes(), self._drive.trajectory()), facts)
+        driven = Driven(self._drive.outcomes(), self._drive.trajectory())
+        tracking_mps = float(np.sqrt(np.mean(self._squares))) if self._squares else None
+        return Looped(record, driven, self.real_time_factor, tracking_mps)
 
     @property
     def real_time_factor(self) -> float:

@@ -9,6 +9,7 @@ from s2a_bench.experiments.cells import ANY, HIDDEN, JsonKey, Metric, metrics_of
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
+from s2a_bench.scenario.ccrb.labels import outcome_label
 from s2a_bench.store.schema import Facts, Many, NonNegative, Positive, Table, about
 
 _DEADLINE: Final = (
@@ -88,6 +89,11 @@ class RolloutRow:
     tracking_rms_mps: Annotated[
         float | None, Metric("tracking", "RMS of set-point minus speed in skills, if one ran.", unit="m/s")
     ] = None
+
+    @property
+    def label(self) -> str:
+        """The outcome in words."""
+        return outcome_label(self.outcome, bool(self.follower_survives)) + (" (late)" if self.late else "")
 
 
 METRICS: Final = metrics_of(RolloutRow)

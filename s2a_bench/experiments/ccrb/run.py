@@ -64,9 +64,17 @@ def resolve(config: CcrbModelled) -> CcrbPlan:
 def studies(config: CcrbComputed) -> Iterator[tuple[str, Scenes]]:
     """Yield the studies beside the operating point, with their scenarios."""
     if config.phase:
-        axes = config.phase_rates, config.phase_gaps_m, config.phase_points
-        prompt_s, tokens = config.board.prompt_s, config.tokens_per_skill
-        yield "phase", plane(config.scenario, *axes, prompt_s=prompt_s, tokens_per_skill=tokens)
+        yield (
+            "phase",
+            plane(
+                config.scenario,
+                config.phase_rates,
+                config.phase_gaps_m,
+                config.phase_points,
+                prompt_s=config.board.prompt_s,
+                tokens_per_skill=config.tokens_per_skill,
+            ),
+        )
     if config.random:
         yield "random", draw_scenes(generator(config.seed, "ccrb", "random"), config.random)
 

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from s2a_bench.experiments.ccrb.drives import rollout_rows
+from s2a_bench.experiments.ccrb.drives import metrics_of_drives
 from s2a_bench.experiments.ccrb.rows import RolloutRow
+from s2a_bench.harness.timelines.rows import to_ns
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.policy import COMPARED, Plans, Schedule, policy
 from s2a_bench.policy.arrivals import uniform
@@ -33,30 +34,34 @@ def drive_block(scenario: CcrbOptions, study: str, scenes: Scenes) -> tuple[int,
     The check on the car behind is one more roll-out a scenario. A policy that never stalls is driven once, with a row
     for every gap behaviour.
     """
+    count = len(scenes)
     cases = [(name, gap) for name, form in FORMS.items() for gap in (GAPS if form.stalls else (scenario.gap,))]
-    gaps = np.repeat([gap for _, gap in cases], len(scenes))
     every = scenes.times(len(cases))
-    cars = every.cars(gaps, scenario)
+    cars = every.cars(np.repeat([gap for _, gap in cases], count), scenario)
     schedule = schedules(scenes, [name for name, _ in cases])
     deadline_s = start_deadline(cars, every.numbers["plan_decel_mps2"])
-    about: dict[str, Any] = {
-        **every.numbers,
-        "cell": np.repeat([f"{study}/{gap}/{name}" for name, gap in cases], len(scenes)),
-        "study": study,
-        "policy": np.repeat([name for name, _ in cases], len(scenes)),
-        "board": "",
-        "title": "",
-        "emulated": True,
-        "follower_survives": np.tile(survived(scenes, scenes.cars(gaps[: len(scenes)], scenario)), len(cases)),
-        "simulator": Longitudinal.name,
-        "follower": scenario.follower,
-        "gap_behaviour": gaps,
-        "reflex": scenario.reflex,
-        "lane_change": False,
-        "deadline_ns": np.rint(deadline_s * 1e9).astype(np.int64),
-        "late": None,
-    }
-    rows = list(rollout_rows(about, schedule, drive_along(every, cars, schedule)))
+    survives = survived(scenes, scenes.cars(np.repeat(cases[0][1], count), scenario)).tolist()
+    rows = []
+    for place, metrics in enumerate(metrics_of_drives(schedule, drive_along(every, cars, schedule))):
+        policy, gap = cases[place // count]
+        row = RolloutRow(
+            **{name: values[place].item() for name, values in every.numbers.items()},
+            cell=f"{study}/{gap}/{policy}",
+            study=study,
+            policy=policy,
+            board="",
+            title="",
+            emulated=True,
+            follower_survives=survives[place % count],
+            simulator=Longitudinal.name,
+            follower=scenario.follower,
+            gap_behaviour=gap,
+            reflex=scenario.reflex,
+            lane_change=False,
+            deadline_ns=to_ns(deadline_s[place]),
+            **metrics,
+        )
+        rows.append(row)
     again = [
         replace(row, gap_behaviour=gap, cell=f"{study}/{gap}/{row.policy}")
         for gap in GAPS
@@ -64,7 +69,7 @@ def drive_block(scenario: CcrbOptions, study: str, scenes: Scenes) -> tuple[int,
         for row in rows
         if not FORMS[row.policy].stalls
     ]
-    return len(scenes) + len(rows), rows + again
+    return count + len(rows), rows + again
 
 
 def schedules(scenes: Scenes, names: Sequence[str]) -> Schedule:
@@ -79,9 +84,9 @@ def schedules(scenes: Scenes, names: Sequence[str]) -> Schedule:
         nominal_s = np.broadcast_to(at["t_nom_s"][mine], arrival_s.shape)
         plans = Plans(arrival_s, nominal_s, nominal_s, nominal_s)  # the closed forms neither compress nor extend
         for name, form in FORMS.items():
-            found = form.schedule(plans)
-            start_s[name][:length, mine], duration_s[name][:length, mine] = found.start_s, found.duration_s
-            start_s[name][length:, mine] = found.start_s[-1] + found.duration_s[-1]
+            planned = form.schedule(plans)
+            start_s[name][:length, mine], duration_s[name][:length, mine] = planned.start_s, planned.duration_s
+            start_s[name][length:, mine] = planned.start_s[-1] + planned.duration_s[-1]
     return Schedule(
         np.concatenate([start_s[name] for name in names], axis=1),
         np.concatenate([duration_s[name] for name in names], axis=1),

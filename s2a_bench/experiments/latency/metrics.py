@@ -3,128 +3,127 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
+from dataclasses import dataclass
 from itertools import chain
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from s2a_bench.experiments.requests import (
-    TOKEN_METRICS,
-    RequestCell,
+    GROUP,
+    ITL,
+    TOKEN_DELAY,
+    RequestCells,
     RequestMetric,
-    cell_class,
+    RequestsCell,
     cell_json,
-    cells_of,
     compared_by,
-    groups_present,
     in_ms,
     ratio_table,
-    ratios,
-    stages_present,
+    summaries_of,
     summarised,
+    summarised_by,
 )
 from s2a_bench.stats import Summary, SummaryEnds, summary_of
 from s2a_bench.store.schema import Count, Facts, about
 from s2a_bench.trace import GROUPS
 from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
-from s2a_bench.writers.json import frame, ratio_entry, summaries, summaries_of_ends
+from s2a_bench.writers.json import frame, ratio_entry
 
 if TYPE_CHECKING:
     from s2a_bench.stats import Ratio
-    from s2a_bench.store.run import StoredRun
 
 AROUND: Final[tuple[RequestMetric, ...]] = tuple(chain.from_iterable(shown("metrics")))
-"""What is known of a request by what surrounds its run, beside e2e without inference."""
-METRICS: Final = (
-    in_ms("e2e_without_inference", "e2e w/o infer.", "Absent if the server does not report its inference time."),
-    in_ms(
-        "e2e_without_model",
-        "e2e w/o model",
-        "e2e less the model's time up to the first token; preprocessing is included. Of a llama-server: "
-        "e2e less the prompt_ms it reports.",
-    ),
-    in_ms("e2e", "e2e"),
-    in_ms("ttft", about="From the prompt: e2e without capture."),
-    in_ms(
-        "round_trip",
-        "round trip",
-        "network and return together: exact, where a server on another host has them as intervals.",
-    ),
-    in_ms("frame_age", about="Age of the frame when inference starts.", ends=lambda cell: cell.ends("frame_age")),
-    *AROUND,
-    *TOKEN_METRICS,
-    in_ms("residual", "residual", "The time between the stages."),
-    RequestMetric(name="residual_share", about="The residual as a share of e2e without inference."),
-)
+"""What is known of a request by what surrounds its run, after the metrics of `LatencyCell`."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class LatencyCell(RequestsCell):
+    """One pipeline, stage by stage; a value that no sample has is an absent key."""
+
+    residual_flagged: Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")]
+    stages_ms: Annotated[dict[str, Summary | SummaryEnds], Facts(propertyNames={"pattern": "^[a-z][a-z0-9_]*$"})]
+    groups_ms: Annotated[dict[str, Summary | SummaryEnds], Facts(propertyNames={"enum": list(GROUPS)})]
+    e2e_without_inference_ms: Annotated[
+        Summary | None, RequestMetric("e2e w/o infer.", "Absent if the server does not report its inference time.")
+    ] = None
+    e2e_without_model_ms: Annotated[
+        Summary | None,
+        RequestMetric(
+            "e2e w/o model",
+            "e2e less the model's time up to the first token; preprocessing is included. Of a llama-server: "
+            "e2e less the prompt_ms it reports.",
+        ),
+    ] = None
+    e2e_ms: Annotated[Summary | None, RequestMetric("e2e")] = None
+    ttft_ms: Annotated[Summary | None, RequestMetric(about="From the prompt: e2e without capture.")] = None
+    round_trip_ms: Annotated[
+        Summary | None,
+        RequestMetric(
+            "round trip",
+            "network and return together: exact, where a server on another host has them as intervals.",
+        ),
+    ] = None
+    frame_age_ms: Annotated[
+        Summary | SummaryEnds | None, RequestMetric(about="Age of the frame when inference starts.", ends=True)
+    ] = None
+    itl_ms: Annotated[Summary | None, ITL] = None
+    token_delay_ms: Annotated[Summary | SummaryEnds | None, TOKEN_DELAY] = None
+    residual_ms: Annotated[Summary | None, RequestMetric("residual", "The time between the stages.")] = None
+    residual_share: Annotated[
+        Summary | None, RequestMetric(about="The residual as a share of e2e without inference.")
+    ] = None
+
+
+METRICS: Final = (*summarised_by(LatencyCell).values(), *AROUND)
 COMPARED: Final = compared_by(
-    (*METRICS, *(in_ms(f"group.{name}", of=partial(RequestCell.sums_ms, group=name)) for name in GROUPS)),
+    (*METRICS, *(in_ms(f"{GROUP}{name}") for name in GROUPS)),
     ("e2e_without_inference", "e2e", "itl"),
     run_metrics=lambda run: map(in_ms, run.stages),
 )
 """What latency runs are compared by: metrics, groups of stages, and each run's stages."""
-LatencyCell: Final = cell_class(
-    "LatencyCell",
-    "One pipeline, stage by stage; a value that no sample has is an absent key.",
-    METRICS,
-    residual_flagged=Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")],
-    stages_ms=Annotated[dict[str, Summary | SummaryEnds], Facts(propertyNames={"pattern": "^[a-z][a-z0-9_]*$"})],
-    groups_ms=Annotated[dict[str, Summary | SummaryEnds], Facts(propertyNames={"enum": list(GROUPS)})],
-)
 
 
-def latency_json(run: StoredRun) -> dict[str, Any]:
-    cells = cells_of(run)
-    found = [
+def latency_json(cells: RequestCells) -> dict[str, Any]:
+    each = [
         cell_json(
             LatencyCell,
-            cell,
-            run,
-            METRICS,
+            cells.only([cell]),
             residual_flagged=cell.flagged(),
-            stages_ms={
-                **summaries((stage, cell.values_ms(stage)) for stage in stages_present([cell])),
-                **summaries_of_ends((stage, cell.ends(stage)) for stage in stages_present([cell])),
-            },
-            groups_ms={
-                **summaries((group, cell.group_ms(group)) for group in groups_present([cell])),
-                **summaries_of_ends((group, cell.group_ends(group)) for group in groups_present([cell])),
-            },
+            stages_ms=summaries_of(cell, {stage: stage for stage in cell.stages}),
+            groups_ms=summaries_of(cell, {group: f"{GROUP}{group}" for group in GROUPS}),
         )
+        | summaries_of(cell, {metric.key: metric for metric in AROUND})
         for cell in cells
     ]
-    return frame(run, found, [ratio_entry(*ratio) for ratio in _ratios(cells, run)])
+    return frame(cells.run, each, [ratio_entry(*ratio) for ratio in _ratios(cells)])
 
 
-def latency_csv(run: StoredRun) -> dict[str, CsvTable]:
+def latency_csv(cells: RequestCells) -> dict[str, CsvTable]:
     """Return file name -> CSV table in long form, unrounded; absent values have no row."""
-    cells = cells_of(run)
     return {
         "stages.csv": CsvTable.of(("cell", "group", "stage", *SUMMARY, "emulated"), _stage_rows(cells)),
         "summary.csv": CsvTable.of(("cell", "metric", "errors", "warmups", *SUMMARY, "emulated"), _rows(cells)),
-        "ratios.csv": ratio_table(cells, _ratios(cells, run)),
+        "ratios.csv": ratio_table(cells, _ratios(cells)),
     }
 
 
-def _ratios(cells: list[RequestCell], run: StoredRun) -> Iterator[tuple[str, str, str, Ratio]]:
-    for metric, cell, base, ratio in ratios(cells, run.bootstrap_seed):
+def _ratios(cells: RequestCells) -> Iterator[tuple[str, str, str, Ratio]]:
+    for metric, cell, base, ratio in cells.ratios:
         yield f"{metric}_ms", cell.name, base.name, ratio
 
 
-def _stage_rows(cells: list[RequestCell]) -> Iterator[tuple[object, ...]]:
+def _stage_rows(cells: RequestCells) -> Iterator[tuple[object, ...]]:
     for cell in cells:
-        for stage in (*stages_present([cell]), "residual"):
-            columns = {"": cell.values_ms(stage), **cell.ends(stage).named}
-            for end, values in columns.items():
+        for stage in (*cell.stages, "residual"):
+            for end, values in {"": cell.values(stage), **cell.ends(stage).named}.items():
                 if summary := summary_of(values):
                     place = cell.name, cell.stages.get(stage, ""), stage + end
                     yield *place, *summary_values(summary), cell.emulated
 
 
-def _rows(cells: list[RequestCell]) -> Iterator[tuple[object, ...]]:
+def _rows(cells: RequestCells) -> Iterator[tuple[object, ...]]:
     """Yield a row a cell and metric; a cell without successful samples has one row, without numbers."""
     for cell in cells:
-        found = [(key, summary_values(summary)) for _, key, summary in summarised([cell], METRICS)]
-        for key, values in found or [("", (0, *[None] * (len(SUMMARY) - 1)))]:
+        rows = [(key, summary_values(summary)) for _, key, summary in summarised([cell], METRICS)]
+        for key, values in rows or [("", (0, *[None] * (len(SUMMARY) - 1)))]:
             yield cell.name, key, cell.errors, cell.warmups, *values, cell.emulated

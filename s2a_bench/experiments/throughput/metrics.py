@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
+import numpy as np
+
 from s2a_bench.experiments.requests import (
-    ANSWER_METRICS,
-    TOKEN_METRICS,
+    OF_ANSWERS,
+    AnswersCell,
     RequestCell,
-    by_launch,
-    cell_class,
+    RequestCells,
     cell_json,
     cells_of,
     compared_by,
@@ -19,6 +21,7 @@ from s2a_bench.experiments.requests import (
     summarised,
 )
 from s2a_bench.stats import Floats, Ratio, Summary, summarise
+from s2a_bench.stats.batches import Blocks
 from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import Count, Table, about
@@ -27,7 +30,8 @@ from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
 from s2a_bench.writers.json import frame, ratio_entry
 
 if TYPE_CHECKING:
-    from s2a_bench.stats.batches import Blocks
+    import pandas as pd
+
     from s2a_bench.store.run import StoredRun
 
 
@@ -55,7 +59,7 @@ ENGINE_METRIC: Final = "tokens_per_s"
 LLAMA_BENCH: Final = "llama-bench"
 BIN: Final = 32
 
-METRICS: Final = (*ANSWER_METRICS, *TOKEN_METRICS)
+METRICS: Final = (*OF_ANSWERS.values(),)
 COMPARED: Final = compared_by(METRICS, (ENGINE_METRIC, RATIO_METRIC, "ttft_ms", "prefill_tokens_per_s", "itl"))
 
 
@@ -68,16 +72,15 @@ class Position:
     decode_tokens_per_s: Summary
 
 
-ThroughputCell: Final = cell_class(
-    "ThroughputCell",
-    "One pipeline in tokens a second; a value that no request has is an absent key.",
-    METRICS,
-    t_eval=Annotated[
+@dataclass(frozen=True, kw_only=True)
+class ThroughputCell(AnswersCell):
+    """One pipeline in tokens a second; a value that no request has is an absent key."""
+
+    t_eval: Annotated[
         Literal["engine", "client"],
         about("Source of T_eval: the engine; or the client, where tokens_per_s is decode_tokens_per_s."),
-    ],
-    positions=Annotated[list[Position], about("Decode rate by the place in the answer.")],
-)
+    ]
+    positions: Annotated[list[Position], about("Decode rate by the place in the answer.")]
 
 
 @dataclass(frozen=True)
@@ -90,14 +93,49 @@ class Reference:
     decode_tokens_per_s: Summary
 
 
-def throughput_cells(run: StoredRun) -> list[RequestCell]:
-    """Return the cells of a run, in-process first."""
-    return sorted(cells_of(run), key=lambda cell: not declared_transport(cell.pipeline).in_process)
+@dataclass(frozen=True, eq=False)
+class ThroughputCells(RequestCells):
+    """The cells of a run, in-process first, and llama-bench beside them if it ran."""
+
+    @cached_property
+    def reference(self) -> dict[int, Blocks]:
+        """llama-bench's tokens/s by launch, without warm-ups."""
+        rows = self._reference_rows
+        launch, block = (rows[name].to_numpy(dtype="int64") for name in ("launch", "block"))
+        return Blocks.by_launch((rows["n_gen"] / rows["decode_ns"] * 1e9).to_numpy(dtype="float64"), launch, block)
+
+    @property
+    def reference_values(self) -> Floats:
+        """llama-bench's tokens/s in the order of the blocks."""
+        return np.array([rate for launch in self.reference.values() for rate in launch.values.tolist()])  # noqa: PD011
+
+    @property
+    def reference_depths(self) -> list[int]:
+        """The distinct numbers of tokens before those that llama-bench timed."""
+        return sorted({int(depth) for depth in self._reference_rows["depth"]})
+
+    @property
+    def _reference_rows(self) -> pd.DataFrame:
+        rows = self.run.table(REFERENCE)
+        return rows[~rows["warmup"]]
+
+    @cached_property
+    def rate_ratios(self) -> list[tuple[str, str, str, Ratio]]:
+        """Metric, cell, base and ratio: every cell to llama-bench, if it ran, and to in-process.
+
+        Cells of different engines are compared by the engines' figures too.
+        """
+        return [*_ratios(self)]
+
+
+def throughput_cells(run: StoredRun) -> ThroughputCells:
+    cells = sorted(cells_of(run), key=lambda cell: not declared_transport(cell.pipeline).in_process)
+    return ThroughputCells(run, tuple(cells))
 
 
 def joined(cell: RequestCell) -> int:
     """Count tokens that arrived together with another, as when a server holds back half a character."""
-    return int((cell.n_tokens - cell.fact("events")).clip(lower=0).sum())
+    return int(np.nansum(np.maximum(cell.n_tokens - cell.n_arrivals, 0)))
 
 
 def rates_by_position(cell: RequestCell) -> dict[tuple[int, int], Floats]:
@@ -105,42 +143,29 @@ def rates_by_position(cell: RequestCell) -> dict[tuple[int, int], Floats]:
 
     The gap before token i belongs to the bin of i.
     """
-    answers = cell.answers
-    gaps = answers.assign(bin=answers["index"] // BIN).dropna(subset="gap_ns")
-    spent = gaps.groupby(["bin", "request_id"])["gap_ns"].agg(["sum", "size"])
-    spent = spent[spent["sum"] > 0].reset_index()
-    rates = spent["size"].to_numpy(dtype="float64") / spent["sum"].to_numpy(dtype="float64") * 1e9
-    places = spent["bin"].to_numpy(dtype="int64")
-    return {(place * BIN, place * BIN + BIN - 1): rates[places == place] for place in sorted(set(places.tolist()))}
+    answers = cell.columns.answers
+    tokens = answers.tokens_of(cell.by_id)
+    request = np.repeat(np.arange(cell.n), answers.counts[cell.by_id])
+    place, gap_ns = answers.index()[tokens] // BIN, answers.times_ns("gap")[tokens]
+    bins = int(place.max(initial=-1)) + 1
+    counted = ~np.isnan(gap_ns)
+    spent_ns, gaps = (
+        np.bincount((request * bins + place)[counted], weights, cell.n * bins).reshape(cell.n, bins)
+        for weights in (gap_ns[counted], None)
+    )
+    rates = ((number, spent_ns[:, number] > 0) for number in range(bins))
+    return {
+        (number * BIN, number * BIN + BIN - 1): gaps[reached, number] / spent_ns[reached, number] * 1e9
+        for number, reached in rates
+        if reached.any()
+    }
 
 
-def reference_by_launch(run: StoredRun) -> dict[int, Blocks]:
-    """Return llama-bench's tokens/s by launch and block, without warm-ups."""
-    rows = run.table(REFERENCE)
-    counted = rows[~rows["warmup"]]
-    return by_launch(counted, counted["n_gen"] / counted["decode_ns"] * 1e9)
-
-
-def reference_values(run: StoredRun) -> list[float]:
-    """Return llama-bench's tokens/s in the order of the blocks."""
-    return [value for blocks in reference_by_launch(run).values() for value in blocks.values.tolist()]
-
-
-def reference_depths(run: StoredRun) -> list[int]:
-    """Return the distinct numbers of tokens before those that llama-bench timed."""
-    rows = run.table(REFERENCE)
-    return sorted({int(depth) for depth in rows[~rows["warmup"]]["depth"]})
-
-
-def ratios_of(run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[str, str, str, Ratio]]:
-    """Yield metric, cell, base and ratio: every cell to llama-bench, if it ran, and to in-process.
-
-    Cells of different engines are compared by the engines' figures too.
-    """
-    reference, seed = reference_by_launch(run), run.bootstrap_seed
+def _ratios(cells: ThroughputCells) -> Iterator[tuple[str, str, str, Ratio]]:
+    seed = cells.run.bootstrap_seed
     bases = [(cell, _base(cell, cells)) for cell in cells]
     for cell, base in bases:
-        others = {LLAMA_BENCH: reference, **({base.name: base.by_launch(RATIO_METRIC)} if base else {})}
+        others = {LLAMA_BENCH: cells.reference, **({base.name: base.by_launch(RATIO_METRIC)} if base else {})}
         for name, values in others.items():
             if ratio := ratio_of_launches(cell.by_launch(RATIO_METRIC), values, seed):
                 yield RATIO_METRIC, cell.name, name, ratio
@@ -152,33 +177,29 @@ def ratios_of(run: StoredRun, cells: Sequence[RequestCell]) -> Iterator[tuple[st
             yield ENGINE_METRIC, cell.name, base.name, ratio
 
 
-def throughput_json(run: StoredRun) -> dict[str, Any]:
-    cells = throughput_cells(run)
-    found = [
+def throughput_json(cells: ThroughputCells) -> dict[str, Any]:
+    each = [
         cell_json(
             ThroughputCell,
-            cell,
-            run,
-            METRICS,
+            cells.only([cell]),
             t_eval="engine" if cell.has_engine_time else "client",
             positions=[Position(*place, summarise(rates)) for place, rates in rates_by_position(cell).items()],
         )
         for cell in cells
     ]
     more = {}
-    if rates := reference_values(run):
-        command = run.manifest.get("reference", {}).get("command", [])
-        more["reference"] = present(Reference(LLAMA_BENCH, command, reference_depths(run), summarise(rates)))
-    return frame(run, found, [ratio_entry(*ratio) for ratio in ratios_of(run, cells)], **more)
+    if (rates := cells.reference_values).size:
+        command = cells.run.manifest.get("reference", {}).get("command", [])
+        more["reference"] = present(Reference(LLAMA_BENCH, command, cells.reference_depths, summarise(rates)))
+    return frame(cells.run, each, [ratio_entry(*ratio) for ratio in cells.rate_ratios], **more)
 
 
-def throughput_csv(run: StoredRun) -> dict[str, CsvTable]:
+def throughput_csv(cells: ThroughputCells) -> dict[str, CsvTable]:
     """Return file name -> CSV table, unrounded; absent values have no row."""
-    cells = throughput_cells(run)
     rows = [
         (cell.name, key, *summary_values(summary), cell.emulated) for cell, key, summary in summarised(cells, METRICS)
     ]
-    if reference := reference_values(run):
+    if (reference := cells.reference_values).size:
         rows.append((LLAMA_BENCH, RATIO_METRIC, *summary_values(summarise(reference)), False))
     positions = [
         (cell.name, *place, *summary_values(summarise(rates)), cell.emulated)
@@ -188,13 +209,13 @@ def throughput_csv(run: StoredRun) -> dict[str, CsvTable]:
     return {
         "throughput.csv": CsvTable.of(("cell", "metric", *SUMMARY, "emulated"), rows),
         "positions.csv": CsvTable.of(("cell", "first", "last", *SUMMARY, "emulated"), positions),
-        "ratios.csv": ratio_table(cells, ratios_of(run, cells)),
+        "ratios.csv": ratio_table(cells, cells.rate_ratios),
     }
 
 
-def _base(cell: RequestCell, cells: Sequence[RequestCell]) -> RequestCell | None:
+def _base(cell: RequestCell, cells: ThroughputCells) -> RequestCell | None:
     """Return the in-process cell with the same engine settings (the end of its name), or the first; None for itself."""
     local = [each for each in cells if declared_transport(each.pipeline).in_process]
     matching = [each for each in local if each is not cell and cell.name.endswith(each.name.partition("?")[2])]
-    found = max(matching, key=lambda each: len(each.name), default=local[0] if local else None)
-    return None if found is cell else found
+    base = max(matching, key=lambda each: len(each.name), default=local[0] if local else None)
+    return None if base is cell else base

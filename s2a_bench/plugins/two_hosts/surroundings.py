@@ -40,6 +40,7 @@ class TwoHosts(Surroundings):
 
     options: ClassVar[type[Options]] = HostOptions
     columns: ClassVar[str] = "s2a_bench.plugins.two_hosts.view:bounded"
+    reads: ClassVar[Sequence[str]] = ("mode", "payload_bytes")
     metrics: ClassVar[str] = "s2a_bench.plugins.two_hosts.view:METRICS"
     figures: ClassVar[str] = "s2a_bench.plugins.two_hosts.view:figures"
 

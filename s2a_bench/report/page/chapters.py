@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from s2a_bench.experiments import Shown, Tables, experiment_of
 from s2a_bench.experiments.latency.view import against_bytes
-from s2a_bench.experiments.requests import RequestCell, Split, metric_phrase, split, stand_ins
+from s2a_bench.experiments.requests import RequestCell, RequestCells, cells_of, metric_phrase, stand_ins
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.report.compare.agreement import SETTING, Difference, differences, differing_names, is_other_machine
@@ -171,7 +171,7 @@ def overview(sweep: Sweep, runs: Runs) -> Shown:
         sentences.append(
             f"{failed} failed; the table of cells has the errors, --resume --retry-failed runs them again."
         )
-    cells = split(run for _, run in runs)
+    cells = [cells_of(run) for _, run in runs]
     lines, figures = against_bytes.shown(cells)
     measured = partial(measured_table, [settings for settings, _ in runs], cells)
     builders: Tables = {**lines, "overview": measured, "cells": partial(cell_table, sweep)}
@@ -198,14 +198,14 @@ def cell_table(sweep: Sweep) -> TextTable:
     return TextTable("Cells", ("cell", "settings", "host", "state", "repeat", "attempt", "took s"), rows, 4)
 
 
-def measured_table(settings: Sequence[Mapping[str, Any]], runs: Split) -> TextTable | None:
+def measured_table(settings: Sequence[Mapping[str, Any]], runs: Sequence[RequestCells]) -> TextTable | None:
     """Make a table of the numbers of latency and throughput cells; None if there are none."""
     rows: list[tuple[str, ...]] = []
-    for setting, (run, cells) in zip(settings, runs, strict=True):
+    for setting, cells in zip(settings, runs, strict=True):
+        host = str(cells.run.manifest.get("host", ""))
         for cell in cells:
-            what, values = _quantity(cell, run)
+            what, values = _quantity(cell, str(cells.run.manifest["command"]))
             numbers = entries(values, MEAN_SD, "median", "p99")
-            host = str(run.manifest.get("host", ""))
             rows.append((settings_text(setting), cell.name, what, host, str(cell.n), str(cell.errors), *numbers))
     if not rows:
         return None
@@ -261,9 +261,9 @@ def _joined(sweep: Sweep, runs: Sequence[StoredRun]) -> StoredRun:
     return StoredRun(sweep.path, manifest, tables)
 
 
-def _quantity(cell: RequestCell, run: StoredRun) -> tuple[str, Floats]:
+def _quantity(cell: RequestCell, command: str) -> tuple[str, Floats]:
     """Return name and values of tokens/s of a throughput run, else of e2e without inference if it is known."""
-    if run.manifest["command"] == "throughput":
+    if command == "throughput":
         return "tokens/s", cell.values("tokens_per_s")
-    metric = next((name for name in ("e2e_without_inference", "e2e") if cell.values_ms(name).size), "e2e")
-    return f"{metric_phrase(metric)}, ms", cell.values_ms(metric)
+    metric = next((name for name in ("e2e_without_inference", "e2e") if cell.values(name).size), "e2e")
+    return f"{metric_phrase(metric)}, ms", cell.values(metric)

@@ -9,7 +9,8 @@ import pytest
 
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.metrics import latency_csv, latency_json
-from s2a_bench.experiments.latency.view import build_stage_breakdown, show
+from s2a_bench.experiments.latency.view import latency_figures, show
+from s2a_bench.experiments.requests import cells_of
 from s2a_bench.report.compare.comparison import metrics_of, open_comparison
 from s2a_bench.store.run import StoredRun
 from tests.experiments.view.test_latency_json import validate
@@ -24,7 +25,7 @@ def run(make_run: Callable[..., StoredRun]) -> StoredRun:
 
 
 def test_json_has_both_ends_and_no_point_between_them(run: StoredRun) -> None:
-    whole = json.loads(json.dumps(latency_json(run), allow_nan=False))
+    whole = json.loads(json.dumps(latency_json(cells_of(run)), allow_nan=False))
     validate(whole)
     (cell,) = whole["cells"]
 
@@ -41,10 +42,10 @@ def test_json_has_both_ends_and_no_point_between_them(run: StoredRun) -> None:
 
 
 def test_csv_and_tables_have_both_ends(run: StoredRun) -> None:
-    rows = {row[2]: row[4] for row in latency_csv(run)["stages.csv"].rows}
+    rows = {row[2]: row[4] for row in latency_csv(cells_of(run))["stages.csv"].rows}
     assert (rows["network_lo"], rows["network_hi"]) == (2.5, 3.5)
     assert "network" not in rows
-    summary = {row[1]: row[5] for row in latency_csv(run)["summary.csv"].rows}
+    summary = {row[1]: row[5] for row in latency_csv(cells_of(run))["summary.csv"].rows}
     assert (summary["frame_age_lo_ms"], summary["frame_age_hi_ms"]) == (5, 6)
     table = show(run).tables["stages"]
     entries = {row[1]: row[2] for row in table.rows}
@@ -54,7 +55,7 @@ def test_csv_and_tables_have_both_ends(run: StoredRun) -> None:
 
 
 def test_the_figure_shows_where_the_ends_may_lie(run: StoredRun) -> None:
-    axes = build_stage_breakdown(run).axes[0]
+    axes = latency_figures(cells_of(run))["stages"]().axes[0]
     lines = [line.get_xdata().tolist() for line in axes.get_lines() if len(set(line.get_ydata())) == 1]  # type: ignore[union-attr]
     assert [6.5, 7.5] in lines  # capture 1, pack 2, network 4 in the middle of 3.5 to 4.5
     assert len(lines) == 2

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,7 +16,8 @@ from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.boundary.run import NaiveTrial, rows, run_boundary
-from s2a_bench.experiments.boundary.view import board_table, build_boundary, disagreements, line_table
+from s2a_bench.experiments.boundary.view import BoardPoints, build_boundary, disagreements, show
+from s2a_bench.experiments.cells import Cells
 from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.conformal import ANY_STALL_S
 from s2a_bench.policy.metrics import measure
@@ -42,7 +44,7 @@ def jittery(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
 
 def drawn(run: StoredRun) -> Figure:
     with paper_column():
-        return build_boundary(run)
+        return show(run).figures["boundary"]()
 
 
 @settings(max_examples=40)
@@ -103,7 +105,7 @@ def test_with_jitter_the_line_is_a_slope(jittery: StoredRun) -> None:
     assert share[0] == 1
     assert share[-1] == 0
     assert ((share > 0) & (share < 1)).sum() >= 2
-    assert disagreements(jittery) > 0
+    assert disagreements(Cells.of(jittery, BOUNDARY)) > 0
 
 
 def test_the_figure_draws_both_lines_every_trial_and_every_board(even: StoredRun) -> None:
@@ -129,6 +131,17 @@ def test_the_figure_draws_both_lines_every_trial_and_every_board(even: StoredRun
     assert all(text.get_window_extent().x0 > axes.bbox.x1 for text in axes.texts)  # none lies on a marker
 
 
+def test_the_figure_is_drawn_from_points() -> None:
+    points = {trial.duration: list(rows(trial, (1, 2), (1.1, 4.0))) for trial in (T_NOM, T_MIN)}
+    grid = {duration: pd.DataFrame([asdict(row) for row in tried]) for duration, tried in points.items()}
+    board = BoardPoints("mine", "My board", "measured", 3.0, list(rows(T_NOM, (2, 4), (3.0,), "mine")))
+    axes = build_boundary(("A title",), grid, [board], random=False).axes[0]
+    filled, empty = (line.get_xydata().tolist() for line in axes.lines if line.get_marker() == "s")
+    assert (filled, empty) == ([[2, 3.0]], [[4, 3.0]])
+    trials = {each.get_label(): each.get_offsets().tolist() for each in axes.collections if each.get_offsets().any()}
+    assert trials == {"trial: no stall": [[1, 1.1], [1, 4.0], [2, 4.0]], "trial: stalls": [[2, 1.1]]}
+
+
 def test_with_jitter_the_share_is_shaded_and_has_a_scale(jittery: StoredRun) -> None:
     figure = drawn(jittery)
     (mesh,) = [found for found in figure.axes[0].collections if isinstance(found, QuadMesh)]
@@ -139,11 +152,11 @@ def test_with_jitter_the_share_is_shaded_and_has_a_scale(jittery: StoredRun) -> 
 
 
 def test_tables_give_the_formula_and_the_first_rate_that_passed(even: StoredRun) -> None:
-    table = line_table(even)
+    table = show(even).tables["boundary"]
     assert [row[1] for row in table.rows][:4] == ["1.00", "2.00", "3.00", "4.00"]
     for row in table.rows:
         assert float(row[1]) <= float(row[2]) <= float(row[1]) * 1.26
         assert float(row[3]) <= float(row[4]) <= float(row[3]) * 1.26
-    verdicts = {row[1:3]: row[4:] for row in board_table(even).rows}
+    verdicts = {row[1:3]: row[4:] for row in show(even).tables["boards"].rows}
     assert verdicts["4", "0.833"] == ("stall-free", "stalls")
-    assert any("agree at 424 of 424 points" in note for note in board_table(even).notes)
+    assert any("agree at 424 of 424 points" in note for note in show(even).tables["boards"].notes)

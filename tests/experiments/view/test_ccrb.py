@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jsonschema
 import numpy as np
+import pandas as pd
 import pytest
 from rosbags.highlevel import AnyReader
 
@@ -18,11 +19,12 @@ from s2a_bench.experiments import EXPERIMENTS
 from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbComputed, CcrbLiveLoop, DrivingRequests
 from s2a_bench.experiments.ccrb.loop import ClosedLoop
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
-from s2a_bench.experiments.ccrb.view.figures import build_scenario
-from s2a_bench.experiments.ccrb.view.outcomes import token_times_s
-from s2a_bench.experiments.ccrb.view.tables import ccrb_json, show
+from s2a_bench.experiments.ccrb.view.figures import DrivenPlan, build_phase, build_scenario, path_of
+from s2a_bench.experiments.ccrb.view.outcomes import Rollouts
+from s2a_bench.experiments.ccrb.view.tables import show
 from s2a_bench.inference import EngineConfig
 from s2a_bench.options import Options
+from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
@@ -87,7 +89,7 @@ def test_a_closed_loop_is_followed_by_its_roll_out(virtual: StoredRun) -> None:
         ("  roll-out", "no impact", "3.55", "0"),
     ]
     assert [row[-2] for row in table.rows] == ["1.00", "\N{EN DASH}"] * 3
-    printed = ccrb_json(virtual)
+    printed = show(virtual).json()
     jsonschema.validate(printed, SCHEMA)
     assert [(cell["policy"], cell["outcome"]) for cell in printed["rollouts"]] == [
         ("naive", "rear"),
@@ -102,9 +104,9 @@ def test_a_run_without_closed_loops_has_no_roll_outs_beside_it(tmp_path: Path) -
     table = show(made).tables["outcomes"]
     assert [row[0] for row in table.rows] == list(POLICIES)
     assert "real-time factor" not in table.header
-    assert "rollouts" not in ccrb_json(made)
+    assert "rollouts" not in show(made).json()
     assert not any("loop" in note for note in table.notes)
-    assert [axes.get_title("left") for axes in build_scenario(made).axes[:3]] == [
+    assert [axes.get_title("left") for axes in show(made).figures["scenario"]().axes[:3]] == [
         "naive: hit from behind",
         "wait-then-act: hits the lead",
         "stream-to-act: no impact",
@@ -131,7 +133,7 @@ def test_a_world_slower_than_the_clock_is_told_with_its_factor(
     slow = [note for note in show(made).tables["outcomes"].notes if "slower than the clock" in note]
     assert [told in note for note in slow] == [True] * bool(told)
     assert [note.labels for note in slow] == [("world slower than the clock",)] * bool(told)  # type: ignore[attr-defined]
-    assert ("slower than the clock" in " ".join(caption_of(build_scenario(made)))) is bool(told)
+    assert ("slower than the clock" in " ".join(caption_of(show(made).figures["scenario"]()))) is bool(told)
 
 
 def test_each_policys_request_has_its_stages_and_they_add_up(virtual: StoredRun, live: Live) -> None:
@@ -154,7 +156,7 @@ def test_each_policys_request_has_its_stages_and_they_add_up(virtual: StoredRun,
 
 
 def test_the_figure_names_the_roll_out_and_marks_the_first_token(virtual: StoredRun) -> None:
-    figure = build_scenario(virtual)
+    figure = show(virtual).figures["scenario"]()
     assert [axes.get_title("left") for axes in figure.axes[:3]] == [
         "naive: hit from behind\nroll-out: hit from behind",
         "wait-then-act: hits the lead\nroll-out: hits the lead",
@@ -164,15 +166,50 @@ def test_the_figure_names_the_roll_out_and_marks_the_first_token(virtual: Stored
     for place, axes in enumerate(figure.axes):
         marks = [line for line in axes.lines if line.get_linestyle() == "-."]
         firsts = [float(np.asarray(line.get_xdata())[0]) for line in marks]
-        assert firsts == [token_times_s(virtual, cells[place % 3])[0]]
+        assert firsts == [Rollouts.of(virtual).token_s(cells[place % 3])[0]]
     assert "CCRB with a car behind (longitudinal simulator, closed loop)" in caption_of(figure)[0]
 
 
 def test_no_skill_is_drawn_beyond_what_was_driven(virtual: StoredRun) -> None:
-    axes = build_scenario(virtual).axes[1]
+    axes = show(virtual).figures["scenario"]().axes[1]
     driven_s = max(float(np.max(line.get_xdata())) for line in axes.lines if len(np.asarray(line.get_xdata())) > 50)
     ends_s = [patch.get_x() + patch.get_width() for patch in axes.patches]  # type: ignore[attr-defined]
     assert max(ends_s) == pytest.approx(driven_s)
+
+
+def trajectory() -> pd.DataFrame:
+    """Return five seconds of a lead 30 m ahead and a rear car that closes 10 m; all stop after two seconds."""
+    at_s = np.arange(0, 5, 0.5)
+    speed, gap = np.where(at_s < 2.5, 10.0, 0.0), np.linspace(6.0, -12.0, len(at_s))
+    columns = {"at_ns": at_s * 1e9, "lead_position_m": at_s + 30, "ego_position_m": at_s, "rear_position_m": at_s - gap}
+    return pd.DataFrame({**columns, **{f"{car}_speed_mps": speed for car in ("lead", "ego", "rear")}})
+
+
+def test_a_path_ends_a_second_after_the_cars_rest_and_the_rear_car_at_its_impact() -> None:
+    path = path_of(trajectory(), hit_from_behind=True)
+    assert path["time_s"].max() == 3.0
+    assert path["rear_gap_m"].isna().tolist() == [False] * 4 + [True] * 3
+    assert path["ego_speed_mps"].notna().all()
+    assert path_of(trajectory(), hit_from_behind=False)["rear_gap_m"].notna().all()
+
+
+def test_a_scenario_is_drawn_from_a_path_skills_and_tokens() -> None:
+    skills = pd.DataFrame({"start_ns": [1e9, 3e9], "end_ns": [2e9, 4e9], "stall_ns": [0.0, 1e9]})
+    plan = DrivenPlan("naive", path_of(trajectory(), hit_from_behind=True), skills, [0.5, 0.7], {"rear": 4.0})
+    figure = build_scenario(("A title",), [plan])
+    assert [text.get_text() for axes in figure.axes for text in axes.texts] == ["4.0 m/s"]
+    spans = [(patch.get_x(), patch.get_width()) for patch in figure.axes[0].patches]  # type: ignore[attr-defined]
+    assert spans == [(0.0, 1.0), (1.0, 1.0), (2.0, 1.0)]  # waiting, a skill, a stall; the second skill is not driven
+
+
+def test_a_phase_diagram_is_drawn_from_scenarios() -> None:
+    outcomes = {"naive": ["rear", "none"] * 2, "wait-then-act": ["front"] * 4, "stream-to-act": ["none"] * 4}
+    plane = {"tokens_per_s": [2.0, 4.0] * 2, "rear_gap_m": [6.0, 6.0, 9.0, 9.0], "paper": [True, False] * 2}
+    figure = build_phase(("A title",), dict.fromkeys(GAPS, pd.DataFrame({**plane, **outcomes})), (2.0, 8.0))
+    assert figure.axes[0].get_title("left") == "stop: the paper's ordering 50.0%, at 8 m: R 2.0\N{EN DASH}2.0"
+    (legend,) = figure.legends
+    labels = ["the paper's ordering", "only wait-then-act has an impact", "operating point"]
+    assert [text.get_text() for text in legend.get_texts()] == labels
 
 
 @pytest.fixture(scope="module")
@@ -182,14 +219,14 @@ def slow(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
 
 
 def test_tokens_that_come_after_the_crash_are_not_drawn(slow: StoredRun) -> None:
-    figure = build_scenario(slow)
+    figure = show(slow).figures["scenario"]()
     figure.canvas.draw()  # a layout without room would warn
     (marks,) = (line for line in figure.axes[0].lines if line.get_marker() == "|")
     assert marks.get_clip_on()
 
 
 def test_tracking_is_absent_where_no_skill_ran_before_the_crash(slow: StoredRun) -> None:
-    (cell,) = ccrb_json(slow)["cells"]
+    (cell,) = show(slow).json()["cells"]
     assert cell["outcome"] == "front"
     assert cell["real_time_factor"] == pytest.approx(1.0)
     assert "tracking_rms_mps" not in cell

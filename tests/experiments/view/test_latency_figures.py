@@ -11,11 +11,8 @@ from matplotlib.patches import Rectangle
 
 from s2a_bench.experiments import write_shown
 from s2a_bench.experiments.latency import EXPERIMENT
-from s2a_bench.experiments.latency.view import (
-    build_latency_bars,
-    build_latency_distribution,
-    build_stage_breakdown,
-)
+from s2a_bench.experiments.latency.view.figures import StageBar, build_stage_breakdown, latency_figures
+from s2a_bench.experiments.requests import cells_of
 from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.figures import Bar, caption_of
 from s2a_bench.writers.style import GREY, paper_column
@@ -31,6 +28,10 @@ HAND = {
 def style() -> Iterator[None]:
     with paper_column():
         yield
+
+
+def drawn(name: str, run: StoredRun, against: str = "") -> Figure:
+    return latency_figures(cells_of(run), against)[name]()
 
 
 def row_names(figure: Figure) -> list[str]:
@@ -50,7 +51,7 @@ def texts(figure: Figure) -> list[str]:
 
 
 def test_bars_are_medians_and_whiskers_are_seen_on_every_colour(make_run: MakeRun) -> None:
-    figure = build_latency_bars(make_run(HAND, n=4, spread=0))
+    figure = drawn("latency_bars", make_run(HAND, n=4, spread=0))
     assert row_names(figure) == ["http/as-deployed\n(raw)", "ros/topic\n(raw)"]
     assert [bar.get_width() for bar in bars(figure)] == [8.0, 4.0]
     assert texts(figure) == ["8.00", "4.00"]
@@ -62,19 +63,19 @@ def test_bars_are_medians_and_whiskers_are_seen_on_every_colour(make_run: MakeRu
 
 
 def test_the_caption_says_how_many_and_what_did_not_really_answer(make_run: MakeRun) -> None:
-    title, observation, _, engine = caption_of(build_latency_bars(make_run(HAND, n=4)))
+    title, observation, _, engine = caption_of(drawn("latency_bars", make_run(HAND, n=4)))
     assert title == "Medians: end to end without inference"
     assert observation == "n = 4 a cell, 640x480, request mode."
     assert engine == "Echo engine."
     dummy = make_run(HAND, n=4, engine="llama", manifest={"model": {"dummy": True}})
-    for build in (build_latency_bars, build_stage_breakdown, build_latency_distribution):
-        assert "Dummy weights." in caption_of(build(dummy))
+    for name in ("latency_bars", "stages", "distribution"):
+        assert "Dummy weights." in caption_of(drawn(name, dummy))
 
 
 def test_the_papers_values_appear_only_when_asked_for_and_as_another_machines(make_run: MakeRun) -> None:
     run = make_run(HAND, n=4, spread=0)
-    assert "paper" not in "".join(row_names(build_latency_bars(run)))
-    figure = build_latency_bars(run, against="paper")
+    assert "paper" not in "".join(row_names(drawn("latency_bars", run)))
+    figure = drawn("latency_bars", run, against="paper")
     assert row_names(figure)[2:] == ["paper:\nHTTP/JSON", "paper:\nROS-native"]
     assert [bar.get_width() for bar in bars(figure)][2:] == [101.8, 15.5]
     assert {mpl.colors.to_hex(bar.get_facecolor()).upper() for bar in bars(figure)[2:]} == {GREY}
@@ -84,7 +85,7 @@ def test_the_papers_values_appear_only_when_asked_for_and_as_another_machines(ma
 
 
 def test_the_stacked_groups_are_medians_beside_that_of_the_whole(make_run: MakeRun) -> None:
-    figure = build_stage_breakdown(make_run(HAND, n=4, spread=0))
+    figure = drawn("stages", make_run(HAND, n=4, spread=0))
     assert len(figure.axes) == 1
     assert legend(figure) == ["capture", "encode", "pack", "network", "return", "residual", "whole"]
     parts = bars(figure)
@@ -97,7 +98,7 @@ def test_the_stacked_groups_are_medians_beside_that_of_the_whole(make_run: MakeR
 
 def test_cells_that_differ_widely_get_a_panel_of_shares(make_run: MakeRun) -> None:
     small = {"loopback": {"capture": 0.2, "inference": 100, "return": 0.2}}
-    figure = build_stage_breakdown(make_run(HAND | small, n=4, spread=0))
+    figure = drawn("stages", make_run(HAND | small, n=4, spread=0))
     assert [axes.get_xlabel() for axes in figure.axes] == ["e2e without inference (ms)", "share (%)"]
     ends = [bar.get_x() + bar.get_width() for bar in bars(figure, 1) if bar.get_hatch() == "//////"]
     assert ends == pytest.approx([100, 100, 100])
@@ -105,11 +106,20 @@ def test_cells_that_differ_widely_get_a_panel_of_shares(make_run: MakeRun) -> No
     assert capture == pytest.approx([12.5, 25, 50])
 
 
+def test_the_breakdown_is_drawn_from_numbers_alone() -> None:
+    parts = {"capture": 1.0, "network": 2.0, "return": 0.5, "residual": 0.25}
+    caption = ("Stages, medians", "n = 4 a cell.")
+    figure = build_stage_breakdown(caption, [StageBar("ros/topic", parts, 4.0, {"return": 0.1})], "ms")
+    assert [bar.get_width() for bar in bars(figure)] == list(parts.values())
+    assert [list(line.get_xdata()) for line in figure.axes[0].get_lines()] == [[2.9, 3.1], [4.0, 4.0]]
+    assert (texts(figure), caption_of(figure)) == (["4.00"], caption)
+
+
 def test_a_black_box_is_left_out_by_name_or_shown_with_its_inference(make_run: MakeRun, black_box: Any) -> None:
-    mixed = build_latency_bars(make_run(HAND | {"http/black-box": black_box}, n=4))
+    mixed = drawn("latency_bars", make_run(HAND | {"http/black-box": black_box}, n=4))
     assert "http/black-box not shown (inference unknown)" in " ".join(caption_of(mixed))
     assert len(bars(mixed)) == 2
-    alone = build_stage_breakdown(make_run({"http/black-box": black_box}, n=4, spread=0))
+    alone = drawn("stages", make_run({"http/black-box": black_box}, n=4, spread=0))
     assert alone.axes[0].get_xlabel() == "e2e, inference included (ms)"
     assert "server" in legend(alone)
 
@@ -119,8 +129,7 @@ def test_no_text_is_clipped_or_smaller_than_seven_points(
     make_run: MakeRun, plausible: dict[str, Any], count: int
 ) -> None:
     run = make_run(dict(list(plausible.items())[:count]), n=10)
-    drawn = build_latency_bars(run, against="paper"), build_stage_breakdown(run), build_latency_distribution(run)
-    for figure in drawn:
+    for figure in (drawn("latency_bars", run, against="paper"), drawn("stages", run), drawn("distribution", run)):
         figure.draw_without_rendering()
         inked = figure.get_tightbbox()
         assert min(inked.x0, inked.y0) >= 0

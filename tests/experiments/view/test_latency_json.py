@@ -7,6 +7,7 @@ import jsonschema
 
 from s2a_bench.experiments.latency import EXPERIMENT
 from s2a_bench.experiments.latency.metrics import latency_json
+from s2a_bench.experiments.requests import cells_of
 from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import StoredRun
 from s2a_bench.trace import GROUPS, path_of
@@ -32,7 +33,7 @@ def test_the_schema_is_a_schema_and_knows_every_stage_and_group() -> None:
 def test_real_output_is_strict_json_and_valid(make_run: MakeRun, plausible: Any, black_box: Any) -> None:
     cells = plausible | {"http/black-box": black_box}
     run = make_run(cells, n=5, manifest={"warnings": [WARNING], "environment": {"cpu": "EPYC"}}, frame_age_ns=5_000_000)
-    whole = json.loads(json.dumps(latency_json(run), allow_nan=False))
+    whole = json.loads(json.dumps(latency_json(cells_of(run)), allow_nan=False))
     validate(whole)
     assert whole["schema"] == "s2a-bench/1"
     assert whole["command"] == "latency"
@@ -50,7 +51,9 @@ def test_real_output_is_strict_json_and_valid(make_run: MakeRun, plausible: Any,
 
 def test_one_cell_by_hand(make_run: MakeRun) -> None:
     stages = {"capture": 1, "cdr_pack": 2, "": 0.25, "network": 3, "inference": 100, "return": 1.75}
-    (cell,) = latency_json(make_run({"ros/topic": stages}, n=4, spread=0, n_tokens=2, frame_age_ns=7_000_000))["cells"]
+    (cell,) = latency_json(
+        cells_of(make_run({"ros/topic": stages}, n=4, spread=0, n_tokens=2, frame_age_ns=7_000_000))
+    )["cells"]
 
     def exactly(value: float, n: int = 4) -> dict[str, float]:
         return {"n": n, "median": value, "mean": value, "sd": 0.0, "p90": value, "p99": value}
@@ -85,7 +88,7 @@ def test_one_cell_by_hand(make_run: MakeRun) -> None:
 
 
 def test_a_ratio_carries_its_interval(make_run: MakeRun) -> None:
-    whole = latency_json(make_run(n=30, manifest={"seeds": {"bootstrap": 4}}))
+    whole = latency_json(cells_of(make_run(n=30, manifest={"seeds": {"bootstrap": 4}})))
     ratio = whole["ratios"][0]
     assert (ratio["metric"], ratio["of"], ratio["to"]) == ("e2e_without_inference_ms", "http/as-deployed", "ros/topic")
     low, high = ratio["ci95"]
@@ -97,7 +100,7 @@ def test_a_cell_in_which_everything_failed_is_still_a_cell(
     make_run: MakeRun, make_row: Callable[..., SampleRow]
 ) -> None:
     extra = tuple(make_row("ros/topic", {"capture": 1}, block, error="lost") for block in range(3))
-    whole = latency_json(make_run({}, extra=extra))
+    whole = latency_json(cells_of(make_run({}, extra=extra)))
     validate(whole)
     (cell,) = whole["cells"]
     assert (cell["n"], cell["errors"], cell["stages_ms"]) == (0, 3, {})
@@ -106,7 +109,7 @@ def test_a_cell_in_which_everything_failed_is_still_a_cell(
 
 def test_a_run_without_samples_is_valid_and_has_no_figures(make_run: MakeRun) -> None:
     run = make_run({})
-    whole = latency_json(run)
+    whole = latency_json(cells_of(run))
     validate(whole)
     assert whole["cells"] == whole["ratios"] == []
     assert EXPERIMENT.show(run).figures == {}

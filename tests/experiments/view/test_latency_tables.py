@@ -14,6 +14,7 @@ from s2a_bench.experiments import write_shown
 from s2a_bench.experiments.latency import EXPERIMENT
 from s2a_bench.experiments.latency.metrics import latency_csv
 from s2a_bench.experiments.latency.view import group_table, show, stage_table, summary_table
+from s2a_bench.experiments.requests import cells_of
 from s2a_bench.stats import Ratio, Summary
 from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
@@ -44,21 +45,21 @@ def test_without_model_reads_as_a_sum_where_it_is_told(make_run: MakeRun) -> Non
     theirs = {"capture": 1, "json_pack": 2, "ingest": 30, "inference": 81}
     cells = {"http/llama-server": theirs, "ros/topic": ours}
     run = make_run(cells, n=4, spread=0, manifest={"stages": path_of([STAGES])}, server_prompt_ms=80.0)
-    assert stage_table(run, full=False).rows[-5:] == [
+    assert stage_table(cells_of(run), full=False).rows[-5:] == [
         ("", "e2e without inference", "33.0", "4.50"),
         ("", "preprocess", NONE, "20.0"),
         ("", "e2e without model", "34.0", "24.5"),
         ("", "inference", "81.0", "80.0"),
         ("", "e2e", "114", "104"),
     ]
-    assert group_table(run).header[-5:] == ("e2e w/o infer.", "preproc.", "e2e w/o model", "infer.", "e2e")
+    assert group_table(cells_of(run)).header[-5:] == ("e2e w/o infer.", "preproc.", "e2e w/o model", "infer.", "e2e")
     assert "e2e less the prompt_ms it reports, which is assumed to be all" in " ".join(printed(run).split())
     assert show(run).sentences[-1].startswith("Without model, http/llama-server takes 1.39 times as long as ros/topic")
 
 
 def test_an_engine_that_tells_no_preprocessing_has_no_rows_about_it(make_run: MakeRun) -> None:
     run = make_run(HAND, n=4, spread=0)
-    assert not {"preprocess", "e2e without model"} & {row[1] for row in stage_table(run).rows}
+    assert not {"preprocess", "e2e without model"} & {row[1] for row in stage_table(cells_of(run)).rows}
     assert "summary-model" not in show(run).tables
 
 
@@ -93,7 +94,7 @@ def test_a_ratio_without_bounds_or_value_says_so() -> None:
 
 
 def test_the_stage_table_by_hand(make_run: MakeRun) -> None:
-    table = stage_table(make_run(HAND, n=4, spread=0), full=False)
+    table = stage_table(cells_of(make_run(HAND, n=4, spread=0)), full=False)
     assert table.header == ("group", "stage", "http/as-deployed", "ros/topic")
     assert table.rows == [
         ("capture", "capture", "1.00", "1.00"),
@@ -113,11 +114,11 @@ def test_the_stage_table_by_hand(make_run: MakeRun) -> None:
         "Echo engine.",
         "4 of 8 samples have a residual above 5% of e2e without inference.",
     )
-    assert stage_table(make_run(HAND, n=4, spread=0)).rows[1][2] == "3.00 (3.00 ± 0.00)"
+    assert stage_table(cells_of(make_run(HAND, n=4, spread=0))).rows[1][2] == "3.00 (3.00 ± 0.00)"
 
 
 def test_the_group_table_has_a_row_a_cell(make_run: MakeRun) -> None:
-    table = group_table(make_run(HAND, n=4, spread=0))
+    table = group_table(cells_of(make_run(HAND, n=4, spread=0)))
     assert table.header == ("cell", "capture", "encode", "pack", "network", "return", "e2e w/o infer.", "infer.", "e2e")
     assert table.rows == [
         ("http/as-deployed", "1.00", "5.00", NONE, "18.0", "0.500", "26.0", "100", "126"),
@@ -128,7 +129,7 @@ def test_the_group_table_has_a_row_a_cell(make_run: MakeRun) -> None:
 def test_the_summary_table_by_hand(make_run: MakeRun, make_row: Callable[..., SampleRow]) -> None:
     loopback = {"loopback": {"capture": 1, "inference": 100, "return": 0.3}}
     extra = (make_row("loopback", loopback["loopback"], 9, error="x"),)
-    table = summary_table(make_run(HAND | loopback, n=5, spread=0, extra=extra))
+    table = summary_table(cells_of(make_run(HAND | loopback, n=5, spread=0, extra=extra)))
     assert table.header[-2:] == ("ratio to ros/topic", "ratio to loopback")
     assert table.rows == [
         ("http/as-deployed", "5", "0", "26.0 ± 0.0", "26.0", "26.0", "26.0", "5.76 [5.76, 5.76]", "20.0 [20.0, 20.0]"),
@@ -149,7 +150,7 @@ BLOCKS = {
 
 def test_payloads_are_blocks_and_ratios_stay_inside_them(make_run: MakeRun) -> None:
     run = make_run(BLOCKS, n=4, spread=0)
-    table = summary_table(run)
+    table = summary_table(cells_of(run))
     figures = "n", "errors", "mean ± sd", "median", "p90", "p99"
     assert table.header == ("payload", "cell", *figures, "ratio to ros/topic")
     assert [(*row[:2], row[5], row[8].split()[0]) for row in table.rows] == [
@@ -159,7 +160,7 @@ def test_payloads_are_blocks_and_ratios_stay_inside_them(make_run: MakeRun) -> N
         ("", "ros/topic", "5.00", "1"),
     ]
     assert table.rules == {2}
-    assert stage_table(run).header[2:] == (
+    assert stage_table(cells_of(run)).header[2:] == (
         *("http/as-deployed raw", "ros/topic raw"),
         *("http/as-deployed jpeg", "ros/topic jpeg"),
     )
@@ -176,19 +177,19 @@ def test_unlike_payloads_are_compared_where_a_name_has_its_payload(make_run: Mak
     run = make_run(HAND, n=4, spread=0, payloads={"http": "jpeg"}, manifest={"configuration": {"transports": names}})
     sentence_start = "http/as-deployed with jpeg pictures takes 5.76 times as long as ros/topic with raw pictures"
     assert any(sentence.startswith(sentence_start) for sentence in show(run).sentences) is named
-    assert any("ratio" in name for name in summary_table(run).header) is named
+    assert any("ratio" in name for name in summary_table(cells_of(run)).header) is named
 
 
 def test_a_black_box_is_absent_where_its_inference_is_unknown(make_run: MakeRun, black_box: Any) -> None:
     run = make_run(HAND | {"http/black-box": black_box}, n=4, spread=0)
-    assert summary_table(run).rows[1][3:] == (NONE,) * 5
-    assert summary_table(run, "e2e").rows[1][3:5] == ("302 ± 0", "302")
+    assert summary_table(cells_of(run)).rows[1][3:] == (NONE,) * 5
+    assert summary_table(cells_of(run), "e2e").rows[1][3:5] == ("302 ± 0", "302")
     assert " 302 " in printed(run)
 
 
 def test_markdown_and_latex_are_tables(make_run: MakeRun) -> None:
     run = make_run(HAND, n=4, spread=0)
-    table = replace(stage_table(run), provenance=run.origins.line)
+    table = replace(stage_table(cells_of(run)), provenance=run.origins.line)
     markdown = to_markdown(table).splitlines()
     assert markdown[0] == "**Stages in ms: median (mean ± sd)**"
     assert markdown[2:5] == [
@@ -210,7 +211,7 @@ def test_markdown_and_latex_are_tables(make_run: MakeRun) -> None:
 
 def test_csv_keeps_every_digit_and_leaves_absent_stages_out(make_run: MakeRun) -> None:
     run = make_run(HAND, n=4, spread=0)
-    texts = {name: table.text(run.origins) for name, table in latency_csv(run).items()}
+    texts = {name: table.text(run.origins) for name, table in latency_csv(cells_of(run)).items()}
     stages = list(csv.DictReader(io.StringIO(texts["stages.csv"])))
     ros = {row["stage"]: row for row in stages if row["cell"] == "ros/topic"}
     assert list(ros) == ["capture", "cdr_pack", "network", "inference", "return", "residual"]
@@ -224,7 +225,7 @@ def test_csv_keeps_every_digit_and_leaves_absent_stages_out(make_run: MakeRun) -
     ratio = next(csv.DictReader(io.StringIO(texts["ratios.csv"])))
     assert ratio["emulated"] == "False"
     replayed = make_run(HAND, n=4, engine="replay", manifest={"model": {"engine": "replay", "emulated": True}})
-    for table in latency_csv(replayed).values():
+    for table in latency_csv(cells_of(replayed)).values():
         text = table.text(replayed.origins)
         assert {row["emulated"] for row in csv.DictReader(io.StringIO(text))} == {"True"}
     assert (ratio["of"], ratio["to"], float(ratio["value"])) == ("http/as-deployed", "ros/topic", 26 / 4.5124)
@@ -249,8 +250,8 @@ def test_a_cell_in_which_everything_failed_is_in_the_summary(
     make_run: MakeRun, make_row: Callable[..., SampleRow]
 ) -> None:
     run = make_run({}, extra=(make_row("ros/topic", {"capture": 1}, 1, error="lost"),))
-    assert latency_csv(run)["summary.csv"].rows == [("ros/topic", "", 1, 0, 0, *[None] * 5, False)]
-    assert summary_table(run).rows == [("ros/topic", "0", "1", NONE, NONE, NONE, NONE)]
+    assert latency_csv(cells_of(run))["summary.csv"].rows == [("ros/topic", "", 1, 0, 0, *[None] * 5, False)]
+    assert summary_table(cells_of(run)).rows == [("ros/topic", "0", "1", NONE, NONE, NONE, NONE)]
 
 
 @pytest.mark.parametrize("folder", ["tables", "figures"])
@@ -272,9 +273,9 @@ def test_the_terminal_shows_the_stages_what_they_say_and_where_the_rest_is(
     assert "…" not in text
     tables, _, sentences = text.partition("8 requests a cell")
     assert all(len(line.rstrip()) <= width for line in tables.splitlines())
-    assert {row[-1] for row in (group_table(run) if count > 5 else stage_table(run, full=False)).rows} <= {
-        *tables.split()
-    }
+    assert {
+        row[-1] for row in (group_table(cells_of(run)) if count > 5 else stage_table(cells_of(run), full=False)).rows
+    } <= {*tables.split()}
     assert "Echo engine." in " ".join(sentences.split())
     assert "mean ± sd" not in tables or count < 3
     assert "more tables (summary, summary-e2e" in sentences
@@ -292,6 +293,6 @@ def test_over_launches_the_table_says_by_how_much_they_differ(
         for cell, durations in HAND.items():
             slow = {stage: ms * (factor if cell.startswith("http") else 1) for stage, ms in durations.items()}
             rows += [make_row(cell, slow, 10 * launch + block, launch=launch) for block in range(3)]
-    table = summary_table(make_run({}, extra=tuple(rows)))
+    table = summary_table(cells_of(make_run({}, extra=tuple(rows))))
     assert "Ratios are over 3 launches" in table.notes[-1]
     assert "10 %" in table.notes[-1]

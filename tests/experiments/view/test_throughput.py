@@ -19,15 +19,11 @@ from s2a_bench.experiments.throughput.metrics import (
     ReferenceRow,
     joined,
     rates_by_position,
-    ratios_of,
     throughput_cells,
     throughput_csv,
     throughput_json,
 )
 from s2a_bench.experiments.throughput.view import (
-    build_gap_distribution,
-    build_rate_by_position,
-    build_throughput_bars,
     position_table,
     show,
     speed_table,
@@ -114,7 +110,7 @@ def test_the_parts_of_the_prompt_stand_side_by_side(make: Make) -> None:
     assert {name: list(only(run).values(name)) for name in parts} == {name: [ms] * 3 for name, ms in parts.items()}
     table = show(run).tables["prompt"]
     assert table.rows == [("in-process", "30.0", "10.0", "130", "50.0", "200", "150", "21.0", "100", "100")]
-    (cell,) = throughput_json(run)["cells"]
+    (cell,) = throughput_json(throughput_cells(run))["cells"]
     assert {name: cell[name]["median"] for name in parts} == parts
 
 
@@ -122,17 +118,21 @@ def test_another_engine_is_compared_by_the_engines_own_figures_too(make: Make) -
     names = ("in-process", "http/as-deployed", "http/llama-server")
     facts = {name: {"predicted_n": 5.0, "predicted_ms": ms} for name, ms in zip(names, (50.0, 50.0, 62.5), strict=True)}
     run = make(dict.fromkeys(names, [10] * 4), facts=facts)
-    found = [(ratio["metric"], ratio["of"], ratio["value"]) for ratio in throughput_json(run)["ratios"]]
+    found = [
+        (ratio["metric"], ratio["of"], ratio["value"]) for ratio in throughput_json(throughput_cells(run))["ratios"]
+    ]
     assert found == [
         ("decode_tokens_per_s", "http/as-deployed", 1.0),
         ("decode_tokens_per_s", "http/llama-server", 1.0),
         ("tokens_per_s", "http/llama-server", 0.8),
     ]
-    assert "tokens_per_s,http/llama-server,in-process,0.8" in throughput_csv(run)["ratios.csv"].text(run.origins)
-    sentence = throughput_sentences(run)[-1]
+    assert "tokens_per_s,http/llama-server,in-process,0.8" in throughput_csv(throughput_cells(run))["ratios.csv"].text(
+        run.origins
+    )
+    sentence = throughput_sentences(throughput_cells(run))[-1]
     assert sentence == "By their own figures the engine of http/llama-server has 0.800 of the rate of in-process."
     untold = make(dict.fromkeys(names, [10] * 4), facts={"in-process": facts["in-process"]})
-    assert {ratio["metric"] for ratio in throughput_json(untold)["ratios"]} == {"decode_tokens_per_s"}
+    assert {ratio["metric"] for ratio in throughput_json(throughput_cells(untold))["ratios"]} == {"decode_tokens_per_s"}
 
 
 def test_a_server_that_tells_nothing_has_the_clients_rate_and_no_zeros(make: Make) -> None:
@@ -141,8 +141,8 @@ def test_a_server_that_tells_nothing_has_the_clients_rate_and_no_zeros(make: Mak
     assert list(cell.values("tokens_per_s")) == list(cell.values("decode_tokens_per_s")) == [100.0] * 3
     for absent in ("prompt_ms", "image_ms", "prompt_eval_ms", "prefill_tokens_per_s", "tokens_per_joule"):
         assert cell.values(absent).size == 0
-    assert "the server does not report T_eval" in " ".join(speed_table(run).notes)
-    (cell,) = throughput_json(run)["cells"]
+    assert "the server does not report T_eval" in " ".join(speed_table(throughput_cells(run)).notes)
+    (cell,) = throughput_json(throughput_cells(run))["cells"]
     assert cell["t_eval"] == "client"
     assert not {"prompt_ms", "image_ms", "tokens_per_joule"} & set(cell)
 
@@ -152,14 +152,14 @@ def test_tokens_that_come_together_are_counted_by_the_server(make: Make) -> None
     cell = only(run)
     assert list(cell.values("decode_tokens_per_s")) == [pytest.approx(100.0)] * 3  # 6 of 7 tokens in 60 ms
     assert joined(cell) == 12
-    assert "12 tokens arrived together with another one" in " ".join(speed_table(run).notes)
+    assert "12 tokens arrived together with another one" in " ".join(speed_table(throughput_cells(run)).notes)
 
 
 def test_warm_ups_are_in_no_number(make: Make) -> None:
     run = make({"in-process": [10] * 3}, n=2, reference=[1.0, 80.0, 90.0])
     assert only(run).n == 2
     assert only(run).values("itl").size == 6
-    reference = throughput_json(run)["reference"]
+    reference = throughput_json(throughput_cells(run))["reference"]
     assert reference["decode_tokens_per_s"]["n"] == 2
     assert reference["decode_tokens_per_s"]["mean"] == pytest.approx(85.0)
     assert reference["depths"] == [42]
@@ -177,7 +177,7 @@ def test_a_slower_part_of_the_answer_shows_at_its_position(make: Make) -> None:
 
 def test_cells_are_compared_with_in_process_and_with_llama_bench(make: Make) -> None:
     run = make({"http/as-deployed": [20] * 4, "in-process": [10] * 4}, reference=[1.0, 50.0, 80.0, 100.0])
-    found = {(of, to): ratio.value for _, of, to, ratio in ratios_of(run, throughput_cells(run))}
+    found = {(of, to): ratio.value for _, of, to, ratio in throughput_cells(run).rate_ratios}
     assert found == {
         ("in-process", "llama-bench"): pytest.approx(100 / 80),
         ("http/as-deployed", "llama-bench"): pytest.approx(50 / 80),
@@ -188,7 +188,7 @@ def test_cells_are_compared_with_in_process_and_with_llama_bench(make: Make) -> 
 
 def test_a_reference_that_broke_off_is_compared_all_the_same(make: Make) -> None:
     run = make({"in-process": [10] * 4}, n=3, reference=[1.0, 50.0])
-    ((*_, ratio),) = ratios_of(run, throughput_cells(run))
+    ((*_, ratio),) = throughput_cells(run).rate_ratios
     assert ratio.value == pytest.approx(2.0)
 
 
@@ -197,7 +197,7 @@ def test_the_json_is_strict_and_valid(make: Make) -> None:
     joules = {"in-process": {**facts, "energy_j": 3.0}}
     gaps = {"in-process": [10.0] * 69, "http/as-deployed": [11.0] * 69}
     run = make(gaps, facts=joules, reference=[9.0, 99.0, 98.0, 97.0], reference_command=["x"])
-    whole = json.loads(json.dumps(throughput_json(run), allow_nan=False))
+    whole = json.loads(json.dumps(throughput_json(throughput_cells(run)), allow_nan=False))
     jsonschema.validate(whole, SCHEMA, cls=jsonschema.Draft202012Validator)
     cell = whole["cells"][0]
     assert cell["tokens_per_s"]["mean"] == pytest.approx(100.0)
@@ -209,18 +209,18 @@ def test_the_json_is_strict_and_valid(make: Make) -> None:
 
 
 def test_answers_of_one_bin_have_no_table_of_positions(make: Make) -> None:
-    assert position_table(make({"in-process": [7] * 3})) is None
+    assert position_table(throughput_cells(make({"in-process": [7] * 3}))) is None
 
 
 def test_bars_start_at_zero_and_the_papers_are_labelled(make: Make) -> None:
     run = make({"in-process": [25] * 4}, n=2, model={"dummy": True})
-    figure = build_throughput_bars(run)
+    figure = throughput_figures(throughput_cells(run))["throughput_bars"]()
     bars = [patch.get_width() for patch in figure.axes[0].patches if isinstance(patch, Rectangle)]
     assert bars == [pytest.approx(40.0)]
     assert figure.axes[0].get_xlim()[0] == 0
     assert "Dummy weights." in caption_of(figure)
     assert not figure.legends
-    beside = build_throughput_bars(run, against="paper")
+    beside = throughput_figures(throughput_cells(run), against="paper")["throughput_bars"]()
     names = [label.get_text() for label in beside.axes[0].get_yticklabels()]
     assert names == ["in-process", "paper:\nRTX 4080", "paper:\nJetson AGX Orin", "paper:\nJetson Orin Nano"]
     assert [text.get_text() for text in beside.axes[0].texts] == ["40.0", "34.2", "4.8", "0.58"]
@@ -233,9 +233,10 @@ def test_bars_start_at_zero_and_the_papers_are_labelled(make: Make) -> None:
 
 def test_one_late_burst_does_not_hide_the_rates(make: Make) -> None:
     run = make({"in-process": [10.0] * 40 + [0.001] * 23}, n=1)
-    figure = build_rate_by_position(run)
-    assert build_gap_distribution(make({"in-process": [10.0] * 40})).axes[0].get_xscale() == "linear"
-    assert throughput_figures(make({"in-process": []})) == {}
+    figure = throughput_figures(throughput_cells(run))["positions"]()
+    gaps = throughput_figures(throughput_cells(make({"in-process": [10.0] * 40})))["gaps"]()
+    assert gaps.axes[0].get_xscale() == "linear"
+    assert throughput_figures(throughput_cells(make({"in-process": []}))) == {}
     (line,) = figure.axes[0].get_lines()
     medians: Any = line.get_ydata()
     assert medians[0] == pytest.approx(100.0)

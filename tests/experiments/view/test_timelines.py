@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
-from s2a_bench.experiments.timeline.rows import TIMELINES
-from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_json, timelines_of
+from s2a_bench.experiments.timeline.rows import TIMELINES, TimelineRow
+from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, timelines_json, timelines_of
 from s2a_bench.experiments.timeline.view.figures import build_timelines
 from s2a_bench.experiments.timeline.view.tables import (
     execution_table,
@@ -25,6 +26,7 @@ from s2a_bench.harness.timelines.rows import skill_rows, token_rows
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
+from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.requests import SKILLS, TOKENS, TokenRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.writers.figures import caption_of
@@ -133,12 +135,24 @@ def test_requests_of_their_own_have_their_tokens_in_their_lanes(live: StoredRun)
     )
 
 
+def test_a_figure_is_of_rows_and_needs_no_run() -> None:
+    plans, setting = plans_of(6), PlanSetting("orin", "Orin", 4.8, 0.5, 6, 8, 1.0)
+    schedule = Schedule(work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[0]), plans.nominal_s)
+    rows, skills = timeline_rows(setting, "naive", plans, schedule, ["a"]), skill_rows("a", plans, schedule, ["a"])
+    cell = Timelines(pd.DataFrame(rows), TimelineRow, Origins(Provenance()), skills, uniform(0.5, 1, 4.8, 48)[:, 0])
+    with paper_column():
+        figure = build_timelines([cell], ["A note."])
+    assert len(bars(figure.axes[0], hatched=False)) == 8
+    assert caption_of(figure) == ("Execution timelines: N = 8 skills, T_nom = 1 s", "A note.")
+
+
 def column(table: TextTable, name: str) -> list[str]:
     return [row[table.header.index(name)] for row in table.rows]
 
 
 def test_the_table_groups_rows_by_board_and_granularity(computed: StoredRun) -> None:
     table = execution_table(timelines_of(computed), computed.manifest)
+    assert table.title == "Timelines, N = 8, T_nom = 1 s: times in s"
     assert column(table, "board") == ["Orin", "", "", "", "", ""]
     assert column(table, "L") == ["6", "", "", "4", "", ""]
     assert column(table, "start") == ["1.75", "10.50", "3.50", "1.33", "7.17", "1.33"]

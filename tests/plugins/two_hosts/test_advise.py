@@ -388,7 +388,7 @@ def test_only_pipelines_over_a_network_of_runs_without_a_link_are_fitted(monkeyp
         replace(RAW, path=("loopback", "")),
     ]
     monkeypatch.setattr(room, "_runs", lambda path: [runs[""], runs["4g"]] if path == Path("a") else [runs[""]])
-    monkeypatch.setattr(room, "split", list)
+    monkeypatch.setattr(room, "cells_of", lambda run: run)
     monkeypatch.setattr(room, "against_bytes", lambda runs: seen.extend(runs) or lines)
     monkeypatch.setattr(room, "joined", lambda origins: SimpleNamespace(line=f"{[*origins]}"))
     assert FITTED((Path("a"), Path("b"))) == ([RAW], "['', '']")

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
-import pandas as pd
-
-from s2a_bench.experiments.ccrb.rows import METRICS, ROLLOUTS
-from s2a_bench.experiments.cells import TIME
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS, RolloutRow
+from s2a_bench.experiments.cells import Cells
+from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
 from s2a_bench.scenario.ccrb.labels import NAIVE, PAPER, STREAM_TO_ACT, WAIT, follower_check, law
 from s2a_bench.store.requests import SKILLS, TOKENS
-from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    import pandas as pd
 
     from s2a_bench.store.run import StoredRun
 
 
 IN_TIME: Final = 0.99
+STUDIES: Final = ("phase", "random")
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,113 +39,118 @@ class Share:
     def interval(self) -> tuple[float, float]:
         from scipy.stats import binomtest
 
-        found = binomtest(self.k, self.n).proportion_ci(0.95, method="exact")
-        return float(found.low), float(found.high)
+        interval = binomtest(self.k, self.n).proportion_ci(0.95, method="exact")
+        return float(interval.low), float(interval.high)
 
 
-def rollouts_of(run: StoredRun, study: str) -> pd.DataFrame:
-    """Return the rows of a study: point (the operating point), rollout (beside closed loops), phase or random."""
-    rows = run.table(ROLLOUTS)
-    return rows[rows["study"] == study].reset_index(drop=True)
+@dataclass(frozen=True)
+class Rollouts:
+    """The roll-outs of a run, and the plans that they were driven on."""
+
+    run: StoredRun
+    cells: Cells[RolloutRow]
+
+    @classmethod
+    def of(cls, run: StoredRun) -> Rollouts:
+        return cls(run, Cells.of(run, ROLLOUTS))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        settings: dict[str, Any] = self.run.manifest["configuration"]
+        return settings
+
+    @property
+    def live(self) -> dict[str, Any] | None:
+        """The facts of the model that answered, if one did."""
+        return self.run.manifest.get("live")
+
+    @cached_property
+    def point(self) -> list[RolloutRow]:
+        """The operating point, a row a policy."""
+        return self.cells.where(study="point").rows
+
+    @cached_property
+    def beside(self) -> dict[str, RolloutRow]:
+        """The roll-outs beside closed loops, by cell; empty for a run without closed loops."""
+        return {row.cell: row for row in self.cells.where(study="rollout").rows}
+
+    @cached_property
+    def studies(self) -> dict[str, dict[str, pd.DataFrame]]:
+        """The `scenes_of` each study that was run, by gap behaviour."""
+        rows = {study: self.cells.where(study=study) for study in STUDIES}
+        return {
+            study: {gap: scenes_of(of_study.where(gap_behaviour=gap).frame) for gap in GAPS}
+            for study, of_study in rows.items()
+            if len(of_study)
+        }
+
+    @cached_property
+    def skills(self) -> dict[str, pd.DataFrame]:
+        """The skills of each cell's plan."""
+        return {str(cell): skills for cell, skills in self.run.table(SKILLS).groupby("cell", sort=False)}
+
+    def request_of(self, cell: str) -> str:
+        """Return the id of the request whose plan ``cell`` was driven on."""
+        return str(self.skills[cell]["request_id"].iloc[0])
+
+    def token_s(self, cell: str) -> list[float]:
+        """Return the arrival times of the tokens that ``cell`` was driven on, in s from its request."""
+        request_id, tokens, manifest = self.request_of(cell), self.run.table(TOKENS), self.run.manifest
+        zero_ns = manifest.get("requests", {}).get(request_id, 0) or manifest.get("request", {}).get("requested_ns", 0)
+        return [(int(at_ns) - zero_ns) / 1e9 for at_ns in tokens[tokens["request_id"] == request_id]["client_ns"]]
 
 
-def cells_of(run: StoredRun, studies: Collection[str] = ("point",)) -> list[dict[str, Any]]:
-    """Return each policy's rows at the operating point as JSON, times in s; absent values have no key."""
-    rows = run.table(ROLLOUTS)
-    return [_cell(row) for row in rows[rows["study"].isin(studies)].to_dict("records")]
-
-
-def scenes_of(run: StoredRun, study: str, gap: str) -> pd.DataFrame:
-    """Return a row a scenario of a study under one gap behaviour, with a boolean column for each ordering.
+def scenes_of(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return a row a scenario, of a study's roll-outs under one gap behaviour, with a boolean column an ordering.
 
     ``paper``: naive is hit from behind only, wait-then-act hits the lead only, stream-to-act has no impact.
     ``wait_worse``, ``wait_better``, ``naive_worse``, ``naive_better``: the impact is more than 0.5 m/s faster or slower
     than stream-to-act's (none counts as 0); ``naive_rear_worse``, ``naive_rear_better``: the same for rear impacts.
     ``survives``: the car behind avoids an ego with immediate tokens.
     """
-    rows = rollouts_of(run, study)
-    rows = rows[rows["gap_behaviour"] == gap]
     policies = {name: group.set_index("draw").sort_index() for name, group in rows.groupby("policy")}
     mine = policies[STREAM_TO_ACT]
-    found = mine[["tokens_per_s", "rear_gap_m", "front_gap_m", "reaction_s", "lead_decel_mps2"]].copy()
-    for name, group in policies.items():
-        found[name] = group["outcome"]
-    found["paper"] = pd.concat([policies[name]["outcome"] == outcome for name, outcome in PAPER.items()], axis=1).all(
-        axis=1
-    )
-    found["survives"] = mine["follower_survives"]
-    for short, name in (("wait", WAIT), (NAIVE, NAIVE)):
-        found[f"{short}_worse"], found[f"{short}_better"] = _compared(policies[name], mine, "impact_speed_mps")
-    found["naive_rear_worse"], found["naive_rear_better"] = _compared(policies[NAIVE], mine, "rear_impact_mps")
-    return found
+    scenes = mine[["tokens_per_s", "rear_gap_m", "front_gap_m", "reaction_s", "lead_decel_mps2"]].copy()
+    scenes["paper"], scenes["survives"] = True, mine["follower_survives"]
+    for name, outcome in PAPER.items():
+        scenes[name] = policies[name]["outcome"]
+        scenes["paper"] &= scenes[name] == outcome
+    for short, name, column in (
+        ("wait", WAIT, "impact_speed_mps"),
+        ("naive", NAIVE, "impact_speed_mps"),
+        ("naive_rear", NAIVE, "rear_impact_mps"),
+    ):
+        theirs, ours = (each[column].astype("float64").fillna(0.0) for each in (policies[name], mine))
+        scenes[f"{short}_worse"] = theirs - ours > LEAST_IMPACT_MPS
+        scenes[f"{short}_better"] = theirs - ours < -LEAST_IMPACT_MPS
+    return scenes
 
 
 def share_of(scenes: pd.DataFrame, ordering: str) -> Share:
     return Share(int(scenes[ordering].sum()), len(scenes))
 
 
-def rate_span(run: StoredRun, gap: str, *, at_point: bool = False) -> tuple[float, float] | None:
-    """Return the least and greatest R of the phase diagram with the paper's ordering; None without any.
+def rate_span(scenes: pd.DataFrame, rear_gap_m: float | None = None) -> tuple[float, float] | None:
+    """Return the least and greatest R of a phase diagram with the paper's ordering; None without any.
 
-    ``at_point``: only at the grid's rear gap nearest to the operating point's.
+    With ``rear_gap_m`` only at the grid's nearest rear gap.
     """
-    scenes = scenes_of(run, "phase", gap)
-    if at_point:
-        wanted = configuration(run)["rear_gap_m"]
-        nearest = min(scenes["rear_gap_m"].unique(), key=lambda gap_m: abs(gap_m - wanted))
+    if rear_gap_m is not None:
+        nearest = min(scenes["rear_gap_m"].unique(), key=lambda gap_m: abs(gap_m - rear_gap_m))
         scenes = scenes[scenes["rear_gap_m"] == nearest]
     rates = scenes[scenes["paper"]]["tokens_per_s"]
     return (float(rates.min()), float(rates.max())) if len(rates) else None
 
 
-def has(run: StoredRun, study: str) -> bool:
-    return bool((run.table(ROLLOUTS)["study"] == study).any())
-
-
-def configuration(run: StoredRun) -> dict[str, Any]:
-    found: dict[str, Any] = run.manifest["configuration"]
-    return found
-
-
-def request_of(run: StoredRun, cell: str) -> str:
-    """Return the id of the request whose plan ``cell`` was driven on."""
-    skills = run.table(SKILLS)
-    return str(skills[skills["cell"] == cell]["request_id"].iloc[0])
-
-
-def token_times_s(run: StoredRun, cell: str) -> list[float]:
-    """Return the arrival times of the tokens that ``cell`` was driven on, in s from its request."""
-    request_id, tokens = request_of(run, cell), run.table(TOKENS)
-    zero_ns = run.manifest.get("requests", {}).get(request_id, 0) or run.manifest.get("request", {}).get(
-        "requested_ns", 0
-    )
-    return [(int(at_ns) - zero_ns) / 1e9 for at_ns in tokens[tokens["request_id"] == request_id]["client_ns"]]
-
-
-def _cell(row: dict[Any, Any]) -> dict[str, Any]:
-    plain = {str(name): value for name, value in row.items() if not pd.isna(value)}
-    for name in ("draw", "title", PROVENANCE):
-        plain.pop(name, None)
-    plain |= {metric.name: plain.pop(metric.column) / 1e9 for metric in METRICS.values() if metric.kind == TIME}
-    plain["rate_tokens_per_s"] = plain.pop("tokens_per_s")
-    plain["profile"] = plain.pop("board") or None
-    return plain
-
-
-def _compared(theirs: pd.DataFrame, mine: pd.DataFrame, column: str) -> tuple[pd.Series[Any], pd.Series[Any]]:
-    """Return where a policy's impact is faster than stream-to-act's, and where it is slower."""
-    difference = theirs[column].astype("float64").fillna(0.0) - mine[column].astype("float64").fillna(0.0)
-    return difference > LEAST_IMPACT_MPS, difference < -LEAST_IMPACT_MPS
-
-
-def origin_notes(run: StoredRun) -> tuple[str, ...]:
-    settings = configuration(run)
-    notes = _live_notes(run) if "live" in run.manifest else _emulated_notes(run)
-    notes += _loop_notes(run) if has(run, "rollout") else []
+def origin_notes(rollouts: Rollouts) -> tuple[str, ...]:
+    settings = rollouts.settings
+    notes = _live_notes(rollouts, rollouts.live) if rollouts.live else _emulated_notes(rollouts.run)
+    if rollouts.beside:
+        notes += _loop_notes(rollouts)
     if ego := settings.get("ego"):
         notes.append(f"Ego: commanded and seen over ROS 2 ({ego}).")
     notes.append(f"Rear: {law(settings)}.")
-    notes.append(follower_check(settings, bool(rollouts_of(run, "point")["follower_survives"].all())))
+    notes.append(follower_check(settings, all(row.follower_survives for row in rollouts.point)))
     reflex = "on" if settings["reflex"] else "off"
     notes.append(f"Front: while no skill is valid the ego does '{settings['gap']}'; the reflex layer is {reflex}.")
     return tuple(notes)
@@ -155,21 +160,20 @@ def tokens_line(run: StoredRun) -> Note:
     if (live := run.manifest.get("live")) is None:
         return Note(f"EMULATED tokens, {run.manifest['boards'][0]['tokens_per_s']:g}/s.", EMULATED)
     kind = "EMULATED (replayed)" if live["emulated"] else "LIVE"
-    pace = live.get("paced_tokens_per_s")
-    paced = f", paced to {pace:g} tokens/s (the rate is set)" if pace else ""
-    unseen = run.origins.run.unseen
-    line = f"{kind} tokens over {live['transport']}{paced}{unseen and f', {unseen}'}; car simulated."
-    return Note(line, *([EMULATED] if live["emulated"] else []), *([unseen] if unseen else []))
+    pace, unseen = live.get("paced_tokens_per_s"), run.origins.run.unseen
+    line = f"{kind} tokens over {live['transport']}"
+    line += f", paced to {pace:g} tokens/s (the rate is set)" if pace else ""
+    line += f", {unseen}" if unseen else ""
+    labels = [label for label, holds in ((EMULATED, live["emulated"]), (unseen, unseen)) if holds]
+    return Note(f"{line}; car simulated.", *labels)
 
 
-def _live_notes(run: StoredRun) -> list[str]:
-    live = run.manifest["live"]
-    rate = rollouts_of(run, "point")["tokens_per_s"].iloc[0]
-    line = tokens_line(run)
+def _live_notes(rollouts: Rollouts, live: dict[str, Any]) -> list[str]:
+    line = tokens_line(rollouts.run)
     if "paced_tokens_per_s" not in live:
-        line = Note(f"{line} {rate:g} tokens/s arrived.", *line.labels)
+        line = Note(f"{line} {rollouts.point[0].tokens_per_s:g} tokens/s arrived.", *line.labels)
     road = "Open loop: one request at t = 0 about the rendered scene; the road does not change the answer."
-    if has(run, "rollout"):
+    if rollouts.beside:
         road = "A request a policy, about the view at that moment."
     driven = "the set-points driven are those of the scenario."
     if live.get("dummy"):
@@ -177,13 +181,15 @@ def _live_notes(run: StoredRun) -> list[str]:
     return [line, road, f"What the plan says is not driven; {driven}"]
 
 
-def _loop_notes(run: StoredRun) -> list[str]:
-    step, beside = f"in steps of {run.manifest['step_s'] * 1e3:g} ms", rollouts_of(run, "rollout")["simulator"].iloc[0]
-    clock = f"ran {'on the clock' if 'live' in run.manifest else 'in virtual time'}"
-    roll_out = f"Roll-out: the same arrivals in virtual time, {beside} simulator."
-    notes = [f"Closed loop: the world {clock}, {step}, while the plan arrived.", roll_out]
-    factors = rollouts_of(run, "point").set_index("policy")["real_time_factor"]
-    if slow := ", ".join(f"{factor:.3g} ({policy})" for policy, factor in factors.items() if factor < IN_TIME):
+def _loop_notes(rollouts: Rollouts) -> list[str]:
+    clock = "on the clock" if rollouts.live else "in virtual time"
+    step_ms, beside = rollouts.run.manifest["step_s"] * 1e3, next(iter(rollouts.beside.values()))
+    notes = [
+        f"Closed loop: the world ran {clock}, in steps of {step_ms:g} ms, while the plan arrived.",
+        f"Roll-out: the same arrivals in virtual time, {beside.simulator} simulator.",
+    ]
+    factors = [(row.real_time_factor, row.policy) for row in rollouts.point if row.real_time_factor is not None]
+    if slow := ", ".join(f"{factor:.3g} ({policy})" for factor, policy in factors if factor < IN_TIME):
         late = f"The world was slower than the clock, real-time factor {slow}: in its own time tokens came faster."
         notes.append(Note(late, "world slower than the clock"))
     return notes

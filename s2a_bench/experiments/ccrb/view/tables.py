@@ -2,80 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from s2a_bench.experiments import Shown, requests
 from s2a_bench.experiments.ccrb.rows import METRICS, RolloutRow
 from s2a_bench.experiments.ccrb.view.figures import ccrb_figures
-from s2a_bench.experiments.ccrb.view.outcomes import (
-    Share,
-    cells_of,
-    configuration,
-    has,
-    origin_notes,
-    rate_span,
-    request_of,
-    rollouts_of,
-    scenes_of,
-    share_of,
-    tokens_line,
-)
-from s2a_bench.experiments.cells import TIME, Metric
+from s2a_bench.experiments.ccrb.view.outcomes import Rollouts, Share, origin_notes, rate_span, share_of, tokens_line
+from s2a_bench.experiments.cells import json_of
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.scenario.ccrb.labels import NO_SCORE, ORDERING, law, operating_point, outcome_label
-from s2a_bench.store.schema import Positive
+from s2a_bench.scenario.ccrb.labels import NO_SCORE, ORDERING, law, operating_point
 from s2a_bench.writers.csv_text import CsvTable
-from s2a_bench.writers.json import cell_of_row, frame
+from s2a_bench.writers.json import frame
 from s2a_bench.writers.tables import ABSENT, PAPERS, Note, TextTable, entries, number
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping, Sequence
+
+    import pandas as pd
 
     from s2a_bench.store.run import StoredRun
-
-
-def show(run: StoredRun, **_: Any) -> Shown:
-    return Shown.build(
-        sentences=lambda: _ccrb_sentences(run),
-        tables={
-            "random": lambda: _random_table(run) if has(run, "random") else None,
-            "phase": lambda: _phase_table(run) if has(run, "phase") else None,
-            "margins": lambda: _margin_table(run),
-            "stages": lambda: _stage_table(run) if "live" in run.manifest and has(run, "rollout") else None,
-            "outcomes": lambda: _outcome_table(run),
-        },
-        main=["outcomes", "stages", "phase", "random"],
-        csvs=lambda: _ccrb_csv(run),
-        figures=lambda: ccrb_figures(run),
-        json=lambda: ccrb_json(run),
-    )
-
-
-def _ccrb_sentences(run: StoredRun) -> list[str]:
-    sentences = [
-        f"{cell['policy']}: {outcome_label(cell['outcome'], cell['follower_survives'])}, "
-        f"{cell['stalls']} stalls of {cell['stall_s']:.2f} s."
-        for cell in cells_of(run)
-    ]
-    if has(run, "phase"):
-        sentences += [f"Phase diagram, gap behaviour {finding(run, gap)}" for gap in GAPS]
-    if studies := run.manifest.get("studies"):
-        speed = studies["rollouts_per_cpu_s"]
-        sentences.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time.")
-    return sentences
-
-
-def finding(run: StoredRun, gap: str) -> str:
-    share = share_of(scenes_of(run, "phase", gap), "paper")
-    sentence = f"{gap}: the paper's ordering holds at {share.value:.1%} of the diagram"
-    span, at_point = rate_span(run, gap), rate_span(run, gap, at_point=True)
-    if span is None:
-        return f"{gap}: the paper's ordering holds nowhere in the diagram."
-    at = f"at a rear gap of {configuration(run)['rear_gap_m']:g} m"
-    where = f"{at} for {at_point[0]:.1f} to {at_point[1]:.1f}" if at_point else f"{at} nowhere"
-    return f"{sentence}, for R = {span[0]:.1f} to {span[1]:.1f} tokens/s; {where}."
-
 
 TIMES: Final = ("start_s", "stalls", "stall_s")
 IMPACTS: Final = ("impact_speed_mps", "min_front_gap_m", "min_rear_gap_m")
@@ -99,64 +45,96 @@ _ORDERING_NOTES: Final = (
     "Where the follower hits even an ego with immediate tokens, a rear impact says nothing about the policy.",
 )
 
-_TIMES: Final = [metric for metric in METRICS.values() if metric.kind == TIME]
-CcrbCell = cell_of_row(
-    "CcrbCell",
-    "A policy at the operating point.",
-    RolloutRow,
-    without=("draw", "board", "title", "tokens_per_s", *(metric.column for metric in _TIMES)),
-    own={
-        "profile": str | None,
-        "rate_tokens_per_s": Positive,
-        **{metric.name: float for metric in _TIMES},
-    },
-)
+
+def show(run: StoredRun, **_: Any) -> Shown:
+    rollouts = Rollouts.of(run)
+    return Shown.build(
+        sentences=partial(_sentences, rollouts),
+        tables={
+            "random": partial(_random_table, rollouts),
+            "phase": partial(_phase_table, rollouts),
+            "margins": lambda: _margin_table(rollouts.point),
+            "stages": partial(_stage_table, rollouts),
+            "outcomes": partial(_outcome_table, rollouts),
+        },
+        main=["outcomes", "stages", "phase", "random"],
+        csvs=lambda: {"orderings.csv": _ordering_csv(rollouts.studies)},
+        figures=partial(ccrb_figures, rollouts),
+        json=partial(_json, rollouts),
+    )
 
 
-def _outcome_table(run: StoredRun) -> TextTable:
-    names = (*TIMES, *IMPACTS, *(LOOP if has(run, "rollout") else ()))
-    rows, shown = [], [METRICS[name] for name in names]
-    for cell in cells_of(run, ("point", "rollout")):
-        outcome = outcome_label(cell["outcome"], cell["follower_survives"]) + (" (late)" if cell.get("late") else "")
-        name = cell["policy"] if cell["study"] == "point" else "  roll-out"
-        rows.append((name, outcome, *(_entry(cell, metric) for metric in shown)))
-    settings = configuration(run)
+def _sentences(rollouts: Rollouts) -> list[str]:
+    sentences = [
+        f"{row.policy}: {row.label}, {row.stalls} stalls of {row.stall_ns / 1e9:.2f} s." for row in rollouts.point
+    ]
+    for gap, scenes in rollouts.studies.get("phase", {}).items():
+        sentences.append(f"Phase diagram, gap behaviour {finding(gap, scenes, rollouts.settings['rear_gap_m'])}")
+    if studies := rollouts.run.manifest.get("studies"):
+        speed = studies["rollouts_per_cpu_s"]
+        sentences.append(f"{studies['rollouts']} roll-outs, {speed:.0f} a second of processor time.")
+    return sentences
+
+
+def finding(gap: str, scenes: pd.DataFrame, rear_gap_m: float) -> str:
+    """Return where the paper's ordering holds in the phase diagram of a gap behaviour, and at a rear gap."""
+    span, at_point = rate_span(scenes), rate_span(scenes, rear_gap_m)
+    if span is None:
+        return f"{gap}: the paper's ordering holds nowhere in the diagram."
+    sentence = f"{gap}: the paper's ordering holds at {share_of(scenes, 'paper').value:.1%} of the diagram"
+    where = f"for {at_point[0]:.1f} to {at_point[1]:.1f}" if at_point else "nowhere"
+    return f"{sentence}, for R = {span[0]:.1f} to {span[1]:.1f} tokens/s; at a rear gap of {rear_gap_m:g} m {where}."
+
+
+def _outcome_table(rollouts: Rollouts) -> TextTable:
+    """Return a line a policy, each closed loop with its roll-out below it."""
+    rows, names = list[tuple[str, ...]](), [*TIMES, *IMPACTS]
+    if rollouts.beside:
+        names += LOOP
+    for row in rollouts.point:
+        rows.append((row.policy, row.label, *_entries(row, names)))
+        if beside := rollouts.beside.get(row.cell):
+            rows.append(("  roll-out", beside.label, *_entries(beside, names)))
+    settings, deadline_s = rollouts.settings, rollouts.point[0].deadline_ns / 1e9
     title = f"CCRB with a car behind, {settings['simulator']} simulator: {operating_point(settings)}"
-    header = ("policy", "outcome", *map(_title, shown))
-    deadline_s = float(rollouts_of(run, "point")["deadline_ns"].iloc[0]) / 1e9
     deadline = f"S_front = {deadline_s:.2f} s: planned braking that starts by then keeps 2 m to the lead."
-    return TextTable(title, header, rows, 2, notes=(*origin_notes(run), deadline, NO_SCORE))
+    notes = (*origin_notes(rollouts), deadline, NO_SCORE)
+    return TextTable(title, ("policy", "outcome", *_titles(names)), rows, 2, notes=notes)
 
 
-def _stage_table(run: StoredRun) -> TextTable:
-    (cell,) = requests.cells_of(run)
-    groups, whole = requests.groups_present([cell]), ("residual", "ttft", "e2e")
-    rows = []
-    for policy in cells_of(run):
-        mine = replace(cell, good=cell.good[cell.good["request_id"] == request_of(run, policy["cell"])])
-        values = (*map(mine.group_ms, groups), *map(mine.values_ms, whole))
-        rows.append((policy["policy"], *(entries(each, "median")[0] for each in values)))
-    title, header = "Each policy's request in ms, to its first token", ("policy", *groups, "residual", "TTFT", "e2e")
-    return TextTable(title, header, rows, 1, notes=(tokens_line(run), "TTFT: from the prompt; e2e: with the capture."))
+def _stage_table(rollouts: Rollouts) -> TextTable | None:
+    """Return the stages of each closed loop's request to a model; None without such requests."""
+    if not (rollouts.live and rollouts.beside):
+        return None
+    cells = requests.cells_of(rollouts.run)
+    (cell,) = cells
+    metrics, rows = (*(f"{requests.GROUP}{group}" for group in cells.groups), "residual", "ttft", "e2e"), []
+    for policy in rollouts.point:
+        mine = cell.of_requests(cell.counted[cell.ids == rollouts.request_of(policy.cell)])
+        rows.append((policy.policy, *(entries(mine.values(metric), "median")[0] for metric in metrics)))
+    title = "Each policy's request in ms, to its first token"
+    header = ("policy", *cells.groups, "residual", "TTFT", "e2e")
+    notes = (tokens_line(rollouts.run), "TTFT: from the prompt; e2e: with the capture.")
+    return TextTable(title, header, rows, 1, notes=notes)
 
 
-def _margin_table(run: StoredRun) -> TextTable:
-    rows = [(cell["policy"], *(_entry(cell, METRICS[name]) for name in (*MARGINS, *MOTION))) for cell in cells_of(run)]
+def _margin_table(point: list[RolloutRow]) -> TextTable:
+    names = [*MARGINS, *MOTION]
+    rows = [(row.policy, *_entries(row, names)) for row in point]
     notes = (
         "TTC: least time to collision. DRAC: greatest deceleration required towards the lead, closing^2 / (2 gap).",
         "Motion: the ego's simulated speed until it rests (with the jolt then) or hits the lead: a crash looks smooth.",
     )
-    return TextTable(
-        "Margins and motion", ("policy", *(_title(METRICS[name]) for name in (*MARGINS, *MOTION))), rows, 1, notes=notes
-    )
+    return TextTable("Margins and motion", ("policy", *_titles(names)), rows, 1, notes=notes)
 
 
-def _phase_table(run: StoredRun) -> TextTable:
-    rows = _share_rows(run, "phase", lambda share: f"{share.value:.1%}")
-    settings = configuration(run)
-    rows.append(("R of the paper's ordering", *(_span(rate_span(run, gap)) for gap in GAPS)))
-    at_point = (_span(rate_span(run, gap, at_point=True)) for gap in GAPS)
-    rows.append((f"  at a rear gap of {settings['rear_gap_m']:g} m", *at_point))
+def _phase_table(rollouts: Rollouts) -> TextTable | None:
+    if (diagram := rollouts.studies.get("phase")) is None:
+        return None
+    settings, rows = rollouts.settings, _share_rows(diagram, lambda share: f"{share.value:.1%}")
+    rear_gap_m = settings["rear_gap_m"]
+    rows.append(("R of the paper's ordering", *(_span(scenes) for scenes in diagram.values())))
+    rows.append((f"  at a rear gap of {rear_gap_m:g} m", *(_span(scenes, rear_gap_m) for scenes in diagram.values())))
     (low, high), (near, far) = settings["phase_rates"], settings["phase_gaps_m"]
     spans = f"R {low:g} to {high:g} tokens/s, rear gap {near:g} to {far:g} m"
     title = f"Phase diagram: {spans}, {settings['follower']} follower"
@@ -164,71 +142,77 @@ def _phase_table(run: StoredRun) -> TextTable:
     return TextTable(title, ("share of the diagram", *GAPS), rows, 1, rules, _ORDERING_NOTES)
 
 
-def _random_table(run: StoredRun) -> TextTable:
-    settings = configuration(run)
+def _random_table(rollouts: Rollouts) -> TextTable | None:
+    if (drawn := rollouts.studies.get("random")) is None:
+        return None
+    settings = rollouts.settings
     title = f"{settings['random']} random scenarios: % [95 % Clopper-Pearson], {settings['follower']} follower"
-    return TextTable(title, ("ordering", *GAPS), _share_rows(run, "random", _with_interval), 1, notes=_ORDERING_NOTES)
+    return TextTable(title, ("ordering", *GAPS), _share_rows(drawn, _with_interval), 1, notes=_ORDERING_NOTES)
 
 
-def _share_rows(run: StoredRun, study: str, written: Callable[[Share], str]) -> list[tuple[str, ...]]:
-    scenes = {gap: scenes_of(run, study, gap) for gap in GAPS}
-    checked = all(found["survives"].notna().all() for found in scenes.values())
-    counted = {**ORDERINGS, **({"survives": "follower survives fast tokens"} if checked else {})}
-    return [(text, *(written(share_of(scenes[gap], name)) for gap in GAPS)) for name, text in counted.items()]
+def _share_rows(study: Mapping[str, pd.DataFrame], written: Callable[[Share], str]) -> list[tuple[str, ...]]:
+    counted = dict(ORDERINGS)
+    if all(scenes["survives"].notna().all() for scenes in study.values()):
+        counted["survives"] = "follower survives fast tokens"
+    return [(text, *(written(share_of(scenes, name)) for scenes in study.values())) for name, text in counted.items()]
 
 
-def _ccrb_csv(run: StoredRun) -> dict[str, CsvTable]:
+def _ordering_csv(studies: Mapping[str, Mapping[str, pd.DataFrame]]) -> CsvTable:
     rows: list[tuple[Any, ...]] = []
-    for study in ("phase", "random"):
-        if has(run, study):
-            for gap in GAPS:
-                scenes = scenes_of(run, study, gap)
-                for name in ORDERINGS:
-                    share = share_of(scenes, name)
-                    interval = share.interval if study == "random" else (None, None)
-                    rows.append((study, gap, name, share.k, share.n, share.value, *interval))
-    return {
-        "orderings.csv": CsvTable.of(("study", "gap_behaviour", "ordering", "k", "n", "share", "low", "high"), rows)
-    }
+    for study, by_gap in studies.items():
+        for gap, scenes in by_gap.items():
+            for name in ORDERINGS:
+                share = share_of(scenes, name)
+                low, high = share.interval if study == "random" else (None, None)
+                rows.append((study, gap, name, share.k, share.n, share.value, low, high))
+    return CsvTable.of(("study", "gap_behaviour", "ordering", "k", "n", "share", "low", "high"), rows)
 
 
-def ccrb_json(run: StoredRun) -> dict[str, Any]:
+def _json(rollouts: Rollouts) -> dict[str, Any]:
     """Return the ``--json`` object (docs/schema/s2a-bench-1.json): SI units, a cell a policy, studies as shares."""
-    studies = [_study(run, study, gap) for study in ("phase", "random") if has(run, study) for gap in GAPS]
-    live = {"live": run.manifest["live"]} if "live" in run.manifest else {}
-    beside = {"rollouts": cells_of(run, ("rollout",))} if has(run, "rollout") else {}
-    return frame(run, cells_of(run), [], **live, **beside, follower_law=law(configuration(run)), studies=studies)
+    more: dict[str, Any] = {"live": rollouts.live} if rollouts.live else {}
+    if rollouts.beside:
+        more["rollouts"] = [json_of(row) for row in rollouts.beside.values()]
+    studies = [
+        _study_json(study, gap, scenes) for study, by_gap in rollouts.studies.items() for gap, scenes in by_gap.items()
+    ]
+    cells = [json_of(row) for row in rollouts.point]
+    return frame(rollouts.run, cells, [], **more, follower_law=law(rollouts.settings), studies=studies)
 
 
-def _study(run: StoredRun, study: str, gap: str) -> dict[str, Any]:
-    scenes = scenes_of(run, study, gap)
-    found = {name: share_of(scenes, name) for name in ORDERINGS}
-    shares = {
-        name: {"k": share.k, "value": share.value, **({"ci95": list(share.interval)} if study == "random" else {})}
-        for name, share in found.items()
-    }
-    check = {}
+def _study_json(study: str, gap: str, scenes: pd.DataFrame) -> dict[str, Any]:
+    shares = {name: _share_json(share_of(scenes, name), interval=study == "random") for name in ORDERINGS}
+    entry = {"study": study, "gap_behaviour": gap, "scenarios": len(scenes), "orderings": shares}
     if scenes["survives"].notna().all():
-        survives = share_of(scenes, "survives")
-        check = {"follower_survives": {"k": survives.k, "value": survives.value}}
-    span = rate_span(run, gap) if study == "phase" else None
-    rates = {} if span is None else {"paper_rates_tokens_per_s": list(span)}
-    return {"study": study, "gap_behaviour": gap, "scenarios": len(scenes), "orderings": shares, **check, **rates}
+        entry["follower_survives"] = _share_json(share_of(scenes, "survives"))
+    if study == "phase" and (span := rate_span(scenes)):
+        entry["paper_rates_tokens_per_s"] = list(span)
+    return entry
 
 
-def _title(metric: Metric) -> str:
-    return f"{metric.title} {metric.unit}".strip()
+def _share_json(share: Share, *, interval: bool = False) -> dict[str, Any]:
+    entry: dict[str, Any] = {"k": share.k, "value": share.value}
+    return {**entry, "ci95": list(share.interval)} if interval else entry
 
 
-def _entry(cell: dict[str, Any], metric: Metric) -> str:
-    value = cell.get(metric.name)
+def _titles(metrics: Sequence[str]) -> list[str]:
+    return [f"{METRICS[name].title} {METRICS[name].unit}".strip() for name in metrics]
+
+
+def _entries(row: RolloutRow, metrics: Sequence[str]) -> list[str]:
+    values = [METRICS[name].read(row) for name in metrics]
+    return [_entry(value) for value in values]
+
+
+def _entry(value: float | None) -> str:
     if value is None:
         return ABSENT
     return str(value) if isinstance(value, int) else number(value)
 
 
-def _span(found: tuple[float, float] | None) -> str:
-    return f"{found[0]:.1f}\N{EN DASH}{found[1]:.1f}" if found else ABSENT
+def _span(scenes: pd.DataFrame, rear_gap_m: float | None = None) -> str:
+    span = rate_span(scenes, rear_gap_m)
+    return f"{span[0]:.1f}\N{EN DASH}{span[1]:.1f}" if span else ABSENT
 
 
 def _with_interval(share: Share) -> str:

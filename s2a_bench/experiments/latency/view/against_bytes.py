@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from s2a_bench.experiments import Tables
-from s2a_bench.experiments.requests import RequestCell, Split, payloads_of, stand_ins
+from s2a_bench.experiments.requests import GROUP, RequestCell, RequestCells, stand_ins
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.batches import Blocks
 from s2a_bench.stats.change import FEWEST_LAUNCHES, ratio_of_launches
@@ -75,20 +75,19 @@ class FittedPipeline:
     """Whether a black box prepares the pictures before inference: then the metric means something else."""
 
 
-def against_bytes(runs: Split) -> list[FittedPipeline]:
+def against_bytes(runs: Sequence[RequestCells]) -> list[FittedPipeline]:
     """Return the pipelines of latency runs with pictures of different sizes; empty for other runs."""
-    found: dict[tuple[str, str], list[tuple[int, int, RequestCell]]] = {}
-    for place, (run, cells) in enumerate(runs):
-        if run.manifest["command"] != "latency" or run.samples.empty or not (pixels := _pixels(run)):
+    sized: dict[tuple[str, str], list[tuple[int, int, RequestCell]]] = {}
+    for place, cells in enumerate(runs):
+        if cells.run.manifest["command"] != "latency" or not (pixels := _pixels(cells.run)):
             continue
-        payloads = payloads_of(cells)
+        link = cells.run.manifest["configuration"].get("link")
         for cell in cells:
-            if cell.values_ms(METRIC).size:
-                for payload in [cell.payload] if cell.payload else payloads or [""]:  # in process: beside each payload
-                    link = run.manifest["configuration"].get("link")
-                    name = f"{cell.label} over {link}" if link else cell.label
-                    found.setdefault((name, payload), []).append((place, pixels, cell))
-    lines = [_pipeline(name, payload, sized) for (name, payload), sized in found.items()]
+            if cell.values(METRIC).size:
+                name = f"{cell.label} over {link}" if link else cell.label
+                for payload in [cell.payload] if cell.payload else cells.payloads or [""]:  # in process: beside each
+                    sized.setdefault((name, payload), []).append((place, pixels, cell))
+    lines = [_pipeline(name, payload, of_size) for (name, payload), of_size in sized.items()]
     order = sorted(
         lines, key=lambda each: (payload_order(each.payload), declared_transport(each.path[0]).order, each.name)
     )
@@ -97,27 +96,31 @@ def against_bytes(runs: Split) -> list[FittedPipeline]:
 
 def _pipeline(name: str, payload: str, cells: Sequence[tuple[int, int, RequestCell]]) -> FittedPipeline:
     sizes: dict[float, Launches] = {}
-    medians = []
+    medians, bounds, shares, coding = [], [], [], []
     for run, pixels, cell in cells:
+        size = pixels / MB
         for launch, blocks in cell.by_launch(METRIC).items():
-            sizes.setdefault(pixels / MB, {})[run, launch] = blocks
-            medians.append((pixels / MB, float(np.median(blocks.values))))
-    bounds = sorted(
-        (pixels / MB, float(np.median(of))) for _, pixels, cell in cells if (of := cell.values_ms("bound")).size
-    )
-    shares = [
-        float(sent.median()) / pixels for _, pixels, cell in cells if (sent := cell.good["payload_bytes"].dropna()).size
-    ]
-    wire_share = float(np.median(shares)) if shares else None
+            sizes.setdefault(size, {})[run, launch] = blocks
+            medians.append((size, float(np.median(blocks.values))))
+        if (bound := cell.values("bound")).size:
+            bounds.append((size, float(np.median(bound))))
+        if (sent := cell.values("payload_bytes")).size:
+            shares.append(float(np.median(sent)) / pixels)
+        if ms := sum(float(np.median(of)) for group in CODING if (of := cell.values(f"{GROUP}{group}")).size):
+            coding.append((size, ms))
     first = cells[0][2]
-    coding = [
-        (pixels / MB, ms)
-        for _, pixels, cell in cells
-        if (ms := sum(float(np.median(of)) for group in CODING if (of := cell.group_ms(group)).size))
-    ]
-    line = fit_line(medians)
-    path, ingest = first.path, first.has_ingest
-    return FittedPipeline(name, payload, path, sizes, medians, bounds, line, fit_line(coding), wire_share, ingest)
+    return FittedPipeline(
+        name,
+        payload,
+        first.path,
+        sizes,
+        medians,
+        sorted(bounds),
+        fit_line(medians),
+        fit_line(coding),
+        float(np.median(shares)) if shares else None,
+        first.has_ingest,
+    )
 
 
 def _pixels(run: StoredRun) -> int:
@@ -133,7 +136,7 @@ def order_changes(pipelines: Sequence[FittedPipeline]) -> list[tuple[FittedPipel
     At these measured sizes the 95 % interval of the ratio leaves out 1, over at least `FEWEST_LAUNCHES` launches that
     measured both; at none between.
     """
-    found = []
+    changes = []
     for one, other in permutations(pipelines, 2):
         differ: list[tuple[bool, At]] = []
         for size in sorted(one.sizes.keys() & other.sizes.keys()):
@@ -143,8 +146,8 @@ def order_changes(pipelines: Sequence[FittedPipeline]) -> list[tuple[FittedPipel
             ratio = ratio_of_launches(*pair, seed=0)
             if ratio and ratio.ci95 and not ratio.ci95[0] <= 1 <= ratio.ci95[1]:
                 differ.append((ratio.ci95[0] > 1, (size, ratio)))
-        found += [(one, other, first[1], then[1]) for first, then in pairwise(differ) if first[0] < then[0]]
-    return sorted(found, key=lambda change: (change[2][0], change[3][0]))
+        changes += [(one, other, first[1], then[1]) for first, then in pairwise(differ) if first[0] < then[0]]
+    return sorted(changes, key=lambda change: (change[2][0], change[3][0]))
 
 
 def line_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> TextTable:
@@ -182,9 +185,9 @@ def _order_table(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -
     return TextTable("Where one becomes faster than another", header, rows, 2, notes=(ORDER, *answered))
 
 
-def _estimate(found: Estimate) -> str:
-    bounds = "" if found.ci95 is None else " [{}, {}]".format(*map(number, found.ci95))
-    return number(found.value) + bounds
+def _estimate(estimate: Estimate) -> str:
+    bounds = "" if estimate.ci95 is None else " [{}, {}]".format(*map(number, estimate.ci95))
+    return number(estimate.value) + bounds
 
 
 def _build_lines(pipelines: Sequence[FittedPipeline], answered: Sequence[str]) -> Figure:
@@ -227,7 +230,7 @@ def _draw(axes: Axes, pipelines: Sequence[FittedPipeline], styles: Mapping[str, 
     axes.grid(visible=True, linewidth=0.3, color="#DDDDDD")
 
 
-def shown(runs: Split) -> tuple[Tables, dict[str, Callable[[], Figure]]]:
+def shown(runs: Sequence[RequestCells]) -> tuple[Tables, dict[str, Callable[[], Figure]]]:
     """Return what builds the tables and the figure of runs with pictures of different sizes, by their files' names."""
     pipelines = against_bytes(runs)
     if not pipelines:

@@ -131,9 +131,8 @@ def origin_notes(manifest: Mapping[str, Any], cells: Iterable[Cells[TimelineRow]
 
 
 def _live_note(live: Mapping[str, Any], unseen: str) -> Note:
-    paced = (
-        f", paced to {live['paced_tokens_per_s']:g} tokens/s (the rate is set)" if "paced_tokens_per_s" in live else ""
-    )
+    pace = live.get("paced_tokens_per_s")
+    paced = f", paced to {pace:g} tokens/s (the rate is set)" if pace else ""
     dummy = " Dummy weights: what the plan says means nothing." if live.get("dummy") else ""
     grammar = "held to its form by a grammar" if live["grammar"] else "without a grammar"
     robot = "skills only take their time" if live["robot"] == "timed" else f"skills are carried out by {live['robot']}"

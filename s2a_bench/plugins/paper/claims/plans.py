@@ -12,18 +12,9 @@ import numpy as np
 
 from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.boundary.view import grid_of, is_random
-from s2a_bench.experiments.ccrb.rows import ROLLOUTS
-from s2a_bench.experiments.ccrb.view.outcomes import (
-    Share,
-    configuration,
-    has,
-    rollouts_of,
-    scenes_of,
-    share_of,
-    tokens_line,
-)
+from s2a_bench.experiments.ccrb.view.outcomes import Rollouts, Share, share_of, tokens_line
+from s2a_bench.experiments.cells import Cells
 from s2a_bench.experiments.timeline.view.cells import Timelines, timelines_of
-from s2a_bench.plan.skillset import GAPS
 from s2a_bench.plugins.paper import ORIN, Published
 from s2a_bench.plugins.paper.claims import Check, Need, RunPart, Trial
 from s2a_bench.plugins.paper.claims.requests import (
@@ -255,10 +246,10 @@ PLANE: Final = {"n_skills": 8, "t_nom_s": 1.0, "t_min": 0.8, "most_tokens": 8, "
 
 
 def plane(run: StoredRun) -> Iterator[RunPart]:
-    if not run.table(BOUNDARY).empty:
+    if cells := Cells.of(run, BOUNDARY):
         settings = _unlike(run.manifest.get("configuration", {}), PLANE)
-        facts = {"tokens": "with jitter" if is_random(run) else "evenly", "settings": settings}
-        yield RunPart(run, facts, [run.origins.run])  # the grid, not the boards
+        facts = {"tokens": "with jitter" if is_random(cells) else "evenly", "settings": settings}
+        yield RunPart(run, facts, [run.origins.run], cells=cells)  # the grid, not the boards
 
 
 EVENLY: Final = Need("tokens", "evenly: with jitter no line separates the regions", lambda fact: fact == "evenly")
@@ -267,8 +258,8 @@ OF_THE_PLANE: Final = _chosen(PLANE)
 
 def stalls_at(side: str, part: RunPart) -> tuple[list[Ratio], str]:
     """Measure the share of the points above or below R = L / T_min at which naive, which runs for T_nom, stalls."""
-    least_s = float(grid_of(part.run, "t_min")["duration_s"].iloc[0])
-    points = grid_of(part.run, "t_nom")
+    least_s = float(grid_of(part.cells, "t_min")["duration_s"].iloc[0])
+    points = grid_of(part.cells, "t_nom")
     points = points[(points["tokens_per_s"] >= points["tokens_per_skill"] / least_s) == (side == "above")]
     stalls = int((points["p_stall"] > 0).sum())
     shares = [] if points.empty else [exact(stalls / len(points))]
@@ -292,13 +283,13 @@ _VARIED: Final = ("rear_gap_m", "gap")
 
 def drives(run: StoredRun) -> Iterator[RunPart]:
     """Yield a CCRB run, with the settings that differ from the chosen point or diagram."""
-    settings, scenario, rows = run.manifest.get("configuration", {}), CcrbOptions(), run.table(ROLLOUTS)
+    settings, scenario, rollouts = run.manifest.get("configuration", {}), CcrbOptions(), Rollouts.of(run)
     wanted = {**scenario.to_manifest(), "t_nom_s": scenario.durations.nominal_s, **CHOSEN}
-    facts = {name: ", ".join(dict.fromkeys(rows[name])) for name in ("study", "policy")}
+    facts = {name: ", ".join(rollouts.cells.frame[name].unique()) for name in ("study", "policy")}
     for name, free in (("point", _SPANS), ("diagram", _VARIED)):
         facts[name] = _unlike(settings, {key: value for key, value in wanted.items() if key not in free})
     origins = run.origins.every
-    yield RunPart(run, facts_of(run, origins) | facts, origins, int("live" in run.manifest))
+    yield RunPart(run, facts_of(run, origins) | facts, origins, int("live" in run.manifest), rollouts)
 
 
 POINT, DIAGRAM = (Need(name, AS_CHOSEN, AS_CHOSEN.__eq__, chosen=True) for name in ("point", "diagram"))
@@ -307,31 +298,30 @@ BOARD: Final = one_of("source", emulated("jetson-agx-orin", ORIN.mean))
 
 def outcome(policy: str, part: RunPart) -> tuple[list[Ratio], str]:
     """Measure whether the paper's outcome of a policy occurs: at the chosen point, else at most in the diagram."""
-    rows, settings = rollouts_of(part.run, "point"), configuration(part.run)
-    row = rows[rows["policy"] == policy].iloc[0]
-    speed = "" if row["outcome"] == "none" else f" at {row['impact_speed_mps']:.1f} m/s"
-    occurs, most = float(row["outcome"] == PAPER[policy]), 1.0
+    rollouts: Rollouts = part.cells
+    settings, row = rollouts.settings, next(row for row in rollouts.point if row.policy == policy)
+    speed = "" if row.impact_speed_mps is None else f" at {row.impact_speed_mps:.1f} m/s"
+    met, most = float(row.outcome == PAPER[policy]), 1.0
     share = "its share of the diagram: run with --phase"
-    if has(part.run, "phase"):
-        driven = rollouts_of(part.run, "phase")
-        held = float((driven.loc[driven["policy"] == policy, "outcome"] == PAPER[policy]).mean())
+    if diagram := rollouts.studies.get("phase"):
+        driven = rollouts.cells.where(study="phase", policy=policy).frame["outcome"]
+        held = float((driven == PAPER[policy]).mean())
         most = held if part.facts["diagram"] == AS_CHOSEN else 1.0
-        paper = share_of(scenes_of(part.run, "phase", settings["gap"]), "paper").value
+        paper = share_of(diagram[settings["gap"]], "paper").value
         share = (
             f"this outcome holds at {held:.1%} of the diagram with all gap behaviours, "
             f"the paper's outcomes of all three policies at {paper:.1%} with {settings['gap']}"
         )
     gaps = f"front gap {settings['front_gap_m']:g} m, rear gap {settings['rear_gap_m']:g} m"
-    point = f"R = {row['tokens_per_s']:g}, {gaps}, gap behaviour {settings['gap']}; {law(settings)}"
-    text = f"{OUTCOME_LABELS[str(row['outcome'])]}{speed}; {share}. {tokens_line(part.run)} {point}"
-    return [Ratio(occurs, occurs, max(occurs, most))], text
+    point = f"R = {row.tokens_per_s:g}, {gaps}, gap behaviour {settings['gap']}; {law(settings)}"
+    text = f"{OUTCOME_LABELS[row.outcome]}{speed}; {share}. {tokens_line(part.run)} {point}"
+    return [Ratio(met, met, max(met, most))], text
 
 
 def worse(policy: str, part: RunPart) -> tuple[list[Ratio], str]:
     """Measure the share of the phase diagram at which a policy is worse than stream-to-act, minus that of better."""
     excess, texts = [], []
-    for gap in GAPS:
-        scenes = scenes_of(part.run, "phase", gap)
+    for gap, scenes in part.cells.studies["phase"].items():
         bad, good = (share_of(scenes, f"{policy.partition('-')[0]}_{side}").value for side in ("worse", "better"))
         excess.append(exact(bad - good) if bad != good else Ratio(0.0, -1.0, 1.0))  # undecided
         texts.append(f"{gap} {bad:.0%} worse and {good:.0%} better")

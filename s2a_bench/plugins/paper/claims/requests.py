@@ -122,14 +122,14 @@ def pairs(run: StoredRun) -> Iterator[RunPart]:
             "launches": sum(map(bool, _blocks(pair)[0].values())),
             "stages": "".join(f"hidden by {cell.name}" for cell in pair if cell.has_ingest) or "seen",
         }
-        summaries = [(cell.name, summary_of(cell.values_ms(_metric(pair)))) for cell in pair]
+        summaries = [(cell.name, summary_of(cell.values(_metric(pair)))) for cell in pair]
         times = ", ".join(f"{name} {mean_sd(each)} ms" for name, each in summaries if each)
         yield _pair(run, pair, facts, f"{times} (mean ± sd, n = {pair[0].n}).")
 
 
 def bodies(run: StoredRun) -> Iterator[RunPart]:
     """Yield pairs of HTTP with Base64 and without, of the same payload and size."""
-    cells = [cell for cell in cells_of(run) if cell.good["payload_bytes"].notna().any()]
+    cells = [cell for cell in cells_of(run) if cell.values("payload_bytes").size]
     coded, plain = ([cell for cell in cells if "/".join(cell.path) == path] for path in (_HTTP, _BINARY))
     for pair in product(coded, plain):
         if all(pair[0].about[name] == pair[1].about[name] for name in ("payload", "size")):
@@ -144,7 +144,7 @@ def _pair(run: StoredRun, pair: tuple[RequestCell, RequestCell], facts: dict[str
 
 
 def _launches(*cells: RequestCell) -> int:
-    return min(int(cell.good["launch"].nunique()) for cell in cells)
+    return min(len(np.unique(cell.column("launch"))) for cell in cells)
 
 
 def _unlike(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> list[str]:
@@ -222,7 +222,7 @@ def shares(
     Without groups the whole is the time without inference.
     """
     cell: RequestCell = part.cells[side]
-    whole, seed = cell.values_ms(_METRIC), part.run.bootstrap_seed
+    whole, seed = cell.values(_METRIC), part.run.bootstrap_seed
     spent = {stage: _spent(cell, [stage]).sum() for stage, of in cell.stages.items() if of != "inference"}
     ratios = []
     for stages, within in groups.values():
@@ -235,14 +235,14 @@ def shares(
 
 def _spent(cell: RequestCell, stages: Sequence[str]) -> Floats:
     """Return the sum of stages in ms, for each sample that has the metric."""
-    good = cell.good[cell.good[f"{_METRIC}_ns"].notna()]
-    names = [f"{stage}_ns" for stage in stages if f"{stage}_ns" in good]
-    spent: Floats = good[names].fillna(0).sum(axis=1).to_numpy(dtype="float64") / 1e6
-    return spent
+    spent_ns = np.zeros(cell.n)
+    for stage in stages:
+        spent_ns += np.nan_to_num(cell.column(f"{stage}_ns"))
+    return spent_ns[~np.isnan(cell.column(_METRIC))] / 1e6
 
 
 def _bytes(cell: RequestCell) -> float:
-    return float(cell.good["payload_bytes"].dropna().mean())
+    return float(cell.values("payload_bytes").mean())
 
 
 def _metric(pair: Sequence[RequestCell]) -> str:
@@ -251,6 +251,7 @@ def _metric(pair: Sequence[RequestCell]) -> str:
 
 
 def _blocks(pair: Sequence[RequestCell]) -> tuple[Mapping[int, Blocks], Mapping[int, Blocks]]:
+    """Return the values of both sides by launch, of the blocks that both have."""
     http, ros = (cell.by_launch(_metric(pair)) for cell in pair)
     both = [launch for launch in http if launch in ros]
     return (

@@ -16,7 +16,6 @@ from pydantic import AfterValidator
 from s2a_bench.cli.adapter import command
 from s2a_bench.cli.output import Json, print_json, print_line, print_table
 from s2a_bench.experiments import EXPERIMENTS
-from s2a_bench.experiments.requests import cells_of
 from s2a_bench.inference import STAND_IN
 from s2a_bench.options import Options, Size, option
 from s2a_bench.plugins.two_hosts.profiles import published
@@ -100,6 +99,7 @@ def _advise(config: AdviseConfig, *, json_: Json = False) -> None:
 def _measured_ms(config: AdviseConfig, found: Sequence[Advice], progress: Progress) -> list[float]:
     """Return the medians of pipelines' e2e without inference on the emulated link, in ms, of one run at the rate."""
     from s2a_bench.experiments.latency.view.against_bytes import METRIC
+    from s2a_bench.experiments.requests import cells_of
 
     latency = EXPERIMENTS["latency"]
     requests = resolve_name(latency.config)(
@@ -113,7 +113,7 @@ def _measured_ms(config: AdviseConfig, found: Sequence[Advice], progress: Progre
         think_s=min(LONGEST_PAUSE_S, max(0.0, config.period_ms - max(each.e2e_ms for each in found)) / 1e3),
     )
     cells = {cell.name: cell for cell in cells_of(read_run(latency.run_with(requests, config.output, progress)))}
-    return [float(statistics.median(cells[each.name].values_ms(METRIC))) for each in requests.pipelines]
+    return [float(statistics.median(cells[each.name].values(METRIC))) for each in requests.pipelines]
 
 
 advise = command(_advise, AdviseConfig)

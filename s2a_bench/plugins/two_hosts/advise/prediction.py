@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.latency.view.against_bytes import FittedPipeline, against_bytes
-from s2a_bench.experiments.requests import split
+from s2a_bench.experiments.requests import cells_of
 from s2a_bench.plugins.two_hosts.advise import MB, AdviseConfig
 from s2a_bench.plugins.two_hosts.profiles import DELAY_OFF_MS, OFF, Direction, LinkProfile, bound_s, load_link
 from s2a_bench.provenance import joined
@@ -114,7 +114,7 @@ def fitted(paths: Sequence[Path]) -> tuple[list[FittedPipeline], str]:
     runs = [run for path in paths for run in _runs(path) if not run.manifest["configuration"].get("link")]
     lines = [
         each
-        for each in against_bytes(split(runs))
+        for each in against_bytes([cells_of(run) for run in runs])
         if each.wire_share and not each.has_ingest and declared_transport(each.path[0]).crosses_links
     ]
     return lines, joined(run.origins for run in runs).line
