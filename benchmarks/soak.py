@@ -33,7 +33,7 @@ import numpy as np
 
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.stats.batches import Blocks
-from s2a_bench.stats.change import ratio_of_blocks
+from s2a_bench.stats.change import ratio_of_launches
 from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.http.native import PATHS
@@ -360,7 +360,7 @@ def soak(transport: str, engine: str, minutes: float, log: Path, blocks: int = B
         result.not_met = sorted({case.name for case in load.cases} - {*load.attacks})
         result.idle_ms_before, result.idle_ms_after = median(plain_before), median(plain_after)
         later = Blocks(relative_after.values, relative_after.block + blocks)
-        if (ratio := ratio_of_blocks(later, relative_before, 1)) is not None:
+        if (ratio := ratio_of_launches({0: later}, {0: relative_before}, 1)) is not None:
             result.slower, result.slower_low, result.slower_high = ratio.value, ratio.low, ratio.high
         began = time.monotonic()
         server.process.send_signal(signal.SIGTERM)

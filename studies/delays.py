@@ -20,8 +20,8 @@ from s2a_bench.machine import environment
 from s2a_bench.options import Options, option
 from s2a_bench.plugins.chunks.modes import ControlSetting, Ints, mode
 from s2a_bench.plugins.chunks.modes.metrics import measure
-from s2a_bench.plugins.chunks.modes.trigger import Maximum, TrackedLatency, calibrate, follow, trigger
-from s2a_bench.policy.conformal import GUARANTEE, Guarantee
+from s2a_bench.plugins.chunks.modes.trigger import Maximum, calibrate, follow, trigger
+from s2a_bench.policy.conformal import GUARANTEE, Guarantee, Tracker
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.stats.batches import Rows
 from s2a_bench.stats.change import change_of_ranks
@@ -117,10 +117,10 @@ def rows(config: DelaysConfig, process: str, seed: int) -> Iterator[DelayRow]:
     maximum = Maximum(float(learnt.max()))
     hindsight = int(np.sort(judged)[-1 - int(config.epsilon * judged.size)])
     ticks = [Rows(SETTING.delay_ticks(each).astype(float)) for each in (learnt, judged)]
-    change = change_of_ranks(*ticks, seed=0)
+    change = change_of_ranks(*ticks)
     chosen: dict[str, Ints] = {
         "calibrated": np.array([trigger(known.caution, SETTING, MOST).ticks]),
-        "tracked": follow(TrackedLatency.begin(learnt.tolist(), config.epsilon), judged, SETTING, MOST),
+        "tracked": follow(Tracker(learnt.tolist(), config.epsilon), judged, SETTING, MOST),
         "maximum": follow(maximum, judged, SETTING, MOST),
         "hindsight": np.array([trigger(hindsight, SETTING, MOST).ticks]),
     }

@@ -11,7 +11,6 @@ import csv
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from itertools import chain, cycle, repeat
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -34,25 +33,17 @@ STRETCH: Final = 65_536
 """Latencies that are drawn together."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Latencies:
-    """Latencies to be drawn from ``gaps``, or ``recorded_ns``; the other is None."""
-
-    gaps: Gaps | None = None
-    recorded_ns: Ints | None = None
-
-
-def read_latency(written: str) -> Latencies | None:
-    """Read latencies as users write them, None for an unknown form; raises UsageError naming the field."""
+def read_latency(written: str) -> Gaps | Ints | None:
+    """Read latencies to be drawn, or recorded ones in ns; None for an unknown form; raises UsageError."""
     with suppress(ValueError):
         constant = float(written)
         if not 0 <= constant <= LONGEST_MS:
             raise UsageError(f"`latency`: {written} should be between 0 and {LONGEST_MS:g} ms")
-        return Latencies(Constant(constant / 1e3))
+        return Constant(constant / 1e3)
     if ":" in written and "/" not in written:
-        return Latencies(family(written))
+        return family(written)
     if written.endswith(".csv"):
-        return Latencies(recorded_ns=read_delays(Path(written)))
+        return read_delays(Path(written))
     return None
 
 
@@ -60,17 +51,15 @@ def draw_ns(gaps: Gaps, rng: np.random.Generator, count: int) -> Ints:
     return whole_ns(gaps.sample(rng, count, 1)[:, 0])
 
 
-def sequence_ns(latencies: Latencies) -> Iterator[int]:
+def sequence_ns(latencies: Gaps | Ints) -> Iterator[int]:
     """Return the endless latencies of requests 0, 1, ... in ns, the same in every call.
 
     A recording is played in its order, again and again. A family with memory keeps it for `STRETCH` latencies.
     """
-    if latencies.recorded_ns is not None:
-        return cycle(latencies.recorded_ns.tolist())
-    if latencies.gaps is None:
-        raise TypeError("no latencies")
+    if isinstance(latencies, np.ndarray):
+        return cycle(latencies.tolist())
     rng = np.random.default_rng(SEED)
-    stretches = (draw_ns(gaps, rng, STRETCH).tolist() for gaps in repeat(latencies.gaps))
+    stretches = (draw_ns(gaps, rng, STRETCH).tolist() for gaps in repeat(latencies))
     return chain(next(stretches), chain.from_iterable(stretches))  # the first is drawn now, before a request waits
 
 

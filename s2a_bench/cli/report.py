@@ -46,9 +46,9 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
     compared = comparison.open_comparison(baseline, other, unlike=config.unlike, least=config.min_effect / 100)
     wanted = comparison.metrics_of(compared, [name for text in config.metric for name in listed(text)])
     compared = comparison.compare(compared, [*wanted, *gates.concerned(compared, conditions)])
-    judgements = gates.judge(compared, conditions, strict=config.strict, one_launch=config.one_launch)
+    gated = gates.judge(compared, conditions, strict=config.strict, one_launch=config.one_launch)
     warnings = comparison.warnings_of(compared)
-    whole = shown.compare_json(compared, judgements, warnings)
+    whole = shown.compare_json(compared, gated, warnings)
     for warning in warnings:
         print_error(f"note [{warning.code}]: {warning.message}; {warning.advice}")
     written = shown.write_comparison(config.output, compared, whole) if config.output else []
@@ -59,14 +59,15 @@ def _compare(config: CompareConfig, *, json_: Json = False) -> None:
         print_table(table)
         for line in (*table.notes, *(f"written: {path}" for path in written)):
             print_line(line)
-    for one in judgements:
-        line = f"gate {one.gate.text} {one.outcome} in {one.comparison.pair.name}: {shown.change_text(one.comparison)}"
-        line += "" if one.comparison.p_holm is None else f", p = {one.comparison.p_holm:.2g}"
+    for one in gated:
+        line = f"gate {one.gate} {one.outcome} in {one.cell}: {shown.change_text(one.change, one.ci95)}"
+        line += "" if one.p_holm is None else f", p = {one.p_holm:.2g}"
         line += "" if one.detectable is None else f", sees {shown.detectable_text(one.detectable)}"
         print_error(f"{line}; {one.reason}" if one.reason else line)
-    outcomes = {one.outcome for one in judgements}  # a tripped gate comes before an undecided one
-    undecided = UNDECIDED if gates.UNDECIDED in outcomes else 0
-    raise typer.Exit(TRIPPED if gates.TRIPPED in outcomes else undecided)
+    outcomes = {one.outcome for one in gated}
+    if "tripped" in outcomes:  # comes before an undecided one
+        raise typer.Exit(TRIPPED)
+    raise typer.Exit(UNDECIDED if "undecided" in outcomes else 0)
 
 
 compare = command(_compare, CompareConfig)

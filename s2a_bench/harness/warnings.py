@@ -52,7 +52,7 @@ def change_warnings(name: str, learned: Rows, seen: Rows, unit: str, advice: str
     """
     if min(len(learned), len(seen)) < FEWEST_ROWS:
         return []
-    change = change_of_ranks(learned, seen, seed=0)
+    change = change_of_ranks(learned, seen)
     if change.p is None or change.p >= LEVEL:
         return []
     before, now = (float(np.median(rows.values)) for rows in (learned, seen))

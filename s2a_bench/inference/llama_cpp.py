@@ -102,7 +102,10 @@ def _refused(what: str, llama: _Prefilled) -> Iterator[None]:
 
 
 class LlamaCppEngine(Engine):
-    """A GGUF model on this machine. ``facts`` holds numbers of the last request, under llama-server's names."""
+    """A GGUF model on this machine. ``facts`` holds numbers of the last request, under llama-server's names.
+
+    An answer ends before the next request, and before `close`, as `OneThreadEngine` sees to.
+    """
 
     def __init__(self, config: EngineConfig) -> None:
         """Load both files; raises UsageError for layers on a GPU that this build cannot use, ModelError."""
@@ -114,7 +117,6 @@ class LlamaCppEngine(Engine):
         self._files = load_headers(config)
         self._config = config
         self._threads = config.threads or len(os.sched_getaffinity(0))
-        self._turn = 0
         llama_log.silence()
         llama_log.reason()
         self._llama: _Prefilled | None = self._load()
@@ -160,8 +162,6 @@ class LlamaCppEngine(Engine):
         llama = self._llama
         if llama is None:
             raise EngineError("llama: the engine is closed; open a new one")
-        self._turn += 1
-        turn = self._turn
         self._check(request)
         started = now_ns()
         prepared_ns, encode_ns = self._evaluate(llama, request)
@@ -185,8 +185,6 @@ class LlamaCppEngine(Engine):
         count, last_ns, pieces = 0, prompt_done, self._pieces
         try:
             for index in range(request.max_tokens):
-                if turn != self._turn:
-                    raise EngineError("llama: a later request took over the engine; one request at a time")
                 started_ns = now_ns()
                 token = next(ids)
                 if index == 1:
@@ -199,9 +197,8 @@ class LlamaCppEngine(Engine):
         except RuntimeError as error:
             raise EngineError(f"llama: generation failed: {llama_log.reason() or error}") from error
         finally:
-            if turn == self._turn:
-                self._facts[PREDICTED_N] = float(count)
-                self._facts[PREDICTED_MS] = (last_ns - prompt_done) / _MS_NS
+            self._facts[PREDICTED_N] = float(count)
+            self._facts[PREDICTED_MS] = (last_ns - prompt_done) / _MS_NS
 
     def _evaluate(self, llama: _Prefilled, request: Request) -> tuple[int, int]:
         """Evaluate pictures and prompt, on an empty KV cache, up to the first token's logits; return its times."""
@@ -263,7 +260,6 @@ class LlamaCppEngine(Engine):
         return facts
 
     def close(self) -> None:
-        self._turn += 1
         if self._llama is not None:
             self._llama.close()
             self._llama = None

@@ -6,7 +6,6 @@ import hashlib
 import json
 import os
 import re
-import tempfile
 from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
@@ -221,7 +220,5 @@ def sha256(path: Path) -> str:
             computed.update(block)
     with suppress(OSError):
         note.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile("w", dir=note.parent, delete=False) as file:
-            json.dump({"path": str(path.resolve()), "sha256": computed.hexdigest()}, file)
-        Path(file.name).replace(note)
+        note.write_text(json.dumps({"path": str(path.resolve()), "sha256": computed.hexdigest()}))
     return computed.hexdigest()

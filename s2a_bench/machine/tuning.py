@@ -18,7 +18,7 @@ from threading import Thread, current_thread, main_thread
 from typing import Any, Final
 
 PR_SET_PDEATHSIG: Final = 1
-_prctl = ctypes.CDLL(None).prctl
+_libc = ctypes.CDLL(None)
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
 M_ARENA_MAX = -8
@@ -59,12 +59,12 @@ def is_allowed() -> bool:
 
 
 def keep_large_blocks() -> bool:
-    """Make glibc keep large freed blocks; return False if that is not allowed, or on musl, which has no mallopt.
+    """Make glibc keep large freed blocks; return False if that is not allowed.
 
     All threads share one arena: several would each keep the most that their threads ever held.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if _undo is None or mallopt is None:
+    mallopt = _libc.mallopt
+    if _undo is None:
         return False
     _undo.callback(give_back_memory)
     _undo.callback(mallopt, M_TRIM_THRESHOLD, 2 * KEEP_BYTES)  # the value that glibc adapts to with such blocks
@@ -76,9 +76,7 @@ def keep_large_blocks() -> bool:
 def give_back_memory() -> None:
     """Collect cycles, and return free memory to the kernel: a block that grew in place stays in the heap."""
     gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:  # musl has none
-        trim(0)
+    _libc.malloc_trim(0)
 
 
 def limit_threads() -> None:
@@ -96,7 +94,7 @@ def limit_threads() -> None:
 
 def end_with_parent(number: signal.Signals = signal.SIGKILL) -> None:
     """Make the kernel end this process when the thread that started it ends."""
-    _prctl(PR_SET_PDEATHSIG, number)
+    _libc.prctl(PR_SET_PDEATHSIG, number)
 
 
 def start_child(command: Sequence[str], **options: Any) -> subprocess.Popen[bytes]:

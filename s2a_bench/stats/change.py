@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final, Literal, TypeAlias, TypeVar
+from typing import Final, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from s2a_bench.stats import Floats, Ratio
 from s2a_bench.stats.batches import FEWEST_ROWS, Blocks, LaunchValues, RowCorrelation, Rows, ranks_of
 
-Middle: TypeAlias = Literal["median", "mean"]
-
 _Launch = TypeVar("_Launch")
 
+CONFIDENCE: Final = 0.95
 POWER: Final = 0.8
 """Probability of finding the smallest detectable change (Cohen 1988)."""
 
@@ -36,14 +35,14 @@ class Noise:
     freedom: float
     logarithmic: bool = True
 
-    def detectable(self, level: float, *, falls: bool = False, power: float = POWER) -> float:
-        """Return the smallest rise (or fall), over the baseline, that a two-sided t test finds with ``power``."""
+    def detectable(self, level: float, *, falls: bool = False) -> float:
+        """Return the smallest rise (or fall), over the baseline, that a two-sided t test finds with `POWER`."""
         from scipy import special
 
         if not self.error:
             return 0.0
         critical = -float(special.stdtrit(self.freedom, level / 2))
-        shift = float(special.nctdtrinc(self.freedom, 1 - power, critical)) * self.error
+        shift = float(special.nctdtrinc(self.freedom, 1 - POWER, critical)) * self.error
         if not self.logarithmic:
             return shift
         return -math.expm1(-shift) if falls else math.expm1(min(shift, _MOST))
@@ -93,7 +92,6 @@ def change_between(
     statistic: str,
     *,
     seed: int,
-    confidence: float = 0.95,
     exact: bool = False,
     paired: bool = False,
 ) -> Change:
@@ -116,48 +114,49 @@ def change_between(
     if paired:
         draws[1] = draws[0]
     below, above = (_Side.of(side, statistic, drawn, exact) for side, drawn in zip(launches, draws, strict=True))
-    plain = _Test.of(below, above, confidence, paired)
-    if below.positive and above.positive:
-        test = _Test.of(below.log(), above.log(), confidence, paired)
-        low, high = (None if bound is None else math.exp(bound) for bound in (test.low, test.high))
+    test = plain = _Test.of(below, above, paired)
+    ratio = Ratio(above.mean / below.mean if below.mean > 0 else None, None, None)
+    logarithmic = below.positive and above.positive
+    if logarithmic:
+        test = _Test.of(below.log(), above.log(), paired)
+        low, high = (None if bound is None else math.exp(bound) for bound in (test.shift.low, test.shift.high))
         ratio = Ratio(above.level / below.level, low, high)
-        noise = test.noise(1.0, logarithmic=True)
-    else:
-        test = plain
-        noise = test.noise(abs(below.level), logarithmic=False)
-        ratio = Ratio(above.mean / below.mean if below.mean > 0 else None, None, None)
-    return Change(
-        below.level,
-        above.level,
-        ratio,
-        Ratio(plain.shift, plain.low, plain.high),
-        _superiority(launches, draws, confidence),
-        test.p,
-        test.dependent,
-        noise,
-    )
+    unit = 1.0 if logarithmic else abs(below.level)
+    noise = None
+    if test.p is not None and (unit or not test.error):
+        noise = Noise(test.error / unit if test.error else 0.0, test.freedom, logarithmic)
+    superiority = _superiority(launches, draws)
+    return Change(below.level, above.level, ratio, plain.shift, superiority, test.p, test.dependent, noise)
 
 
-def change_of_ranks(baseline: Rows, other: Rows, *, seed: int) -> Change:
+def change_of_ranks(baseline: Rows, other: Rows) -> Change:
     """Compare the ranks of two launches' values: the rank test of Wilcoxon, with the batches of `change_between`."""
     ranks = ranks_of(np.concatenate([baseline.values, other.values]))
     below, above = np.split(ranks, [len(baseline.values)])
-    return change_between([Rows(below, baseline.sizes)], [Rows(above, other.sizes)], "mean", seed=seed)
+    return change_between([Rows(below, baseline.sizes)], [Rows(above, other.sizes)], "mean", seed=0)
 
 
 def ratio_of_launches(
-    above: Mapping[_Launch, Blocks], below: Mapping[_Launch, Blocks], seed: int, statistic: Middle = "median"
+    above: Mapping[_Launch, Blocks],
+    below: Mapping[_Launch, Blocks],
+    seed: int,
+    statistic: Literal["median", "mean"] = "median",
 ) -> Ratio | None:
     """Divide the medians (or means) of two cells, given by launch and block; None if no launch has values of both.
 
-    One launch: `ratio_of_blocks`. Several: the geometric mean of their ratios, with the interval of Student's t on the
-    logarithms, which includes differences between launches.
+    One launch: `change_between` of its blocks, paired if both cells have the same. Several: the geometric mean of their
+    ratios, with the interval of Student's t on the logarithms, which includes differences between launches.
     """
     from scipy import special
 
     both = [launch for launch in above if above[launch] and below.get(launch)]
-    if len(both) <= 1:
-        return ratio_of_blocks(above[both[0]], below[both[0]], seed, statistic) if both else None
+    if not both:
+        return None
+    if len(both) == 1:
+        cells = [below[both[0]], above[both[0]]]
+        blocks, sizes = zip(*(np.unique(cell.block, return_counts=True) for cell in cells), strict=True)
+        first, second = map(Rows, (cell.values for cell in cells), sizes)
+        return change_between([first], [second], statistic, seed=seed, paired=np.array_equal(*blocks)).ratio
     middle = np.median if statistic == "median" else np.mean
     middles = np.array([[middle(cell[launch].values) for launch in both] for cell in (above, below)])
     n = len(both)
@@ -168,17 +167,6 @@ def ratio_of_launches(
     centre, sd = float(logs.mean()), float(logs.std(ddof=1))
     reach = float(special.stdtrit(n - 1, 0.975)) * sd / math.sqrt(n)
     return Ratio(math.exp(centre), math.exp(centre - reach), math.exp(centre + reach), n, sd)
-
-
-def ratio_of_blocks(above: Blocks, below: Blocks, seed: int, statistic: Middle = "median") -> Ratio | None:
-    """Divide the medians (or means) of two cells of one launch; paired if both have the same blocks.
-
-    None if a cell has no values.
-    """
-    if not above or not below:
-        return None
-    paired = np.array_equal(np.unique(above.block), np.unique(below.block))
-    return change_between([below.rows], [above.rows], statistic, seed=seed, paired=paired).ratio
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
@@ -260,22 +248,14 @@ class _Side:
 class _Test:
     """Welch's t of two means, Student's of paired ones; no interval and no p if a side's variance is unknown."""
 
-    shift: float
-    low: float | None
-    high: float | None
+    shift: Ratio
     p: float | None
     dependent: bool
     error: float = 0.0
     freedom: float = math.inf
 
-    def noise(self, unit: float, *, logarithmic: bool) -> Noise | None:
-        """Return the standard error of the shift in ``unit``; None if it is unknown, or the unit is 0."""
-        if self.p is None or (self.error and not unit):
-            return None
-        return Noise(self.error / unit if self.error else 0.0, self.freedom, logarithmic)
-
     @classmethod
-    def of(cls, below: _Side, above: _Side, confidence: float, paired: bool) -> _Test:
+    def of(cls, below: _Side, above: _Side, paired: bool) -> _Test:
         from scipy import special
 
         sides = [above.less(below)] if paired else [below, above]
@@ -283,42 +263,35 @@ class _Test:
         shift = above.mean - below.mean
         known = [variance for side in sides if (variance := side.variance) is not None]
         if len(known) < len(sides):
-            return cls(shift, None, None, None, dependent)
+            return cls(Ratio(shift, None, None), None, dependent)
         total = sum(variance for variance, _ in known)
         if total == 0:  # no variance: every difference is certain
-            return cls(shift, shift, shift, 0.0 if shift else 1.0, dependent)
+            return cls(Ratio(shift, shift, shift), 0.0 if shift else 1.0, dependent)
         freedom = total**2 / sum(variance**2 / df for variance, df in known)
         error = math.sqrt(total)
-        reach = float(special.stdtrit(freedom, (1 + confidence) / 2)) * error
+        reach = float(special.stdtrit(freedom, (1 + CONFIDENCE) / 2)) * error
         p = float(2 * special.stdtr(freedom, -abs(shift) / error))
-        return cls(shift, shift - reach, shift + reach, p, dependent, error, freedom)
+        return cls(Ratio(shift, shift - reach, shift + reach), p, dependent, error, freedom)
 
 
-def _superiority(
-    sides: Sequence[Sequence[LaunchValues]], draws: Sequence[NDArray[np.int64] | None], confidence: float
-) -> Ratio:
+def _superiority(sides: Sequence[Sequence[LaunchValues]], draws: Sequence[NDArray[np.int64] | None]) -> Ratio:
     """Return P(other > baseline) + P(equal) / 2, with a percentile interval over the batches of two single launches."""
-    below, above = (np.sort(np.concatenate([launch.values for launch in side])) for side in sides)
-    value = float(_wins([above], [below])[0, 0]) / (len(above) * len(below))
+    below, above = (
+        side[0].ordered if len(side) == 1 else [np.sort(np.concatenate([launch.values for launch in side]))]
+        for side in sides
+    )
+    wins = np.array([[_wins(one, two) for two in below] for one in above])
+    pairs = np.outer([len(one) for one in above], [len(two) for two in below])
+    value = float(wins.sum() / pairs.sum())
     first, second = draws
     if first is None or second is None or any(side[0].n_rows < FEWEST_ROWS for side in sides):
         return Ratio(value, None, None)
-    one, two = (side[0].ordered for side in sides)
-    wins = _wins(two, one)
-    pairs = np.outer([len(batch) for batch in two], [len(batch) for batch in one])
     resampled = ((second @ wins) * first).sum(axis=1) / ((second @ pairs) * first).sum(axis=1)
-    tail = (1 - confidence) / 2
+    tail = (1 - CONFIDENCE) / 2
     low, high = np.quantile(resampled, (tail, 1 - tail))
     return Ratio(value, float(low), float(high))
 
 
-def _wins(above: Sequence[Floats], below: Sequence[Floats]) -> Floats:
-    """Count, for each pair of sorted batches, the pairs of values of which the one above is larger, ties half."""
-    every = np.sort(np.concatenate(below))
-    places = [[np.searchsorted(every, batch, side) for side in ("left", "right")] for batch in above]
-    wins = np.empty((len(above), len(below)))
-    for column, batch in enumerate(below):
-        # Element n is how many of the n smallest of all values below are of this batch.
-        smaller = np.cumsum(np.bincount(np.searchsorted(every, batch) + 1, minlength=len(every) + 1))
-        wins[:, column] = [sum(smaller[place].sum() for place in pair) / 2 for pair in places]
-    return wins
+def _wins(above: Floats, below: Floats) -> float:
+    """Count the pairs of values, which are sorted, of which the one above is larger; ties count half."""
+    return float(sum(np.searchsorted(below, above, side).sum() for side in ("left", "right"))) / 2

@@ -54,7 +54,6 @@ def caption_of(figure: Figure) -> tuple[str, ...]:
 
 
 def markdown_caption(figure: Figure) -> str:
-    """Return a figure's title and notes as a paragraph of Markdown."""
     title, *notes = map(markdown_text, caption_of(figure))
     return " ".join((f"{title}.", *notes))
 
@@ -177,11 +176,12 @@ def build_distribution(
 _DAY = len("2026-11-23")
 
 
-def source_line(runs: Iterable[StoredRun]) -> str:
+def source_line(runs: Sequence[StoredRun]) -> str:
     """Return one line with the origin of the numbers of runs, the hosts and the days."""
-    manifests = [run.manifest for run in runs]
-    facts = (str(each.get(name, ""))[:most] for name, most in (("host", None), ("started", _DAY)) for each in manifests)
-    return " · ".join(dict.fromkeys((joined(run.origins for run in runs).brief, *filter(None, facts))))
+    hosts = [str(run.manifest.get("host", "")) for run in runs]
+    days = [str(run.manifest.get("started", ""))[:_DAY] for run in runs]
+    origin = joined(run.origins for run in runs).brief
+    return " · ".join(filter(None, dict.fromkeys((origin, *hosts, *days))))
 
 
 def marked(build: Callable[[], Figure], *runs: StoredRun) -> Figure:

@@ -62,5 +62,5 @@ def summaries_of_ends(metrics: Iterable[tuple[str, tuple[Floats, Floats]]]) -> d
 
 def summaries(metrics: Iterable[tuple[str, Floats]]) -> dict[str, Any]:
     """Summarise the metrics that have values; ``n`` is smaller if only some samples have a stage."""
-    found = ((name, summary_of(values)) for name, values in metrics)
-    return {name: asdict(summary) for name, summary in found if summary}
+    known = ((name, summary_of(values)) for name, values in metrics)
+    return {name: asdict(summary) for name, summary in known if summary}

@@ -15,7 +15,7 @@ from s2a_bench.text import one_line
 from s2a_bench.writers.tables import ABSENT, TextTable
 
 _PLAIN: Final = re.compile(r"[-+]?\d+(?:\.\d+)?(?: ± \d+(?:\.\d+)?)?")
-_NUMBER: Final = re.compile(r"(?<![\w.])[-+]?\d+(?:\.\d+)?(?: ± \d+(?:\.\d+)?)?(?![\w.]*\w)")
+_NUMBER: Final = re.compile(r"(?<![\w.])([-+]?\d+(?:\.\d+)?(?: ± \d+(?:\.\d+)?)?)(?![\w.]*\w)")
 _SIGNS: Final = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -130,16 +130,16 @@ def _kind(column: Sequence[str], *, names: bool, width: str) -> str:
         return f">{{\\raggedright\\arraybackslash}}p{{{width}}}"
     if names:
         return "l"
-    found = [text for text in column if text not in {"", ABSENT}]
-    if not found or not all(_PLAIN.fullmatch(text) for text in found):
+    texts = [text for text in column if text not in {"", ABSENT}]
+    if not texts or not all(_PLAIN.fullmatch(text) for text in texts):
         return "r"
     before, after, spread = 1, 0, 0
-    for text in found:
+    for text in texts:
         value, _, sd = text.lstrip("+-").partition(" ± ")
         whole, _, decimals = value.partition(".")
         before, after = max(before, len(whole)), max(after, len(decimals))
         spread = max(spread, len(sd.replace(".", "").lstrip("0") or "0") if sd else 0)
-    sign = "-" if any(text.startswith("-") for text in found) else ""
+    sign = "-" if any(text.startswith("-") for text in texts) else ""
     return f"S[table-format={sign}{before}.{after}{f'({spread})' if spread else ''}]"
 
 
@@ -148,11 +148,8 @@ def _entry(text: str, kind: str, *, names: bool) -> str:
         return "{--}" if text == ABSENT else _plain(text)
     if names or kind != "r":
         return escape(text)
-    done, place = "", 0  # text between numbers is escaped, numbers are left to siunitx
-    for found in _NUMBER.finditer(text):
-        done += escape(text[place : found.start()]) + f"\\num{{{_plain(found[0])}}}"
-        place = found.end()
-    return done + escape(text[place:])
+    parts = enumerate(_NUMBER.split(text))  # every second one is a number, left to siunitx
+    return "".join(f"\\num{{{_plain(part)}}}" if place % 2 else escape(part) for place, part in parts)
 
 
 def _plain(number: str) -> str:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from typing import Any, Final
 
 from s2a_bench.transport import declared_transport
@@ -60,8 +60,7 @@ def cell_styles(cells: Mapping[str, tuple[str, str]]) -> dict[str, tuple[str, st
     return styles | {name: _OTHER_STYLES[place % len(_OTHER_STYLES)] for place, name in enumerate(others)}
 
 
-@contextmanager
-def paper_column() -> Iterator[None]:
+def paper_column() -> AbstractContextManager[None]:
     """Draw with 7 and 8 point text, thin lines, and fonts that a publisher accepts (Type 42)."""
     import matplotlib as mpl
 
@@ -84,5 +83,4 @@ def paper_column() -> Iterator[None]:
         "pdf.fonttype": 42,
         "savefig.dpi": 300,
     }
-    with mpl.rc_context(settings):
-        yield
+    return mpl.rc_context(settings)

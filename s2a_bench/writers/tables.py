@@ -75,7 +75,9 @@ class TextTable:
         rules = set()
         for group in groups:
             rules.add(len(rows))
-            rows += [(*([""] * once if place else row[:once]), *row[once:]) for place, row in enumerate(group)]
+            for place, row in enumerate(group):
+                names = ("",) * once if place else row[:once]
+                rows.append((*names, *row[once:]))
         return cls(title, tuple(header), rows, left, frozenset(rules - {0}), tuple(notes), cells=tuple(cells))
 
     @property
@@ -104,10 +106,10 @@ def mean_sd(summary: Summary) -> str:
 
 def entries(values: Floats, *statistics: str) -> list[str]:
     """Format statistics of values, fields of `Summary` or `MEAN_SD`; `ABSENT` if there are no values."""
-    found = summary_of(values)
-    if found is None:
+    summary = summary_of(values)
+    if summary is None:
         return [ABSENT] * len(statistics)
-    return [mean_sd(found) if name == MEAN_SD else number(getattr(found, name)) for name in statistics]
+    return [mean_sd(summary) if name == MEAN_SD else number(getattr(summary, name)) for name in statistics]
 
 
 def median_mean(values: Floats) -> str:
@@ -117,8 +119,8 @@ def median_mean(values: Floats) -> str:
 
 
 def ends_entries(ends: tuple[Floats, Floats], *statistics: str) -> list[str]:
-    """Format statistics of both ends of intervals."""
-    return [f"[{lo}, {hi}]" for lo, hi in zip(*(entries(values, *statistics) for values in ends), strict=True)]
+    low, high = (entries(values, *statistics) for values in ends)
+    return [f"[{lo}, {hi}]" for lo, hi in zip(low, high, strict=True)]
 
 
 def interval(ratio: Ratio | None) -> str:
@@ -143,7 +145,7 @@ _MARKED = re.compile(r"[\\|*<]|(?<=\])(?=\()")
 
 def markdown_text(text: str) -> str:
     """Escape a text for one line of Markdown: no cell, emphasis, tag or link."""
-    return _MARKED.sub(lambda found: f"\\{found[0]}", one_line(text))
+    return _MARKED.sub(lambda match: f"\\{match[0]}", one_line(text))
 
 
 def _decimals(value: float) -> int:
@@ -168,7 +170,9 @@ def lay_out(table: TextTable, width: int) -> RenderableType:
     from rich.console import Group
     from rich.text import Text
 
-    blocks = [item for each in _blocks(table, width) for item in (_block(table, *each), Text())]
+    blocks = [
+        item for columns, wide, gap in _blocks(table, width) for item in (_block(table, columns, wide, gap), Text())
+    ]
     return Group(Text(one_line(table.title), "bold"), *blocks)
 
 

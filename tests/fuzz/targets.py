@@ -55,7 +55,7 @@ from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.pipeline import pipelines
 from s2a_bench.transport.ros import wire
 from s2a_bench.transport.serving import Core
-from s2a_bench.types import Action, Frame, Request, Token
+from s2a_bench.types import Frame, Request, Token
 from tests.made_runs import STAGES
 from tests.plan.test_parser import FORMATS
 from tests.servers.speakers import SPEAKERS
@@ -285,7 +285,7 @@ def read_gr00t(data: bytes) -> None:
     if isinstance(message, dict):
         observation, layout = layouts.observation_in(message.get("data"))
         observed.request_of(observation, observed.take_extension(message), Trace(), LIMITS)
-        layouts.answer_of(observation, layout, [Action(0, np.zeros(2, np.float32))])
+        layouts.answer_of(observation, layout, np.zeros((1, 2), np.float32))
     layouts.actions_in(message)
 
 
@@ -300,7 +300,7 @@ def gr00ts() -> list[bytes]:
         {"endpoint": "get_action", "data": {"observation": nested, "options": None}},
         [{"a": np.zeros((1, 4, 2)), "b": np.zeros((1, 4, 1))}, {}],
         {"action.a": np.zeros((4, 2), np.float32)},
-        observed.remote_message(Trace().to_remote()),
+        observed.ActionsExchange().marks(),
     ]
     return [bytes(gr00t.pack(message, maps=maps)) for message in messages for maps in (False, True)]
 
@@ -330,7 +330,7 @@ TARGETS = {
     "yaml": Target(read_yaml, lambda: [METADATA]),
     "observation": Target(read_observation, observations),
     "marks": Target(
-        lambda data: observed.remote_of(unpackb(data)), lambda: [packb(observed.remote_message(Trace().to_remote()))]
+        lambda data: observed.remote_of(unpackb(data)), lambda: [packb(observed.ActionsExchange().marks())]
     ),
     "gr00t": Target(read_gr00t, gr00ts),
     "template": Target(

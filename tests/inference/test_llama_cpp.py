@@ -15,7 +15,6 @@ from s2a_bench.inference.llama_cpp import LlamaCppEngine, llama_cpp
 from s2a_bench.inference.llama_prompt import VisionTower, bitmap_of, mtmd_cpp
 from s2a_bench.testing.engine import EngineSuite, ask, rgb_frame
 from s2a_bench.transport.ros.action import BOUNDS
-from s2a_bench.types import Request
 
 PLAN = r"""
 root ::= "[" skill ("," skill){2} "]"
@@ -193,14 +192,6 @@ def test_a_prompt_with_the_marker_of_a_picture_is_refused_not_misread(shared: Ll
     with pytest.raises(EngineError, match="request r was refused"):
         ask(shared, "look at <__media__>")
     assert ask(shared)
-
-
-def test_a_later_request_ends_an_earlier_one(shared: LlamaCppEngine) -> None:
-    early = shared.generate(Request("early", "go", max_tokens=6))
-    next(early)
-    assert ask(shared)
-    with pytest.raises(EngineError, match="one request at a time"):
-        next(early)
 
 
 def test_it_describes_model_and_build(shared: LlamaCppEngine, tiny: EngineConfig) -> None:

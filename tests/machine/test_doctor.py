@@ -87,9 +87,8 @@ def make(tmp_path: Path) -> Make:
         for path, text in tree.items():
             (root / path).parent.mkdir(parents=True, exist_ok=True)
             (root / path).write_text(text)
-        silent: dict[str, Any] = {"run": lambda _command: None, "which": lambda _name: None}
         known: dict[str, Any] = {"environ": {}, "cpus": frozenset(range(4)), "finds": lambda _package: True}
-        return Machine(root, **(known | silent | {"output": tmp_path} | fields))
+        return Machine(root, **(known | {"run": lambda _command: None, "output": tmp_path} | fields))
 
     return machine
 
@@ -116,9 +115,7 @@ def see(machine: Machine, code: str) -> Finding:
 
 
 EVERY = all_checks()
-HARDWARE = {
-    code: check for code, check in EVERY.items() if code not in {"python", "packages", "compiler", "llama-build"}
-}
+HARDWARE = {code: check for code, check in EVERY.items() if code not in {"python", "packages", "llama-build"}}
 
 
 def test_a_well_kept_workstation_has_nothing_to_mend(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -305,13 +302,6 @@ def test_the_disk_of_a_folder_that_is_not_there_yet_is_its_parents(make: Make, t
 def test_disk_space_is_judged(make: Make, monkeypatch: pytest.MonkeyPatch, free_gib: float, level: str) -> None:
     monkeypatch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=int(free_gib * (1 << 30))))
     assert see(make({}), "disk").level == level
-
-
-def test_a_compiler_is_named_with_cuda(make: Make) -> None:
-    answers = {"c++": "g++ (Ubuntu 11.4.0) 11.4.0\nmore", "nvcc": "Cuda compilation tools, release 12.6, V12.6.68"}
-    machine = make({}, which=lambda name: name, run=lambda command: answers.get(command[0]))
-    assert see(machine, "compiler").message == "g++ (Ubuntu 11.4.0) 11.4.0; CUDA 12.6"
-    assert see(make({}), "compiler").level == "advice"
 
 
 def fake_llama(monkeypatch: pytest.MonkeyPatch, info: bytes, *, offload: bool) -> None:

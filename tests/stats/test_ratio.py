@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 
 from s2a_bench.stats import Ratio
 from s2a_bench.stats.batches import Blocks
-from s2a_bench.stats.change import ratio_of_blocks, ratio_of_launches
+from s2a_bench.stats.change import ratio_of_launches
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -24,8 +24,8 @@ def blocks_of(values: Sequence[float] | Floats) -> Blocks:
     return Blocks(np.asarray(values, dtype=np.float64), np.arange(len(values)))
 
 
-def ratio(above: Sequence[float] | Floats, below: Sequence[float] | Floats, seed: int = 1) -> Ratio:
-    return ratio_of_blocks(blocks_of(above), blocks_of(below), seed)
+def ratio(above: Sequence[float] | Floats, below: Sequence[float] | Floats, seed: int = 1, **of: Any) -> Ratio:
+    return ratio_of_launches({0: blocks_of(above)}, {0: blocks_of(below)}, seed, **of)
 
 
 def remembering(rng: np.random.Generator, n: int, correlation: float) -> Floats:
@@ -40,7 +40,7 @@ def width(found: Ratio) -> float:
 
 def test_the_ratio_is_that_of_the_medians() -> None:
     assert ratio([2, 4, 60], [1, 2, 3]) == Ratio(2.0, None, None, launches=1)
-    assert ratio_of_blocks(blocks_of([2, 4, 60]), blocks_of([1, 2, 3]), 1, "mean") == Ratio(11.0, None, None)
+    assert ratio([2, 4, 60], [1, 2, 3], statistic="mean") == Ratio(11.0, None, None)
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,7 @@ def test_samples_of_one_block_stay_together() -> None:
     levels = [1.0, 3.0, 2.0, 1.5, 2.5, 1.2] * 4
     single = ratio(levels, np.ones(24))
     tenfold = Blocks(np.repeat(levels, 10), np.repeat(np.arange(24), 10))
-    many = ratio_of_blocks(tenfold, blocks_of(np.ones(24)), 1)
+    many = ratio_of_launches({0: tenfold}, {0: blocks_of(np.ones(24))}, 1)
     assert width(many) == pytest.approx(width(single), rel=0.1)
 
 
@@ -104,8 +104,8 @@ def test_what_allows_no_interval_has_none_and_is_strict_json(
 
 
 def test_a_cell_without_values_has_no_ratio() -> None:
-    assert ratio_of_blocks(blocks_of([]), blocks_of([1.0]), 0) is None
-    assert ratio_of_blocks(blocks_of([1.0]), blocks_of([]), 0) is None
+    assert ratio([], [1.0]) is None
+    assert ratio([1.0], []) is None
 
 
 def launches(rng: np.random.Generator, n: int, spread: float, runs: int = 15) -> list[dict[int, Blocks]]:

@@ -8,8 +8,7 @@ from typing import Annotated, Final, Literal
 from s2a_bench.bounds import Facts, Many, NonNegative, Positive, about
 from s2a_bench.experiments.cells import ANY, HIDDEN, JsonKey, Metric, metrics_of
 from s2a_bench.plan.skillset import GAPS
-from s2a_bench.scenario.ccrb import FOLLOWERS
-from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
+from s2a_bench.scenario.ccrb.cars import FOLLOWERS, LEAST_IMPACT_MPS
 from s2a_bench.scenario.ccrb.labels import outcome_label
 from s2a_bench.store.schema import Table
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from collections.abc import Generator
+from contextlib import closing
 from dataclasses import dataclass, replace
 from itertools import count, pairwise
 from pathlib import Path
@@ -61,7 +61,7 @@ class TimedAnswer:
     gaps_ns: list[int]
 
 
-def answers(engine: Engine, config: CaptureConfig) -> Iterator[TimedAnswer]:
+def answers(engine: Engine, config: CaptureConfig) -> Generator[TimedAnswer, None, None]:
     """Yield the times of requests without end, each with a new picture and seed; raises EngineError if empty."""
     with closing(Stamped(open_source(config.source, *config.size, seed=config.seed), "capture")) as source:
         for number in count():
@@ -78,20 +78,17 @@ def answers(engine: Engine, config: CaptureConfig) -> Iterator[TimedAnswer]:
 def capture(config: CaptureConfig, progress: Progress) -> dict[str, Any]:
     """Measure, and return the profile as the tables of its file; raises EngineError for short answers."""
     need_engine(config.engine)
+    from s2a_bench.inference.llama_cpp import LlamaCppEngine
+
     limit_threads()
     progress.expect(config.warmup + config.requests)
     warnings = before_run()
-    with ExitStack() as stack:
-        from s2a_bench.inference.llama_cpp import LlamaCppEngine
-
-        model, mmproj = resolve(config.engine)
-        progress.stage("loading the model")
-        # on this thread: another one would hand tokens over late, and several at once
-        engine = LlamaCppEngine(config.engine.but(model=model, mmproj=mmproj))
-        stack.callback(engine.close)
+    model, mmproj = resolve(config.engine)
+    progress.stage("loading the model")
+    # on this thread: another one would hand tokens over late, and several at once
+    engine = LlamaCppEngine(config.engine.but(model=model, mmproj=mmproj))
+    with closing(engine), closing(answers(engine, config)) as timed:
         before = Counters.read(watches_udp=False)
-        timed = answers(engine, config)
-        stack.callback(timed.close)  # type: ignore[attr-defined]  # a generator
         recorded = []
         for number in range(config.warmup + config.requests):
             progress.stage("warming up" if number < config.warmup else "measuring")

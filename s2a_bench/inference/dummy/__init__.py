@@ -9,11 +9,10 @@ their size through the layers.
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
+from uuid import uuid4
 
 import numpy as np
 
@@ -105,9 +104,7 @@ def _write(path: Path, kind: str, keys: dict[str, Any], tensors: list[Tensor], w
     gguf = extras.require("gguf", "model")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".part")
-        os.close(handle)
-        temporary = Path(name)
+        temporary = path.with_name(f".{path.name}.{uuid4().hex}.part")
         writer = gguf.GGUFWriter(temporary, kind)
         try:
             for key, value in keys.items():
@@ -126,7 +123,6 @@ def _write(path: Path, kind: str, keys: dict[str, Any], tensors: list[Tensor], w
                     written(part.nbytes)
                 writer.write_padding(file, tensor.nbytes)
             writer.close()
-            temporary.chmod(0o644)
             temporary.replace(path)
         finally:
             writer.close()

@@ -8,7 +8,6 @@ Python are read directly.
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -57,7 +56,6 @@ class Machine:
     cpus: frozenset[int] = field(default_factory=lambda: frozenset(os.sched_getaffinity(0)))
     output: Path = Path("results")
     run: Callable[[Sequence[str]], str | None] = _run
-    which: Callable[[str], str | None] = shutil.which
     finds: Callable[[str], bool] = extras.installed
 
     def read(self, path: str) -> str | None:
@@ -83,7 +81,6 @@ Check: TypeAlias = Callable[[Machine], Finding | None]
 CHECKS: dict[str, str] = {
     "python": "s2a_bench.machine.doctor.host:python",
     "packages": "s2a_bench.machine.doctor.host:packages",
-    "compiler": "s2a_bench.machine.doctor.host:compiler",
     "board": "s2a_bench.machine.doctor.gpu:board",
     "gpu": "s2a_bench.machine.doctor.gpu:gpu",
     "gpu-throttling": "s2a_bench.machine.doctor.gpu:gpu_throttling",

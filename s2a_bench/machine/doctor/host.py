@@ -1,4 +1,4 @@
-"""Checks of the computer: Python, packages, compiler; CPUs and their clock, memory, disk, socket buffers, cameras."""
+"""Checks of the computer: Python, packages; CPUs and their clock, memory, disk, socket buffers, cameras."""
 
 from __future__ import annotations
 
@@ -74,16 +74,6 @@ def _problem(requirement: Requirement) -> str:
         return f"{requirement.name} is missing"
     fits = requirement.specifier.contains(release, prereleases=True)
     return "" if fits else f"{requirement.name} is {release}, not {requirement.specifier}"
-
-
-def compiler(machine: Machine) -> Finding:
-    name = next((name for name in ("c++", "g++", "clang++") if machine.which(name)), None)
-    if name is None:
-        message = "no C++ compiler: fine while llama-cpp-python stays as it is installed"
-        return Finding("compiler", "advice", message, "sudo apt install build-essential")
-    first = (machine.run([name, "--version"]) or name).splitlines()[0]
-    cuda = re.search(r"release ([\d.]+)", machine.run(["nvcc", "--version"]) or "") if machine.which("nvcc") else None
-    return Finding("compiler", "state", first + (f"; CUDA {cuda[1]}" if cuda else "; no nvcc"))
 
 
 def cpus(machine: Machine) -> Finding | None:

@@ -133,7 +133,5 @@ class Tegrastats(Reader):
         return parse_tegrastats(whole.rpartition(b"\n")[2].decode(errors="replace")) if newline else {}
 
     def close(self) -> None:
-        self._process.terminate()
-        self._process.wait()
-        if self._process.stdout is not None:
-            self._process.stdout.close()
+        with self._process:  # waits, and closes the pipe
+            self._process.terminate()

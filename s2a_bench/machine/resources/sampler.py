@@ -36,6 +36,7 @@ COVERED = 0.5
 @dataclass(frozen=True, slots=True)
 class Reading:
     at_ns: int
+    cost_ns: int
     values: Mapping[str, float]
 
 
@@ -44,9 +45,12 @@ class _Source:
     name: str
     reader: Reader
     readings: deque[Reading] = field(default_factory=lambda: deque(maxlen=KEPT))
-    costs_ns: deque[int] = field(default_factory=lambda: deque(maxlen=KEPT))
     lock: Lock = field(default_factory=Lock)
     broken: bool = False
+
+    @property
+    def cost_us(self) -> float:
+        return median(reading.cost_ns for reading in self.readings) / 1e3 if self.readings else 0.0
 
 
 class ResourceSampler:
@@ -128,10 +132,8 @@ class ResourceSampler:
             "left_out": self._left_out,
             "polls": self._polls,
             "late": self._late,
-            "cost_us": {
-                source.name: round(median(source.costs_ns) / 1e3, 1) for source in self._sources if source.costs_ns
-            },
-            "edge_us": round(sum(median(source.costs_ns) for source in self._cheap if source.costs_ns) / 1e3, 1),
+            "cost_us": {source.name: round(source.cost_us, 1) for source in self._sources if source.readings},
+            "edge_us": round(sum(source.cost_us for source in self._cheap), 1),
             "core_share": round(self._thread_cpu_ns / elapsed_ns, 6) if elapsed_ns else None,
         }
 
@@ -145,12 +147,11 @@ class ResourceSampler:
                 values = source.reader.read()
             except Exception as error:  # noqa: BLE001 - drivers and foreign clients raise anything
                 source.broken = True
-                self._left_out[source.name] = f"stopped after {len(source.costs_ns)} readings: {error!r}"
+                self._left_out[source.name] = f"stopped after {len(source.readings)} readings: {error!r}"
                 return
             cost_ns = self._clock() - before
             at_ns = before + cost_ns // 2
-            source.readings.append(Reading(at_ns, values))
-            source.costs_ns.append(cost_ns)
+            source.readings.append(Reading(at_ns, cost_ns, values))
             self._rows.append(ResourceRow(at_ns, source.name, cost_ns, **values))  # type: ignore[arg-type]
 
     def _run(self) -> None:

@@ -135,13 +135,13 @@ class RobotTicks:
     def _deliver(self, before_ns: int, tick: int) -> None:
         """Pass the stepper what had arrived before a time; the next call passes what was delivered late."""
         for _ in range(len(self._inbox)):
-            arrival = self._inbox.popleft()
-            if arrival[0] < before_ns:
-                self.stepper.arrived(arrival[1], arrival[2], tick)
+            at_ns, request, count = self._inbox.popleft()
+            if at_ns < before_ns:
+                self.stepper.arrived(request, count, tick)
                 if self._weight < 1:
-                    self._blend(self._actions[arrival[1]])
+                    self._blend(self._actions[request])
             else:
-                self._inbox.append(arrival)
+                self._inbox.append((at_ns, request, count))
 
     def _blend(self, actions: Sequence[Vector]) -> None:
         due = actions[self.stepper.past :]

@@ -69,7 +69,7 @@ def sources(written: str, tokens: int) -> Iterator[Source]:
     A run folder has a source a cell, FOLDER#CELL is one of them. ``tokens`` are those of a chunk, for a profile.
     """
     if (read := read_latency(written)) is not None:
-        yield Source(written, read.gaps, read.recorded_ns)
+        yield Source(written, recorded_ns=read) if isinstance(read, np.ndarray) else Source(written, read)
     elif Path(folder := written.partition("#")[0]).is_dir():
         yield from measured(Path(folder), written.partition("#")[2])
     else:
@@ -83,11 +83,13 @@ def split(value: object) -> object:
     """Split text at the commas between sources, not at those of a family's parameters; drop duplicates."""
     if not isinstance(value, str):
         return tuple(map(str, value)) if isinstance(value, (list, tuple)) else (str(value),)
-    found: list[str] = []
+    names: list[str] = []
     for text in (text.strip() for text in value.split(",") if text.strip()):
-        continues = found and ":" in found[-1] and _PARAMETER.match(text)
-        found[-1:] = [f"{found[-1]},{text}"] if continues else [*found[-1:], text]
-    return tuple(dict.fromkeys(found))
+        if names and ":" in names[-1] and _PARAMETER.match(text):
+            names[-1] += f",{text}"
+        else:
+            names.append(text)
+    return tuple(dict.fromkeys(names))
 
 
 def measured(folder: Path, only: str = "") -> Iterator[Source]:
@@ -160,10 +162,10 @@ def service_of(
 
 def _pieces(run: StoredRun) -> dict[str, tuple[int, int | None]]:
     """Return for each request the time from the first to the last piece, and when that left the engine."""
-    found: pd.DataFrame = run.tokens.groupby("request_id").agg(
+    times: pd.DataFrame = run.tokens.groupby("request_id").agg(
         first=("client_ns", "min"), last=("client_ns", "max"), left=("engine_ns", "max")
     )
-    return {str(name): (int(last - first), _whole(left)) for name, first, last, left in found.itertuples()}
+    return {str(name): (int(last - first), _whole(left)) for name, first, last, left in times.itertuples()}
 
 
 def _whole(value: Any) -> int | None:
@@ -186,21 +188,7 @@ COLUMNS: Final = (
     "delta_t_ns",
     "provenance",
 )
-"""Columns of the exported delays, a row a request.
-
-| column | meaning |
-|---|---|
-| request | number, from 0 |
-| observation_ns, received_ns | when the observation was made, when the whole chunk was there; L is their difference |
-| sent_ns, server_in_ns, server_out_ns | when it left the client, reached and left the server; empty if unknown, as
-those of a server on another host |
-| bytes | of the request; empty in process |
-| latency_ns | L |
-| d | L in control ticks, by the convention of the column ``rounding`` (floor, ceil) |
-| delta_t_ns | the control tick that d counts in |
-
-All times are whole ns of one clock. `boards.latency` reads the file back.
-"""
+"""Columns of the exported delays, a row a request, which docs/chunks.md explains; `boards.latency` reads the file."""
 
 
 def delay_rows(source: Source, drawn_ns: Ints, mode: Mode, setting: ControlSetting) -> Iterator[dict[str, object]]:

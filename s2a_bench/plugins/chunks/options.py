@@ -20,7 +20,6 @@ WITHOUT_PACKAGES: Final = "http/binary"
 
 
 def acting_modes(default: tuple[str, ...]) -> Any:
-    """Declare the option of the modes that are tried."""
     about = f"{', '.join(MODES)}, each with ?parameter=value&...; several with commas"
     return option(default, about, first=True, names=lambda: MODES)
 

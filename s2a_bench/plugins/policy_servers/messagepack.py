@@ -53,7 +53,7 @@ def _no_extension(code: int, _: bytes) -> Any:
     raise ValueError(f"an extension of type {code}, which is not allowed")
 
 
-def array_in(data: Any, shape: Any, dtype: np.dtype[Any], start: int = 0, *, fortran: bool = False) -> NDArray[Any]:
+def array_in(data: Any, shape: Any, dtype: np.dtype[Any], start: int = 0) -> NDArray[Any]:
     """Return the read-only array whose elements begin at ``start``; raises RequestFailed if the bytes do not fit."""
     if not isinstance(data, bytes):
         raise RequestFailed(f"an array whose data is {type(data).__name__}, not bytes")
@@ -64,4 +64,4 @@ def array_in(data: Any, shape: Any, dtype: np.dtype[Any], start: int = 0, *, for
     if prod(axes) * dtype.itemsize != size:
         raise RequestFailed(f"an array of shape {tuple(axes)} and type {dtype} in {size} bytes")
     flat = np.frombuffer(data, dtype, offset=start) if size else np.empty(0, dtype)
-    return flat.reshape(axes[::-1]).T if fortran else flat.reshape(axes)
+    return flat.reshape(axes)

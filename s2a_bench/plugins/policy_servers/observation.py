@@ -1,20 +1,10 @@
 """Observation templates: a TOML or JSON file that describes the observation of a policy server, with placeholders.
 
-It holds the nested dictionary that the policy expects. These texts in it are placeholders:
-
-- ``"{image}"``, ``"{image:1}"``: the first, the second picture, uint8 (H, W, 3) RGB. ``"{image:0|CHW}"`` is
-  (3, H, W), ``"{image:0|bytes}"`` the bytes of its file, if pictures are sent as JPEG or PNG.
-- ``"{state}"``, ``"{state:0:7}"``, ``"{state:7:}"``: the robot's state, float32 (D,), or a slice of it.
-- ``"{images}"``: all pictures of the request, as a list.
-- ``{prompt}``, also within a text: ``"Task: {prompt}"``; ``{session}``, an identifier that every client draws once. Any
-  other brace is written twice.
-
-A list of arrays becomes one array with one more axis in front: ``[["{image}"]]`` is (1, 1, H, W, 3) and
-``["{image:0}", "{image:1}"]`` is (2, H, W, 3), while ``[["{prompt}"]]`` stays a list of lists of text. A key that ends
-with ``?`` is optional: it is left out if the request lacks the picture or the numbers of its value. A key of
-``"{images}"`` that ends with ``*`` stands for one key a picture, with the names that the server's greeting lists. All
-other values are constants. The table `EXTENSION` is no part of the observation: it describes the server, as
-`ExternalServer` reads it. The files in ``templates`` beside this module are known by name.
+It holds the nested dictionary that the policy expects; docs/policy-servers.md lists the texts in it that are
+placeholders. Pictures are uint8 (H, W, 3) RGB, the state is float32 (D,). A list of arrays becomes one array with one
+more axis in front: ``["{image:0}", "{image:1}"]`` is (2, H, W, 3), while ``[["{prompt}"]]`` stays a list of lists of
+text. The table `EXTENSION` is no part of the observation: it describes the server, as `ExternalServer` reads it. The
+files in ``templates`` beside this module are known by name.
 """
 
 from __future__ import annotations
@@ -55,7 +45,7 @@ _IN_TEXT = re.compile(r"\{\{|\}\}|\{prompt\}|\{session\}|[{}]")
 _BRACES = {"{{": "{", "}}": "}"}
 
 
-class _Missing(Exception):
+class _Missing(RequestFailed):
     """The request lacks the value of a placeholder."""
 
 
@@ -96,11 +86,10 @@ class ExternalServer(toml_file.TomlTable):
         """Return the actions of an answer, as the server has them; raises RequestFailed for an answer without."""
         value = answer
         for key in filter(None, self.answer.split(".")):
-            by_key = dict(enumerate(value)) if isinstance(value, list) and key.isdecimal() else value
-            place = int(key) if by_key is not value else key
-            if not isinstance(by_key, dict) or place not in by_key:
-                raise RequestFailed(f"an answer without {self.answer}: {_keys(value)}")
-            value = by_key[place]
+            try:
+                value = value[int(key) if isinstance(value, list) else key]
+            except (LookupError, TypeError, ValueError):
+                raise RequestFailed(f"an answer without {self.answer}: {_keys(value)}") from None
         return value
 
 
@@ -135,10 +124,7 @@ class Template:
             raise RequestFailed(f"`template` {self.name} has places for {self.pictures} pictures, not {len(pictures)}")
         if len(state) and not self.accepts_state:
             raise RequestFailed(f"`template` {self.name} has no place for the robot's state")
-        try:
-            filled: dict[str, Any] = self._make(_Values(pictures, np.asarray(state, np.float32), prompt, names))
-        except _Missing as missing:
-            raise RequestFailed(f"`template` {self.name}: {missing}") from None
+        filled: dict[str, Any] = self._make(_Values(pictures, np.asarray(state, np.float32), prompt, names))
         return filled
 
     def check_request(self, cameras: int, state: int) -> dict[str, Any]:
@@ -162,6 +148,9 @@ class Template:
 
     def _refuse(self, path: str, why: str) -> NoReturn:
         raise UsageError(f"`template` {self.name}: {path or 'it'} {why}")
+
+    def _missing(self, path: str, wanted: str, given: object) -> _Missing:
+        return _Missing(f"`template` {self.name}: {path} wants {wanted}, and the request has {given}")
 
     def _value(self, value: Any, path: str, depth: int) -> _Make:
         self._values += 1
@@ -237,7 +226,7 @@ class Template:
 
         def make(values: _Values) -> list[Pixels]:
             if not values.pictures:
-                raise _Missing(f"{path} wants pictures, and the request has none")
+                raise self._missing(path, "pictures", "none")
             return list(values.pictures)
 
         return make
@@ -253,7 +242,7 @@ class Template:
 
         def make(values: _Values) -> Any:
             if index >= len(values.pictures):
-                raise _Missing(f"{path} wants {index + 1} pictures, and the request has {len(values.pictures)}")
+                raise self._missing(path, f"{index + 1} pictures", len(values.pictures))
             picture = values.pictures[index]
             if form is None:
                 return picture
@@ -270,7 +259,7 @@ class Template:
         def make(values: _Values) -> Vector:
             if len(values.state) < (last or first + 1):
                 wanted = f"{first}:{last or ''}" if first or last else "all"
-                raise _Missing(f"{path} wants the state's numbers ({wanted}), and the request has {len(values.state)}")
+                raise self._missing(path, f"the state's numbers ({wanted})", len(values.state))
             return values.state[first:last]
 
         return make

@@ -17,19 +17,50 @@ from typing import Any, Final
 
 import numpy as np
 
-from s2a_bench.errors import RequestFailed
+from s2a_bench.errors import EngineError, RequestFailed
 from s2a_bench.plugins.policy_servers.observation import EXTENSION
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import chunks
 from s2a_bench.transport.limits import Limits, check_pixels, text
 from s2a_bench.transport.pictures import decoded
-from s2a_bench.types import Frame, Request
+from s2a_bench.transport.serving import Disconnected, Exchange
+from s2a_bench.types import Action, Frame, Piece, Request, Vector
 
 PICTURES, NUMBERS = 64, 4096
 """The most pictures, and numbers of the state, in one request."""
 PROMPT: Final = "prompt"
 DEPTH: Final = 32
 COLOURS: Final = 3
+
+
+class ActionsExchange(Exchange):
+    """A request for actions; those of the answer are kept until its end."""
+
+    parse_stage = "msgpack_parse"
+
+    def __init__(self, trace: Trace | None = None) -> None:
+        super().__init__(trace)
+        self._actions: list[Vector] = []
+
+    def send(self, piece: Piece) -> bool:
+        if self.disconnected():
+            raise Disconnected
+        if not isinstance(piece, Action):
+            raise EngineError(
+                "the engine answers with tokens, and this protocol knows actions; choose `answer` actions"
+            )
+        self._actions.append(piece.values)
+        return True
+
+    def chunk(self) -> Vector:
+        """Return all actions, (H, D)."""
+        if not self._actions:
+            raise EngineError("the engine answered with no action at all")
+        return np.stack(self._actions)
+
+    def marks(self) -> dict[str, Any]:
+        """Return the message with the server's marks, which may take time to find."""
+        return {EXTENSION: self.trace.to_remote().to_json()}
 
 
 def read_observation(
@@ -115,10 +146,6 @@ def request_of(observation: Any, extension: dict[Any, Any] | None, trace: Trace,
     images, state, prompt = read_observation(observation, trace, limits)
     name = text("id", fields.get("id")) or "observation-0"
     return chunks.request_of(fields, limits, name, prompt, images, state, limits.answer_tokens)
-
-
-def remote_message(remote: Remote) -> dict[str, Any]:
-    return {EXTENSION: remote.to_json()}
 
 
 def remote_of(message: Any) -> Remote:

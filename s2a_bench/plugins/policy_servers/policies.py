@@ -37,7 +37,6 @@ class PolicyTransport(Transport[P]):
     usual_template: ClassVar[str] = DEFAULT
 
     def template(self, options: P) -> Template:
-        """Return the template of a client's observations."""
         return template_of(options.template or self.usual_template)
 
     def capabilities(self, choice: Choice[P]) -> Capabilities[P]:

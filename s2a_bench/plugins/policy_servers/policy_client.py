@@ -68,7 +68,6 @@ class PolicyClient(Client, Generic[P]):
         self._abandon()
 
     def _observation(self, request: Request, trace: Trace) -> dict[str, Any]:
-        """Fill the template, marking the stages of each picture."""
         pictures = [self._picture(frame, place, trace) for place, frame in enumerate(request.images)]
         return self._template.fill(pictures, request.state, request.prompt, self._listed)
 

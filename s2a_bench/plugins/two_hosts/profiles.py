@@ -144,9 +144,9 @@ class LinkProfile(TomlTable):
         )
 
 
-def bound_s(link: tuple[Direction, Direction], bytes_up: float, bytes_first_down: float = 0) -> float:
-    """Return the least time in s of a request on a link: its body up, and the first piece of its answer down."""
-    return link[0].least_s(bytes_up) + link[1].least_s(bytes_first_down)
+def bound_s(link: tuple[Direction, Direction], bytes_up: float) -> float:
+    """Return the least time in s of a request on a link: its body up, and the delay down."""
+    return link[0].least_s(bytes_up) + link[1].least_s(0)
 
 
 def published() -> dict[str, LinkProfile]:

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
-from s2a_bench.provenance import Origins
 from s2a_bench.text import dotted
 
 if TYPE_CHECKING:
@@ -49,23 +48,28 @@ class Difference:
 
 def differences(baseline: StoredRun, other: StoredRun) -> list[Difference]:
     """Return the differences, the fatal first. A fact that only one run knows is never fatal."""
-    sides = baseline.manifest, other.manifest
-    machines = [manifest.get("environment", {}) for manifest in sides]
-    models = [manifest.get("model") or {} for manifest in sides]
-    ignored = *_MACHINE, *_PASSING
-    others = [dict(dotted({name: each[name] for name in each if name not in ignored})) for each in machines]
-    found = [
-        *_of("", *({name: facts[name] for name in _MACHINE if name in facts} for facts in machines), fatal=True),
-        *_of("", *(_gpus(facts, "name") for facts in machines), fatal=True),
-        *_of("tuning ", *(_tuning(manifest) for manifest in sides), fatal=True),
-        *_of("model ", *({name: facts[name] for name in _MODEL if name in facts} for facts in models), fatal=True),
-        *_of("provenance ", *(_origin(manifest) for manifest in sides), fatal=True),
-        *_of("", *others, fatal=False),
-        *_of("", *(_gpus(facts, "driver") for facts in machines), fatal=False),
-        *_of("package ", *(facts.get("packages", {}) for facts in machines), fatal=False),
-        *_of(SETTING, *(dict(dotted(manifest.get("configuration", {}))) for manifest in sides), fatal=False),
+    every: list[Difference] = []
+    for (prefix, fatal, first), (_, _, second) in zip(_facts(baseline), _facts(other), strict=True):
+        every += _differing(prefix, first, second, fatal=fatal)
+    return sorted(every, key=lambda difference: not difference.fatal)
+
+
+def _facts(run: StoredRun) -> list[tuple[str, bool, Mapping[str, Any]]]:
+    """Return groups of facts: the prefix of their names, whether a difference is fatal, and the facts."""
+    manifest = run.manifest
+    machine, model = manifest.get("environment", {}), manifest.get("model") or {}
+    others = {name: value for name, value in machine.items() if name not in (*_MACHINE, *_PASSING)}
+    return [
+        ("", True, {name: machine[name] for name in _MACHINE if name in machine}),
+        ("", True, _gpus(machine, "name")),
+        ("tuning ", True, _tuning(manifest)),
+        ("model ", True, {name: model[name] for name in _MODEL if name in model}),
+        ("provenance ", True, _origin(run)),
+        ("", False, dict(dotted(others))),
+        ("", False, _gpus(machine, "driver")),
+        ("package ", False, machine.get("packages", {})),
+        (SETTING, False, dict(dotted(manifest.get("configuration", {})))),
     ]
-    return sorted(found, key=lambda difference: not difference.fatal)
 
 
 def is_other_machine(difference: Difference) -> bool:
@@ -73,19 +77,21 @@ def is_other_machine(difference: Difference) -> bool:
     return difference.fatal and difference.what in {*_KIND, "GPU name"}
 
 
-def differing_names(found: Iterable[Difference]) -> str:
+def differing_names(every: Iterable[Difference]) -> str:
     """Return the names of the first differences that both sides know, without machine, model and provenance."""
-    known = (one for one in found if _ABSENT not in {one.baseline, one.other} and not is_other_machine(one))
+    known = (one for one in every if _ABSENT not in {one.baseline, one.other} and not is_other_machine(one))
     names = [*dict.fromkeys(one.what for one in known if not one.what.startswith(("model ", "provenance ")))]
     return ", ".join(names[:_LISTED]) + (f", and {len(names) - _LISTED} more" if len(names) > _LISTED else "")
 
 
-def as_line(found: Sequence[Difference]) -> str:
-    more = f"; and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
-    return "; ".join(map(str, found[:_LISTED])) + more
+def as_line(every: Sequence[Difference]) -> str:
+    more = f"; and {len(every) - _LISTED} more" if len(every) > _LISTED else ""
+    return "; ".join(map(str, every[:_LISTED])) + more
 
 
-def _of(prefix: str, first: Mapping[str, Any], second: Mapping[str, Any], *, fatal: bool) -> Iterator[Difference]:
+def _differing(
+    prefix: str, first: Mapping[str, Any], second: Mapping[str, Any], *, fatal: bool
+) -> Iterator[Difference]:
     """Yield the facts that differ; an empty and an absent one are equal."""
     for name in dict.fromkeys((*first, *second)):
         one, two = first.get(name), second.get(name)
@@ -101,10 +107,10 @@ def _tuning(manifest: Mapping[str, Any]) -> dict[str, Any]:
     return {} if tuned is None else {"process": "tuned" if tuned else "not tuned (the library's tune=False)"}
 
 
-def _origin(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    every = Origins.of_manifest(manifest).every
-    found = {name: ", ".join(dict.fromkeys(getattr(each, name) for each in every)) for name in _ORIGIN}
-    return found | {"pictures": found["pictures"] or "seen"}
+def _origin(run: StoredRun) -> dict[str, Any]:
+    every = run.origins.every
+    fields = {name: ", ".join(dict.fromkeys(getattr(each, name) for each in every)) for name in _ORIGIN}
+    return fields | {"pictures": fields["pictures"] or "seen"}
 
 
 def _gpus(facts: Mapping[str, Any], key: str) -> dict[str, Any]:

@@ -131,39 +131,40 @@ def open_comparison(
     experiment = experiment_of(commands[0])
     by = experiment.compared_by() if experiment else None
     if by is None:
-        known = ", ".join(sorted(name for name, found in EXPERIMENTS.loaded() if found.compared))
+        known = ", ".join(sorted(name for name, each in EXPERIMENTS.loaded() if each.compared))
         raise UsageError(f"runs of {commands[0]} cannot be compared, only those of {known}")
     with fits(*runs):
         dated = [[each for run in side for each in _launches(run, by.subjects(run))] for side in (baseline, other)]
         sides = [[launch for _, launch in side] for side in dated]
-        found = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
+        differ = list(dict.fromkeys(difference for run in runs[1:] for difference in differences(runs[0], run)))
         metrics = {**by.metrics, **by_name(metric for run in runs for metric in by.run_metrics(run))}
     if (len(sides[0]) > 1) != (len(sides[1]) > 1):
         raise UsageError(
             "name several launches on both sides, or one on each: the test uses launches or requests; "
             "`launches` measures several in one run"
         )
-    fatal = [difference for difference in found if difference.fatal]
+    fatal = [difference for difference in differ if difference.fatal]
     if fatal and not unlike:
         raise UnlikeRuns(f"the runs are unlike: {as_line(fatal)}; `unlike` compares them anyway")
-    pairs, only, settings = _match(*sides)
+    pairs, only, settings = _match(sides[0], sides[1])
     if settings and not unlike:
         raise UnlikeRuns(f"cells of one name differ: {as_line(settings)}; `unlike` compares them anyway")
     if not pairs:
         raise UnlikeRuns(f"no cell is in every run: {', '.join(only[0])} against {', '.join(only[1])}")
     started = tuple(tuple(when for when, _ in side) for side in dated)
-    differ = (*settings, *found)
-    return ComparedRuns(tuple(baseline), tuple(other), by, metrics, differ, tuple(pairs), only, least, started)
+    return ComparedRuns(
+        tuple(baseline), tuple(other), by, metrics, (*settings, *differ), tuple(pairs), only, least, started
+    )
 
 
 def _launches(run: StoredRun, subjects: Iterable[Subject]) -> list[tuple[str, dict[str, Subject]]]:
     """Return when a run started and name -> cell, for each launch; raises UnlikeRuns if it has none."""
-    found: dict[int, dict[str, Subject]] = {}
+    launches: dict[int, dict[str, Subject]] = {}
     for subject in subjects:
-        found.setdefault(subject.launch, {})[subject.name] = subject
-    if not found:
+        launches.setdefault(subject.launch, {})[subject.name] = subject
+    if not launches:
         raise UnlikeRuns(f"{run.path} has no complete cell, its state is {run.manifest['state']}: measure it again")
-    return [(str(run.manifest.get("started") or ""), launch) for launch in found.values()]
+    return [(str(run.manifest.get("started") or ""), launch) for launch in launches.values()]
 
 
 def _match(
@@ -181,8 +182,8 @@ def _match(
         first = pair.baseline[0]
         for subject in (*pair.baseline[1:], *pair.other):
             for key, value in first.setting.items():
-                if (found := subject.setting.get(key)) != value:
-                    settings[Difference(f"{pair.name} {key}", value, str(found), fatal=True)] = None
+                if (other_value := subject.setting.get(key)) != value:
+                    settings[Difference(f"{pair.name} {key}", value, str(other_value), fatal=True)] = None
     return pairs, (left[0], left[1]), list(settings)
 
 
@@ -202,18 +203,18 @@ def metrics_of(compared: ComparedRuns, names: Sequence[str]) -> list[tuple[Metri
 def metric_of(compared: ComparedRuns, name: str, flag: str) -> tuple[Metric, str]:
     """Parse NAME or NAME.STATISTIC; raises UsageError for an unknown metric, or if no cell has it."""
     metrics = compared.metrics
-    metric, dot, statistic = name.rpartition(".")
+    stem, dot, statistic = name.rpartition(".")
     if name in metrics:
-        found, statistic = metrics[name], metrics[name].statistic
-    elif dot and metric in metrics and statistic in STATISTICS:
-        found = metrics[metric]
+        metric, statistic = metrics[name], metrics[name].statistic
+    elif dot and stem in metrics and statistic in STATISTICS:
+        metric = metrics[stem]
     else:
         has = [one for one in metrics if any(_rows(pair, one) for pair in compared.pairs)]
-        known = f"the statistics are {', '.join(STATISTICS)}" if metric in metrics else f"there are {', '.join(has)}"
+        known = f"the statistics are {', '.join(STATISTICS)}" if stem in metrics else f"there are {', '.join(has)}"
         raise UsageError(f"{flag}: '{name}' is no metric of these {compared.command} runs; {known}")
-    if not any(_rows(pair, found.name) for pair in compared.pairs):
-        raise UsageError(f"{flag}: no cell has {found.name} on both sides")
-    return found, statistic
+    if not any(_rows(pair, metric.name) for pair in compared.pairs):
+        raise UsageError(f"{flag}: no cell has {metric.name} on both sides")
+    return metric, statistic
 
 
 def compare(compared: ComparedRuns, wanted: Sequence[tuple[Metric, str]]) -> ComparedRuns:
@@ -222,16 +223,16 @@ def compare(compared: ComparedRuns, wanted: Sequence[tuple[Metric, str]]) -> Com
     The detectable change is that of the first step of Holm's correction, which has the strictest level.
     """
     with fits(*compared.baseline, *compared.other):
-        found = [found for metric, statistic in dict.fromkeys(wanted) for found in changes(compared, metric, statistic)]
-    corrected = holm([comparison.change.p for comparison in found])
+        every = [one for metric, statistic in dict.fromkeys(wanted) for one in changes(compared, metric, statistic)]
+    corrected = holm([one.change.p for one in every])
     judged = [
         replace(
             one,
             p_holm=p,
             verdict=verdict(one.change, p, one.metric, compared.least),
-            detectable=detectable(one.change, len(found)),
+            detectable=detectable(one.change, len(every)),
         )
-        for one, p in zip(found, corrected, strict=True)
+        for one, p in zip(every, corrected, strict=True)
     ]
     return replace(compared, comparisons=tuple(judged))
 
@@ -246,7 +247,7 @@ def changes(compared: ComparedRuns, metric: Metric, statistic: str) -> Iterator[
     for pair in compared.pairs:
         if rows := _rows(pair, metric.name):
             exact = all(subject.exact for subject in (*pair.baseline, *pair.other))
-            change = change_between(*rows, statistic, seed=compared.baseline[0].bootstrap_seed, exact=exact)
+            change = change_between(rows[0], rows[1], statistic, seed=compared.baseline[0].bootstrap_seed, exact=exact)
             n = [sum(len(launch) for launch in side) for side in rows]
             yield CellComparison(pair, metric, statistic, (n[0], n[1]), change)
 
@@ -286,37 +287,39 @@ def read_side(text: str, flag: str) -> list[StoredRun]:
 
 def warnings_of(compared: ComparedRuns) -> list[RunWarning]:
     """Return the warnings about a comparison, the most important first."""
-    return [RunWarning(*each) for each in (*_of_runs(compared), *_of_cells(compared))]
+    return [*_of_runs(compared), *_of_cells(compared)]
 
 
-def _of_runs(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
+def _of_runs(compared: ComparedRuns) -> Iterator[RunWarning]:
     if fatal := [one for one in compared.differences if one.fatal]:
-        yield "unlike", f"the runs are unlike: {as_line(fatal)}", "a change may come from any of them"
+        yield RunWarning("unlike", f"the runs are unlike: {as_line(fatal)}", "a change may come from any of them")
     for run in (*compared.baseline, *compared.other):
         if (state := run.manifest["state"]) != "finished":
-            yield "state", f"{run.path} is {state}, not finished", "its samples so far count; run it again"
+            yield RunWarning("state", f"{run.path} is {state}, not finished", "its samples so far count; run it again")
         if codes := sorted({warning["code"] for warning in run.manifest.get("warnings", [])}):
-            yield "warnings", f"{run.path} has warnings: {', '.join(codes)}", "read them in its manifest"
+            yield RunWarning("warnings", f"{run.path} has warnings: {', '.join(codes)}", "read them in its manifest")
     if compared.launches_below(2):
-        yield "one-launch", "one launch a side: the intervals do not include the variation between launches", IN_TURN
+        within = "one launch a side: the intervals do not include the variation between launches"
+        yield RunWarning("one-launch", within, IN_TURN)
     if out_of_turn := compared.out_of_turn:
-        yield "turns", out_of_turn, IN_TURN
+        yield RunWarning("turns", out_of_turn, IN_TURN)
 
 
-def _of_cells(compared: ComparedRuns) -> Iterator[tuple[str, str, str]]:
+def _of_cells(compared: ComparedRuns) -> Iterator[RunWarning]:
     if names := sorted({one.pair.name for one in compared.comparisons if one.change.dependent}):
-        yield (
+        yield RunWarning(
             "dependent",
             f"neighbouring requests are correlated, and the intervals too narrow ({', '.join(names)})",
             "measure longer, or repeat the launches",
         )
     for side, cells in zip(("A", "B"), compared.only, strict=True):
         if cells:
-            yield "only", f"only in {side}: {', '.join(cells)}", "they are not compared"
+            yield RunWarning("only", f"only in {side}: {', '.join(cells)}", "they are not compared")
     for pair in compared.pairs:
         for side, subjects in (("A", pair.baseline), ("B", pair.other)):
             if failed := sum(subject.errors for subject in subjects):
                 total = failed + sum(subject.n for subject in subjects)
-                yield "errors", f"{pair.name}: {failed} of {total} requests failed in {side}", "see samples.csv"
+                message = f"{pair.name}: {failed} of {total} requests failed in {side}"
+                yield RunWarning("errors", message, "see samples.csv")
     if harmless := [one for one in compared.differences if not one.fatal]:
-        yield "differs", as_line(harmless), "this may be what you compare"
+        yield RunWarning("differs", as_line(harmless), "this may be what you compare")

@@ -10,8 +10,9 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Final
+from typing import Annotated, Final, Literal, TypeAlias
 
+from s2a_bench.bounds import Fraction, NonNegative, about
 from s2a_bench.errors import UsageError
 from s2a_bench.experiments.cells import Metric
 from s2a_bench.report.compare.comparison import IN_TURN, LEVEL, CellComparison, ComparedRuns, detectable, metric_of
@@ -20,7 +21,12 @@ from s2a_bench.stats.change import FEWEST_LAUNCHES
 _FLAG: Final = "`fail_if`"
 _FORM: Final = re.compile(r"(?:(?P<cells>.+):)?(?P<metric>[\w.]+)\s*(?P<sign>>|<\s*-)\s*(?P<limit>\d+(?:\.\d+)?)\s*%")
 
-PASSED, TRIPPED, UNDECIDED = "passed", "tripped", "undecided"
+Outcome: TypeAlias = Literal["passed", "tripped", "undecided"]
+Interval: TypeAlias = tuple[float, float] | None
+Probability: TypeAlias = Fraction | None
+Detectable: TypeAlias = Annotated[
+    NonNegative | None, about("The smallest change, as a share, that the test finds; null: unknown.")
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,26 +47,27 @@ class Gate:
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
-    """The outcome of a gate in one cell."""
+class Gated:
+    """The outcome of a gate in one cell; ``p_holm`` is that of its comparison."""
 
-    gate: Gate
-    comparison: CellComparison
-    outcome: str
-    reason: str
-    """Why it is undecided, and the way out; else empty."""
-    detectable: float | None
-    """The smallest change towards the limit that the test finds, as a share."""
+    gate: str
+    cell: str
+    change: float | None
+    ci95: Interval
+    p_holm: Probability
+    detectable: Detectable
+    outcome: Outcome
+    reason: Annotated[str, about("Why the gate is undecided, and the way out; else empty.")]
 
 
 def read_gate(text: str) -> Gate:
     """Parse a gate; raises UsageError."""
-    found = _FORM.fullmatch(text.strip())
-    if not found:
+    match = _FORM.fullmatch(text.strip())
+    if not match:
         raise UsageError(f"{_FLAG}: '{text}' should look like e2e.median>5%, tokens_per_s<-5% or ros/topic:e2e.p99>10%")
-    rises = found["sign"] == ">"
-    limit = float(found["limit"]) / 100
-    return Gate(text, found["cells"] or "", found["metric"], rises, limit if rises else -limit)
+    rises = match["sign"] == ">"
+    limit = float(match["limit"]) / 100
+    return Gate(text, match["cells"] or "", match["metric"], rises, limit if rises else -limit)
 
 
 def concerned(compared: ComparedRuns, gates: Sequence[Gate]) -> list[tuple[Metric, str]]:
@@ -70,7 +77,7 @@ def concerned(compared: ComparedRuns, gates: Sequence[Gate]) -> list[tuple[Metri
 
 def judge(
     compared: ComparedRuns, gates: Sequence[Gate], *, strict: bool = False, one_launch: bool = False
-) -> list[Judgement]:
+) -> list[Gated]:
     """Judge every gate in every cell that it selects, by the comparisons of the `concerned` metrics.
 
     A gate trips if the change is past the limit *and* its p-value, corrected for all comparisons, is below `LEVEL`. It
@@ -85,30 +92,33 @@ def judge(
     judged = []
     for gate, wanted in zip(gates, concerned(compared, gates), strict=True):
         every = [one for one in compared.comparisons if (one.metric, one.statistic) == wanted]
-        found = [one for one in every if not gate.cells or fnmatchcase(one.pair.name, gate.cells)]
-        if not found:
+        selected = [one for one in every if not gate.cells or fnmatchcase(one.pair.name, gate.cells)]
+        if not selected:
             names = ", ".join(one.pair.name for one in every)
             raise UsageError(f"{_FLAG}: no cell with {wanted[0].name} is called '{gate.cells}'; there are {names}")
-        for one in found:
+        for one in selected:
             least = detectable(one.change, len(compared.comparisons), falls=not gate.rises)
             outcome, reason = _outcome(gate, one, least, strict=strict, lacking=lacking)
-            judged.append(Judgement(gate, one, outcome, reason, least))
+            relative, bounds = one.change.relative, one.change.bounds
+            judged.append(Gated(gate.text, one.pair.name, relative, bounds, one.p_holm, least, outcome, reason))
     return judged
 
 
-def _outcome(gate: Gate, one: CellComparison, least: float | None, *, strict: bool, lacking: str) -> tuple[str, str]:
+def _outcome(
+    gate: Gate, one: CellComparison, least: float | None, *, strict: bool, lacking: str
+) -> tuple[Outcome, str]:
     """Return outcome and reason; ``least`` is the smallest detectable change, ``lacking`` what the launches lack."""
     change, p_holm = one.change, one.p_holm
     rises = change.other > change.baseline
     past = gate.beyond(change.relative, rises)
     if strict:
-        return TRIPPED if past else PASSED, ""
+        return "tripped" if past else "passed", ""
     if lacking:
-        return UNDECIDED, lacking
+        return "undecided", lacking
     significant = p_holm is not None and p_holm < LEVEL
     if past and significant:
-        return TRIPPED, ""
+        return "tripped", ""
     if (significant and rises != gate.rises) or (least is not None and least <= abs(gate.limit)):
-        return PASSED, ""
+        return "passed", ""
     hidden = "too few values for a test" if least is None else "the noise may hide a change beyond the limit"
-    return UNDECIDED, f"{hidden}: measure more launches in turn, compare less (--metric), or --strict"
+    return "undecided", f"{hidden}: measure more launches in turn, compare less (--metric), or --strict"

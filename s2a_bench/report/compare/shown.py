@@ -10,13 +10,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-from s2a_bench.bounds import Facts, Fraction, Many, NonNegative, about
+from s2a_bench.bounds import Facts, Many, NonNegative, about
 from s2a_bench.errors import StoreError
 from s2a_bench.experiments.cells import Better
 from s2a_bench.report.compare.agreement import Difference
 from s2a_bench.report.compare.comparison import LEVEL, SAME, TOO_FEW, UNCLEAR, CellComparison, ComparedRuns
+from s2a_bench.report.compare.gates import Detectable, Gated, Interval, Probability
 from s2a_bench.stats.batches import BATCHES
 from s2a_bench.stats.change import POWER
 from s2a_bench.store.manifest import RunWarning, plain
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from s2a_bench.report.compare.gates import Judgement
-
 _HEADER = ("cell", "n", "A", "B", "change [95 %]", "P(B > A)", "p", "sees", "verdict")
 _LEAST_P = 0.0005
 _LARGEST_DETECTABLE = 10
@@ -39,32 +38,28 @@ _LARGEST_DETECTABLE = 10
 
 def compare_table(compared: ComparedRuns) -> TextTable:
     """Make a table with a row a comparison, below the name of its metric."""
-    groups = [
-        [(_title(same[0]), *[""] * (len(_HEADER) - 1)), *((one.pair.name, *_row(one)) for one in same)]
-        for same in (list(group) for _, group in groupby(compared.comparisons, lambda one: one.name))
-    ]
+    groups = []
+    for _, group in groupby(compared.comparisons, lambda one: one.name):
+        same = list(group)
+        heading = (_title(same[0]), *("" for _ in _HEADER[1:]))
+        groups.append([heading, *map(_row, same)])
     table = TextTable.grouped(f"{compared.command}: B against A", _HEADER, groups, 1, notes(compared))
     return replace(table, provenance=compared.origins.line)
 
 
 def notes(compared: ComparedRuns) -> tuple[str, ...]:
-    """Return the names of A and B, and the rules of the verdicts."""
+    """Return the names of A and B, the notes about emulated or dummy origins, and the rules of the verdicts."""
+    a, b = (", ".join(run.path.resolve().name for run in side) for side in (compared.baseline, compared.other))
+    origin = dict.fromkeys(note for run in (*compared.baseline, *compared.other) for note in compared.by.origin(run))
     of_one = ", that of one launch a side" if compared.launches_below(2) else ""
     unit = "launches" if compared.launches > 1 else f"{BATCHES} batches in time of each launch"
     return (
-        title(compared),
+        " ".join((f"A: {a}. B: {b}.", *origin)),
         f"Welch's t on logarithms over {unit}; p corrected for {len(compared.comparisons)} comparisons (Holm).",
         f"better, worse: p < {LEVEL:g} and a change of at least {compared.least * 100:g} %.",
         "same: the interval is within that; unclear: neither; too few: no interval.",
         f"sees: the smallest change found in {POWER * 100:g} of 100 repeats at this noise{of_one}.",
     )
-
-
-def title(compared: ComparedRuns) -> str:
-    """Return the names of A and B, and notes about emulated or dummy origins."""
-    sides = (", ".join(run.path.resolve().name for run in side) for side in (compared.baseline, compared.other))
-    origin = dict.fromkeys(note for run in (*compared.baseline, *compared.other) for note in compared.by.origin(run))
-    return " ".join(("A: {}. B: {}.".format(*sides), *origin))
 
 
 def compare_csv(compared: ComparedRuns) -> str:
@@ -84,8 +79,7 @@ def percent(share: float) -> str:
     return text.replace("-0.0", "0.0").replace("+0.0", "0.0")
 
 
-def change_text(one: CellComparison) -> str:
-    relative, bounds = one.change.relative, one.change.bounds
+def change_text(relative: float | None, bounds: Interval) -> str:
     if relative is None:
         return "from 0"
     interval = "" if bounds is None else f" [{percent(bounds[0])}, {percent(bounds[1])}]"
@@ -106,22 +100,23 @@ def _row(one: CellComparison) -> tuple[str, ...]:
     n = str(one.n[0]) if one.n[0] == one.n[1] else f"{one.n[0]}/{one.n[1]}"
     change = one.change
     superiority = ABSENT if change.superiority.value is None else f"{change.superiority.value:.2f}"
-    values = number(change.baseline), number(change.other)
-    return n, *values, change_text(one), superiority, _p(one.p_holm), detectable_text(one.detectable), one.verdict
+    return (
+        one.pair.name,
+        n,
+        number(change.baseline),
+        number(change.other),
+        change_text(change.relative, change.bounds),
+        superiority,
+        _p(one.p_holm),
+        detectable_text(one.detectable),
+        one.verdict,
+    )
 
 
 def _p(value: float | None) -> str:
     if value is None:
         return ABSENT
     return f"{value:.3f}" if value >= _LEAST_P or value == 0 else f"{value:.0e}"
-
-
-Interval: TypeAlias = tuple[float, float] | None
-Probability: TypeAlias = Fraction | None
-Detectable: TypeAlias = Annotated[
-    NonNegative | None, about("The smallest change, as a share, that the test finds; null: unknown.")
-]
-Folders: TypeAlias = Annotated[list[str], Facts(minItems=1)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,27 +193,6 @@ class Row:
 
 
 @dataclass(frozen=True, slots=True)
-class Gated:
-    """The outcome of a gate in one cell; ``p_holm`` is that of its comparison."""
-
-    gate: str
-    cell: str
-    change: float | None
-    ci95: Interval
-    p_holm: Probability
-    detectable: Detectable
-    outcome: Literal["passed", "tripped", "undecided"]
-    reason: Annotated[str, about("Why the gate is undecided, and the way out; else empty.")]
-
-    @classmethod
-    def of(cls, one: Judgement) -> Gated:
-        comparison, change = one.comparison, one.comparison.change
-        outcome: Any = one.outcome
-        values = change.relative, change.bounds, comparison.p_holm, one.detectable
-        return cls(one.gate.text, comparison.pair.name, *values, outcome, one.reason)
-
-
-@dataclass(frozen=True, slots=True)
 class CompareJson:
     """The object of `compare --json`, explained in docs/compare.md. A is the baseline, B the other.
 
@@ -229,8 +203,8 @@ class CompareJson:
     schema: Literal["s2a-bench-compare/1"]
     command: Literal["compare"]
     compared: Annotated[str, about("The command whose runs these are.")]
-    baseline: Annotated[Folders, about("Run folders of A; several are repeated launches.")]
-    other: Annotated[Folders, about("Run folders of B.")]
+    baseline: Annotated[list[str], Facts(minItems=1), about("Run folders of A; several are repeated launches.")]
+    other: Annotated[list[str], Facts(minItems=1), about("Run folders of B.")]
     test: Test
     comparisons: list[Row]
     only_in_baseline: list[str]
@@ -240,9 +214,7 @@ class CompareJson:
     warnings: list[RunWarning]
 
 
-def compare_json(
-    compared: ComparedRuns, judgements: Sequence[Judgement], warnings: Sequence[RunWarning]
-) -> dict[str, Any]:
+def compare_json(compared: ComparedRuns, gated: Sequence[Gated], warnings: Sequence[RunWarning]) -> dict[str, Any]:
     unit: Literal["batch", "launch"] = "launch" if compared.launches > 1 else "batch"
     batches = None if compared.launches > 1 else BATCHES
     whole: dict[str, Any] = plain(
@@ -256,7 +228,7 @@ def compare_json(
             comparisons=[Row.of(one) for one in compared.comparisons],
             only_in_baseline=list(compared.only[0]),
             only_in_other=list(compared.only[1]),
-            gates=[Gated.of(one) for one in judgements],
+            gates=list(gated),
             differences=list(compared.differences),
             warnings=list(warnings),
         )

@@ -19,7 +19,7 @@ from s2a_bench.experiments import Shown, Tables, experiment_of
 from s2a_bench.experiments.latency.view import against_bytes
 from s2a_bench.experiments.requests import RequestCell, RequestCells, cells_of, metric_phrase, stand_ins
 from s2a_bench.experiments.timeline.rows import TIMELINES
-from s2a_bench.provenance import Origins
+from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.report.compare.agreement import SETTING, Difference, differences, differing_names, is_other_machine
 from s2a_bench.stats import Floats
 from s2a_bench.store.requests import SKILLS, TOKENS
@@ -61,18 +61,18 @@ class Chapter:
 
 def read_chapters(paths: Sequence[Path], *, against: str = "") -> list[Chapter]:
     """Read run folders and sweeps, each once, in order, beside a reference; raises StoreError for a damaged one."""
-    found: list[Chapter] = []
+    chapters: list[Chapter] = []
     for path in dict.fromkeys(path.resolve() for path in paths):
         run = read_run(path)
         if is_sweep(run.manifest):
-            found += _sweep(read_sweep(path), against)
+            chapters += _sweep(read_sweep(path), against)
         else:
-            found.append(_chapter(run, title_of(run.manifest), against))
-    names = [chapter.name for chapter in found]
+            chapters.append(_chapter(run, title_of(run.manifest), against))
+    names = [chapter.name for chapter in chapters]
     numbers = [names[:place].count(name) + 1 for place, name in enumerate(names)]
     return [
         replace(chapter, name=f"{chapter.name}-{number}") if number > 1 else chapter
-        for chapter, number in zip(found, numbers, strict=True)
+        for chapter, number in zip(chapters, numbers, strict=True)
     ]
 
 
@@ -85,7 +85,6 @@ def when(manifest: Mapping[str, Any]) -> str:
 
 
 def repeat_command(manifest: Mapping[str, Any]) -> str:
-    """Return the command line of a run, quoted for a shell."""
     return shlex.join(["s2a-bench", *map(str, manifest.get("argv", [])[1:])])
 
 
@@ -96,10 +95,10 @@ def differences_of(chapters: Sequence[Chapter]) -> list[str]:
     of_command: dict[str, StoredRun] = {}
     for chapter in chapters:
         same = of_command.setdefault(str(chapter.manifest["command"]), chapter.run)
-        found = differences(chapters[0].run, chapter.run)
-        others += [each for each in found if not each.what.startswith(SETTING)]
+        every = differences(chapters[0].run, chapter.run)
+        others += [each for each in every if not each.what.startswith(SETTING)]
         others += [each for each in differences(same, chapter.run) if each.what.startswith(SETTING)]
-        if what := "; ".join(str(each) for each in found if is_other_machine(each)):
+        if what := "; ".join(str(each) for each in every if is_other_machine(each)):
             lines.append(
                 f"{chapter.title} ran on another machine than {chapters[0].title} ({what}): "
                 "their numbers are side by side, and none combines both."
@@ -252,10 +251,12 @@ def _joined(sweep: Sweep, runs: Sequence[StoredRun]) -> StoredRun:
     for name in ("boards", "warnings"):
         every = [each for run in runs for each in run.manifest.get(name, [])]
         manifest[name] = list({json.dumps(each, sort_keys=True): each for each in every}.values())
-    manifest["calibrations"] = {
-        name: found for run in runs for name, found in (run.manifest.get("calibrations") or {}).items()
-    }
-    cells = {name: origin for run in runs for name, origin in run.origins.cells.items()}
+    calibrations: dict[str, Any] = {}
+    cells: dict[str, Provenance] = {}
+    for run in runs:
+        calibrations |= run.manifest.get("calibrations") or {}
+        cells |= run.origins.cells
+    manifest["calibrations"] = calibrations
     manifest["provenance"] = Origins(runs[0].origins.run, cells).to_manifest()
     return StoredRun(sweep.path, manifest, tables)
 

@@ -48,7 +48,7 @@ def draw(name: str, content: Shown, *, pdf: bool) -> dict[str, DrawnFigure]:
     """Build each figure once; ``name`` makes its ids differ from those of other figures."""
     import matplotlib as mpl
 
-    found = {}
+    drawn = {}
     for place, (figure_name, build) in enumerate(content.figures.items()):
         prefix = f"{re.sub(r'[^A-Za-z0-9]', '-', name)}-{place}-"
         style: Any = {"svg.fonttype": "path", "svg.hashsalt": prefix}
@@ -56,14 +56,14 @@ def draw(name: str, content: Shown, *, pdf: bool) -> dict[str, DrawnFigure]:
             figure = build()
             title, *notes = caption_of(figure)
             svg = _saved(figure, "svg", "Creator", "Date", "Format", "Type").decode()
-            found[figure_name] = DrawnFigure(
+            drawn[figure_name] = DrawnFigure(
                 inline(svg[svg.index("<svg") :], prefix),
                 title,
                 notes,
                 figure.get_figwidth() > WIDTH_IN,
                 _saved(figure, "pdf", "CreationDate") if pdf else None,
             )
-    return found
+    return drawn
 
 
 def _saved(figure: Figure, suffix: str, *without: str) -> bytes:
@@ -77,7 +77,7 @@ def inline(svg: str, prefix: str) -> str:
     svg = re.sub(r"<!--.*?-->\s*|<(metadata|style)\b.*?</\1>\s*", "", svg, flags=re.DOTALL)
     svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg)
     svg = svg.replace("xlink:href=", "href=")
-    return re.sub(r'(\bid="|href="#|url\(#)', lambda found: found[1] + prefix, svg)
+    return re.sub(r'(\bid="|href="#|url\(#)', lambda match: match[1] + prefix, svg)
 
 
 _MARK = f"<!-- {GENERATOR} -->"

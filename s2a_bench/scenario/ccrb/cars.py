@@ -28,6 +28,12 @@ CAR_WIDTH_M: Final = 2.0
 OUTCOMES: Final = ("none", "front", "rear", "both")
 """By code: bit 0 is a front impact, bit 1 a rear impact."""
 TTC: Final = "s2a-ttc"
+FOLLOWERS: Final[dict[str, str]] = {
+    "careful": "s2a_bench.scenario.ccrb.follower:Careful",
+    "hdm": "s2a_bench.scenario.ccrb.follower:Hdm",
+    "idm": "s2a_bench.scenario.ccrb.follower:Idm",
+    "hybrid": "s2a_bench.scenario.ccrb.follower:Hybrid",
+}
 
 
 @dataclass(frozen=True, slots=True)

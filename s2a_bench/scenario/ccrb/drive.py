@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from s2a_bench.errors import UsageError
 from s2a_bench.policy import Floats, Schedule
 from s2a_bench.scenario import EGO, LEAD, REAR, DriveCommand, Simulator, State
-from s2a_bench.scenario.ccrb import FOLLOWERS
-from s2a_bench.scenario.ccrb.cars import LEAD_JERK_MPS3, LEAST_IMPACT_MPS, Cars, DrivingPlan
+from s2a_bench.scenario.ccrb.cars import FOLLOWERS, LEAD_JERK_MPS3, LEAST_IMPACT_MPS, Cars, DrivingPlan
 from s2a_bench.scenario.ccrb.ego import DONE, Ego
 from s2a_bench.scenario.ccrb.follower import CarMotion, DriverView, Follower
 from s2a_bench.scenario.ccrb.outcome import CollisionWatch, Outcomes

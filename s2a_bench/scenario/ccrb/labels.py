@@ -7,7 +7,7 @@ from pkgutil import resolve_name
 from typing import Any, Final
 
 from s2a_bench.policy import COMPARED
-from s2a_bench.scenario.ccrb import FOLLOWERS
+from s2a_bench.scenario.ccrb.cars import FOLLOWERS
 
 NAIVE, WAIT, STREAM_TO_ACT = COMPARED
 PAPER: Final = {NAIVE: "rear", WAIT: "front", STREAM_TO_ACT: "none"}

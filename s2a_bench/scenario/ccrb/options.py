@@ -10,9 +10,9 @@ from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, one_of, option
 from s2a_bench.plan import Call, Skill, load_skills
 from s2a_bench.plan.skillset import GAPS, Gap
-from s2a_bench.scenario.ccrb import FOLLOWERS
 from s2a_bench.scenario.ccrb.cars import (
     EGO_LEAST_MPS2,
+    FOLLOWERS,
     KMH,
     Cars,
     DrivingPlan,

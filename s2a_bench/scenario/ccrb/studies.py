@@ -16,9 +16,6 @@ from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.outcome import Outcomes
 from s2a_bench.scenario.longitudinal import Longitudinal
 
-RESTING_MPS: Final = LEAST_IMPACT_MPS
-"""Below it the trailing car counts as stopped: there is no impact any more, but the gap still shrinks."""
-
 RANGES: Final[dict[str, tuple[float, float]]] = {
     "tokens_per_s": (1.0, 20.0),
     "prompt_s": (0.1, 1.0),
@@ -105,8 +102,11 @@ def survived(scenes: Scenes, cars: Cars) -> NDArray[np.bool_]:
 
 
 def drive_along(scenes: Scenes, cars: Cars, schedule: Schedule) -> Outcomes:
-    """Drive the scenarios with the bare integrator; the least rear gap is NaN without an impact."""
-    outcomes = drive(Longitudinal(), cars, _plan(scenes, cars), schedule, resting_mps=RESTING_MPS).outcomes
+    """Drive the scenarios with the bare integrator; the least rear gap is NaN without an impact.
+
+    The trailing car counts as stopped when it is too slow for an impact, although the gap still shrinks.
+    """
+    outcomes = drive(Longitudinal(), cars, _plan(scenes, cars), schedule, resting_mps=LEAST_IMPACT_MPS).outcomes
     outcomes.min_rear_gap_m[np.isnan(outcomes.rear_impact_mps)] = np.nan
     return outcomes
 

@@ -15,7 +15,6 @@ from s2a_bench.plugins.policy_servers.observation import DEFAULT, EXTENSION, Tem
 from s2a_bench.plugins.policy_servers.observed import (
     extension_of,
     read_observation,
-    remote_message,
     remote_of,
     request_of,
     take_extension,
@@ -286,7 +285,7 @@ def test_a_request_s_own_fields_come_back_and_leave_the_observation() -> None:
 
 
 def test_marks_come_back() -> None:
-    assert remote_of(remote_message(Remote("c", [("queue", 1)], [2]))) == Remote("c", [("queue", 1)], [2])
+    assert remote_of({EXTENSION: Remote("c", [("queue", 1)], [2]).to_json()}) == Remote("c", [("queue", 1)], [2])
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import EngineError, RequestFailed
-from s2a_bench.plugins.policy_servers.zmq.layouts import actions_in, answer_of
+from s2a_bench.plugins.policy_servers.observed import ActionsExchange
+from s2a_bench.plugins.policy_servers.zmq.layouts import actions_in
 from s2a_bench.plugins.policy_servers.zmq.wire import PictureFile, array_of, file_of, pack, read
 from s2a_bench.types import Token
 
@@ -231,6 +232,6 @@ def test_parts_of_actions_stand_side_by_side(answer: Any, expected: Any) -> None
 
 def test_neither_tokens_nor_nothing_are_an_answer() -> None:
     with pytest.raises(EngineError, match="choose `answer` actions"):
-        answer_of({}, "n1.6", [Token(0, "go")])
+        ActionsExchange().send(Token(0, "go"))
     with pytest.raises(EngineError, match="no action at all"):
-        answer_of({}, "n1.6", [])
+        ActionsExchange().chunk()

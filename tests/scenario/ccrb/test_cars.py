@@ -13,8 +13,7 @@ from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.scenario import SIMULATORS
-from s2a_bench.scenario.ccrb import FOLLOWERS
-from s2a_bench.scenario.ccrb.cars import SAFETY_M, Cars, braking_plan, start_deadline, ttc_aware
+from s2a_bench.scenario.ccrb.cars import FOLLOWERS, SAFETY_M, Cars, braking_plan, start_deadline, ttc_aware
 from s2a_bench.scenario.ccrb.drive import drive
 from s2a_bench.scenario.ccrb.follower import IDM_COMFORT_MPS2, IDM_HASTE, IDM_STANDSTILL_M, idm_acceleration, needed
 from s2a_bench.scenario.ccrb.options import CcrbOptions

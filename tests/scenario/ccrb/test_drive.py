@@ -15,8 +15,7 @@ from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.nominal import Clairvoyant, Naive, WaitThenAct
 from s2a_bench.scenario import EGO, LEAD, REAR, SIMULATORS
-from s2a_bench.scenario.ccrb import FOLLOWERS
-from s2a_bench.scenario.ccrb.cars import Cars, braking_plan
+from s2a_bench.scenario.ccrb.cars import FOLLOWERS, Cars, braking_plan
 from s2a_bench.scenario.ccrb.drive import Driven, drive
 from s2a_bench.scenario.ccrb.ego import ACTING, GAP, WAITING
 

@@ -117,8 +117,8 @@ def scenes_of(rows: pd.DataFrame) -> pd.DataFrame:
         scenes["paper"] &= scenes[name] == outcome
     for short, name, column in (
         ("wait", WAIT, "impact_speed_mps"),
-        ("naive", NAIVE, "impact_speed_mps"),
-        ("naive_rear", NAIVE, "rear_impact_mps"),
+        (NAIVE, NAIVE, "impact_speed_mps"),
+        (f"{NAIVE}_rear", NAIVE, "rear_impact_mps"),
     ):
         theirs, ours = (each[column].astype("float64").fillna(0.0) for each in (policies[name], mine))
         scenes[f"{short}_worse"] = theirs - ours > LEAST_IMPACT_MPS

@@ -43,14 +43,14 @@ class Limit:
 
     @staticmethod
     def read(written: str) -> Limit:
-        """Read ``METRIC=VALUE``; raises ValueError."""
+        """Read ``METRIC=VALUE``; raises UsageError."""
         match = _LIMIT.fullmatch(written)
         if match is None:
-            raise ValueError(f"'{written}' should be one of {LIMITS}")
+            raise UsageError(f"`limit`: '{written}' should be one of {LIMITS}")
         if match[1]:
             share = float(match[2]) / (100 if written.endswith("%") else 1)
             if share >= 1:
-                raise ValueError(f"'{written}' allows every tick to stall; write 1% or 0.01")
+                raise UsageError(f"`limit`: '{written}' allows every tick to stall; write 1% or 0.01")
             return Limit("stalled", share, share)
         value_ns = float(match[5]) * (1e9 if match[6] == "s" else 1e6)
         return Limit(f"{match[3]}_ns", value_ns, 1 - int(match[4]) / 100)
@@ -90,7 +90,6 @@ class RobotLoad:
         return self.mode is not None and self.mode.blocks and limit is not None and limit.column == "stalled"
 
     def limit_text(self, limit: Limit) -> str:
-        """Return a limit in words."""
         if limit.column != "stalled":
             return f"{limit.column.removesuffix('_ns').replace('_', ' ')} of at most {limit.value / 1e6:g} ms"
         beyond = " beyond those of one robot alone" if self.beyond_alone(limit) else ""
@@ -180,12 +179,8 @@ class CapacityOptions(ControlOptions):
     @cached_property
     def search(self) -> SearchPlan:
         """The search; by default without a limit for clients without a clock."""
-        limit = None
-        if self.limit and ("limit" in self.model_fields_set or not self.closed_loop):
-            try:
-                limit = Limit.read(self.limit)
-            except ValueError as error:
-                raise UsageError(f"`limit`: {error}") from error
+        wanted = self.limit if "limit" in self.model_fields_set or not self.closed_loop else ""
+        limit = Limit.read(wanted) if wanted else None
         bisects = ".." in self.robots and limit is not None
         return SearchPlan(self.numbers, bisects, limit, round(self.seconds * 1e9), self.looks)
 
@@ -202,12 +197,11 @@ class CapacityOptions(ControlOptions):
 
     @property
     def settle_ns(self) -> int:
-        settle_s = self.settle_s if self.settle_s is not None else 0.0 if self.episodes_s else SETTLE_S
-        return round(settle_s * 1e9)
+        by_default_s = 0.0 if self.episodes_s else SETTLE_S
+        return round((by_default_s if self.settle_s is None else self.settle_s) * 1e9)
 
     @property
     def answer(self) -> str:
-        """What the server answers with."""
         return ACTIONS if self.plan_every_s is None else TOKENS
 
     @cached_property
@@ -222,7 +216,6 @@ class CapacityOptions(ControlOptions):
         return round((self.plan_every_s or PLAN_EVERY_S) * 1e9)
 
     def check(self) -> None:
-        """Refuse what makes no sense together; raises UsageError naming the fields."""
         super().check()
         if self.numbers[-1] > self.MOST_ROBOTS:
             raise UsageError(f"`robots`: {self.numbers[-1]} are more than {self.MOST_ROBOTS}")

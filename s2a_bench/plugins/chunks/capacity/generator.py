@@ -348,12 +348,12 @@ class FleetProcess(RemoteFleet):
     def _call(self, name: str, *given: Any) -> Any:
         try:
             self._pipe.send((name, given))
-            found = self._pipe.recv()
+            reply = self._pipe.recv()
         except (EOFError, OSError) as error:
             raise ServerDied(f"a process of robots (pid {self._process.pid}) died; take fewer robots") from error
-        if isinstance(found, BaseException):
-            raise found
-        return found
+        if isinstance(reply, BaseException):
+            raise reply
+        return reply
 
 
 def _serve(plan: FleetPlan, pipe: Connection) -> None:
@@ -365,10 +365,10 @@ def _serve(plan: FleetPlan, pipe: Connection) -> None:
         while name != "close":
             name, given = pipe.recv()
             try:
-                found = getattr(fleet, name)(*given)
+                reply = getattr(fleet, name)(*given)
             except Exception as error:  # noqa: BLE001 - raised again by the caller
-                found = error
-            pipe.send(found)
+                reply = error
+            pipe.send(reply)
 
 
 class FleetOnRay(RemoteFleet):
@@ -380,10 +380,10 @@ class FleetOnRay(RemoteFleet):
 
     def machine(self) -> dict[str, Any]:
         """Return what the process runs on; raises UsageError if no core of the cluster comes free."""
-        found = self._fleet.machine.remote()
-        if not self._ray.wait([found], timeout=FREE_CORE_S)[0]:
+        reply = self._fleet.machine.remote()
+        if not self._ray.wait([reply], timeout=FREE_CORE_S)[0]:
             raise UsageError(f"`processes`: no core of the cluster came free within {FREE_CORE_S:g} s; take fewer")
-        facts: dict[str, Any] = self._result(found)
+        facts: dict[str, Any] = self._result(reply)
         return facts
 
     def close(self) -> None:

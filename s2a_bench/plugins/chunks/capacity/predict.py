@@ -107,8 +107,8 @@ def read_batches(path: Path) -> Sequence[float]:
     sizes = [int(each) for each in written if re.fullmatch("[1-9][0-9]{0,3}", each)]
     if len(sizes) < len(written) or sizes[0] != 1 or sorted({*sizes}) != sizes or not latency_ns.all():
         raise UsageError(f"`batch`: {path} needs a column batch, 1 and larger sizes up to 9999, and times above 0")
-    found: list[float] = (np.interp(np.arange(1, sizes[-1] + 1), sizes, latency_ns) / latency_ns[0]).tolist()
-    return found
+    slower: list[float] = (np.interp(np.arange(1, sizes[-1] + 1), sizes, latency_ns) / latency_ns[0]).tolist()
+    return slower
 
 
 def run_predicted(config: CapacityPredicted, output: Path, progress: Progress) -> Path:

@@ -74,9 +74,9 @@ def knee(tried: Iterable[Tried]) -> Knee | None:
     def largest(fit: Callable[[Tried], bool], before: int | None) -> int:
         return max((each.robots for each in clean if fit(each) and (before is None or each.robots < before)), default=0)
 
-    found = largest(lambda each: each.within, broken)
+    robots = largest(lambda each: each.within, broken)
     low = largest(lambda each: each.verdict == "below", above)
-    return Knee(found, min(low, found), None if above is None else max(above - 1, found))
+    return Knee(robots, min(low, robots), None if above is None else max(above - 1, robots))
 
 
 @dataclass(slots=True)
@@ -117,8 +117,10 @@ class Judge:
                 return "undecided", False
             low, high = share_interval(above, at_ns, robots, cycle_ns(traces), self.confidence)
             share = float(above.mean())
-        verdict: Verdict = "below" if high <= limit.share else "above" if low > limit.share else "undecided"
-        return verdict, share <= limit.share
+        within = share <= limit.share
+        if high <= limit.share:
+            return "below", within
+        return "above" if low > limit.share else "undecided", within
 
 
 def above_limit(limit: Limit, traces: Sequence[RobotTrace], settle_ns: int) -> tuple[Ints, Ints, Any]:
@@ -126,7 +128,7 @@ def above_limit(limit: Limit, traces: Sequence[RobotTrace], settle_ns: int) -> t
 
     A request without an answer counts once it waits for longer than the limit.
     """
-    found = []
+    parts = []
     for trace in traces:
         if limit.column.startswith("age"):
             if trace.ticks is None:
@@ -144,8 +146,9 @@ def above_limit(limit: Limit, traces: Sequence[RobotTrace], settle_ns: int) -> t
             known = (taken_ns >= 0) | exceeds
         kept = known & (since_ns >= settle_ns)
         robots = np.full(int(kept.sum()), trace.robot)
-        found.append((trace.start_ns + since_ns[kept], robots, exceeds[kept]))
-    if not found:
-        return (np.empty(0, np.int64),) * 2 + (np.empty(0, bool),)
-    at_ns, of, above = (np.concatenate(each) for each in zip(*found, strict=True))
+        parts.append((trace.start_ns + since_ns[kept], robots, exceeds[kept]))
+    if not parts:
+        none = np.empty(0, np.int64)
+        return none, none, np.empty(0, bool)
+    at_ns, of, above = (np.concatenate(each) for each in zip(*parts, strict=True))
     return at_ns, of, above

@@ -58,7 +58,8 @@ def simulate(
     """Return the traces of ``robots`` robots that act for ``span_ns``, in each episode; `serve` is the server."""
     if not load.episode_ns:
         starts = rng.integers(0, load.cycle_ns + 1, robots).tolist()
-        return serve([robot_of(load, *each, span_ns) for each in enumerate(starts)], times, servers, slower)
+        fleet = [robot_of(load, robot, start_ns, span_ns) for robot, start_ns in enumerate(starts)]
+        return serve(fleet, times, servers, slower)
     traces = []
     for start_ns in range(0, span_ns, load.episode_ns):
         episode_ns = min(load.episode_ns, span_ns - start_ns)
@@ -117,7 +118,7 @@ def _acting(robot: int, mode: Mode, setting: ControlSetting, start_ns: int, most
         while True:
             leave_ns = start_ns + tick * setting.period_ns
             answer = yield leave_ns
-            times.append((leave_ns, *answer))
+            times.append((leave_ns, answer.first_ns, answer.whole_ns))
             latency_ns = answer.whole_ns - leave_ns
             tick = steps.send(latency_ns if pace is not None else np.maximum(0, latency_ns - before_ns))
     except StopIteration as end:
@@ -131,11 +132,10 @@ def _paced(pace: Pace, mode: Mode, setting: ControlSetting, most: int) -> Genera
     while tick < most:
         latency_ns = yield tick
         latencies.append(min(latency_ns, (most + 1 - tick) * setting.period_ns))  # no matter how long after the end
-        known = -(-latency_ns // setting.period_ns)
-        tick, _ = pace.send((latency_ns // setting.period_ns if setting.rounding == "floor" else known, known))
+        tick, _ = pace.send((setting.delay(latency_ns), -(-latency_ns // setting.period_ns)))
     done = mode.ticks(np.array(latencies, np.int64), setting)
-    chunk, index, age = (each[:most].copy() for each in (done.chunk, done.index, done.age))
-    return (Ticks(chunk, index, age, done.stalled[:most].copy()),)
+    kept = slice(most)
+    return (Ticks(done.chunk[kept].copy(), done.index[kept].copy(), done.age[kept].copy(), done.stalled[kept].copy()),)
 
 
 def _requesting(robot: int, every_ns: int, think_ns: int, start_ns: int, end_ns: int) -> Robot:
@@ -148,7 +148,7 @@ def _requesting(robot: int, every_ns: int, think_ns: int, start_ns: int, end_ns:
     while due_ns < end_ns:
         answer = yield max(due_ns, done_ns)
         done_ns = answer.whole_ns
-        times.append((due_ns, *answer))
+        times.append((due_ns, answer.first_ns, answer.whole_ns))
         due_ns = due_ns + every_ns if every_ns else done_ns + think_ns
     if not every_ns:
         return _trace(robot, start_ns, end_ns, times)

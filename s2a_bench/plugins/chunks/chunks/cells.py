@@ -15,13 +15,13 @@ from s2a_bench.plugins.chunks.modes.trigger import (
     Learning,
     Maximum,
     Mean,
-    TrackedLatency,
     TriggerRule,
     calibrate,
     follow,
     greatest_trigger,
     trigger,
 )
+from s2a_bench.policy.conformal import Tracker
 from s2a_bench.policy.parameters import canonical
 from s2a_bench.stats.batches import Rows
 from s2a_bench.stats.seeds import generator
@@ -127,7 +127,7 @@ def without_trigger(mode: Mode) -> str:
 
 def _learner(rule: str, drawn: LatencyDraw, epsilon: float) -> TriggerRule:
     if rule == "tracked":
-        return TrackedLatency.begin(drawn.learnt.tolist(), epsilon)
+        return Tracker(drawn.learnt.tolist(), epsilon)
     learner: TriggerRule = Maximum() if rule == "maximum" else Mean()
     for latency_ns in drawn.learnt.tolist():
         learner.learn(latency_ns, stalled=False)

@@ -150,15 +150,13 @@ class ChunksVirtual(ChunksOptions):
     def too_few(self) -> str:
         """The source with too few latencies for a rule that keeps to `epsilon`, as text; else empty."""
         needed = fewest(self.epsilon)
-        return next(
-            (
-                f"{each.name} has {count} latencies to learn from (of a recording the first half); "
-                f"a stall in {self.epsilon:.2%} of the cycles takes {needed}"
-                for each in self.sources
-                if (count := each.learnable(self.calibration_cycles)) < needed
-            ),
-            "",
-        )
+        for source in self.sources:
+            if (count := source.learnable(self.calibration_cycles)) < needed:
+                return (
+                    f"{source.name} has {count} latencies to learn from (of a recording the first half); "
+                    f"a stall in {self.epsilon:.2%} of the cycles takes {needed}"
+                )
+        return ""
 
     @property
     def learnt(self) -> int:
@@ -166,7 +164,6 @@ class ChunksVirtual(ChunksOptions):
         return self.calibration_cycles if self.rules_plan.mode is not None and self.rules_plan.tried else 0
 
     def check(self) -> None:
-        """Refuse what makes no sense together; raises UsageError naming the fields."""
         super().check()
         if not self.latency:
             raise UsageError("`latency`: name at least one")
@@ -194,7 +191,6 @@ class ChunksLive(ChunksOptions, ServedOptions):
     seconds: float = option(20.0, "how long each mode acts", gt=0, le=86_400)
 
     def check(self) -> None:
-        """Refuse what makes no sense together; raises UsageError naming the fields."""
         super().check()
         if self.seconds * 1e9 < 2 * self.setting.period_ns:
             raise UsageError(

@@ -83,9 +83,9 @@ class TrackingPlant:
         first = int((chunk >= 0).argmax())
         actions = executed(mode, cycles, ticks, target)[first:, np.newaxis]
         wanted = target.position[first : chunk.size, np.newaxis]
-        found = smoothness(self.plant.respond(actions, period_s), actions, chunk[first:], wanted)
+        metrics = smoothness(self.plant.respond(actions, period_s), actions, chunk[first:], wanted)
         ideal = smoothness(self.plant.respond(wanted, period_s), wanted, chunk[first:], wanted)
-        return {**found, **{f"{name}_ideal": ideal[name] for name in ("tracking_rms", "jerk_rms")}}
+        return metrics | {f"{name}_ideal": ideal[name] for name in ("tracking_rms", "jerk_rms")}
 
 
 def follower(plant: ActionKind, control: ControlPlan) -> TrackingPlant:
@@ -97,12 +97,12 @@ def follower(plant: ActionKind, control: ControlPlan) -> TrackingPlant:
 def executed(mode: Mode, cycles: Cycles, ticks: Ticks, target: TargetPath) -> Floats:
     """Return the action of each tick of the target; NaN without an action."""
     length = min(ticks.chunk.size, target.position.size)
-    found = np.full(length, np.nan)
+    actions = np.full(length, np.nan)
     for tick, chunk, index, share in mode.blend(cycles, ticks):
         early = tick < length
         at, request_tick = tick[early], cycles.request_tick[chunk[early]]
-        found[at] = np.nan_to_num(found[at]) + share[early] * target.forecast(request_tick, index[early])
-    return found
+        actions[at] = np.nan_to_num(actions[at]) + share[early] * target.forecast(request_tick, index[early])
+    return actions
 
 
 def smoothness(motion: Motion, actions: Floats, chunk: Ints, reference: Floats | None = None) -> dict[str, float]:
@@ -117,13 +117,13 @@ def smoothness(motion: Motion, actions: Floats, chunk: Ints, reference: Floats |
     step = np.linalg.norm(np.diff(actions[acted], axis=0), axis=1)
     other = np.diff(chunk[acted]) != 0
     jump = step[other]
-    found = {
+    metrics = {
         "jerk_rms": _rms(motion.jerk),
         "boundary_jump_mean": mean(jump),
         "boundary_jump_p99": p99(jump),
         "action_step_mean": mean(step[~other]),
     }
-    return found if reference is None else {"tracking_rms": _rms(motion.position[:, 0] - reference), **found}
+    return metrics if reference is None else {"tracking_rms": _rms(motion.position[:, 0] - reference), **metrics}
 
 
 def _rms(values: Floats) -> float:

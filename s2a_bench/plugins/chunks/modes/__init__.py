@@ -67,6 +67,10 @@ class ControlSetting:
             raise ValueError(f"a latency of {latency_ns.min()} ns")
         return latency_ns // self.period_ns if self.rounding == "floor" else self.known_ticks(latency_ns)
 
+    def delay(self, latency_ns: int) -> int:
+        """Return d for one latency."""
+        return latency_ns // self.period_ns if self.rounding == "floor" else -(-latency_ns // self.period_ns)
+
     def known_ticks(self, latency_ns: Ints) -> Ints:
         return -(-latency_ns // self.period_ns)
 
@@ -294,10 +298,10 @@ def mode(written: str) -> Mode:
 
 def modes(written: Iterable[str], setting: ControlSetting) -> dict[str, Mode]:
     """Build each mode once, by its canonical name; raises UsageError, also for one that needs longer chunks."""
-    found = {canonical(each.name, each): each for each in map(mode, written)}
-    for name, each in found.items():
+    by_name = {canonical(each.name, each): each for each in map(mode, written)}
+    for name, each in by_name.items():
         try:
             each.execution_horizon(setting)
         except ValueError as error:
             raise UsageError(f"`modes`: {name}: a chunk has {setting.horizon} actions (`horizon`)") from error
-    return found
+    return by_name

@@ -8,10 +8,8 @@ time, on a robot whose ticks are shifted by a stall, d Delta t is L.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from s2a_bench.plugins.chunks.modes import ControlSetting, Ints, Mode
 from s2a_bench.policy import Floats
@@ -30,9 +28,15 @@ class Closed:
 
     @property
     def mean_reaction_ticks(self) -> float | None:
+        """Return the mean reaction time with random waits and cycles: E[w] + E[c^2] / (2 E[c]).
+
+        An event falls into a long cycle more often than into a short one, so under sync a random latency costs
+        Var(L) / (2 E[c]) more than its mean. The wait is that of the request after the cycle, assumed independent.
+        """
         if self.wait_ticks is None or self.cycle_ticks is None:
             return None
-        return mean_reaction_s(self.wait_ticks, self.cycle_ticks)
+        cycle = self.cycle_ticks.astype(np.float64)
+        return float(self.wait_ticks.mean() + np.square(cycle).mean() / (2 * cycle.mean()))
 
     def reaction_ticks(self, shares: Floats) -> Floats | None:
         """Return the quantiles of the time from an event at a uniform moment to the reaction, for shares of any shape.
@@ -52,8 +56,8 @@ class Closed:
         waits = np.bincount(self.wait_ticks - least) / self.wait_ticks.size
         together = np.maximum(convolve(waits, within), 0)  # by FFT for many ticks
         reached = np.concatenate(([0.0], np.cumsum(together)))
-        found: Floats = np.interp(shares, reached, least + np.arange(reached.size))
-        return found
+        quantiles: Floats = np.interp(shares, reached, least + np.arange(reached.size))
+        return quantiles
 
 
 def closed(mode: Mode, latency_ns: Ints, setting: ControlSetting) -> Closed:
@@ -74,25 +78,6 @@ def beta(mode: Mode, latency_ns: Ints, setting: ControlSetting, epsilon: float) 
     if slack is None or slack < 1:
         return None
     return slow_down(float(np.quantile(latency_ns, 1 - epsilon)) / 1e9, slack, setting.period_ns / 1e9)
-
-
-def mean_reaction_s(wait_s: ArrayLike, cycle_s: ArrayLike) -> float:
-    """Return the mean reaction time with random waits and cycles: E[w] + E[c^2] / (2 E[c]).
-
-    An event falls into a long cycle more often than into a short one, so under sync a random latency costs
-    Var(L) / (2 E[c]) more than its mean. The wait is that of the request after the cycle, assumed independent of it.
-    """
-    wait, cycle = np.asarray(wait_s, dtype=np.float64), np.asarray(cycle_s, dtype=np.float64)
-    return float(wait.mean() + np.square(cycle).mean() / (2 * cycle.mean()))
-
-
-def slack_ticks(horizon: int, execute: int, under_way: Literal["one", "many"] = "one") -> int:
-    """Return the greatest d without a stall under replace: H - s, and with one pending request at most H / 2.
-
-    With one pending request d may exceed s; the cycle then lasts d ticks, and the chunk has to last for two delays (at
-    whole L / Delta t; otherwise known is d + 1 if actions leave at the end of their tick).
-    """
-    return min(horizon - execute, horizon // 2) if under_way == "one" else horizon - execute
 
 
 def stall_share(delay_ticks: Ints, slack: int) -> float:

@@ -46,8 +46,8 @@ def assemble(
 
 def paced(pace: Pace, delay: Ints, known: Ints) -> tuple[Ints, Ints]:
     """Return the tick of each request and of the one after them, and the actions left at each: (R + 1,) and (R,)."""
-    found = [next(pace), *map(pace.send, zip(delay.tolist(), known.tolist(), strict=True))]
-    leaves, left = np.array(found, np.int64).T
+    requests = [next(pace), *map(pace.send, zip(delay.tolist(), known.tolist(), strict=True))]
+    leaves, left = np.array(requests, np.int64).T
     return leaves, left[:-1]
 
 
@@ -149,11 +149,11 @@ def drive(mode: Mode, setting: ControlSetting, most: int = NEVER) -> Generator[i
             arrival_ns = yield tick
             if arrival_ns is None:
                 break
-            usable, known = (
-                (tick + ticks(arrival_ns)).tolist() for ticks in (setting.delay_ticks, setting.known_ticks)
-            )
-            for at, actions in {at: actions for actions, at in enumerate(zip(usable, known, strict=True), 1)}.items():
-                heapq.heappush(coming, (*at, len(leaves), actions))
+            usable = (tick + setting.delay_ticks(arrival_ns)).tolist()
+            known = (tick + setting.known_ticks(arrival_ns)).tolist()
+            arrived = {at: actions for actions, at in enumerate(zip(usable, known, strict=True), 1)}
+            for (usable_at, known_at), actions in arrived.items():
+                heapq.heappush(coming, (usable_at, known_at, len(leaves), actions))
             leaves.append(tick)
             usable_tick.append(usable[0])
         while coming and coming[0][0] <= tick:
@@ -162,10 +162,8 @@ def drive(mode: Mode, setting: ControlSetting, most: int = NEVER) -> Generator[i
         chunk.append(-1 if acted is None else acted.request)
         index.append(-1 if acted is None else acted.index)
         tick += 1
-    request_tick, usable_at, chunks, indices = (
-        np.array(each, np.int64) for each in (leaves, usable_tick, chunk, index)
-    )
-    return gather(request_tick, usable_at, chunks, indices, setting.horizon)
+    request_tick, usable_ticks = np.array(leaves, np.int64), np.array(usable_tick, np.int64)
+    return gather(request_tick, usable_ticks, np.array(chunk, np.int64), np.array(index, np.int64), setting.horizon)
 
 
 def _deliver(stepper: ChunkStepper, arrival: _Arrival) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from s2a_bench.plugins.chunks.modes import ChunkAction, ChunkStepper, ControlSetting, Cycles, Ints, Mode, Pace
-from s2a_bench.plugins.chunks.modes.closed import Closed, replace_stall_share, slack_ticks, stall_share
+from s2a_bench.plugins.chunks.modes.closed import Closed, replace_stall_share, stall_share
 from s2a_bench.plugins.chunks.modes.cycles import assemble, paced
 
 
@@ -47,7 +47,13 @@ class Replace(Mode):
         return setting.length(self.execute)
 
     def slack(self, setting: ControlSetting) -> int:
-        return slack_ticks(setting.horizon, self.execute, self.under_way)
+        """Return the greatest d without a stall: H - s, and with one pending request at most H / 2.
+
+        With one pending request d may exceed s; the cycle then lasts d ticks, and the chunk has to last for two delays
+        (at whole L / Delta t; otherwise known is d + 1 if actions leave at the end of their tick).
+        """
+        slack = setting.horizon - self.execute
+        return slack if self.several else min(slack, setting.horizon // 2)
 
     def closed_form(self, latency_ns: Ints, setting: ControlSetting) -> Closed:
         if self.assumed >= 0:

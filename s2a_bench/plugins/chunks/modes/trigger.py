@@ -2,7 +2,9 @@
 
 A cycle's score is its latency: queue stalls if d > m, so the latency is the least trigger, in ns, without a stall in
 this cycle. Choosing the r-th greatest of n recorded latencies is the conformal rule that calibrates stream-to-act, with
-the same bound (`conformal`): for exchangeable latencies P(stall) <= (r + 1) / (n + 1).
+the same bound (`conformal`): for exchangeable latencies P(stall) <= (r + 1) / (n + 1). `conformal.Tracker` follows it
+from cycle to cycle while the latencies drift. Its infinite caution is the greatest trigger here, so its bound on stalls
+does not cover latencies above that one: they need a slow-down.
 
 Rules for comparison are lerobot's all-time maximum, whose trigger only grows, and the mean. ``most`` is the greatest
 possible trigger, s for queue and H - s for the others: above it no trigger helps, only slower actions.
@@ -11,7 +13,7 @@ possible trigger, s for queue and H - s for the others: above it no trigger help
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -19,7 +21,7 @@ import numpy as np
 
 from s2a_bench.plugins.chunks.modes import ChunkAction, ChunkStepper, ControlSetting, Ints, Mode
 from s2a_bench.plugins.chunks.modes.closed import slow_down
-from s2a_bench.policy.conformal import EPSILON, Calibration, Guarantee, Tracker, choose
+from s2a_bench.policy.conformal import EPSILON, Calibration, Guarantee, choose
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +36,11 @@ class TriggerRule(Protocol):
     """A rule that learns from each latency and limits the next one."""
 
     @property
-    def latency_ns(self) -> float:
-        """Return the greatest latency without a stall in the next cycle; infinity: the greatest trigger."""
+    def caution(self) -> float:
+        """Return the greatest latency without a stall in the next cycle, in ns; infinity: the greatest trigger."""
 
-    def learn(self, latency_ns: int, *, stalled: bool) -> None:
-        """Learn from the latency of an answer, and from whether the robot stalled."""
+    def learn(self, score: int, /, *, stalled: bool) -> None:
+        """Learn from the latency of an answer, in ns, and from whether the robot stalled."""
 
 
 def trigger(latency_ns: float, setting: ControlSetting, most: int) -> Trigger:
@@ -49,7 +51,7 @@ def trigger(latency_ns: float, setting: ControlSetting, most: int) -> Trigger:
     """
     if math.isinf(latency_ns):
         return Trigger(most)
-    ticks = _ticks(latency_ns, setting)
+    ticks = setting.delay(math.ceil(latency_ns))
     if ticks <= most:
         return Trigger(ticks)
     return Trigger(most, slow_down(latency_ns / 1e9, most, setting.period_ns / 1e9))
@@ -73,10 +75,10 @@ class Maximum:
     is the trigger, the least that would have been safe so far.
     """
 
-    latency_ns: float = 0.0
+    caution: float = 0.0
 
-    def learn(self, latency_ns: int, *, stalled: bool) -> None:  # noqa: ARG002 - only the latency matters
-        self.latency_ns = max(self.latency_ns, float(latency_ns))
+    def learn(self, latency_ns: int, /, *, stalled: bool) -> None:  # noqa: ARG002 - only the latency matters
+        self.caution = max(self.caution, float(latency_ns))
 
 
 @dataclass(slots=True)
@@ -87,34 +89,12 @@ class Mean:
     count: int = 0
 
     @property
-    def latency_ns(self) -> float:
+    def caution(self) -> float:
         return self.sum_ns / max(self.count, 1)
 
-    def learn(self, latency_ns: int, *, stalled: bool) -> None:  # noqa: ARG002 - only the latency matters
+    def learn(self, latency_ns: int, /, *, stalled: bool) -> None:  # noqa: ARG002 - only the latency matters
         self.sum_ns += latency_ns
         self.count += 1
-
-
-@dataclass(slots=True)
-class TrackedLatency:
-    """The calibrated latency, tracked from cycle to cycle while the latencies drift: `conformal.Tracker`.
-
-    An infinite caution is the greatest trigger here, so the tracker's bound on stalls does not cover latencies above
-    it: they need a slow-down.
-    """
-
-    tracker: Tracker = field(repr=False)
-
-    @staticmethod
-    def begin(latency_ns: Iterable[float], epsilon: float = EPSILON) -> TrackedLatency:
-        return TrackedLatency(Tracker(map(float, latency_ns), epsilon))
-
-    @property
-    def latency_ns(self) -> float:
-        return self.tracker.caution
-
-    def learn(self, latency_ns: int, *, stalled: bool) -> None:
-        self.tracker.learn(float(latency_ns), stalled=stalled)
 
 
 def follow(rule: TriggerRule, latency_ns: Ints, setting: ControlSetting, most: int) -> Ints:
@@ -124,14 +104,9 @@ def follow(rule: TriggerRule, latency_ns: Ints, setting: ControlSetting, most: i
     """
     triggers = np.empty(latency_ns.size, np.int64)
     for request, latency in enumerate(latency_ns.tolist()):
-        triggers[request] = trigger(rule.latency_ns, setting, most).ticks
-        rule.learn(latency, stalled=_ticks(latency, setting) > int(triggers[request]))
+        triggers[request] = trigger(rule.caution, setting, most).ticks
+        rule.learn(latency, stalled=setting.delay(latency) > int(triggers[request]))
     return triggers
-
-
-def _ticks(latency_ns: float, setting: ControlSetting) -> int:
-    whole = math.ceil(latency_ns)
-    return whole // setting.period_ns if setting.rounding == "floor" else -(-whole // setting.period_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +186,7 @@ class Learning(Chosen):
         length = self.mode.execution_horizon(setting)
 
         def choose() -> int:
-            return trigger(rule.latency_ns, setting, most).ticks
+            return trigger(rule.caution, setting, most).ticks
 
         return LearningStepper(self.mode.stepper(setting), choose, rule=rule, setting=setting, length=length)
 

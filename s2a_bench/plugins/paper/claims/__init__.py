@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import compress
 from math import inf
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
@@ -53,9 +52,10 @@ class Need:
     chosen: bool = field(default=False, kw_only=True)
 
     def of(self, facts: Mapping[str, Any]) -> Met:
-        found = facts[self.name]
-        met, shown = self.test(found), round(found, 3) if isinstance(found, float) else found
-        return Met(f"{self.name}: {shown}" + ("" if met else f" (needs {self.wanted})"), met)
+        fact = facts[self.name]
+        met = self.test(fact)
+        text = f"{self.name}: {round(fact, 3) if isinstance(fact, float) else fact}"
+        return Met(text if met else f"{text} (needs {self.wanted})", met)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +84,10 @@ def within(low: float, high: float, least: float, most: float) -> str:
 
 def all_of(verdicts: Iterable[str]) -> str:
     """Return the verdict on a claim about all: one contradiction is enough."""
-    found = set(verdicts)
-    return CONTRADICTED if CONTRADICTED in found else SUPPORTED if found == {SUPPORTED} else UNDECIDED
+    different = set(verdicts)
+    if CONTRADICTED in different:
+        return CONTRADICTED
+    return SUPPORTED if different == {SUPPORTED} else UNDECIDED
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,10 +137,10 @@ class Claim:
     def judge(self, part: RunPart) -> tuple[str, str]:
         """Return the verdict of a part that meets all needs, and the evidence."""
         shown = [(check, *check.measure(part)) for check in self.checks]
-        found = all_of(check.verdict(values) for check, values, _ in shown)
-        verdict, remark = self.reads.get(found, (found, ""))
+        of_checks = all_of(check.verdict(values) for check, values, _ in shown)
+        verdict, remark = self.reads.get(of_checks, (of_checks, ""))
         texts = [check.sentence.format(text) for check, _, text in shown]
-        if found == UNDECIDED and any(value.low is None for _, values, _ in shown for value in values):
+        if of_checks == UNDECIDED and any(value.low is None for _, values, _ in shown for value in values):
             texts.append("Too few samples for an interval.")
         return verdict, " ".join(filter(None, (*texts, remark, part.about)))
 
@@ -153,12 +155,13 @@ class ClaimFinding:
     origins: tuple[Provenance, ...] = ()
     launches: int = 0
 
-    def told(self, runs: Iterable[str], *, with_verdict: bool) -> Evidence:
+    def with_basis(self, runs: Iterable[str], *, with_verdict: bool) -> Evidence:
         """Return the evidence, and its basis: the runs, the launches, and the origin of the numbers."""
-        origin = joined(map(Origins, self.origins))
-        launches = [f"{self.launches} launch{'es' * (self.launches > 1)}"] if self.launches else []
+        origin, basis = joined(map(Origins, self.origins)), list(runs)
+        if self.launches:
+            basis.append(f"{self.launches} launch{'es' if self.launches > 1 else ''}")
         verdict = f"{self.verdict.capitalize()}: " if with_verdict else ""
-        text = f"{verdict}{self.evidence} Basis: {', '.join((*runs, *launches))}. {origin.line}"
+        text = f"{verdict}{self.evidence} Basis: {', '.join(basis)}. {origin.line}"
         return Evidence(text, origin.labels, self.needs)
 
     @property
@@ -168,20 +171,20 @@ class ClaimFinding:
 
 def judge(claim: Claim, runs: Iterable[StoredRun]) -> ClaimVerdict:
     """Judge one claim by each run; the order of the runs changes only the order of the evidence."""
-    found: dict[ClaimFinding, tuple[str, ...]] = {}
+    names: dict[ClaimFinding, dict[str, None]] = {}
     for run in runs:
         if run.manifest.get("command") == claim.trial.command:
             for finding in _findings(claim, run):
-                found[finding] = tuple(dict.fromkeys((*found.get(finding, ()), run.path.name)))
-    return combine(claim, found)
+                names.setdefault(finding, {})[run.path.name] = None
+    return combine(claim, names)
 
 
-def combine(claim: Claim, found: Mapping[ClaimFinding, Sequence[str]]) -> ClaimVerdict:
+def combine(claim: Claim, names: Mapping[ClaimFinding, Iterable[str]]) -> ClaimVerdict:
     """Return the verdict of the findings that meet all needs, each with the names of its runs.
 
     It is undecided if there is none, or if they disagree. The evidence has the testable ones first.
     """
-    findings = sorted(found, key=lambda finding: not finding.testable)
+    findings = sorted(names, key=lambda finding: not finding.testable)
     verdicts = {finding.verdict for finding in findings if finding.testable}
     notes = () if verdicts else (f"Run: {claim.trial.run}",)
     required = dict.fromkeys("; ".join(need.text for need in finding.needs) for finding in findings)
@@ -191,7 +194,7 @@ def combine(claim: Claim, found: Mapping[ClaimFinding, Sequence[str]]) -> ClaimV
         claim.rule,
         next(iter(verdicts)) if len(verdicts) == 1 else UNDECIDED,
         " | ".join(required) or "; ".join(f"{need.name}: {need.wanted}" for need in claim.trial.needs),
-        [each.told(found[each], with_verdict=len(findings) > 1) for each in findings],
+        [each.with_basis(names[each], with_verdict=len(findings) > 1) for each in findings],
         notes if len(verdicts) < 2 else ("Runs disagree: each is listed, none counts more.",),  # noqa: PLR2004
         tested=bool(verdicts),
     )
@@ -199,15 +202,18 @@ def combine(claim: Claim, found: Mapping[ClaimFinding, Sequence[str]]) -> ClaimV
 
 def _findings(claim: Claim, run: StoredRun) -> Iterator[ClaimFinding]:
     """Judge the parts that meet all needs; else measure those of other settings; else yield the nearest's needs."""
-    every = [(part, tuple(need.of(part.facts) for need in claim.trial.needs)) for part in claim.trial.parts(run)]
-    fit = [(part, needs) for part, needs in every if all(need.met for need in needs)]
-    fixed = [not need.chosen for need in claim.trial.needs]
-    free = [(part, needs) for part, needs in every if all(need.met for need in compress(needs, fixed))]
+    every = []
+    for part in claim.trial.parts(run):
+        needs = tuple(need.of(part.facts) for need in claim.trial.needs)
+        unmet = [need for need, (_, met) in zip(claim.trial.needs, needs, strict=True) if not met]
+        every.append((part, needs, unmet))
+    fit = [(part, needs) for part, needs, unmet in every if not unmet]
+    free = [(part, needs) for part, needs, unmet in every if all(need.chosen for need in unmet)]
     for part, needs in fit or free:
         verdict, evidence = claim.judge(part)
         if not fit:
             verdict, evidence = UNDECIDED, f"At your settings, no verdict: {evidence}"
         yield ClaimFinding(verdict, evidence, needs, tuple(part.origins), part.launches)
     if every and not free:
-        part, needs = min(every, key=lambda each: sum(not need.met for need in each[1]))
+        part, needs, _ = min(every, key=lambda each: len(each[2]))
         yield ClaimFinding(UNDECIDED, "Not testable with this run.", needs, tuple(part.origins), part.launches)

@@ -50,11 +50,11 @@ _UNMODELLED: Final = {"t_nom_cv": 0.0, "prompt_s": None, "jitter": "none"}
 
 
 def listed(name: str, *values: str) -> Need:
-    return Need(name, ", ".join(dict.fromkeys(values)), lambda found: set(values) <= set(found.split(", ")))
+    return Need(name, ", ".join(dict.fromkeys(values)), lambda fact: set(values) <= set(fact.split(", ")))
 
 
 def more(name: str, limit: float) -> Need:
-    return Need(name, f"more than {limit:g}", lambda found: found > limit)
+    return Need(name, f"more than {limit:g}", lambda fact: fact > limit)
 
 
 @dataclass(frozen=True)
@@ -65,15 +65,16 @@ class _Or(Need):
 
     def of(self, facts: Mapping[str, Any]) -> Met:
         """Test the facts of a part; if any is missing, the text has only those."""
-        rows = [Met(f"{self.name}: {facts[self.name]}", met=True)] if self.test(facts[self.name]) else []
-        rows = rows or [need.of(facts) for need in self.others]
+        if self.test(facts[self.name]):
+            return Met(f"{self.name}: {facts[self.name]}", met=True)
+        rows = [need.of(facts) for need in self.others]
         missing = [row.text for row in rows if not row.met]
         return Met(", ".join(missing or [row.text for row in rows]), not missing)
 
 
 def _unlike(settings: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
-    found = {name: settings.get(name, UNKNOWN) for name in wanted}
-    return ", ".join(f"{name} {found[name]}" for name in wanted if found[name] != wanted[name]) or AS_CHOSEN
+    chosen = {name: settings.get(name, UNKNOWN) for name in wanted}
+    return ", ".join(f"{name} {chosen[name]}" for name in wanted if chosen[name] != wanted[name]) or AS_CHOSEN
 
 
 def _chosen(wanted: Mapping[str, Any], *more: str) -> Need:
@@ -134,8 +135,8 @@ def _stall_s(cell: Timelines) -> float:
 
 
 SETTINGS: Final = _chosen(PLANS, f"jitter none or {NAMED_JITTER}")
-EVEN, UNEVEN = (one_of("times", times) for times in (EXACT, VARYING))
-SEVERAL: Final = Need("L", "two or more", lambda found: ", " in found), more("stall of naive in s", TOLERANCE_S)
+EVEN, UNEVEN = one_of("times", EXACT), one_of("times", VARYING)
+SEVERAL: Final = Need("L", "two or more", lambda fact: ", " in fact), more("stall of naive in s", TOLERANCE_S)
 WAITS: Final = more("S0 after the first arrival in s", TOLERANCE_S)
 STRETCHABLE: Final = more("T_max / T_nom", 1)
 
@@ -143,11 +144,11 @@ STRETCHABLE: Final = more("T_max / T_nom", 1)
 def figure_5(board: Published, *policies: str) -> Trial:
     """Return the trial of a board: tokens at the rate of table II, or of the paper's model on it, and all four L."""
     profile, rate = board.name.lower().replace(" ", "-"), board.mean
-    like = Need("tokens/s", f"within {NEAR:.0%} of {rate:g}", lambda found: abs(found / rate - 1) <= NEAR)
+    like = Need("tokens/s", f"within {NEAR:.0%} of {rate:g}", lambda fact: abs(fact / rate - 1) <= NEAR)
     measured = on_board(board.name), *PAPERS_MODEL, like
     either = f"{emulated(profile, rate)}; or {', '.join(f'{need.name} {need.wanted}' for need in measured)}"
     source = _Or("source", either, emulated(profile, rate).__eq__, measured)
-    needs = source, listed("L", *_LENGTHS), listed("policies", *policies), SETTINGS
+    needs = (source, listed("L", *_LENGTHS), listed("policies", *policies), SETTINGS)
     return Trial(f"s2a-bench timeline --profile {profile}", timelines, needs)
 
 
@@ -157,11 +158,11 @@ def no_stalls(*policies: str) -> Check:
     def measure(part: RunPart) -> tuple[list[Ratio], str]:
         promised, even = part.facts["promised"], part.facts["times"] == EXACT
         cells = [of_length[policy] for of_length in part.cells.values() for policy in policies]
-        found, stalled = [], []
+        ratios, stalled = [], []
         for cell in cells:
             share = Share(round(cell.p_any_stall * len(cell)), len(cell))
             low, high = (share.value, share.value) if even else share.interval
-            found.append(Ratio(share.value / promised, low / promised, high / promised))
+            ratios.append(Ratio(share.value / promised, low / promised, high / promised))
             if share.k or high > promised:
                 spread = "" if even else f" [{low:.1%}, {high:.1%}]"
                 many = f"{share.k} of {share.n} plans stall{spread}, {_stall_s(cell):.2f} s in the mean"
@@ -170,7 +171,7 @@ def no_stalls(*policies: str) -> Check:
         regrets = [cell.mean("signed_start_regret") for cell in cells if cell.policy == STREAM]
         starts = [late for late in regrets if late is not None]
         late = f" Stream-to-act starts at S0 {_signed(min(starts))} to {_signed(max(starts))}." if starts else ""
-        return found, f"{text}; promised: at most {promised:.1%}.{late}"
+        return ratios, f"{text}; promised: at most {promised:.1%}.{late}"
 
     return Check("{}", measure, 0, 1)
 
@@ -179,11 +180,11 @@ def after(policy: str, than: str, metric: str, least: float = -inf, most: float 
     """Check the ratio of the mean starts or ends of two policies at every L."""
 
     def measure(part: RunPart) -> tuple[list[Ratio], str]:
-        found = [_compared(part, cells[policy], cells[than], metric) for cells in part.cells.values()]
-        shares = ["" if each.ratio.value is None else f" ({_signed(each.ratio.value - 1)})" for each in found]
-        shifts = [round(each.difference.value or 0.0, 2) + 0.0 for each in found]
+        changes = [_compared(part, cells[policy], cells[than], metric) for cells in part.cells.values()]
+        shares = ["" if each.ratio.value is None else f" ({_signed(each.ratio.value - 1)})" for each in changes]
+        shifts = [round(each.difference.value or 0.0, 2) + 0.0 for each in changes]
         texts = [f"{shift:+.2f} s{share}" for shift, share in zip(shifts, shares, strict=True)]
-        return [each.ratio for each in found], _at(part, texts)
+        return [each.ratio for each in changes], _at(part, texts)
 
     return Check(f"{policy}'s {metric.removesuffix('_s')} after {than}'s: {{}}.", measure, least, most)
 
@@ -216,12 +217,12 @@ def early_stalls(part: RunPart) -> tuple[list[Ratio], str]:
 
 def stretched(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure how long before S0 a plan can start without a stall, with the extension that the paper allows."""
-    found = []
+    earlier = []
     for plan in _shown(part.cells):
         as_planned = replace(plan, least_s=np.minimum(plan.least_s, plan.nominal_s))
         start_s, safe_s = float(elastic(as_planned).start_s[0, 0]), float(safe_start(plan.arrival_s, plan.nominal_s)[0])
-        found.append((safe_s - start_s, f"{start_s:.2f} s instead of S0 = {safe_s:.2f} s"))
-    early_s, text = max(found)
+        earlier.append((safe_s - start_s, f"{start_s:.2f} s instead of S0 = {safe_s:.2f} s"))
+    early_s, text = max(earlier)
     return [exact(early_s)], text
 
 
@@ -251,7 +252,7 @@ def plane(run: StoredRun) -> Iterator[RunPart]:
         yield RunPart(run, facts, [run.origins.run], cells=cells)  # the grid, not the boards
 
 
-EVENLY: Final = Need("tokens", "evenly: with jitter no line separates the regions", lambda found: found == "evenly")
+EVENLY: Final = Need("tokens", "evenly: with jitter no line separates the regions", lambda fact: fact == "evenly")
 OF_THE_PLANE: Final = _chosen(PLANE)
 
 
@@ -261,8 +262,8 @@ def stalls_at(side: str, part: RunPart) -> tuple[list[Ratio], str]:
     points = grid_of(part.cells, "t_nom")
     points = points[(points["tokens_per_s"] >= points["tokens_per_skill"] / least_s) == (side == "above")]
     stalls = int((points["p_stall"] > 0).sum())
-    found = [] if points.empty else [exact(stalls / len(points))]
-    return found, f"{stalls} of {len(points)} points {side} R = L/T_min ({least_s:g} s)"
+    shares = [] if points.empty else [exact(stalls / len(points))]
+    return shares, f"{stalls} of {len(points)} points {side} R = L/T_min ({least_s:g} s)"
 
 
 CHOSEN: Final[dict[str, Any]] = {
@@ -319,9 +320,9 @@ def outcome(policy: str, part: RunPart) -> tuple[list[Ratio], str]:
 
 def worse(policy: str, part: RunPart) -> tuple[list[Ratio], str]:
     """Measure the share of the phase diagram at which a policy is worse than stream-to-act, minus that of better."""
-    found, texts = [], []
+    excess, texts = [], []
     for gap, scenes in part.cells.studies["phase"].items():
         bad, good = (share_of(scenes, f"{policy.partition('-')[0]}_{side}").value for side in ("worse", "better"))
-        found.append(exact(bad - good) if bad != good else Ratio(0.0, -1.0, 1.0))  # undecided
+        excess.append(exact(bad - good) if bad != good else Ratio(0.0, -1.0, 1.0))  # undecided
         texts.append(f"{gap} {bad:.0%} worse and {good:.0%} better")
-    return found, ", ".join(texts)
+    return excess, ", ".join(texts)

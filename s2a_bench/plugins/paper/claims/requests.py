@@ -42,14 +42,14 @@ _BITS: Final = re.compile(r"[QF](\d+)")
 
 def one_of(name: str, *values: str) -> Need:
     """Return the need that a fact is one of these texts."""
-    return Need(name, " or ".join(values), lambda found: found in values)
+    return Need(name, " or ".join(values), lambda fact: fact in values)
 
 
 def on_board(board: str) -> Need:
     """Return the need for a board of that name; with "super" or "laptop" after it, it is another one."""
     name = re.escape(board.removeprefix("Jetson "))
     known = re.compile(rf"(?<!\S){name}(?![^\s,])(?! (?:super|laptop)\b)", re.IGNORECASE)
-    return Need("board", board, lambda found: bool(known.search(found)))
+    return Need("board", board, lambda fact: bool(known.search(fact)))
 
 
 PAPERS_MODEL: Final = (
@@ -122,8 +122,8 @@ def pairs(run: StoredRun) -> Iterator[RunPart]:
             "launches": sum(map(bool, _blocks(pair)[0].values())),
             "stages": "".join(f"hidden by {cell.name}" for cell in pair if cell.has_ingest) or "seen",
         }
-        found = [(cell.name, summary_of(cell.values(_metric(pair)))) for cell in pair]
-        times = ", ".join(f"{name} {mean_sd(each)} ms" for name, each in found if each)
+        summaries = [(cell.name, summary_of(cell.values(_metric(pair)))) for cell in pair]
+        times = ", ".join(f"{name} {mean_sd(each)} ms" for name, each in summaries if each)
         yield _pair(run, pair, facts, f"{times} (mean ± sd, n = {pair[0].n}).")
 
 
@@ -154,9 +154,9 @@ def _unlike(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> list[str]:
     same_file = engines == ("llama-server", "llama") and http["model_sha256"] == ros["model_sha256"] != ""
     both = {name: dict.fromkeys((http[name] or NONE, value or NONE)) for name, value in ros.items()}
     return [
-        f"{name} {' and '.join(found)}"
-        for name, found in both.items()
-        if (len(found) > 1 or UNKNOWN in found) and not (same_file and name in _NAMES)
+        f"{name} {' and '.join(values)}"
+        for name, values in both.items()
+        if (len(values) > 1 or UNKNOWN in values) and not (same_file and name in _NAMES)
     ]
 
 
@@ -173,11 +173,11 @@ def _asked(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> list[str]:
 
 def _others(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> str:
     pipelines = run.manifest.get("configuration", {}).get("pipelines", {})
-    found = [f"{cell.name} {UNKNOWN}" for cell in pair if cell.name not in pipelines]
+    external = [f"{cell.name} {UNKNOWN}" for cell in pair if cell.name not in pipelines]
     for cell in pair:
         named = {name for name in _external(cell) if pipelines.get(cell.name, {}).get(name)}
-        found += [f"{cell.name} by {name}" for name in sorted(named - {"llama_server"})]
-    return ", ".join(found)
+        external += [f"{cell.name} by {name}" for name in sorted(named - {"llama_server"})]
+    return ", ".join(external)
 
 
 def _external(cell: RequestCell) -> list[str]:
@@ -195,15 +195,16 @@ COMPARED: Final = (
         "alike".__eq__,
     ),
     one_of("servers", "started by the run"),
-    Need("launches", f"{FEWEST_LAUNCHES} or more", lambda found: found >= FEWEST_LAUNCHES),
+    Need("launches", f"{FEWEST_LAUNCHES} or more", lambda fact: fact >= FEWEST_LAUNCHES),
 )
 """The needs of a pair of HTTP/JSON and ROS."""
-LARGE: Final = Need("bytes a picture", f"{_SMALL} or more, by a larger --size", lambda found: found >= _SMALL)
+LARGE: Final = Need("bytes a picture", f"{_SMALL} or more, by a larger --size", lambda fact: fact >= _SMALL)
 
 
 def times_as_long(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure the ratio of the mean times of HTTP and ROS, launch by launch and block by block."""
-    ratio = ratio_of_launches(*_blocks(part.cells), part.run.bootstrap_seed, "mean") or Ratio(None, None, None)
+    http, ros = _blocks(part.cells)
+    ratio = ratio_of_launches(http, ros, part.run.bootstrap_seed, "mean") or Ratio(None, None, None)
     return [ratio], interval(ratio)
 
 
@@ -223,13 +224,13 @@ def shares(
     cell: RequestCell = part.cells[side]
     whole, seed = cell.values(_METRIC), part.run.bootstrap_seed
     spent = {stage: _spent(cell, [stage]).sum() for stage, of in cell.stages.items() if of != "inference"}
-    found = []
+    ratios = []
     for stages, within in groups.values():
         each, base = _spent(cell, stages), _spent(cell, [stage for stage, of in cell.stages.items() if of in within])
-        found.append(change(each, base if within else whole, seed, paired=True).ratio if each.any() else exact(0.0))
-    spread = ["" if each.low is None else f" [{each.low:.0%}, {each.high:.0%}]" for each in found]
-    texts = [f"{each.value or 0:.0%}{more}{name}" for each, more, name in zip(found, spread, groups, strict=True)]
-    return found, f"{', '.join(texts)} of {cell.name}; the longest stage is {max(spent, key=spent.__getitem__)}"
+        ratios.append(change(each, base if within else whole, seed, paired=True).ratio if each.any() else exact(0.0))
+    spread = ["" if each.low is None else f" [{each.low:.0%}, {each.high:.0%}]" for each in ratios]
+    texts = [f"{each.value or 0:.0%}{more}{name}" for each, more, name in zip(ratios, spread, groups, strict=True)]
+    return ratios, f"{', '.join(texts)} of {cell.name}; the longest stage is {max(spent, key=spent.__getitem__)}"
 
 
 def _spent(cell: RequestCell, stages: Sequence[str]) -> Floats:
@@ -252,10 +253,11 @@ def _metric(pair: Sequence[RequestCell]) -> str:
 def _blocks(pair: Sequence[RequestCell]) -> tuple[Mapping[int, Blocks], Mapping[int, Blocks]]:
     """Return the values of both sides by launch, of the blocks that both have."""
     http, ros = (cell.by_launch(_metric(pair)) for cell in pair)
-    both = [(launch, http[launch], ros[launch]) for launch in http if launch in ros]
-    return {launch: one.shared(other) for launch, one, other in both}, {
-        launch: other.shared(one) for launch, one, other in both
-    }
+    both = [launch for launch in http if launch in ros]
+    return (
+        {launch: http[launch].shared(ros[launch]) for launch in both},
+        {launch: ros[launch].shared(http[launch]) for launch in both},
+    )
 
 
 def speeds(run: StoredRun) -> Iterator[RunPart]:
@@ -267,7 +269,7 @@ def speeds(run: StoredRun) -> Iterator[RunPart]:
             yield RunPart(run, facts_of(run, origins) | source, origins, _launches(speed), speed)
 
 
-KNOWN: Final = Need("quantisation", "known (the paper does not say which it used)", lambda found: found != UNKNOWN)
+KNOWN: Final = Need("quantisation", "known (the paper does not say which it used)", lambda fact: fact != UNKNOWN)
 
 
 def speed_over(board: Published, part: RunPart) -> tuple[list[Ratio], str]:
@@ -278,7 +280,7 @@ def speed_over(board: Published, part: RunPart) -> tuple[list[Ratio], str]:
     values = part.cells.values("tokens_per_s")
     ratio = change(values, np.full(len(values), board.mean), part.run.bootstrap_seed).ratio
     rate, quantisation = summarise(values), part.facts["quantisation"]
-    bits = int(found[1]) if (found := _BITS.search(quantisation)) else (FEWEST_BITS + MOST_BITS) // 2
+    bits = int(match[1]) if (match := _BITS.search(quantisation)) else (FEWEST_BITS + MOST_BITS) // 2
     if ratio.high is not None and ratio.high < 1 - NEAR and bits > FEWEST_BITS:
         ratio = Ratio(ratio.value, ratio.low, inf)
     elif ratio.low is not None and ratio.low > 1 + NEAR and bits < MOST_BITS:

@@ -47,7 +47,6 @@ _LOADED: Final[dict[str, dict[str, Any]]] = {}
 
 class GrpcClient(PolicyClient[GrpcOptions]):
     def __init__(self, wiring: Wiring[GrpcOptions], alive: Callable[[], bool]) -> None:
-        """Prepare to ask the server at ``wiring.address``; the first request connects and has it load the policy."""
         super().__init__(wiring, alive)
         self._channel: grpc.Channel | None = None  # kept when a request fails: each call is a stream of its own
         self._connected = False
@@ -107,7 +106,6 @@ class GrpcClient(PolicyClient[GrpcOptions]):
         return stamp, pieces
 
     def _exchanged(self, channel: grpc.Channel, pieces: list[bytes], bounds: Bounds, trace: Trace) -> bytes:
-        """Wait for the chunk while the observation is sent."""
         patience_s, started_ns = self._patience_s(bounds), now_ns()
         answer = channel.unary_unary(SERVICE + "GetActions").future(b"", patience_s)
         try:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from io import BytesIO
-from math import isfinite
 from typing import Any
 from urllib.parse import SplitResult, urlsplit, urlunsplit
 
@@ -41,7 +40,6 @@ from s2a_bench.types import Action, Frame, Piece, Request
 
 class WebsocketClient(PolicyClient[WebsocketOptions]):
     def __init__(self, wiring: Wiring[WebsocketOptions], alive: Callable[[], bool]) -> None:
-        """Prepare to ask the server at ``wiring.address``; the first request, or `describe`, connects."""
         super().__init__(wiring, alive)
         self._streams = wiring.variant == STREAM
         self._server = ExternalServer() if self._native else self._template.server
@@ -64,16 +62,15 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
                 self._connected(bounds)
                 trace.mark("connect")
             body = self._pack(request, trace)
-            message, packed_ns = self._sent(body, len(request.images), bounds, trace)
+            message = self._sent(body, len(request.images), bounds, trace)
             trace.provenance = self._provenance
-            yield from self._actions(message, packed_ns, trace)
+            yield from self._actions(message, trace)
         except Broken as error:
             if not self._alive():
                 raise ServerDied(f"the server has ended: {error}") from error
             raise RequestFailed(str(error), starting=error.starting) from error
 
     def _pack(self, request: Request, trace: Trace) -> bytes:
-        """Fill the template and write it as MessagePack, marking each stage."""
         observation = self._observation(request, trace)
         if self._native:
             observation[EXTENSION] = observed.extension_of(request)
@@ -92,17 +89,17 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         trace.mark("image_encode")
         return {"__image__": True, "format": payload, "data": file.getvalue(), "shape": rgb.shape}
 
-    def _sent(self, body: bytes, cameras: int, bounds: Bounds, trace: Trace) -> tuple[bytes, int]:
+    def _sent(self, body: bytes, cameras: int, bounds: Bounds, trace: Trace) -> bytes:
         """Send, once more if the server had just closed the kept connection; return the answer's first message."""
         if self._link is not None:
             if self._link.alive(bounds):
                 with suppress(Broken):
-                    return self._exchanged(self._link, body, cameras, trace)
+                    return self._exchanged(self._link, body, cameras)
             trace.facts[RECONNECTS] = 1.0
-            self._link.close()
+            self._abandon()
         link = self._connected(bounds)
         trace.mark("connect")
-        return self._exchanged(link, body, cameras, trace)
+        return self._exchanged(link, body, cameras)
 
     def _connected(self, bounds: Bounds) -> BoundedConnection:
         self._link = None
@@ -111,23 +108,22 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             if self._server.greets:
                 self._greeted(link)
             if self._server.reset is not None:
-                link.send(packb(self._server.reset))
+                link.send_in_time(packb(self._server.reset))
                 self._ready(link.receive())
         except BaseException:
-            link.close()
+            link.close_socket()
             raise
         self._link = link
         return link
 
-    def _exchanged(self, link: BoundedConnection, body: bytes, cameras: int, trace: Trace) -> tuple[bytes, int]:
+    def _exchanged(self, link: BoundedConnection, body: bytes, cameras: int) -> bytes:
         for index, path in self._ignored:
             if index < cameras:
                 known, cure = ", ".join(map(repr, self._listed)), "take a template with these keys, or write one"
                 name = self._template.name
                 raise UsageError(f"`template` {name}: the server ignores '{path}', it reads {known}; {cure}")
-        packed_ns = trace.marks[-1][1]
-        link.send(body)
-        return self._message(link), packed_ns
+        link.send_in_time(body)
+        return self._message(link)
 
     def _greeted(self, link: BoundedConnection) -> None:
         metadata = unpackb(self._message(link))
@@ -168,7 +164,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             if isinstance(answer, str):
                 raise self._failed(answer)
 
-    def _actions(self, message: bytes, packed_ns: int, trace: Trace) -> Iterator[Action]:
+    def _actions(self, message: bytes, trace: Trace) -> Iterator[Action]:
         """Yield the actions of an answer; after the last, complete the trace."""
         assert self._link  # noqa: S101 - for mypy
         count, first_ns = 0, 0
@@ -190,17 +186,14 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
                 break
             message = self._message(self._link)
         if isinstance(answer, dict) and isinstance(timing := answer.get(codec.TIMING), dict):
-            trace.learn({TIMING[name]: _plain(value) for name, value in timing.items() if name in TIMING})
+            plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in timing.items()}
+            trace.learn({fact: plain[name] for name, fact in TIMING.items() if name in plain})
         if self._native:
             trace.receive(observed.remote_of(unpackb(self._message(self._link))))
-        self._mark(trace, packed_ns, first_ns)
-
-    def _mark(self, trace: Trace, packed_ns: int, first_ns: int) -> None:
+        infer_ns = round(trace.facts.get(INFER_MS, 0) * 1e6)
         if trace.remote is not None:
             trace.marks.append(("return", first_ns))
-            return
-        infer_ns = round(trace.facts.get(INFER_MS, 0) * 1e6)
-        if 0 < infer_ns < first_ns - packed_ns and not self._streams:
+        elif 0 < infer_ns < first_ns - trace.marks[-1][1] and not self._streams:
             trace.marks += [("server", first_ns - infer_ns), ("inference", first_ns)]
         else:
             trace.marks.append(("server", first_ns))
@@ -211,16 +204,21 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
             self._connected(self._wiring.bounds(self._url, 1))
         return {**super().describe(), **self._metadata}
 
+    def _abandon(self) -> None:
+        if self._link is not None:
+            self._link.close_socket()
+            self._link = None
+
     def close(self) -> None:
         if self._link is not None:
-            self._link.close(orderly=True)
-            self._link = None
+            self._link.close()
+        self._abandon()
 
 
 def examine(parts: SplitResult) -> Iterator[Finding | str]:
     """Shake hands without a key, and at templates' paths if that is refused; no request is sent."""
     servers = {name: template_of(name).server for name in names()}
-    given, why, extensions = parts.path or "/", "", None
+    given, why, compresses = parts.path or "/", "", None
     for path in (given, *sorted({each.path or "/" for each in servers.values()} - {given})):
         url = urlunsplit(parts._replace(path=path))
         bounds, offered = Bounds(url, PATIENCE_S, 0), [ClientPerMessageDeflateFactory()]
@@ -228,7 +226,7 @@ def examine(parts: SplitResult) -> Iterator[Finding | str]:
             with closing(BoundedConnection(url, {}, bounds, PATIENCE_S, extensions=offered)) as link:
                 with suppress(RequestFailed):  # as of servers that wait for their client's first message
                     link.receive()
-                extensions = link.headers().get("Sec-WebSocket-Extensions", "")
+                compresses = bool(link.protocol.extensions)
                 break
         except ServerDied as error:
             raise OSError(str(error).rpartition(": ")[2]) from error
@@ -236,12 +234,12 @@ def examine(parts: SplitResult) -> Iterator[Finding | str]:
             why = str(error) if REFUSED not in str(error) else why or str(error)
             if REFUSED not in why:
                 break
-    if extensions is None:
+    if compresses is None:
         yield Finding("server", "state", f"it answers, and refuses a client without a key: {why}")
         return
     if why:
         yield Finding("path", "advice", f"{why}; it lets clients in at {path}", f"name {url}")
-    if "permessage-deflate" in extensions:
+    if compresses:
         what = "it compresses for clients that offer it, as libraries do by default: each observation is deflated first"
         cure = "connect with compression=None, as the clients of openpi and s2a-bench do, or turn it off in the server"
         yield Finding("compression", "advice", what, cure)
@@ -254,9 +252,3 @@ def examine(parts: SplitResult) -> Iterator[Finding | str]:
 def _kind(answer: Any) -> str:
     kind = answer.get(codec.TYPE) if isinstance(answer, dict) else None
     return kind if isinstance(kind, str) else ""
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.generic):
-        value = value.item()
-    return float(value) if type(value) in {int, float} and isfinite(value) else value

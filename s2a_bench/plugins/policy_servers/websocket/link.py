@@ -37,20 +37,9 @@ class Broken(RequestFailed):
     """The server has closed the connection, orderly or not."""
 
 
-class _Counted(ClientConnection):
+class BoundedConnection(ClientConnection):
     """A connection that ends where more comes than the bounds of its request allow."""
 
-    def __init__(self, bounds: Bounds, *arguments: Any, **keywords: Any) -> None:
-        self.bounds = bounds
-        super().__init__(*arguments, **keywords)
-
-    def process_event(self, event: Any) -> None:
-        if isinstance(event, Frame):
-            self.bounds.count_bytes(len(event.data) + FRAME_BYTES)
-        super().process_event(event)
-
-
-class BoundedConnection:
     def __init__(
         self,
         url: str,
@@ -64,40 +53,45 @@ class BoundedConnection:
 
         Empty messages keep the connection open if the server closes it after ``idle_s`` without a message.
         """
+        self.bounds = bounds
         self._url, self._timeout_s = url, timeout_s
         self._sent_ns, self._closed = now_ns(), Event()
         try:
             uri = parse_uri(url)
         except (InvalidURI, ValueError) as error:
             raise TransportError(f"`url`: '{url}' is no URL of a WebSocket: {error}") from error
-        plain = self._connected(bounds, uri.host, uri.port, secure=uri.secure)
+        plain = self._connected(uri.host, uri.port, secure=uri.secure)
         protocol = ClientProtocol(uri, extensions=extensions, max_size=MESSAGE_BYTES, logger=codec.QUIET)
-        self._connection = _Counted(bounds, plain, protocol, ping_interval=None, close_timeout=CLOSING_S)
-        self._connection.__enter__()
+        super().__init__(plain, protocol, ping_interval=None, close_timeout=CLOSING_S)
+        self.__enter__()
         try:
             with self._in_time() as seconds:
-                self._connection.handshake(headers, timeout=seconds)
+                self.handshake(headers, timeout=seconds)
         except BaseException:
-            self.close()
+            self.close_socket()
             raise
         if idle_s:
             Thread(target=self._keep_open, args=(idle_s / 3,), daemon=True).start()
+
+    def process_event(self, event: Any) -> None:
+        if isinstance(event, Frame):
+            self.bounds.count_bytes(len(event.data) + FRAME_BYTES)
+        super().process_event(event)
 
     def _keep_open(self, third_s: float) -> None:
         """Send an empty message after each ``third_s`` without a message of ours."""
         with suppress(OSError, ConnectionClosed):
             while not self._closed.wait(third_s):
                 if now_ns() - self._sent_ns >= third_s * 1e9:
-                    self._connection.send(b"")
+                    self.send(b"")
 
-    def _connected(self, bounds: Bounds, host: str, port: int, *, secure: bool) -> socket.socket:
-        timeout_s = min(self._timeout_s, bounds.left_s())
+    def _connected(self, host: str, port: int, *, secure: bool) -> socket.socket:
+        timeout_s = min(self._timeout_s, self.bounds.left_s())
         try:
             plain = socket.create_connection((host, port), timeout_s)
-        except TimeoutError as error:
-            raise ServerDied(f"nothing answers at {self._url} within {timeout_s:g} s") from error
         except OSError as error:
-            raise ServerDied(f"nothing answers at {self._url}: {error}") from error
+            why = f" within {timeout_s:g} s" if isinstance(error, TimeoutError) else f": {error}"
+            raise ServerDied(f"nothing answers at {self._url}{why}") from error
         plain.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         if not secure:
             return plain
@@ -109,28 +103,28 @@ class BoundedConnection:
 
     def alive(self, bounds: Bounds) -> bool:
         """Whether the connection may be used again, within ``bounds``: it is open, and nothing came unasked."""
-        self._connection.bounds = bounds
+        self.bounds = bounds
         with suppress(TimeoutError, ConnectionClosed):
-            self._connection.recv(0)
+            self.recv(0)
             return False
-        return self._connection.state is State.OPEN
+        return self.state is State.OPEN
 
-    def send(self, message: bytes) -> None:
+    def send_in_time(self, message: bytes) -> None:
         """Send a binary message, masked; raises Broken, RequestFailed."""
         with self._in_time() as seconds:
-            self._connection.socket.settimeout(seconds)
-            self._connection.send(message)
+            self.socket.settimeout(seconds)
+            self.send(message)
             self._sent_ns = now_ns()
 
     def receive(self) -> bytes | str:
         """Wait for one message, a text or bytes; raises Broken, RequestFailed."""
         with self._in_time() as seconds:
-            return self._connection.recv(seconds)
+            return self.recv(seconds)
 
     @contextmanager
     def _in_time(self) -> Iterator[float]:
         try:
-            yield min(self._timeout_s, self._connection.bounds.left_s())
+            yield min(self._timeout_s, self.bounds.left_s())
         except (OSError, ConnectionClosed, InvalidHandshake) as error:
             raise self._reason(error) from error
 
@@ -139,11 +133,11 @@ class BoundedConnection:
         why = error if isinstance(error, OSError) else error.__cause__
         if isinstance(why, S2AError):
             return why
-        breach = self._connection.protocol.parser_exc
+        breach = self.protocol.parser_exc
         if breach is not None and not isinstance(breach, EOFError):
             return RequestFailed(f"{self._url} does not keep to the protocol: {str(breach)[:QUOTED]}")
         if isinstance(why, TimeoutError):
-            self._connection.bounds.left_s()  # tells if it was the deadline
+            self.bounds.left_s()  # tells if it was the deadline
             return RequestFailed(f"{self._url} was silent for too long, {self._timeout_s:g} s", starting=True)
         if isinstance(error, InvalidStatus):
             response = error.response
@@ -157,12 +151,7 @@ class BoundedConnection:
             return Broken(f"{self._url} {did[:QUOTED]}", starting=closed is None)
         return RequestFailed(f"{self._url} is no WebSocket: {str(why or error)[:QUOTED]}")
 
-    def headers(self) -> Mapping[str, str]:
-        return self._connection.response.headers if self._connection.response else {}
-
-    def close(self, *, orderly: bool = False) -> None:
-        """Close, where it is ``orderly`` with a word, for which the server has a second; may be called twice."""
+    def close_socket(self) -> None:
+        """Close without a word, which `close` sends, and for which the server has a second."""
         self._closed.set()
-        if orderly:
-            self._connection.close()
-        self._connection.close_socket()
+        super().close_socket()

@@ -12,8 +12,8 @@ import socket
 from collections.abc import Mapping
 from contextlib import ExitStack, suppress
 from http import HTTPStatus
-from queue import SimpleQueue
-from threading import RLock, Semaphore, Thread
+from queue import Queue
+from threading import RLock, Thread
 from typing import Any, Final, cast
 
 import numpy as np
@@ -26,7 +26,7 @@ from websockets.protocol import State
 from websockets.server import ServerProtocol
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import Busy, EngineError, S2AError, TooLarge
+from s2a_bench.errors import Busy, S2AError, TooLarge
 from s2a_bench.facts import INFER_MS
 from s2a_bench.plugins.policy_servers import observed
 from s2a_bench.plugins.policy_servers.websocket import PREV_TOTAL_MS, STREAM_PATH, WebsocketOptions, codec
@@ -34,8 +34,8 @@ from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.access import Access, WebServer
 from s2a_bench.transport.connections import LINGER_S, Connections, Wire
-from s2a_bench.transport.serving import Core, Disconnected, Exchange, Queued
-from s2a_bench.types import Action, Piece, Request
+from s2a_bench.transport.serving import Core, Disconnected, Queued
+from s2a_bench.types import Piece, Request
 
 PIECE: Final = 1 << 16
 """Bytes that are read at once."""
@@ -82,8 +82,7 @@ class PolicyConnection:
         self._lock = RLock()  # of the protocol, and of what is sent
         self._message = bytearray()
         self._timed = False
-        self._requests: SimpleQueue[WebsocketExchange | None] = SimpleQueue()
-        self._room = Semaphore(2)
+        self._requests: Queue[WebsocketExchange | None] = Queue(1)
         self._held = ExitStack()
         self._count()
 
@@ -214,7 +213,6 @@ class PolicyConnection:
             if not frame.fin:
                 return
             message, self._message = bytes(self._message), bytearray()
-        self._room.acquire()
         self._requests.put(WebsocketExchange(self, message, self._held.pop_all()))
         self._count()
 
@@ -227,12 +225,9 @@ class PolicyConnection:
 
     def _answer_all(self) -> None:
         while (exchange := self._requests.get()) is not None:
-            try:
-                with exchange.held:
-                    if self._open and not self.core.answer(exchange):
-                        self.wire.hang_up()
-            finally:
-                self._room.release()
+            with exchange.held:
+                if self._open and not self.core.answer(exchange):
+                    self.wire.hang_up()
             del exchange  # nothing of a request is kept while the next is waited for
 
     def flush(self, left_s: float) -> None:
@@ -277,9 +272,7 @@ class PolicyConnection:
                 self.wire.sendall(data)
 
 
-class WebsocketExchange(Exchange):
-    parse_stage = "msgpack_parse"
-
+class WebsocketExchange(observed.ActionsExchange):
     def __init__(self, connection: PolicyConnection, message: bytes, held: ExitStack) -> None:
         super().__init__()
         self.held = held
@@ -287,7 +280,6 @@ class WebsocketExchange(Exchange):
         self.disconnected = connection.wire.disconnected  # type: ignore[method-assign]
         self._connection, self._message = connection, message
         self._began_ns = self.trace.marks[0][1]
-        self._actions: list[Any] = []
 
     def request(self) -> Request:
         observation, self._message = unpackb(self._message), b""
@@ -300,24 +292,16 @@ class WebsocketExchange(Exchange):
         return request
 
     def send(self, piece: Piece) -> bool:
-        if self.disconnected():
-            raise Disconnected
-        if not isinstance(piece, Action):
-            raise EngineError(
-                "the engine answers with tokens, and this protocol knows actions; choose `answer` actions"
-            )
-        self._actions.append(piece.values)
+        wanted = super().send(piece)
         if self._connection.streams:
-            partial = {codec.TYPE: codec.PARTIAL, codec.ACTIONS: piece.values[None]}
+            partial = {codec.TYPE: codec.PARTIAL, codec.ACTIONS: self._actions[-1][None]}
             partial[codec.INDICES] = np.array([len(self._actions) - 1])
             self._connection.send(packb(partial))
-        return True
+        return wanted
 
     def end(self) -> None:
-        """Send the chunk, then to our own client the marks, which may take time to find."""
-        if not self._actions:
-            raise EngineError("the engine answered with no action at all")
-        connection, trace = self._connection, self.trace
+        """Send the chunk, then the marks to our own client."""
+        connection, trace, chunk = self._connection, self.trace, self.chunk()
         if not connection.streams:
             self.sent_whole()
         ended_ns = trace.token_ns[-1] if trace.token_ns else now_ns()
@@ -325,10 +309,10 @@ class WebsocketExchange(Exchange):
         if connection.previous_ms is not None:
             timing[str(PREV_TOTAL_MS)] = connection.previous_ms
         kind = {codec.TYPE: codec.FINAL} if connection.streams else {}
-        connection.send(packb({**kind, codec.ACTIONS: np.stack(self._actions), codec.TIMING: timing}))
+        connection.send(packb({**kind, codec.ACTIONS: chunk, codec.TIMING: timing}))
         connection.previous_ms = (now_ns() - self._began_ns) / 1e6
         if connection.native:
-            connection.send(packb(observed.remote_message(trace.to_remote())))
+            connection.send(packb(self.marks()))
         connection.flush(self.left_s())
 
     def fail(self, error: S2AError) -> None:

@@ -94,7 +94,6 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         return self._link
 
     def _pack(self, request: Request, trace: Trace) -> memoryview:
-        """Fill the template and write it as MessagePack, marking each stage."""
         if self._modalities:
             self._template = layouts.template_of(self._layout, self._modalities, len(request.state))
             self._modalities = {}
@@ -140,7 +139,6 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         return answer
 
     def describe(self) -> dict[str, str]:
-        """Return where the server is, and how requests for it are packed, for the manifest."""
         template = {"template": layouts.MODALITIES} if self._modalities else {}
         return {**super().describe(), **template, "layout": self._layout}
 
@@ -183,6 +181,7 @@ class ReqSocket:
         self._watch = ConnectionWatch(self._socket)
         self._poller = zmq.Poller()
         self._poller.register(self._watch.monitor, zmq.POLLIN)
+        self._poller.register(self._socket, zmq.POLLIN)
         try:
             self._socket.connect(url)
         except zmq.ZMQError as error:
@@ -195,26 +194,12 @@ class ReqSocket:
 
     def greet(self, bounds: Bounds) -> None:
         """Wait until both sides have greeted; raises ServerDied or RequestFailed."""
-        ends_ns = self._patience_ns(bounds)
-        while not any(connection.ready for connection in self._watch.connections.values()):
-            self._poller.poll(POLL_MS)
-            self._watch.hear()
-            if not self._watch.connections and self._watch.met:
-                raise self._broke("; is it a ZeroMQ peer?")
-            if self._watch.refused and not self._watch.met:
-                raise ServerDied(f"nothing answers at {self._url}")
-            self._check(ends_ns, bounds)
-        self._poller.register(self._socket, zmq.POLLIN)
+        self._wait(bounds, greeting=True)
 
     def exchange(self, body: memoryview, bounds: Bounds) -> bytes:
         try:
             self._socket.send(body, copy=False)
-            ends_ns = self._patience_ns(bounds)
-            while self._socket not in dict(self._poller.poll(POLL_MS)):
-                self._watch.hear()
-                if not self._watch.connections:
-                    raise self._broke()
-                self._check(ends_ns, bounds)
+            self._wait(bounds)
             answer: bytes = self._socket.recv(zmq.NOBLOCK)
             more = bool(self._socket.rcvmore)  # the rest goes with the socket
         except zmq.ZMQError as error:
@@ -224,23 +209,24 @@ class ReqSocket:
             raise RequestFailed(f"{self._url} answered with several frames, not one")
         return answer
 
-    def _check(self, ends_ns: int, bounds: Bounds) -> None:
-        """Raise what says why waiting has to end."""
-        bounds.left_s()
-        if now_ns() > ends_ns:
-            raise RequestFailed(f"{self._url} was silent for too long: {self._timeout_s:g} s", starting=True)
-        if not self._alive():
-            raise ServerDied(f"the server at {self._url} has ended")
-
-    def _broke(self, doubt: str = "") -> TransportError:
-        if not self._alive():
-            return ServerDied(f"the server at {self._url} has ended")
-        return RequestFailed(f"{self._url} broke the connection{doubt}", starting=True)
-
-    def _patience_ns(self, bounds: Bounds) -> int:
-        return now_ns() + round(min(self._timeout_s, bounds.left_s()) * 1e9)
+    def _wait(self, bounds: Bounds, *, greeting: bool = False) -> None:
+        """Wait for an answer, or for the end of the ``greeting``; raises what says why waiting has to end."""
+        ends_ns, watch = now_ns() + round(min(self._timeout_s, bounds.left_s()) * 1e9), self._watch
+        while self._socket not in dict(self._poller.poll(POLL_MS)):
+            watch.hear()
+            if greeting and any(connection.ready for connection in watch.connections.values()):
+                return
+            if watch.refused and not watch.met:
+                raise ServerDied(f"nothing answers at {self._url}")
+            if not self._alive():
+                raise ServerDied(f"the server at {self._url} has ended")
+            if watch.met and not watch.connections:
+                doubt = "; is it a ZeroMQ peer?" if greeting else ""
+                raise RequestFailed(f"{self._url} broke the connection{doubt}", starting=True)
+            bounds.left_s()
+            if now_ns() > ends_ns:
+                raise RequestFailed(f"{self._url} was silent for too long: {self._timeout_s:g} s", starting=True)
 
     def close(self) -> None:
-        """Close the connection, whatever is on its way."""
         self._watch.close()
         self._context.destroy(0)

@@ -17,10 +17,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from s2a_bench.errors import EngineError, RequestFailed
+from s2a_bench.errors import RequestFailed
 from s2a_bench.plugins.policy_servers.observation import EXTENSION, VALUES, Template
 from s2a_bench.transport.chunks import actions_of
-from s2a_bench.types import Action, Piece
+from s2a_bench.types import Action, Vector
 
 MARKS: Final = "s2a_marks"
 GET_ACTION, PING, RESET, MODALITIES, KILL = "get_action", "ping", "reset", "get_modality_config", "kill"
@@ -56,13 +56,7 @@ def observation_in(data: Any) -> tuple[Any, str]:
     return (nested, N1_6) if isinstance(nested, dict) else (data, N1_5)
 
 
-def answer_of(observation: Mapping[Any, Any], layout: str, pieces: Sequence[Piece]) -> Any:
-    """Return what a request is answered; raises EngineError for tokens, and for nothing."""
-    if not all(isinstance(piece, Action) for piece in pieces):
-        raise EngineError("the engine answers with tokens, and this protocol knows actions; choose `answer` actions")
-    if not pieces:
-        raise EngineError("the engine answered with no action at all")
-    chunk = np.stack([piece.values for piece in pieces if isinstance(piece, Action)])
+def answer_of(observation: Mapping[Any, Any], layout: str, chunk: Vector) -> Any:
     if layout == N1_6:
         return [{NAMES["action"]: chunk[np.newaxis]}, {}]
     return {f"action.{NAMES['action']}": chunk[np.newaxis] if _batched(observation) else chunk}

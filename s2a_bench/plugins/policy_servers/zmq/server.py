@@ -12,7 +12,7 @@ import select
 import socket
 from collections import OrderedDict
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from concurrent.futures import TimeoutError as NotYet
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -29,8 +29,8 @@ from s2a_bench.plugins.policy_servers.zmq.wire import pack, read
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.listening import cannot_bind, in_url, key_for, split_address
-from s2a_bench.transport.serving import RETRY_AFTER_S, Core, Exchange, SharedSourceWorkers, client_error
-from s2a_bench.types import Piece, Request
+from s2a_bench.transport.serving import RETRY_AFTER_S, Core, SharedSourceWorkers, client_error
+from s2a_bench.types import Request
 
 POLL_MS: Final = 100
 """How often it is looked whether connections have begun or ended while nothing comes over them."""
@@ -160,7 +160,9 @@ class ZmqServer:
                 request = (client.name, str(extension.get("id"))) if extension is not None else None
                 if endpoint == layouts.GET_ACTION:
                     promised = self._marks.promise(request) if request else None
-                    self._core.answer(ActionExchange(client, message, marks, extension, trace, promised, self._core))
+                    self._core.answer(ZmqExchange(client, message, marks, extension, trace, promised, self._core))
+                    if promised is not None:
+                        promised.marks.cancel()  # if the answer has failed
                 elif endpoint == layouts.MARKS and request:
                     client.say(self._marks.take(request, self._core.limits.answer_s))
                 else:
@@ -223,11 +225,7 @@ class ReplyAddress:
         self._send([*self._envelope, message])
 
 
-class ActionExchange(Exchange):
-    """One request for actions; the chunk goes back whole."""
-
-    parse_stage = "msgpack_parse"
-
+class ZmqExchange(observed.ActionsExchange):
     def __init__(
         self,
         client: ReplyAddress,
@@ -243,28 +241,22 @@ class ActionExchange(Exchange):
         self._client, self._data, self._extension, self._core = client, message.get(layouts.DATA), extension, core
         self._promised = promised
         self._maps = layouts.marked(marks) == layouts.N1_7
-        self._pieces: list[Piece] = []
 
     def request(self) -> Request:
         self._observation, self._layout = layouts.observation_in(self._data)
         return observed.request_of(self._observation, self._extension, self.trace, self._core.limits)
 
-    def send(self, piece: Piece) -> bool:
-        self._pieces.append(piece)
-        return not self.disconnected()
-
     def end(self) -> None:
-        """Send the chunk, then find the marks, which may take time, for our own client."""
+        """Send the chunk, then find the marks for our own client."""
+        answer = layouts.answer_of(self._observation, self._layout, self.chunk())
         self.sent_whole()
-        self._client.say(pack(layouts.answer_of(self._observation, self._layout, self._pieces), maps=self._maps))
+        self._client.say(pack(answer, maps=self._maps))
         if self._promised is not None:
             self._promised.wanted.wait(WANTED_S)
-            self._promised.marks.set_result(bytes(pack(observed.remote_message(self.trace.to_remote()))))
+            self._promised.marks.set_result(bytes(pack(self.marks())))
 
     def fail(self, error: S2AError) -> None:
         self._client.say(_error(error))
-        if self._promised is not None and not self._promised.marks.done():
-            self._promised.marks.set_exception(_unknown())
 
     def disconnected(self) -> bool:
         return self._client.connection.disconnected
@@ -277,10 +269,6 @@ class Promise(NamedTuple):
     wanted: Event
 
 
-def _unknown() -> RequestFailed:
-    return RequestFailed("unknown request, or its marks were requested before")
-
-
 class Marks:
     """The marks of the latest requests of our clients, each requested once."""
 
@@ -289,7 +277,6 @@ class Marks:
         self._promises: OrderedDict[tuple[bytes, str], Promise] = OrderedDict()
 
     def promise(self, request: tuple[bytes, str]) -> Promise:
-        """Return the promise of a client's request, given by its name and the request's id."""
         promised = Promise(Future(), Event())
         with self._lock:
             self._promises[request] = promised
@@ -301,13 +288,11 @@ class Marks:
         """Wait for the marks of a request; raises RequestFailed for one that is not known."""
         with self._lock:
             promised = self._promises.pop(request, None)
-        if promised is None:
-            raise _unknown()
-        promised.wanted.set()
-        try:
-            return promised.marks.result(seconds)
-        except NotYet:
-            raise _unknown() from None
+        if promised is not None:
+            promised.wanted.set()
+            with suppress(CancelledError, NotYet):
+                return promised.marks.result(seconds)
+        raise RequestFailed("unknown request, or its marks were requested before")
 
 
 def _error(error: S2AError) -> memoryview:

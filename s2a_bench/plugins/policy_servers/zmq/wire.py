@@ -25,7 +25,6 @@ from s2a_bench.plugins.policy_servers.zmq.layouts import CONFIG_MARKS, N1_5, N1_
 from s2a_bench.types import Pixels
 
 ARRAY, FILE = "__ndarray_class__", "as_npy"
-ND, TYPE, KIND, SHAPE, BYTES = "nd", "type", "kind", "shape", "data"
 SMALL: Final = 1 << 16
 """Bytes that a message without large pictures takes, or fewer."""
 NO_FILES: Final[Mapping[int, PictureFile]] = {}
@@ -71,8 +70,7 @@ def pack(message: Any, files: Mapping[int, PictureFile] = NO_FILES, *, maps: boo
         if maps:  # its elements are packed from where they are
             solid = np.ascontiguousarray(value)
             data = solid.reshape(-1).view(np.uint8).data
-            fields = {ND: True, TYPE: solid.dtype.str, KIND: b"", SHAPE: value.shape, BYTES: data}
-            return {key.encode(): each for key, each in fields.items()}
+            return {b"nd": True, b"type": solid.dtype.str, b"kind": b"", b"shape": value.shape, b"data": data}
         file = files.get(value.__array_interface__["data"][0])
         return {ARRAY: True, FILE: (file.file(value) if file else None) or file_of(value)}
 
@@ -96,9 +94,9 @@ def read(data: Any) -> tuple[Any, set[str]]:
         if ARRAY in value:
             marks.add(N1_6)
             return array_of(value.get(FILE))
-        if b"nd" in value or ND in value:
+        if b"nd" in value or "nd" in value:
             fields = {key.decode() if isinstance(key, bytes) else key: each for key, each in value.items()}
-            if fields.keys() >= {TYPE, BYTES}:
+            if fields.keys() >= {"type", "data"}:
                 marks.add(N1_7)
                 return _array_in(fields)
         for layout, mark in (*CONFIG_MARKS.items(), (OURS, OURS)):
@@ -111,15 +109,15 @@ def read(data: Any) -> tuple[Any, set[str]]:
 
 def _array_in(fields: Mapping[str, Any]) -> Any:
     """Return the read-only array, or scalar, in a map of msgpack-numpy; raises RequestFailed for what is none."""
-    kind, descr, data = fields.get(KIND) or b"", fields[TYPE], fields[BYTES]
-    shape = fields.get(SHAPE) if fields[ND] else []
+    kind, descr, data = fields.get("kind") or b"", fields["type"], fields["data"]
+    shape = fields.get("shape") if fields["nd"] else []
     kind = kind.decode("latin-1") if isinstance(kind, bytes) else kind
     if kind in ("O", "V") or not isinstance(descr, str) or not _NUMBERS.fullmatch(descr):
         raise RequestFailed(
             f"an array of kind {str(kind)[:8]!r} and type {str(descr)[:80]!r}: numbers are taken, nothing is unpickled"
         )
     array = array_in(data, shape, np.dtype(descr))
-    return array if fields[ND] else array[()]
+    return array if fields["nd"] else array[()]
 
 
 def file_of(array: NDArray[Any]) -> bytes:
@@ -132,7 +130,7 @@ def array_of(data: Any) -> NDArray[Any]:
     if not isinstance(data, bytes):
         raise RequestFailed(f"an array whose as_npy is {type(data).__name__}, not bytes")
     start, shape, fortran, dtype = _read_head(_head_in(data))
-    return array_in(data, shape, dtype, start, fortran=fortran)
+    return array_in(data, shape[::-1], dtype, start).T if fortran else array_in(data, shape, dtype, start)
 
 
 def _head_in(data: bytes) -> bytes:

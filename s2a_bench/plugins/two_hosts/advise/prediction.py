@@ -78,6 +78,10 @@ class Advice:
         return f"{self.pipeline}{'&' if '?' in self.pipeline else '?'}payload={self.payload}"
 
     @property
+    def predicted(self) -> str:
+        return number(self.e2e_ms) + (" [{}, {}]".format(*map(number, self.ends_ms)) if self.ends_ms else "")
+
+    @property
     def limit(self) -> str:
         """What takes the most: the link, coding, or the transport."""
         transport_ms = self.e2e_ms - self.link_ms - self.coding_ms
@@ -224,23 +228,19 @@ def waiting_ms(load: float, service_ms: float) -> float | None:
 
 
 def advice_table(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile, provenance: str) -> TextTable:
-    checked = any(each.measured_ms is not None for each in found)
-    rows = [
-        (
-            each.pipeline,
-            each.payload,
-            number(each.e2e_ms) + (f" [{number(each.ends_ms[0])}, {number(each.ends_ms[1])}]" if each.ends_ms else ""),
-            *([_measured(each)] if checked else []),
-            number(each.bound_ms),
-            each.limit,
-            *([f"{each.load:.0%}", ABSENT if each.wait_ms is None else number(each.wait_ms)] if config.rate else []),
-            *([{True: "yes", False: "no", None: "unclear"}[each.meets]] if config.deadline or config.rate else []),
-        )
-        for each in found
-    ]
-    header = ("pipeline", "payload", "predicted ms", *(["measured ms"] if checked else []), "bound ms", "limited by")
-    header += ("of the rate", "wait ms") if config.rate else ()
-    header += ("meets it",) if config.deadline or config.rate else ()
+    columns = {
+        "pipeline": [each.pipeline for each in found],
+        "payload": [each.payload for each in found],
+        "predicted ms": [each.predicted for each in found],
+    }
+    if any(each.measured_ms is not None for each in found):
+        columns["measured ms"] = [_measured(each) for each in found]
+    columns |= {"bound ms": [number(each.bound_ms) for each in found], "limited by": [each.limit for each in found]}
+    if config.rate:
+        columns["of the rate"] = [f"{each.load:.0%}" for each in found]
+        columns["wait ms"] = [ABSENT if each.wait_ms is None else number(each.wait_ms) for each in found]
+    if config.deadline or config.rate:
+        columns["meets it"] = [{True: "yes", False: "no", None: "unclear"}[each.meets] for each in found]
     notes = (
         PREDICTION,
         f"TCP: {host_tcp()}, as this host's; requests {_pause(config)}.",
@@ -249,7 +249,8 @@ def advice_table(found: Sequence[Advice], config: AdviseConfig, profile: LinkPro
         *(["Losses are not predicted: the times hold for requests without one."] if profile.loss else []),
     )
     title = f"{config.cameras} x {config.size[0]}x{config.size[1]} over {profile.about}, predicted"
-    return TextTable(title, header, rows, 2, notes=notes, provenance=provenance)
+    rows = [*zip(*columns.values(), strict=True)]
+    return TextTable(title, tuple(columns), rows, 2, notes=notes, provenance=provenance)
 
 
 def _pause(config: AdviseConfig) -> str:
@@ -266,8 +267,7 @@ def sentence(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile
     best = found[0]
     if best.load > 1:
         return f"{profile.name} carries {config.rate:g} such requests a second over no transport of the sweep."
-    ends = f" [{number(best.ends_ms[0])}, {number(best.ends_ms[1])}]" if best.ends_ms else ""
-    text = f"{best.pipeline} with {best.payload} is the quickest over {profile.name}: {number(best.e2e_ms)}{ends} ms"
+    text = f"{best.pipeline} with {best.payload} is the quickest over {profile.name}: {best.predicted} ms"
     if config.deadline:
         meet = sum(each.meets is True for each in found)
         text += f"; {meet} of {len(found)} surely meet {config.deadline_ms:g} ms"

@@ -44,8 +44,6 @@ AT_ONCE: Final = 32
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A measured quantity beside the profile's."""
-
     what: str
     unit: str
     profile: float

@@ -73,7 +73,6 @@ class Shaper:
         return self._last_s
 
     def _sent_s(self, start_s: float, size: float) -> float:
-        """Return when the last of ``size`` bytes leaves."""
         if not self._way.steps:
             return start_s + size * 8e-6 / self._way.mbps
         while True:

@@ -21,7 +21,7 @@ from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, METRICS, REQUESTS, TICK
 from s2a_bench.plugins.chunks.chunks.run import run_virtual
 from s2a_bench.plugins.chunks.chunks.view import show
 from s2a_bench.plugins.chunks.modes import ControlSetting, mode
-from s2a_bench.plugins.chunks.modes.closed import Closed, closed, mean_reaction_s
+from s2a_bench.plugins.chunks.modes.closed import Closed, closed
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from tests.cli.program import called, printed
@@ -274,8 +274,8 @@ def test_the_reaction_to_constant_waits_and_cycles_is_even(wait: int, cycle: int
 def test_its_quantiles_have_the_mean_of_the_closed_form(pairs: list[tuple[int, int]]) -> None:
     waits, cycles = (np.array(column) for column in zip(*pairs, strict=True))
     shares = (np.arange(20_000) + 0.5) / 20_000
-    found = Closed(0.0, waits, cycles).reaction_ticks(shares)
-    assert found.mean() == pytest.approx(mean_reaction_s(waits, cycles), rel=1e-3)
+    form = Closed(0.0, waits, cycles)
+    assert form.reaction_ticks(shares).mean() == pytest.approx(form.mean_reaction_ticks, rel=1e-3)
 
 
 def test_hundreds_of_thousands_of_ticks_take_no_minutes() -> None:
@@ -283,7 +283,7 @@ def test_hundreds_of_thousands_of_ticks_take_no_minutes() -> None:
     waits, cycles = rng.integers(0, 300_000, 500), rng.integers(1, 600_000, 500)
     found = Closed(0.0, waits, cycles).reaction_ticks((np.arange(2000) + 0.5) / 2000)
     assert (np.diff(found) >= 0).all()
-    assert found.mean() == pytest.approx(mean_reaction_s(waits, cycles), rel=1e-3)
+    assert found.mean() == pytest.approx(Closed(0.0, waits, cycles).mean_reaction_ticks, rel=1e-3)
 
 
 @pytest.mark.parametrize("written", ["sync", "queue?trigger=6", "aggregate?trigger=5", "streamed?trigger=4&gap_s=0.01"])

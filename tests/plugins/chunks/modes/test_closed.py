@@ -17,9 +17,7 @@ from s2a_bench.plugins.chunks.modes.append import Queue, Streamed, Sync
 from s2a_bench.plugins.chunks.modes.closed import (
     Closed,
     appended,
-    mean_reaction_s,
     replace_stall_share,
-    slack_ticks,
     slow_down,
     stall_share,
 )
@@ -188,7 +186,7 @@ def test_random_latencies_cost_a_blocking_robot_more_than_their_mean() -> None:
     reactions = cycles.start_tick[answered] - moments
     delay = cycles.delay_ticks.astype(float)
     error = reactions.std() / 400_000**0.5 * 3  # moments share cycles
-    assert reactions.mean() == pytest.approx(mean_reaction_s(delay, delay + 4), abs=4 * error)
+    assert reactions.mean() == pytest.approx(Closed(0.0, delay, delay + 4).mean_reaction_ticks, abs=4 * error)
     assert reactions.mean() > 1.5 * delay.mean() + 2 + 4 * error  # the form for a constant latency
 
 
@@ -269,7 +267,7 @@ def test_slowed_down_by_beta_no_cycle_stalls_and_by_less_each_does(
     latency: int, s: int, rest: int, rounding: Rounding, under_way: Any
 ) -> None:
     horizon = s + rest
-    slack = slack_ticks(horizon, s, under_way)
+    slack = Replace(s, under_way).slack(ControlSetting(1000, horizon, rounding))
     beta = slow_down(latency / 1e9, slack, 1e-6)
     # Ticks of 1000 ns, so that rounding to whole ns is little.
     latency_ns = constant(latency * 1000, 30)

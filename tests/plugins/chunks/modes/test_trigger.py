@@ -25,14 +25,13 @@ from s2a_bench.plugins.chunks.modes.trigger import (
     LearningStepper,
     Maximum,
     Mean,
-    TrackedLatency,
     Trigger,
     TriggerRule,
     calibrate,
     follow,
     trigger,
 )
-from s2a_bench.policy.conformal import EPSILON
+from s2a_bench.policy.conformal import EPSILON, Tracker
 
 MS = 1_000_000
 CALIBRATION, FRESH = 8_000, 100_000
@@ -42,9 +41,9 @@ CALIBRATION, FRESH = 8_000, 100_000
 class Fixed:
     """One latency for ever: what a calibration or the oracle found."""
 
-    latency_ns: float
+    caution: float
 
-    def learn(self, latency_ns: int, *, stalled: bool) -> None:
+    def learn(self, latency_ns: int, /, *, stalled: bool) -> None:
         """Learn nothing."""
 
 
@@ -182,7 +181,7 @@ def test_tracking_brings_a_machine_that_drifts_back_to_epsilon(latencies: Gaps, 
     fresh = np.rint(draw(latencies, np.random.default_rng(2), 40_000) * scale).astype(np.int64)
     rules: dict[str, TriggerRule] = {
         "fixed": Fixed(calibrate(known).caution),
-        "tracked": TrackedLatency.begin(known),
+        "tracked": Tracker(known.tolist()),
         "maximum": Maximum(float(known.max())),
         "mean": Mean(int(known.sum()), known.size),
     }
@@ -203,7 +202,7 @@ def test_the_maximum_never_forgets_one_outlier_and_tracking_does() -> None:
     found = follow(Maximum(), latency_ns, setting, 60)
     assert set(found[501:].tolist()) == {45}
     assert np.flatnonzero(stalled(found, latency_ns, setting)).tolist() == [0, 500]
-    found = follow(TrackedLatency.begin(latency_ns[:500], 0.01), latency_ns[500:], setting, 60)
+    found = follow(Tracker(latency_ns[:500].tolist(), 0.01), latency_ns[500:], setting, 60)
     assert set(found.tolist()) == {2}
     assert np.flatnonzero(stalled(found, latency_ns[500:], setting)).tolist() == [0]
 
@@ -231,8 +230,8 @@ def test_a_trigger_is_safe_at_its_latency_slowed_down_or_not(
 
 def test_a_rule_that_needs_the_greatest_trigger_gets_it() -> None:
     assert trigger(math.inf, ControlSetting(20, 8), 5) == Trigger(5, 1.0)
-    assert TrackedLatency.begin([1.0] * 50, 0.01).latency_ns == math.inf  # too few to promise 1 %
-    found = follow(TrackedLatency.begin([1.0] * 50, 0.01), np.array([90, 110, 130]), ControlSetting(20, 8), 5)
+    assert Tracker([1.0] * 50, 0.01).caution == math.inf  # too few to promise 1 %
+    found = follow(Tracker([1.0] * 50, 0.01), np.array([90, 110, 130]), ControlSetting(20, 8), 5)
     assert found.tolist() == [5, 5, 5]
 
 
@@ -242,7 +241,7 @@ def test_a_tracked_robot_stalls_while_its_latencies_exceed_the_slack(rounding: R
     known = draw(latencies, np.random.default_rng(1), 2000)
     fresh = draw(latencies, np.random.default_rng(2), 30_000)
     fresh[10_000:20_000] *= 2  # above the slack of 80 ms for a while
-    stalls = stalled(follow(TrackedLatency.begin(known), fresh, setting, 4), fresh, setting)
+    stalls = stalled(follow(Tracker(known.tolist()), fresh, setting, 4), fresh, setting)
     assert np.mean(stalls[10_000:20_000]) > 0.1
     assert np.mean(stalls[:10_000]) < 0.0115
     assert np.mean(stalls[24_000:]) < 0.0115
@@ -262,7 +261,7 @@ def drawn(count: int, seed: int, scale: float = 80e6) -> NDArray[np.int64]:
 
 
 def tracked() -> TriggerRule:
-    return TrackedLatency.begin(drawn(500, 1).tolist(), 0.05)
+    return Tracker(drawn(500, 1).tolist(), 0.05)
 
 
 @pytest.mark.parametrize("begin", [Maximum, Mean, tracked])
@@ -296,7 +295,7 @@ def test_a_mean_of_ticks_is_the_mean(rounding: Rounding) -> None:
             stepper.act(tick)
             tick += 1
         stepper.arrived(request, 16, tick + delay)
-    assert stepper.rule.latency_ns == pytest.approx(latency_ns.mean(), rel=0.01)
+    assert stepper.rule.caution == pytest.approx(latency_ns.mean(), rel=0.01)
 
 
 def test_each_robot_has_a_rule_of_its_own() -> None:
@@ -304,4 +303,4 @@ def test_each_robot_has_a_rule_of_its_own() -> None:
     one, other = mode.stepper(SETTING), mode.stepper(SETTING)
     assert one.ask(0)
     one.arrived(0, 16, 9)
-    assert (one.rule.latency_ns, other.rule.latency_ns) == (19 * SETTING.period_ns // 2, 0)
+    assert (one.rule.caution, other.rule.caution) == (19 * SETTING.period_ns // 2, 0)
