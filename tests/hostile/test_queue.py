@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Generator, Iterator
-from contextlib import closing, contextmanager
-from dataclasses import replace
+from collections.abc import Generator
+from contextlib import closing
 from threading import Event
 from typing import Any
 
@@ -14,25 +13,19 @@ import httpx
 import pytest
 
 from s2a_bench.errors import BadRequest, RequestFailed
-from s2a_bench.testing.transport import ask, served, wiring_of
+from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler, open_client
+from s2a_bench.transport import open_client
 from s2a_bench.transport.http.native import PATHS
-from s2a_bench.transport.limits import LIMITS, Limits
+from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.serving import Queued, Turns
 from s2a_bench.types import Request, Token
+from tests.transport.test_http import serving
 from tests.waiting import until
 
 CHAT, BEST_EFFORT = PATHS["as-deployed"], PATHS["best-effort"]
 SERVERS = {CHAT: "http", BEST_EFFORT: "http/best-effort"}
 paths = pytest.mark.parametrize("path", [CHAT, BEST_EFFORT])
-
-
-@contextmanager
-def serving(handler: Handler, name: str = "http", limits: Limits = LIMITS) -> Iterator[str]:
-    """Serve for as long as the context lasts."""
-    with served(replace(wiring_of(name), limits=limits), handler) as (server, _):
-        yield server.address
 
 
 def body(prompt: str = "go on", *, stream: bool = True, **more: Any) -> dict[str, Any]:

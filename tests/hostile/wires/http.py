@@ -101,7 +101,6 @@ def _clients(path: str) -> Iterator[Case[Attack]]:
     yield Case("bad grammar", sends(chat(fields=f'"grammar": {parentheses(20_000)}', path=path)))
     goes_on = chat(fields=GOES_ON, path=path)
     yield Case("gone in the middle of an answer", sends(goes_on, then="goes"))
-    yield Case("reset in the middle of an answer", sends(goes_on, then="resets"))
     yield Case("100 clients that go", crowd(100, sends(goes_on, then="goes")))
     yield Case("a page in a browser", sends(head("Origin: http://localhost", path=path, length=0)), "^HTTP/1.1 403 ")
     yield Case("a name that means us", sends(head("Host: example.com", path=path, length=0)), "^HTTP/1.1 403 ")

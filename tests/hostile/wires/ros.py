@@ -102,7 +102,6 @@ CLIENTS: tuple[Case[Attack], ...] = (
     Case("2^32-1 pictures announced", publishes(lambda: [CDR + b"\x01\0\0\0\0\0\0\0" * 4 + b"\xff" * 400], answers=0)),
     Case("no UTF-8", publishes(_altered(b"marker", b"\xff\xfe\xc0\xed\xa0\x80"), answers=0)),
     Case("max_tokens 2^32-1", publishes(_asks(max_tokens=(1 << 32) - 1)), "max_tokens should be"),
-    Case("a prompt of 16 MiB", publishes(_asks(prompt="go" + " " * (16 << 20)))),
     Case(
         "8 requests of 16 MiB",
         publishes(lambda: [*_asks(id="flood", prompt="go" + " " * (16 << 20))()] * 8, answers=8),

@@ -86,7 +86,6 @@ def _many(number: int) -> bytes:
 CLIENTS: tuple[Case[Attack], ...] = (
     *ANY_CLIENT,
     Case("greeting, then silence", sends(GREETING, seconds=1)),
-    Case("greeting, then noise", sends(ready(b"REQ"), NOISE)),
     Case("half a message, then silence", sends(ready(b"REQ"), message(request())[:-5], seconds=1, first=len(GREETING))),
     Case(
         "1 GiB announced",
@@ -191,7 +190,6 @@ SERVERS: tuple[Case[Trap], ...] = (
     Case("an error that forges lines", _answers(packed({"error": CONTROL})), "^RequestFailed: .*all is well"),
     Case("an error of 15 MiB", _answers(packed({"error": "no " * 5 * MIB})), FAILED),
     Case("1 GiB announced in an answer", converses([frame(b"", more=True) + frame(b"a", said=1 << 30)]), FAILED),
-    Case("half an answer, then silence", converses([message(MOVES)[:-3]]), "^RequestFailed: .*silent"),
     Case("actions, then silence where the marks belong", _answers(MOVES), "^RequestFailed: .*silent"),
     Case("marks that are none", converses([message(MOVES)], [message(packed({"s2a": {"clock": 5}}))]), FAILED),
 )
