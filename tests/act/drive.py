@@ -17,8 +17,6 @@ ZERO_NS = 7_000_000_000
 """When the request is made: not at 0, so that nobody mistakes one for the other."""
 
 EVERY_POLICY = tuple(POLICIES)
-SAFE_START = {"s2a-clairvoyant"}
-"""Policies that get S0, which a robot could not know."""
 
 
 def ns(seconds: float) -> int:

@@ -9,7 +9,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from tests.cli.program import called, printed, refused
+from tests.cli.program import called, printed
 
 ROOT = Path(__file__).parent.parent.parent
 SCHEMA = json.loads((ROOT / "docs/schema/s2a-bench-compare-1.json").read_text())
@@ -68,26 +68,3 @@ def test_computed_timelines_are_the_same_to_the_last_digit_and_gated_without_lau
     whole = printed(done, SCHEMA)
     assert {one["verdict"] for one in whole["comparisons"]} == {"same"}
     assert {one["p"] for one in whole["comparisons"]} == {1.0}
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "message"),
-    [
-        ([ECHO], 2, "Missing argument 'B'"),
-        ([ECHO, "/no/such"], 1, "/no/such is no run folder"),
-        ([ECHO, RAW], 1, "cells of one name differ: http/as-deployed payload: jpeg against raw"),
-        ([ECHO, LLAMA], 1, "the runs are unlike: model engine: echo against llama; provenance engine: echo "),
-        ([ECHO, ECHO, "--metric", "speed"], 2, "--metric: 'speed' is no metric of these latency runs; there are e2e"),
-        ([ECHO, ECHO, "--fail-if", "e2e"], 2, "--fail-if: 'e2e' should look like e2e.median>5%"),
-        ([ECHO, ECHO, "--fail-if", "zmq:e2e>5%"], 2, "no cell with e2e is called 'zmq'; there are ros/topic, http/as-"),
-        ([ECHO, ECHO, "--strict"], 2, "--strict: there is no gate; add --fail-if"),
-        ([ECHO, ECHO, "--one-launch"], 2, "--one-launch: there is no gate; add --fail-if"),
-        ([ECHO, ECHO, "--min-effect", "-1"], 2, "--min-effect"),
-        ([f"{ECHO},{ECHO}", ECHO], 2, "A: a folder is named twice"),
-        ([ECHO, " , "], 2, "B: name a run folder"),
-        ([f"{ECHO},{RAW}", ECHO], 2, "name several launches on both sides, or one on each"),
-        ([ECHO, ECHO, "--output", __file__], 1, f"--output {__file__}: "),
-    ],
-)
-def test_wrong_use_is_one_line(arguments: list[str], code: int, message: str) -> None:
-    assert message in refused("compare", *arguments, code=code)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -45,17 +44,6 @@ def test_a_replay_behind_a_url_is_emulated(tmp_path: Path) -> None:
     assert (origin.engine, origin.tokens, origin.profile) == ("replay", "emulated", "rtx-4080")
     assert set(run.samples["engine"]) == {"replay"}
     assert set(run.samples["provenance"]) == {"replay/none/emulated"}
-    assert "EMULATED" in output
-
-
-def test_a_replay_behind_an_action_is_emulated_too(tmp_path: Path) -> None:
-    namespace = f"/replayed_{os.getpid()}"
-    with serving("ros", "--engine", "replay", "--profile", "rtx-4080", "--namespace", namespace) as line:
-        assert line
-        action = ("--transport", "ros/action", "--action", f"{namespace}/generate_response")
-        run, output = measured(tmp_path, *action, "--data-only")
-    assert run.origins.of("ros/action").code == "replay/none/emulated/link-unknown"
-    assert set(run.samples["engine"]) == {"replay"}
     assert "EMULATED" in output
 
 

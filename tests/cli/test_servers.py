@@ -15,7 +15,7 @@ import pytest
 
 from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.types import Token
-from tests.cli.program import command, only_run, printed, program, refused
+from tests.cli.program import command, only_run, printed, program
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, Ollama, answering
 
@@ -96,18 +96,3 @@ def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: P
     assert before == ["", ""]
     assert last.startswith("Interrupted: the run was ended during this request")
     assert "failed-samples" not in output
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["--url", "http://x", "--dialect", "openvla", "--payload", "jpeg"], "can send a picture as raw, not as jpeg"),
-        (["--url", "http://x", "--api-key-env", KEY], "takes the name of an environment variable, not the key itself"),
-        (["--url", "http://x", "--extra-body", "@/no/such"], "--extra-body: cannot read /no/such"),
-    ],
-)
-def test_bad_flags_are_named_before_anything_is_kept(arguments: list[str], says: str, tmp_path: Path) -> None:
-    output = refused("latency", *SMALL, *arguments, "--output", tmp_path / "results")
-    assert says in output
-    assert KEY not in output
-    assert not (tmp_path / "results").exists()

@@ -188,10 +188,6 @@ def test_the_papers_sweep_is_36_timelines() -> None:
     ("text", "message"),
     [
         ('command = "fly"', "command: 'fly' is none of boundary, capacity, ccrb, chunks, latency"),
-        (
-            'command = "timeline"\n[settings]\npolicies = "naive"',
-            "'policies' is no flag of s2a-bench timeline; did you",
-        ),
         ('command = "timeline"\n[grid]\nplans = [1, 5]', "plans=5: --plans: without --jitter or --t-nom-cv all plans"),
         ('command = "timeline"\n[settings]\nt-min = "soon"', "t-min=soon: Invalid value for '--t-min'"),
         ('command = "latency"\n[settings]\nboard = "orin"', "--board: "),

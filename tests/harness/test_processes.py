@@ -45,11 +45,6 @@ def test_a_server_that_met_an_illegal_instruction_says_to_set_up_again(tmp_path:
     assert "; run `make setup` again; its log is" in str(error.value)
 
 
-def test_another_signal_is_only_told(tmp_path: Path) -> None:
-    with Dies(tmp_path / "log", "SIGTERM") as server, pytest.raises(ServerDied, match="by signal 15; its log is"):
-        server.wait_ready()
-
-
 def test_a_server_that_does_not_start_says_its_last_lines_and_where_its_log_is(tmp_path: Path) -> None:
     log = tmp_path / "server-http-launch-2.log"
     with OwnProcess("http", "s2a_bench.nothing", "{}", log) as server, pytest.raises(ServerDied) as error:

@@ -49,14 +49,6 @@ def test_it_is_absent_and_told(dialect: str, message: str, fact: str, value: str
     assert trace.odd == {fact}
 
 
-@pytest.mark.parametrize(("dialect", "message", "fact"), TOLD)
-def test_a_number_that_can_be_is_kept(dialect: str, message: str, fact: str) -> None:
-    trace = Trace()
-    trace.learn(open_dialect(dialect).event(json.loads(message % "12")).facts)
-    assert trace.facts[fact] in {12.0, 12e-6}
-    assert not trace.odd
-
-
 @pytest.mark.parametrize("value", ["NaN", "1e300", '"12"'])
 def test_a_rate_that_can_be_none_fails_no_sample(value: str) -> None:
     trace = Trace()

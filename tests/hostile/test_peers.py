@@ -16,19 +16,11 @@ class TestHttp(HostileSuite):
     clients = http.CLIENTS
     servers = http.SERVERS
 
-    @classmethod
-    def wiring(cls) -> Wiring[Any]:
-        return replace(super().wiring(), limits=Limits(head_s=2))  # one case waits for it
-
 
 class TestHttpBestEffort(HostileSuite):
     name = "http/best-effort"
     clients = http.FAST
     servers = http.SERVERS
-
-    @classmethod
-    def wiring(cls) -> Wiring[Any]:
-        return replace(super().wiring(), limits=Limits(head_s=2))  # as above
 
 
 class TestRosTopic(HostileSuite):
@@ -55,7 +47,7 @@ class TestWebsocket(HostileSuite):
 
     @classmethod
     def wiring(cls) -> Wiring[Any]:
-        return replace(super().wiring(), limits=Limits(head_s=2, body_s=3))  # two cases wait for them
+        return replace(super().wiring(), limits=Limits(head_s=2))  # one case waits for it
 
 
 class TestWebsocketStreamed(HostileSuite):

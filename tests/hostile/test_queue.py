@@ -4,35 +4,28 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Generator, Iterator
-from contextlib import closing, contextmanager
-from dataclasses import replace
+from collections.abc import Generator
+from contextlib import closing
 from threading import Event
 from typing import Any
 
 import httpx
 import pytest
 
-from s2a_bench.errors import BadRequest, EngineError, RequestFailed
-from s2a_bench.testing.transport import ask, served, wiring_of
+from s2a_bench.errors import BadRequest, RequestFailed
+from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Handler, open_client
+from s2a_bench.transport import open_client
 from s2a_bench.transport.http.native import PATHS
-from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.transport.serving import Queued, Turn, Turns
+from s2a_bench.transport.limits import Limits
+from s2a_bench.transport.serving import Queued, Turns
 from s2a_bench.types import Request, Token
+from tests.transport.test_http import serving
 from tests.waiting import until
 
 CHAT, BEST_EFFORT = PATHS["as-deployed"], PATHS["best-effort"]
 SERVERS = {CHAT: "http", BEST_EFFORT: "http/best-effort"}
 paths = pytest.mark.parametrize("path", [CHAT, BEST_EFFORT])
-
-
-@contextmanager
-def serving(handler: Handler, name: str = "http", limits: Limits = LIMITS) -> Iterator[str]:
-    """Serve for as long as the context lasts."""
-    with served(replace(wiring_of(name), limits=limits), handler) as (server, _):
-        yield server.address
 
 
 def body(prompt: str = "go on", *, stream: bool = True, **more: Any) -> dict[str, Any]:
@@ -58,28 +51,13 @@ class Gate:
             self.ended.append(request.id)
 
 
-class TestTurns:
-    def test_leaving_twice_lets_one_run_not_two(self) -> None:
-        turns = Turns()
-        first, second, third = (turns.join() for _ in range(3))
-        first.leave()
-        first.leave()
-        assert second.has_started
-        assert not third.has_started
-
-    @pytest.mark.parametrize(
-        "fails", [EngineError("no"), ValueError("no"), UnicodeEncodeError("utf-8", "", 0, 1, "no")]
-    )
-    def test_whatever_is_raised_frees_the_engine(self, fails: Exception) -> None:
-        def failing(_request: Request, _trace: Trace, _turn: Turn) -> Generator[Token, None, None]:
-            yield Token(0, "a")
-            raise fails
-
-        queued = Queued(failing)
-        for _ in range(2):
-            with pytest.raises(type(fails)):
-                list(queued(Request("a", ""), Trace()))
-        assert queued.turns.join().has_started
+def test_leaving_twice_lets_one_run_not_two() -> None:
+    turns = Turns()
+    first, second, third = (turns.join() for _ in range(3))
+    first.leave()
+    first.leave()
+    assert second.has_started
+    assert not third.has_started
 
 
 def ask_and_go(url: str, *, stream: bool, request_id: str, path: str = CHAT) -> socket.socket:

@@ -58,11 +58,6 @@ class TestLetters:
         assert one_line("キッチン é λ → ☃ C:\\x") == "キッチン é λ → ☃ C:\\x"
         assert visible("a\n\tb") == "a\n\tb"
 
-    def test_every_error_is_one_line(self) -> None:
-        message = str(RequestFailed(f"the server: {FORGED}"))
-        assert message.startswith(r"the server: no\nerror: forged\u000d\u001b[2J")
-        assert len(message.splitlines()) == 1
-
     def test_progress_and_tables_show_them(self, capsys: pytest.CaptureFixture[str]) -> None:
         with RunProgress() as progress:
             progress.say(FORGED)

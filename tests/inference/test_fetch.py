@@ -259,9 +259,7 @@ def test_the_files_of_the_commit_that_was_fetched_last_are_the_model(hub: Hub) -
     ("what", "status", "headers", "message"),
     [
         ("refuse", 404, {"X-Error-Code": "RepoNotFound"}, f"{REPOSITORY}: no such repository at http://127.0.0.1"),
-        ("refuse", 401, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
         ("refuse", 403, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),
-        ("refuse", 401, {}, "answered 401; check the name and HF_TOKEN, try later, or download"),
         ("refuse", 401, {"X-Error-Message": "Invalid credentials in"}, "answered 401 Invalid credentials"),
         ("refuse", 500, {}, "answered 500; check the name and HF_TOKEN, try later"),
         ("refuse_files", 403, {"X-Error-Code": "GatedRepo"}, "gated; ask for access"),

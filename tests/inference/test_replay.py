@@ -192,7 +192,6 @@ def test_facts_tell_prompt_and_decoding_time() -> None:
         (EngineConfig(name="replay", profile="tx1"), "`profile`: 'tx1' is none of"),
         (EngineConfig(name="replay", profile="rtx-4080", gaps="trace"), "profile rtx-4080 holds no recording"),
         (EngineConfig(name="replay", profile="rtx-4080", gaps="wild"), "'wild' is none of constant, parametric"),
-        (EngineConfig(name="echo", profile="rtx-4080"), "`profile` needs `engine` replay; `engine` echo answers at"),
         (EngineConfig(name="llama", gaps="trace"), "`gaps` needs `engine` replay"),
     ],
 )

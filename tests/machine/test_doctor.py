@@ -264,8 +264,6 @@ OURS = f"python{sys.version_info.major}.{sys.version_info.minor}"
 
 NONE, ALL = {"finds": lambda _package: False}, {"finds": lambda _package: True}
 SOURCED = {"environ": HUMBLE}
-LISTENING = "  sl  local st\n  0: 0100007F:1D17 00000000:0000 0A 0\n"
-CONNECTED = "  0: 0100007F:9999 0100007F:1D17 01 0\n  1: 0100007F:1D17 0:0 01 0\nx\n"
 
 
 @pytest.mark.parametrize(

@@ -75,23 +75,14 @@ def test_rgb_is_what_opencv_makes_of_it(encoding: str, padding: int) -> None:
 
 
 @pytest.mark.parametrize("big", [False, True])
-def test_grey_of_16_bits_is_scaled_to_8_as_cv_bridge_does(big: bool) -> None:
-    values = np.arange(HEIGHT * WIDTH, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 170
-    data = np.ascontiguousarray(values.astype(">u2" if big else "<u2")).view(np.uint8).reshape(HEIGHT, WIDTH, 2)
-    expected = np.rint(values * (255 / 65535)).astype(np.uint8)
-    for padding in (0, 3):
-        got = rgb("mono16", data, padding, is_bigendian=int(big))
-        np.testing.assert_array_equal(got, expected[..., None].repeat(3, axis=2))
-
-
-@pytest.mark.parametrize("big", [False, True])
-@pytest.mark.parametrize("encoding", ["rgb16", "bgr16"])
-def test_colours_of_16_bits_are_scaled_to_8_too(encoding: str, big: bool) -> None:
-    values = np.arange(HEIGHT * WIDTH * 3, dtype=np.uint16).reshape(HEIGHT, WIDTH, 3) * 50
+@pytest.mark.parametrize(("encoding", "channels", "step"), [("mono16", 1, 170), ("rgb16", 3, 50), ("bgr16", 3, 50)])
+def test_16_bits_are_scaled_to_8_as_cv_bridge_does(encoding: str, channels: int, step: int, big: bool) -> None:
+    values = np.arange(HEIGHT * WIDTH * channels, dtype=np.uint16).reshape(HEIGHT, WIDTH, channels) * step
     data = np.ascontiguousarray(values.astype(">u2" if big else "<u2")).view(np.uint8)
-    expected = np.rint(values * (255 / 65535)).astype(np.uint8)
-    got = rgb(encoding, data, 3, is_bigendian=int(big))
-    np.testing.assert_array_equal(got, expected if encoding == "rgb16" else expected[..., ::-1])
+    expected = np.rint(values * (255 / 65535)).astype(np.uint8).repeat(3 // channels, axis=2)
+    for padding in (0, 3):
+        got = rgb(encoding, data, padding, is_bigendian=int(big))
+        np.testing.assert_array_equal(got, expected[..., ::-1] if encoding == "bgr16" else expected)
 
 
 @pytest.mark.parametrize(("opencv", "named"), [("8UC3", "bgr8"), ("8UC1", "mono8")])
@@ -112,15 +103,10 @@ def test_a_mosaic_of_one_colour_is_that_colour(encoding: str) -> None:
     ("encoding", "fields"),
     [
         ("nv12", {"step": WIDTH + 1}),
-        ("nv12", {"height": 1}),
-        ("nv21", {"width": 3}),
         ("yuv422", {"width": 3}),
-        ("bgra8", {"step": WIDTH * 3}),
-        ("mono16", {"step": WIDTH}),
         ("bayer_rggb8", {"height": HEIGHT + 1}),
         ("bgr8", {"width": 0}),
         ("bgr8", {"step": 0}),
-        ("bgr8", {"height": HEIGHT + 1}),
         ("bgr8", dict.fromkeys(("width", "height", "step"), 2**32 - 1)),
         ("bgr8", {"width": 50_000_001, "height": 1, "step": 150_000_003}),
         ("rgb16", {}),

@@ -70,22 +70,6 @@ def test_the_table_says_that_the_weights_are_dummies(folder: Path) -> None:
     assert "DUMMY WEIGHTS" in text
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--tokens-per-skill", "few"], "--tokens-per-skill: 'few' should be paper or a whole number"),
-        (["--answers", "0"], "--answers: '0' should be greater than or equal to 1"),
-        (["--skills", "circus"], "circus"),
-        (["--task", "@/no/such/file"], "--task: cannot read /no/such/file"),
-    ],
-)
-def test_wrong_use_is_one_line_and_leaves_nothing_behind(arguments: list[str], message: str, tmp_path: Path) -> None:
-    done = run("validity", *arguments, output=tmp_path, code=2)
-    assert message in done.stderr.splitlines()[-1]
-    assert done.stdout == ""
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_model_that_is_not_there_is_named(tmp_path: Path) -> None:
     done = run("validity", "--model", "/no/such.gguf", output=tmp_path, code=1)
     assert "--model /no/such.gguf" in done.stderr

@@ -6,7 +6,7 @@ import base64
 import json
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import count
 from threading import Event, Thread, get_ident
 
@@ -19,6 +19,7 @@ from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of
 from s2a_bench.trace import Remote, Trace, budget
 from s2a_bench.transport import Handler, open_client, open_server
 from s2a_bench.transport.http import native
+from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.types import Request, Token
 
@@ -29,9 +30,9 @@ def handler() -> RecordingHandler:
 
 
 @contextmanager
-def serving(handler: Handler, name: str = "http") -> Iterator[str]:
+def serving(handler: Handler, name: str = "http", limits: Limits = LIMITS) -> Iterator[str]:
     """Serve for as long as the context lasts."""
-    with served(wiring_of(name), handler) as (server, _):
+    with served(replace(wiring_of(name), limits=limits), handler) as (server, _):
         yield server.address
 
 

@@ -60,7 +60,6 @@ def test_options_hold_for_every_variant_that_is_meant() -> None:
         ("ros/topic?wire=bgr", "ros has no option 'wire'; it has payload, action, url, namespace"),
         ("ros?payload", "'ros?payload' should look like ros?option=value"),
         ("http?port=x", "`port`: 'x' should be a valid integer"),
-        ("http?port=-1", "`port`: '-1' should be greater than or equal to 0"),
         ("ros?publish_tokens=maybe", "`publish_tokens`: 'maybe' should be a valid boolean"),
         ("", "`transport`: '' is none of http, ros, loopback"),
     ],

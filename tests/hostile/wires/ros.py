@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import socket
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import closing, suppress
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from s2a_bench.clock import now_ns
-from s2a_bench.ros import QoS, Rejected, Result
+from s2a_bench.ros import QoS
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.ros.service import READER_QOS, appeared
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.ros.action import ACTION
 from s2a_bench.transport.ros.camera import CAMERA, POLL_S
 from s2a_bench.transport.ros.joining import domain_of, join, namespace_of
 from s2a_bench.transport.ros.wire import request_message
@@ -54,18 +52,6 @@ def publishes(
     return attack
 
 
-def sends_goals(acts: Callable[[Any], Iterable[Any]]) -> Attack:
-    """Return an action client that does something, and returns the events that came of it."""
-
-    def attack(wiring: Wiring[Any]) -> str:
-        with closing(join(wiring, "hostile")) as middleware:
-            client = middleware.action_client(namespace_of(wiring) + ACTION, GENERATE_RESPONSE)
-            assert appeared(client.server_present, MATCHES_S), "no server to attack"
-            return "\n".join(str(said) for said in acts(client))
-
-    return attack
-
-
 def _request(images: Iterable[Any] = (), compressed: Iterable[Any] = (), **fields: Any) -> Any:
     request = Request(**{"id": "hostile", "prompt": "go on", "max_tokens": 3, **fields})
     return request_message(request, list(images), list(compressed))
@@ -97,28 +83,6 @@ def _altered(at: bytes, by: bytes) -> Messages:
     return lambda: [bytes(ros.serialise(_request(prompt="marker"), ros.REQUEST)).replace(at, by, 1)]
 
 
-def _event(client: Any, *kinds: type, seconds: float = MATCHES_S) -> Any:
-    """Return the next event of a kind."""
-    deadline = now_ns() + round(seconds * 1e9)
-    while now_ns() < deadline:
-        if isinstance(event := client.next_event(POLL_S), kinds):
-            return event
-    return None
-
-
-def _goal(prompt: str = "go on", **more: Any) -> Any:
-    return generate_goal(prompt, **more)
-
-
-def _with(image_of_goal: Any) -> Callable[[Any], Iterator[Any]]:
-    def act(client: Any) -> Iterator[Any]:
-        client.send(client.pack(_goal(images=[image_of_goal])))
-        result = _event(client, Rejected, Result)
-        yield client.unpack_result(result.packed).response.text if isinstance(result, Result) else result
-
-    return act
-
-
 def datagrams(wiring: Wiring[Any]) -> str:
     """Send noise to the UDP ports of the domain's first participants (DDSI-RTPS, 9.6.1)."""
     base = 7400 + 250 * domain_of(wiring)
@@ -138,7 +102,6 @@ CLIENTS: tuple[Case[Attack], ...] = (
     Case("2^32-1 pictures announced", publishes(lambda: [CDR + b"\x01\0\0\0\0\0\0\0" * 4 + b"\xff" * 400], answers=0)),
     Case("no UTF-8", publishes(_altered(b"marker", b"\xff\xfe\xc0\xed\xa0\x80"), answers=0)),
     Case("max_tokens 2^32-1", publishes(_asks(max_tokens=(1 << 32) - 1)), "max_tokens should be"),
-    Case("a prompt of 16 MiB", publishes(_asks(prompt="go" + " " * (16 << 20)))),
     Case(
         "8 requests of 16 MiB",
         publishes(lambda: [*_asks(id="flood", prompt="go" + " " * (16 << 20))()] * 8, answers=8),
@@ -150,8 +113,5 @@ CLIENTS: tuple[Case[Attack], ...] = (
     Case("300 requests at once", publishes(lambda: [*_asks(id="flood", max_tokens=50)()] * 300, answers=300)),
     Case("gone in the middle of an answer", publishes(_asks(max_tokens=5000), answers=0)),
     Case("noise as a camera", publishes(lambda: [CDR + NOISE] * 50, CAMERA, ros.IMAGE, qos=QoS(1), answers=0)),
-    Case(
-        "a goal of 2^31 x 2^31 pixels", sends_goals(_with(image((1 << 31) - 1, (1 << 31) - 1, 12, step=12))), "at most"
-    ),
 )
-"""What our server outlives; both variants' clients are served by one."""
+"""What our server outlives; both variants' clients are served by one, and read their pictures alike."""

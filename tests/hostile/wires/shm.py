@@ -137,14 +137,6 @@ def on_a_disk(link: socket.socket) -> None:
         hello(link, os.dup(file.fileno()), 4096)
 
 
-def three_files(link: socket.socket) -> None:
-    """Send more files than belong to an offer."""
-    files = [file_of(4096) for _ in range(3)]
-    socket.send_fds(link, [HELLO.pack(MAGIC, 4096)], files)
-    for file in files:
-        os.close(file)
-
-
 def does_not_read(link: socket.socket) -> None:
     """Ask for more than the memory holds, and read nothing."""
     header = fields(max_tokens=60_000)
@@ -157,18 +149,13 @@ def does_not_read(link: socket.socket) -> None:
 CLIENTS: tuple[Case[Attack], ...] = (
     Case("silence", attack(sends(), seconds=1)),
     Case("gone at once", attack(goes)),
-    Case("packet of 3 bytes", attack(sends(b"abc")), "no offer"),
     Case("request without memory", attack(sends(PLACE.pack(64, 10))), "no offer"),
-    Case("memory of another version", attack(sends(HELLO.pack(b"S2A-SHM9", 4096))), "another version"),
     Case("memory without a file", attack(lambda link: hello(link, -1, 4096)), "should be one file"),
-    Case("memory of three files", attack(three_files), "should be one file"),
     Case("1 TiB of memory", attack(lambda link: hello(link, file_of(4096), 1 << 40)), "at most"),
     Case("more memory than the file has", attack(lambda link: hello(link, file_of(4096), MIB)), "its size may change"),
-    Case("a pipe as memory", attack(lambda link: hello(link, os.pipe()[0], 4096)), "is no memory"),
     Case("a file on a disk as memory", attack(on_a_disk), "is no memory"),
     Case("memory that may shrink", attack(lambda link: hello(link, file_of(MIB, fields(), sealed=False), MIB)), "may"),
     Case("memory that shrinks", attack(truncates)),
-    Case("header beyond the memory", asks(fields(), at=1 << 40), "cannot be"),
     Case("header across the end", asks(fields(), at=1), "cannot be"),
     Case("header of 5 MiB", asks(b"[" + b"{}," * (5 * MIB // 3) + b"{}]"), "cannot be"),
     Case("200,000 pictures", asks(fields(images=[{}] * (HEADER_BYTES // 5))), "more than 20000 values"),

@@ -46,15 +46,6 @@ def test_commas_stand_between_sources_and_between_the_parameters_of_a_family() -
     assert split((40, "60")) == ("40", "60")
 
 
-def test_a_number_a_family_and_a_recording_are_sources(tmp_path: Path) -> None:
-    file = tmp_path / "delays.csv"
-    file.write_text("latency_ns\n5\n7\n")
-    assert drawn("2.5", 3).tolist() == [2_500_000] * 3
-    assert drawn("lognormal:mean_ms=80,cv=0.5").mean() == pytest.approx(80 * MS, rel=0.05)
-    recorded = one(str(file)).recorded_ns
-    assert recorded.tolist() == [5, 7]
-
-
 def test_a_profile_takes_as_long_as_its_tokens() -> None:
     latency_s = drawn("rtx-4080", 500) / 1e9
     assert latency_s.mean() == pytest.approx(0.05 + 112 / 34.2, rel=0.05)
@@ -69,19 +60,6 @@ def test_a_run_gives_each_cell_until_its_last_token_without_warm_ups(make_run: M
     whole_ns = good["e2e_ns"] + (times.max() - times.min()).reindex(good.index).fillna(0)
     for name, latency_ns in found.items():
         assert latency_ns.tolist() == whole_ns[good["cell"] == name.partition("#")[2]].tolist()
-
-
-@pytest.mark.parametrize(
-    ("written", "message"),
-    [
-        ("-1", "`latency`: -1 should be between 0 and 3.6e+06 ms"),
-        ("none.csv", "cannot read none.csv"),
-    ],
-)
-def test_what_is_no_source_is_one_line_that_names_it(written: str, message: str) -> None:
-    with pytest.raises(UsageError) as error:
-        list(sources(written, 1))
-    assert message in str(error.value)
 
 
 def exported(folder: Path, **options: Any) -> list[dict[str, str]]:

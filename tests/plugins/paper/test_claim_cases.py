@@ -80,12 +80,6 @@ class Kit:
         samples.loc[samples["pipeline"] == "ros", "size"] = "1280x720"
         return replace(run, tables=run.tables | {"samples": samples})
 
-    def cut(self, launch: int) -> StoredRun:
-        """Make a latency run without ROS in one launch."""
-        run = self.latency()
-        missing = (run.samples["pipeline"] == "ros") & (run.samples["launch"] == launch)
-        return replace(run, tables=run.tables | {"samples": run.samples[~missing]})
-
     def beside_llama_server(
         self, *, without_model_ms: float = 60, engine: Provenance = REAL, server: Provenance = LLAMA_SERVER
     ) -> StoredRun:
@@ -196,10 +190,6 @@ NO_EVIDENCE: dict[str, dict[str, tuple[Made, str]]] = {
         ),
         "servers that do not tell": (lambda kit: kit.latency(manifest={"provenance": {}}), "engine unknown"),
         "two sizes": (lambda kit: kit.sizes(), "size 640x480 and 1280x720"),
-        "a new client for each request beside a kept connection": (
-            lambda kit: kit.latency(options={"http/as-deployed": {"connection": "client-per-request"}}),
-            "both sides: http/as-deployed with connection client-per-request (needs",
-        ),
         "a black box": (
             lambda kit: kit.latency(
                 options={"http/as-deployed": {"url": "http://10.0.0.2:8080"}},
@@ -211,19 +201,11 @@ NO_EVIDENCE: dict[str, dict[str, tuple[Made, str]]] = {
             lambda kit: kit.latency(manifest={"configuration": {}}),
             "servers: http/as-deployed unknown, ros/topic unknown",
         ),
-        "llama-server on another file": (
-            lambda kit: kit.beside_llama_server(server=replace(LLAMA_SERVER, model_sha256="cd")),
-            "model_sha256 cd and ab",
-        ),
     },
     "colour conversions": {
         "two model files": (
             lambda kit: kit.latency(origins={"ros/topic": replace(REAL, model_sha256="cd")}),
             "model_sha256 ab and cd",
-        ),
-        "a third launch that one side did not finish": (
-            lambda kit: kit.cut(launch=2),
-            "launches: 2 (needs 3 or more)",
         ),
     },
     "CCRB:": {"another rate": (lambda kit: kit.ccrb(rate=34.2), "rate 34.2")},

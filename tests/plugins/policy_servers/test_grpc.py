@@ -36,7 +36,6 @@ from tests.servers.lerobot import (
     name,
     storage,
     text,
-    timed_action,
 )
 
 GOLDEN = Path(__file__).with_name("data")
@@ -286,7 +285,6 @@ def bombs(path: Path) -> dict[str, tuple[bytes, str]]:
     deep = b"]" + b"\x85" * (OPCODES - 10)
     return {
         "bare": (b"\x80\x02" + bomb + b".", refused),
-        "in an action": (answer(timed_action(1.0, bomb)), refused),
         "in a storage": (answer(action(1.0, b"\x80\x02" + bomb + b".", 0, 3)), refused),
         "at the storage's end": (answer(action(1.0, KEPT[:-8] + bomb, 0, 3)), "a storage of|buffer size"),
         "as an instance": (b"\x80\x02" + name("subprocess", "Popen") + b")\x81.", "subprocess.Popen"),
@@ -306,7 +304,6 @@ def bombs(path: Path) -> dict[str, tuple[bytes, str]]:
             "more than 1048576",
         ),
         "no list": (b"\x80\x02}.", "no chunk"),
-        "no action": (b"\x80\x02](e.", "no chunk"),
         "an attribute of a name": (
             answer(name("torch._utils", "_rebuild_tensor_v2") + b"}" + text("x") + b"Nsb"),
             "no chunk",

@@ -27,7 +27,6 @@ HOSTILE = {
     "a map of 2^32 keys": b"\xdf\xff\xff\xff\xff",
     "bytes of 2^32": b"\xc6\xff\xff\xff\xff",
     "deep lists": b"\x91" * 100_000,
-    "deep lists with room": b"\x91" * 400 + b"\xdd\x00\x00\x0f\xff" * 100,
     "very many lists": (b"\xdc\x0f\xff" + b"\x90" * 4095) * 64,
     "very many maps": b"\xdc\x0f\xff" + (b"\xdc\x0f\xff" + b"\x80" * 4095) * 4095,
     "a key that is a number": b"\x81\x01\x01",
@@ -35,9 +34,7 @@ HOSTILE = {
     "half a surrogate pair": b"\x81\xa8endpoint\xa3\xed\xa0\x80",
     "an extension": msgpack.packb(msgpack.ExtType(5, b"abc")),
     "an extension of no bytes": b"\xc7\x00\x05",
-    "a time stamp of 32 bits": msgpack.packb(msgpack.Timestamp(1)),
-    "a time stamp of 64 bits": msgpack.packb(msgpack.Timestamp(1, 1)),
-    "a time stamp of 96 bits": b"\xc7\x0c\xff" + struct.pack(">Iq", 1, -1),
+    "a time stamp": b"\xc7\x0c\xff" + struct.pack(">Iq", 1, -1),
     "a time stamp of no bytes": b"\xc7\x00\xff",
 }
 

@@ -138,6 +138,8 @@ def deep() -> Any:
         ({"s2a": {"path": "no/slash"}}, "s2a: path: 'no/slash' should match pattern"),
         ({"s2a": {"idle_s": 0}}, "s2a: idle_s: 0 should be greater than or equal to 1"),
         ({"s2a": {"reset": "x"}}, "s2a: reset: 'x' should be a table"),
+        ({"a": "{image}", "s2a": [["a"]]}, "s2a: it should be a table of keys"),
+        ({"a": "{image:0|bytes}", "s2a": {"image_maps": True}}, "a wants bytes, and s2a.image_maps has pictures as"),
     ],
 )
 def test_a_template_that_makes_no_sense_is_refused_with_the_key(content: Any, says: str) -> None:
@@ -191,7 +193,7 @@ def test_a_file_that_cannot_be_read_is_refused_in_a_line(tmp_path: Path, name: s
         template_of(str(tmp_path / name))
 
 
-@pytest.mark.parametrize(("name", "says"), [("drold", "is none of aloha, droid"), ("no/such.toml", "cannot read")])
+@pytest.mark.parametrize(("name", "says"), [("vllm-omni", "is none of aloha, droid"), ("no/such.toml", "cannot read")])
 def test_an_unknown_name_is_refused(name: str, says: str) -> None:
     with pytest.raises(UsageError, match=says):
         template_of(name)

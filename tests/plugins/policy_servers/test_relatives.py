@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from http import HTTPStatus
@@ -172,11 +171,6 @@ def test_a_traceback_as_the_answer_to_a_reset_is_an_error() -> None:
     assert len(heard) == 2
 
 
-def test_the_name_that_had_keys_of_no_policy_is_answered_with_the_names_of_those_that_have() -> None:
-    with pytest.raises(UsageError, match=r"^`template`: 'vllm-omni' is none of .*vllm-omni-dreamzero, .*vllm-omni-pi0"):
-        template_of("vllm-omni")
-
-
 def test_an_empty_message_keeps_a_connection_open_that_would_be_cut(tmp_path: Path) -> None:
     (tmp_path / "idle.toml").write_text('prompt = "{prompt}"\ns2a.idle_s = 1\n')
     with (
@@ -317,20 +311,6 @@ def test_of_paths_that_are_refused_the_one_that_wants_a_key_is_told() -> None:
     with gated({"/openpi/policy": HTTPStatus.UNAUTHORIZED}, HTTPStatus.NOT_FOUND) as address:
         found = {finding.code: finding.message for finding in examine(address)}
     assert f"{address}/openpi/policy answered 401" in found["server"]
-
-
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        ('{"a": "{image:0|bytes}", "s2a": {"image_maps": true}}', "a wants bytes, and s2a.image_maps has pictures as"),
-        ('{"a": "{image}", "s2a": [["a"]]}', "s2a: it should be a table of keys"),
-    ],
-)
-def test_a_template_that_makes_no_sense_is_a_line(tmp_path: Path, content: str, says: str) -> None:
-    file = tmp_path / "mine.json"
-    file.write_text(content)
-    with pytest.raises(UsageError, match=re.escape(says)):
-        template_of(str(file))
 
 
 def test_starvla_has_an_envelope_in_both_directions() -> None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import gc
-import logging
 import os
 import sys
 import weakref
 from collections.abc import Iterator
 from contextlib import closing
-from threading import Event, Thread
+from threading import Thread
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
@@ -20,13 +19,11 @@ from s2a_bench.errors import MissingInterface, TransportError
 from s2a_bench.ros import Accepted, Feedback, QoS, Result, Tuning, llama, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.config import CYCLONE_URI, LARGE_PICTURES, RMW_CYCLONE
-from s2a_bench.ros.parameters import SERVICE, Parameter, value_of
 from s2a_bench.scenario.longitudinal import Longitudinal
 from s2a_bench.scenario.ros import EgoParameters, RosEgo
 from s2a_bench.testing.transport import RecordingHandler, ask, connector, wiring_of, yuyv_frame
 from s2a_bench.transport import open_client, open_server
 from s2a_bench.transport.ros import ROS
-from s2a_bench.transport.ros.node import LOG, ROSOUT_QOS, NodeApi
 from s2a_bench.types import Frame, Request
 from tests.plugins.rclpy.rclpy_stand_in import GRAPH, INTERFACES, PACKAGES, action, generated, modules
 from tests.ros.action_suite import NAME, ActionSuite
@@ -258,21 +255,3 @@ def test_without_a_name_the_environment_chooses(monkeypatch: pytest.MonkeyPatch)
     middleware = open_middleware(domain_id=7)
     assert middleware.describe()["middleware"] == "rclpy"
     middleware.close()
-
-
-def test_a_node_has_parameters_and_a_log_there_too(join: Join) -> None:
-    serving, peer = join(), join()
-    heard = peer.subscription("/rosout", LOG, ROSOUT_QOS)
-    parameters = [Parameter("depth", 3, live=True)]
-    node = NodeApi(serving, "/robot/brain", parameters, lambda _: None, lambda: iter(()), "info")
-    stopped = Event()
-    node.start(stopped)
-    try:
-        client = peer.service_client("/robot/brain/get_parameters", SERVICE + "GetParameters")
-        values = client.call(ros.default(SERVICE + "GetParameters_Request", names=["depth", "other"]), 5).values
-        assert [value_of(value) for value in values] == [3, None]
-        logging.getLogger("s2a_bench.x").info("hello")
-        assert "hello" in heard.unpack(heard.take(5)).msg
-    finally:
-        stopped.set()
-        node.close()

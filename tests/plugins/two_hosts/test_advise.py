@@ -304,7 +304,6 @@ def test_what_is_measured_is_inside_up_to_both_ends_and_the_limit_is_the_largest
 @pytest.mark.parametrize(
     ("options", "more", "cells"),
     [
-        ({}, [], []),
         ({"rate": 3}, ["of the rate", "wait ms", "meets it"], ["25%", "7.00", "yes"]),
         ({"deadline": "1s"}, ["meets it"], ["yes"]),
         ({"rate": 3, "deadline": "1s"}, ["of the rate", "wait ms", "meets it"], ["25%", "7.00", "yes"]),

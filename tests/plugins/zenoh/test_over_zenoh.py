@@ -14,19 +14,18 @@ from s2a_bench.act import ActionKind, kind
 from s2a_bench.act.ros import TRAJECTORY, RosRobot
 from s2a_bench.cli.doctor import all_checks
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import SourceError, TransportError, UsageError
+from s2a_bench.errors import SourceError, UsageError
 from s2a_bench.frames.ros import TopicCamera
 from s2a_bench.machine.doctor import Finding, Machine, examine
 from s2a_bench.plugins.zenoh import free_endpoint
 from s2a_bench.policy.parameters import build
 from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros.join import RosParameters
-from s2a_bench.scenario.embedded import Embedded
-from s2a_bench.scenario.ros import EgoParameters, RosEgo
+from s2a_bench.scenario.ros import EgoParameters
 from s2a_bench.store.run import read_run
 from s2a_bench.testing.transport import TransportSuite, wiring_of
 from s2a_bench.transport import Choice, Wiring
-from s2a_bench.transport.pipeline import one_pipeline, pipelines
+from s2a_bench.transport.pipeline import one_pipeline
 from tests.cli.test_latency import SMALL, only_run, run
 from tests.cli.test_serve import ONE_BY_ONE, Start, start  # noqa: F401 - a fixture
 from tests.ros.middleware_suite import WAIT_S
@@ -100,12 +99,6 @@ def test_a_camera_without_a_router_is_one_line() -> None:
         TopicCamera(f"/c?middleware=zenoh&router={free_endpoint()}", 64, 48)
 
 
-def test_an_ego_without_a_router_is_one_line() -> None:
-    how = build(EgoParameters, f"ros?middleware=zenoh&router={free_endpoint()}", "ego")
-    with pytest.raises(TransportError, match=r"^`ego`: ros: no Zenoh router answers at .* with \?router=$"):
-        RosEgo(Embedded(), how)
-
-
 @pytest.mark.parametrize(
     ("tree", "says"),
     [
@@ -134,11 +127,6 @@ def test_a_router_is_zenohs() -> None:
 def test_a_parameter_that_is_no_endpoint_is_refused(made_by: type[RosParameters]) -> None:
     with pytest.raises(UsageError, match=r"router: 'here' should look like tcp/127\.0\.0\.1:7447"):
         build(made_by, "ros?router=here")
-
-
-def test_an_option_that_is_no_endpoint_is_refused() -> None:
-    with pytest.raises(UsageError, match=r"'7447' should look like tcp/127\.0\.0\.1:7447"):
-        pipelines(["ros?router=7447"])
 
 
 def examined(machine: Machine) -> Finding:

@@ -121,15 +121,6 @@ def test_stalls_that_come_back_every_cycle_are_decided() -> None:
     assert Judge(Limit.read("stalled=2%"), True, 0, 0.99, 2 / 18)(row, traces)[0] == "above"
 
 
-def test_one_long_stall_is_one_event() -> None:
-    traces = [
-        trace(robot, np.arange(1000) // 40 == 12 if robot == 3 else [False] * 1000, [50] * 100) for robot in range(8)
-    ]
-    row = measures(traces, SETTING)
-    assert row.stalled == 0.005
-    assert Judge(Limit.read("stalled=1%"), False, 0, 0.95)(row, traces)[0] == "undecided"
-
-
 def test_a_request_without_an_answer_is_above_the_limit_once_it_waits_for_longer() -> None:
     latency_ms = [50] * 98 + [-1, -1]  # 400 and 200 ms before the end
     _, robots, above = above_limit(Limit.read("latency_p99=300ms"), [trace(3, [False] * 1000, latency_ms)], 5000 * MS)

@@ -213,20 +213,6 @@ def test_a_mode_that_never_acts_has_no_numbers_instead_of_wrong_ones(tmp_path: P
     assert all(pd.isna(found[name]) for name in ("p_stall_cycle", "p_stall_high", "jump_mean"))
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"modes": ""}, "`modes`: name at least one"),
-        ({"latency": ""}, "`latency`: name at least one"),
-        ({"control_hz": 0}, "`control_hz`"),
-    ],
-)
-def test_what_makes_no_sense_is_refused_by_its_field(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(UsageError) as error:
-        ChunksVirtual(**options)
-    assert message in str(error.value)
-
-
 def test_what_would_not_fit_into_memory_is_refused_before_a_folder_is_made(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"`cycles`: 1000000 chunks @ 3\.6e6 make"):
         run_virtual(ChunksVirtual(latency="3.6e6", cycles=1_000_000, rules=""), tmp_path / "none", NullProgress())

@@ -10,8 +10,6 @@ import pytest
 from scipy.special import gammainc
 
 from s2a_bench.act import Motion
-from s2a_bench.errors import UsageError
-from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, METRICS
 from s2a_bench.plugins.chunks.chunks.smooth import (
     RATE,
@@ -187,19 +185,6 @@ class TestRuns:
         table = run.table(CHUNKS).set_index("rule")
         assert table.loc["given", NAMES].notna().all()
         assert table.loc["calibrated", NAMES].isna().all()
-
-    @pytest.mark.parametrize(
-        ("robot", "message"),
-        [
-            ("ros", "`robot`: ros: virtual time has no actions to send; name a plant, or nothing"),
-            ("plant?frequency_hz=0", "`robot`: plant: frequency_hz = '0': input should be greater than 0"),
-            ("timed", "`robot`: timed takes no actions; ros, call, plant do"),
-        ],
-    )
-    def test_a_robot_that_cannot_be_is_refused(self, robot: str, message: str) -> None:
-        with pytest.raises(UsageError) as error:
-            ChunksVirtual(robot=robot)
-        assert message in str(error.value)
 
 
 class TestSmoothness:
