@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,7 +12,7 @@ from s2a_bench.harness.warnings import exchange_warnings
 from s2a_bench.machine import environment
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, mean_rows, trigger_rows
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes, draw
-from s2a_bench.plugins.chunks.chunks.config import PROMISING
+from s2a_bench.plugins.chunks.chunks.config import PROMISING, RulesPlan
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS, MEANS, REACTIONS, REQUESTS, TICKS, TRIGGERS
 from s2a_bench.plugins.chunks.chunks.smooth import TrackingPlant, follower
 from s2a_bench.plugins.chunks.latencies import delay_rows, write_delays
@@ -23,25 +23,47 @@ from s2a_bench.store.run import RunWriter
 if TYPE_CHECKING:
     from s2a_bench.plugins.chunks.chunks.config import ChunksVirtual
     from s2a_bench.plugins.chunks.modes import ControlSetting
+    from s2a_bench.plugins.chunks.options import ControlPlan
     from s2a_bench.progress import Progress
 
 MOST_TICKS: Final = 100_000_000
 """Control ticks of a cell, which are held in memory."""
 
 
-def _manifest(config: ChunksVirtual, tried: Sequence[ActingCell]) -> dict[str, Any]:
-    """Return the manifest, with what the rules learned and warnings about it."""
+@dataclass(frozen=True, slots=True, eq=False)
+class VirtualPlan:
+    """A run in virtual time."""
+
+    control: ControlPlan
+    rules: RulesPlan
+    drawn: Sequence[LatencyDraw]
+    """Of each source."""
+    cells: Sequence[ActingCell]
+    follows: TrackingPlant | None
+    """The robot and its target; None without a robot, or with actions slowed down."""
+    shown_ticks: int
+    export_delays: Path | None
+    manifest: dict[str, Any]
+
+
+def resolve(config: ChunksVirtual) -> VirtualPlan:
+    """Draw the latencies, have the rules learn, and decide what follows; raises S2AError."""
+    control, rules, setting = config.control, config.rules_plan, config.setting
+    drawn = [draw(source, config.cycles, config.learnt, config.seed) for source in config.sources]
+    for each in drawn:
+        _check_memory(each, setting)
+    tried = [cell.followed(setting) for each in drawn for cell in cells(control, rules, each)]
     calibrations = {cell.drawn.source.name: asdict(cell.calibration) for cell in tried if cell.calibration}
     warnings = exchange_warnings(calibrations, FOLLOW)
-    if config.learnt and (missing := ", ".join(rule for rule in config.rules if rule not in config.rules_tried)):
+    if config.learnt and (missing := ", ".join(rule for rule in config.rules if rule not in rules.tried)):
         few = f"without the rules {missing}: {config.too_few}"
         warnings = [RunWarning("few-latencies", few, "record more, or raise --eps"), *warnings]
     for each in {cell.drawn.source.name: cell.drawn for cell in tried if cell.rule in PROMISING}.values():
         name, recorded = each.source.name, each.source.recorded_ns is not None
-        if recorded and (changed := changes(config.setting, name, each)):
+        if recorded and (changed := changes(setting, name, each)):
             warnings += changed
             calibrations.get(name, {})["changed"] = True
-    return {
+    manifest = {
         "configuration": config.to_manifest(),
         "environment": environment.collect(),
         "seeds": {"latencies": config.seed},
@@ -51,6 +73,9 @@ def _manifest(config: ChunksVirtual, tried: Sequence[ActingCell]) -> dict[str, A
             Provenance.computed(), {cell.cell: cell.drawn.source.provenance for cell in tried}
         ).to_manifest(),
     }
+    plant = config.robot_kind if config.slow_down == 1 else None
+    follows = None if plant is None else follower(plant, control)
+    return VirtualPlan(control, rules, drawn, tried, follows, config.shown_ticks, config.export_delays, manifest)
 
 
 def _check_memory(drawn: LatencyDraw, setting: ControlSetting) -> None:
@@ -65,29 +90,23 @@ def _check_memory(drawn: LatencyDraw, setting: ControlSetting) -> None:
 
 def run_virtual(config: ChunksVirtual, output: Path, progress: Progress) -> Path:
     """Act in virtual time and return the run folder; raises S2AError."""
-    control, rules, setting = config.control, config.rules_plan, config.setting
-    drawn = [draw(source, config.cycles, config.learnt, config.seed) for source in config.sources]
-    for each in drawn:
-        _check_memory(each, setting)
-    tried = [cell.followed(setting) for each in drawn for cell in cells(control, rules, each)]
-    follows = follower(config.robot_kind, control) if config.robot_kind and config.slow_down == 1 else None
-    manifest = _manifest(config, tried)
-    with RunWriter.create(output, "chunks", manifest, (CHUNKS, REACTIONS, TICKS, REQUESTS)) as writer:
+    plan = resolve(config)
+    setting, mode, first = plan.control.setting, plan.rules.mode, plan.drawn[0]
+    with RunWriter.create(output, "chunks", plan.manifest, (CHUNKS, REACTIONS, TICKS, REQUESTS)) as writer:
         progress.opened(writer.path)
         progress.stage("acting in virtual time")
-        progress.expect(len(tried))
-        for cell in tried:
-            acted = _acted(cell, setting.slowed(cell.slower), follows)
-            for table, rows in cell_rows(acted, config.shown_ticks, rules.epsilon, control.seed).items():
+        progress.expect(len(plan.cells))
+        for cell in plan.cells:
+            acted = _acted(cell, setting.slowed(cell.slower), plan.follows)
+            for table, rows in cell_rows(acted, plan.shown_ticks, plan.rules.epsilon, plan.control.seed).items():
                 writer.append(table, rows)
             progress.advance()
-        if rules.mode is not None:
-            for each in drawn:
-                writer.append(TRIGGERS, trigger_rows(rules.mode, setting, each))
-        first = drawn[0]
-        writer.append(MEANS, mean_rows(control, first, follows))
-        if config.export_delays is not None:
-            write_delays(config.export_delays, delay_rows(first.source, first.judged, tried[0].mode, setting))
+        if mode is not None:
+            for drawn in plan.drawn:
+                writer.append(TRIGGERS, trigger_rows(mode, setting, drawn))
+        writer.append(MEANS, mean_rows(plan.control, first, plan.follows))
+        if plan.export_delays is not None:
+            write_delays(plan.export_delays, delay_rows(first.source, first.judged, plan.cells[0].mode, setting))
         return writer.path
 
 
