@@ -150,7 +150,7 @@ def test_a_function_is_called_with_every_skill(config: TimelineLive, tmp_path: P
     (cell,) = timelines_of(run)
     assert acted == [skill.text for skill in cell.skills]
     assert len(acted) == 8
-    assert f"skills are carried out by call?function={__name__}:act" in origin_notes(run, [cell])[0]
+    assert f"skills are carried out by call?function={__name__}:act" in origin_notes(run.manifest, [cell])[0]
 
 
 @pytest.mark.slow

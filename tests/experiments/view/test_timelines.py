@@ -152,6 +152,7 @@ def column(table: TextTable, name: str) -> list[str]:
 
 def test_the_table_groups_rows_by_board_and_granularity(computed: StoredRun) -> None:
     table = execution_table(timelines_of(computed), computed.manifest)
+    assert table.title == "Timelines, N = 8, T_nom = 1 s: times in s"
     assert column(table, "board") == ["Orin", "", "", "", "", ""]
     assert column(table, "L") == ["6", "", "", "4", "", ""]
     assert column(table, "start") == ["1.75", "10.50", "3.50", "1.33", "7.17", "1.33"]

@@ -143,17 +143,17 @@ def timeline_csv(cells: Iterable[Timelines]) -> dict[str, CsvTable]:
 
 def _table(cells: Sequence[Timelines], title: str, metrics: Sequence[str], notes: Iterable[str]) -> TextTable:
     """Return a table of means, a group of rows a board."""
-    several = len({cell.shape for cell in cells}) > 1
+    several, shown = len({cell.shape for cell in cells}) > 1, [METRICS[name] for name in metrics]
     boards: dict[str, list[tuple[str, ...]]] = {}
     names: dict[str, list[str]] = {}
     for panel in panels(cells):
-        title, tokens, n_skills, t_nom_s = panel.cells[0].setting
-        board = title + (f", N {n_skills}, T {t_nom_s:g}" if several else "")
+        name, tokens, n_skills, t_nom_s = panel.cells[0].setting
+        board = name + (f", N {n_skills}, T {t_nom_s:g}" if several else "")
         for place, cell in enumerate(panel.cells):
-            row = (board, "" if place else str(tokens), cell.policy, *(_entry(cell, METRICS[name]) for name in metrics))
+            row = (board, "" if place else str(tokens), cell.policy, *(_entry(cell, metric) for metric in shown))
             boards.setdefault(board, []).append(row)
             names.setdefault(board, []).append(cell.first.cell)
-    header = ("board", "L", "policy", *(METRICS[name].title for name in metrics))
+    header = ("board", "L", "policy", *(metric.title for metric in shown))
     return TextTable.grouped(title, header, boards.values(), 3, notes, once=1, cells=chain(*names.values()))
 
 
