@@ -299,10 +299,3 @@ class Comparable:
     def of(cls, table: Table[Any], shown: tuple[str, ...], setting: Sequence[str] = ()) -> Self:
         """Return what compares the rows of a table, cell by cell."""
         return cls(metrics_of(table.row), lambda run: Cells.of(run, table).subjects(setting), shown)
-
-
-def plain_rows(run: StoredRun, table: Table[Any]) -> list[dict[str, Any]]:
-    """Return the rows of a table without their provenance, None for a missing value."""
-    found = run.table(table).drop(columns=PROVENANCE)
-    rows = found.astype(object).where(found.notna(), None).to_dict("records")
-    return [{str(name): value for name, value in row.items()} for row in rows]

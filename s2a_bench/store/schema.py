@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, make_dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from types import NoneType
-from typing import Annotated, Any, Final, Generic, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Final, Generic, Literal, TypeAlias, TypeVar, get_args, get_origin, get_type_hints
 
 from s2a_bench.bounds import Count, Facts, Fraction, Many, NonNegative, Positive, about
 from s2a_bench.secrets import struck
@@ -89,23 +89,3 @@ def _kind(hint: Any) -> Kind:
     plain = next((arg for arg in get_args(hint) if arg is not NoneType), hint) if NoneType in get_args(hint) else hint
     kinds: dict[Any, Kind] = {int: "int64", float: "float64", bool: "bool", list: "json", dict: "json"}
     return kinds.get(get_origin(plain) or plain, "string")
-
-
-def with_fields(
-    name: str, about: str, base: type, fields: Mapping[str, Any], own: Mapping[str, Any] | None = None
-) -> Any:
-    """Return a dataclass with the fields of its base, ``fields``, and ``own`` ones, which have no default.
-
-    One of ``fields`` that may be None has that default: an absent key of ``--json``.
-    """
-    made: list[Any] = [
-        (key, hint, field(default=None)) if _may_lack(hint) else (key, hint) for key, hint in fields.items()
-    ]
-    made += (own or {}).items()
-    return make_dataclass(
-        name, made, bases=(base,), namespace={"__doc__": about}, frozen=True, slots=True, kw_only=True
-    )
-
-
-def _may_lack(hint: Any) -> bool:
-    return NoneType in get_args(get_args(hint)[0] if get_origin(hint) is Annotated else hint)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING, Any
 
 from s2a_bench.stats import Floats, Ratio, SummaryEnds, summarise, summary_of
 from s2a_bench.store.manifest import present
-from s2a_bench.store.schema import SCHEMA, Many, NonNegative, with_fields
+from s2a_bench.store.schema import SCHEMA, Many, NonNegative
 
 if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
@@ -48,15 +48,6 @@ def frame(
         **more,
         "warnings": run.manifest.get("warnings", []),
     }
-
-
-def cell_of_row(
-    name: str, about: str, row: type, *, without: Sequence[str], own: Mapping[str, Any] | None = None
-) -> type:
-    """Return the class of a cell: a row's fields, absent if None, ``without`` some, and with ``own`` ones."""
-    hints = {key: hint for key, hint in get_type_hints(row, include_extras=True).items() if key not in without}
-    made: type = with_fields(name, about, object, hints, own)
-    return made
 
 
 def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
