@@ -9,9 +9,8 @@ included: (n - 1) / (t_last - t_first).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from functools import cached_property, partial
-from statistics import median
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -43,8 +42,7 @@ from s2a_bench.store.schema import Count, Facts, about
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport, payload_order
 from s2a_bench.transport.pipeline import without
-from s2a_bench.writers.csv_text import CsvTable
-from s2a_bench.writers.json import summaries, summaries_of_ends
+from s2a_bench.writers.csv_text import CsvTable, summary_values
 from s2a_bench.writers.tables import DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
@@ -65,21 +63,6 @@ class Ends(NamedTuple):
 
     lo: Floats
     hi: Floats
-
-    @property
-    def named(self) -> dict[str, Floats]:
-        """Return both ends by what follows the name of a stage or metric."""
-        return dict(zip(_ENDS, self, strict=True))
-
-    @property
-    def middle(self) -> float:
-        """Return the middle between the medians; raises ValueError without values."""
-        return float(median(self.lo.tolist()) + median(self.hi.tolist())) / 2
-
-    @property
-    def half(self) -> float:
-        """Return half the distance between the medians; raises ValueError without values."""
-        return float(median(self.hi.tolist()) - median(self.lo.tolist())) / 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +186,11 @@ class RequestCell:
         if declared.of_tokens:
             return Ends(*(known(self._of_tokens(f"{declared.of_tokens}{end}", self.by_id)) for end in _ENDS))
         return Ends(*(known(self._numbers(declared.name, end)) for end in _ENDS))
+
+    def summaries(self, metric: RequestMetric | str) -> dict[str, Summary]:
+        """Return the summaries of the values, and of both ends of the intervals, by what follows the metric's name."""
+        sides = {"": self.values(metric), **dict(zip(_ENDS, self.ends(metric), strict=True))}
+        return {end: summary for end, values in sides.items() if (summary := summary_of(values))}
 
     def rows(self, metric: RequestMetric | str) -> Rows:
         """Return a metric's values, a row for each request that has any."""
@@ -649,19 +637,19 @@ def cell_json(cls: type, cells: RequestCells, **fields: Any) -> dict[str, Any]:
 
 def summaries_of(cell: RequestCell, metrics: Mapping[str, RequestMetric | str]) -> dict[str, Any]:
     """Return key -> summary as JSON, or of both ends, of the metrics that some sample has."""
-    exact = summaries((key, cell.values(metric)) for key, metric in metrics.items())
-    return {**exact, **summaries_of_ends((key, cell.ends(metric)) for key, metric in metrics.items())}
+    each = {key: cell.summaries(metric) for key, metric in metrics.items()}
+    exact = {key: asdict(by_end[""]) for key, by_end in each.items() if "" in by_end}
+    lo, hi = _ENDS
+    ends = {key: asdict(SummaryEnds(by_end[lo], by_end[hi])) for key, by_end in each.items() if lo in by_end}
+    return exact | ends
 
 
-def summarised(
-    cells: Iterable[RequestCell], metrics: Sequence[RequestMetric]
-) -> Iterator[tuple[RequestCell, str, Summary]]:
-    """Yield cell, key of a metric and summary, where there are values; intervals have one a side."""
-    for cell in cells:
-        for metric in metrics:
-            for end, values in {"": cell.values(metric), **cell.ends(metric).named}.items():
-                if summary := summary_of(values):
-                    yield cell, f"{metric.key.removesuffix('_ms')}{end}_ms" if end else metric.key, summary
+def summary_rows(cell: RequestCell, metrics: Iterable[RequestMetric]) -> Iterator[tuple[object, ...]]:
+    """Yield the key of a metric and its summary, where there are values; intervals have one a side."""
+    for metric in metrics:
+        for end, summary in cell.summaries(metric).items():
+            key = f"{metric.key.removesuffix('_ms')}{end}_ms" if end else metric.key
+            yield key, *summary_values(summary)
 
 
 def ratio_table(cells: Iterable[RequestCell], ratios: Iterable[tuple[str, str, str, Ratio]]) -> CsvTable:

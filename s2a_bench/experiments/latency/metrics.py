@@ -19,10 +19,10 @@ from s2a_bench.experiments.requests import (
     in_ms,
     ratio_table,
     summaries_of,
-    summarised,
     summarised_by,
+    summary_rows,
 )
-from s2a_bench.stats import Summary, SummaryEnds, summary_of
+from s2a_bench.stats import Summary, SummaryEnds
 from s2a_bench.store.schema import Count, Facts, about
 from s2a_bench.trace import GROUPS
 from s2a_bench.transport.surroundings import shown
@@ -115,15 +115,13 @@ def _ratios(cells: RequestCells) -> Iterator[tuple[str, str, str, Ratio]]:
 def _stage_rows(cells: RequestCells) -> Iterator[tuple[object, ...]]:
     for cell in cells:
         for stage in (*cell.stages, "residual"):
-            for end, values in {"": cell.values(stage), **cell.ends(stage).named}.items():
-                if summary := summary_of(values):
-                    place = cell.name, cell.stages.get(stage, ""), stage + end
-                    yield *place, *summary_values(summary), cell.emulated
+            for end, summary in cell.summaries(stage).items():
+                place = cell.name, cell.stages.get(stage, ""), stage + end
+                yield *place, *summary_values(summary), cell.emulated
 
 
 def _rows(cells: RequestCells) -> Iterator[tuple[object, ...]]:
     """Yield a row a cell and metric; a cell without successful samples has one row, without numbers."""
     for cell in cells:
-        rows = [(key, summary_values(summary)) for _, key, summary in summarised([cell], METRICS)]
-        for key, values in rows or [("", (0, *[None] * (len(SUMMARY) - 1)))]:
+        for key, *values in [*summary_rows(cell, METRICS)] or [("", 0, *[None] * (len(SUMMARY) - 1))]:
             yield cell.name, key, cell.errors, cell.warmups, *values, cell.emulated

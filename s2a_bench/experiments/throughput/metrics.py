@@ -19,7 +19,7 @@ from s2a_bench.experiments.requests import (
     cells_of,
     compared_by,
     ratio_table,
-    summarised,
+    summary_rows,
 )
 from s2a_bench.stats import Floats, Ratio, Summary, summarise
 from s2a_bench.stats.batches import Blocks
@@ -202,9 +202,7 @@ def throughput_json(cells: ThroughputCells) -> dict[str, Any]:
 
 def throughput_csv(cells: ThroughputCells) -> dict[str, CsvTable]:
     """Return file name -> CSV table, unrounded; absent values have no row."""
-    rows = [
-        (cell.name, key, *summary_values(summary), cell.emulated) for cell, key, summary in summarised(cells, METRICS)
-    ]
+    rows = [(cell.name, *row, cell.emulated) for cell in cells for row in summary_rows(cell, METRICS)]
     if (reference := cells.reference_values).size:
         rows.append((LLAMA_BENCH, RATIO_METRIC, *summary_values(summarise(reference)), False))
     positions = [
