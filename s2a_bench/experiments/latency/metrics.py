@@ -11,12 +11,11 @@ from s2a_bench.experiments.requests import (
     GROUP,
     ITL,
     TOKEN_DELAY,
+    RequestCellJson,
     RequestCells,
     RequestMetric,
-    RequestsCell,
     cell_json,
     compared_by,
-    in_ms,
     ratio_table,
     summaries_of,
     summarised_by,
@@ -37,7 +36,7 @@ AROUND: Final[tuple[RequestMetric, ...]] = tuple(chain.from_iterable(shown("metr
 
 
 @dataclass(frozen=True, kw_only=True)
-class LatencyCell(RequestsCell):
+class LatencyCell(RequestCellJson):
     """One pipeline, stage by stage; a value that no sample has is an absent key."""
 
     residual_flagged: Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")]
@@ -64,7 +63,7 @@ class LatencyCell(RequestsCell):
         ),
     ] = None
     frame_age_ms: Annotated[
-        Summary | SummaryEnds | None, RequestMetric(about="Age of the frame when inference starts.", ends=True)
+        Summary | SummaryEnds | None, RequestMetric(about="Age of the frame when inference starts.")
     ] = None
     itl_ms: Annotated[Summary | None, ITL] = None
     token_delay_ms: Annotated[Summary | SummaryEnds | None, TOKEN_DELAY] = None
@@ -74,11 +73,15 @@ class LatencyCell(RequestsCell):
     ] = None
 
 
+def _in_ms(name: str) -> RequestMetric:
+    return RequestMetric(unit="ms", name=name)
+
+
 METRICS: Final = (*summarised_by(LatencyCell).values(), *AROUND)
 COMPARED: Final = compared_by(
-    (*METRICS, *(in_ms(f"{GROUP}{name}") for name in GROUPS)),
+    (*METRICS, *(_in_ms(f"{GROUP}{name}") for name in GROUPS)),
     ("e2e_without_inference", "e2e", "itl"),
-    run_metrics=lambda run: map(in_ms, run.stages),
+    run_metrics=lambda run: map(_in_ms, run.stages),
 )
 """What latency runs are compared by: metrics, groups of stages, and each run's stages."""
 
@@ -117,11 +120,11 @@ def _stage_rows(cells: RequestCells) -> Iterator[tuple[object, ...]]:
         for stage in (*cell.stages, "residual"):
             for end, summary in cell.summaries(stage).items():
                 place = cell.name, cell.stages.get(stage, ""), stage + end
-                yield *place, *summary_values(summary), cell.emulated
+                yield *place, *summary_values(summary), cell.origin.emulated
 
 
 def _rows(cells: RequestCells) -> Iterator[tuple[object, ...]]:
     """Yield a row a cell and metric; a cell without successful samples has one row, without numbers."""
     for cell in cells:
         for key, *values in [*summary_rows(cell, METRICS)] or [("", 0, *[None] * (len(SUMMARY) - 1))]:
-            yield cell.name, key, cell.errors, cell.warmups, *values, cell.emulated
+            yield cell.name, key, cell.errors, cell.warmups, *values, cell.origin.emulated

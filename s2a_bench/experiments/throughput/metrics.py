@@ -13,8 +13,8 @@ from s2a_bench.experiments.requests import (
     OF_ANSWERS,
     AnswersCell,
     RequestCell,
+    RequestCellJson,
     RequestCells,
-    RequestsCell,
     cell_json,
     cells_of,
     compared_by,
@@ -74,7 +74,7 @@ class Position:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PositionsCell(RequestsCell):
+class PositionsCell(RequestCellJson):
     """The fields that come before the metrics."""
 
     t_eval: Annotated[
@@ -113,7 +113,7 @@ class ThroughputCells(RequestCells):
     @property
     def reference_values(self) -> Floats:
         """llama-bench's tokens/s in the order of the blocks."""
-        return np.array([rate for launch in self.reference.values() for rate in launch.values.tolist()])  # noqa: PD011
+        return np.concatenate([np.empty(0), *(launch.values for launch in self.reference.values())])  # noqa: PD011
 
     @property
     def reference_depths(self) -> list[int]:
@@ -202,11 +202,11 @@ def throughput_json(cells: ThroughputCells) -> dict[str, Any]:
 
 def throughput_csv(cells: ThroughputCells) -> dict[str, CsvTable]:
     """Return file name -> CSV table, unrounded; absent values have no row."""
-    rows = [(cell.name, *row, cell.emulated) for cell in cells for row in summary_rows(cell, METRICS)]
+    rows = [(cell.name, *row, cell.origin.emulated) for cell in cells for row in summary_rows(cell, METRICS)]
     if (reference := cells.reference_values).size:
         rows.append((LLAMA_BENCH, RATIO_METRIC, *summary_values(summarise(reference)), False))
     positions = [
-        (cell.name, *place, *summary_values(summarise(rates)), cell.emulated)
+        (cell.name, *place, *summary_values(summarise(rates)), cell.origin.emulated)
         for cell in cells
         for place, rates in rates_by_position(cell).items()
     ]

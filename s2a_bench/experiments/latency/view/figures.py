@@ -34,8 +34,8 @@ RESIDUAL = "residual"
 
 def latency_figures(cells: RequestCells, against: str = "") -> dict[str, Callable[[], Figure]]:
     """Return what draws each figure, of e2e without inference; of e2e if no cell has that."""
-    metric = "e2e_without_inference" if cells.have("e2e_without_inference") else "e2e"
-    drawn = cells.only(cell for cell in cells if cell.values(metric).size)
+    metric = "e2e_without_inference" if cells.having("e2e_without_inference") else "e2e"
+    drawn = cells.having(metric)
     if not drawn:
         return {}
     label = "e2e without inference (ms)" if metric == "e2e_without_inference" else "e2e, inference included (ms)"
