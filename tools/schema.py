@@ -24,7 +24,7 @@ from s2a_bench.experiments.ccrb.view.tables import ORDERINGS
 from s2a_bench.experiments.cells import columns_of
 from s2a_bench.experiments.latency.metrics import AROUND, LatencyCell
 from s2a_bench.experiments.profile_capture import ProfileJson
-from s2a_bench.experiments.requests import RequestsCell
+from s2a_bench.experiments.requests import RequestCellJson
 from s2a_bench.experiments.throughput.metrics import Reference
 from s2a_bench.inference.fetch import FetchedFile
 from s2a_bench.inference.model_list import ListedModel
@@ -78,7 +78,7 @@ def _without_null(schema: dict[str, Any]) -> dict[str, Any]:
 def _keys(cls: type, made: dict[str, Any]) -> dict[str, Any]:
     """Return properties and required keys of a class of rows, as `json_of` writes them; nothing for another class."""
     columns = columns_of(cls)
-    if issubclass(cls, RequestsCell) or not any(column.metric or column.json_key for column in columns):
+    if issubclass(cls, RequestCellJson) or not any(column.metric or column.json_key for column in columns):
         return {}
     properties, required = {}, []
     for column in columns:

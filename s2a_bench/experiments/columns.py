@@ -47,7 +47,7 @@ class RequestColumns:
         return {name: of_cell for name, of_cell in places.items() if of_cell.size}
 
     @cached_property
-    def counts(self) -> NDArray[np.bool_]:
+    def counted(self) -> NDArray[np.bool_]:
         """Whether each request counts: no warm-up, no failure."""
         return ~(self.warmup | self.failed)
 
@@ -82,8 +82,8 @@ class RequestColumns:
             self._numbers[name] = self._missing
             for column, unit in ((f"{name.removesuffix('_ms')}_ns", NS_PER_MS), (name, 1)):
                 if column in self._table.columns or column in self._added:
-                    values = self._added.get(column)
-                    numbers = _floats(self._read(column) if values is None else values)
+                    values = self._added[column] if column in self._added else self._read(column)
+                    numbers = values.to_numpy(dtype="float64", na_value=np.nan)
                     self._numbers[name] = self._missing if np.isnan(numbers).all() else numbers / unit
         return self._numbers[name]
 
@@ -240,8 +240,3 @@ def _requests_of(ids: pd.Series[str], requests: pd.Series[str]) -> NDArray[np.in
     codes = ids.cat.codes.to_numpy()
     of_ids: NDArray[np.int32] = np.append(of_category, np.int32(-1))[codes]
     return of_ids
-
-
-def _floats(column: pd.Series[Any]) -> Floats:
-    numbers: Floats = column.to_numpy(dtype="float64", na_value=np.nan)
-    return numbers

@@ -9,10 +9,9 @@ included: (n - 1) / (t_last - t_first).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import asdict, astuple, dataclass, replace
 from functools import cached_property, partial
-from statistics import median
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +42,7 @@ from s2a_bench.store.requests import ONE_WAY
 from s2a_bench.trace import GROUPS, RESIDUAL_LIMIT
 from s2a_bench.transport import declared_transport, payload_order
 from s2a_bench.transport.pipeline import without
-from s2a_bench.writers.csv_text import CsvTable
-from s2a_bench.writers.json import summaries, summaries_of_ends
+from s2a_bench.writers.csv_text import CsvTable, summary_values
 from s2a_bench.writers.tables import DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
@@ -53,7 +51,6 @@ if TYPE_CHECKING:
     from s2a_bench.store.run import StoredRun
     from s2a_bench.store.schema import Kind
 
-Of: TypeAlias = "Callable[[RequestCell], Floats]"
 RATIO_METRICS = ("e2e_without_inference", "e2e_without_model", "e2e")
 """What cells are compared by: columns of the samples without their unit."""
 _ENDS: Final = ("_lo", "_hi")
@@ -67,21 +64,6 @@ class Ends(NamedTuple):
     lo: Floats
     hi: Floats
 
-    @property
-    def named(self) -> dict[str, Floats]:
-        """Return both ends by what follows the name of a stage or metric."""
-        return dict(zip(_ENDS, self, strict=True))
-
-    @property
-    def middle(self) -> float:
-        """Return the middle between the medians; raises ValueError without values."""
-        return float(median(self.lo.tolist()) + median(self.hi.tolist())) / 2
-
-    @property
-    def half(self) -> float:
-        """Return half the distance between the medians; raises ValueError without values."""
-        return float(median(self.hi.tolist()) - median(self.lo.tolist())) / 2
-
 
 @dataclass(frozen=True, slots=True)
 class RequestMetric(Metric):
@@ -91,13 +73,10 @@ class RequestMetric(Metric):
     """
 
     bounds: tuple[float | None, float | None] = ANY
-    of: Of | None = None
+    of: Callable[[RequestCell], Floats] | None = None
     """Its values, one a request that counts; NaN where one is missing."""
     of_tokens: str = ""
-    """Of a metric of tokens: their time, a key of `Answers.times_ns`."""
-    ends: bool = False
-    """Whether it may begin on one host and end on another: then it has intervals."""
-    shown: tuple[str, ...] = ()
+    """Of a metric of tokens: their time, ``gap`` or ``delay``."""
 
     def of_column(self, column: str, stored: Kind) -> Self:  # noqa: ARG002 - the key says it
         """Return the metric with what follows from its key."""
@@ -132,7 +111,7 @@ class RequestCell:
     @cached_property
     def counted(self) -> Places:
         """The samples that count."""
-        return self.requests[self.columns.counts[self.requests]]
+        return self.requests[self.columns.counted[self.requests]]
 
     @property
     def n(self) -> int:
@@ -145,11 +124,6 @@ class RequestCell:
     @property
     def errors(self) -> int:
         return int((self.columns.failed & ~self.columns.warmup)[self.requests].sum())
-
-    @property
-    def emulated(self) -> bool:
-        """Whether the engine's times come from a profile, or from given latencies."""
-        return self.origin.emulated
 
     @property
     def pipeline(self) -> str:
@@ -174,10 +148,6 @@ class RequestCell:
         sent = [cell.origin.pictures != NOT_SENT for cell in (self, base)]
         return matching and sent[0] == sent[1] and base.pipeline in declared_transport(self.pipeline).compared_with
 
-    def of_requests(self, requests: Places) -> Self:
-        """Return the cell of these requests alone."""
-        return replace(self, requests=requests)
-
     def column(self, metric: RequestMetric | str) -> Floats:
         """Return a value a sample, NaN where it has none; times in ms.
 
@@ -190,19 +160,23 @@ class RequestCell:
                 return declared.of(self)
         return self._numbers(declared.name)
 
-    def values(self, metric: RequestMetric | str) -> Floats:
-        """Return a metric's values: one a request or token that has it."""
-        token = _declared(metric).of_tokens
-        return known(self._of_tokens(token, self.by_id) if token else self.column(metric))
+    def values(self, metric: RequestMetric | str, end: str = "") -> Floats:
+        """Return a metric's values, or one ``end`` of its intervals: one a request or token that has it."""
+        declared = _declared(metric)
+        if declared.of_tokens:
+            return known(self._of_tokens(declared.of_tokens + end, self.by_id))
+        return known(self._numbers(declared.name, end) if end else self.column(declared))
 
     def ends(self, metric: RequestMetric | str) -> Ends:
         """Return the intervals of a metric; none if it is exact, or absent."""
-        declared = _declared(metric)
-        if not self.columns.bounded or (declared.of_tokens and not declared.ends):
+        if not self.columns.bounded or _declared(metric).of_tokens == "gap":
             return Ends(np.empty(0), np.empty(0))
-        if declared.of_tokens:
-            return Ends(*(known(self._of_tokens(f"{declared.of_tokens}{end}", self.by_id)) for end in _ENDS))
-        return Ends(*(known(self._numbers(declared.name, end)) for end in _ENDS))
+        return Ends(*(self.values(metric, end) for end in _ENDS))
+
+    def summaries(self, metric: RequestMetric | str) -> dict[str, Summary]:
+        """Return the summaries of the values, and of both ends of the intervals, by what follows the metric's name."""
+        sides = {"": self.values(metric), **dict(zip(_ENDS, self.ends(metric), strict=True))}
+        return {end: summary for end, values in sides.items() if (summary := summary_of(values))}
 
     def rows(self, metric: RequestMetric | str) -> Rows:
         """Return a metric's values, a row for each request that has any."""
@@ -227,9 +201,8 @@ class RequestCell:
     def _sum(self, group: str, end: str) -> Floats:
         """Return the sums of a group's stages; NaN where they are intervals, or exact if an ``end`` is asked for."""
         stages = [stage for stage, of in self.stages.items() if of == group]
-        each = np.empty((len(stages), self.n))
-        for row, stage in zip(each, stages, strict=True):
-            row[:] = self._numbers(f"{stage}{end if stage in ONE_WAY else ''}_ns")
+        each = np.array([self._numbers(f"{stage}{end if stage in ONE_WAY else ''}_ns") for stage in stages])
+        each = each.reshape(len(stages), self.n)  # also without stages
         sums = np.where(np.isnan(each).all(axis=0), np.nan, np.nansum(each, axis=0))
         crosses = not {*stages}.isdisjoint(ONE_WAY)
         bounded = ~np.isnan(self._numbers("clock_error")) & crosses
@@ -298,10 +271,6 @@ def _engine_rate(cell: RequestCell) -> Floats:
     return _or(steps / _some(cell.fact(PREDICTED_MS)) * 1e3, decode_rate(cell))
 
 
-def in_ms(name: str, title: str = "", about: str = "", of: Of | None = None, **more: Any) -> RequestMetric:
-    return RequestMetric(title, about, "ms", name=name, of=of, **more)
-
-
 def _of_fact(fact: Fact, title: str, about: str) -> RequestMetric:
     return RequestMetric(title, about, name=str(fact), of=lambda cell: cell.fact(fact))
 
@@ -323,23 +292,14 @@ def _tokens_per_joule(cell: RequestCell) -> Floats:
 
 
 _rate = partial(RequestMetric, better="higher")
-ITL: Final = RequestMetric(
-    "gap",
-    "Every gap between a token and the next, as the client saw them.",
-    of_tokens="gap",
-    shown=("median", "p99"),
-)
+ITL: Final = RequestMetric("gap", "Every gap between a token and the next, as the client saw them.", of_tokens="gap")
 TOKEN_DELAY: Final = RequestMetric(
-    "delay",
-    "From a token's leaving the engine to the client's seeing it.",
-    of_tokens="delay",
-    ends=True,
-    shown=("median", "p90", "p99"),
+    "delay", "From a token's leaving the engine to the client's seeing it.", of_tokens="delay"
 )
 
 
 @dataclass(frozen=True, kw_only=True)
-class RequestsCell:
+class RequestCellJson:
     """The fields that cells of all runs of requests have."""
 
     cell: Annotated[str, about("The name that ratios use.")]
@@ -472,18 +432,12 @@ class RequestCells:
 
     def launches(self) -> dict[int, Self]:
         """Return the cells of each launch, in the order of time."""
-        if not self:
-            return {}
-        launch = self[0].columns.launch
-        every, first = np.unique(launch, return_index=True)
-        return {
-            int(number): self.only(
-                cell.of_requests(requests)
-                for cell in self
-                if (requests := cell.requests[launch[cell.requests] == number]).size
-            )
-            for number in every[np.argsort(first)]
-        }
+        launch = self[0].columns.launch if self else np.empty(0, dtype=np.int64)
+        by_launch = {}
+        for number in dict.fromkeys(launch.tolist()):
+            requests = ((cell, cell.requests[launch[cell.requests] == number]) for cell in self)
+            by_launch[number] = self.only(replace(cell, requests=of_cell) for cell, of_cell in requests if of_cell.size)
+        return by_launch
 
     @property
     def observation(self) -> str:
@@ -514,16 +468,16 @@ class RequestCells:
     @property
     def groups(self) -> list[str]:
         """The groups that some sample has, in path order."""
-        return [group for group in GROUPS if self.have(GROUP + group)]
+        return [group for group in GROUPS if self.having(GROUP + group)]
 
     @property
     def stages(self) -> list[str]:
         """The stages that some sample has, in path order."""
-        return [stage for stage in self.run.stages if self.have(stage)]
+        return [stage for stage in self.run.stages if self.having(stage)]
 
-    def have(self, metric: RequestMetric | str) -> bool:
-        """Return True if a sample has the metric, or its interval."""
-        return any(cell.values(metric).size or cell.ends(metric).lo.size for cell in self)
+    def having(self, metric: RequestMetric | str) -> Self:
+        """Return the cells with a sample that has the metric, or its interval."""
+        return self.only(cell for cell in self if cell.values(metric).size or cell.ends(metric).lo.size)
 
     @cached_property
     def ratios(self) -> list[tuple[str, RequestCell, RequestCell, Ratio]]:
@@ -545,8 +499,8 @@ class RequestCells:
         engines = dict.fromkeys(cell.about["engine"] for cell in self)
         idle = [name for name in engines if not declared_engine(name).computes]
         notes = [Note(f"{name} engine", f"{name} engine") for name in idle]
-        drawn = dict.fromkeys(cell.origin.profile for cell in self if cell.about["engine"] in idle and cell.emulated)
-        notes += [Note(f"EMULATED: {latencies}", EMULATED) for latencies in drawn]
+        drawn = [cell.origin for cell in self if cell.about["engine"] in idle and cell.origin.emulated]
+        notes += [Note(f"EMULATED: {each}", EMULATED) for each in dict.fromkeys(origin.profile for origin in drawn)]
         if any(declared_engine(name).plays for name in engines):
             notes.append(_emulated(self._replayed()))
         answered = [cell.origin for cell in self if not declared_engine(cell.about["engine"]).plays]
@@ -640,7 +594,10 @@ def cell_json(cls: type, cells: RequestCells, **fields: Any) -> dict[str, Any]:
             answer=cells.answer,
             profile=origin.profile or None,
             dummy={"real": False, "dummy": True, NONE: not declared_engine(origin.engine).plays}.get(origin.weights),
-            **{name: getattr(cell, name) for name in ("emulated", "n", "errors", "warmups")},
+            emulated=origin.emulated,
+            n=cell.n,
+            errors=cell.errors,
+            warmups=cell.warmups,
             **fields,
             **summaries_of(cell, {each.key: each for each in summarised_by(cls).values()}),
         )
@@ -649,23 +606,23 @@ def cell_json(cls: type, cells: RequestCells, **fields: Any) -> dict[str, Any]:
 
 def summaries_of(cell: RequestCell, metrics: Mapping[str, RequestMetric | str]) -> dict[str, Any]:
     """Return key -> summary as JSON, or of both ends, of the metrics that some sample has."""
-    exact = summaries((key, cell.values(metric)) for key, metric in metrics.items())
-    return {**exact, **summaries_of_ends((key, cell.ends(metric)) for key, metric in metrics.items())}
+    each = {key: cell.summaries(metric) for key, metric in metrics.items()}
+    exact = {key: asdict(by_end[""]) for key, by_end in each.items() if "" in by_end}
+    lo, hi = _ENDS
+    ends = {key: asdict(SummaryEnds(by_end[lo], by_end[hi])) for key, by_end in each.items() if lo in by_end}
+    return exact | ends
 
 
-def summarised(
-    cells: Iterable[RequestCell], metrics: Sequence[RequestMetric]
-) -> Iterator[tuple[RequestCell, str, Summary]]:
-    """Yield cell, key of a metric and summary, where there are values; intervals have one a side."""
-    for cell in cells:
-        for metric in metrics:
-            for end, values in {"": cell.values(metric), **cell.ends(metric).named}.items():
-                if summary := summary_of(values):
-                    yield cell, f"{metric.key.removesuffix('_ms')}{end}_ms" if end else metric.key, summary
+def summary_rows(cell: RequestCell, metrics: Iterable[RequestMetric]) -> Iterator[tuple[object, ...]]:
+    """Yield the key of a metric and its summary, where there are values; intervals have one a side."""
+    for metric in metrics:
+        for end, summary in cell.summaries(metric).items():
+            key = f"{metric.key.removesuffix('_ms')}{end}_ms" if end else metric.key
+            yield key, *summary_values(summary)
 
 
 def ratio_table(cells: Iterable[RequestCell], ratios: Iterable[tuple[str, str, str, Ratio]]) -> CsvTable:
-    emulated = {cell.name for cell in cells if cell.emulated}
+    emulated = {cell.name for cell in cells if cell.origin.emulated}
     header = ("metric", "of", "to", "value", "ci95_low", "ci95_high", "launches", "launch_sd", "emulated")
     return CsvTable.of(
         header, ((metric, of, to, *astuple(ratio), bool({of, to} & emulated)) for metric, of, to, ratio in ratios)

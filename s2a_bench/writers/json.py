@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from s2a_bench.bounds import Many, NonNegative
-from s2a_bench.stats import Floats, Ratio, SummaryEnds, summarise, summary_of
+from s2a_bench.stats import Ratio
 from s2a_bench.store.manifest import present
 from s2a_bench.store.schema import SCHEMA
 
@@ -53,14 +52,3 @@ def frame(
 
 def ratio_entry(metric: str, of: str, to: str, ratio: Ratio) -> dict[str, Any]:
     return present(RatioJson(metric, of, to, ratio.value, ratio.ci95, ratio.launches, ratio.launch_sd))
-
-
-def summaries_of_ends(metrics: Iterable[tuple[str, tuple[Floats, Floats]]]) -> dict[str, Any]:
-    """Summarise both ends of the metrics that are intervals."""
-    return {name: asdict(SummaryEnds(*map(summarise, ends))) for name, ends in metrics if ends[0].size}
-
-
-def summaries(metrics: Iterable[tuple[str, Floats]]) -> dict[str, Any]:
-    """Summarise the metrics that have values; ``n`` is smaller if only some samples have a stage."""
-    known = ((name, summary_of(values)) for name, values in metrics)
-    return {name: asdict(summary) for name, summary in known if summary}

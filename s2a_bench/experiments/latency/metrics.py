@@ -12,18 +12,17 @@ from s2a_bench.experiments.requests import (
     GROUP,
     ITL,
     TOKEN_DELAY,
+    RequestCellJson,
     RequestCells,
     RequestMetric,
-    RequestsCell,
     cell_json,
     compared_by,
-    in_ms,
     ratio_table,
     summaries_of,
-    summarised,
     summarised_by,
+    summary_rows,
 )
-from s2a_bench.stats import Summary, SummaryEnds, summary_of
+from s2a_bench.stats import Summary, SummaryEnds
 from s2a_bench.trace import GROUPS
 from s2a_bench.transport.surroundings import shown
 from s2a_bench.writers.csv_text import SUMMARY, CsvTable, summary_values
@@ -37,7 +36,7 @@ AROUND: Final[tuple[RequestMetric, ...]] = tuple(chain.from_iterable(shown("metr
 
 
 @dataclass(frozen=True, kw_only=True)
-class LatencyCell(RequestsCell):
+class LatencyCell(RequestCellJson):
     """One pipeline, stage by stage; a value that no sample has is an absent key."""
 
     residual_flagged: Annotated[Count, about("Samples whose residual is more than 5 % of e2e without inference.")]
@@ -64,7 +63,7 @@ class LatencyCell(RequestsCell):
         ),
     ] = None
     frame_age_ms: Annotated[
-        Summary | SummaryEnds | None, RequestMetric(about="Age of the frame when inference starts.", ends=True)
+        Summary | SummaryEnds | None, RequestMetric(about="Age of the frame when inference starts.")
     ] = None
     itl_ms: Annotated[Summary | None, ITL] = None
     token_delay_ms: Annotated[Summary | SummaryEnds | None, TOKEN_DELAY] = None
@@ -74,11 +73,15 @@ class LatencyCell(RequestsCell):
     ] = None
 
 
+def _in_ms(name: str) -> RequestMetric:
+    return RequestMetric(unit="ms", name=name)
+
+
 METRICS: Final = (*summarised_by(LatencyCell).values(), *AROUND)
 COMPARED: Final = compared_by(
-    (*METRICS, *(in_ms(f"{GROUP}{name}") for name in GROUPS)),
+    (*METRICS, *(_in_ms(f"{GROUP}{name}") for name in GROUPS)),
     ("e2e_without_inference", "e2e", "itl"),
-    run_metrics=lambda run: map(in_ms, run.stages),
+    run_metrics=lambda run: map(_in_ms, run.stages),
 )
 """What latency runs are compared by: metrics, groups of stages, and each run's stages."""
 
@@ -115,15 +118,13 @@ def _ratios(cells: RequestCells) -> Iterator[tuple[str, str, str, Ratio]]:
 def _stage_rows(cells: RequestCells) -> Iterator[tuple[object, ...]]:
     for cell in cells:
         for stage in (*cell.stages, "residual"):
-            for end, values in {"": cell.values(stage), **cell.ends(stage).named}.items():
-                if summary := summary_of(values):
-                    place = cell.name, cell.stages.get(stage, ""), stage + end
-                    yield *place, *summary_values(summary), cell.emulated
+            for end, summary in cell.summaries(stage).items():
+                place = cell.name, cell.stages.get(stage, ""), stage + end
+                yield *place, *summary_values(summary), cell.origin.emulated
 
 
 def _rows(cells: RequestCells) -> Iterator[tuple[object, ...]]:
     """Yield a row a cell and metric; a cell without successful samples has one row, without numbers."""
     for cell in cells:
-        rows = [(key, summary_values(summary)) for _, key, summary in summarised([cell], METRICS)]
-        for key, values in rows or [("", (0, *[None] * (len(SUMMARY) - 1)))]:
-            yield cell.name, key, cell.errors, cell.warmups, *values, cell.emulated
+        for key, *values in [*summary_rows(cell, METRICS)] or [("", 0, *[None] * (len(SUMMARY) - 1))]:
+            yield cell.name, key, cell.errors, cell.warmups, *values, cell.origin.emulated

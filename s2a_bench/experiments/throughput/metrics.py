@@ -14,13 +14,13 @@ from s2a_bench.experiments.requests import (
     OF_ANSWERS,
     AnswersCell,
     RequestCell,
+    RequestCellJson,
     RequestCells,
-    RequestsCell,
     cell_json,
     cells_of,
     compared_by,
     ratio_table,
-    summarised,
+    summary_rows,
 )
 from s2a_bench.stats import Floats, Ratio, Summary, summarise
 from s2a_bench.stats.batches import Blocks
@@ -75,7 +75,7 @@ class Position:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PositionsCell(RequestsCell):
+class PositionsCell(RequestCellJson):
     """The fields that come before the metrics."""
 
     t_eval: Annotated[
@@ -114,7 +114,7 @@ class ThroughputCells(RequestCells):
     @property
     def reference_values(self) -> Floats:
         """llama-bench's tokens/s in the order of the blocks."""
-        return np.array([rate for launch in self.reference.values() for rate in launch.values.tolist()])  # noqa: PD011
+        return np.concatenate([np.empty(0), *(launch.values for launch in self.reference.values())])  # noqa: PD011
 
     @property
     def reference_depths(self) -> list[int]:
@@ -203,13 +203,11 @@ def throughput_json(cells: ThroughputCells) -> dict[str, Any]:
 
 def throughput_csv(cells: ThroughputCells) -> dict[str, CsvTable]:
     """Return file name -> CSV table, unrounded; absent values have no row."""
-    rows = [
-        (cell.name, key, *summary_values(summary), cell.emulated) for cell, key, summary in summarised(cells, METRICS)
-    ]
+    rows = [(cell.name, *row, cell.origin.emulated) for cell in cells for row in summary_rows(cell, METRICS)]
     if (reference := cells.reference_values).size:
         rows.append((LLAMA_BENCH, RATIO_METRIC, *summary_values(summarise(reference)), False))
     positions = [
-        (cell.name, *place, *summary_values(summarise(rates)), cell.emulated)
+        (cell.name, *place, *summary_values(summarise(rates)), cell.origin.emulated)
         for cell in cells
         for place, rates in rates_by_position(cell).items()
     ]

@@ -77,7 +77,7 @@ def speed_table(cells: ThroughputCells) -> TextTable:
     ratios = {(of, to): ratio for metric, of, to, ratio in cells.rate_ratios if metric == RATIO_METRIC}
     bases = list(dict.fromkeys(to for _, to in ratios))
     metrics = [ENGINE_METRIC, RATIO_METRIC]
-    metrics += ["tokens_per_joule"] if cells.have("tokens_per_joule") else []
+    metrics += ["tokens_per_joule"] if cells.having("tokens_per_joule") else []
     rows: list[tuple[str, ...]] = [
         (
             *(cell.name, str(cell.n), str(cell.errors)),
@@ -164,7 +164,7 @@ def _notes(cells: ThroughputCells, launches: tuple[str, ...]) -> list[str]:
 
 
 def throughput_figures(cells: ThroughputCells, against: str = "") -> dict[str, Callable[[], Figure]]:
-    if not cells.have(RATIO_METRIC):
+    if not cells.having(RATIO_METRIC):
         return {}
 
     def bars() -> Figure:
@@ -172,7 +172,7 @@ def throughput_figures(cells: ThroughputCells, against: str = "") -> dict[str, C
 
         Bars from zero; points on a logarithmic axis if the rates differ too much.
         """
-        drawn = cells.only(cell for cell in cells if cell.values(ENGINE_METRIC).size)
+        drawn = cells.having(ENGINE_METRIC)
         styles = _styles(drawn)
         bars = [Bar.of(cell.name, cell.values(ENGINE_METRIC), styles[cell.name][0]) for cell in drawn]
         if (reference := cells.reference_values).size:
@@ -182,7 +182,7 @@ def throughput_figures(cells: ThroughputCells, against: str = "") -> dict[str, C
         return build_bars(caption, [*bars, *others.bars], "tokens/s", others.label, scaled=True)
 
     def gaps() -> Figure:
-        drawn = cells.only(cell for cell in cells if cell.values("itl").size)
+        drawn = cells.having("itl")
         lines, styles = {}, _styles(drawn)
         for cell in drawn:
             values = cell.values("itl")

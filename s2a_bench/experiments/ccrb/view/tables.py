@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -110,7 +111,7 @@ def _stage_table(rollouts: Rollouts) -> TextTable | None:
     (cell,) = cells
     metrics, rows = (*(f"{requests.GROUP}{group}" for group in cells.groups), "residual", "ttft", "e2e"), []
     for policy in rollouts.point:
-        mine = cell.of_requests(cell.counted[cell.ids == rollouts.request_of(policy.cell)])
+        mine = replace(cell, requests=cell.counted[cell.ids == rollouts.request_of(policy.cell)])
         rows.append((policy.policy, *(entries(mine.values(metric), "median")[0] for metric in metrics)))
     title = "Each policy's request in ms, to its first token"
     header = ("policy", *cells.groups, "residual", "TTFT", "e2e")

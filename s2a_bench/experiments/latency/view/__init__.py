@@ -12,10 +12,11 @@ from s2a_bench.experiments.latency.metrics import AROUND, METRICS, latency_csv, 
 from s2a_bench.experiments.latency.view.figures import latency_figures
 from s2a_bench.experiments.requests import (
     GROUP,
+    ITL,
+    TOKEN_DELAY,
     Ends,
     RequestCell,
     RequestCells,
-    RequestMetric,
     cells_of,
     launches_note,
     metric_phrase,
@@ -38,7 +39,7 @@ _MOST = 6
 
 def show(run: StoredRun, *, against: str = "", **_: Any) -> Shown:
     cells = cells_of(run)
-    modelled = cells.have("e2e_without_model")
+    modelled = cells.having("e2e_without_model")
     return Shown.build(
         sentences=lambda: _latency_sentences(cells),
         tables={
@@ -65,7 +66,7 @@ def _latency_sentences(cells: RequestCells) -> list[str]:
     requests = span_of((cell.n for cell in cells), "request")
     pictures = " ".join((" and ".join(cells.payloads), "frames")).lstrip()
     sentences = [f"{requests} a cell over {names}; {pictures} of {cells.observation}, {mode} mode."]
-    metric = "e2e_without_inference" if cells.have("e2e_without_inference") else "e2e"
+    metric = "e2e_without_inference" if cells.having("e2e_without_inference") else "e2e"
     for payload in dict.fromkeys(cell.payload for cell in cells):
         medians = [
             f"{cell.label} {number(middle.median)} ms"
@@ -167,7 +168,7 @@ def summary_table(cells: RequestCells, metric: str = "e2e_without_inference") ->
             bases.setdefault(base.name if base.mixed else base.label, []).append(base)
     figures = (MEAN_SD, "median", "p90", "p99")
     around = AROUND if metric == "e2e_without_inference" else ()
-    bounds = [each for each in around if any(cell.values(each).size for cell in cells)]
+    bounds = [each for each in around if cells.having(each)]
     rows = []
     over: list[Ratio] = []
     for cell in cells:
@@ -185,12 +186,18 @@ def summary_table(cells: RequestCells, metric: str = "e2e_without_inference") ->
 
 def _token_table(cells: RequestCells) -> TextTable | None:
     """Return the table of gaps and delays of tokens; None if no server reports when they left the engine."""
-    reported = cells.only(cell for cell in cells if cells.only([cell]).have("token_delay"))
+    reported = cells.having(TOKEN_DELAY)
     if not reported:
         return None
-    columns = [metric for metric in METRICS if metric.shown]
-    rows = [tuple(text for metric in columns for text in _statistics(cell, metric)) for cell in reported]
-    header = [f"{metric.title} {statistic}" for metric in columns for statistic in metric.shown]
+    columns = ((ITL, ("median", "p99")), (TOKEN_DELAY, ("median", "p90", "p99")))
+    header = [f"{metric.title} {statistic}" for metric, shown in columns for statistic in shown]
+    rows = []
+    for cell in reported:
+        texts = []
+        for metric, shown in columns:
+            ends = cell.ends(metric)
+            texts += ends_entries(ends, *shown) if ends.lo.size else entries(cell.values(metric), *shown)
+        rows.append(tuple(texts))
     title = f"{cells.answer.capitalize()} in ms: from one to the next (gap), and engine to client (delay)"
     return _by_cell(title, header, reported, rows, reported.engine_notes)
 
@@ -209,12 +216,7 @@ def fact_table(cells: RequestCells) -> TextTable | None:
 def _foot(cells: RequestCells) -> list[str]:
     """Return the rows below the stages; preprocessing and e2e without model only if reported."""
     optional = {"round_trip", "preprocess", "e2e_without_model"}
-    return [name for name in _FOOT if name not in optional or any(cell.values(name).size for cell in cells)]
-
-
-def _statistics(cell: RequestCell, metric: RequestMetric) -> list[str]:
-    ends = cell.ends(metric)
-    return ends_entries(ends, *metric.shown) if ends.lo.size else entries(cell.values(metric), *metric.shown)
+    return [name for name in _FOOT if name not in optional or cells.having(name)]
 
 
 def _entry(cell: RequestCell, metric: str, *, full: bool = False) -> str:

@@ -34,8 +34,8 @@ RESIDUAL = "residual"
 
 def latency_figures(cells: RequestCells, against: str = "") -> dict[str, Callable[[], Figure]]:
     """Return what draws each figure, of e2e without inference; of e2e if no cell has that."""
-    metric = "e2e_without_inference" if cells.have("e2e_without_inference") else "e2e"
-    drawn = cells.only(cell for cell in cells if cell.values(metric).size)
+    metric = "e2e_without_inference" if cells.having("e2e_without_inference") else "e2e"
+    drawn = cells.having(metric)
     if not drawn:
         return {}
     label = "e2e without inference (ms)" if metric == "e2e_without_inference" else "e2e, inference included (ms)"
@@ -85,13 +85,17 @@ class StageBar:
         """Take the medians over all samples that have the metric; one without a group counts as 0."""
         whole = cell.values(metric).tolist()
         metrics = {**{group: f"{GROUP}{group}" for group in groups}, RESIDUAL: RESIDUAL}
-        ends = {name: both for name, column in metrics.items() if (both := cell.ends(column)).lo.size}
+        ends = {
+            name: [float(median(side.tolist())) for side in both]
+            for name, column in metrics.items()
+            if (both := cell.ends(column)).lo.size
+        }
         spent = {name: cell.values(column).tolist() for name, column in metrics.items()}
         parts = {
-            name: ends[name].middle if name in ends else float(median((*values, *[0.0] * (len(whole) - len(values)))))
+            name: sum(ends[name]) / 2 if name in ends else median((*values, *[0.0] * (len(whole) - len(values))))
             for name, values in spent.items()
         }
-        return cls(_label(cell), parts, median(whole), {name: both.half for name, both in ends.items()})
+        return cls(_label(cell), parts, median(whole), {name: (hi - lo) / 2 for name, (lo, hi) in ends.items()})
 
     @property
     def sum(self) -> float:

@@ -117,7 +117,7 @@ def pairs(run: StoredRun) -> Iterator[RunPart]:
     https = [cell for cell in cells if "/".join(cell.path) in {_HTTP, _LLAMA_SERVER}]
     for pair in product(https, [cell for cell in cells if cell.pipeline == _ROS]):
         facts = {
-            "both sides": ", ".join([*_unlike(run, pair), *_asked(run, pair)]) or "alike",
+            "both sides": ", ".join([*_unlike(pair), *_asked(run, pair)]) or "alike",
             "servers": _others(run, pair) or "started by the run",
             "launches": sum(map(bool, _blocks(pair)[0].values())),
             "stages": "".join(f"hidden by {cell.name}" for cell in pair if cell.has_ingest) or "seen",
@@ -139,7 +139,7 @@ def bodies(run: StoredRun) -> Iterator[RunPart]:
 
 def _pair(run: StoredRun, pair: tuple[RequestCell, RequestCell], facts: dict[str, Any], about: str) -> RunPart:
     both = {name: " and ".join(dict.fromkeys(cell.about[name] for cell in pair)) for name in ("mode", "payload")}
-    origins = [run.origins.of(cell.name) for cell in pair]
+    origins = [cell.origin for cell in pair]
     return RunPart(run, facts_of(run, origins) | both | facts, origins, _launches(*pair), pair, about)
 
 
@@ -147,9 +147,9 @@ def _launches(*cells: RequestCell) -> int:
     return min(len(np.unique(cell.column("launch"))) for cell in cells)
 
 
-def _unlike(run: StoredRun, pair: tuple[RequestCell, RequestCell]) -> list[str]:
+def _unlike(pair: tuple[RequestCell, RequestCell]) -> list[str]:
     """Return the differences of frames and engines; llama-server and llama on the same file are equal."""
-    http, ros = (run.origins.of(cell.name).to_dict() | {"size": cell.about["size"]} for cell in pair)
+    http, ros = (cell.origin.to_dict() | {"size": cell.about["size"]} for cell in pair)
     engines = http["engine"], ros["engine"]
     same_file = engines == ("llama-server", "llama") and http["model_sha256"] == ros["model_sha256"] != ""
     both = {name: dict.fromkeys((http[name] or NONE, value or NONE)) for name, value in ros.items()}
@@ -265,8 +265,8 @@ def speeds(run: StoredRun) -> Iterator[RunPart]:
     for speed in throughput_cells(run):
         if speed.values("tokens_per_s").size:
             source = {"T_eval": "the engine's" if speed.has_engine_time else "the client's"}
-            origins = [run.origins.of(speed.name)]
-            yield RunPart(run, facts_of(run, origins) | source, origins, _launches(speed), speed)
+            facts = facts_of(run, [speed.origin]) | source
+            yield RunPart(run, facts, [speed.origin], _launches(speed), speed)
 
 
 KNOWN: Final = Need("quantisation", "known (the paper does not say which it used)", lambda fact: fact != UNKNOWN)
