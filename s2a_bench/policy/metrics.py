@@ -161,6 +161,15 @@ def peak_jerk(speed_mps: Floats, sample_s: float) -> float:
     return float(np.abs(jerk(speed_mps, sample_s)).max())
 
 
+def motion(speed_mps: Floats, sample_s: float) -> dict[str, float]:
+    """Return jerk and smoothness of a speed profile by the columns of rows."""
+    return {
+        "rms_jerk": rms_jerk(speed_mps, sample_s),
+        "peak_jerk": peak_jerk(speed_mps, sample_s),
+        "sparc": sparc(speed_mps, sample_s),
+    }
+
+
 def sparc(
     speed_mps: Floats, sample_s: float, *, padding: int = 4, cutoff_hz: float = 10.0, threshold: float = 0.05
 ) -> float:

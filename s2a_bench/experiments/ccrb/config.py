@@ -18,8 +18,6 @@ from s2a_bench.scenario import SIMULATORS, simulator_class
 from s2a_bench.scenario.ccrb.options import SKILL_SET, CcrbOptions
 
 LONG_S: Final = 600.0
-SPANS: Final = {"phase_rates": 10_000.0, "phase_gaps_m": 1000.0}
-"""Fields with a span (from, to) -> its greatest end."""
 BOARD: Final = "jetson-agx-orin"
 TTC_POLICY: Final[Any] = option(False, "add s2a-ttc: stream-to-act that starts by the lead's deadline")
 """The option of roll-outs, whose arrivals are known beforehand."""
@@ -94,8 +92,7 @@ class CcrbComputed(CcrbModelled):
 
     def check(self) -> None:
         super().check()
-        for name, most in SPANS.items():
-            span = getattr(self, name)
+        for name, span, most in (("phase_rates", self.phase_rates, 10_000), ("phase_gaps_m", self.phase_gaps_m, 1000)):
             if len(span) != 2 or not 0 < span[0] < span[1] <= most:  # noqa: PLR2004 - from, to
                 raise UsageError(f"`{name}`: should be two numbers above 0 and at most {most:g}, the lower first")
 

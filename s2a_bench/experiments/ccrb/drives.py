@@ -16,7 +16,7 @@ from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES, RolloutRow, 
 from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import skill_rows, to_ns
 from s2a_bench.policy import TOLERANCE_S, Plans, Policy, Schedule
-from s2a_bench.policy.metrics import peak_jerk, rms_jerk, sparc, stalls
+from s2a_bench.policy.metrics import motion, stalls
 from s2a_bench.scenario import EGO, LEAD, REAR, Simulator, open_simulator
 from s2a_bench.scenario.ccrb.cars import TTC, ttc_aware
 from s2a_bench.scenario.ccrb.drive import Driven, Trajectory, drive
@@ -149,8 +149,7 @@ def motion_of(path: Trajectory) -> dict[str, Any]:
     speed = path.speed_mps[:, EGO, 0]
     if len(speed) < 3:  # noqa: PLR2004 - over at once
         return {}
-    step_s = float(path.time_s[1] - path.time_s[0])
-    return {"rms_jerk": rms_jerk(speed, step_s), "peak_jerk": peak_jerk(speed, step_s), "sparc": sparc(speed, step_s)}
+    return motion(speed, float(path.time_s[1] - path.time_s[0]))
 
 
 def trajectory_rows(cell: str, path: Trajectory) -> Iterator[TrajectoryRow]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from s2a_bench.harness.timelines.cases import PlanSetting
 from s2a_bench.harness.timelines.rows import KEPT_PLANS, to_ns
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.conformal import ANY_STALL_S
-from s2a_bench.policy.metrics import measure, peak_jerk, rms_jerk, sparc, speed_profile
+from s2a_bench.policy.metrics import measure, motion, speed_profile
 from s2a_bench.policy.schedule import align, least_end, safe_start
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def timeline_rows(
 
     def row(place: int, request_id: str) -> TimelineRow:
         plan = first_plan + place
-        motion = _motion(schedule, plans.nominal_s, place) if plan < KEPT_PLANS else _Motion()
+        moved = _motion(schedule, plans.nominal_s, place) if plan < KEPT_PLANS else {}
         return TimelineRow(
             cell=f"{setting.name}/{policy}",
             policy=policy,
@@ -89,9 +89,7 @@ def timeline_rows(
             oldest_action_ns=to_ns(of_plan.oldest_action_s[place]),
             speed_distortion=share(of_plan.speed_distortion[place]),
             fluidity=share(of_plan.fluidity[place]),
-            rms_jerk=motion.rms_jerk,
-            peak_jerk=motion.peak_jerk,
-            sparc=motion.sparc,
+            **moved,
         )
 
     return [row(place, request_id) for place, request_id in enumerate(request_ids)]
@@ -102,20 +100,11 @@ def share(value: float) -> float:
     return round(float(value), 9) + 0.0
 
 
-class _Motion(NamedTuple):
-    """Jerk and smoothness of one timeline in the model of `speed_profile`."""
-
-    rms_jerk: float | None = None
-    peak_jerk: float | None = None
-    sparc: float | None = None
-
-
-def _motion(schedule: Schedule, nominal_s: Floats, place: int) -> _Motion:
-    """Return the motion of one timeline, with no values if it is too long or too short."""
+def _motion(schedule: Schedule, nominal_s: Floats, place: int) -> dict[str, float]:
+    """Return the `motion` of one timeline in the model of `speed_profile`; none if it is too long or too short."""
     start_s, duration_s, nominal_s = (
         np.ascontiguousarray(values[:, place]) for values in align(schedule.start_s, schedule.duration_s, nominal_s)
     )
     if not SHORTEST_MOTION_S <= start_s[-1] + duration_s[-1] - start_s[0] <= LONGEST_MOTION_S:
-        return _Motion()
-    speed = speed_profile(start_s, duration_s, nominal_s, SAMPLE_S)
-    return _Motion(rms_jerk(speed, SAMPLE_S), peak_jerk(speed, SAMPLE_S), sparc(speed, SAMPLE_S))
+        return {}
+    return motion(speed_profile(start_s, duration_s, nominal_s, SAMPLE_S), SAMPLE_S)

@@ -26,8 +26,6 @@ _CARS: Final[dict[str, Style]] = {
     "ego": {"color": "#000000", "linestyle": "-", "label": "ego"},
     "rear": {"color": "#D55E00", "linestyle": ":", "label": "car behind; gap to it"},
 }
-_SIDES: Final = {"front": "lead", "rear": "rear"}
-"""The car at each side of the ego."""
 _TOKEN: Final[Style] = {"color": "#555555", "marker": "|", "linestyle": "", "label": "a token arrives"}
 _FIRST: Final[Style] = {"color": "#555555", "linestyle": "-.", "linewidth": 0.6, "label": "the first token"}
 _WAITING: Final[Style] = {"facecolor": "#EEEEEE", "linewidth": 0, "label": "no skill yet"}
@@ -94,7 +92,7 @@ def _scenario(rollouts: Rollouts) -> tuple[tuple[str, ...], list[DrivenPlan]]:
         speeds = {"front": row.front_impact_mps, "rear": row.rear_impact_mps}
         impacts = {side: speed for side, speed in speeds.items() if speed is not None}
         path = path_of(every[every["cell"] == row.cell], hit_from_behind="rear" in impacts)
-        plans.append(DrivenPlan(title, path, rollouts.skills[row.cell], rollouts.token_s(row.cell), impacts))
+        plans.append(DrivenPlan(title, path, rollouts.skills[row.cell].frame, rollouts.token_s(row.cell), impacts))
     return caption, plans
 
 
@@ -155,7 +153,7 @@ def _draw_cars(axes: Axes, path: pd.DataFrame, column: str, scale: float = 1.0) 
 
 
 def _draw_gaps(axes: Axes, path: pd.DataFrame, impacts: Mapping[str, float]) -> None:
-    for side, car in _SIDES.items():
+    for side, car in (("front", "lead"), ("rear", "rear")):
         gap, colour = path[f"{side}_gap_m"], _CARS[car]["color"]
         axes.plot(path["time_s"], gap.clip(lower=0), linewidth=1.2, **_CARS[car])
         if side in impacts:

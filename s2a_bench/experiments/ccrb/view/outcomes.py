@@ -4,24 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from s2a_bench.experiments.ccrb.rows import ROLLOUTS, RolloutRow
 from s2a_bench.experiments.cells import Cells
 from s2a_bench.plan.skillset import GAPS
 from s2a_bench.scenario.ccrb.cars import LEAST_IMPACT_MPS
 from s2a_bench.scenario.ccrb.labels import NAIVE, PAPER, STREAM_TO_ACT, WAIT, follower_check, law
-from s2a_bench.store.requests import SKILLS, TOKENS
+from s2a_bench.store.requests import SKILLS, TOKENS, SkillRow
 from s2a_bench.writers.tables import ASSUMED, DUMMY, EMULATED, PAPERS, Note
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from s2a_bench.store.run import StoredRun
-
-
-IN_TIME: Final = 0.99
-STUDIES: Final = ("phase", "random")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +73,7 @@ class Rollouts:
     @cached_property
     def studies(self) -> dict[str, dict[str, pd.DataFrame]]:
         """The `scenes_of` each study that was run, by gap behaviour."""
-        rows = {study: self.cells.where(study=study) for study in STUDIES}
+        rows = {study: self.cells.where(study=study) for study in ("phase", "random")}
         return {
             study: {gap: scenes_of(of_study.where(gap_behaviour=gap).frame) for gap in GAPS}
             for study, of_study in rows.items()
@@ -85,19 +81,20 @@ class Rollouts:
         }
 
     @cached_property
-    def skills(self) -> dict[str, pd.DataFrame]:
+    def skills(self) -> dict[str, Cells[SkillRow]]:
         """The skills of each cell's plan."""
-        return {str(cell): skills for cell, skills in self.run.table(SKILLS).groupby("cell", sort=False)}
+        return Cells.of(self.run, SKILLS).split()
 
     def request_of(self, cell: str) -> str:
         """Return the id of the request whose plan ``cell`` was driven on."""
-        return str(self.skills[cell]["request_id"].iloc[0])
+        return self.skills[cell].first.request_id
 
     def token_s(self, cell: str) -> list[float]:
         """Return the arrival times of the tokens that ``cell`` was driven on, in s from its request."""
-        request_id, tokens, manifest = self.request_of(cell), self.run.table(TOKENS), self.run.manifest
+        request_id, manifest = self.request_of(cell), self.run.manifest
         zero_ns = manifest.get("requests", {}).get(request_id, 0) or manifest.get("request", {}).get("requested_ns", 0)
-        return [(int(at_ns) - zero_ns) / 1e9 for at_ns in tokens[tokens["request_id"] == request_id]["client_ns"]]
+        tokens = Cells.of(self.run, TOKENS).where(request_id=request_id)
+        return [(int(at_ns) - zero_ns) / 1e9 for at_ns in tokens.frame["client_ns"]]
 
 
 def scenes_of(rows: pd.DataFrame) -> pd.DataFrame:
@@ -189,7 +186,7 @@ def _loop_notes(rollouts: Rollouts) -> list[str]:
         f"Roll-out: the same arrivals in virtual time, {beside.simulator} simulator.",
     ]
     factors = [(row.real_time_factor, row.policy) for row in rollouts.point if row.real_time_factor is not None]
-    if slow := ", ".join(f"{factor:.3g} ({policy})" for factor, policy in factors if factor < IN_TIME):
+    if slow := ", ".join(f"{factor:.3g} ({policy})" for factor, policy in factors if factor < 0.99):  # noqa: PLR2004 - late
         late = f"The world was slower than the clock, real-time factor {slow}: in its own time tokens came faster."
         notes.append(Note(late, "world slower than the clock"))
     return notes

@@ -24,11 +24,9 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.run import StoredRun
 
-TIMES: Final = ("start_s", "stalls", "stall_s")
-IMPACTS: Final = ("impact_speed_mps", "min_front_gap_m", "min_rear_gap_m")
-MARGINS: Final = ("min_front_ttc_s", "min_rear_ttc_s", "required_decel_mps2")
-MOTION: Final = ("rms_jerk", "peak_jerk", "sparc")
+OUTCOME: Final = ("start_s", "stalls", "stall_s", "impact_speed_mps", "min_front_gap_m", "min_rear_gap_m")
 LOOP: Final = ("real_time_factor", "tracking_rms_mps")
+MARGINS: Final = ("min_front_ttc_s", "min_rear_ttc_s", "required_decel_mps2", "rms_jerk", "peak_jerk", "sparc")
 
 ORDERINGS: Final = {
     "paper": "the paper's ordering",
@@ -89,9 +87,8 @@ def finding(gap: str, scenes: pd.DataFrame, rear_gap_m: float) -> str:
 
 def _outcome_table(rollouts: Rollouts) -> TextTable:
     """Return a line a policy, each closed loop with its roll-out below it."""
-    rows, names = list[tuple[str, ...]](), [*TIMES, *IMPACTS]
-    if rollouts.beside:
-        names += LOOP
+    rows: list[tuple[str, ...]] = []
+    names = (*OUTCOME, *LOOP) if rollouts.beside else OUTCOME
     for row in rollouts.point:
         rows.append((row.policy, row.label, *_entries(row, names)))
         if beside := rollouts.beside.get(row.cell):
@@ -120,13 +117,12 @@ def _stage_table(rollouts: Rollouts) -> TextTable | None:
 
 
 def _margin_table(point: list[RolloutRow]) -> TextTable:
-    names = [*MARGINS, *MOTION]
-    rows = [(row.policy, *_entries(row, names)) for row in point]
+    rows = [(row.policy, *_entries(row, MARGINS)) for row in point]
     notes = (
         "TTC: least time to collision. DRAC: greatest deceleration required towards the lead, closing^2 / (2 gap).",
         "Motion: the ego's simulated speed until it rests (with the jolt then) or hits the lead: a crash looks smooth.",
     )
-    return TextTable("Margins and motion", ("policy", *_titles(names)), rows, 1, notes=notes)
+    return TextTable("Margins and motion", ("policy", *_titles(MARGINS)), rows, 1, notes=notes)
 
 
 def _phase_table(rollouts: Rollouts) -> TextTable | None:
@@ -201,8 +197,7 @@ def _titles(metrics: Sequence[str]) -> list[str]:
 
 
 def _entries(row: RolloutRow, metrics: Sequence[str]) -> list[str]:
-    values = [METRICS[name].read(row) for name in metrics]
-    return [_entry(value) for value in values]
+    return [_entry(METRICS[name].read(row)) for name in metrics]
 
 
 def _entry(value: float | None) -> str:
