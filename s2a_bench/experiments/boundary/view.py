@@ -54,7 +54,7 @@ class BoardPoints:
 def show(run: StoredRun, **_: Any) -> Shown:
     cells, settings = Cells.of(run, BOUNDARY), run.manifest["configuration"]
     random = is_random(cells)
-    grid = {duration: grid_of(cells, duration) for duration in DURATIONS}
+    grid: dict[str, pd.DataFrame] = {duration: grid_of(cells, duration) for duration in DURATIONS}
     boards = [BoardPoints(**board, points=cells.where(board=board["name"]).rows) for board in run.manifest["boards"]]
     caption = _caption(settings, boards, random=random)
     return Shown.build(

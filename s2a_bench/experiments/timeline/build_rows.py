@@ -34,12 +34,12 @@ def timeline_rows(
     *,
     first_plan: int = 0,
     requested_ns: Sequence[int] | None = None,
-    caution: float | Sequence[float | None] | None = None,
+    cautions: Sequence[float | None] | None = None,
     tolerance_s: float = ANY_STALL_S,
 ) -> list[TimelineRow]:
     """Return the rows of M timelines; gaps up to ``tolerance_s`` are no stall for ``any_stall``.
 
-    ``caution`` is one lambda, or one a plan. Motion is computed for plans below `KEPT_PLANS`.
+    ``cautions`` has a lambda for each plan. Motion is computed for plans below `KEPT_PLANS`.
     """
     arrival_s, nominal_s, least_s = align(plans.arrival_s, plans.nominal_s, plans.least_s)
     safe_s = safe_start(arrival_s, nominal_s)
@@ -64,7 +64,7 @@ def timeline_rows(
             plan=plan,
             request_id=request_id,
             requested_ns=requested_ns[place] if requested_ns else 0,
-            caution=caution[place] if isinstance(caution, Sequence) else caution,
+            caution=cautions[place] if cautions else None,
             start_ns=to_ns(of_plan.first_action_s[place]),
             end_ns=to_ns(of_plan.end_s[place]),
             safe_start_ns=to_ns(safe_s[place]),

@@ -48,8 +48,9 @@ class SideBySide:
         for inbox in self._inboxes:
             inbox.put(event)
 
-    def finish(self) -> list[Record]:
-        return [future.result() for future in self._futures]
+    def finish(self) -> None:
+        for future in self._futures:
+            future.result()
 
     def __enter__(self) -> SideBySide:  # noqa: PYI034 - Self is typing's since 3.11
         self._futures = [self._pool.submit(executor.run) for executor in self._executors]
@@ -86,7 +87,7 @@ def keep(
                 [request_id],
                 first_plan=plan,
                 requested_ns=[record.requested_ns],
-                caution=finite(policies[record.policy].caution),
+                cautions=[finite(policies[record.policy].caution)],
                 tolerance_s=TOLERANCE_S,
             )
             texts = [[str(skill.call) for skill in record.ran]]

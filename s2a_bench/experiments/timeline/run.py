@@ -104,13 +104,12 @@ def computed_rows(
     request_ids = [setting.request_id(plan) for plan in range(token_s.shape[1])]
     yield TOKENS, token_rows(setting.name, token_s, request_ids)
     for name, policy in following.made.items():
-        caution: float | Sequence[float | None] | None = finite(policy.caution)
         if name in following.tracked:
-            cautions, schedule = following.tracked[name].follow(plans)
-            caution = [finite(float(each)) for each in cautions]
+            followed, schedule = following.tracked[name].follow(plans)
+            cautions = [finite(float(caution)) for caution in followed]
         else:
-            schedule = policy.schedule(plans)
-        rows = timeline_rows(setting, name, plans, schedule, request_ids, caution=caution)
+            cautions, schedule = [finite(policy.caution)] * len(request_ids), policy.schedule(plans)
+        rows = timeline_rows(setting, name, plans, schedule, request_ids, cautions=cautions)
         yield TIMELINES, rows
         yield SKILLS, skill_rows(rows[0].cell, plans, schedule, request_ids)
 

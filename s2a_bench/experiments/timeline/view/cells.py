@@ -48,6 +48,11 @@ class Timelines(Cells[TimelineRow]):
         return self.mean("p_any_stall") or 0.0
 
     @property
+    def stall_s(self) -> float:
+        """The mean of the stalls of a plan together."""
+        return self.mean("stall_s") or 0.0
+
+    @property
     def complete_s(self) -> Floats:
         """The times at which the shown plan's skills were complete, in s from the request."""
         return np.array([skill.arrival_ns for skill in self.skills]) / 1e9
@@ -163,13 +168,12 @@ def _json(cell: Timelines) -> dict[str, Any]:
     return {**json_of(cell.first), "plans": len(cell), **means}
 
 
-_SETTING: Final = ("policy", "board", "tokens_per_s", "prompt_s", "tokens_per_skill", "n_skills", "t_nom_s")
-
-
 def _subjects(run: StoredRun) -> list[Subject]:
     settings, cells = run.manifest.get("configuration", {}), Cells.of(run, TIMELINES)
     even = settings.get("jitter") == "none" and not settings.get("t_nom_cv")
-    return cells.subjects((*_SETTING, "mode", "emulated"), exact=even and set(cells.frame["mode"]) == {"virtual"})
+    shape = ("board", "tokens_per_s", "prompt_s", "tokens_per_skill", "n_skills", "t_nom_s")
+    exact = even and set(cells.frame["mode"]) == {"virtual"}
+    return cells.subjects(("policy", *shape, "mode", "emulated"), exact=exact)
 
 
 COMPARED: Final = Comparable(

@@ -65,14 +65,14 @@ def _policy_sentence(policy: str, cells: Sequence[Timelines]) -> str:
     moved = f"starts after {_span(starts)} s and ends after {_span(ends)} s"
     if not stalling:
         return f"{policy} never stalls; it {moved}."
-    worst = max(stalling, key=lambda cell: cell.mean("stall_s") or 0.0)
-    stall_s, plans = worst.mean("stall_s") or 0.0, len(worst)
+    worst = max(stalling, key=lambda cell: cell.stall_s)
+    plans = len(worst)
     share = ""
     if plans > 1:
         high = upper_bound(int(worst.values("p_any_stall").sum()), plans, 0.975)
         share = f" there {worst.p_any_stall:.1%} of {plans} plans stall (95 % interval up to {high:.1%});"
     where = f"{len(stalling)} of {len(cells)} settings" if len(cells) > 1 else "the one setting"
-    most = f"most on {worst.first.title} with L = {worst.first.tokens_per_skill}: {stall_s:.2f} s a plan"
+    most = f"most on {worst.first.title} with L = {worst.first.tokens_per_skill}: {worst.stall_s:.2f} s a plan"
     return f"{policy} stalls in {where}, {most};{share} it {moved}."
 
 

@@ -38,15 +38,12 @@ from s2a_bench.stats.change import Change
 from s2a_bench.store.run import StoredRun
 
 NAIVE, WAIT, STREAM = "naive", "wait-then-act", "stream-to-act"
-_LENGTHS: Final = ("6", "4", "2", "1")
 _PROMISED: Final = 0.01
 AS_CHOSEN: Final = "as chosen"
 EXACT, VARYING = "exact", "random, or measured"
 NAMED_JITTER: Final = "lognormal:cv=0.2"
 PLANS: Final = {"n_skills": 8, "t_nom_s": 1.0, "t_min": 0.8, "t_max": 1.5, "t_nom_cv": 0.0, "prompt_s": None}
 """The defaults of `s2a-bench timeline` that decide its claims; a test compares them. The paper gives none of them."""
-_UNMODELLED: Final = {"t_nom_cv": 0.0, "prompt_s": None, "jitter": "none"}
-"""The settings that a live run does not have."""
 
 
 def listed(name: str, *values: str) -> Need:
@@ -89,6 +86,7 @@ def timelines(run: StoredRun) -> Iterator[RunPart]:
         return cell.first.title, *cell.shape
 
     settings = run.manifest.get("configuration", {})
+    unmodelled = {"t_nom_cv": 0.0, "prompt_s": None, "jitter": "none"}  # settings that a live run does not have
     spread, jitter = settings.get("t_nom_cv") or 0.0, settings.get("jitter", "none")
     named = {} if jitter == NAMED_JITTER else {"jitter": "none"}
     for (title, n_skills, t_nom_s), same in groupby(sorted(timelines_of(run), key=setting), key=setting):
@@ -101,10 +99,10 @@ def timelines(run: StoredRun) -> Iterator[RunPart]:
         launches = int(any(cell.first.mode != "virtual" for cell in every))
         facts = facts_of(run, origins) | {
             "tokens/s": every[0].first.tokens_per_s,
-            "settings": _unlike({**_UNMODELLED, **settings, "n_skills": n_skills, "t_nom_s": t_nom_s}, PLANS | named),
+            "settings": _unlike({**unmodelled, **settings, "n_skills": n_skills, "t_nom_s": t_nom_s}, PLANS | named),
             "L": ", ".join(map(str, cells)),
             "policies": ", ".join(name for name in cells[max(cells)] if all(name in each for each in cells.values())),
-            "stall of naive in s": max([0.0, *(_stall_s(each[NAIVE]) for each in cells.values() if NAIVE in each)]),
+            "stall of naive in s": max([0.0, *(each[NAIVE].stall_s for each in cells.values() if NAIVE in each)]),
             "S0 after the first arrival in s": max(
                 [0.0, *(float((safe_start(plan.arrival_s, plan.nominal_s) - plan.arrival_s[0])[0]) for plan in shown)]
             ),
@@ -130,10 +128,6 @@ def _shown(cells: Mapping[int, Mapping[str, Timelines]]) -> list[Plans]:
     return plans
 
 
-def _stall_s(cell: Timelines) -> float:
-    return cell.mean("stall_s") or 0.0
-
-
 SETTINGS: Final = _chosen(PLANS, f"jitter none or {NAMED_JITTER}")
 EVEN, UNEVEN = one_of("times", EXACT), one_of("times", VARYING)
 SEVERAL: Final = Need("L", "two or more", lambda fact: ", " in fact), more("stall of naive in s", TOLERANCE_S)
@@ -148,7 +142,7 @@ def figure_5(board: Published, *policies: str) -> Trial:
     measured = on_board(board.name), *PAPERS_MODEL, like
     either = f"{emulated(profile, rate)}; or {', '.join(f'{need.name} {need.wanted}' for need in measured)}"
     source = _Or("source", either, emulated(profile, rate).__eq__, measured)
-    needs = (source, listed("L", *_LENGTHS), listed("policies", *policies), SETTINGS)
+    needs = (source, listed("L", "6", "4", "2", "1"), listed("policies", *policies), SETTINGS)
     return Trial(f"s2a-bench timeline --profile {profile}", timelines, needs)
 
 
@@ -165,7 +159,7 @@ def no_stalls(*policies: str) -> Check:
             ratios.append(Ratio(share.value / promised, low / promised, high / promised))
             if share.k or high > promised:
                 spread = "" if even else f" [{low:.1%}, {high:.1%}]"
-                many = f"{share.k} of {share.n} plans stall{spread}, {_stall_s(cell):.2f} s in the mean"
+                many = f"{share.k} of {share.n} plans stall{spread}, {cell.stall_s:.2f} s in the mean"
                 stalled.append(f"{cell.policy} at L = {cell.first.tokens_per_skill}: {many}")
         text = "; ".join(stalled) or f"{', '.join(policies)}: no plan stalls"
         regrets = [cell.mean("signed_start_regret") for cell in cells if cell.policy == STREAM]
@@ -199,8 +193,8 @@ def stalled_gaps(part: RunPart) -> tuple[list[Ratio], str]:
 def growth(part: RunPart) -> tuple[list[Ratio], str]:
     """Measure the increase of naive's stall time at each larger L, from the first that stalls."""
     cells = [of_length[NAIVE] for _, of_length in sorted(part.cells.items())]
-    steps = [pair for pair in pairwise(cells) if max(map(_stall_s, pair)) > TOLERANCE_S]
-    text = f"{', '.join(f'{_stall_s(cell):.2f}' for cell in cells)} s at L = {', '.join(map(str, sorted(part.cells)))}"
+    steps = [pair for pair in pairwise(cells) if max(cell.stall_s for cell in pair) > TOLERANCE_S]
+    text = f"{', '.join(f'{cell.stall_s:.2f}' for cell in cells)} s at L = {', '.join(map(str, sorted(part.cells)))}"
     return [_compared(part, more, less, "stall_s").difference for less, more in steps], text
 
 
@@ -276,9 +270,6 @@ CHOSEN: Final[dict[str, Any]] = {
     "phase_gaps_m": [6.0, 30.0],
 }
 """The defaults of `s2a-bench ccrb` besides the scenario's; a test compares them."""
-_SPANS: Final = ("phase_rates", "phase_gaps_m")
-_VARIED: Final = ("rear_gap_m", "gap")
-"""The settings that the diagram varies; its c is the board's."""
 
 
 def drives(run: StoredRun) -> Iterator[RunPart]:
@@ -286,7 +277,8 @@ def drives(run: StoredRun) -> Iterator[RunPart]:
     settings, scenario, rollouts = run.manifest.get("configuration", {}), CcrbOptions(), Rollouts.of(run)
     wanted = {**scenario.to_manifest(), "t_nom_s": scenario.durations.nominal_s, **CHOSEN}
     facts = {name: ", ".join(rollouts.cells.frame[name].unique()) for name in ("study", "policy")}
-    for name, free in (("point", _SPANS), ("diagram", _VARIED)):
+    # The point has no spans; the diagram varies rear gap and gap behaviour, its c is the board's.
+    for name, free in (("point", ("phase_rates", "phase_gaps_m")), ("diagram", ("rear_gap_m", "gap"))):
         facts[name] = _unlike(settings, {key: value for key, value in wanted.items() if key not in free})
     origins = run.origins.every
     yield RunPart(run, facts_of(run, origins) | facts, origins, int("live" in run.manifest), rollouts)
