@@ -135,9 +135,11 @@ def json_of(row: Any) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for column in columns_of(row.__class__):
         value = getattr(row, column.name)
-        if column.key and value is not None:
-            empty = column.json_key and value == ""
-            values[column.key] = None if empty else value / 1e9 if column.in_s else value
+        if not column.key or value is None:
+            continue
+        if column.in_s:
+            value /= 1e9
+        values[column.key] = None if column.json_key and not value else value
     return values
 
 

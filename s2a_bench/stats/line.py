@@ -52,14 +52,14 @@ def fit_line(launches: Iterable[tuple[float, float]]) -> Line | None:
     """Fit a line through (x, y above 0) of launches; None for fewer than two different x."""
     from scipy import special
 
-    found: dict[float, list[float]] = {}
+    at: dict[float, list[float]] = {}
     for x, y in launches:
-        found.setdefault(x, []).append(y)
-    freedom = len(found) - 2
+        at.setdefault(x, []).append(y)
+    freedom = len(at) - 2
     if freedom < 0:
         return None
-    points = np.exp([np.mean(np.log(ys)) for ys in found.values()])
-    design = np.stack([np.ones_like(points), np.array([*found])], 1) / points[:, None]
+    points = np.exp([np.mean(np.log(ys)) for ys in at.values()])
+    design = np.stack([np.ones_like(points), np.array([*at])], 1) / points[:, None]
     covariance = np.linalg.inv(design.T @ design)
     values = covariance @ design.sum(0)
     squares = float(np.sum(np.square(design @ values - 1)))

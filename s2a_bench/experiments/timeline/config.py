@@ -110,7 +110,9 @@ class TimelineComputed(TimelineOptions):
 
     @property
     def plans_a_cell(self) -> int:
-        return self.plans if self.plans is not None else PLANS if self.random else 1
+        if self.plans is not None:
+            return self.plans
+        return PLANS if self.random else 1
 
     def check(self) -> None:
         super().check()

@@ -48,13 +48,13 @@ def build_link(link: Mapping[str, Any]) -> Figure:
     """Draw what a probe measured of the emulated link, as a share of its profile, with the tolerance."""
     about = LinkProfile.model_construct(**link["profile"])  # runs of older versions lack defaults
     bars, others = [], []
-    for found in link["probe"]["quantities"]:
-        what, profile, measured = found["what"], found["profile"], found["measured"]
-        if found["tolerance"] < profile:
-            band = tuple(100 * (1 + sign * found["tolerance"] / profile) for sign in (-1, 1))
-            bars.append(Bar(what, 100 * measured / profile, band, f"{number(measured)} {found['unit']}".rstrip()))
+    for quantity in link["probe"]["quantities"]:
+        what, profile, measured = quantity["what"], quantity["profile"], quantity["measured"]
+        if quantity["tolerance"] < profile:
+            band = tuple(100 * (1 + sign * quantity["tolerance"] / profile) for sign in (-1, 1))
+            bars.append(Bar(what, 100 * measured / profile, band, f"{number(measured)} {quantity['unit']}".rstrip()))
         else:
-            others.append(f"{what}: {number(measured)} of {number(profile)} {found['unit']}".rstrip())
+            others.append(f"{what}: {number(measured)} of {number(profile)} {quantity['unit']}".rstrip())
     notes = (f"The line is what the probe allows{''.join(f'; {each}' for each in others)}.", about.source)
     return build_bars((f"Emulated link {about.name}, probed before the run", *notes), bars, "share (%)")
 

@@ -207,9 +207,9 @@ def share_interval(
     span_ns, side = np.ptp(at_ns) + 1, (1 + confidence) / 2
     variance = squares
     groupings = ((at_ns - at_ns.min()) * BLOCKS // span_ns, robots)
-    found = [_variance(stalled, labels) for labels in groupings if np.unique(labels).size >= BLOCKS]
-    if found and hits:
-        variance, groups = max(found)
+    variances = [_variance(stalled, labels) for labels in groupings if np.unique(labels).size >= BLOCKS]
+    if variances and hits:
+        variance, groups = max(variances)
         freedom = max(1.0, min(groups, hits**2 / squares) - 1)
         variance *= float(stats.t.ppf(side, freedom) / stats.norm.ppf(side)) ** 2
     low = float(stats.gamma.ppf(1 - side, hits**2 / variance, scale=variance / hits)) if variance else hits
@@ -241,13 +241,13 @@ def _in_time(ticks: Ticks | None, skipped: int) -> Flags:
     if ticks is None or acted.size == 0:
         return acted > 0
     later = np.flatnonzero(np.diff(ticks.chunk[acted])) + 1
-    found: Flags = np.diff(acted)[later - 1] == 1
-    return found[acted[later] >= skipped]
+    without_stall: Flags = np.diff(acted)[later - 1] == 1
+    return without_stall[acted[later] >= skipped]
 
 
 def _joined(parts: Iterable[NDArray[Any]]) -> NDArray[Any]:
-    found = list(parts)
-    return np.concatenate(found) if found else np.empty(0, np.int64)
+    arrays = list(parts)
+    return np.concatenate(arrays) if arrays else np.empty(0, np.int64)
 
 
 def _quantiles(name: str, values_ns: NDArray[Any]) -> dict[str, float]:

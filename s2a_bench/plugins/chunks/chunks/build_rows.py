@@ -105,23 +105,25 @@ def metrics_of(acted: ActedCell, reaction_s: Floats) -> dict[str, float | None]:
     """Return the value of every computed metric; NaN or None if it has none."""
     cell, setting, cycles, latency_ns = acted.cell, acted.setting, acted.cycles, acted.latency_ns
     period_s = setting.period_ns / 1e9
-    found: dict[str, Any] = asdict(measure(cell.mode, cycles, acted.ticks))
+    measured: dict[str, Any] = asdict(measure(cell.mode, cycles, acted.ticks))
     expected = closed(cell.acting, latency_ns, setting)
     mean_reaction = expected.mean_reaction_ticks
     delay = cycles.delay_ticks[: latency_ns.size]  # a live run may end before an answer
     later = setting.rounding == "floor"  # an action leaves at the end of its tick
     assumed = np.array(cell.triggers[1:] or cell.triggers) if cell.triggers else cell.mode.assumed_ticks
-    length = found["ticks"] or math.nan
-    return found | {
+    length = measured["ticks"] or math.nan
+    return measured | {
         **stalls_of(cycles),
-        "stall_ticks_per_s": found["stall_ticks"] / length / period_s,
+        "stall_ticks_per_s": measured["stall_ticks"] / length / period_s,
         "p_stall_closed": expected.p_stall,
         "age_ticks_blended": _blended(cell, cycles),
         "reaction_s_mean": mean(reaction_s),
         "reaction_s_p99": p99(reaction_s),
         "reaction_s_closed": None if mean_reaction is None else mean_reaction * period_s,
-        "first_action_s": (found["first_action_tick"] + later) * period_s if found["age_ticks_mean"] >= 0 else None,
-        "control_rate_hz": (found["ticks"] - found["stall_ticks"]) / length / period_s,
+        "first_action_s": (measured["first_action_tick"] + later) * period_s
+        if measured["age_ticks_mean"] >= 0
+        else None,
+        "control_rate_hz": (measured["ticks"] - measured["stall_ticks"]) / length / period_s,
         "delay_ticks_mean": mean(delay),
         "delay_ticks_p99": p99(delay),
         "delay_ticks_max": greatest(delay),
@@ -137,12 +139,12 @@ def stalls_of(cycles: Cycles) -> dict[str, Any]:
 
 def stall_metrics(stalled: int, boundaries: int) -> dict[str, Any]:
     """Return counts, and with boundaries the share and its two-sided 95 % interval (Clopper and Pearson)."""
-    found: dict[str, Any] = {"boundaries": boundaries, "stalled_cycles": stalled}
+    counts: dict[str, Any] = {"boundaries": boundaries, "stalled_cycles": stalled}
     if boundaries:
-        found["p_stall_cycle"] = stalled / boundaries
-        found["p_stall_low"] = 1 - upper_bound(boundaries - stalled, boundaries, _SIDE)
-        found["p_stall_high"] = upper_bound(stalled, boundaries, _SIDE)
-    return found
+        counts["p_stall_cycle"] = stalled / boundaries
+        counts["p_stall_low"] = 1 - upper_bound(boundaries - stalled, boundaries, _SIDE)
+        counts["p_stall_high"] = upper_bound(stalled, boundaries, _SIDE)
+    return counts
 
 
 def reactions_s(cycles: Cycles, ticks: Ticks, setting: ControlSetting, rng: np.random.Generator) -> Floats:
@@ -151,8 +153,8 @@ def reactions_s(cycles: Cycles, ticks: Ticks, setting: ControlSetting, rng: np.r
     if not acted.any():
         return np.empty(0)
     moments = rng.uniform(int(acted.argmax()), max(int(cycles.request_tick[-1]), int(acted.argmax())), EVENTS)
-    found = reaction_ticks(cycles, moments) * (setting.period_ns / 1e9)
-    return found[~np.isnan(found)]
+    after_s = reaction_ticks(cycles, moments) * (setting.period_ns / 1e9)
+    return after_s[~np.isnan(after_s)]
 
 
 def _reaction_rows(acted: ActedCell, reaction_s: Floats) -> Iterator[ReactionRow]:
@@ -160,9 +162,9 @@ def _reaction_rows(acted: ActedCell, reaction_s: Floats) -> Iterator[ReactionRow
         return
     cell, period_s = acted.cell, acted.setting.period_ns / 1e9
     form = closed(cell.acting, acted.latency_ns, acted.setting).reaction_ticks(SHARES)
-    found = np.quantile(reaction_s, SHARES).tolist()
+    quantiles_s = np.quantile(reaction_s, SHARES).tolist()
     closed_s = [None] * SHARES.size if form is None else (form * period_s).tolist()
-    for share, simulated_s, expected_s in zip(SHARES.tolist(), found, closed_s, strict=True):
+    for share, simulated_s, expected_s in zip(SHARES.tolist(), quantiles_s, closed_s, strict=True):
         yield ReactionRow(cell.cell, share, simulated_s, expected_s)
 
 
@@ -205,7 +207,9 @@ def _request_rows(acted: ActedCell, shown: int) -> Iterator[RequestRow]:
 
 
 def _mean(triggers: tuple[int, ...], given: int | None) -> float | None:
-    return float(np.mean(triggers)) if triggers else None if given is None else float(given)
+    if triggers:
+        return float(np.mean(triggers))
+    return None if given is None else float(given)
 
 
 def _blended(cell: ActingCell, cycles: Cycles) -> float | None:
@@ -229,15 +233,15 @@ def trigger_rows(mode: Mode, setting: ControlSetting, drawn: LatencyDraw) -> Ite
     for ticks in np.unique(np.linspace(0, length - 1, min(length, MOST_POINTS)).round()).astype(int).tolist():
         tried = mode.varied((ticks,))
         cycles = tried.cycles(drawn.judged, setting)
-        found = stalls_of(cycles)
-        del found["stalled_cycles"]
-        if found["boundaries"]:
+        counts = stalls_of(cycles)
+        del counts["stalled_cycles"]
+        if counts["boundaries"]:
             yield TriggerRow(
                 latency=drawn.source.name,
                 mode=without_trigger(mode),
                 execution_horizon=length,
                 trigger=ticks,
-                **found,
+                **counts,
                 p_stall_closed=closed(tried, drawn.judged, setting).p_stall,
                 age_ticks_mean=mean_age(cycles),
             )

@@ -66,8 +66,8 @@ class AdviseConfig(Options):
     @property
     def deadline_ms(self) -> float:
         """The deadline, infinite for none."""
-        found = _DURATION.fullmatch(self.deadline)
-        return float(found[1]) * (1 if found[2] == "ms" else 1e3) if found else math.inf
+        duration = _DURATION.fullmatch(self.deadline)
+        return float(duration[1]) * (1 if duration[2] == "ms" else 1e3) if duration else math.inf
 
     @property
     def period_ms(self) -> float:
@@ -83,34 +83,34 @@ def _advise(config: AdviseConfig, *, json_: Json = False) -> None:
     from s2a_bench.cli.progress import RunProgress
     from s2a_bench.plugins.two_hosts.advise.prediction import advice_json, advice_table, advise, sentence
 
-    found, profile, origin = advise(config)
+    advices, profile, origin = advise(config)
     if config.measure:
         with RunProgress("samples") as progress:
-            times_ms = _measured_ms(config, found[:CHECKED], progress)
-        found[:CHECKED] = [replace(each, measured_ms=ms) for each, ms in zip(found, times_ms, strict=False)]
+            times_ms = _measured_ms(config, advices[:CHECKED], progress)
+        advices[:CHECKED] = [replace(each, measured_ms=ms) for each, ms in zip(advices, times_ms, strict=False)]
     if json_:
-        print_json(advice_json(found, config, profile, origin))
+        print_json(advice_json(advices, config, profile, origin))
         return
-    print_table(table := advice_table(found, config, profile, origin))
-    for line in (*table.notes, sentence(found, config, profile)):
+    print_table(table := advice_table(advices, config, profile, origin))
+    for line in (*table.notes, sentence(advices, config, profile)):
         print_line(line)
 
 
-def _measured_ms(config: AdviseConfig, found: Sequence[Advice], progress: Progress) -> list[float]:
+def _measured_ms(config: AdviseConfig, advices: Sequence[Advice], progress: Progress) -> list[float]:
     """Return the medians of pipelines' e2e without inference on the emulated link, in ms, of one run at the rate."""
     from s2a_bench.experiments.latency.view.against_bytes import METRIC
     from s2a_bench.experiments.requests import cells_of
 
     latency = EXPERIMENTS["latency"]
     requests = resolve_name(latency.config)(
-        transports=tuple(each.name for each in found),
+        transports=tuple(each.name for each in advices),
         link=config.link,
         engine={"name": STAND_IN, "answer": ACTIONS},
         size=config.size,
         cameras=config.cameras,
         state=14,
         requests=30,
-        think_s=min(LONGEST_PAUSE_S, max(0.0, config.period_ms - max(each.e2e_ms for each in found)) / 1e3),
+        think_s=min(LONGEST_PAUSE_S, max(0.0, config.period_ms - max(each.e2e_ms for each in advices)) / 1e3),
     )
     cells = {cell.name: cell for cell in cells_of(read_run(latency.run_with(requests, config.output, progress)))}
     return [float(statistics.median(cells[each.name].values(METRIC))) for each in requests.pipelines]

@@ -106,11 +106,11 @@ def advise(config: AdviseConfig) -> tuple[list[Advice], LinkProfile, str]:
     if any(each.steps for each in link):
         raise UsageError(f"`link`: {profile.name} changes with time; advice needs one rate, as rate=18/75,delay=25")
     lines, line = fitted(tuple(config.runs))
-    found = [_advice(each, each.line, profile, config) for each in lines if each.line]
-    if not found:
+    advices = [_advice(each, each.line, profile, config) for each in lines if each.line]
+    if not advices:
         raise UsageError("`runs`: no pipeline with pictures of two sizes or more; run s2a-bench sweep transports")
     origin = f"{line.removesuffix('.')}; PREDICTED for {profile.about}."
-    return sorted(found, key=lambda each: (each.load > 1, each.meets is False, each.e2e_ms)), profile, origin
+    return sorted(advices, key=lambda each: (each.load > 1, each.meets is False, each.e2e_ms)), profile, origin
 
 
 def fitted(paths: Sequence[Path]) -> tuple[list[FittedPipeline], str]:
@@ -147,7 +147,9 @@ def _advice(pipeline: FittedPipeline, line: Line, profile: LinkProfile, config: 
     wait_ms = waiting_ms(load, load * config.period_ms)
     low, high = ends_ms or (e2e_ms, e2e_ms)
     surely = load < HALF if math.isinf(config.deadline_ms) else high + (wait_ms or 0.0) <= config.deadline_ms
-    meets = False if load > 1 or low > config.deadline_ms else True if surely and wait_ms is not None else None
+    meets = True if surely and wait_ms is not None else None
+    if load > 1 or low > config.deadline_ms:
+        meets = False
     coding_ms = 0.0 if pipeline.coding is None else pipeline.coding.at(config.pixels_mb)
     bound_ms = bound_s(link, size) * 1e3
     return Advice(pipeline.name, pipeline.payload, e2e_ms, ends_ms, link_ms, coding_ms, bound_ms, load, wait_ms, meets)
@@ -227,20 +229,20 @@ def waiting_ms(load: float, service_ms: float) -> float | None:
     return -math.log(WAITS) / decay * service_ms
 
 
-def advice_table(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile, provenance: str) -> TextTable:
+def advice_table(advices: Sequence[Advice], config: AdviseConfig, profile: LinkProfile, provenance: str) -> TextTable:
     columns = {
-        "pipeline": [each.pipeline for each in found],
-        "payload": [each.payload for each in found],
-        "predicted ms": [each.predicted for each in found],
+        "pipeline": [each.pipeline for each in advices],
+        "payload": [each.payload for each in advices],
+        "predicted ms": [each.predicted for each in advices],
     }
-    if any(each.measured_ms is not None for each in found):
-        columns["measured ms"] = [_measured(each) for each in found]
-    columns |= {"bound ms": [number(each.bound_ms) for each in found], "limited by": [each.limit for each in found]}
+    if any(each.measured_ms is not None for each in advices):
+        columns["measured ms"] = [_measured(each) for each in advices]
+    columns |= {"bound ms": [number(each.bound_ms) for each in advices], "limited by": [each.limit for each in advices]}
     if config.rate:
-        columns["of the rate"] = [f"{each.load:.0%}" for each in found]
-        columns["wait ms"] = [ABSENT if each.wait_ms is None else number(each.wait_ms) for each in found]
+        columns["of the rate"] = [f"{each.load:.0%}" for each in advices]
+        columns["wait ms"] = [ABSENT if each.wait_ms is None else number(each.wait_ms) for each in advices]
     if config.deadline or config.rate:
-        columns["meets it"] = [{True: "yes", False: "no", None: "unclear"}[each.meets] for each in found]
+        columns["meets it"] = [{True: "yes", False: "no", None: "unclear"}[each.meets] for each in advices]
     notes = (
         PREDICTION,
         f"TCP: {host_tcp()}, as this host's; requests {_pause(config)}.",
@@ -263,24 +265,26 @@ def _measured(advice: Advice) -> str:
     return number(advice.measured_ms) + {True: ", inside", False: ", outside", None: ""}[advice.inside]
 
 
-def sentence(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile) -> str:
-    best = found[0]
+def sentence(advices: Sequence[Advice], config: AdviseConfig, profile: LinkProfile) -> str:
+    best = advices[0]
     if best.load > 1:
         return f"{profile.name} carries {config.rate:g} such requests a second over no transport of the sweep."
     text = f"{best.pipeline} with {best.payload} is the quickest over {profile.name}: {best.predicted} ms"
     if config.deadline:
-        meet = sum(each.meets is True for each in found)
-        text += f"; {meet} of {len(found)} surely meet {config.deadline_ms:g} ms"
+        meet = sum(each.meets is True for each in advices)
+        text += f"; {meet} of {len(advices)} surely meet {config.deadline_ms:g} ms"
     return f"{text}; the {best.limit} takes the most of it, if TCP is {host_tcp()} and requests {_pause(config)}."
 
 
-def advice_json(found: Sequence[Advice], config: AdviseConfig, profile: LinkProfile, provenance: str) -> dict[str, Any]:
+def advice_json(
+    advices: Sequence[Advice], config: AdviseConfig, profile: LinkProfile, provenance: str
+) -> dict[str, Any]:
     return {
         "schema": "s2a-bench-advise/1",
         "command": "advise",
         "link": profile.model_dump(mode="json", exclude_defaults=True),
         "provenance": provenance,
         "tcp": asdict(host_tcp()),
-        "cells": [{**asdict(each), "limit": each.limit, "inside": each.inside} for each in found],
-        "sentence": sentence(found, config, profile),
+        "cells": [{**asdict(each), "limit": each.limit, "inside": each.inside} for each in advices],
+        "sentence": sentence(advices, config, profile),
     }
