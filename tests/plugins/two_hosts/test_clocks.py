@@ -20,7 +20,7 @@ from scipy.optimize import linprog
 from s2a_bench.clock import VirtualClock, clock_id
 from s2a_bench.errors import ClockMoved, RequestFailed, UsageError
 from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WALL_CLOCKS, WallClock
-from s2a_bench.plugins.two_hosts import HostOptions, clocks
+from s2a_bench.plugins.two_hosts import clocks
 from s2a_bench.plugins.two_hosts.clocks import (
     KEPT,
     RATE,
@@ -31,6 +31,7 @@ from s2a_bench.plugins.two_hosts.clocks import (
     RemoteClock,
     interval_at,
 )
+from s2a_bench.plugins.two_hosts.surroundings import HostOptions
 from s2a_bench.trace import Remote, Trace
 
 SECOND_NS, MS_NS = 10**9, 10**6

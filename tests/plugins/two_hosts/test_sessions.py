@@ -15,7 +15,7 @@ from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.session import Measured, Place, Session
 from s2a_bench.machine.clocks import REALTIME_ERROR_MS, REALTIME_MS, WallClock
-from s2a_bench.plugins.two_hosts import TwoHosts
+from s2a_bench.plugins.two_hosts.surroundings import TwoHosts
 from s2a_bench.store.requests import samples_table
 from s2a_bench.trace import STAGES as COMMON
 from s2a_bench.trace import Remote, Trace
