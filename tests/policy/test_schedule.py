@@ -87,6 +87,15 @@ def test_t1_idling_is_conserved_whenever_execution_starts(plans: Plans, delay: f
 
 @quick
 @given(elastic_plans())
+def test_naive_and_stream_to_act_end_at_the_same_instant(plans: Plans) -> None:
+    naive = work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[0])
+    streamed = work_conserving(plans.arrival_s, plans.nominal_s, safe_start(plans.arrival_s, plans.nominal_s))
+    assert naive[-1, 0] == streamed[-1, 0]
+    assert total(stalls(Schedule(streamed, plans.nominal_s))) == 0
+
+
+@quick
+@given(elastic_plans())
 def test_t2_the_elastic_schedule_never_stalls_and_attains_the_least_start_and_the_least_end(plans: Plans) -> None:
     schedule = elastic(plans)
     assert (schedule.start_s >= plans.arrival_s).all()

@@ -75,6 +75,12 @@ def test_the_lead_and_the_trailing_car_follow_their_commands_to_centimetres(worl
     assert state.position_m[[LEAD, REAR], 0] == pytest.approx([56.0, -2.0], abs=0.1)
 
 
+def test_the_cars_start_where_they_are_placed_though_a_cold_car_loses_speed(world: CarlaWorld) -> None:
+    state = world.place(START, SPEED)
+    assert state.position_m == pytest.approx(START, abs=0.01)
+    assert state.speed_mps == pytest.approx(SPEED, abs=0.15)
+
+
 def test_the_ego_brakes_late_and_the_error_shows(world: CarlaWorld) -> None:
     world.place(START, SPEED)
     late_m = run(world, 1.5, command(ego=-4.0)).position_m[EGO, 0] - (15.0 - 4.0 * 1.5**2 / 2)

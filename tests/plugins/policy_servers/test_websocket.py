@@ -113,6 +113,14 @@ def test_openpi_client_with_its_key(monkeypatch: pytest.MonkeyPatch) -> None:
         assert get(server.address, "/healthz") == (200, "OK\n")
 
 
+def test_policy_websocket_client_gets_actions_from_our_server() -> None:
+    peer = pytest.importorskip("policy_websocket")
+    with serving(RecordingHandler(list(CHUNK))) as server:
+        policy = peer.WebsocketClientPolicy(server.address)
+        np.testing.assert_array_equal(policy.infer({"state": np.zeros(7), "prompt": "go"})["actions"], CHUNK)
+        policy.close()
+
+
 def test_a_stranger_asks_for_the_stream() -> None:
     with serving(RecordingHandler(list(CHUNK))) as server, robot(server.address, "/stream") as (socket, _):
         socket.send(packb({"prompt": "go"}))
@@ -392,6 +400,8 @@ def test_times_that_cannot_be_split_nothing(timing: Any) -> None:
         (packb({"nothing": 1}), "an answer without actions: nothing"),
         (packb([1, 2]), "an answer without actions: list"),
         (packb({"actions": np.full((2, 2), np.nan)}), "actions: not finite numbers"),
+        (packb({"actions": np.zeros((2, 2, 2))}), r"actions: shape \(2, 2, 2\)"),
+        (packb({"actions": "up"}), "actions: "),
         (b"\xc1", "bytes that are no message"),
         (msgpack.packb({b"__ndarray__": True, b"dtype": "|O", b"data": b"", b"shape": []}), "does not travel"),
     ],

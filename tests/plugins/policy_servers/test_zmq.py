@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import io
 import json
 import pickle
@@ -167,6 +168,19 @@ class TestClientsOfOthers:
         assert got.state == (0.0, 1.0, 2.0, 3.0, 4.0, 0.5)
         assert [image.data.shape for image in got.images] == [(48, 64, 3)]
         assert (got.images[0].data == 7).all()
+
+    def test_its_policy_moves_a_robot_by_our_answers(self, strands: Any) -> None:
+        joints = [f"joint_{number}" for number in range(6)]
+        handler = RecordingHandler(list(np.arange(12, dtype=np.float32).reshape(2, 6)))
+        with serving(handler) as server:
+            theirs = strands.Gr00tPolicy("so100", "127.0.0.1", int(server.address.rpartition(":")[2]))
+            theirs.set_robot_state_keys(joints)
+            seen = {"webcam": np.zeros((48, 64, 3), np.uint8), **dict.fromkeys(joints, 0.25)}
+            moves = asyncio.run(theirs.get_actions(seen, "go home"))
+            theirs.client.__del__()
+        assert [list(move.values()) for move in moves] == [[0, 1, 2, 3, 4, 5], [6, 7, 8, 9, 10, 11]]
+        assert handler.requests[0].state == (0.25,) * 6
+        assert handler.requests[0].prompt == "go home"
 
     def test_n1_5_is_answered_flat_with_a_batch_where_it_has_one(self) -> None:
         with serving(RecordingHandler(list(CHUNK))) as server, plain(server.address) as call:

@@ -24,6 +24,11 @@ def constant(service_ns: int) -> Iterator[ServiceTime]:
     return repeat(ServiceTime(service_ns, service_ns))
 
 
+def exponential(mean_ns: float, seed: int = 0) -> Iterator[ServiceTime]:
+    for each in np.random.default_rng(seed).exponential(mean_ns, 200_000).astype(int).tolist():
+        yield ServiceTime(each, each)
+
+
 def fleet(
     written: str = "", seconds: float = 60, horizon: int = 16, rounding: Any = "floor", **given: Any
 ) -> tuple[RobotLoad, int]:
@@ -130,6 +135,14 @@ def test_a_closed_loop_has_the_throughput_of_its_bottleneck(robots: int, think_m
     assert found.latency_mean_ns / 1e9 == pytest.approx(robots / rate - think_s, rel=0.01)
 
 
+def test_the_clients_of_vllm_omni_6567() -> None:
+    table = {1: (6.56, 152), 2: (6.68, 297), 4: (6.71, 589), 8: (6.77, 1165)}
+    for robots, (rate, latency_ms) in table.items():
+        found = measured(fleet(), robots, constant(148 * MS))
+        assert found.requests_per_s == pytest.approx(rate, rel=0.05)
+        assert found.latency_mean_ns / MS == pytest.approx(latency_ms, rel=0.05)
+
+
 def test_of_robots_that_start_together_the_last_one_waits_for_all_others_in_every_episode() -> None:
     service_ns = 7 * MS
     traces = simulate(
@@ -169,6 +182,56 @@ def test_a_queue_with_an_early_trigger_carries_as_many_robots_as_the_server_has_
         assert (found.stalled <= 0.01) is (robots <= knee)
 
 
+@pytest.mark.parametrize("written", ["sync", "queue?trigger=1"])
+def test_other_modes_stall_no_less_than_the_server_s_time_and_one_robot_alone(written: str) -> None:
+    alone = measured(fleet(written, rounding="ceil"), 1, constant(27 * MS)).stalled
+    for robots in (2, 6, 9, 11, 12, 14, 24):
+        found = measured(fleet(written, rounding="ceil"), robots, constant(27 * MS)).stalled
+        assert found >= max(alone, 1 - 16 * 20 / (robots * 27)) - 2e-3
+    assert found == pytest.approx(1 - 16 * 20 / (24 * 27), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("written", "service_ms", "robots", "stalled", "alone"),
+    [("queue?trigger=1", 20, 16, 0.029, 0.0), ("sync", 13, 23, 0.075, 0.059)],
+)
+def test_near_the_knee_requests_wait_for_ticks(
+    written: str, service_ms: int, robots: int, stalled: float, alone: float
+) -> None:
+    load, span_ns = fleet(written, rounding="ceil")
+    shares = []
+    for seed in range(5):
+        starts = np.random.default_rng(seed).integers(0, DT, robots).tolist()  # all within one tick
+        clients = [robot_of(load, *each, span_ns) for each in enumerate(starts)]
+        traces = serve(clients, constant(service_ms * MS))
+        shares.append(measures(traces, load.setting, 30 * 10**9).stalled)
+    assert np.mean(shares) == pytest.approx(stalled, abs=2e-3)
+    assert measured((load, span_ns), 1, constant(service_ms * MS)).stalled == pytest.approx(alone, abs=1e-3)
+
+
+def mean_value_analysis(robots: int, service_s: float, think_s: float) -> tuple[float, float]:
+    """Return latency and throughput of a closed network with one exponential server (Reiser and Lavenberg 1980)."""
+    queued = latency_s = rate = 0.0
+    for number in range(1, robots + 1):
+        latency_s = service_s * (1 + queued)
+        rate = number / (think_s + latency_s)
+        queued = rate * latency_s
+    return latency_s, rate
+
+
+@pytest.mark.parametrize("robots", [1, 4, 12])
+@pytest.mark.parametrize("acting", ["closed", "sync"])
+def test_exponential_service_times_have_their_mean_value_analysis(robots: int, acting: str) -> None:
+    chosen = {
+        "closed": fleet(seconds=2000, think_ns=160 * MS),
+        "sync": fleet("sync", seconds=2000, horizon=40, rounding="ceil", period_ns=4 * MS),
+    }[acting]
+    found = measured(chosen, robots, exponential(40 * MS))
+    latency_s, rate = mean_value_analysis(robots, 0.04, 0.16 if acting == "closed" else 0.162)
+    assert found.requests_per_s == pytest.approx(rate, rel=0.02)
+    assert found.latency_mean_ns / 1e9 == pytest.approx(latency_s, rel=0.03)
+
+
 def test_a_batching_server_reaches_its_rate_with_a_full_batch_waiting() -> None:
     slower = np.interp(np.arange(1, 17), (1, 4, 8, 16), np.array((58.5, 100, 171.7, 324.5)) / 58.5).tolist()
     load, span_ns = fleet()
@@ -201,3 +264,9 @@ def test_plans_stall_when_the_server_falls_behind() -> None:
     assert stalled(4).requests_per_s == pytest.approx(4, rel=0.01)
     assert stalled(5).stalled == 1
     assert stalled(5).latency_p50_ns > 3 * 10**9, "from when it is due, not from when the one before it has come"
+
+
+def test_thousands_of_robots_are_served_by_hundreds_of_servers() -> None:
+    found = measured(fleet("queue?trigger=8", 6), 2000, constant(100 * MS), settle_s=3, servers=640)
+    assert found.requests_per_s == pytest.approx(2000 / 0.32, rel=0.02)
+    assert found.stalled < 0.01
