@@ -662,4 +662,6 @@ def span_of(counts: Iterable[int], what: str = "") -> str:
     """Return least and greatest count as text, such as "50", or "48 to 50 requests"."""
     ordered = sorted(counts)
     span = " to ".join(str(count) for count in dict.fromkeys((*ordered[:1], *ordered[-1:])))
-    return f"{span} {what}{'s' * (ordered[-1] != 1)}" if what else span
+    if not what:
+        return span
+    return f"{span} {what}" if ordered[-1] == 1 else f"{span} {what}s"

@@ -160,7 +160,7 @@ def lag_one(values: Floats) -> float:
 
 
 def ranks_of(values: Floats) -> Floats:
-    """Return the rank of each value from 1; equal ones share their mean rank."""
+    """Return the rank of each value from 1, for equal ones the mean, without the half second to import scipy.stats."""
     _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
     return np.asarray((np.cumsum(counts) - (counts - 1) / 2)[places])
 

@@ -54,7 +54,7 @@ def _timeline_sentences(cells: Sequence[Timelines]) -> list[str]:
         by_policy.setdefault(cell.policy, []).append(cell)
     settings = len({cell.setting for cell in cells})
     plans = span_of(map(len, cells), "plan")
-    sentences = [f"{settings} setting{'s' * (settings != 1)} of board and granularity, {plans} a policy in each."]
+    sentences = [f"{span_of([settings], 'setting')} of board and granularity, {plans} a policy in each."]
     return sentences + [_policy_sentence(policy, mine) for policy, mine in by_policy.items()]
 
 

@@ -150,7 +150,7 @@ class _Cell:
 
     def _fleet(self, robots: _Robots, number: int, source: Source) -> Tried:
         load, launch, confidence = self.load, self.launch, self.search.confidence
-        launch.progress.stage(f"{robots.name}: {number} robot{'s' * (number > 1)}")
+        launch.progress.stage(f"{robots.name}: {number} robots" if number > 1 else f"{robots.name}: 1 robot")
         first = source == "measured" and number == 1
         for looks, (traces, used) in enumerate(robots.looks(number), 1):  # noqa: B007 - their number is kept
             metrics = replace(measures(traces, load.setting, load.settle_ns, confidence=confidence), **used)

@@ -49,7 +49,7 @@ _EMULATED: Final = Note(
 
 @dataclass(frozen=True, slots=True)
 class ChunkCells:
-    """The rows of a run in the order of its options, and what it was asked."""
+    """The rows of a run in the order of its options, and its configuration."""
 
     rows: list[ChunkRow]
     settings: dict[str, Any]
