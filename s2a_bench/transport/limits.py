@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Final
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed
+from s2a_bench.frames import MOST_PIXELS
 from s2a_bench.options import Options, option
 
 KIB: Final = 1 << 10
@@ -33,7 +34,7 @@ class Limits(Options):
     connections: int = option(256, "most connections at once", ge=1, le=MIB)
     head_s: float = option(10.0, "seconds from a request's first byte to the end of its headers", gt=0, le=86_400)
     body_s: float = option(120.0, "seconds from there to the end of its body", gt=0, le=86_400)
-    pixels: int = option(50_000_000, "most pixels of a picture, read before it is decoded", ge=1, le=2**31)
+    pixels: int = option(MOST_PIXELS, "most pixels of a request's pictures", ge=1, le=2**31)
     waiting: int = option(64, "most requests that wait for the engine", flag="max-waiting", ge=0, le=MIB)
     answer_tokens: int = option(65_536, "most tokens that a request may ask for", ge=1, le=2**31 - 1)
     answer_s: float = option(
@@ -105,12 +106,12 @@ def _separators(document: bytes | bytearray) -> int:
     return count
 
 
-def check_pixels(width: int, height: int, limits: Limits) -> None:
+def check_pixels(width: int, height: int, most: int) -> None:
     """Raise RequestFailed for a picture without pixels, or of too many."""
     if width <= 0 or height <= 0:
         raise RequestFailed(f"a picture of {width}x{height} is empty")
-    if width * height > limits.pixels:
-        raise RequestFailed(f"a picture of {width}x{height}; at most {limits.pixels} pixels are taken")
+    if width * height > most:
+        raise RequestFailed(f"a picture of {width}x{height}; at most {most} pixels are taken")
 
 
 PIECES_A_TOKEN, PIECES = 8, 64

@@ -1,40 +1,41 @@
-"""How many values a JSON document may have, counted before it is parsed."""
+"""What a request of a client may cost: its pixels together, and how deep its document goes."""
 
 from __future__ import annotations
 
 import json
+from base64 import b64encode
 
+import numpy as np
 import pytest
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.transport.limits import VALUES, check_values
+from s2a_bench.frames.convert import encode_png
+from s2a_bench.trace import Trace
+from s2a_bench.transport.http import native
+from s2a_bench.transport.http.chat import of_json, of_picture
+from s2a_bench.transport.limits import LIMITS
+
+PNG = bytes(encode_png(np.zeros((10, 10, 3), np.uint8)))
 
 
-@pytest.mark.parametrize(
-    "document",
-    [
-        b"",
-        b"[" + b"[]," * (VALUES // 2 - 1) + b"[]]",
-        json.dumps({"prompt": "[,{" * VALUES}).encode(),
-        json.dumps({"prompt": '\\",[' * VALUES}).encode(),
-        b"\xff" * 100,
-    ],
-)
-def test_few_values_pass_whatever_their_texts_say(document: bytes) -> None:
-    check_values(document)
-    check_values(bytearray(document))
+def with_bodies(count: int, pixels: int) -> int:
+    """Read a request of pictures of 10x10 pixels as the body; return how many it has."""
+    fields = {"pictures": [["image/png", len(PNG)]] * count}
+    headers = [(native.PARAMETERS_HEADER, json.dumps(fields))]
+    request, _ = of_picture(headers, PNG * count, Trace(), LIMITS.but(pixels=pixels))
+    return len(request.images)
 
 
-@pytest.mark.parametrize(
-    "document",
-    [
-        b"[" * (VALUES + 1),
-        b'{"messages": [' + b"[]," * VALUES + b"[]]}",
-        b"[" + b"1," * (VALUES + 1) + b"1]",
-        b'["' + b'","' * (4 * VALUES) + b'"]',
-        *(json.dumps([text * VALUES, *[1] * (VALUES + 1)]).encode() for text in ("\\,[", '",[', '\\",[', "[,{")),
-    ],
-)
-def test_too_many_are_refused(document: bytes) -> None:
-    with pytest.raises(RequestFailed, match=f"more than {VALUES} values"):
-        check_values(document)
+def with_uris(count: int, pixels: int) -> int:
+    url = {"url": f"data:image/png;base64,{b64encode(PNG).decode()}"}
+    message = {"role": "user", "content": [{"type": "image_url", "image_url": url}] * count}
+    request, _ = of_json([], json.dumps({"messages": [message]}).encode(), Trace(), LIMITS.but(pixels=pixels))
+    return len(request.images)
+
+
+@pytest.mark.parametrize("read", [with_bodies, with_uris])
+def test_the_pictures_of_a_request_share_its_pixels(read: object) -> None:
+    assert callable(read)
+    assert read(3, pixels=300) == 3
+    with pytest.raises(RequestFailed, match="a picture of 10x10; at most 99 pixels are taken"):
+        read(3, pixels=299)

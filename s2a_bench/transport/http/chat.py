@@ -32,9 +32,11 @@ def of_picture(headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> 
     fields = _parsed(values.get(native.PARAMETERS_HEADER, "").encode(), f"header {native.PARAMETERS_HEADER}", trace)
     if not (isinstance(fields, dict) and isinstance(prompt := fields.get("prompt", ""), str)):
         raise RequestFailed(f"header {native.PARAMETERS_HEADER} should be an object whose prompt is text")
-    pictures = _cut(fields.get("pictures"), values.get("content-type", ""), body)
-    images = tuple(decoded(kind, data, trace, limits) for kind, data in pictures)
-    return _request(fields, prompt, images, limits)
+    images, pixels = list[Frame](), limits.pixels
+    for kind, data in _cut(fields.get("pictures"), values.get("content-type", ""), body):
+        images.append(decoded(kind, data, trace, pixels))
+        pixels -= images[-1].pixel_count
+    return _request(fields, prompt, tuple(images), limits)
 
 
 def _parsed(document: bytes, what: str, trace: Trace) -> Any:
@@ -67,7 +69,7 @@ def _cut(pictures: Any, media_type: str, body: Buffer) -> list[tuple[str, Buffer
 
 
 def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) -> tuple[Request, bool]:
-    images: list[Frame] = []
+    images, pixels = list[Frame](), limits.pixels
     texts: list[str] = []
     try:
         if not fields["messages"]:
@@ -82,7 +84,8 @@ def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) ->
                 media_type, encoded = native.split_data_uri(part["image_url"]["url"])
                 data = codec.from_base64(encoded)
                 trace.mark("base64_decode")
-                images.append(decoded(media_type, data, trace, limits))
+                images.append(decoded(media_type, data, trace, pixels))
+                pixels -= images[-1].pixel_count
         prompt = "\n".join(texts)
     except (ValueError, KeyError, TypeError) as error:  # binascii.Error is a ValueError
         raise RequestFailed(f"messages: {error!r}") from error

@@ -56,10 +56,10 @@ def picture_message(frame: Frame, payload: str, offset_ns: int, trace: Trace) ->
 def picture_of(message: Any, trace: Trace, limits: Limits = LIMITS) -> Frame:
     """Turn a received image message into an RGB frame; its stamp is ROS time. Raises TransportError."""
     if hasattr(message, "format"):
-        frame = decompressed(message, limits.pixels)
+        frame = decompressed(message)
         trace.mark("image_decode")
         return rgb_of(frame, trace)
-    check_pixels(message.width, message.height, limits)
+    check_pixels(message.width, message.height, limits.pixels)
     return rgb_of(ros.frame_of_image(message), trace)
 
 

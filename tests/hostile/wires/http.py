@@ -97,7 +97,7 @@ def _clients(path: str) -> Iterator[Case[Attack]]:
     for size in (4, 57):
         lists = sends_made(partial(_lists, size, path), seconds=10)
         yield Case(f"{size} MiB of lists", lists, REFUSED + "20000 values", mib=512)
-    yield Case("picture of 900 million pixels", sends_made(lambda: bomb_uri(path)), REFUSED + "30000x30000")
+    yield Case("picture of 900 million pixels", sends_made(lambda: bomb_uri(path)), REFUSED + "IMAGE_PIXELS")
     yield Case("bad grammar", sends(chat(fields=f'"grammar": {parentheses(20_000)}', path=path)))
     goes_on = chat(fields=GOES_ON, path=path)
     yield Case("gone in the middle of an answer", sends(goes_on, then="goes"))
@@ -123,7 +123,11 @@ FAST: tuple[Case[Attack], ...] = (
     *_clients(FAST_CHAT),
     Case("64 MiB of zeros as pixels", sends_made(lambda: [binary(bytes(64 * MIB))]), REFUSED),
     Case("deep parameters", sends(binary(b"", "[" * 50_000)), REFUSED),
-    Case("picture of 900 million pixels as the body", sends_made(lambda: [binary(bomb())]), REFUSED + "30000x30000"),
+    Case(
+        "picture of 900 million pixels as the body",
+        sends_made(lambda: [binary(bomb())]),
+        REFUSED + "IMAGE_PIXELS",
+    ),
 )
 
 

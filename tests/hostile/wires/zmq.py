@@ -107,7 +107,7 @@ CLIENTS: tuple[Case[Attack], ...] = (
         sends_made(
             lambda: [ready(b"REQ"), message(seen(np.frombuffer(bomb(), np.uint8)))], seconds=1, first=len(GREETING)
         ),
-        REFUSED + ".*30000x30000",
+        REFUSED + ".*IMAGE_PIXELS",
     ),
     Case(
         "64 MiB of zeros as pixels",
