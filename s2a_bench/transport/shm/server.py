@@ -20,7 +20,7 @@ from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.chunks import request_of, state_of
 from s2a_bench.transport.connections import Connections, Wire, wait_at_most
-from s2a_bench.transport.limits import Limits, check_pixels, check_values, text, whole_number
+from s2a_bench.transport.limits import Limits, check_pixels, text, whole_number
 from s2a_bench.transport.pictures import decoded, rgb_of
 from s2a_bench.transport.serving import Core, Disconnected, Exchange
 from s2a_bench.transport.shm import ShmOptions
@@ -57,7 +57,6 @@ def size_of(memory: SharedMemory, at: int, length: int) -> int:
 def request_at(memory: SharedMemory, at: int, length: int, limits: Limits, trace: Trace) -> Request:
     """Copy and parse a header, and read its pictures as the engine takes them; raises RequestFailed."""
     header = memory.map[at : at + length]
-    check_values(header)
     try:
         fields = orjson.loads(header)
     except ValueError as error:

@@ -77,12 +77,6 @@ def asks(*bodies: bytes, **more: Any) -> Attack:
 REFUSED = "error"
 
 
-def _many(number: int) -> bytes:
-    """Return lists in lists: few bytes a list."""
-    inner = b"\xdc" + struct.pack(">H", 4000) + b"\x90" * 4000
-    return b"\xdc" + struct.pack(">H", number) + inner * number
-
-
 CLIENTS: tuple[Case[Attack], ...] = (
     *ANY_CLIENT,
     Case("greeting, then silence", sends(GREETING, seconds=1)),
@@ -97,7 +91,6 @@ CLIENTS: tuple[Case[Attack], ...] = (
         "a request is one frame",
     ),
     Case("noise", asks(NOISE), REFUSED),
-    Case("millions of lists", asks(_many(4000)), REFUSED),
     Case("an endpoint that is none", asks(packed({"endpoint": CONTROL})), r"Unknown endpoint: '\\x1b"),
     Case("max_tokens -1", asks(request({}, s2a={"max_tokens": -1})), REFUSED),
     Case("a million pictures", asks(seen(npy(file_of(np.zeros((1 << 20, 1, 1, 3), np.uint8))))), REFUSED),
@@ -177,7 +170,6 @@ _ANSWERS = {
     "noise": NOISE,
     "no actions": chunk(),
     "actions of whole sentences": packed([{"robot": [["a", "b"]]}, {}]),
-    "millions of lists": _many(3000),
 }
 
 SERVERS: tuple[Case[Trap], ...] = (

@@ -243,7 +243,7 @@ def test_the_pictures_of_a_request_share_its_pixels() -> None:
     file = bytes(encode_png(np.zeros((10, 10, 3), np.uint8)))
     images, _, _ = read_observation({"a": [file, file, file]}, Trace(), LIMITS.but(pixels=300))
     assert len(images) == 3
-    with pytest.raises(RequestFailed, match="a: .*a picture of 10x10; at most 99 pixels are taken"):
+    with pytest.raises(RequestFailed, match=r"a: .*a picture of 10x10; at most 99 pixels are taken"):
         read_observation({"a": [file, file, file]}, Trace(), LIMITS.but(pixels=299))
 
 
