@@ -57,7 +57,6 @@ class GrpcClient(PolicyClient[GrpcOptions]):
             answer = self._exchanged(channel, body, bounds, trace)
         except grpc.RpcError as error:
             raise self._reason(error) from error
-        bounds.count_bytes(len(answer))
         trace.facts[PAYLOAD_DOWN_BYTES] = len(answer)
         if not answer:
             _LOADED.pop(self._url, None)  # a server that was started again has no policy
