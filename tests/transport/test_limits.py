@@ -10,10 +10,12 @@ import pytest
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.convert import encode_png
+from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
 from s2a_bench.transport.http import native
 from s2a_bench.transport.http.chat import Reads, of_json, of_picture
 from s2a_bench.transport.limits import LIMITS
+from s2a_bench.transport.ros.camera import pictures_of
 
 PNG = bytes(encode_png(np.zeros((10, 10, 3), np.uint8)))
 
@@ -33,7 +35,12 @@ def with_uris(count: int, pixels: int) -> int:
     return len(request.images)
 
 
-@pytest.mark.parametrize("read", [with_bodies, with_uris])
+def over_ros(count: int, pixels: int) -> int:
+    message = ros.compressed_image_message(np.frombuffer(PNG, np.uint8), 1, "camera", "png")
+    return len(pictures_of([message] * count, Trace(), LIMITS.but(pixels=pixels)))
+
+
+@pytest.mark.parametrize("read", [with_bodies, with_uris, over_ros])
 def test_the_pictures_of_a_request_share_its_pixels(read: object) -> None:
     assert callable(read)
     assert read(3, pixels=300) == 3
