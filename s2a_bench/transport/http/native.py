@@ -105,11 +105,16 @@ def json_answer(status: int, value: Any, headers: Mapping[str, str] | None = Non
 
 
 class Refused(Exception):
-    """A request is refused with `answer`, bytes of HTTP, and its connection closed: the next bytes are unknown."""
+    """A request is refused, and its connection closed: the next bytes are unknown."""
 
     def __init__(self, status: int, message: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(message)
-        self.answer = json_answer(status, error_json(status, message), headers, keep=False)
+        self.status, self.headers = status, headers or {}
+
+    @property
+    def answer(self) -> bytes:
+        """Return the answer as bytes of HTTP."""
+        return json_answer(self.status, error_json(self.status, str(self)), self.headers, keep=False)
 
 
 def admit(access: Access, path: str, headers: Iterable[tuple[str, str]]) -> None:
