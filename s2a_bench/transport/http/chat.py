@@ -10,7 +10,7 @@ from s2a_bench.facts import PROMPT_N
 from s2a_bench.trace import Trace
 from s2a_bench.transport.chunks import request_of, state_of
 from s2a_bench.transport.http import native
-from s2a_bench.transport.limits import Limits, check_values, text
+from s2a_bench.transport.limits import Limits, text
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.serving import Disconnected, Exchange
 from s2a_bench.types import Action, Frame, Piece, Request
@@ -38,7 +38,6 @@ def of_picture(headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> 
 
 
 def _parsed(document: bytes, what: str, trace: Trace) -> Any:
-    check_values(document)
     try:
         fields = native.FAST.loads(document)
     except ValueError as error:

@@ -44,8 +44,6 @@ SCHEME = "Bearer"
 HEALTH, MODELS = "/health", "/v1/models"
 KEEP_ALIVE_S: Final = 3600
 """A client that waits for its turn in an interleaved run keeps its connection."""
-LINES: Final = 128
-"""The most lines of a head: even a short header costs a few hundred bytes of objects."""
 
 PARAMETERS_HEADER = "s2a-request"
 """Binary variant: this header has the parameters as ASCII JSON, the body the picture's bytes."""
