@@ -54,11 +54,9 @@ class Admission:
         with ExitStack() as held, suppress(asyncio.CancelledError, Disconnected):  # uvicorn cancels when it stops
             try:
                 whole = [await self._whole(scope, receive, held)]
-            except Refused as refused:
+            except (Refused, S2AError) as error:
+                refused = error if isinstance(error, Refused) else Refused(*native.refusal_of(error))
                 await _refuse(refused, receive, send)
-                return
-            except S2AError as error:
-                await _refuse(Refused(*native.refusal_of(error)), receive, send)
                 return
 
             async def replay() -> Any:
@@ -77,11 +75,11 @@ class Admission:
         count(sum(len(name) + len(value) for name, value in headers))
         with anyio.move_on_after(limits.body_s):
             while (message := await receive())["type"] != "http.disconnect":
-                pieces.append(message["body"])
+                pieces.append(message.get("body", b""))
                 size += len(pieces[-1])
                 count(len(pieces[-1]))
                 _check_size(size, limits)
-                if not message["more_body"]:
+                if not message.get("more_body"):
                     return {"type": "http.request", "body": b"".join(pieces), "more_body": False}
             raise Disconnected
         raise Refused(408, f"the body took more than {limits.body_s:g} s")
