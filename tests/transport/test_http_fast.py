@@ -75,12 +75,11 @@ def answered(answer: tuple[int, bytes]) -> str:
     return text
 
 
-@pytest.mark.parametrize("cut", [30, 130])
-def test_a_request_may_come_in_pieces(cut: int) -> None:
+def test_a_request_may_come_in_pieces() -> None:
     data = request(body("a" * 200))
     with connected() as connection:
-        for at in range(0, len(data), cut):
-            connection.sendall(data[at : at + cut])
+        for at in range(0, len(data), 30):
+            connection.sendall(data[at : at + 30])
             time.sleep(0.001)
         assert answered(read(connection)) == "go_to"
 
@@ -116,17 +115,11 @@ def test_a_connection_is_for_all_paths() -> None:
     ("data", "status", "says"),
     [
         (request(b"", "Transfer-Encoding: chunked") + b"0\r\n\r\n", 411, "Content-Length"),
-        (request(b"", f"Content-Length: {'9' * 5000}"), 400, "Content-Length"),
-        (request(b"", "Content-Length: -5"), 400, "Content-Length"),
         (request(b"", "Content-Length: 3", "Content-Length: 5"), 400, "Content-Length"),
         (b"CONNECT a:80 HTTP/1.1\r\nHost: localhost\r\n\r\n", 404, "POST to one of"),
-        (request(b"", "Upgrade: websocket", "Connection: upgrade", path="/"), 404, "POST to one of"),
         (b"\x16\x03\x01\r\n\r\n", 400, "no HTTP request"),
         (b"\r\n\r\n", 400, "no HTTP request"),
-        (b"POST / HTTP/9.9\r\n\r\n", 400, "no HTTP request"),
         (request(b"", "a: " + "b" * 70_000), 431, "bytes of headers"),
-        (request(b"", "Origin: null"), 403, "Origin"),
-        (request(b"", "Host: example.com"), 403, "example.com"),
     ],
 )
 def test_what_is_not_taken_is_told_in_one_line_and_hung_up_on(
