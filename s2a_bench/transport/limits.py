@@ -76,10 +76,6 @@ def text(name: str, value: Any, default: str = "") -> str:
     return value
 
 
-def check_values(document: bytes | bytearray) -> None:
-    """Stay until `http.server` no longer imports this."""
-
-
 def check_pixels(width: int, height: int, most: int) -> None:
     """Raise RequestFailed for a picture without pixels, or of too many."""
     if width <= 0 or height <= 0:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
 from urllib.parse import SplitResult, urlsplit, urlunsplit
 
 import httpx
 
-from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.trace import FACT_LIMIT
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.http.clients import BoundedClient, HttpResponse
+from s2a_bench.transport.http.clients import pieces, usual_client
 from s2a_bench.transport.http.dialects import NATIVE, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_LIST, NO_MODEL, Dialect, endpoint, first_model
 from s2a_bench.transport.http.options import HttpOptions
@@ -50,9 +49,9 @@ def met(base: str, key: str, options: HttpOptions) -> tuple[Dialect, str, str]:
     return dialect, dialect.url(base, model), model
 
 
-def probe(url: str) -> BoundedClient:
+def probe(url: str) -> httpx.Client:
     """Return a client for requests that are not measured."""
-    return BoundedClient(Bounds(url, PATIENCE_S, 0), timeout=PATIENCE_S, trust_env=url.startswith("https:"))
+    return usual_client(url, PATIENCE_S)
 
 
 def cache_hits(wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
@@ -89,29 +88,28 @@ def examine(parts: SplitResult) -> Iterator[Finding]:
         yield Finding("connections", "advice", what, "let the server, or a proxy before it, keep connections")
 
 
-def _json(client: BoundedClient, headers: dict[str, str], url: str) -> Any:
+def _json(client: httpx.Client, headers: dict[str, str], url: str) -> Any:
     try:
         return json.loads(_text(client, headers, url))
     except (RequestFailed, httpx.HTTPError, httpx.InvalidURL) as error:
         raise ValueError(str(error)) from error
 
 
-def _text(client: BoundedClient, headers: dict[str, str], url: str) -> str:
+def _text(client: httpx.Client, headers: dict[str, str], url: str) -> str:
     """Return the body of a GET; raises ServerDied if nothing answers, RequestFailed if the answer does not end."""
-    client.bounds = Bounds(url, PATIENCE_S, 0)
     try:
         with client.stream("GET", url, headers=headers) as response:
             response.raise_for_status()
-            return body_of(response, LIMIT, PATIENCE_S)
+            return text_of(pieces(response, Bounds(url, PATIENCE_S, 0)), LIMIT)
     except httpx.ConnectError as error:
         raise ServerDied(f"nothing answers at {url}: {error}") from error
 
 
-def body_of(response: HttpResponse, limit: int, patience_s: float) -> str:
-    """Return a body's first ``limit`` bytes, as far as they arrive in time, as text."""
-    body, deadline = bytearray(), now_ns() + int(patience_s * 1e9)
-    for data in response.iter_raw():
-        body += data
-        if len(body) >= limit or now_ns() > deadline:
+def text_of(body: Iterable[bytes], limit: int) -> str:
+    """Return a body's first ``limit`` bytes as text."""
+    data = bytearray()
+    for piece in body:
+        data += piece
+        if len(data) >= limit:
             break
-    return body[:limit].decode("utf-8", "replace")
+    return data[:limit].decode("utf-8", "replace")

@@ -88,7 +88,6 @@ def _clients(path: str) -> Iterator[Case[Attack]]:
     yield Case("64 MiB of spaces", sends_made(lambda: [post(b" " * 64 * MIB, path=path)]), REFUSED)
     lines = [b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)]
     yield Case("1 MiB of headers", sends(head(path=path)[:-2], *lines))
-    yield Case("16,000 empty headers", sends(head(path=path)[:-2] + b"a:\r\n" * 16_000 + b"\r\n"), "^HTTP/1.1 431 ")
     both = head("Content-Length: 3", CHUNKS, path=path)
     yield Case("length and chunks", sends(both + b"0\r\n\r\nGET / HTTP/1.1\r\n\r\n"))
     many = chat(path=path).replace(b"Connection: close\r\n", b"") * 200
@@ -100,7 +99,8 @@ def _clients(path: str) -> Iterator[Case[Attack]]:
     yield Case("gone in the middle of an answer", sends(goes_on, then="goes"))
     yield Case("100 clients that go", crowd(100, sends(goes_on, then="goes")))
     yield Case("a page in a browser", sends(head("Origin: http://localhost", path=path, length=0)), "^HTTP/1.1 403 ")
-    yield Case("a name that means us", sends(head("Host: example.com", path=path, length=0)), "^HTTP/1.1 403 ")
+    stranger = head(path=path, length=0).replace(b"localhost", b"example.com")
+    yield Case("a name that means us", sends(stranger), "^HTTP/1.1 403 ")
 
 
 FAST_CHAT = PATHS["best-effort"]
