@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing
 from http import HTTPStatus
 from io import BytesIO
 from pathlib import Path
@@ -17,14 +16,13 @@ from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.frames.convert import yuyv_to_rgb
 from s2a_bench.plugins.policy_servers.observation import template_of
 from s2a_bench.plugins.policy_servers.websocket import client as websocket_client
-from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import budget
 from s2a_bench.transport import TRANSPORTS, Choice, Client, open_client
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.transport.risks import examine
 from s2a_bench.types import Request
-from tests.plugins.policy_servers.test_websocket import handled_by
+from tests.servers.policy_websocket import handled_by, relative
 from tests.waiting import until
 
 CHUNK = np.arange(12, dtype=np.float32).reshape(4, 3) / 8
@@ -55,28 +53,6 @@ def envelope(values: Any) -> dict[str, Any]:
     action = {"type": "continuous", "dtype": "float32", "shape": [4, 3], "values": values}
     entry = {"index": 0, "input_index": 0, "candidate_index": 0, "action": action}
     return {"id": "act_1", "object": "action.generation", "data": [entry], "usage": {"batch_size": 1}}
-
-
-@contextmanager
-def relative(
-    answer: Callable[[Any], Any], *, greets: bool = True, greeting: Any = PLAIN, **packing: bool
-) -> Iterator[tuple[str, list[Any]]]:
-    """A server that answers each message by a function: its address, and the paths and messages that came.
-
-    An empty message has no answer.
-    """
-    heard: list[Any] = []
-
-    def handle(socket: Any) -> None:
-        heard.append(socket.request.path)
-        for message in socket:
-            heard.append(unpackb(message) if message else b"")
-            if message:
-                said = answer(heard[-1])
-                socket.send(said if isinstance(said, str) else packb(said, **packing))
-
-    with handled_by(handle, greeting if greets else None) as address:
-        yield address, heard
 
 
 def robot(address: str, template: str, name: str = "websocket") -> closing[Client]:
@@ -190,7 +166,7 @@ def test_sglang_is_asked_by_the_keys_that_it_reads(template: str) -> None:
     said = {"actions": CHUNK, "server_timing": {"infer_ms": 1e-4}}
     answer = {**envelope(CHUNK), "server_timing": {"infer_ms": 1e-4}} if template == "sglang-realtime" else said
     greeting = sglang(cameras="sglang-libero" if template == "sglang-libero" else "sglang")
-    with relative(lambda _: answer, greeting=greeting) as (address, heard):
+    with relative(lambda _: answer, greeting) as (address, heard):
         np.testing.assert_array_equal(asked(address, template), CHUNK)
     path, observation = heard
     assert path == ("/v1/actions/realtime" if template == "sglang-realtime" else "/openpi/policy")
@@ -213,7 +189,7 @@ def test_a_picture_that_the_server_does_not_list_is_an_error(tmp_path: Path, key
     file = tmp_path / "mine.toml"
     file.write_text(f'{key} = "{{image:1}}"\nimage = "{{image:0}}"\nprompt = "{{prompt}}"\nstate = "{{state}}"\n')
     with (
-        relative(lambda _: {"actions": CHUNK}, greeting=sglang(cameras="sglang-libero")) as (address, heard),
+        relative(lambda _: {"actions": CHUNK}, sglang(cameras="sglang-libero")) as (address, heard),
         robot(address, str(file)) as client,
     ):
         client.describe()
@@ -233,7 +209,7 @@ LIBERO = sglang(cameras="sglang-libero")
 @pytest.mark.parametrize("described", [True, False])
 def test_pictures_take_the_names_that_the_greeting_lists_in_its_order(*, described: bool) -> None:
     with (
-        relative(lambda _: {"actions": CHUNK}, greeting=LIBERO) as (address, heard),
+        relative(lambda _: {"actions": CHUNK}, LIBERO) as (address, heard),
         robot(address, "sglang") as client,
     ):
         if described:
@@ -261,7 +237,7 @@ def test_pictures_take_the_names_that_the_greeting_lists_in_its_order(*, describ
 )
 def test_pictures_without_a_name_from_the_greeting_are_not_sent(greeting: Any, says: str) -> None:
     with (
-        relative(lambda _: {"actions": CHUNK}, greeting=greeting) as (address, heard),
+        relative(lambda _: {"actions": CHUNK}, greeting) as (address, heard),
         pytest.raises(RequestFailed, match=says),
     ):
         asked(address, "sglang")
@@ -276,7 +252,7 @@ def test_a_transport_without_a_greeting_refuses_a_template_that_needs_one(tmp_pa
 
 def test_a_camera_that_the_request_lacks_is_not_looked_for_in_the_servers_list() -> None:
     greeting = {"input": {"image_keys": ["base_0_rgb"]}}
-    with relative(lambda _: {"actions": CHUNK}, greeting=greeting) as (address, _):
+    with relative(lambda _: {"actions": CHUNK}, greeting) as (address, _):
         np.testing.assert_array_equal(asked_with(address, "sglang", 1, 2), CHUNK)
 
 
@@ -329,7 +305,7 @@ def test_vla_eval_is_greeted_and_has_texts_as_the_keys_of_an_array() -> None:
     def answer(message: Any) -> Any:
         return {**message, "payload": {"actions": CHUNK[0]} if message["type"] == "observation" else {}}
 
-    with relative(answer, greets=False, text_keys=True) as (address, heard):
+    with relative(answer, None, text_keys=True) as (address, heard):
         np.testing.assert_array_equal(asked(address, "vla-eval"), CHUNK[:1])
     _, hello, observation = heard
     assert (hello["type"], hello["payload"]) == ("hello", {"protocol_version": 1})
@@ -344,7 +320,7 @@ def test_vla_evals_robots_send_maps_of_encoded_pictures(payload: str) -> None:
     def answer(message: Any) -> Any:
         return {**message, "payload": {"actions": CHUNK[0]} if message["type"] == "observation" else {}}
 
-    with relative(answer, greets=False, text_keys=True) as (address, heard):
+    with relative(answer, None, text_keys=True) as (address, heard):
         client = open_client(wiring_of("websocket", url=address, template="vla-eval", payload=payload))
         _, trace = ask(client, REQUEST)
         client.close()
@@ -381,7 +357,7 @@ def test_an_error_in_a_binary_message_is_quoted(template: str, answer: Any, says
     replies = [{"status": "reset"}] if template == "vllm-omni-pi0" else []
     greeting = sglang() if template.startswith("sglang") else PLAIN
     with (
-        relative(lambda _: replies.pop() if replies else answer, greeting=greeting) as (address, _),
+        relative(lambda _: replies.pop() if replies else answer, greeting) as (address, _),
         robot(address, template) as client,
     ):
         with pytest.raises(RequestFailed, match=rf"{says}$") as failed:
@@ -427,5 +403,5 @@ def test_a_description_of_the_server_is_for_websocket_alone() -> None:
 
 def test_the_doctor_tells_of_a_server_that_waits_for_its_clients_first_message(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(websocket_client, "PATIENCE_S", 0.3)
-    with relative(lambda _: None, greets=False) as (address, _):
+    with relative(lambda _: None, None) as (address, _):
         assert [(each.code, each.message) for each in examine(address)] == [("access", "127.0.0.1: no key")]
