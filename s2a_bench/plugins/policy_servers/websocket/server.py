@@ -51,7 +51,7 @@ class WebsocketServer(WebServer):
         self._listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, timeval(SEND_S))  # connections inherit it
         self._metadata = packb(metadata_of(self._core.queued))
         self._most = wiring.limits.connections
-        self._connections: list[ServerConnection] = []
+        self._connections: set[ServerConnection] = set()
         self._answering: set[PolicyConnection] = set()
         self._lock = Lock()  # of the connections
         self._stopped = Event()
@@ -85,7 +85,7 @@ class WebsocketServer(WebServer):
         while self._answering and time.monotonic() < ends:
             time.sleep(POLL_S)
         code, reason = CloseCode.GOING_AWAY, "the server stops"
-        closing = [Thread(target=each.close, args=(code, reason), daemon=True) for each in self._connections]
+        closing = [Thread(target=each.close, args=(code, reason), daemon=True) for each in [*self._connections]]
         if self._library is not None:
             closing.append(Thread(target=self._library.shutdown, daemon=True))
         ends = time.monotonic() + LINGER_S
@@ -112,11 +112,11 @@ class WebsocketServer(WebServer):
     def _connection(self, *arguments: Any, **settings: Any) -> ServerConnection:
         """Return a new connection; raises OSError, which closes it, where as many as are served wait for a refusal."""
         with self._lock:
-            self._connections = [each for each in self._connections if each.state is not State.CLOSED]
+            self._connections = {each for each in self._connections if each.state is not State.CLOSED}
             if len(self._connections) >= 2 * self._most:
                 raise ConnectionRefusedError
             connection = ServerConnection(*arguments, **settings)
-            self._connections.append(connection)
+            self._connections.add(connection)
         return connection
 
     def _refusal(self, connection: ServerConnection, handshake: Handshake) -> Response | None:
@@ -141,11 +141,9 @@ class WebsocketServer(WebServer):
         client = PolicyConnection(connection)
         try:
             client.send(self._metadata)
-            for message in connection:
-                self._answering.add(client)
-                self._answer(client, message)
+            while True:
+                self._answer(client, connection.recv())
                 self._answering.discard(client)
-                del message  # nothing of a request is kept while the next is waited for
         except (ConnectionClosed, Disconnected):
             pass
         except Exception as error:
@@ -153,9 +151,12 @@ class WebsocketServer(WebServer):
             raise
         finally:
             self._answering.discard(client)
+            with self._lock:
+                self._connections.discard(connection)  # and what it holds of a message
 
     def _answer(self, client: PolicyConnection, message: bytes | str) -> None:
         """Answer a request; raises Disconnected where no other can follow."""
+        self._answering.add(client)
         if client.disconnected():
             raise Disconnected
         if isinstance(message, str):
@@ -168,7 +169,7 @@ class WebsocketServer(WebServer):
             exchange.held.close()
             client.refuse(CloseCode.TRY_AGAIN_LATER, f"{error}; come again later")
             return
-        del message
+        del message  # the exchange gives it up once it is read
         if not self._core.answer(exchange):
             raise Disconnected
 
