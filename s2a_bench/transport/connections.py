@@ -187,7 +187,12 @@ class Wire:
 
 def wait_at_most(connection: socket.socket, seconds: float) -> None:
     """Let blocking calls raise BlockingIOError after this time, 0: never; `settimeout` would cost a poll for each."""
-    whole = int(seconds)
-    value = _TIMEVAL.pack(whole, max(int((seconds - whole) * 1e6), int(seconds > 0 and not whole)))
+    value = timeval(seconds)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, value)
+
+
+def timeval(seconds: float) -> bytes:
+    """Return a time as options of sockets have it."""
+    whole = int(seconds)
+    return _TIMEVAL.pack(whole, max(int((seconds - whole) * 1e6), int(seconds > 0 and not whole)))
