@@ -96,14 +96,10 @@ class FastServer(WebServer):
             while early is not None:
                 with ExitStack() as held:
                     early = self._answer(wire, early, held)
-        except Refused as error:
-            refused = error
-        except S2AError as error:  # too many bytes
-            refused = Refused(*native.refusal_of(error))
-        else:
-            return
-        wire.sendall(refused.answer)
-        wire.linger()
+        except (Refused, S2AError) as error:
+            refused = error if isinstance(error, Refused) else Refused(*native.refusal_of(error))
+            wire.sendall(refused.answer)
+            wire.linger()
 
     def _answer(self, wire: Wire, early: bytes, held: ExitStack) -> bytes | None:
         """Answer one request that begins with ``early``; return the first bytes of the next, None to close."""
@@ -140,9 +136,8 @@ class FastServer(WebServer):
 
     def _head(self, wire: Wire, early: bytes) -> tuple[bytes, bytes]:
         """Return a head and the bytes after it; nothing if the client has closed, or sends none for an hour."""
-        data, limits, searched, ends_ns = bytearray(early), self._core.limits, 0, 0
-        while (end := data.find(END, searched)) < 0:
-            searched = max(0, len(data) - len(END))
+        data, limits, ends_ns = bytearray(early), self._core.limits, 0
+        while (end := data.find(END)) < 0:
             if len(data) > limits.header_bytes:
                 break
             if data and not ends_ns:
