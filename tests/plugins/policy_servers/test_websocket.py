@@ -343,6 +343,7 @@ def test_times_that_cannot_be_split_nothing(timing: Any) -> None:
         ({"actions": np.full((2, 2), np.nan)}, "actions: not finite numbers"),
         ({"actions": "up"}, "actions: "),
         (b"\xc1", "bytes that are no message"),
+        ({"actions": CHUNK, "more": bytes(20 << 20)}, r"sent more than \d+ bytes"),
     ],
 )
 def test_answers_that_are_none_are_one_line_and_the_next_request_may_succeed(answer: Any, says: str) -> None:
