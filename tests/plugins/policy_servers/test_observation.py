@@ -202,7 +202,7 @@ PICTURE = np.random.default_rng(1).integers(0, 256, (4, 6, 3), np.uint8)
 
 
 def of(observation: Any) -> Any:
-    return read_observation(observation, Trace(), Limits(pixels=24))
+    return read_observation(observation, Trace(), Limits(pixels=3000))
 
 
 def test_keys_of_any_policy() -> None:
@@ -259,7 +259,7 @@ def test_the_pictures_of_a_request_share_its_pixels() -> None:
         ({"a": np.zeros((64, 64, 3))}, "a: a state of more than 4096 numbers; pictures are uint8"),
         ({"a": float("nan")}, "not finite"),
         ({"prompt": "\ud800"}, "no Unicode text"),
-        ({"a": np.zeros((4, 7, 3), np.uint8)}, "at most 24 pixels"),
+        ({"a": np.zeros((40, 80, 3), np.uint8)}, "at most 3000 pixels"),
         (deep(), "in each other"),
     ],
 )
