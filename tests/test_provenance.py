@@ -26,7 +26,7 @@ from s2a_bench.report.page.files import make_report, write_report
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.figures import new_figure, save
-from s2a_bench.writers.latex import to_latex, to_float
+from s2a_bench.writers.latex import to_float, to_latex
 from s2a_bench.writers.tables import TextTable, to_markdown
 
 LLAMA = {"engine": "llama", "model": "/m/tiny.gguf", "name": "tiny", "dummy": True, "model_sha256": "ab"}
