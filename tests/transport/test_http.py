@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Generator, Iterator
+import socket
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import asdict, replace
-from itertools import count
-from threading import Event, Thread, get_ident
 
 import cv2
 import httpx
@@ -16,12 +15,12 @@ import numpy as np
 import pytest
 
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
-from s2a_bench.trace import Remote, Trace, budget
-from s2a_bench.transport import Handler, open_client, open_server
+from s2a_bench.trace import Remote, budget
+from s2a_bench.transport import Handler, open_client
 from s2a_bench.transport.http import native
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.pipeline import one_pipeline
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Request
 
 
 @pytest.fixture
@@ -70,12 +69,6 @@ def test_each_variant_has_its_stages_and_no_other(
     assert set(budget(trace.chain()).stages_ns) == COMMON | expected
 
 
-def test_a_new_client_per_request_shows_as_connect(url: str) -> None:
-    client = open_client(wiring_of("http/as-deployed", url, connection="client-per-request"))
-    _, trace = ask(client, Request("a", "plan"))
-    assert "connect" in budget(trace.chain()).stages_ns
-
-
 def test_our_own_server_is_known_by_its_url_and_keeps_its_marks(url: str) -> None:
     client = open_client(wiring_of("http/as-deployed", url=url))
     _, trace = ask(client, Request("a", "plan"))
@@ -93,32 +86,27 @@ def test_marks_of_another_hosts_clock_are_not_mixed_with_ours(url: str, monkeypa
     assert set(budget(trace.chain()).stages_ns) == {"json_pack", "server"}
 
 
-@pytest.mark.parametrize(("connection", "connections"), [("keep-alive", 1), ("per-request", 3)])
+@pytest.mark.parametrize(
+    ("connection", "connections"), [("keep-alive", 1), ("per-request", 3), ("client-per-request", 3)]
+)
 def test_connections_are_kept_or_not(
-    handler: RecordingHandler, connection: str, connections: int, monkeypatch: pytest.MonkeyPatch
+    url: str, connection: str, connections: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import socket
-
     opened = []
     connect = socket.create_connection
     monkeypatch.setattr(socket, "create_connection", lambda *a, **k: opened.append(1) or connect(*a, **k))
-    with (
-        serving(handler) as url,
-        closing(open_client(wiring_of("http/as-deployed", url, connection=connection))) as client,
-    ):
-        for _ in range(3):
-            ask(client, Request("a", "plan"))
+    with closing(open_client(wiring_of("http/as-deployed", url, connection=connection))) as client:
+        traces = [ask(client, Request("a", "plan"))[1] for _ in range(3)]
     assert len(opened) == connections
+    shows = connection == "client-per-request"
+    assert [("connect" in budget(trace.chain()).stages_ns) for trace in traces] == [shows] * 3
 
 
 def test_the_whole_answer_comes_without_stream(url: str) -> None:
     body = {"messages": [{"role": "user", "content": "plan"}], "max_tokens": 2}
     answer = httpx.post(url + "/v1/chat/completions", json=body).json()
-    assert answer["choices"][0] == {
-        "index": 0,
-        "message": {"role": "assistant", "content": "go_to"},
-        "finish_reason": "length",
-    }
+    message = {"role": "assistant", "content": "go_to"}
+    assert answer["choices"] == [{"index": 0, "message": message, "finish_reason": "length"}]
     assert answer["usage"]["completion_tokens"] == 2
 
 
@@ -130,13 +118,8 @@ def test_the_stream_is_what_openai_clients_expect(url: str) -> None:
     assert [event["choices"][0]["delta"] for event in events[:-1]] == [{"content": "go"}, {"content": "_to"}, {}]
     assert events[-2]["choices"][0]["finish_reason"] == "stop"
     assert events[-1]["choices"] == []
-    assert [stage for stage, _ in events[-1]["s2a"]["marks"]] == [
-        "network",
-        "json_parse",
-        "json_parse",
-        "",
-        "inference",
-    ]
+    stages = [stage for stage, _ in events[-1]["s2a"]["marks"]]
+    assert stages == ["network", "json_parse", "json_parse", "", "inference"]
 
 
 def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: RecordingHandler) -> None:
@@ -156,9 +139,7 @@ def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: Reco
         ("best-effort", b"{}", "messages"),
         ("as-deployed", b'{"messages": []}', "messages"),
         ("best-effort", b'{"messages": []}', "messages"),
-        ("best-effort", b'{"messages": [{"content": "go"}], "max_tokens": "many"}', "max_tokens"),
         ("best-effort", b'{"messages": [{"content": [{"type": "text", "text": 3}]}]}', "messages"),
-        ("best-effort", b"[" * 20_001, "no JSON"),
         ("binary", b"", "s2a-request"),
     ],
 )
@@ -173,55 +154,6 @@ def test_a_bad_body_is_refused_with_the_reason(urls: dict[str, str], variant: st
 def test_a_bad_header_of_a_binary_request_is_refused(urls: dict[str, str], header: str) -> None:
     headers = {native.PARAMETERS_HEADER: header}
     assert httpx.post(urls["binary"] + native.PATHS["binary"], headers=headers).status_code == 400
-
-
-def test_an_answer_that_nobody_reads_any_more_ends_on_its_own_thread() -> None:
-    threads: list[int] = []
-    gone, ended = Event(), Event()
-
-    def endless(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        try:
-            for index in count():
-                threads.append(get_ident())
-                yield Token(index, "go")
-                if index:
-                    gone.wait(30)
-        finally:
-            threads.append(get_ident())
-            ended.set()
-
-    body = {"messages": [{"role": "user", "content": "plan"}], "stream": True}
-    with serving(endless) as url:
-        with httpx.stream("POST", url + "/v1/chat/completions", json=body) as answer:
-            next(answer.iter_bytes())
-        gone.set()
-        assert ended.wait(30)
-    assert threads[-1] == threads[-2]  # not the loop's: the end may wait for the engine
-
-
-def test_stopping_in_the_middle_of_an_answer_leaves_no_traceback(capsys: pytest.CaptureFixture[str]) -> None:
-    over = Event()
-
-    def slow(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        yield Token(0, "go")
-        over.wait(30)
-        yield Token(1, "on")
-
-    server = open_server(wiring_of("http"), slow)
-    thread = Thread(target=server.serve)
-    thread.start()
-    body = {"messages": [{"role": "user", "content": "plan"}], "stream": True}
-    with httpx.stream("POST", server.address + "/v1/chat/completions", json=body) as answer:
-        pieces = answer.iter_bytes()
-        next(pieces)
-        server.stop()
-        with pytest.raises(httpx.RemoteProtocolError):
-            list(pieces)
-    over.set()
-    thread.join()
-    stderr = capsys.readouterr().err
-    assert "graceful shutdown exceeded" in stderr
-    assert "Traceback" not in stderr
 
 
 @pytest.mark.parametrize("uri", ["http://example.org/x.jpg", "data:image/jpeg;base64,AAAA", "data:image/png;base64,%"])
