@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from base64 import b64encode
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -41,8 +42,7 @@ def over_ros(count: int, pixels: int) -> int:
 
 
 @pytest.mark.parametrize("read", [with_bodies, with_uris, over_ros])
-def test_the_pictures_of_a_request_share_its_pixels(read: object) -> None:
-    assert callable(read)
+def test_the_pictures_of_a_request_share_its_pixels(read: Callable[..., int]) -> None:
     assert read(3, pixels=300) == 3
     with pytest.raises(RequestFailed, match="a picture of 10x10; at most 99 pixels are taken"):
         read(3, pixels=299)
