@@ -11,6 +11,7 @@ import pytest
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.convert import encode_png
+from s2a_bench.plugins.policy_servers.observed import read_observation
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
 from s2a_bench.transport.http import native
@@ -41,7 +42,11 @@ def over_ros(count: int, pixels: int) -> int:
     return len(pictures_of([message] * count, Trace(), LIMITS.but(pixels=pixels)))
 
 
-@pytest.mark.parametrize("read", [with_bodies, with_uris, over_ros])
+def in_an_observation(count: int, pixels: int) -> int:
+    return len(read_observation({"a": [PNG] * count}, Trace(), LIMITS.but(pixels=pixels))[0])
+
+
+@pytest.mark.parametrize("read", [with_bodies, with_uris, over_ros, in_an_observation])
 def test_the_pictures_of_a_request_share_its_pixels(read: Callable[..., int]) -> None:
     assert read(3, pixels=300) == 3
     with pytest.raises(RequestFailed, match="a picture of 10x10; at most 99 pixels are taken"):

@@ -254,8 +254,7 @@ def test_a_server_that_came_back_is_connected_to_again() -> None:
 
 
 def test_an_address_where_nobody_is() -> None:
-    client = open_client(replace(wiring_of("websocket"), address="ws://127.0.0.1:9"))
-    with pytest.raises(ServerDied, match=r"nothing answers at ws://127.0.0.1:9"):
+    with foreign("ws://127.0.0.1:9") as client, pytest.raises(ServerDied, match=r"nothing answers at ws://127.0.0.1:9"):
         ask(client, Request("a", "go"))
 
 
