@@ -220,18 +220,23 @@ def test_what_tells_of_the_server_is_for_websocket_alone(tmp_path: Path, text: s
         template_of(str(tmp_path / "mine.toml")).check_server("zmq", ())
 
 
-def gate(connection: Any, request: Any) -> Any:
-    """Let clients in at a path; others have 403, as of FastAPI, of which SGLang's and vLLM-Omni's are."""
-    return None if request.path == "/openpi/policy" else connection.respond(HTTPStatus.FORBIDDEN, "no\n")
+@pytest.mark.parametrize(
+    ("status", "advice"),
+    [
+        (HTTPStatus.UNAUTHORIZED, "; see `api_key_env`"),
+        (HTTPStatus.FORBIDDEN, "; refused: a wrong path or a key; see `url` and `api_key_env`"),  # FastAPI's for a path
+    ],
+)
+def test_a_handshake_that_is_refused_is_told_with_the_way_out(status: HTTPStatus, advice: str) -> None:
+    def gate(connection: Any, _request: Any) -> Any:
+        return connection.respond(status, "no\n")
 
-
-def test_a_path_that_fastapi_refuses_is_not_taken_for_a_key() -> None:
-    with handled_by(lambda socket: socket.recv(), {}, process_request=gate) as address:
-        with pytest.raises(RequestFailed, match=r"403.*refused: a wrong path or a key; see `url` and `api_key_env`"):
+    with handled_by(lambda _: None, process_request=gate) as address:
+        with pytest.raises(RequestFailed, match=rf"answered {status.value}: no{advice}$"):
             asked(address, "openpi")
         (found,) = examine(address)
     assert (found.code, found.level) == ("server", "state")
-    assert "refused: a wrong path or a key" in found.message
+    assert advice in found.message
 
 
 def test_starvla_has_an_envelope_in_both_directions() -> None:
