@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from functools import partial
 from typing import Any
 from urllib.parse import SplitResult, urlsplit, urlunsplit
@@ -13,17 +12,17 @@ from urllib.parse import SplitResult, urlsplit, urlunsplit
 import httpx
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, S2AError, ServerDied
+from s2a_bench.errors import RequestFailed, ServerDied
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.trace import FACT_LIMIT
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.http.clients import BoundedClient, HttpResponse
-from s2a_bench.transport.http.dialects import DIALECTS, NATIVE, open_dialect
+from s2a_bench.transport.http.dialects import NATIVE, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_LIST, NO_MODEL, Dialect, endpoint, first_model
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, idle_cut
+from s2a_bench.transport.risks import PATIENCE_S, idle_cut
 
 OWNERS = {"llamacpp": "llama-server", "vllm": "vllm", "s2a-bench": NATIVE}
 """``owned_by`` of the first model -> dialect. Ollama gives ``library``, clouds their names: plain OpenAI."""
@@ -74,37 +73,20 @@ def cache_hits(wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
     return hits
 
 
-def examine(parts: SplitResult) -> Iterator[Finding | str]:
-    """Request the list of models without a key, and where there is none an action of no observation."""
-    url, model, why = urlunsplit(parts), "", ""
-    heads: list[httpx.Response] = []
+def examine(parts: SplitResult) -> Iterator[Finding]:
+    """Request the list of models without a key: its headers show how the server treats its connections."""
+    url = endpoint(urlunsplit(parts).removesuffix("/chat/completions"), "/v1", "/models")
     try:
-        with probe(url) as client:
-            client.event_hooks["response"] = [heads.append]
-            _, model = first_model(url, partial(_json, client, {}))
-    except ServerDied as error:
-        raise OSError(str(error).rpartition(": ")[2]) from error
-    except (*NO_LIST, S2AError, httpx.HTTPError, httpx.InvalidURL) as error:
-        why = f": {error}"
-    for head in heads[-1:]:
-        if idle := re.search(r"timeout=(\d{1,6})", head.headers.get("keep-alive", "")):
-            yield idle_cut(int(idle[1]), "send requests more often, or start the server with a longer keep-alive")
-        if head.is_success and (head.http_version == "HTTP/1.0" or head.headers.get("connection") == "close"):
-            what = "it closes the connection after each answer: each request connects first"
-            yield Finding("connections", "advice", what, "let the server, or a proxy before it, keep connections")
-    if model or (not why and _acts(url)):
-        yield NO_KEY
-    else:
-        yield Finding("server", "state", f"it answers, and shows no list of models without a key{why}")
-
-
-def _acts(base: str) -> bool:
-    """Return whether a policy takes POST alone, and from everybody an object whose refusal needs no model."""
-    for url in (endpoint(base, "", each.path) for _, each in DIALECTS.loaded() if each.takes_task):
-        with suppress(S2AError, httpx.HTTPError), probe(url) as client:
-            if client.get(url).status_code == httpx.codes.METHOD_NOT_ALLOWED:
-                return client.post(url, json={}).status_code in {200, 400, 500}
-    return False
+        with probe(url) as client, client.stream("GET", url) as response:
+            closes = response.http_version == "HTTP/1.0" or response.headers.get("connection") == "close"
+            idle = re.search(r"timeout=(\d{1,6})", response.headers.get("keep-alive", ""))
+    except (httpx.HTTPError, httpx.InvalidURL) as error:
+        raise OSError(str(error)) from error
+    if idle:
+        yield idle_cut(int(idle[1]), "send requests more often, or start the server with a longer keep-alive")
+    if closes and response.is_success:
+        what = "it closes the connection after each answer: each request connects first"
+        yield Finding("connections", "advice", what, "let the server, or a proxy before it, keep connections")
 
 
 def _json(client: BoundedClient, headers: dict[str, str], url: str) -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from typing import Any
 
 import msgpack
@@ -53,13 +52,6 @@ def asked(*pieces: bytes, **more: Any) -> Attack:
     return sends(upgrade(), *pieces, **more)
 
 
-def large(unit: bytes) -> Sequence[bytes]:
-    """Return a message of nearly 64 MiB of one unit, over and over, in lists as long as they may be."""
-    part = b"\xdc\x0f\xff" + unit * 4095
-    parts = (60 * MIB) // len(part)
-    return [upgrade(), frame(b"\xdc" + min(parts, 4095).to_bytes(2, "big") + part * min(parts, 4095))]
-
-
 def floods(small: bytes, *before: bytes) -> Attack:
     """Return a client that sends 6 MB of small frames on one connection."""
     return sends_made(lambda: [upgrade(), *before, *[small * 1000] * 1000])
@@ -91,9 +83,12 @@ CLIENTS: tuple[Case[Attack], ...] = (
     Case(
         "pings whose pongs nobody reads", sends_made(lambda: [upgrade(), *[frame(bytes(99), Opcode.PING) * 999] * 999])
     ),
-    Case("60 MiB of empty maps", sends_made(lambda: large(b"\x80")), NO_MESSAGE),
     Case("60 MiB of zeros", sends_made(lambda: [upgrade(), frame(bytes(60 * MIB))]), NO_MESSAGE),
-    Case("a picture of 900 million pixels", sends_made(lambda: [upgrade(), says({"image": bomb()})]), "30000x30000"),
+    Case(
+        "a picture of 900 million pixels",
+        sends_made(lambda: [upgrade(), says({"image": bomb()})]),
+        "IMAGE_PIXELS",
+    ),
     Case("200 requests in one piece", asked(GO * 200), "actions|more than two requests at once|HTTP/1.1 101 "),
     Case("gone in the middle of an answer", asked(GO, then="goes")),
     Case("100 clients at once", crowd(100, asked(GO)), "actions"),

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.plugins.policy_servers.messagepack import MAP, VALUES
+from s2a_bench.plugins.policy_servers.messagepack import LIST, MAP
 from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
 from s2a_bench.plugins.policy_servers.zmq import wire
 from s2a_bench.plugins.policy_servers.zmq.wire import pack
@@ -27,8 +27,7 @@ HOSTILE = {
     "a map of 2^32 keys": b"\xdf\xff\xff\xff\xff",
     "bytes of 2^32": b"\xc6\xff\xff\xff\xff",
     "deep lists": b"\x91" * 100_000,
-    "very many lists": (b"\xdc\x0f\xff" + b"\x90" * 4095) * 64,
-    "very many maps": b"\xdc\x0f\xff" + (b"\xdc\x0f\xff" + b"\x80" * 4095) * 4095,
+    "deep maps": b"\x81\xa1a" * 100_000,
     "a key that is a number": b"\x81\x01\x01",
     "a key that is a list": b"\x81\x90\x01",
     "half a surrogate pair": b"\x81\xa8endpoint\xa3\xed\xa0\x80",
@@ -53,12 +52,12 @@ def test_bytes_that_are_no_message_are_refused_in_a_line(name: str, read: Callab
 
 
 @pytest.mark.parametrize("read", [unpackb, unpack])
-def test_a_message_has_not_more_values_than_are_read(read: Callable[[bytes], Any]) -> None:
-    read(msgpack.packb({str(number): 0 for number in range(MAP)}))
+def test_lists_and_maps_have_not_more_elements_than_are_read(read: Callable[[bytes], Any]) -> None:
+    read(msgpack.packb({str(number): [0] * LIST for number in range(MAP)}))
     with pytest.raises(RequestFailed, match="no message"):
         read(msgpack.packb({str(number): 0 for number in range(MAP + 1)}))
-    with pytest.raises(RequestFailed, match=f"more than {VALUES} values"):
-        read(msgpack.packb([[0] * 4000 for _ in range(20)]))
+    with pytest.raises(RequestFailed, match="no message"):
+        read(msgpack.packb([0] * (LIST + 1)))
 
 
 Write = Callable[[Any], bytes]
@@ -142,7 +141,7 @@ ARRAYS_THAT_ARE_NONE = {
     "a shape below zero": ndarray(shape=(-1, -2)),
     "a shape of fractions": ndarray(shape=(2.0,)),
     "a shape of truths": ndarray(b"1234", shape=(True,)),
-    "a shape of many axes": ndarray(shape=(1,) * 40),
+    "a shape of many axes": ndarray(b"1234", shape=(1,) * 70),
     "a shape that is none": ndarray(shape="2"),
     "data that is text": ndarray("12345678"),
     "data that is missing": msgpack.packb({b"__ndarray__": True}),

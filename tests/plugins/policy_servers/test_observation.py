@@ -239,6 +239,14 @@ def test_files_are_decoded(whole: bool) -> None:
     assert [stage for stage, _ in trace.marks] == ["image_decode"]
 
 
+def test_the_pictures_of_a_request_share_its_pixels() -> None:
+    file = bytes(encode_png(np.zeros((10, 10, 3), np.uint8)))
+    images, _, _ = read_observation({"a": [file, file, file]}, Trace(), LIMITS.but(pixels=300))
+    assert len(images) == 3
+    with pytest.raises(RequestFailed, match=r"a: .*a picture of 10x10; at most 99 pixels are taken"):
+        read_observation({"a": [file, file, file]}, Trace(), LIMITS.but(pixels=299))
+
+
 def test_nothing_is_an_observation_too() -> None:
     assert of({}) == ((), (), "")
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import io
 import json
-import pickle
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -30,7 +29,6 @@ from s2a_bench.trace import budget
 from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
-from s2a_bench.transport.risks import examine
 from s2a_bench.types import Request
 from tests.transport.test_every_server import Gate
 from tests.waiting import until
@@ -406,15 +404,12 @@ class TestLayoutOfAServer:
             if request["endpoint"] == "get_modality_config":
                 told = {name: {"delta_indices": [0], "modality_keys": each} for name, each in keys.items()}
                 return {name: {"__ModalityConfig_class__": True, "as_json": json.dumps(told[name])} for name in told}
-            if request["endpoint"] == "ping":
-                return {"status": "ok", "message": "Server is running"}
             seen.append({key: np.shape(request["data"][key]) for each in keys.values() for key in each})
             return {"action.single_arm": CHUNK[:, :2], "action.gripper": CHUNK[:, 2]}
 
         with policy(answers) as url, robot("", url=url) as client:
             assert client.describe() == {"url": url, "template": "get_modality_config", "layout": "n1.5"}
             actions, _ = ask(client, numbered(6, 1))
-            assert [each.message for each in examine(url)] == ["127.0.0.1: no key"]
         np.testing.assert_array_equal(np.stack([action.values for action in actions]), CHUNK)  # type: ignore[union-attr]
         assert seen == [
             {"video.front": (1, 48, 64, 3), "state.single_arm": (1, 5), "state.gripper": (1, 1), TASK: (1,)}
@@ -581,46 +576,6 @@ class TestEmbodiments:
                 ask(client, numbered(6, 2))
         shapes = {key: part.shape for key, part in server.seen["state"].items()}
         assert shapes == {"single_arm": (1, 1, 5), "gripper": (1, 1, 1)}
-
-
-class TestDangers:
-    @pytest.mark.parametrize(
-        ("configured", "may"),
-        [
-            ({"status": "ok"}, ", may unpickle what it receives (early GR00T N1.7)"),
-            (configs("__ModalityConfig__"), ", may unpickle what it receives (early GR00T N1.7)"),
-            (configs("__ModalityConfig_class__"), ""),
-        ],
-    )
-    def test_which_gr00t_answers_everybody_a_ping_and_its_configurations_tell(self, configured: Any, may: str) -> None:
-        answers = Policy(configured)
-        with policy(answers) as url:
-            (found,) = examine(url)
-        assert answers.requests == [{"endpoint": "ping"}, {"endpoint": "get_modality_config"}]
-        assert (found.level, found.message) == ("advice", f"127.0.0.1: no key{may}")
-
-    @pytest.mark.parametrize("answer", [b"ERROR", b"PK\x03\x04" + bytes(9), pickle.dumps({"status": "ok"})])
-    def test_n1_is_known_by_its_answer_to_a_ping(self, answer: bytes) -> None:
-        requests: list[Any] = []
-        with policy(lambda request: requests.append(request) or answer) as url:  # type: ignore[func-returns-value]
-            (found,) = examine(url)
-        assert requests == [{"endpoint": "ping"}]
-        assert found.level == "warning"
-        assert "127.0.0.1: unpickles what it receives (GR00T N1," in found.message
-
-    @pytest.mark.parametrize("answer", [b"hello", [1]])
-    def test_what_is_no_gr00t_is_an_error(self, answer: Any) -> None:
-        with policy(lambda _: answer) as url:
-            assert [(finding.code, finding.level) for finding in examine(url)] == [("server", "error")]
-
-    def test_a_key_is_no_danger(self) -> None:
-        with policy(lambda _: {"error": "Unauthorized: Invalid API token"}) as url:
-            found = {finding.code: finding for finding in examine(url)}
-        assert "no key" not in found["access"].message
-        assert "Invalid API token" in found["server"].message
-
-    def test_where_nothing_answers_it_is_told(self) -> None:
-        assert [finding.level for finding in examine("tcp://127.0.0.1:1") if finding.code == "server"] == ["error"]
 
 
 def test_it_carries_actions_and_state_alone() -> None:

@@ -18,7 +18,7 @@ from PIL import Image
 from websockets.extensions.permessage_deflate import ClientPerMessageDeflateFactory
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, S2AError, ServerDied, UsageError
+from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.plugins.policy_servers import observed
@@ -26,7 +26,7 @@ from s2a_bench.plugins.policy_servers.observation import CAMERAS, EXTENSION, Ext
 from s2a_bench.plugins.policy_servers.policy_client import PolicyClient, policy_picture
 from s2a_bench.plugins.policy_servers.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
 from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
-from s2a_bench.plugins.policy_servers.websocket.link import REFUSED, BoundedConnection, Broken
+from s2a_bench.plugins.policy_servers.websocket.link import BoundedConnection, Broken
 from s2a_bench.provenance import Provenance
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
@@ -34,7 +34,7 @@ from s2a_bench.transport import Wiring
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, idle_cut
+from s2a_bench.transport.risks import PATIENCE_S, idle_cut
 from s2a_bench.types import Action, Frame, Piece, Request
 
 
@@ -215,38 +215,19 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         self._abandon()
 
 
-def examine(parts: SplitResult) -> Iterator[Finding | str]:
-    """Shake hands without a key, and at templates' paths if that is refused; no request is sent."""
+def examine(parts: SplitResult) -> Iterator[Finding]:
+    """Shake hands without a key, offering compression; no request is sent."""
     servers = {name: template_of(name).server for name in names()}
-    given, why, compresses = parts.path or "/", "", None
-    for path in (given, *sorted({each.path or "/" for each in servers.values()} - {given})):
-        url = urlunsplit(parts._replace(path=path))
-        bounds, offered = Bounds(url, PATIENCE_S, 0), [ClientPerMessageDeflateFactory()]
-        try:
-            with closing(BoundedConnection(url, {}, bounds, PATIENCE_S, extensions=offered)) as link:
-                with suppress(RequestFailed):  # as of servers that wait for their client's first message
-                    link.receive()
-                compresses = bool(link.protocol.extensions)
-                break
-        except ServerDied as error:
-            raise OSError(str(error).rpartition(": ")[2]) from error
-        except S2AError as error:
-            why = str(error) if REFUSED not in str(error) else why or str(error)
-            if REFUSED not in why:
-                break
-    if compresses is None:
-        yield Finding("server", "state", f"it answers, and refuses a client without a key: {why}")
-        return
-    if why:
-        yield Finding("path", "advice", f"{why}; it lets clients in at {path}", f"name {url}")
-    if compresses:
-        what = "it compresses for clients that offer it, as libraries do by default: each observation is deflated first"
-        cure = "connect with compression=None, as the clients of openpi and s2a-bench do, or turn it off in the server"
-        yield Finding("compression", "advice", what, cure)
-    if cut := {name: each.idle_s for name, each in servers.items() if each.idle_s and each.path == path.rstrip("/")}:
+    path = parts.path.rstrip("/")
+    if cut := {name: each.idle_s for name, each in servers.items() if each.idle_s and each.path == path}:
         cure = f"--template {' or '.join(cut)}, of servers with this path: it keeps the connection open"
         yield idle_cut(min(cut.values()), cure)
-    yield NO_KEY
+    url, offered = urlunsplit(parts), [ClientPerMessageDeflateFactory()]
+    with closing(BoundedConnection(url, {}, Bounds(url, PATIENCE_S, 0), PATIENCE_S, extensions=offered)) as link:
+        if link.protocol.extensions:
+            what = "it compresses for clients that offer it, as libraries do: each observation is deflated first"
+            cure = "connect with compression=None, as openpi's and s2a-bench's clients do, or turn it off in the server"
+            yield Finding("compression", "advice", what, cure)
 
 
 def _kind(answer: Any) -> str:

@@ -11,7 +11,7 @@ import socket
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from typing import Any, Final
-from urllib.parse import SplitResult, urlsplit, urlunsplit
+from urllib.parse import urlsplit
 
 import zmq
 
@@ -19,7 +19,6 @@ from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, ServerDied
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
-from s2a_bench.machine.doctor import Finding
 from s2a_bench.plugins.policy_servers import observed
 from s2a_bench.plugins.policy_servers.observation import EXTENSION
 from s2a_bench.plugins.policy_servers.policy_client import PolicyClient
@@ -28,8 +27,7 @@ from s2a_bench.plugins.policy_servers.zmq.wire import PictureFile, pack, read
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Bounds
-from s2a_bench.transport.listening import in_url, read_key
-from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, UNPICKLES, printable
+from s2a_bench.transport.listening import read_key
 from s2a_bench.types import Frame, Piece, Pixels, Request
 
 ANSWER_BYTES: Final = 16 << 20
@@ -40,8 +38,6 @@ KEPT_FILES: Final = 16
 """Most pictures whose memory is kept for the next request."""
 WRONG_POLICY: Final = b"ERROR"
 """The reply of some GR00T servers that serve another kind of policy."""
-N1: Final = WRONG_POLICY, b"PK\x03\x04", *(bytes((0x80, protocol)) for protocol in range(2, 6))
-"""How answers of GR00T N1 begin: its only error, an archive of torch.save, a pickle."""
 
 
 class ZmqClient(PolicyClient[ZmqOptions]):
@@ -135,28 +131,6 @@ class ZmqClient(PolicyClient[ZmqOptions]):
     def describe(self) -> dict[str, str]:
         template = {"template": layouts.MODALITIES} if self._modalities else {}
         return {**super().describe(), **template, "layout": self._layout}
-
-
-def examine(parts: SplitResult) -> Iterator[Finding | str]:
-    """Ping without a key; if that is answered, read how its configurations are marked."""
-    url = urlunsplit((parts.scheme, f"{in_url(parts.hostname or '')}:{parts.port or 5555}", "", "", ""))
-    bounds = Bounds(url, 3 * PATIENCE_S, 0)
-    with closing(Dealer(url, PATIENCE_S, lambda: True, bounds)) as link:
-        pong = link.exchange(pack({layouts.ENDPOINT: layouts.PING}), bounds)
-        if pong.startswith(N1):
-            yield f"{UNPICKLES} (GR00T N1, whose protocol s2a-bench does not speak)"
-            return
-        answer, marks = read(pong)
-        if not isinstance(answer, dict):
-            raise RequestFailed(f"{url} answers a ping with {type(answer).__name__}, which GR00T's servers do not")
-        if layouts.ERROR in answer:
-            error = printable(str(answer[layouts.ERROR]))
-            yield Finding("server", "state", f"it answers, and refuses requests without a key: {error}")
-        else:
-            yield NO_KEY
-            _, marks = read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES}), bounds))
-    if not marks & {layouts.N1_5, layouts.N1_6}:
-        yield "may unpickle what it receives (early GR00T N1.7)"
 
 
 class Dealer:
