@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import partial
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.act.events import (
@@ -79,7 +79,6 @@ def follow(plans: Plans, name: str) -> Record:
 
 
 @pytest.mark.parametrize("name", EVERY_POLICY)
-@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(plans=seeded)
 def test_what_is_executed_is_what_the_policy_schedules(name: str, plans: Plans) -> None:
     plan_ = one(plans, 0)
@@ -94,7 +93,6 @@ def test_what_is_executed_is_what_the_policy_schedules(name: str, plans: Plans) 
     assert [skill.jitter_ns for skill in record.skills] == [0] * len(start_s)
 
 
-@settings(deadline=None, max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(plans=seeded, name=st.sampled_from(EVERY_POLICY), dies=st.data(), how=st.sampled_from(["broke", "silent"]))
 def test_a_stream_that_dies_anywhere_leaves_the_robot_holding(
     plans: Plans, name: str, dies: st.DataObject, how: str

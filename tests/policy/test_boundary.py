@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.policy import policy as build
@@ -13,7 +13,6 @@ from s2a_bench.policy.schedule import safe_start
 from s2a_bench.testing.policy import draw
 
 
-@settings(deadline=None, max_examples=80)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 8), st.floats(0.2, 1.6))
 def test_naive_is_stall_free_exactly_if_the_safe_start_is_the_first_arrival(seed: int, n: int, rho: float) -> None:
     plans = draw(seed, n, 2, rho, 20, gap_cv=0.2)
@@ -22,7 +21,6 @@ def test_naive_is_stall_free_exactly_if_the_safe_start_is_the_first_arrival(seed
     assert free.tolist() == (measured.stalls == 0).tolist()
 
 
-@settings(deadline=None, max_examples=80)
 @given(st.integers(1, 8), st.integers(1, 400), st.integers(1, 80), st.integers(2, 32))
 def test_uniform_arrivals_are_stall_free_exactly_if_a_gap_fits_a_skill(
     length: int, tenths: int, twentieths: int, n: int

@@ -7,7 +7,7 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.policy import Plans, Schedule, policy
@@ -106,7 +106,6 @@ def test_a_regret_over_nothing_is_absent() -> None:
     assert found.fluidity == [1.0]
 
 
-@settings(deadline=None, max_examples=100)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 9), st.floats(0.3, 4.0))
 def test_fluidity_agrees_with_etalons_algorithm(seed: int, n_skills: int, rho: float) -> None:
     plans = draw(seed, n_skills, 2, rho, 3)

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.policy.metrics import jerk, peak_jerk, rms_jerk, sparc, speed_profile
@@ -56,7 +56,6 @@ def arc_length(speed: list[float], sample_s: float, padding: int, cutoff_hz: flo
     return -sum(math.hypot((hz2 - hz1) / width_hz, two - one) for (hz1, one), (hz2, two) in pairwise(band))
 
 
-@settings(deadline=None, max_examples=40)
 @given(
     speed=st.lists(st.floats(0.1, 2.0), min_size=3, max_size=20),
     cutoff_hz=st.sampled_from([1.0, 2.5, 6.0]),

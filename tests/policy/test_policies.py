@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
@@ -58,7 +58,6 @@ def test_clairvoyant_waits_for_its_start_with_skills_in_hand() -> None:
     assert stepper.decide(3.0) == Start(1.0, 1.0)
 
 
-@settings(deadline=None, max_examples=100)
 @given(
     st.sampled_from(["naive", "wait-then-act", "s2a-clairvoyant"]),
     st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=1, max_size=7),

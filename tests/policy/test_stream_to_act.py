@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.policy import Plans, PlanShape, Start, Timing, stepping
@@ -189,7 +189,6 @@ def test_lateness_is_recovered_down_to_the_least_duration_and_not_beyond_schedul
     assert later.duration_s == pytest.approx(0.8)
 
 
-@settings(deadline=None, max_examples=150)
 @given(
     kind=VARIANTS,
     prior=PRIORS,
@@ -236,7 +235,6 @@ def test_steps_and_arrays_agree_whatever_is_believed_and_however_fragments_lag(
     np.testing.assert_allclose(stepped.duration_s, schedule.duration_s, rtol=0, atol=EXACT)
 
 
-@settings(deadline=None, max_examples=60)
 @given(kind=KINDS, seed=st.integers(0, 2**32 - 1), rho=st.floats(0.2, 4.0), low=CAUTIONS, high=CAUTIONS)
 def test_more_caution_never_starts_earlier(
     kind: type[StreamToAct], seed: int, rho: float, low: float, high: float
@@ -277,7 +275,6 @@ def test_without_any_spread_the_online_start_is_the_paper_s_s0() -> None:
     np.testing.assert_allclose(np.diff(schedule.start_s, axis=0), 1.0, atol=1e-4)
 
 
-@settings(deadline=None, max_examples=30)
 @given(seed=st.integers(0, 2**32 - 1), rho=st.floats(0.2, 4.0))
 def test_the_mean_rule_starts_with_stream_to_act_at_its_least_and_stalls_more(seed: int, rho: float) -> None:
     plans = draw(seed, 6, 3, rho, 20)

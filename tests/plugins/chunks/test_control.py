@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.clock import SWITCH_S, SystemClock, VirtualClock, now_ns
@@ -75,7 +75,6 @@ def act(written: str, setting: ControlSetting, latency_ns: list[int], clock: Vir
 
 @pytest.mark.parametrize("written", MODES)
 @pytest.mark.parametrize("rounding", ["floor", "ceil"])
-@settings(max_examples=25)
 @given(
     latency_ns=st.lists(st.integers(0, 8).map(lambda half: half * PERIOD_NS // 2), min_size=2, max_size=20),
     late_ns=st.lists(st.integers(0, 5 * PERIOD_NS), min_size=1, max_size=5),

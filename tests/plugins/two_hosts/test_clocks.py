@@ -13,7 +13,7 @@ from statistics import mean
 from typing import Any
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
@@ -165,7 +165,6 @@ ONE = st.builds(
 )
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.lists(ONE, min_size=1, max_size=7), st.integers(-9000, 9000))
 @example([Exchange(0, 100, 100, 200), Exchange(1000, 1250, 1250, 1200)], 0)
 @example([Exchange(0, 100, 100, 200), Exchange(1000, 950, 950, 1200)], 0)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from s2a_bench.clock import SystemClock
+from s2a_bench.clock import SystemClock, VirtualClock
 from s2a_bench.errors import ClockMoved
 from s2a_bench.frames import open_source
 from s2a_bench.harness.config import RequestsConfig
@@ -47,6 +47,12 @@ class ElsewhereClient:
             self.true = came_ns - sent_ns, trace.marks[-1][1] - left_ns
         marks = [("network", came_ns + self.ahead_ns), ("inference", left_ns + self.ahead_ns)]
         trace.receive(Remote(ELSEWHERE, marks, [left_ns + self.ahead_ns], facts=self.facts))
+
+
+@pytest.fixture(autouse=True)
+def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exchange one after another instead of over a second."""
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.SystemClock", VirtualClock)
 
 
 @pytest.fixture

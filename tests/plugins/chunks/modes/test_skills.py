@@ -11,7 +11,6 @@ from s2a_bench.plugins.chunks.modes import ControlSetting, Ints
 from s2a_bench.plugins.chunks.modes.append import Streamed
 from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.schedule import safe_start
-from tests.plugins.chunks.modes.forms import start_s
 
 PERIOD = 20_000_000
 NS = 1e9
@@ -36,7 +35,7 @@ def test_the_start_of_a_streamed_chunk_is_the_safe_start_of_its_plan(
     first: int, gap: int, horizon: int, period: int
 ) -> None:
     plans = as_plans(streamed_arrivals(np.array([first]), gap, horizon), period)
-    closed = start_s(first / 1e9, gap / 1e9, horizon, period / 1e9)
+    closed = (first + (horizon - 1) * max(0, gap - period)) / 1e9
     assert safe_start(plans.arrival_s, plans.nominal_s)[0] == pytest.approx(closed, abs=1e-9)
     later = max(at - i * period for i, at in enumerate(range(first, first + gap * horizon, gap) if gap else [first]))
     assert closed * 1e9 == pytest.approx(max(later, first), abs=1)
