@@ -15,7 +15,7 @@ from s2a_bench.stats.seeds import generator
 from studies.worlds import World
 
 WORLD = World(0.58, 3.0, 1, 8, 1.0)
-CALIBRATION = WORLD.draw(generator(0, "tracking"), 120)
+CALIBRATION = WORLD.draw(generator(0, "tracking"), 60)
 
 
 def begin(policy: StreamToAct | None = None) -> TrackedPolicy:
@@ -31,7 +31,7 @@ def slow(plans: int) -> Plans:
 
 @pytest.mark.parametrize("policy", [StreamToAct(), StreamToAct(detect=True), EarlyStart()])
 def test_arrays_are_plans_one_after_another(policy: StreamToAct) -> None:
-    plans, together, alone = slow(40), begin(policy), begin(policy)
+    plans, together, alone = slow(16), begin(policy), begin(policy)
     cautions, schedule = together.follow(plans)
     assert len(set(cautions)) > 1
     for column, caution in enumerate(cautions):
@@ -43,7 +43,7 @@ def test_arrays_are_plans_one_after_another(policy: StreamToAct) -> None:
 
 
 def test_plans_that_do_not_fit_the_memory_at_once_are_the_same_plans(monkeypatch: pytest.MonkeyPatch) -> None:
-    plans, whole, parts = slow(20), begin(), begin()
+    plans, whole, parts = slow(14), begin(), begin()
     cautions, schedule = whole.follow(plans)
     monkeypatch.setattr(conformal, "AT_ONCE", 6)
     again, in_parts = parts.follow(plans)

@@ -234,7 +234,8 @@ def test_where_no_trigger_is_enough_calibrated_and_oracle_slow_actions_down(tmp_
 
 def test_json_keeps_its_schema(tmp_path: Path) -> None:
     latencies = "40,bimodal:mean_ms=80,cv=.2,pause_share=.1,pause_ratio=3"
-    done = called("chunks", "--json", "--cycles", "200", "--latency", latencies, "--output", tmp_path)
+    options = ("--cycles", "50", "--robot", "", "--latency", latencies)
+    done = called("chunks", "--json", *options, "--output", tmp_path)
     found = printed(done)
     assert found["command"] == "chunks"
     assert all(cell["emulated"] is True for cell in found["cells"])

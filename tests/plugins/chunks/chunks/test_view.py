@@ -120,16 +120,15 @@ def test_what_a_run_has_no_rows_for_is_not_drawn(run: StoredRun, tmp_path: Path)
 
 @pytest.mark.parametrize("modes", ["sync", "sync,replace"])
 def test_few_lanes_have_room_for_their_labels(tmp_path: Path, modes: str) -> None:
-    few = read_run(
-        run_virtual(ChunksVirtual(latency="60", modes=modes, rules="", cycles=100), tmp_path, NullProgress())
-    )
+    config = ChunksVirtual(latency="60", modes=modes, rules="", cycles=100, robot="")
+    few = read_run(run_virtual(config, tmp_path, NullProgress()))
     assert len(lanes_of(few, ChunkCells.of(few))) == modes.count(",") + 1
     drawn(few, "lanes").savefig(tmp_path / "lanes.png")  # a warning where they have none
 
 
 @pytest.fixture(scope="module")
 def lanes_run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
-    config = ChunksVirtual(modes="sync,replace?execute=8", latency="60,100", cycles=100, shown_ticks=60)
+    config = ChunksVirtual(modes="sync,replace?execute=8", latency="60,100", cycles=100, shown_ticks=60, robot="")
     return read_run(run_virtual(config, tmp_path_factory.mktemp("chunks"), NullProgress()))
 
 
