@@ -238,17 +238,3 @@ def test_tracking_begins_with_the_calibration_and_keeps_as_many_scores() -> None
     assert tracker.caution == 7.0
     with pytest.raises(ValueError, match="begins with the scores"):
         Tracker([])
-
-
-def test_stalls_raise_the_caution_and_calm_lowers_it() -> None:
-    tracker = Tracker(np.linspace(0, 4, 400), 0.01)
-    before = tracker.caution
-    tracker.learn(0.0, stalled=True)
-    assert tracker.caution > before
-    for _ in range(5):
-        tracker.learn(0.0, stalled=True)
-    assert tracker.caution == math.inf
-    for _ in range(2000):
-        tracker.learn(float(np.linspace(0, 4, 400)[_ % 400]), stalled=False)
-    assert tracker.caution <= before
-    assert tracker.level <= 0.02

@@ -68,13 +68,6 @@ def test_shares_are_the_same_for_a_plan_of_a_sixteenth_of_the_time(name: str) ->
         assert value == (long / 16 if field.name.endswith("_s") else long), field.name
 
 
-def test_stream_to_act_acts_on_older_plans_than_naive() -> None:
-    plans = draw(5, 8, 3, 1.6, 50)
-    naive, streamed = (measure(plans, policy(name).schedule(plans)) for name in ("naive", "s2a-clairvoyant"))
-    assert (streamed.mean_action_age_s >= naive.mean_action_age_s).all()
-    assert streamed.mean_action_age_s.mean() > naive.mean_action_age_s.mean() + 0.5
-
-
 def test_holding_on_is_slow_motion_and_no_stall() -> None:
     schedule = Schedule(column(1.0, 4.0, 6.0), column(2.0, 2.0, 1.0))
     found = measure(PLANS, schedule)

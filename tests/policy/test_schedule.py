@@ -170,6 +170,15 @@ def test_t7_the_pre_roll_is_the_highest_point_of_the_walk_of_gaps_minus_duration
     assert safe_start(plans.arrival_s, plans.nominal_s)[0] - plans.arrival_s[0, 0] == highest
 
 
+@given(st.integers(1, 8), st.integers(1, 400), st.integers(1, 80), st.integers(2, 32))
+def test_uniform_arrivals_are_stall_free_exactly_if_a_gap_fits_a_skill(
+    length: int, tenths: int, twentieths: int, n: int
+) -> None:
+    arrival_s = uniform(0.5, length, tenths / 10, n)
+    free = safe_start(arrival_s, np.full((n, 1), twentieths / 20)) - arrival_s[0] <= EXACT
+    assert free.tolist() == [length * 200 <= tenths * twentieths]  # L / R <= T, in whole numbers
+
+
 @pytest.mark.parametrize("n_skills", [1, 2, 8, 32])
 @pytest.mark.parametrize("rho", [0.1, 0.5, 1.0, 1.5, 7.0])
 def test_stream_to_act_starts_before_wait_by_n_minus_1_times_the_shorter_of_gap_and_skill(

@@ -79,14 +79,6 @@ def test_a_step_has_the_textbook_s_response() -> None:
     assert overshoot == pytest.approx(1 + math.exp(-math.pi / math.sqrt(3)), rel=1e-3)
 
 
-@given(plants, numbers, st.integers(1, 30))
-def test_it_stays_where_the_first_action_puts_it(plant: Plant, where: float, ticks: int) -> None:
-    motion = plant.respond(np.full((ticks, 1), where), PERIOD_S)
-    assert (motion.position == where).all()
-    assert not motion.velocity.any()
-    assert not motion.jerk.any()
-
-
 def test_before_its_first_action_it_does_not_move() -> None:
     robot = PlantRobot(Plant(), 3, PERIOD_NS)
     robot.send(None, 0)

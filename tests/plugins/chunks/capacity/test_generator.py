@@ -201,7 +201,7 @@ def test_ctrl_c_ends_the_search_in_a_line_and_what_was_measured_stays(tmp_path: 
 
 
 def test_no_mode_has_the_names_or_the_pictures_of_another(tmp_path: Any) -> None:
-    run = small(tmp_path, transports="loopback", modes="sync,queue", limit="", robots="2", seconds=0.5, settle=0)
+    run = small(tmp_path, transports="loopback", modes="sync,queue", limit="", robots="2", seconds=0.3, settle=0)
     assert run.samples["request_id"].is_unique
     assert "duplicate-frames" not in {warning["code"] for warning in run.manifest["warnings"]}
 

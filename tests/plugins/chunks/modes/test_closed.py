@@ -19,7 +19,6 @@ from s2a_bench.plugins.chunks.modes.closed import (
     appended,
     replace_stall_share,
     slow_down,
-    stall_share,
 )
 from s2a_bench.plugins.chunks.modes.replace import Replace
 from tests.plugins.chunks.modes.drawn import plainly
@@ -161,20 +160,6 @@ def test_a_reaction_takes_the_wait_and_up_to_a_cycle(latency: int, s: int, trigg
     assert np.mean(reactions) + 0.5 == (wait + cycle / 2) * PERIOD  # moments are whole ns
 
 
-def test_random_latencies_cost_a_blocking_robot_more_than_their_mean() -> None:
-    rng = np.random.default_rng(3)
-    latency = lognormal(rng, 3 * PERIOD * 1_000_000, 0.8, 100_000)
-    period = PERIOD * 1_000_000
-    cycles = Sync(4).cycles(latency, ControlSetting(period, 4, "ceil"))
-    moments = rng.uniform(0, cycles.request_tick[-1], 400_000)
-    answered = np.searchsorted(cycles.request_tick, moments)
-    reactions = cycles.start_tick[answered] - moments
-    delay = cycles.delay_ticks.astype(float)
-    error = reactions.std() / 400_000**0.5 * 3  # moments share cycles
-    assert reactions.mean() == pytest.approx(Closed(0.0, delay, delay + 4).mean_reaction_ticks, abs=4 * error)
-    assert reactions.mean() > 1.5 * delay.mean() + 2 + 4 * error  # the form for a constant latency
-
-
 # (e) random latencies
 
 
@@ -209,24 +194,6 @@ def test_a_cycle_stalls_as_often_as_its_latency_exceeds_the_slack(made: Mode, sl
     law = stats.lognorm(variance**0.5, scale=60 * MS * np.exp(-variance / 2))
     at = slack * 20 * MS if rounding == "ceil" else (slack + 1) * 20 * MS
     assert within(stalls, count - 1, float(law.sf(at)))
-
-
-@pytest.mark.parametrize("rounding", ["floor", "ceil"])
-def test_where_latencies_exceed_s_one_late_answer_makes_the_next_one_late_too(rounding: Rounding) -> None:
-    setting, s, count = ControlSetting(20 * MS, 8, rounding), 3, 200_000
-    latency = lognormal(np.random.default_rng(7), 60 * MS, 0.5, count)
-    cycles = Replace(s).cycles(latency, setting)
-    settled = cycles.settled
-    # A chunk that is all past when it arrives has no boundary; the tick before a cycle's end says what it left.
-    gap = cycles.usable_tick[1:] - cycles.request_tick[:-1] - 8
-    share = float(np.mean(gap[1:] > 0))
-    delay, known = setting.delay_ticks(latency), setting.known_ticks(latency)
-    expected = replace_stall_share(delay, known, s, 8)
-    assert share == pytest.approx(expected, abs=4 * (expected / count * 2) ** 0.5)
-    assert share > 2 * stall_share(delay, 8 - s)  # P(L > (H - s) Delta t) alone
-    few = Replace(s).ticks(latency[:2000], setting)
-    assert few.stalled.sum() > 0
-    assert settled.sum() > 0.9 * count
 
 
 def test_the_share_over_pairs_is_the_share_over_all_pairs() -> None:
