@@ -154,7 +154,7 @@ def test_a_lone_surrogate_is_not_the_code_that_python_replaces_it_with() -> None
     assert calls(parse(stream, ["\ud800"])) == []
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", ["paper household", "4 household", "1 household", "pairs", "küche"])
 @pytest.mark.parametrize("piece", [b"x", b" ", b"\xff", b"1", b"(", b"\n", b"go_to(kitchen)\n"])
 def test_work_grows_with_the_length_only(name: str, piece: bytes) -> None:
     def work(data: bytes, size: int) -> int:
