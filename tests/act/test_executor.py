@@ -20,7 +20,7 @@ from s2a_bench.act.events import (
     VirtualInbox,
 )
 from s2a_bench.act.executor import Executor
-from s2a_bench.act.record import Record
+from s2a_bench.act.record import Record, observed
 from s2a_bench.act.timed import TimedRobot
 from s2a_bench.clock import VirtualClock
 from s2a_bench.policy import Plans, PlanShape, Start, Stepper, policy
@@ -272,3 +272,26 @@ def test_being_late_for_several_events_is_jitter_since_the_first() -> None:
     inbox = LateInbox(clock, events, came_ns + 9_000_000)
     record = Executor(Naive(), shape(1), TimedRobot(), inbox, clock).run()
     assert [run.jitter_ns for run in record.skills] == [9_000_000]
+
+
+SKILLS = [(1.5, call("a", 2.0)), (3.0, call("b", 1.0)), (3.5, call("c"))]
+
+
+def test_a_plan_that_came_is_seen_in_seconds_from_its_request() -> None:
+    record, _ = run(script([1.0, 1.5, 2.0, 3.0, 3.5], SKILLS), 2)
+    plans = observed(record, shape(2))
+    assert plans is not None
+    assert plans.arrival_s.tolist() == [[1.5], [3.0]]
+    assert plans.nominal_s.tolist() == [[2.0], [1.0]]
+    assert plans.least_s.tolist() == [[1.6], [0.8]]
+    assert plans.most_s.tolist() == [[3.0], [1.5]]
+    assert plans.token_s is not None
+    assert plans.token_s.tolist() == [[1.0], [1.5], [2.0], [3.0], [3.5]]
+    assert plans.shape == shape(2)
+
+
+@pytest.mark.parametrize("lack", [{"requested_ns": None}, {"token_ns": []}, {"arrivals": [(ns(1), call("a"))]}])
+def test_a_plan_that_did_not_come_whole_is_not_seen(lack: dict[str, object]) -> None:
+    record, _ = run(script([1.0, 1.5, 3.0], SKILLS[:2]), 2)
+    assert observed(record, shape(2)) is not None
+    assert observed(replace(record, **lack), shape(2)) is None  # type: ignore[arg-type]
