@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -140,22 +141,33 @@ def test_silence_counts_from_the_last_token() -> None:
     assert robot.commands == [(-1.0, "cruise")]
 
 
-def test_silence_after_the_last_announced_skill_means_nothing() -> None:
-    record, _ = run(plan([1.0, 1.5])[:-1], 2, silence_s=0.1 + 1.0)
-    assert (record.outcome, ends(record)) == ("completed", [2.0, 3.0])
+BROKE = StreamBroke(ns(1.2), "invalid-line", "Enjoy!")
+
+
+@pytest.mark.parametrize(
+    ("events", "options", "starts_s", "ends_s"),
+    [
+        (plan([1.0, 1.5])[:-1], {"silence_s": 1.1}, [1.0, 2.0], [2.0, 3.0]),
+        ([*plan([1.0, 1.1])[:-1], BROKE], {}, [1.0, 2.0], [2.0, 3.0]),
+        (plan([1.0, 1.1]), {"robot": partial(SelfPaced, off_s=-0.25)}, [1.0, 1.75], [1.75, 2.5]),
+        (plan([1.0, 1.1]), {"robot": partial(SelfPaced, off_s=0.5)}, [1.0, 2.5], [2.5, 4.0]),
+        (script([1.0, 4.0], [(1.0, call("a")), (4.0, call("b"))]), {"by": Elastic()}, [1.0, 4.0], [2.5, 5.0]),
+    ],
+    ids=["silence after the last skill", "prose after the plan", "done early", "overrun", "extended to its bound"],
+)
+def test_a_plan_is_completed_with_each_skill_after_the_one_before(
+    events: list[Event], options: dict[str, Any], starts_s: list[float], ends_s: list[float]
+) -> None:
+    record, _ = run(events, 2, **options)
+    assert (record.outcome, starts(record), ends(record)) == ("completed", starts_s, ends_s)
 
 
 def test_a_bad_line_ends_the_plan_where_it_stands() -> None:
     first, second = call("first"), call("second")
-    events = [Requested(ns(0)), SkillArrived(ns(1), first), StreamBroke(ns(1.2), "invalid-line", "line 2")]
+    events = [Requested(ns(0)), SkillArrived(ns(1), first), BROKE]
     record, _ = run([*events, SkillArrived(ns(1.3), second), StreamEnded(ns(2))], 2)
     assert (record.outcome, len(record.arrivals)) == ("invalid-line", 1)
     assert [skill.call for skill in record.skills] == [first]
-
-
-def test_prose_after_the_whole_plan_does_no_harm() -> None:
-    record, _ = run([*plan([1.0, 1.1])[:-1], StreamBroke(ns(1.2), "invalid-line", "Enjoy!")], 2)
-    assert (record.outcome, ends(record)) == ("completed", [2.0, 3.0])
 
 
 @pytest.mark.parametrize("name", [name for name in EVERY_POLICY if name != "s2a-clairvoyant"])
@@ -187,22 +199,6 @@ def test_a_skill_is_extended_while_the_next_is_missing_and_compressed_when_it_co
     assert [command.what for command in record.commands][1:5] == ["start", "extend", "compress", "end"]
     assert (record.stalls_ns, ends(record)) == ([0], [2.2, 3.2])
     assert [(skill.duration_ns, skill.latest_ns) for skill in record.skills] == [(10**9, 3 * 10**9 // 2)] * 2
-
-
-def test_a_skill_is_extended_no_longer_than_allowed() -> None:
-    record, _ = run(script([1.0, 4.0], [(1.0, call("a")), (4.0, call("b"))]), 2, by=Elastic())
-    assert (record.stalls_ns, ends(record)) == ([1_500_000_000], [2.5, 5.0])
-
-
-def test_a_skill_that_is_done_early_makes_room_for_the_next() -> None:
-    record, _ = run(plan([1.0, 1.1]), 2, robot=partial(SelfPaced, off_s=-0.25))
-    assert (starts(record), ends(record)) == ([1.0, 1.75], [1.75, 2.5])
-
-
-def test_a_skill_that_overruns_delays_the_next() -> None:
-    record, _ = run(plan([1.0, 1.1]), 2, robot=partial(SelfPaced, off_s=0.5))
-    assert record.outcome == "completed"
-    assert (starts(record), ends(record)) == ([1.0, 2.5], [2.5, 4.0])
 
 
 def test_a_skill_that_never_ends_is_aborted_when_the_patience_is_over() -> None:
