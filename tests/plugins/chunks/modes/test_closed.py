@@ -21,6 +21,7 @@ from s2a_bench.plugins.chunks.modes.closed import (
     slow_down,
 )
 from s2a_bench.plugins.chunks.modes.replace import Replace
+from s2a_bench.policy.schedule import safe_start
 from tests.plugins.chunks.modes.drawn import plainly
 from tests.plugins.chunks.modes.plain import Log
 
@@ -158,6 +159,40 @@ def test_a_reaction_takes_the_wait_and_up_to_a_cycle(latency: int, s: int, trigg
     assert left_at == max(moments)
     assert (min(reactions), max(reactions) + 1) == (wait * PERIOD, (wait + cycle) * PERIOD)
     assert np.mean(reactions) + 0.5 == (wait + cycle / 2) * PERIOD  # moments are whole ns
+
+
+# (d) streamed
+
+
+@given(first=st.integers(0, 10**9), gap=st.integers(0, 10**8), horizon=st.integers(1, 60), period=st.integers(1, 10**8))
+def test_the_start_of_a_streamed_chunk_is_the_safe_start_of_its_plan(
+    first: int, gap: int, horizon: int, period: int
+) -> None:
+    arrival_ns = first + gap * np.arange(horizon)[:, np.newaxis]
+    start_s = safe_start(arrival_ns / 1e9, np.full((horizon, 1), period / 1e9))
+    assert start_s[0] == pytest.approx((first + (horizon - 1) * max(0, gap - period)) / 1e9, abs=1e-9)
+
+
+@given(
+    latency=st.integers(0, 200),
+    gap=st.integers(0, 60),
+    rounding=ROUNDINGS,
+    s=st.integers(1, 9),
+)
+def test_a_safe_start_is_never_early_and_at_most_a_tick_late(
+    latency: int, gap: int, rounding: Rounding, s: int
+) -> None:
+    setting = ControlSetting(20, 9, rounding)
+    safe, naive = (Streamed(0, s, gap * 1e-9, start) for start in ("safe", "naive"))  # type: ignore[arg-type]
+    latency_ns = np.array([latency])
+    ticks = safe.ticks(latency_ns, setting)
+    first = int(np.argmax(ticks.chunk == 0))
+    arrivals = setting.delay_ticks(latency + gap * np.arange(s))
+    exact = int(np.max(arrivals - np.arange(s)))
+    assert exact <= first <= exact + 1
+    assert ticks.chunk[first:].tolist() == [0] * s  # no stall within the chunk
+    last = int(np.flatnonzero(naive.ticks(latency_ns, setting).chunk == 0)[-1])
+    assert last == exact + s - 1  # T1: naive ends when an exact start does
 
 
 # (e) random latencies
