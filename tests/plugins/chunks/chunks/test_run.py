@@ -234,7 +234,7 @@ def test_where_no_trigger_is_enough_calibrated_and_oracle_slow_actions_down(tmp_
 
 def test_json_keeps_its_schema(tmp_path: Path) -> None:
     latencies = "40,bimodal:mean_ms=80,cv=.2,pause_share=.1,pause_ratio=3"
-    options = ("--cycles", "50", "--robot", "", "--latency", latencies)
+    options = ("--cycles", "50", "--robot", "", "--data-only", "--latency", latencies)
     done = called("chunks", "--json", *options, "--output", tmp_path)
     found = printed(done)
     assert found["command"] == "chunks"
