@@ -21,6 +21,7 @@ from s2a_bench.transport.http import native
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.types import Request
+from tests.transport.test_every_server import Gate
 
 
 @pytest.fixture
@@ -154,6 +155,24 @@ def test_a_bad_body_is_refused_with_the_reason(urls: dict[str, str], variant: st
 def test_a_bad_header_of_a_binary_request_is_refused(urls: dict[str, str], header: str) -> None:
     headers = {native.PARAMETERS_HEADER: header}
     assert httpx.post(urls["binary"] + native.PATHS["binary"], headers=headers).status_code == 400
+
+
+def test_stopping_in_the_middle_of_an_answer_waits_for_no_engine(capsys: pytest.CaptureFixture[str]) -> None:
+    gate = Gate("http/as-deployed")
+    body = {"messages": [{"role": "user", "content": "plan"}], "stream": True}
+    with (
+        served(wiring_of("http"), gate) as (server, _),
+        httpx.stream("POST", server.address + "/v1/chat/completions", json=body) as answer,
+    ):
+        pieces = answer.iter_bytes()
+        next(pieces)
+        server.stop()
+        with pytest.raises(httpx.RemoteProtocolError):
+            list(pieces)
+        gate.go.set()
+    stderr = capsys.readouterr().err
+    assert "graceful shutdown exceeded" in stderr
+    assert "Traceback" not in stderr
 
 
 @pytest.mark.parametrize("uri", ["http://example.org/x.jpg", "data:image/jpeg;base64,AAAA", "data:image/png;base64,%"])

@@ -93,7 +93,7 @@ LARGE, UPGRADE = body("a" * 100_000), ("Upgrade: h2c", "Connection: Upgrade")
     [
         (slices(request(body("a" * 200)), 30), 1),
         ([*of_every_path(), *of_every_path()], 6),
-        ([request(LARGE) * 3 + request(body())[:-1], request(body())[-1:]], 4),
+        ([request(body()) * 2 + request(LARGE) * 3 + request(body())[:-1], request(body())[-1:]], 6),
         ([request(body(), f"Content-Length: {len(body())}", *UPGRADE)], 1),
     ],
     ids=["in pieces", "for all paths", "together", "an upgrade, which is ignored"],
