@@ -73,6 +73,14 @@ def test_events_are_cut_as_httpx_sse_cuts_them(parts: list[str], places: list[in
     assert [*found, *framing.end()] == expected
 
 
+@pytest.mark.parametrize("end", [b"\n", b"\r\n", b"\r"])
+def test_each_end_of_a_line_is_one_end_wherever_it_is_cut(end: bytes) -> None:
+    framing = ServerSentEvents()
+    body = end.join([b"data: a", b"data:b", b"", b"data:c", b"", b""])
+    found = [message for place in range(len(body)) for message in framing.feed(body[place : place + 1])]
+    assert [*found, *framing.end()] == ["a\nb", "c"]
+
+
 def test_bytes_that_are_no_utf_8_do_not_end_a_stream() -> None:
     assert events("openai", [b'data: {"choices":[{"delta":{"content":"a\xff"}}]}\n\n']) == [Event(text="a\ufffd")]
 

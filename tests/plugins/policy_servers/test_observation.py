@@ -12,15 +12,12 @@ from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.frames.convert import encode_png
 from s2a_bench.plugins.policy_servers.observation import DEFAULT, EXTENSION, Template, names, template_of
 from s2a_bench.plugins.policy_servers.observed import (
-    extension_of,
     read_observation,
     remote_of,
-    request_of,
     take_extension,
 )
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.types import Request
 
 FIRST, SECOND = (np.full((4, 6, 3), number, np.uint8) for number in (1, 2))
 STATE = tuple(float(number) for number in range(8))
@@ -247,11 +244,7 @@ def test_what_can_be_no_observation_is_refused_in_a_line(observation: Any, says:
         of(observation)
 
 
-def test_a_request_s_own_fields_come_back_and_leave_the_observation() -> None:
-    request = Request("a", "go", max_tokens=3, seed=7, grammar="root ::= 'x'")
-    message = {"prompt": "go", EXTENSION: extension_of(request)}
-    assert request_of(message, take_extension(message), Trace(), LIMITS) == request
-    assert message == {"prompt": "go"}
+def test_what_is_no_map_is_no_word_of_ours() -> None:
     assert take_extension(np.zeros(3)) is None
     with pytest.raises(RequestFailed, match="s2a should be a map"):
         take_extension({EXTENSION: [1]})
