@@ -16,7 +16,6 @@ from s2a_bench.trace import budget
 from s2a_bench.transport import Handler, open_client
 from s2a_bench.transport.http import native
 from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.transport.pipeline import one_pipeline
 from s2a_bench.types import Request
 from tests.transport.test_every_server import Gate
 
@@ -175,8 +174,3 @@ def test_the_pages_of_fastapi_are_served_on_request_only(
     with served(wiring_of("http", **options), handler) as (server, _):
         for page in ("/openapi.json", "/docs", "/redoc"):
             assert httpx.get(server.address + page).status_code == status
-
-
-def test_best_effort_and_binary_share_a_server_and_as_deployed_has_its_own() -> None:
-    deployed, best_effort, binary = (one_pipeline(f"http/{name}").server for name in native.PATHS)
-    assert deployed != best_effort == binary
