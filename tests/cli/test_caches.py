@@ -12,7 +12,7 @@ import pytest
 
 from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.types import Request, Token
-from tests.cli.program import program
+from tests.cli.program import called
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, answering
 
@@ -57,7 +57,7 @@ def caching(server: Caching) -> Iterator[str]:
 
 
 def run(url: str, *arguments: str, output: Path) -> dict[str, Any]:
-    done = program("latency", "--transport", "http", "--url", url, *SMALL, *arguments, "--output", output)
+    done = called("latency", "--transport", "http", "--url", url, *SMALL, *arguments, "--output", output)
     return {**json.loads(done.stdout), "stderr": done.stderr}
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.program import called, printed, program
+from tests.cli.program import called, printed
 
 
 def test_json_is_one_object_that_the_schema_describes(tmp_path: Path) -> None:
@@ -23,7 +23,9 @@ def test_json_is_one_object_that_the_schema_describes(tmp_path: Path) -> None:
 
 
 def test_tables_name_the_law_and_what_is_emulated(tmp_path: Path) -> None:
-    done = called("ccrb", "--rate", "9", "--prompt-time", "0.2", "--follower", "idm", "--output", tmp_path)
+    done = called(
+        "ccrb", "--rate", "9", "--prompt-time", "0.2", "--follower", "idm", "--data-only", "--output", tmp_path
+    )
     for text in ("EMULATED: no model answered", "Rear: IDM follower", "does 'stop'", "S_front", "run folder:"):
         assert text in done.stdout
 
@@ -31,7 +33,7 @@ def test_tables_name_the_law_and_what_is_emulated(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_live_run_prints_one_object_and_leaves_a_whole_folder(tmp_path: Path) -> None:
     flags = ("--live", "--transport", "loopback", "--pace", "40", "--threads", "1", "--skills", "3", "--ttc")
-    done = program("ccrb", *flags, "--json", "--output", tmp_path)
+    done = called("ccrb", *flags, "--json", "--output", tmp_path)
     whole = printed(done)
     assert [cell["policy"] for cell in whole["cells"]] == ["naive", "wait-then-act", "stream-to-act", "s2a-ttc"]
     assert {(cell["emulated"], cell["profile"]) for cell in whole["cells"]} == {(False, None)}

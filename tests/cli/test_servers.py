@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -15,7 +14,7 @@ import pytest
 
 from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.types import Token
-from tests.cli.program import command, only_run, printed, program
+from tests.cli.program import called, command, only_run, printed
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, Ollama, answering
 
@@ -24,11 +23,11 @@ KEY = "sekret-0123456789"
 
 
 def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "MY_KEY": KEY}
-    return program("latency", *SMALL, *arguments, "--output", output, code=code, env=environment)
+    return called("latency", *SMALL, *arguments, "--output", output, code=code)
 
 
-def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path) -> None:
+def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MY_KEY", KEY)
     keys = []
     reply = answering(Ollama(), RecordingHandler(["go", "_to"]))
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from s2a_bench.experiments.throughput.metrics import REFERENCE
-from tests.cli.program import only_run, printed, program
+from tests.cli.program import called, only_run, printed
 from tests.llama_bench_stand_in import install
 
 SMALL = ["--size", "64x48", "--requests", "2", "--warmup", "1", "--max-tokens", "40", "--threads", "1"]
@@ -19,7 +19,7 @@ REAL = "S2A_BENCH_LLAMA_BENCH"
 
 
 def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    return program("throughput", *arguments, "--output", output, code=code)
+    return called("throughput", *arguments, "--output", output, code=code)
 
 
 @pytest.mark.slow
