@@ -21,7 +21,7 @@ def test_it_is_measured_beside_our_own_cells_whose_port_it_does_not_take(tmp_pat
     cells = ("http/llama-server", *CLOSED, "http/as-deployed", "loopback")
     done = called("latency", *SMALL, "--transport", ",".join(cells), "--port", "18471", "--output", tmp_path)
     run = only_run(tmp_path)
-    assert set(run.samples["cell"]) == {*cells}
+    assert {*cells} <= set(run.samples["cell"])
     assert (run.samples["error"] == "").all()
     theirs = run.samples[run.samples["cell"] == "http/llama-server"]
     assert theirs["ingest_ns"].notna().all()

@@ -17,8 +17,8 @@ from tests.cli.program import only_run as only
 
 FEW = ("--size", "64x48", "--max-tokens", "4", "--requests", "2", "--warmup", "1", "--threads", "1", "--data-only")
 UNSEEN, UNSENT = "picture not seen", "picture not seen or sent"
-THEIRS = "http/llama-server?payload=jpeg"
-CELLS = {"http/binary?payload=raw": UNSEEN, "http/as-deployed?payload=jpeg": UNSEEN} | (
+THEIRS = "http/llama-server"
+CELLS = {"http/binary": UNSEEN, "http/as-deployed?payload=jpeg": UNSEEN} | (
     {THEIRS: UNSENT} if find_spec("xllamacpp") else {}
 )
 LLAMA_SERVER = pytest.mark.skipif(THEIRS not in CELLS, reason="the wheel xllamacpp is not installed")
@@ -45,10 +45,10 @@ def test_the_picture_travels_and_is_decoded_and_the_manifest_says_that_it_is_not
     run = read_run(Path(blind["run"]))
     assert (run.samples["error"] == "").all()
     assert {cell: each.unseen for cell, each in run.origins.cells.items()} == CELLS
-    samples = run.samples[run.samples["cell"] == "http/binary?payload=raw"]
+    samples = run.samples[run.samples["cell"] == "http/binary"]
     assert (samples["payload_bytes"] == 64 * 48 * 3).all()
     assert (samples["rgb_engine"] == samples["rgb_source"]).all()
-    assert run.origins.of("http/binary?payload=raw").pictures == "not seen"
+    assert run.origins.of("http/binary").pictures == "not seen"
     model = run.manifest["model"]
     assert model["pictures"] == "not seen"
     assert not {"mmproj", "mmproj_sha256", "projector"} & model.keys()

@@ -136,6 +136,16 @@ def test_a_world_slower_than_the_clock_is_told_with_its_factor(
     assert ("slower than the clock" in " ".join(caption_of(show(made).figures["scenario"]()))) is bool(told)
 
 
+def test_each_policy_has_a_request_of_its_own_and_its_roll_out_beside_it(live: Live) -> None:
+    skills = live.run.table(SKILLS)
+    assert list(skills.groupby("cell", sort=False)["request_id"].nunique()) == [1, 1, 1]
+    assert skills["request_id"].nunique() == 3
+    assert set(live.run.manifest["requests"]) == set(skills["request_id"])
+    assert live.run.manifest["configuration"]["time"] == "monotonic"
+    assert 0 <= live.run.table(TRAJECTORIES).groupby("cell")["at_ns"].min().max() < 200e6
+    assert live.run.table(ROLLOUTS)["study"].value_counts().to_dict() == {"point": 3, "rollout": 3}
+
+
 def test_each_policys_request_has_its_stages_and_they_add_up(virtual: StoredRun, live: Live) -> None:
     table = show(live.run).tables["stages"]
     assert table.header[0] == "policy"
