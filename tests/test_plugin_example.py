@@ -41,19 +41,21 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(target), str(ROOT), os.environ.get("PYTHONPATH", "")])}
 
 
-@pytest.fixture
-def command(installed: dict[str, str], tmp_path: Path) -> Command:
-    """Run s2a-bench with the package there, below a folder of this test's own."""
+def command_in(folder: Path, installed: dict[str, str]) -> Command:
+    """Return what runs s2a-bench with the package there, in a folder."""
 
     def run(*args: str, code: int = 0) -> subprocess.CompletedProcess[str]:
         line = [sys.executable, "-m", "s2a_bench", *args]
-        done = subprocess.run(
-            line, capture_output=True, text=True, check=False, env=installed, cwd=tmp_path, timeout=240
-        )
+        done = subprocess.run(line, capture_output=True, text=True, check=False, env=installed, cwd=folder, timeout=240)
         assert done.returncode == code, done.stderr
         return done
 
     return run
+
+
+@pytest.fixture
+def command(installed: dict[str, str], tmp_path: Path) -> Command:
+    return command_in(tmp_path, installed)
 
 
 def folder_of(done: subprocess.CompletedProcess[str], tmp_path: Path) -> Path:
@@ -62,12 +64,15 @@ def folder_of(done: subprocess.CompletedProcess[str], tmp_path: Path) -> Path:
     return max((tmp_path / "results").iterdir(), key=lambda path: path.stat().st_mtime_ns)
 
 
-@pytest.fixture
-def measured(command: Command, tmp_path: Path) -> Path:
-    """Measure the toy transport beside loopback."""
-    done = command("latency", "--transport", "toy,loopback", *SMALL)
-    assert re.search(r"toy_frame", done.stdout)
-    folder = folder_of(done, tmp_path)
+@pytest.fixture(scope="module")
+def measured(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Measure the toy transport beside loopback, with its camera and in its room."""
+    place = tmp_path_factory.mktemp("measured")
+    toys = ("--transport", "toy,loopback", "--source", "toy-stripes", "--toy-room", "34.3")
+    done = command_in(place, installed)("latency", *toys, *SMALL)
+    assert "toy_frame" in done.stdout
+    assert "entering the room" in done.stderr
+    folder = folder_of(done, place)
     assert "ratio to" in (folder / "tables" / "summary.md").read_text()
     return folder
 
@@ -82,38 +87,37 @@ def test_its_tests_are_the_shipped_suites(installed: dict[str, str]) -> None:
     assert int(passed[1]) > 30
 
 
-def test_its_transport_is_measured_with_stages_of_its_own(measured: Path) -> None:
+def test_what_it_adds_is_measured_compared_and_reported(measured: Path, command: Command, tmp_path: Path) -> None:
     samples = pd.read_csv(measured / "samples.csv")
-    toy = samples[samples["cell"] == "toy"]
+    toy, loopback = (samples[samples["cell"] == name] for name in ("toy", "loopback"))
     assert (toy["toy_frame_ns"] > 0).all()
     assert (toy["toy_unframe_ns"] > 0).all()
     assert (toy["rgb_source"] == toy["rgb_engine"]).all()
-    loopback = samples[samples["cell"] == "loopback"]
     assert loopback["toy_frame_ns"].isna().all()
+    assert {json.loads(facts)["toy_messages"] for facts in toy["facts"]} == {4.0}
     stages = pd.read_csv(measured / "tables" / "stages.csv")
     assert set(stages[stages["stage"] == "toy_frame"]["group"]) == {"pack"}
     ratios = pd.read_csv(measured / "tables" / "ratios.csv")
     assert {("toy", "loopback")} == set(zip(ratios["of"], ratios["to"], strict=True))
     assert (measured / "figures" / "stages.png").exists()
-
-
-def test_a_fact_of_its_transport_is_in_manifest_samples_and_table(measured: Path) -> None:
-    facts = json.loads((measured / "manifest.json").read_text())["facts"]
-    assert facts["toy_messages"] == {"unit": "messages", "about": "messages of the answer"}
-    samples = pd.read_csv(measured / "samples.csv")
-    assert {json.loads(facts)["toy_messages"] for facts in samples[samples["cell"] == "toy"]["facts"]} == {4.0}
     assert "| toy_messages | messages | 4.00 |" in (measured / "tables" / "facts.md").read_text()
+    manifest = json.loads((measured / "manifest.json").read_text())
+    assert manifest["facts"]["toy_messages"] == {"unit": "messages", "about": "messages of the answer"}
+    assert (manifest["toy_room"], manifest["configuration"]["toy_room"]) == (34.3, 34.3)
 
-
-def test_its_runs_are_compared_and_reported(measured: Path, command: Command, tmp_path: Path) -> None:
-    again = folder_of(command("latency", "--transport", "toy,loopback", *SMALL), tmp_path)
-    whole = json.loads(command("compare", str(measured), str(again), "--metric", "toy_frame", "--json").stdout)
+    done = command("latency", "--transport", "toy,loopback", "--toy-room", "34.3", *SMALL, "--json")
+    cell = json.loads(done.stdout)["cells"][0]
+    assert "toy_frame" in cell["stages_ms"]
+    assert cell["toy_walk_ms"]["median"] == pytest.approx(100)
+    assert "--toy-room has place for three" in command("latency", "--toy-room", "1", *SMALL, code=2).stderr
+    again = folder_of(done, tmp_path)
+    flags = ("--unlike", "--metric", "toy_frame", "--json")
+    whole = json.loads(command("compare", str(measured), str(again), *flags).stdout)
     assert {comparison["cell"] for comparison in whole["comparisons"]} == {"toy"}
-    command("report", str(measured), "--output", str(tmp_path / "report.html"))
+    command("report", str(measured), "--output", "report.html")
     page = (tmp_path / "report.html").read_text()
     assert "toy_frame" in page
     assert "toy_messages" in page
-    json.loads(command("latency", "--transport", "toy", "--json", *SMALL).stdout)["cells"][0]["stages_ms"]["toy_frame"]
 
 
 def test_an_option_of_its_transport_is_part_of_the_name(command: Command) -> None:
@@ -131,11 +135,6 @@ def test_its_server_runs_by_name(installed: dict[str, str], tmp_path: Path) -> N
         server.terminate()
         assert server.wait(20) == 0
     assert re.search(r"toy at 127\.0\.0\.1:\d+; engine echo", line)
-
-
-def test_its_frame_source_is_a_camera(command: Command, tmp_path: Path) -> None:
-    done = command("latency", "--transport", "loopback", "--source", "toy-stripes", *SMALL)
-    assert json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())["state"] == "finished"
 
 
 def test_its_middleware_carries_the_ros_transport(command: Command, tmp_path: Path, dds_domain: int) -> None:
@@ -304,15 +303,6 @@ def test_its_experiment_is_a_command_and_a_function(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=installed, cwd=tmp_path
     )
     assert done.stdout.strip() == "1", done.stderr
-
-
-def test_its_surroundings_are_options_manifest_and_columns(command: Command, tmp_path: Path) -> None:
-    done = command("latency", "--transport", "loopback", "--toy-room", "34.3", *SMALL, "--json")
-    assert json.loads(done.stdout)["cells"][0]["toy_walk_ms"]["median"] == pytest.approx(100)
-    manifest = json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())
-    assert (manifest["toy_room"], manifest["configuration"]["toy_room"]) == (34.3, 34.3)
-    assert "entering the room" in done.stderr
-    assert "--toy-room has place for three" in command("latency", "--toy-room", "1", *SMALL, code=2).stderr
 
 
 def test_its_command_is_one_of_the_commands(command: Command) -> None:

@@ -178,11 +178,6 @@ def test_the_metrics_are_keys_of_the_cells_and_columns_of_the_tables(made: Calla
     assert tables["outcomes"].rows[0][:4] == ("naive", "hit from behind", "1.75", "4")
 
 
-def test_the_run_shows_what_its_options_ask_for(made: Callable[..., StoredRun]) -> None:
-    assert set(show(made()).tables) == {"margins", "outcomes"}
-    assert set(show(made(**GRID)).figures) == {"scenario", "phase"}
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -133,11 +133,6 @@ def test_a_llama_server_is_compared_without_model_where_both_tell_it(make_run: M
     assert found == {"e2e_without_model": pytest.approx(35.4 / 28), "e2e": pytest.approx(115.4 / 108)}
 
 
-def test_a_black_box_has_no_ratio_without_inference(make_run: MakeRun, black_box: Any) -> None:
-    run = make_run({"http/black-box": black_box, "ros/topic": HAND["ros/topic"]}, n=3)
-    assert [metric for metric, *_ in cells_of(run).ratios] == ["e2e"]
-
-
 def test_what_did_not_really_answer_is_said(make_run: MakeRun) -> None:
     def note(**facts: Any) -> Note:
         return cells_of(make_run(HAND, n=1, **facts)).engine_note
@@ -157,5 +152,7 @@ def test_what_did_not_really_answer_is_said(make_run: MakeRun) -> None:
         "EMULATED: replayed profile agx (constant gaps, the paper's rate)"
     )
     assert note(engine="llama", manifest={"model": {"dummy": True}}) == "dummy weights"
+    unseen = {"engine": "llama", "dummy": True, "pictures": "not seen"}
+    assert note(engine="llama", manifest={"model": unseen}) == "dummy weights, picture not seen"
     assert note(engine="llama", manifest={"model": {"dummy": False}}) == ""
     assert note(engine="llama") == ""

@@ -58,7 +58,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Live:
     (folder / "fast.toml").write_text(to_toml({**facts, "gaps": {"family": "constant"}}))
     engine = EngineConfig(name="replay", profile=str(folder / "fast.toml"))
     requests = DrivingRequests(transports="http/binary", engine=engine, record=folder / "run.mcap")
-    made = run(folder, CcrbLiveLoop(requests=requests, scenario=CcrbOptions(n_skills=3, speed_kmh=20)))
+    made = run(folder, CcrbLiveLoop(requests=requests, scenario=CcrbOptions(n_skills=3, speed_kmh=20, t_nom_s=0.4)))
     return Live(made, folder / "run.mcap")
 
 
