@@ -57,12 +57,6 @@ def test_without_model_reads_as_a_sum_where_it_is_told(make_run: MakeRun) -> Non
     assert show(run).sentences[-1].startswith("Without model, http/llama-server takes 1.39 times as long as ros/topic")
 
 
-def test_an_engine_that_tells_no_preprocessing_has_no_rows_about_it(make_run: MakeRun) -> None:
-    run = make_run(HAND, n=4, spread=0)
-    assert not {"preprocess", "e2e without model"} & {row[1] for row in stage_table(cells_of(run)).rows}
-    assert "summary-model" not in show(run).tables
-
-
 @pytest.mark.parametrize(
     ("value", "text"),
     [
@@ -262,8 +256,7 @@ def test_a_folder_that_cannot_be_written_is_named(make_run: MakeRun, folder: str
         write_shown(run, EXPERIMENT.show(run))
 
 
-@pytest.mark.parametrize("count", [1, 2, 6])
-@pytest.mark.parametrize("width", [60, 80, 120])
+@pytest.mark.parametrize(("count", "width"), [(1, 120), (2, 80), (6, 60)])
 def test_the_terminal_shows_the_stages_what_they_say_and_where_the_rest_is(
     make_run: MakeRun, plausible: dict[str, Any], black_box: Any, count: int, width: int
 ) -> None:
