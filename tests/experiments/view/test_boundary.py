@@ -46,7 +46,7 @@ def drawn(run: StoredRun) -> Figure:
         return show(run).figures["boundary"]()
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(
     n_skills=st.integers(2, 40),
     t_nom_s=st.floats(0.1, 10),
