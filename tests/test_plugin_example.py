@@ -276,10 +276,7 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
 
     assert "Check this machine" in run("--help").stdout  # the name of a command that there is counts for nothing
     assert run("boundary", "--points", "3").returncode == 0
-    middleware = ("latency", "--transport", "ros?middleware=broken", *SMALL)
-    transport = ("latency", "--transport", "broken", *SMALL)
-    reference = ("latency", "--against", "broken", *SMALL)
-    for args in (("broken",), ("lost",), transport, middleware, reference, ("timeline", "--policy", "broken")):
+    for args in (("broken",), ("lost",), ("latency", "--against", "broken"), ("timeline", "--policy", "broken")):
         done = run(*args)
         assert done.returncode == 2
         assert "the package s2a-broken does not load: ModuleNotFoundError" in done.stderr

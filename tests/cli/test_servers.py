@@ -55,16 +55,6 @@ def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path, monkeypa
     assert KEY not in done.stdout + done.stderr
 
 
-def test_a_run_that_is_refused_waits_as_asked_and_ends_with_the_reason(tmp_path: Path) -> None:
-    reply = [head("429 Too Many Requests", "application/json", "Retry-After: 0.01"), Cloud().refusal(429, "slow down")]
-    with serving(lambda _: reply) as url:
-        flags = ("--url", url, "--dialect", "openai", "--transport", "http/best-effort", "--requests", "9")
-        done = run(*flags, output=tmp_path, code=1)
-    assert "waiting 0.01 s for the server of http/best-effort" in done.stderr
-    last = done.stderr.strip().splitlines()[-2:]
-    assert any("failed 5 times in a row" in line and "answered 429: slow down" in line for line in last)
-
-
 def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: Path) -> None:
     requests, under_way, over = 0, Event(), Event()
     speaker = Cloud()

@@ -69,20 +69,6 @@ def test_both_ways_of_flash_attention_are_cells_of_one_run(tmp_path: Path) -> No
     assert "flash_attention" not in manifest["model"]  # it has no one value
 
 
-def test_a_reference_that_fails_ends_the_run_with_one_line_and_keeps_the_samples(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("S2A_STAND_IN_FAULT", "crash")
-    arguments = [*SMALL, "--reference", str(install(tmp_path))]
-    done = run(*arguments, output=tmp_path / "r", code=1)
-    (line,) = (line for line in done.stderr.splitlines() if line.startswith("error:"))
-    assert "exit code 1: main: error: failed to load model" in line
-    kept = only_run(tmp_path / "r")
-    assert kept.manifest["state"] == "failed"
-    assert len(kept.samples) == 1
-    assert str(kept.path) in done.stderr
-
-
 @pytest.mark.skipif(REAL not in os.environ, reason=f"{REAL} does not name llama.cpp's llama-bench")
 def test_the_real_llama_bench_understands_what_it_is_asked(tmp_path: Path) -> None:
     settings = ["--kv-type", "q8_0", "--batch", "64", "--reference", os.environ[REAL]]
