@@ -34,6 +34,7 @@ from s2a_bench.policy import Plans
 from s2a_bench.policy.conformal import TrackedPolicy
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.testing import NullProgress
 from s2a_bench.trace import Trace
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Frame, Request, Token
@@ -42,25 +43,13 @@ from tests.made_runs import SCHEMA
 THREE = ("naive", "wait-then-act", "stream-to-act")
 
 
-class Watched:
+class Watched(NullProgress):
     """Looks at every scene and keeps it."""
+
+    folder: Path
 
     def __init__(self) -> None:
         self.scenes: list[Scene] = []
-        self.lines: list[str] = []
-
-    def opened(self, folder: Path) -> None:
-        self.folder = folder
-
-    def say(self, line: str) -> None:
-        self.lines.append(line)
-
-    def stage(self, text: str) -> None:
-        self.lines.append(text)
-
-    def expect(self, samples: int) -> None: ...
-
-    def advance(self) -> None: ...
 
     def watch(self, scene: Scene) -> AbstractContextManager[None]:
         self.scenes.append(scene)

@@ -6,12 +6,10 @@ import pytest
 from s2a_bench.experiments.requests import cells_of
 from s2a_bench.stats import summary_of
 from s2a_bench.store.requests import SampleRow
-from s2a_bench.store.run import StoredRun
 from s2a_bench.trace import path_of
 from s2a_bench.writers.tables import Note
-from tests.made_runs import STAGES
+from tests.made_runs import STAGES, MakeRun
 
-MakeRun = Callable[..., StoredRun]
 HAND = {
     "ros/topic": {"capture": 1, "cdr_pack": 2, "": 0.5, "network": 3, "inference": 100, "return": 1.5},
     "http/as-deployed": {

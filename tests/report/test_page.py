@@ -29,7 +29,7 @@ from s2a_bench.report.page import ReportConfig
 from s2a_bench.report.page.chapters import MOST_CHAPTERS, read_chapters
 from s2a_bench.report.page.files import inline, make_report, write_report
 from s2a_bench.store.requests import SampleRow
-from s2a_bench.store.run import RunWriter, StoredRun, read_run
+from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.store.sweep import CELLS, CellRow
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import caption_of
@@ -37,9 +37,9 @@ from s2a_bench.writers.lanes import LanePanel
 from s2a_bench.writers.latex import escape, to_float
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import ABSENT, TextTable
+from tests.made_runs import MakeRun
 from tests.report.conftest import REAL
 
-MakeRun = Callable[..., StoredRun]
 MakeRow = Callable[..., SampleRow]
 HOSTILE = "<script>alert('x')</script>&\"%_$#{}\\"
 VOID = {"meta", "br", "hr", "img", "input", "link"}

@@ -1,5 +1,5 @@
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,8 @@ from s2a_bench.experiments.requests import cells_of
 from s2a_bench.store.run import StoredRun
 from s2a_bench.writers.figures import Bar, caption_of
 from s2a_bench.writers.style import GREY, paper_column
+from tests.made_runs import MakeRun
 
-MakeRun = Callable[..., StoredRun]
 HAND = {
     "http/as-deployed": {"capture": 1, "image_encode": 3, "network": 2, "inference": 100, "": 1.5, "return": 0.5},
     "ros/topic": {"capture": 1, "cdr_pack": 0.5, "network": 2, "inference": 100, "return": 0.5},

@@ -21,9 +21,8 @@ from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.trace import path_of
 from s2a_bench.writers.latex import to_latex
 from s2a_bench.writers.tables import interval, mean_sd, number, to_markdown
-from tests.made_runs import STAGES, known
+from tests.made_runs import STAGES, MakeRun, known
 
-MakeRun = Callable[..., StoredRun]
 NONE = "\N{EN DASH}"
 HAND = {
     "http/as-deployed": {"capture": 1, "image_encode": 3, "base64_encode": 2, "network": 18, "inference": 100, "": 1.5},
