@@ -44,11 +44,12 @@ def test_the_exit_code_is_the_severitys(level: Level, plain: int, strict: int, m
 
 
 def test_a_run_samples_resources_and_says_what_that_cost(tmp_path: Path) -> None:
-    done = called(*ECHO, "--transport", "http,loopback", "--verbose", "--sample-resources", "2", "--output", tmp_path)
+    flags = ("--transport", "http,loopback", "--latency", "50", "--verbose", "--sample-resources", "50")
+    done = called(*ECHO, *flags, "--output", tmp_path)
     assert "sampling takes" in done.stdout
     run = only_run(tmp_path)
     resources = run.manifest["resources"]
-    assert resources["hz"] == 2
+    assert resources["hz"] == 50
     assert {"cpu", "memory"} <= resources["readers"].keys()
     assert resources["polls"] >= 1
     assert resources["core_share"] > 0
