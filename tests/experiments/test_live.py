@@ -196,20 +196,6 @@ def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
     assert len(run.tokens) == tokens
 
 
-def test_prose_is_not_executed(config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def prose(self: ReplayEngine, request: Request) -> Iterator[Token]:
-        del self, request
-        yield from (
-            Token(index, text) for index, text in enumerate(["Sure", "!", " Here is", " the plan:", "\n", "1."])
-        )
-
-    monkeypatch.setattr(ReplayEngine, "generate", prose)
-    run, _ = live(config, tmp_path)
-    executions = run.manifest["executions"].values()
-    assert [(found["outcome"], found["started"]) for found in executions] == [("invalid-line", 0)] * 3
-    assert run.table(TIMELINES).empty
-
-
 def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
     config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
