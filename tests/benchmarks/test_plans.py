@@ -23,7 +23,7 @@ def test_every_prompt_is_printed_with_its_plans_and_gaps(
 ) -> None:
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path))
     model, _ = resolve(EngineConfig())
-    monkeypatch.setattr("sys.argv", ["plans", f"one={model}", f"other={model}", "--answers", "2"])
+    monkeypatch.setattr("sys.argv", ["plans", f"one={model}", f"other={model}", "--answers", "1"])
     plans.main()
     tables = [block.splitlines() for block in capsys.readouterr().out.split("\n\n")]
     _, valid, gaps, families, starts, *apart = tables

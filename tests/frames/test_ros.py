@@ -136,6 +136,7 @@ def test_the_subscription_is_as_reliable_as_its_publishers(camera: Camera, runni
         assert source._subscription.matched() == 2  # type: ignore[attr-defined]
 
 
+@once
 def test_the_newest_picture_wins_and_none_is_read_twice(camera: Camera) -> None:
     numbers = [np.full((48, 64), number, np.uint8) for number in range(256)]
     publish = camera.publisher([image(number, "mono8") for number in numbers], QoS(1))
