@@ -18,12 +18,13 @@ def shares(row: str) -> list[float]:
     return [float(number) for number in re.findall(r"([\d.]+) \[", row)]
 
 
+@pytest.mark.slow
 def test_every_prompt_is_printed_with_its_plans_and_gaps(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path))
     model, _ = resolve(EngineConfig())
-    monkeypatch.setattr("sys.argv", ["plans", f"one={model}", f"other={model}", "--answers", "1"])
+    monkeypatch.setattr("sys.argv", ["plans", f"one={model}", f"other={model}", "--answers", "2"])
     plans.main()
     tables = [block.splitlines() for block in capsys.readouterr().out.split("\n\n")]
     _, valid, gaps, families, starts, *apart = tables

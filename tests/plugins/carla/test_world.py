@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Iterator
 from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,7 +37,9 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[CarlaWorld]:
         yield world
 
 
-class CarlaSuite(SimulatorSuite):
+class TestCarla(SimulatorSuite):
+    """With the vectors of the real client where that is installed."""
+
     name = "carla"
     PLACED = 0.2
     """The loop around the ego's speed may not be at rest yet."""
@@ -44,28 +47,15 @@ class CarlaSuite(SimulatorSuite):
     """At 10 m/s a pedal that acts 0.2 s late is 2 m; below, the lead and the trailing car are held to centimetres."""
     RESTS = 1e-4
     """Float32 at hundreds of metres."""
-    values: ClassVar[Any] = None
 
     @pytest.fixture(autouse=True)
     def _server(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setitem(sys.modules, "carla", fresh(self.values))
+        client = importlib.import_module("carla") if find_spec("carla") else None
+        monkeypatch.setitem(sys.modules, "carla", fresh(client))
 
     @classmethod
     def outside(cls) -> object:
         return SERVER.settings, [actor.id for actor in SERVER.actors]
-
-
-class TestCarla(CarlaSuite):
-    pass
-
-
-@pytest.mark.skipif(find_spec("carla") is None, reason="the client, pip install '.[carla]', is not installed")
-class TestCarlaWithTheClientsVectors(CarlaSuite):
-    @pytest.fixture(autouse=True)
-    def _server(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        import carla
-
-        monkeypatch.setitem(sys.modules, "carla", fresh(carla))
 
 
 def test_the_lead_and_the_trailing_car_follow_their_commands_to_centimetres(world: CarlaWorld) -> None:

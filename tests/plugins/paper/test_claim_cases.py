@@ -29,12 +29,11 @@ from s2a_bench.plugins.paper.claims.requests import change
 from s2a_bench.plugins.paper.claims.table import CLAIMS
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.report.verdicts import ClaimVerdict
-from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
+from tests.plugins.paper.test_claims import MakeRow, MakeRun, bodies
 from tests.report.conftest import REAL
 
-MakeRun = Callable[..., StoredRun]
 Made = Callable[["Kit"], StoredRun]
 ORIN = {"board": "NVIDIA Jetson AGX Orin Developer Kit"}
 RTX = {"cpu": "AMD Ryzen 9", "gpus": [{"name": "NVIDIA GeForce RTX 4080"}]}
@@ -394,8 +393,6 @@ def test_policies_are_compared_plan_by_plan(kit: Kit) -> None:
 
 
 PAGE = Path(__file__).parents[2] / "data" / "claims.md"
-MakeRow = Callable[..., SampleRow]
-SENT = {"convert": 10, "inference": 5, "return": 0}
 
 
 def claim_lines(about: str, run: StoredRun) -> list[str]:
@@ -411,11 +408,6 @@ def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_ro
 
     def boundary(**settings: object) -> StoredRun:
         return read_run(run_boundary(BoundaryConfig(**settings), tmp_path, NullProgress()))  # type: ignore[arg-type]
-
-    def bodies(coded: int, plain: int) -> StoredRun:
-        sizes = {"http/as-deployed": coded, "http/binary": plain}
-        rows = [make_row(name, SENT, 1, payload_bytes=size, request_id=name) for name, size in sizes.items()]
-        return make_run({}, extra=tuple(rows))
 
     orin = {"profiles": ("jetson-agx-orin",), "tokens_per_skill": (1, 2, 4, 6)}
     jitter = orin | {"jitter": "lognormal:cv=0.2", "plans": 60}
@@ -442,8 +434,8 @@ def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_ro
             manifest={"provenance": Origins(DUMMY, {"http/as-deployed": REPLAY}).to_manifest()},
         ),
         "Transports, llama-server (longer|6.57)": kit.beside_llama_server,
-        "Bodies": lambda: bodies(120_500, 90_000),
-        "Small bodies": lambda: bodies(66_666, 49_999),
+        "Bodies": lambda: bodies(make_run, make_row, 90_000, 120_500),
+        "Small bodies": lambda: bodies(make_run, make_row, 49_999, 66_666),
         "A rate (V-D, table II)": lambda: kit.rates(rate=34.0),
         "Another rate (V-D, table II)": lambda: kit.rates(rate=50.0),
         "A rate of layers on CPU and GPU (V-D, table II)": lambda: kit.rates(rate=34.0, model=GPU | {"gpu_layers": 8}),
