@@ -134,7 +134,7 @@ def compressed(data: NDArray[np.uint8], kind: str, format_: str) -> Any:
 def test_a_compressed_picture_has_its_colours(kind: str, format_: str) -> None:
     bgr = np.full((HEIGHT, WIDTH, 3), (40, 120, 200), np.uint8)
     got = picture_of(compressed(bgr, kind, format_.format(kind)), Trace())
-    assert got.stamp_ns == 5
+    assert (got.stamp_ns, got.width, got.height) == (5, WIDTH, HEIGHT)
     assert np.abs(got.data.astype(int) - (200, 120, 40)).max() <= 2
 
 

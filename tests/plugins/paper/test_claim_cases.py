@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pandas as pd
 import pytest
@@ -49,12 +49,18 @@ REPLAY = replace(DUMMY, engine="replay", tokens="emulated", profile="rtx-4080")
 class Kit:
     """Makes runs."""
 
+    computed: ClassVar[dict[str, StoredRun]] = {}
+
     def __init__(self, root: Path, beside: MakeRun, spoken: MakeRun) -> None:
         self.root, self.beside, self.spoken = root, beside, spoken
 
     def timeline(self, **settings: Any) -> StoredRun:
-        """Compute a timeline run."""
-        return read_run(run_timeline(TimelineComputed(**settings), self.root, NullProgress()))
+        """Compute a timeline run, once of the same settings."""
+        key = repr(sorted(settings.items()))
+        if key not in self.computed:
+            run = run_timeline(TimelineComputed(**settings), self.root, NullProgress())
+            self.computed[key] = read_run(run)
+        return self.computed[key]
 
     def live(self, provenance: Provenance, rate: float, **facts: Any) -> StoredRun:
         """Make a live run of the four L, with timings as one at that rate has them."""
