@@ -19,6 +19,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
+from s2a_bench.trace import Trace
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.ros import camera as camera_module
 from s2a_bench.transport.ros.camera import CAMERA, CAMERA_QOS, CLOCK_QOS
@@ -237,8 +238,11 @@ def test_an_old_frame_is_told_of_with_buffers_while_there_is_a_publisher(
     cache = robot.server._cache
     until(lambda: cache._newest is not None and now_ns() - cache._newest.received_ns > 300_000_000)
     for _ in range(2):
-        why = refusal(client)
-        assert re.search(rf"more than `max_frame_age` 0\.3 s: 1 publisher on {TOPIC}, no frame comes: look at", why)
+        trace, came = Trace(), r"newest frame came \d+\.\d s ago, more than `max_frame_age` 0\.3 s"
+        with pytest.raises(RequestFailed, match=f"{came}: 1 publisher on {TOPIC}, no frame comes: look at"):
+            list(client.request(Request("a", "plan"), trace))
+        assert trace.facts["stale_frames"] == 1
+        assert 300 < trace.facts["camera_age_ms"] < trace.facts["camera_stamp_age_ms"] - 4_000  # by a stamp of 1970
     assert len(logged(caplog, "newest frame came")) == 1
     other.close()
     until(lambda: robot.server._cache._publishers().get("/robot" + CAMERA, 0) == 0)
