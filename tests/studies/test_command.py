@@ -15,7 +15,7 @@ from tests.studies.program import ROOT, run
 
 
 def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
-    done = run("misfit", "--plans", "100", "--calibration-plans", "100", output=tmp_path)
+    done = run("misfit", "--plans", "20", "--calibration-plans", "100", output=tmp_path)
     assert "Wrong beliefs" in done.stdout
     assert (
         "warning [few-calibration-plans]: 100 calibration plans are few: one lambda may stall up to 6.7%" in done.stderr
@@ -28,7 +28,7 @@ def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
     assert (folder / "studies.parquet").exists()
     rows = kept.table(STUDY_CELLS)
     assert len(rows) == 3 * 17
-    assert (rows["plans"] == 100).all()
+    assert (rows["plans"] == 20).all()
     for name in ("| N -2 |", "| L x 1.25 |", "| gap x 2 |"):
         assert name in done.stdout
     for name in ("figures/misfit.png", "figures/misfit.pdf", "tables/wrong-beliefs.md", "tables/misfit.csv"):
