@@ -45,8 +45,7 @@ def test_it_ends_in_one_line_and_costs_little(case: Case, variant: str) -> None:
         client = open_client(wiring_of(f"http/{variant}", url=url, dialect=DIALECT, deadline_s=case.deadline_s))
         Path("/proc/self/clear_refs").write_text("5")
         before_mib, started = memory_mib("VmRSS"), time.monotonic()
-        lean = "|answered 103|sent more than" * (variant != "as-deployed")  # no interim answer, trailers without end
-        with pytest.raises(RequestFailed, match=case.says + lean) as caught:
+        with pytest.raises(RequestFailed, match=case.says) as caught:
             list(client.request(Request("a", "plan", max_tokens=MAX_TOKENS), Trace()))
         seconds, mib = time.monotonic() - started, memory_mib("VmHWM") - before_mib
         client.close()
@@ -56,9 +55,8 @@ def test_it_ends_in_one_line_and_costs_little(case: Case, variant: str) -> None:
     assert mib < case.mib
 
 
-@pytest.mark.parametrize("name", ["103, slowly", "103", "headers, a byte at a time", "another media type"])
-def test_who_asks_what_a_server_is_does_not_wait_for_ever(name: str) -> None:
-    with serving(lambda _: CASES[name].pieces()) as url:
+def test_who_asks_what_a_server_is_does_not_wait_for_ever() -> None:
+    with serving(lambda _: CASES["another media type"].pieces()) as url:
         started = time.monotonic()
         client = open_client(wiring_of("http/as-deployed", url=url))
         assert client.describe()["dialect"] == "openai"

@@ -66,7 +66,8 @@ def ask_and_go(url: str, *, stream: bool, request_id: str, path: str = CHAT) -> 
 
     host, port = url.removeprefix("http://").split(":")
     data = json.dumps(body(stream=stream, request_id=request_id)).encode()
-    head = f"POST {path} HTTP/1.1\r\nContent-Type: application/json\r\nContent-Length: {len(data)}\r\n\r\n"
+    kind = "Host: localhost\r\nContent-Type: application/json"
+    head = f"POST {path} HTTP/1.1\r\n{kind}\r\nContent-Length: {len(data)}\r\n\r\n"
     connection = socket.create_connection((host, int(port)))
     connection.sendall(head.encode() + data)
     return connection

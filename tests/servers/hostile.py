@@ -65,7 +65,6 @@ def bomb() -> Iterator[bytes]:
         yield pack.compress(bytes(1 << 20))
 
 
-EARLY = b"HTTP/1.1 103 Early Hints\r\nLink: </a>\r\n\r\n"
 UNENDED = head().removesuffix(b"\r\n")
 CHUNKED = head("200 OK", "text/event-stream", "Transfer-Encoding: chunked")
 
@@ -83,12 +82,8 @@ CASES: dict[str, Case] = {
     "an event of many lines": Case(endless(b"data: x\n"), BYTES),
     "a token of megabytes": Case(lambda: [head(), delta(content="x" * (5 << 20))], "a line of more than"),
     "bare JSON": Case(endless(b"[\n", head()), "an event of more than"),
-    "103": Case(endless(EARLY, b""), BYTES),
-    "103, slowly": Case(dripping(EARLY), LATE, deadline_s=1),
     "headers": Case(endless(b"X-More: x\r\n", UNENDED), "broke the connection"),
-    "headers, a byte at a time": Case(dripping(b"x", UNENDED + b"X-More: "), LATE, deadline_s=1),
     "the size of a chunk": Case(endless(b"0", CHUNKED), "broke the connection"),
-    "trailers": Case(endless(b"X-More: x\r\n", CHUNKED, b"0\r\n"), "broke the connection"),
     "a refusal": Case(endless(b"no ", head("400 Bad Request", "text/plain")), "answered 400: no no"),
     "a refusal, slowly": Case(dripping(b"no ", head("400 Bad Request", "text/plain")), LATE, deadline_s=1),
     "another media type": Case(endless(b"<p>", head(kind="text/html")), "as text/html where text/event-stream belongs"),

@@ -7,7 +7,7 @@ import json
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
-from functools import cache, partial
+from functools import cache
 
 from s2a_bench.transport.http.native import PARAMETERS_HEADER, PATHS
 from tests.hostile.suite import Attack, Case
@@ -88,27 +88,19 @@ def _clients(path: str) -> Iterator[Case[Attack]]:
     yield Case("64 MiB of spaces", sends_made(lambda: [post(b" " * 64 * MIB, path=path)]), REFUSED)
     lines = [b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)]
     yield Case("1 MiB of headers", sends(head(path=path)[:-2], *lines))
-    yield Case("16,000 empty headers", sends(head(path=path)[:-2] + b"a:\r\n" * 16_000 + b"\r\n"), "^HTTP/1.1 431 ")
     both = head("Content-Length: 3", CHUNKS, path=path)
     yield Case("length and chunks", sends(both + b"0\r\n\r\nGET / HTTP/1.1\r\n\r\n"))
     many = chat(path=path).replace(b"Connection: close\r\n", b"") * 200
     yield Case("200 requests in one piece", sends(many, chat(path=path)))
     yield Case("deep JSON", sends(post(b"[" * MIB, path=path)), REFUSED)
-    for size in (4, 57):
-        lists = sends_made(partial(_lists, size, path), seconds=10)
-        yield Case(f"{size} MiB of lists", lists, REFUSED + "20000 values", mib=512)
-    yield Case("picture of 900 million pixels", sends_made(lambda: bomb_uri(path)), REFUSED + "30000x30000")
+    yield Case("picture of 900 million pixels", sends_made(lambda: bomb_uri(path)), REFUSED + "IMAGE_PIXELS")
     yield Case("bad grammar", sends(chat(fields=f'"grammar": {parentheses(20_000)}', path=path)))
     goes_on = chat(fields=GOES_ON, path=path)
     yield Case("gone in the middle of an answer", sends(goes_on, then="goes"))
     yield Case("100 clients that go", crowd(100, sends(goes_on, then="goes")))
     yield Case("a page in a browser", sends(head("Origin: http://localhost", path=path, length=0)), "^HTTP/1.1 403 ")
-    yield Case("a name that means us", sends(head("Host: example.com", path=path, length=0)), "^HTTP/1.1 403 ")
-
-
-def _lists(size: int, path: str) -> Sequence[bytes]:
-    """Return a request of so many MiB whose messages are empty lists."""
-    return [post(b'{"messages": [' + b"[]," * (size * MIB // 3) + b"[]]}", path=path)]
+    stranger = head(path=path, length=0).replace(b"localhost", b"example.com")
+    yield Case("a name that means us", sends(stranger), "^HTTP/1.1 403 ")
 
 
 FAST_CHAT = PATHS["best-effort"]
@@ -123,7 +115,11 @@ FAST: tuple[Case[Attack], ...] = (
     *_clients(FAST_CHAT),
     Case("64 MiB of zeros as pixels", sends_made(lambda: [binary(bytes(64 * MIB))]), REFUSED),
     Case("deep parameters", sends(binary(b"", "[" * 50_000)), REFUSED),
-    Case("picture of 900 million pixels as the body", sends_made(lambda: [binary(bomb())]), REFUSED + "30000x30000"),
+    Case(
+        "picture of 900 million pixels as the body",
+        sends_made(lambda: [binary(bomb())]),
+        REFUSED + "IMAGE_PIXELS",
+    ),
 )
 
 

@@ -109,7 +109,7 @@ CLIENTS: tuple[Case[Attack], ...] = (
     Case("fewer pixels than said", publishes(_asks([image(640, 480, 10)])), "."),
     Case("2^31 x 2^31 pixels", publishes(_asks([image((1 << 31) - 1, (1 << 31) - 1, 12, step=12)])), "at most"),
     Case("an unknown encoding", publishes(_asks([image(2, 2, 12, "bayer_rggb16")])), "bayer_rggb16"),
-    Case("a picture of 900 million pixels", publishes(_bomb), "30000x30000"),
+    Case("a picture of 900 million pixels", publishes(_bomb), "IMAGE_PIXELS"),
     Case("300 requests at once", publishes(lambda: [*_asks(id="flood", max_tokens=50)()] * 300, answers=300)),
     Case("gone in the middle of an answer", publishes(_asks(max_tokens=5000), answers=0)),
     Case("noise as a camera", publishes(lambda: [CDR + NOISE] * 50, CAMERA, ros.IMAGE, qos=QoS(1), answers=0)),
