@@ -280,37 +280,6 @@ def test_pictures_are_not_handed_to_another_users_server(monkeypatch: pytest.Mon
             open_client(wiring_of("shm", path))
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody else")
-@pytest.mark.parametrize("mode", [0o600, 0o666])
-def test_another_user_of_the_machine_gets_no_memory(tmp_path: Path, mode: int) -> None:
-    """At the permissions; and at the kernel's word of who asks, where somebody has opened these."""
-    path = tmp_path / "robot.sock"
-    for folder in (tmp_path, *tmp_path.parents):
-        if folder.name.startswith(("pytest", "popen", "test")):
-            folder.chmod(0o755)
-    for connect in connector(wiring_of("shm", str(path))):
-        connect(RecordingHandler(["x"]))
-        path.chmod(mode)
-        child = os.fork()
-        if not child:
-            os._exit(_as_nobody(str(path)))
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == (1 if mode == 0o600 else 2)
-
-
-def _as_nobody(path: str) -> int:
-    """Return 1 where the socket cannot be opened, 2 where all that comes is a refusal, 0 otherwise."""
-    os.setgid(NOBODY)
-    os.setuid(NOBODY)
-    link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    link.settimeout(10)
-    try:
-        link.connect(path)
-    except PermissionError:
-        return 1
-    data, files, _, _ = socket.recv_fds(link, 256, 4)
-    return 2 if data.startswith(b"refused:") and not files and not link.recv(1) else 0
-
-
 def test_memory_above_the_limit_is_refused() -> None:
     for connect in connector(replace(wiring_of("shm"), limits=Limits(body_mib=2))):
         client = connect(RecordingHandler(["x"]))
