@@ -58,16 +58,12 @@ def robot(address: str, template: str, payload: str = "raw") -> closing[Client]:
     return closing(open_client(wiring_of("websocket", url=address, template=template, payload=payload)))
 
 
-def asked(address: str, template: str, request: Request = REQUEST) -> np.ndarray[Any, Any]:
+def asked(address: str, template: str, cameras: int = 2, state: int = 2) -> np.ndarray[Any, Any]:
+    frames = tuple(yuyv_frame(64, 48, index) for index in range(cameras))
     with robot(address, template) as client:
-        actions, trace = ask(client, request)
+        actions, trace = ask(client, Request("a", "go", frames, state=tuple(np.arange(state) / 8)))
     assert "server" in budget(trace.chain()).stages_ns
     return np.stack([action.values for action in actions])
-
-
-def asked_with(address: str, template: str, cameras: int, state: int) -> np.ndarray[Any, Any]:
-    frames = tuple(yuyv_frame(64, 48, index) for index in range(cameras))
-    return asked(address, template, request=Request("a", "go", frames, state=tuple(np.arange(state) / 8)))
 
 
 PICTURE, TWICE = (48, 64, 3), (1, 2, 48, 64, 3)
@@ -110,10 +106,10 @@ def test_vllm_omni_is_asked_by_the_keys_that_its_policy_reads_after_a_reset(
     ready = "reset successful" if policy == "pi0" else {"status": "reset successful"}  # before 0.30, and since
     with relative(lambda message: ready if "endpoint" in message else answer) as (address, heard):
         for _ in "ab":
-            np.testing.assert_array_equal(asked_with(address, f"vllm-omni-{policy}", cameras, state), CHUNK)
+            np.testing.assert_array_equal(asked(address, f"vllm-omni-{policy}", cameras, state), CHUNK)
         if policy == "pi0":  # which would take zeros for it
             with pytest.raises(RequestFailed, match=r"vllm-omni-pi0: state wants the state's numbers \(all\)"):
-                asked_with(address, "vllm-omni-pi0", 1, 0)
+                asked(address, "vllm-omni-pi0", 1, 0)
     path, reset, observation, _, _, again = heard[:6]
     assert (path, reset) == ("/v1/realtime/robot/openpi", {"endpoint": "reset"})
     assert observation.pop("session_id") != again["session_id"]
@@ -204,7 +200,7 @@ def test_pictures_without_a_name_from_the_greeting_are_not_sent(greeting: Any, s
         asked(address, "sglang")
     assert heard == ["/openpi/policy"]
     with relative(lambda _: {"actions": CHUNK}, {"input": {"image_keys": ["image"]}}) as (address, _):
-        np.testing.assert_array_equal(asked_with(address, "sglang", 1, 2), CHUNK)
+        np.testing.assert_array_equal(asked(address, "sglang", 1, 2), CHUNK)
 
 
 @pytest.mark.parametrize(
@@ -248,7 +244,7 @@ def test_starvla_has_an_envelope_in_both_directions() -> None:
     (example,) = heard[1]["payload"]["examples"]
     assert heard[1]["type"] == "infer"
     assert [picture.shape for picture in example["image"]] == [(48, 64, 3)] * 2
-    assert (example["lang"], example["state"].tolist()) == ("go", [0.5, 1.0])
+    assert (example["lang"], example["state"].tolist()) == ("go", [0.0, 0.125])
 
 
 @pytest.mark.parametrize("payload", ["raw", "png", "jpeg"])
