@@ -111,29 +111,30 @@ def test_the_stream_is_what_openai_clients_expect(url: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("variant", "body", "message"),
+    ("variant", "sent", "message"),
     [
-        ("as-deployed", b"{}", "body.messages"),
-        ("as-deployed", b"{", "JSON"),
-        ("best-effort", b"{", "no JSON"),
-        ("best-effort", b"{}", "messages"),
-        ("as-deployed", b'{"messages": []}', "messages"),
-        ("best-effort", b'{"messages": []}', "messages"),
-        ("best-effort", b'{"messages": [{"content": [{"type": "text", "text": 3}]}]}', "messages"),
-        ("binary", b"", "s2a-request"),
+        ("as-deployed", "{}", "body.messages"),
+        ("as-deployed", "{", "JSON"),
+        ("as-deployed", '{"messages": []}', "messages"),
+        ("best-effort", "{", "no JSON"),
+        ("best-effort", "{}", "messages"),
+        ("best-effort", '{"messages": []}', "messages"),
+        ("best-effort", '{"messages": [{"content": [{"type": "text", "text": 3}]}]}', "messages"),
+        ("binary", "", "s2a-request"),
+        ("binary", "[1]", "an object"),
+        ("binary", '{"prompt": 3}', "prompt"),
+        ("binary", '{"seed": [1]}', "seed"),
     ],
 )
-def test_a_bad_body_is_refused_with_the_reason(urls: dict[str, str], variant: str, body: bytes, message: str) -> None:
-    headers = {"content-type": "application/json"}
+def test_a_bad_body_or_header_is_refused_with_the_reason(
+    urls: dict[str, str], variant: str, sent: str, message: str
+) -> None:
+    headers, body = {"content-type": "application/json"}, sent
+    if variant == "binary" and sent:
+        headers, body = {native.PARAMETERS_HEADER: sent}, ""
     answer = httpx.post(urls[variant] + native.PATHS[variant], content=body, headers=headers)
     assert answer.status_code == 400
     assert message in answer.json()["error"]["message"]
-
-
-@pytest.mark.parametrize("header", ["[1]", '{"prompt": 3}', '{"seed": [1]}'])
-def test_a_bad_header_of_a_binary_request_is_refused(urls: dict[str, str], header: str) -> None:
-    headers = {native.PARAMETERS_HEADER: header}
-    assert httpx.post(urls["binary"] + native.PATHS["binary"], headers=headers).status_code == 400
 
 
 def test_stopping_in_the_middle_of_an_answer_waits_for_no_engine(capsys: pytest.CaptureFixture[str]) -> None:
@@ -161,16 +162,13 @@ def test_a_bad_picture_is_refused_with_the_reason(url: str, uri: str) -> None:
     assert httpx.post(url + "/v1/chat/completions", json=body).status_code == 400
 
 
-def test_health_and_models_answer(urls: dict[str, str]) -> None:
+@pytest.mark.parametrize(("options", "status"), [({}, 404), ({"api_docs": True}, 200)])
+def test_health_and_models_answer_and_on_request_the_pages_of_fastapi(
+    urls: dict[str, str], handler: RecordingHandler, options: dict[str, bool], status: int
+) -> None:
     for url in urls.values():
         assert httpx.get(url + "/health").json() == {"status": "ok"}
         assert httpx.get(url + "/v1/models").json()["data"][0]["id"] == "s2a"
-
-
-@pytest.mark.parametrize(("options", "status"), [({}, 404), ({"api_docs": True}, 200)])
-def test_the_pages_of_fastapi_are_served_on_request_only(
-    handler: RecordingHandler, options: dict[str, bool], status: int
-) -> None:
     with served(wiring_of("http", **options), handler) as (server, _):
         for page in ("/openapi.json", "/docs", "/redoc"):
             assert httpx.get(server.address + page).status_code == status
