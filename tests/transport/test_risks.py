@@ -64,6 +64,7 @@ def test_a_server_of_this_machine_is_no_risk() -> None:
 
 
 def test_off_this_machine_it_is_a_warning_that_names_encryption(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not risks.is_local("192.168.0.5")
     monkeypatch.setattr(risks, "is_local", lambda _host: False)
     with answering(ANSWER) as (place, _):
         access = found(f"http://{place}")["access"]
