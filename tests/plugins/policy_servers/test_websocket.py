@@ -304,9 +304,12 @@ def test_what_a_foreign_server_says_of_itself_is_bounded(greeting: Any, engine: 
 )
 def test_a_foreign_server_describes_itself_and_its_time_is_split(timing: Any, inference_ns: int | None) -> None:
     answer = {"actions": CHUNK.astype(np.float64), "server_timing": timing}
-    with relative(lambda _: answer, {"model": "pi0", "secret": b"x"}) as (address, heard), foreign(address) as client:
+    with (
+        relative(lambda _: answer, {"model": "m" * 99, "secret": b"x"}) as (address, heard),
+        foreign(address) as client,
+    ):
         actions, trace = ask(client, Request("a", "go"))
-        assert client.describe() == {"url": address, "template": "openpi", "model": "pi0"}
+        assert client.describe() == {"url": address, "template": "openpi", "model": "m" * 64}
     np.testing.assert_array_equal(np.stack([action.values for action in actions]), CHUNK)
     assert len(heard) == 2  # one connection, one observation
     stages = budget(trace.chain()).stages_ns
