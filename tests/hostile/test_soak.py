@@ -11,9 +11,9 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from tests.hostile.asking import usage
 
 from benchmarks.soak import HOSTILE, served, wiring
-from tests.hostile.asking import usage
 
 MINUTES = float(os.environ.get("S2A_SOAK_MINUTES", "0.5"))
 KEPT_MIB = 100.0

@@ -1,23 +1,21 @@
-"""The queue in front of an engine: bounded, in the order of arrival, and never stuck."""
+"""What HTTP's clients hear of impossible numbers and texts, of the queue, and of a stuck engine."""
 
 from __future__ import annotations
 
-import socket
-import time
 from collections.abc import Generator
 from contextlib import closing
-from threading import Event
+from threading import Event, Thread
 from typing import Any
 
 import httpx
 import pytest
 
 from s2a_bench.errors import BadRequest, RequestFailed
-from s2a_bench.testing.transport import ask, wiring_of
+from s2a_bench.testing.transport import RecordingHandler, ask, wiring_of
 from s2a_bench.trace import Trace
 from s2a_bench.transport import open_client
-from s2a_bench.transport.http.native import PATHS
-from s2a_bench.transport.limits import Limits
+from s2a_bench.transport.http.native import PARAMETERS_HEADER, PATHS
+from s2a_bench.transport.limits import LIMITS
 from s2a_bench.transport.serving import Queued, Turns
 from s2a_bench.types import Request, Token
 from tests.transport.test_http import serving
@@ -28,27 +26,37 @@ SERVERS = {CHAT: "http", BEST_EFFORT: "http/best-effort"}
 paths = pytest.mark.parametrize("path", [CHAT, BEST_EFFORT])
 
 
-def body(prompt: str = "go on", *, stream: bool = True, **more: Any) -> dict[str, Any]:
-    return {"messages": [{"role": "user", "content": prompt}], "stream": stream, **more}
+def body(*, stream: bool = True) -> dict[str, Any]:
+    return {"messages": [{"role": "user", "content": "go on"}], "stream": stream}
 
 
-class Gate:
-    """An answer that goes on for ever once `go` is set, and counts who came and who ended."""
+VARIANTS = {"as-deployed": "http", "best-effort": "http/best-effort", "binary": "http/binary"}
+ODD_NUMBERS = [
+    *(("max_tokens", value) for value in ("-1", "0", "1.5", "1e99", '"many"', str(LIMITS.answer_tokens + 1))),
+    *(("seed", value) for value in ("-1", "[]", "true", str(2**32))),
+]
 
-    def __init__(self) -> None:
-        self.go = Event()
-        self.began: list[str] = []
-        self.ended: list[str] = []
 
-    def __call__(self, request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        self.began.append(request.id)
-        try:
-            for index in range(100_000):
-                yield Token(index, "a")
-                self.go.wait(30)
-                time.sleep(0.001)
-        finally:
-            self.ended.append(request.id)
+def post(url: str, variant: str, fields: str, prompt: str = '"go on"') -> httpx.Response:
+    """Send a request of a variant, whose prompt and ``fields`` are JSON text."""
+    if variant == "binary":
+        return httpx.post(url + PATHS[variant], headers={PARAMETERS_HEADER: f'{{"prompt": {prompt}, {fields}}}'})
+    text = f'{{"messages": [{{"role": "user", "content": {prompt}}}], {fields}}}'
+    return httpx.post(url + PATHS[variant], content=text.encode(), headers={"content-type": "application/json"})
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_numbers_and_texts_that_are_none_are_refused_by_name_and_hold_no_engine(variant: str) -> None:
+    with serving(RecordingHandler(["a"]), VARIANTS[variant]) as url:
+        for name, value in ODD_NUMBERS:
+            answer = post(url, variant, f'"{name}": {value}')
+            assert (answer.status_code, value) == (400, value)
+            assert name in answer.json()["error"]["message"]
+        for stream in ("true", "false"):
+            assert post(url, variant, f'"request_id": "\\ud800", "stream": {stream}').status_code == 400
+            assert post(url, variant, f'"stream": {stream}', prompt='"\\ud800"').status_code == 400
+        whole = post(url, variant, f'"max_tokens": 1, "seed": {2**32 - 1}')
+        assert whole.json()["usage"]["completion_tokens"] == 1
 
 
 def test_leaving_twice_lets_one_run_not_two() -> None:
@@ -58,18 +66,6 @@ def test_leaving_twice_lets_one_run_not_two() -> None:
     first.leave()
     assert second.has_started
     assert not third.has_started
-
-
-def ask_and_go(url: str, *, stream: bool, request_id: str, path: str = CHAT) -> socket.socket:
-    """Send a request over a socket of its own, and do not read."""
-    import json
-
-    host, port = url.removeprefix("http://").split(":")
-    data = json.dumps(body(stream=stream, request_id=request_id)).encode()
-    head = f"POST {path} HTTP/1.1\r\nContent-Type: application/json\r\nContent-Length: {len(data)}\r\n\r\n"
-    connection = socket.create_connection((host, int(port)))
-    connection.sendall(head.encode() + data)
-    return connection
 
 
 @paths
@@ -92,25 +88,21 @@ def test_a_token_that_cannot_be_sent_frees_the_engine(stream: bool, path: str) -
 @paths
 def test_health_says_when_the_engine_is_stuck(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("s2a_bench.transport.serving.STUCK_S", 0.2)
-    gate = Gate()
-    with serving(gate, SERVERS[path]) as url:
+    go = Event()
+
+    def stuck(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
+        yield Token(0, "a")
+        go.wait(30)
+
+    with serving(stuck, SERVERS[path]) as url:
         assert httpx.get(url + "/health").status_code == 200
-        connection = ask_and_go(url, stream=True, request_id="a", path=path)
+        asking = Thread(target=httpx.post, args=(url + path,), kwargs={"json": body(), "timeout": 60})
+        asking.start()
         until(lambda: httpx.get(url + "/health").status_code == 503)
         assert "no sign of life" in httpx.get(url + "/health").json()["reason"]
-        gate.go.set()
-        connection.close()
-        until(lambda: httpx.get(url + "/health").status_code == 200)
-
-
-@paths
-def test_an_answer_that_is_not_streamed_is_504_at_its_deadline(path: str) -> None:
-    gate = Gate()
-    gate.go.set()
-    with serving(gate, SERVERS[path], Limits(answer_s=1.0)) as url:
-        answer = httpx.post(url + path, json=body("for ever", stream=False, max_tokens=60_000), timeout=30)
-    assert answer.status_code == 504
-    assert "1 s after its arrival the request is still being answered" in answer.json()["error"]["message"]
+        go.set()
+        asking.join()
+        assert httpx.get(url + "/health").status_code == 200
 
 
 @pytest.mark.parametrize("name", [*(f"http/{variant}" for variant in PATHS), "ros/topic", "ros/action"])
