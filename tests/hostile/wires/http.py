@@ -59,7 +59,7 @@ def clients(variant: str) -> tuple[Case, ...]:
     kept = chat(path).replace(b"Connection: close\r\n", b"")
     both = head("Content-Length: 3", CHUNKS, path=path) + b"0\r\n\r\nGET / HTTP/1.1\r\n\r\n"
     return (
-        Case("noise", sends(NOISE), f"{REFUSED}|^{CLOSED}"),
+        Case("noise", sends(NOISE, b"\r\n\r\n"), f"{REFUSED}|^{CLOSED}"),
         Case("half a head", sends(head(path=path)[:40], then="leaves")),
         Case("half a body", sends(head(JSON, path=path, length=1000) + b"{", then="resets")),
         Case("a length and chunks", sends(both)),
@@ -82,7 +82,7 @@ def large(variant: str) -> tuple[Case, ...]:
         Case("1 GiB announced", sends(head(JSON, path=path, length=1 << 30), bytes(MIB)), REFUSED),
         Case("1 GiB in chunks", sends(*unsaid), f"{REFUSED}|^{CLOSED}"),
         Case("60 MiB of spaces", sends(lambda: post(b" " * 60 * MIB, path)), REFUSED),
-        Case("1 MiB of headers", sends(head(path=path)[:-2], *lines), f"{REFUSED}|^{CLOSED}"),
+        Case("1 MiB of headers", sends(head(path=path)[:-2], *lines, b"\r\n"), f"{REFUSED}|^{CLOSED}"),
         Case("a picture of 900 million pixels", sends(lambda: picture(path, bomb())), REFUSED),
         Case("300 connections at once", crowd(300, sends(chat(path))), BUSY_OR_ANSWERED),
     )
