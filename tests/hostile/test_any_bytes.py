@@ -155,6 +155,7 @@ def test_garbage_and_guesses_beside_an_answer_are_skipped_and_counted(dds_domain
         assert unreadable == 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
 def test_out_of_descriptors_those_that_are_connected_are_answered(variant: str, tmp_path: Path) -> None:
     wiring = wiring_of(f"http/{variant}")

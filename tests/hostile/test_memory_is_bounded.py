@@ -43,6 +43,7 @@ def test_what_is_large_or_many_costs_little_memory_and_the_next_client_is_served
     targets(name).meets(case)
 
 
+@pytest.mark.slow
 def test_the_memory_of_large_bodies_is_given_back(targets: Callable[[str], Target]) -> None:
     """FastAPI's errors hold the body, in cycles that Python looks for when it likes; grown blocks stay in the heap."""
     (spaces,) = (case for case in http.LARGE if case.name == "60 MiB of spaces")

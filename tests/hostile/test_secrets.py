@@ -90,6 +90,7 @@ def test_a_refused_url_is_not_repeated_with_its_password(url: str) -> None:
     assert "geheim" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_a_run_holds_no_secret(tmp_path: Path) -> None:
     """In files, names and messages, though the server repeats them in tokens, in pieces, and in errors."""
     leak = " ".join(variants(KEY))

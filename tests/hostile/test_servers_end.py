@@ -44,6 +44,7 @@ def test_the_process_of_serve_ends_with_it(number: signal.Signals) -> None:
     until(lambda: ended(child))
 
 
+@pytest.mark.slow
 def test_a_signal_while_it_starts_leaves_nothing() -> None:
     with subprocess.Popen(command("serve", "http", "--engine", "echo", "--port", "0")) as process:
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
