@@ -38,6 +38,10 @@ class Frame:
     encoding: Encoding
     data: Pixels
 
+    @property
+    def pixel_count(self) -> int:
+        return self.width * self.height
+
 
 Sampling: TypeAlias = "tuple[tuple[str, float], ...]"
 """A client's sampling settings: llama.cpp's names, and their values; an engine ignores those it does not support."""

@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+import s2a_bench.frames  # noqa: F401 - its limit of pixels goes before OpenCV
 from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.smoke import smoke_test
 from s2a_bench.ros import MIDDLEWARES

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from time import process_time
 
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
-from s2a_bench.boards.profile import parse_profile
 from s2a_bench.errors import StoreError, UsageError
 from s2a_bench.store import files
 from s2a_bench.sweep.file import read_sweep_file
@@ -25,26 +23,6 @@ def test_line_ends_are_as_python_reads_them(tmp_path: Path) -> None:
     path = tmp_path / "text"
     path.write_bytes("ä\r\nb".encode())
     assert read_text(path) == "ä\nb"
-
-
-@pytest.mark.parametrize("key", ["a." * 20_000 + "a = 1", "['a'" + " . 'a'" * 6_000 + "]", '"a".' * 10_000 + "a = 1"])
-def test_a_key_of_thousands_of_parts_is_refused_before_it_costs_time(key: str) -> None:
-    began = process_time()
-    with pytest.raises(UsageError, match=r"^profile p: .* dotted key of more than 32 names"):
-        parse_profile("p", key, "profile p")
-    assert process_time() - began < 10  # it was 22 s
-
-
-def test_numbers_and_texts_with_dots_are_no_keys() -> None:
-    with pytest.raises(UsageError, match="there is no such key"):
-        parse_profile("p", f"gap = [{', '.join(['0.1'] * 100)}]\nname = '{'one. ' * 20}'", "profile p")
-
-
-def test_a_long_word_costs_no_time() -> None:
-    began = process_time()
-    with pytest.raises(UsageError, match="there is no such key"):
-        parse_profile("p", f"hash = '{'a' * 1_000_000}'", "profile p")
-    assert process_time() - began < 5  # of a search that begins at every letter: hours
 
 
 def test_values_are_counted_by_the_footer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,7 +26,7 @@ from s2a_bench.report.page.files import make_report, write_report
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.store.schema import PROVENANCE
 from s2a_bench.writers.figures import new_figure, save
-from s2a_bench.writers.latex import to_latex, to_siunitx
+from s2a_bench.writers.latex import to_float, to_latex
 from s2a_bench.writers.tables import TextTable, to_markdown
 
 LLAMA = {"engine": "llama", "model": "/m/tiny.gguf", "name": "tiny", "dummy": True, "model_sha256": "ab"}
@@ -118,7 +118,7 @@ def test_boards_alike_but_for_the_profile_share_a_line() -> None:
     assert origins.line == "Provenance: no engine, tokens EMULATED after a, b, virtual time."
 
 
-@pytest.mark.parametrize("write", [to_markdown, to_latex, to_siunitx])
+@pytest.mark.parametrize("write", [to_markdown, to_latex, to_float])
 def test_no_table_is_written_without_it(write: Any) -> None:
     table = TextTable("T", ("a", "b"), [("1", "2")], 1)
     with pytest.raises(ValueError, match="does not say where its numbers come from"):

@@ -8,9 +8,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from rosbags.rosbag2 import Reader
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError
-from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 
 from s2a_bench.errors import SourceError, UsageError
 from s2a_bench.frames.messages import TYPES, ImageMessages
@@ -18,10 +15,6 @@ from s2a_bench.ros.messages import typestore
 from s2a_bench.types import Pixels
 
 TOPIC_KEY = "?topic="
-METADATA = "metadata.yaml"
-MAX_METADATA_BYTES = 8 * 2**20
-MAX_DEPTH = 32
-"""The most nested lists and maps in a recording's YAML, which has 8."""
 MOST_QUOTED = 300
 """Characters that are quoted of a library's error about a damaged file."""
 
@@ -73,7 +66,6 @@ def _open(path: str) -> Any:
     if not Path(path).exists():
         raise SourceError(f"`source`: no recording at {path}")
     try:
-        _check_metadata(Path(path) / METADATA)
         reader = Reader(path)
         reader.open()
         if not all(isinstance(name, str) for each in reader.connections for name in (each.topic, each.msgtype)):
@@ -81,26 +73,6 @@ def _open(path: str) -> Any:
     except Exception as error:  # rosbags raises any exception on a damaged file
         raise SourceError(f"`source`: {_unreadable(path, error)}") from error
     return reader
-
-
-def _check_metadata(path: Path) -> None:
-    """Raise ValueError for a folder's YAML that is invalid, or that could grow without bound when it is read."""
-    if not path.is_file():
-        return
-    if path.stat().st_size > MAX_METADATA_BYTES:
-        raise ValueError(f"{METADATA} is larger than {MAX_METADATA_BYTES >> 20} MiB")
-    depth = 0
-    try:
-        for event in YAML(typ="safe", pure=True).parse(path.read_text(encoding="utf-8")):
-            where = f"{METADATA}, line {event.start_mark.line + 1}"
-            depth += isinstance(event, CollectionStartEvent) - isinstance(event, CollectionEndEvent)
-            if depth > MAX_DEPTH:
-                raise ValueError(f"{where}: deeper than {MAX_DEPTH}")
-            if "<<" in (getattr(event, "value", None) or ""):
-                raise ValueError(f"{where}: merged keys (<<) are not read")
-    except MarkedYAMLError as error:
-        where = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise ValueError(f"{METADATA}{where}: {error.problem}") from error
 
 
 def _connection(connections: list[Any], path: str, topic: str) -> Any:

@@ -7,7 +7,6 @@ the pixels of a row are contiguous; ``out`` must not overlap ``data``.
 
 from __future__ import annotations
 
-import re
 from typing import Final, TypeAlias, cast, get_args
 
 import cv2
@@ -20,8 +19,7 @@ BytesLike: TypeAlias = "bytes | bytearray | memoryview | Pixels"
 # Newer OpenCV has the decoder write RGB itself: the same pixels without another pass over the picture; 4.9 cannot.
 _DECODE_RGB: int | None = getattr(cv2, "IMREAD_COLOR_RGB", None)
 
-MOST_PIXELS: Final = 50_000_000
-"""A picture that has more is not decoded, unless a limit says otherwise."""
+_SIGNATURES: Final = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n")
 AS_IT_IS: Final = -1
 """Instead of a code of OpenCV: no conversion."""
 
@@ -103,7 +101,7 @@ def encode_png(bgr: Pixels) -> Pixels:
 
 
 def decode_image(data: BytesLike) -> Pixels:
-    """Decode a JPEG, PNG or other picture file to (h, w, 3) ``rgb8``; ValueError if it is none.
+    """Decode a JPEG, PNG or other picture file to (h, w, 3) ``rgb8``; ValueError if it is none, or is too large.
 
     A truncated JPEG is an error in OpenCV 5; OpenCV 4 fills in the missing part.
     """
@@ -112,47 +110,11 @@ def decode_image(data: BytesLike) -> Pixels:
     return bgr_to_rgb(_decode(data, cv2.IMREAD_COLOR))
 
 
-def check_encoded(data: memoryview, most_pixels: int = MOST_PIXELS) -> None:
-    """Raise ValueError for a file that is neither JPEG nor PNG, or whose header gives no pixels or too many."""
-    size = _png_size(data) or _jpeg_size(data)
-    if size is None:
+def decode_received(data: BytesLike) -> Pixels:
+    """Decode a JPEG or PNG from outside as `decode_image` does; ValueError for any other format."""
+    if not bytes(data[:8]).startswith(_SIGNATURES):
         raise ValueError("neither a JPEG nor a PNG")
-    if not 0 < size[0] * size[1] <= most_pixels:
-        raise ValueError(f"a picture of {size[0]}x{size[1]}; at most {most_pixels} pixels are taken")
-
-
-def _png_size(data: memoryview) -> tuple[int, int] | None:
-    """Read IHDR, which comes first (PNG, third edition, 5.6)."""
-    head = bytes(data[:24])
-    if not (head.startswith(b"\x89PNG\r\n\x1a\n") and head[12:16] == b"IHDR"):
-        return None
-    return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:], "big")
-
-
-_MARKER = re.compile(rb"[^\xff]*\xff+([^\xff])", re.DOTALL)
-_SEGMENTS = 10_000
-"""More than any picture has before its frame header."""
-_FRAME = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-"""Markers of a JPEG's frame header (ITU T.81, table B.1)."""
-_ALONE = frozenset({0x00, 0x01, *range(0xD0, 0xD8)})
-"""Markers without a length."""
-
-
-def _jpeg_size(data: memoryview) -> tuple[int, int] | None:
-    """Read the first frame header (ITU T.81, B.2.2), skipping what libjpeg skips before a marker."""
-    if bytes(data[:2]) != b"\xff\xd8":
-        return None
-    at = 2
-    for _ in range(_SEGMENTS):
-        match = _MARKER.match(data, at)
-        if match is None or match.end() + 7 > len(data):
-            return None
-        marker, at = match[1][0], match.end()
-        if marker in _FRAME:
-            return int.from_bytes(data[at + 5 : at + 7], "big"), int.from_bytes(data[at + 3 : at + 5], "big")
-        if marker not in _ALONE:
-            at += max(2, int.from_bytes(data[at : at + 2], "big"))
-    return None
+    return decode_image(data)
 
 
 def resize(bgr: Pixels, width: int, height: int) -> Pixels:
@@ -192,7 +154,7 @@ def _decode(data: BytesLike, flags: int) -> Pixels:
     try:
         picture = cv2.imdecode(buffer, flags) if buffer.size else None
     except cv2.error as error:
-        raise ValueError(f"the {buffer.size} bytes are no picture that OpenCV can read: {error}") from error
+        raise ValueError(f"the {buffer.size} bytes are no picture that OpenCV can read: {error.err}") from error
     if picture is None:
         raise ValueError(f"the {buffer.size} bytes are no picture that OpenCV can read")
     return cast("Pixels", picture)

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Final, cast
 
 from s2a_bench.errors import SourceError, TransportError
 from s2a_bench.frames import NumberedSource, check_size
-from s2a_bench.frames.convert import MOST_PIXELS, check_encoded, decode_image, resize, to_bgr
+from s2a_bench.frames.convert import decode_received, resize, to_bgr
 from s2a_bench.ros import messages as ros
 from s2a_bench.types import Encoding, Frame, Pixels
 
@@ -62,7 +62,7 @@ class ImageMessages(NumberedSource):
             raise SourceError(f"`{self.option}`: {self.name}: {what}{error}") from error
 
 
-def decompressed(image: Any, most_pixels: int = MOST_PIXELS) -> Frame:
+def decompressed(image: Any) -> Frame:
     """Decode a CompressedImage; ``format`` is plain, as "jpeg", or says what was compressed as what.
 
     image_transport writes "rgb8; jpeg compressed bgr8". Where bgr8 does not stand at the end, the picture was
@@ -71,8 +71,7 @@ def decompressed(image: Any, most_pixels: int = MOST_PIXELS) -> Frame:
     encoding, _, coding = image.format[: ros.SHOWN].partition(";")
     ros.refuse_depth("16UC1" if "compressedDepth" in coding else encoding)
     try:
-        check_encoded(memoryview(image.data), most_pixels)
-        rgb = decode_image(image.data)
+        rgb = decode_received(image.data)
     except ValueError as error:
         raise TransportError(f"{len(image.data)} bytes of format '{image.format[: ros.SHOWN]}': {error}") from error
     frame = Frame(-1, ros.nanoseconds(image.header.stamp), rgb.shape[1], rgb.shape[0], "rgb8", rgb)

@@ -12,12 +12,10 @@ from enum import IntEnum
 from threading import Lock
 from typing import Any, Final
 
-from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.errors import UsageError
 from s2a_bench.options import Options, extra_of
 from s2a_bench.ros import messages as ros
 
-AT_ONCE: Final = 1000
-"""A request about more parameters is dropped."""
 SERVICE: Final = "rcl_interfaces/srv/"
 VALUE: Final = "rcl_interfaces/msg/ParameterValue"
 PARAMETER: Final = "rcl_interfaces/msg/Parameter"
@@ -135,7 +133,7 @@ class Parameters:
         return [_named(each.name, each.value) for each in self._declared.values()]
 
     def _find(self, names: Sequence[str]) -> list[tuple[str, Parameter | None]]:
-        return [(name, self._declared.get(name)) for name in _bounded(names)]
+        return [(name, self._declared.get(name)) for name in names]
 
     def _describe(self, request: Any) -> Any:
         descriptors = [
@@ -154,17 +152,16 @@ class Parameters:
 
     def _list(self, request: Any) -> Any:
         """Names have no dots, so one level: a prefix is a whole name."""
-        prefixes = _bounded(request.prefixes)
-        names = [name for name in self._declared if not len(prefixes) or name in prefixes]
+        names = [name for name in self._declared if not len(request.prefixes) or name in request.prefixes]
         result = ros.default("rcl_interfaces/msg/ListParametersResult", names=names)
         return ros.default(SERVICE + "ListParameters_Response", result=result)
 
     def _set(self, request: Any) -> Any:
-        results = [self._tried([each]) for each in _bounded(request.parameters)]
+        results = [self._tried([each]) for each in request.parameters]
         return ros.default(SERVICE + "SetParameters_Response", results=results)
 
     def _set_atomically(self, request: Any) -> Any:
-        result = self._tried(_bounded(request.parameters))
+        result = self._tried(request.parameters)
         return ros.default(SERVICE + "SetParametersAtomically_Response", result=result)
 
     def _tried(self, parameters: Sequence[Any]) -> Any:
@@ -190,12 +187,6 @@ class Parameters:
         if (given := Type(parameter.value.type)) != (wanted := type_of(declared.value)):
             raise UsageError(f"parameter {declared.name} is of type {wanted.name}, not {given.name}")
         return value
-
-
-def _bounded(items: Sequence[Any]) -> Sequence[Any]:
-    if len(items) > AT_ONCE:
-        raise TransportError(f"{len(items)} parameters in one request; the most is {AT_ONCE}")
-    return items
 
 
 def _named(name: str, value: Any) -> Any:

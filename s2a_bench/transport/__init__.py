@@ -233,6 +233,8 @@ class Urls:
     schemes: tuple[str, ...] = ()
     examine: str = ""
     """``module:function`` for `doctor --url`, see `transport.risks`."""
+    unpickles: str = ""
+    """Which of these servers run code that a client sends, as a sentence."""
     cache_hits: str = ""
     """``module:function`` that returns counter -> cache hits that the server of a wiring has counted so far."""
 

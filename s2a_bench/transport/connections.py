@@ -11,7 +11,6 @@ import select
 import socket
 import struct
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from threading import Lock, Thread
@@ -24,8 +23,6 @@ GRACE_S: Final = 1.0
 """Time for running answers when a server is stopped."""
 LINGER_S: Final = 1.0
 """Time for a client to read a refusal: closing at once would reset the connection."""
-LINGERING: Final = 1024
-"""The most refused connections that are kept open for this time."""
 PAUSE_S: Final = 0.1
 """Pause after a failed accept: the limit of open files or threads is reached."""
 HANGUP: Final = select.POLLRDHUP | select.POLLHUP | select.POLLERR
@@ -40,7 +37,6 @@ class Connections:
         self._listener, self._handle, self._most, self._refusal = listener, handle, most, refusal
         self._lock = Lock()
         self._wires: dict[Wire, Thread] = {}
-        self._refused: deque[tuple[float, socket.socket]] = deque()
         self._stopped = False
 
     def serve(self) -> None:
@@ -53,7 +49,6 @@ class Connections:
                 if not self._stopped:
                     _log.warning("no connection can be accepted: %s", error)
                     time.sleep(PAUSE_S)
-            self._close_refused()
         ends = time.monotonic() + GRACE_S
         for thread in list(self._wires.values()):
             thread.join(max(0.0, ends - time.monotonic()))
@@ -70,10 +65,8 @@ class Connections:
 
     def _take(self, accepted: socket.socket) -> None:
         if len(self._wires) >= self._most:
-            with suppress(OSError):
+            with suppress(OSError), accepted:
                 accepted.send(self._refusal, socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL)
-                accepted.shutdown(socket.SHUT_WR)
-            self._refused.append((time.monotonic(), accepted))
             return
         wire = Wire(accepted)
         thread = Thread(target=self._handled, args=(wire,), name="connection", daemon=True)
@@ -101,12 +94,6 @@ class Connections:
         with self._lock:
             self._wires.pop(wire, None)
         wire.socket.close()
-
-    def _close_refused(self) -> None:
-        while self._refused and (
-            len(self._refused) > LINGERING or self._stopped or time.monotonic() - self._refused[0][0] > LINGER_S
-        ):
-            self._refused.popleft()[1].close()
 
 
 class Wire:
@@ -200,7 +187,12 @@ class Wire:
 
 def wait_at_most(connection: socket.socket, seconds: float) -> None:
     """Let blocking calls raise BlockingIOError after this time, 0: never; `settimeout` would cost a poll for each."""
-    whole = int(seconds)
-    value = _TIMEVAL.pack(whole, max(int((seconds - whole) * 1e6), int(seconds > 0 and not whole)))
+    value = timeval(seconds)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, value)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, value)
+
+
+def timeval(seconds: float) -> bytes:
+    """Return a time as options of sockets have it."""
+    whole = int(seconds)
+    return _TIMEVAL.pack(whole, max(int((seconds - whole) * 1e6), int(seconds > 0 and not whole)))

@@ -6,20 +6,16 @@ manifest records them; three are flags of `serve`. `Bounds` are those of one ans
 
 from __future__ import annotations
 
-import re
 from typing import Any, ClassVar, Final
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed
+from s2a_bench.frames import MOST_PIXELS
 from s2a_bench.options import Options, option
 
 KIB: Final = 1 << 10
 MIB: Final = 1 << 20
 SEEDS: Final = (1 << 32) - 1
-VALUES: Final = 20_000
-"""The most values of a document from outside."""
-STRING: Final = re.compile(rb'"[^"]*"?')
-"""A string of JSON without escapes, the last of which may be cut off."""
 
 
 class Limits(Options):
@@ -33,7 +29,7 @@ class Limits(Options):
     connections: int = option(256, "most connections at once", ge=1, le=MIB)
     head_s: float = option(10.0, "seconds from a request's first byte to the end of its headers", gt=0, le=86_400)
     body_s: float = option(120.0, "seconds from there to the end of its body", gt=0, le=86_400)
-    pixels: int = option(50_000_000, "most pixels of a picture, read before it is decoded", ge=1, le=2**31)
+    pixels: int = option(MOST_PIXELS, "most pixels of a request's pictures", ge=1, le=2**31)
     waiting: int = option(64, "most requests that wait for the engine", flag="max-waiting", ge=0, le=MIB)
     answer_tokens: int = option(65_536, "most tokens that a request may ask for", ge=1, le=2**31 - 1)
     answer_s: float = option(
@@ -80,37 +76,12 @@ def text(name: str, value: Any, default: str = "") -> str:
     return value
 
 
-def check_values(document: bytes | bytearray) -> None:
-    """Raise RequestFailed for a JSON document of too many values, before it is parsed; other bytes may pass.
-
-    There are at most as many values as commas and brackets; those in strings are excluded only if the first count is
-    too large.
-    """
-    if _separators(document) <= VALUES:
-        return
-    plain = document.replace(rb"\\", b"").replace(rb"\"", b"")
-    rest, strings = STRING.subn(b"", plain, count=2 * VALUES + 1)  # a value has a key at most
-    if strings > 2 * VALUES or _separators(rest) > VALUES:
-        raise RequestFailed(f"the document has more than {VALUES} values")
-
-
-def _separators(document: bytes | bytearray) -> int:
-    """Count commas and opening brackets, up to one too many; `find` is 20 times as fast as `count`."""
-    count = 0
-    for sign in (b",", b"[", b"{"):
-        at = document.find(sign)
-        while at >= 0 and count <= VALUES:
-            count += 1
-            at = document.find(sign, at + 1)
-    return count
-
-
-def check_pixels(width: int, height: int, limits: Limits) -> None:
+def check_pixels(width: int, height: int, most: int) -> None:
     """Raise RequestFailed for a picture without pixels, or of too many."""
     if width <= 0 or height <= 0:
         raise RequestFailed(f"a picture of {width}x{height} is empty")
-    if width * height > limits.pixels:
-        raise RequestFailed(f"a picture of {width}x{height}; at most {limits.pixels} pixels are taken")
+    if width * height > most:
+        raise RequestFailed(f"a picture of {width}x{height}; at most {most} pixels are taken")
 
 
 PIECES_A_TOKEN, PIECES = 8, 64

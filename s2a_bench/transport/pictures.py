@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from s2a_bench.errors import RequestFailed, UsageError
-from s2a_bench.frames.convert import check_encoded, decode_image, encode_jpeg, encode_png, to_bgr, to_rgb
+from s2a_bench.frames.convert import decode_received, encode_jpeg, encode_png, to_bgr, to_rgb
 from s2a_bench.trace import Trace
-from s2a_bench.transport.limits import LIMITS, Limits, check_pixels
+from s2a_bench.transport.limits import LIMITS, check_pixels
 from s2a_bench.types import Frame, Pixels
 
 JPEG_QUALITY = 90
@@ -62,20 +62,23 @@ def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
     return f"image/{payload}", data
 
 
-def decoded(media_type: str, data: bytes | memoryview, trace: Trace, limits: Limits = LIMITS) -> Frame:
-    """Convert received bytes to an ``rgb8`` frame; marks `image_decode` or `channel_swap`. Raises RequestFailed."""
+def decoded(media_type: str, data: bytes | memoryview, trace: Trace, most_pixels: int = LIMITS.pixels) -> Frame:
+    """Convert received bytes to an ``rgb8`` frame; marks `image_decode` or `channel_swap`. Raises RequestFailed.
+
+    ``most_pixels`` are what a request's earlier pictures leave of its limit.
+    """
     try:
         if media_type.startswith(RAW_MIME):
             parameters = dict(each.split("=", 1) for each in media_type.split(";")[1:])
             width, height = int(parameters["width"]), int(parameters["height"])
-            check_pixels(width, height, limits)
+            check_pixels(width, height, most_pixels)
             pixels = np.frombuffer(data, np.uint8).reshape(height, width, 3)
             if parameters["encoding"] != "bgr8":
                 raise ValueError(f"raw encoding '{parameters['encoding']}' is not bgr8")
             return rgb_of(Frame(-1, 0, width, height, "bgr8", pixels), trace)
-        check_encoded(memoryview(data), limits.pixels)
-        rgb = decode_image(data)
+        rgb = decode_received(data)
     except (ValueError, KeyError) as error:
         raise RequestFailed(f"the {len(data)} bytes sent as {media_type} are no such picture: {error}") from error
+    check_pixels(rgb.shape[1], rgb.shape[0], most_pixels)
     trace.mark("image_decode")
     return Frame(-1, 0, rgb.shape[1], rgb.shape[0], "rgb8", rgb)

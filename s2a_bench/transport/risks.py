@@ -1,6 +1,6 @@
 """`doctor --url`: what distorts a measurement of an external server, found without a request to its model.
 
-Each transport with URLs declares its own examination (`Urls.examine`). What all share is here.
+Each transport with URLs declares its own examination (`Urls.examine`), and whether such servers unpickle.
 """
 
 from __future__ import annotations
@@ -13,18 +13,15 @@ from pkgutil import resolve_name
 from typing import Final, TypeAlias
 from urllib.parse import SplitResult, urlsplit
 
-from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.errors import RequestFailed, TransportError, UsageError
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.transport import TRANSPORTS
 
-Examine: TypeAlias = Callable[[SplitResult], Iterator[Finding | str]]
-"""Yields findings about the server at a URL with a host, and what leaves it open (NO_KEY, UNPICKLES); raises OSError or
-TransportError if none answers."""
+Examine: TypeAlias = Callable[[SplitResult], Iterator[Finding]]
+"""Yields findings about the server at a URL with a host; raises OSError or TransportError if none answers."""
 
 PATIENCE_S: Final = 5.0
 ENCRYPTED: Final = frozenset({"https", "wss"})
-NO_KEY: Final = "no key"
-UNPICKLES: Final = "unpickles what it receives"
 
 
 def examine(url: str) -> list[Finding]:
@@ -41,28 +38,35 @@ def examine(url: str) -> list[Finding]:
         raise UsageError(
             f"`url`: '{without_key}' should look like http://192.168.0.5:8000: one of {schemes}, a host, and its port"
         )
-    known[parts.scheme].check_machine()
-    examine_it: Examine = resolve_name(known[parts.scheme].urls.examine)
-    local, results = is_local(host), list[Finding | str]()
-    try:
-        results += examine_it(parts)
-    except (OSError, TransportError) as error:
-        why = f"{host} does not answer: {printable(str(error))}"
-        results.append(Finding("server", "error", why, "start it, or name another"))
-    words = [each for each in results if isinstance(each, str)]
-    if not local and parts.scheme not in ENCRYPTED:
-        words.insert(0, "not encrypted")
-    findings = [each for each in results if not isinstance(each, str)]
-    if words:
-        dangerous = not local or any(UNPICKLES in each for each in words)
+    transport, local = known[parts.scheme], is_local(host)
+    transport.check_machine()
+    exposed = [] if local or parts.scheme in ENCRYPTED else ["not encrypted, so a key can be read on the way"]
+    exposed += [transport.urls.unpickles] if transport.urls.unpickles else []
+    findings: list[Finding] = []
+    if exposed:
         reach = "" if local else f", and reach it by ssh -L {port}:127.0.0.1:{port} {host}"
         cure = f"let it listen on 127.0.0.1 alone{reach}"
-        findings.insert(0, Finding("access", "warning" if dangerous else "advice", f"{host}: {', '.join(words)}", cure))
+        findings.append(Finding("access", "advice" if local else "warning", f"{host}: {'; '.join(exposed)}", cure))
+    examine_it: Examine = resolve_name(transport.urls.examine)
+    try:
+        findings += examine_it(parts)
+        findings.append(Finding("server", "state", f"{host} answers"))
+    except RequestFailed as error:  # it may take a client with a key
+        findings.append(Finding("server", "state", f"{host} refuses: {_line(error)}"))
+    except (OSError, TransportError) as error:
+        why = f"{host} does not answer: {_line(error)}"
+        findings.append(Finding("server", "error", why, "start it, or name another"))
     return findings
 
 
-def printable(text: str, most: int = 120) -> str:
-    return "".join(letter if letter.isprintable() else "?" for letter in text[:most])
+def _line(error: Exception) -> str:
+    return "".join(letter if letter.isprintable() else "?" for letter in str(error)[:120])
+
+
+def connect(parts: SplitResult) -> Iterator[Finding]:
+    """Find out whether something listens; nothing is sent."""
+    socket.create_connection((parts.hostname or "", parts.port or 0), PATIENCE_S).close()
+    yield from ()
 
 
 def is_local(host: str) -> bool:

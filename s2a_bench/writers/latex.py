@@ -1,21 +1,14 @@
-r"""Text tables as LaTeX for papers: booktabs rules, and numbers set by siunitx.
-
-`to_latex` needs booktabs alone, `to_siunitx` the packages of `PREAMBLE`: a column of plain numbers, with or without a
-deviation, becomes an ``S`` column, aligned at the decimal marker; in other columns every number is set in ``\num``.
-"""
+"""Text tables as LaTeX for papers, with booktabs rules: one `tabular`, or floats of the packages in `PREAMBLE`."""
 
 from __future__ import annotations
 
-import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
 from s2a_bench.text import one_line
-from s2a_bench.writers.tables import ABSENT, TextTable
+from s2a_bench.writers.tables import TextTable
 
-_PLAIN: Final = re.compile(r"[-+]?\d+(?:\.\d+)?(?: ± \d+(?:\.\d+)?)?")
-_NUMBER: Final = re.compile(r"(?<![\w.])([-+]?\d+(?:\.\d+)?(?: ± \d+(?:\.\d+)?)?)(?![\w.]*\w)")
 _SIGNS: Final = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -50,8 +43,7 @@ _SIGNS: Final = {
 PREAMBLE: Final = r"""\documentclass[a4paper,landscape]{article}
 \usepackage[margin=15mm]{geometry}
 \usepackage[utf8]{inputenc}
-\usepackage{array,booktabs,graphicx,longtable,siunitx}
-\sisetup{separate-uncertainty=true,retain-explicit-plus=true}
+\usepackage{array,booktabs,graphicx,longtable}
 """
 """The packages of the tables, and a page wide enough for them."""
 
@@ -59,43 +51,25 @@ PREAMBLE: Final = r"""\documentclass[a4paper,landscape]{article}
 def to_latex(table: TextTable) -> str:
     """Return a LaTeX ``tabular`` for booktabs: title and notes are comments, the provenance is a printed last line."""
     lines = [f"% {one_line(note)}" for note in (table.title, *table.footer)]
-    lines += [f"\\begin{{tabular}}{{{'l' * table.left}{'r' * (len(table.header) - table.left)}}}", "\\toprule"]
-    lines += [_row(map(escape, table.header)), "\\midrule"]
-    for place, row in enumerate(table.rows):
-        lines += [*(["\\midrule"] if place in table.rules else []), _row(map(escape, row))]
+    lines += [f"\\begin{{tabular}}{{{_columns(table)}}}", r"\toprule", _row(table.header), r"\midrule", *_body(table)]
     origin = f"\\par{{\\footnotesize {escape(table.provenance)}}}"
-    return "\n".join([*lines, "\\bottomrule", "\\end{tabular}", origin]) + "\n"
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", origin]) + "\n"
 
 
-def to_siunitx(table: TextTable, widths: Sequence[str] = (), *, long: bool = False) -> str:
+def to_float(table: TextTable, widths: Sequence[str] = (), *, long: bool = False) -> str:
     r"""Return a LaTeX ``table``, or a ``longtable`` over several pages; title, notes and provenance are the caption.
 
-    ``widths`` are those of columns of running text (``60mm``, empty for an ordinary one).
+    ``widths`` are those of columns of running text (``60mm``), if they are the first ones.
     """
-    columns = list(zip(*table.rows, strict=True)) if table.rows else [()] * len(table.header)
-    kinds = [
-        _kind(column, names=place < table.left, width=widths[place] if place < len(widths) else "")
-        for place, column in enumerate(columns)
-    ]
-    names = (escape(name) for name in table.header)
-    head = _row([name if place < table.left else f"{{{name}}}" for place, name in enumerate(names)])
+    columns, head = _columns(table, widths), [r"\toprule", _row(table.header), r"\midrule"]
     caption = f"\\caption{{{' '.join(escape(text) for text in (table.title + '.', *table.footer))}}}"
-    body = []
-    for place, row in enumerate(table.rows):
-        body += [r"\midrule"] if place in table.rules and place else []
-        entries = zip(row, kinds, strict=True)
-        body.append(_row([_entry(text, kind, names=n < table.left) for n, (text, kind) in enumerate(entries)]))
     if long:
-        lines = [
-            r"{\footnotesize\setlength{\tabcolsep}{3pt}",
-            f"\\begin{{longtable}}{{{''.join(kinds)}}}",
-            caption + r"\\",
-        ]
-        lines += [r"\toprule", head, r"\midrule", r"\endfirsthead", r"\toprule", head, r"\midrule", r"\endhead"]
-        lines += [r"\bottomrule", r"\endlastfoot", *body, r"\end{longtable}}"]
+        lines = [r"{\footnotesize\setlength{\tabcolsep}{3pt}", f"\\begin{{longtable}}{{{columns}}}", caption + r"\\"]
+        lines += [*head, r"\endfirsthead", *head, r"\endhead", r"\bottomrule", r"\endlastfoot"]
+        lines += [*_body(table), r"\end{longtable}}"]
     else:
         lines = [r"\begin{table}[htbp]", r"\centering\footnotesize\setlength{\tabcolsep}{3pt}", caption]
-        lines += [f"\\begin{{tabular}}{{{''.join(kinds)}}}", r"\toprule", head, r"\midrule", *body]
+        lines += [f"\\begin{{tabular}}{{{columns}}}", *head, *_body(table)]
         lines += [r"\bottomrule", r"\end{tabular}", r"\end{table}"]
     return "\n".join(lines) + "\n"
 
@@ -125,37 +99,20 @@ def _sign(char: str) -> str:
     return plain if plain.isalnum() else f"[U+{ord(char):04X}]"
 
 
-def _kind(column: Sequence[str], *, names: bool, width: str) -> str:
-    if width:
-        return f">{{\\raggedright\\arraybackslash}}p{{{width}}}"
-    if names:
-        return "l"
-    texts = [text for text in column if text not in {"", ABSENT}]
-    if not texts or not all(_PLAIN.fullmatch(text) for text in texts):
-        return "r"
-    before, after, spread = 1, 0, 0
-    for text in texts:
-        value, _, sd = text.lstrip("+-").partition(" ± ")
-        whole, _, decimals = value.partition(".")
-        before, after = max(before, len(whole)), max(after, len(decimals))
-        spread = max(spread, len(sd.replace(".", "").lstrip("0") or "0") if sd else 0)
-    sign = "-" if any(text.startswith("-") for text in texts) else ""
-    return f"S[table-format={sign}{before}.{after}{f'({spread})' if spread else ''}]"
+def _columns(table: TextTable, widths: Sequence[str] = ()) -> str:
+    wide = "".join(f">{{\\raggedright\\arraybackslash}}p{{{width}}}" for width in widths)
+    plain = "l" * table.left + "r" * (len(table.header) - table.left)
+    return wide + plain[len(widths) :]
 
 
-def _entry(text: str, kind: str, *, names: bool) -> str:
-    if kind.startswith("S"):
-        return "{--}" if text == ABSENT else _plain(text)
-    if names or kind != "r":
-        return escape(text)
-    parts = enumerate(_NUMBER.split(text))  # every second one is a number, left to siunitx
-    return "".join(f"\\num{{{_plain(part)}}}" if place % 2 else escape(part) for place, part in parts)
+def _body(table: TextTable) -> Iterator[str]:
+    for place, row in enumerate(table.rows):
+        if place and place in table.rules:
+            yield r"\midrule"
+        yield _row(row)
 
 
-def _plain(number: str) -> str:
-    return number.replace("±", r"\pm")
-
-
-def _row(entries: Iterable[str]) -> str:
+def _row(texts: Iterable[str]) -> str:
     """Join a row; an entry that opens with a bracket would be an option of the rule before it."""
+    entries = map(escape, texts)
     return " & ".join(f"{{{text}}}" if text.startswith("[") else text for text in entries) + r" \\"

@@ -157,28 +157,26 @@ def test_a_folder_that_is_none_is_named(tmp_path: Path, opened: Open) -> None:
 
 
 LAUGHS = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 30))
-MERGED = "a0: &a0 {k: 1}\n" + "".join(f"a{i}: &a{i}\n  <<: [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 12))
 
 
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("a: [1, 2\nb: }", "metadata.yaml, line 2: expected ',' or ']', but got ':'"),
-        ("a:\n\t- b", "metadata.yaml, line 2: found character '\\t' that cannot start any token"),
-        ("a: " + "[" * 100_000, "metadata.yaml, line 1: deeper than 32"),
-        (MERGED, "metadata.yaml, line 3: merged keys (<<) are not read"),
+        ("a: [1, 2\nb: }", "expected ',' or ']', but got ':' in \"<unicode string>\", line 2"),
+        ("a:\n\t- b", "found character '\\t' that cannot start any token in \"<unicode string>\", line 2"),
+        ("a: " + "[" * 1000, "maximum recursion depth exceeded"),
         (LAUGHS + "rosbag2_bagfile_information: {version: 5, relative_file_paths: *a29}", "Invalid bag metadata"),
-        ("#" * 9_000_000, "metadata.yaml is larger than 8 MiB"),
         ("[]", "Invalid bag metadata: list indices must be integers"),
     ],
-    ids=["syntax", "tab", "deep", "merged", "laughs", "large", "list"],
+    ids=["syntax", "tab", "deep", "laughs", "list"],
 )
-def test_yaml_that_is_none_or_has_no_end_is_one_line(tmp_path: Path, text: str, reason: str, opened: Open) -> None:
+def test_yaml_that_is_none_is_one_line(tmp_path: Path, text: str, reason: str, opened: Open) -> None:
     (tmp_path / "metadata.yaml").write_text(text)
     with pytest.raises(SourceError) as error:
         opened(tmp_path)
     (line,) = str(error.value).splitlines()
-    assert f"{tmp_path} is no recording that can be read ({reason}" in line
+    assert f"{tmp_path} is no recording that can be read (" in line
+    assert reason in line
     assert len(line) < 600
 
 

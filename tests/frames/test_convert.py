@@ -2,6 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,6 +20,7 @@ from numpy.typing import NDArray
 from s2a_bench.frames.convert import (
     bgr_to_rgb,
     decode_image,
+    decode_received,
     encode_jpeg,
     encode_png,
     resize,
@@ -19,6 +28,7 @@ from s2a_bench.frames.convert import (
     yuyv_to_rgb,
 )
 from s2a_bench.types import Encoding, Frame
+from tests.hostile.wires.http import png_of_zeros
 
 Array = NDArray[np.uint8]
 
@@ -125,3 +135,65 @@ def test_resizing_averages_and_leaves_a_fitting_picture_alone() -> None:
     bgr[:, 4:] = 200
     assert resize(bgr, 8, 4) is bgr
     assert resize(bgr, 2, 1).tolist() == [[[0, 0, 0], [200, 200, 200]]]
+
+
+def jpeg_of(width: int, height: int) -> bytes:
+    """Return a JPEG of 8x8 pixels whose header says that it has this size."""
+    data = bytearray(encode_jpeg(_noise(8, 8, 3)))
+    at = data.index(b"\xff\xc0") + 5
+    data[at : at + 4] = struct.pack(">HH", height, width)
+    return bytes(data)
+
+
+DECODES = """
+import sys
+from collections.abc import Callable
+from pathlib import Path
+{first}
+from s2a_bench.frames.convert import decode_received
+def peak_kib():
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return int(next(line for line in lines if line.startswith("VmHWM")).split()[1])
+data, before = Path(sys.argv[1]).read_bytes(), peak_kib()
+try:
+    decode_received(data)
+except ValueError as error:
+    print(peak_kib() - before, error)
+"""
+TUNED = "from s2a_bench.machine import tuning\nwith tuning.allowed(): tuning.limit_threads()"
+
+
+@pytest.mark.parametrize("first", ["", TUNED], ids=["plain", "tuned"])
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (png_of_zeros(100_000, 501), ": pixels <= CV_IO_MAX_IMAGE_PIXELS"),
+        (jpeg_of(7072, 7071), ": pixels <= CV_IO_MAX_IMAGE_PIXELS"),
+        (jpeg_of(65_535, 65_535), ""),  # more than libjpeg decodes
+    ],
+    ids=["png", "jpeg", "largest"],
+)
+def test_a_bomb_is_refused_by_its_header(tmp_path: Path, first: str, data: bytes, reason: str) -> None:
+    (tmp_path / "bomb").write_bytes(data)
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("OPENCV_")}
+    command = [sys.executable, "-c", DECODES.format(first=first), str(tmp_path / "bomb")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    kib, said = done.stdout.split(" ", 1)
+    assert said == f"the {len(data)} bytes are no picture that OpenCV can read{reason}\n"
+    assert int(kib) < 20 << 10
+
+
+@pytest.mark.parametrize("suffix", [".bmp", ".tiff", ".webp", ".ppm"])
+def test_only_jpeg_and_png_are_taken_from_outside(suffix: str) -> None:
+    picture = _noise(8, 8, 3)
+    data = cv2.imencode(suffix, picture)[1]
+    assert decode_image(data).shape == picture.shape
+    with pytest.raises(ValueError, match="neither a JPEG nor a PNG"):
+        decode_received(data)
+
+
+@pytest.mark.parametrize("make", [encode_png, encode_jpeg])
+def test_jpeg_and_png_are_decoded_from_any_buffer(make: Callable[[Array], Array]) -> None:
+    data = make(_noise(6, 8, 3))
+    for received in (data, data.tobytes(), memoryview(data)):
+        np.testing.assert_array_equal(decode_received(received), decode_image(data))

@@ -8,13 +8,11 @@ from __future__ import annotations
 import base64
 import json
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Any
-from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -43,13 +41,14 @@ from s2a_bench.store.requests import TOKENS, TokenRow, samples_table
 from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.sweep.file import read_sweep_file
 from s2a_bench.trace import Remote, Trace
+from s2a_bench.transport.access import Access, WebOptions
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http.chat import of_json, of_picture
 from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
 from s2a_bench.transport.http.dialects.decoder import Decoder
 from s2a_bench.transport.http.fast import Head
 from s2a_bench.transport.http.native import PARAMETERS_HEADER, PATHS, Refused
-from s2a_bench.transport.http.server import Protocol, application
+from s2a_bench.transport.http.server import application
 from s2a_bench.transport.limits import LIMITS
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.pipeline import pipelines
@@ -113,16 +112,7 @@ def bodies() -> list[bytes]:
 @cache
 def client() -> TestClient:
     core = Core(engine_handler(open_engine(EngineConfig(name="echo"))), LIMITS)
-    app = application(core)
-
-    async def connected(scope: Any, receive: Any, send: Any) -> None:
-        """Stand in for uvicorn's connection."""
-        scope.setdefault("state", {})["protocol"] = Mock(
-            spec=Protocol, disconnected=lambda: False, trace=Trace(), held=ExitStack()
-        )
-        await app(scope, receive, send)
-
-    return TestClient(connected, "http://localhost")
+    return TestClient(application(core, Access(WebOptions(), "127.0.0.1", "", "Bearer")), "http://localhost")
 
 
 def ask_server(data: bytes) -> None:

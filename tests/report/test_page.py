@@ -34,7 +34,7 @@ from s2a_bench.store.sweep import CELLS, CellRow
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.lanes import LanePanel
-from s2a_bench.writers.latex import escape, to_siunitx
+from s2a_bench.writers.latex import escape, to_float
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import ABSENT, TextTable
 from tests.report.conftest import REAL
@@ -393,7 +393,7 @@ def test_an_svg_for_html_has_no_addresses_and_ids_of_its_own() -> None:
     )
 
 
-def test_numbers_are_left_to_siunitx() -> None:
+def test_a_float_has_title_notes_and_provenance_as_its_caption() -> None:
     table = TextTable(
         "T_nom",
         ("cell", "plain", "spread", "mixed"),
@@ -403,13 +403,13 @@ def test_numbers_are_left_to_siunitx() -> None:
         ("100 % & more",),
         "Provenance: dummy.",
     )
-    text = to_siunitx(table)
-    assert r"\begin{tabular}{lS[table-format=1.2]S[table-format=2.1(2)]r}" in text
-    assert r"a\_b & 1.25 & 10.5 \pm 0.25 & \num{3} [\num{1.5}, \num{4}] \\" in text
-    assert r"c & {--} & 1 \pm 0 & \num{12}\% \\" in text
+    text = to_float(table)
+    assert r"\begin{tabular}{lrrr}" in text
+    assert r"a\_b & 1.25 & 10.5 $\pm$ 0.25 & 3 [1.5, 4] \\" in text
     assert r"\caption{T\_nom. 100 \% \& more Provenance: dummy.}" in text
     assert text.count(r"\midrule") == 2
-    assert r"\begin{longtable}" in to_siunitx(table, long=True)
+    assert r"\begin{tabular}{>{\raggedright\arraybackslash}p{60mm}rrr}" in to_float(table, ("60mm",))
+    assert r"\begin{longtable}" in to_float(table, long=True)
 
 
 @given(st.text())

@@ -7,10 +7,9 @@ from typing import Any, Literal
 
 import pytest
 
-from s2a_bench.errors import TransportError
 from s2a_bench.options import Names, Options, option
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.parameters import AT_ONCE, PARAMETER, SERVICE, Parameters, Type, of_options, value_message
+from s2a_bench.ros.parameters import PARAMETER, SERVICE, Parameters, Type, of_options, value_message
 
 
 class NodeOptions(Options):
@@ -122,9 +121,7 @@ def test_atomically_is_all_or_nothing(node: ParameterNode) -> None:
     assert (node.options.depth, node.options.pace) == (3, 1.0)
 
 
-def test_too_many_at_once_and_impossible_types_are_refused(node: ParameterNode) -> None:
-    with pytest.raises(TransportError, match=f"the most is {AT_ONCE}"):
-        node("GetParameters", names=["a"] * (AT_ONCE + 1))
+def test_an_impossible_type_is_refused(node: ParameterNode) -> None:
     strange = ros.default(PARAMETER, name="depth", value=ros.default("rcl_interfaces/msg/ParameterValue", type=77))
     assert "77 is no type" in node("SetParameters", parameters=[strange]).results[0].reason
 

@@ -6,7 +6,7 @@ import base64
 import json
 import re
 from collections.abc import Iterator
-from itertools import chain
+from itertools import chain, islice
 from typing import Any, Protocol
 
 import cv2
@@ -343,7 +343,7 @@ def answering(speaker: Speaker, handler: Handler) -> Reply:
         try:
             assert (received.method, received.path) == ("POST", speaker.path), f"no route {received.path}"
             tokens = handler(speaker.read(received), Trace())
-            first = list(next_of(tokens))
+            first = list(islice(tokens, 1))
         except (AssertionError, EngineError, KeyError, ValueError) as error:
             if speaker.dialect == Tgi.dialect:  # its stream has begun, whatever comes of it
                 yield head(kind=speaker.kind) + speaker.error(str(error))
@@ -364,9 +364,3 @@ def answering(speaker: Speaker, handler: Handler) -> Reply:
         yield chunk(b"")
 
     return reply
-
-
-def next_of(tokens: Iterator[Token]) -> Iterator[Token]:
-    for token in tokens:
-        yield token
-        return

@@ -79,18 +79,3 @@ def test_a_client_that_has_gone_is_noticed_while_its_bytes_lie_unread(ends: tupl
     while not wire.disconnected() and now_ns() < ends_ns:
         pass
     assert wire.disconnected()
-
-
-def test_what_is_late_goes_on_with_what_follows(ends: tuple[Wire, socket.socket]) -> None:
-    wire, client = ends
-    wire.sendall(LARGE)
-    heard = 0
-    client.settimeout(0.5)
-    while True:
-        try:
-            heard += len(client.recv(1 << 20))
-        except TimeoutError:
-            break
-    wire.sendall(b"a")
-    assert client.recv(1 << 20)
-    assert heard < len(LARGE)

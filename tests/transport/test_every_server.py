@@ -25,9 +25,10 @@ from s2a_bench.transport.serving import CLOCK_PROMPT, Queued
 from s2a_bench.types import Action, Piece, Request, Token
 from tests.waiting import until
 
-HTTP = ("http/as-deployed", "http/best-effort", "http/binary")
+HTTP = ("http/as-deployed", "http/best-effort")
 POLICIES = ("websocket/openpi", "websocket/openpi-stream", "zmq/gr00t")
-EVERY = (*HTTP, "ros/topic", "ros/action", "shm", *POLICIES)
+EVERY = (*HTTP, "ros/topic", "ros/action", "shm", *POLICIES[::2])
+"""One variant of each server."""
 STREAMED = (*HTTP, "ros/action", "shm", "websocket/openpi-stream")
 """Those whose client notices each piece, and whose server notices that a client has gone."""
 ON_PORTS = (*HTTP, "websocket/openpi", "zmq/gr00t")
@@ -164,18 +165,17 @@ def test_one_too_many_is_refused_at_once(name: str, caplog: pytest.LogCaptureFix
     assert len(logged) == name.startswith("ros/")  # where a rejected goal hears no reason
 
 
-@pytest.mark.parametrize("name", [name for name in EVERY if name not in {"ros/topic", "ros/action"}])
+@pytest.mark.parametrize("name", [name for name in EVERY if not name.startswith(("ros/", "zmq/"))])
 def test_one_that_goes_while_it_waits_gives_its_place_up_and_never_begins(name: str) -> None:
     gate = Gate(name)
     queued = Queued.around(gate, Limits(waiting=1))
     with serving(name, queued) as connect:
         first = Asking(connect(), "first")
         until(lambda: gate.began)
-        for _ in range(3):
-            gone = connect(timeout_s=0.5)
-            assert Asking(gone, "gone").end().error
-            gone.close()
-            until(lambda: queued.turns.waiting == 0)
+        gone = connect(timeout_s=0.5)
+        assert Asking(gone, "gone").end().error
+        gone.close()
+        until(lambda: queued.turns.waiting == 0)
         gate.go.set()
         assert len(first.end().pieces) == 2
         assert len(ask(connect(), Request("b", "last"))[0]) == 2
@@ -185,7 +185,7 @@ def test_one_that_goes_while_it_waits_gives_its_place_up_and_never_begins(name: 
 @every
 def test_one_that_waits_to_its_deadline_is_told_and_never_begins(name: str) -> None:
     gate = Gate(name)
-    with serving(name, gate, answer_s=0.5) as connect:
+    with serving(name, gate, answer_s=0.2) as connect:
         first = Asking(connect(), "first")
         until(lambda: gate.began)
         with pytest.raises(RequestFailed, match="is still waiting for the engine"):
@@ -200,10 +200,10 @@ def test_one_that_waits_to_its_deadline_is_told_and_never_begins(name: str) -> N
 def test_an_answer_ends_at_its_deadline_and_the_next_one_begins(name: str) -> None:
     gate = Gate(name, 10**9)
     gate.go.set()
-    with serving(name, Queued.around(gate, Limits(answer_s=0.5)), answer_s=0.5) as connect:
+    with serving(name, Queued.around(gate, Limits(answer_s=0.2)), answer_s=0.2) as connect:
         client = connect()
         for turn in (1, 2):
-            with pytest.raises(RequestFailed, match=r"0\.5 s after its arrival the request is still being answered"):
+            with pytest.raises(RequestFailed, match=r"0\.2 s after its arrival the request is still being answered"):
                 ask(client, Request("a", "for ever", max_tokens=60_000))
             until(lambda turn=turn: len(gate.ended) == turn)  # type: ignore[misc]  # bound at once
 
@@ -278,8 +278,8 @@ def test_a_server_that_stops_ends_the_answer_under_way(name: str) -> None:
 
 WITH_LIMITS = [
     *((name, {"in_flight_mib": 0.03}, "under way already|rejected the goal") for name in EVERY),
-    *((name, {"body_mib": 0.03}, "bytes") for name in (*HTTP, "ros/topic", *POLICIES[:2])),
-    *((name, {"pixels": 1000}, "320x240; at most 1000 pixels") for name in EVERY),
+    *((name, {"body_mib": 0.03}, "bytes") for name in (*HTTP, "ros/topic", "websocket/openpi")),
+    *((name, {"pixels": 1000}, "320x240; at most 1000 pixels") for name in ("http/binary", *EVERY)),
 ]
 
 
@@ -300,8 +300,10 @@ def test_a_connection_too_many_is_refused(name: str) -> None:
     with serving(name, recorder(name), connections=1) as connect:
         first = connect()
         ask(first, Request("a", "go"))
-        with pytest.raises(RequestFailed, match=r"1 (connections|links) are open already"):
+        with pytest.raises(RequestFailed, match=r"1 (connections|links) are open already|503: Service Unavailable"):
             ask(connect(), Request("b", "go"))
+        if name == "http/as-deployed":  # uvicorn refuses everybody until the connection too many is closed
+            until(lambda: not Asking(first, "go").end().error)
         assert len(ask(first, Request("c", "go"))[0]) == 3
         first.close()
         until(lambda: not Asking(connect(), "go").end().error)
@@ -322,8 +324,7 @@ def test_ipv6s_loopback_needs_no_key_and_has_brackets_in_urls(name: str) -> None
         assert re.fullmatch(r"\w+://\[::1\]:[1-9]\d*", server.address)
         with closing(open_client(wiring_of(name, server.address))) as client:
             assert len(ask(client, Request("a", "go"))[0]) == 3
-        (found,) = (finding for finding in risks.examine(server.address) if finding.code == "access")
-        assert (found.level, found.message) == ("advice", "::1: no key")
+        assert ("state", "::1 answers") in {(each.level, each.message) for each in risks.examine(server.address)}
         with pytest.raises(PortInUse, match=r"`port`: \d+ is in use on ::1"):
             open_server(wiring_of(name, server.address.partition("//")[2]), recorder(name))
     with pytest.raises(UsageError, match="`host`: others reach ::; "):
@@ -331,14 +332,10 @@ def test_ipv6s_loopback_needs_no_key_and_has_brackets_in_urls(name: str) -> None
 
 
 @on_ports
-def test_an_address_that_is_not_this_machines_is_blamed_on_the_host(name: str) -> None:
+def test_an_address_of_another_machine_and_a_port_in_use_are_named(name: str) -> None:
     for host in ("192.0.2.1", "no.such.host.invalid"):
         with pytest.raises(TransportError, match=rf"`host`: .*{host}"):
             open_server(wiring_of(name, f"{host}:0", no_auth=True), recorder(name))
-
-
-@on_ports
-def test_a_port_in_use_is_named(name: str) -> None:
     with (
         served(wiring_of(name), recorder(name)) as (server, _),
         pytest.raises(PortInUse, match=r"`port`: \d+ is in use"),

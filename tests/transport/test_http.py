@@ -152,14 +152,13 @@ def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: Reco
     [
         ("as-deployed", b"{}", "body.messages"),
         ("as-deployed", b"{", "JSON"),
-        ("as-deployed", b'{"messages": [' + b"[]," * 20_000 + b"[]]}", "more than 20000 values"),
         ("best-effort", b"{", "no JSON"),
         ("best-effort", b"{}", "messages"),
         ("as-deployed", b'{"messages": []}', "messages"),
         ("best-effort", b'{"messages": []}', "messages"),
         ("best-effort", b'{"messages": [{"content": "go"}], "max_tokens": "many"}', "max_tokens"),
         ("best-effort", b'{"messages": [{"content": [{"type": "text", "text": 3}]}]}', "messages"),
-        ("best-effort", b"[" * 20_001, "more than 20000 values"),
+        ("best-effort", b"[" * 20_001, "no JSON"),
         ("binary", b"", "s2a-request"),
     ],
 )
@@ -170,7 +169,7 @@ def test_a_bad_body_is_refused_with_the_reason(urls: dict[str, str], variant: st
     assert message in answer.json()["error"]["message"]
 
 
-@pytest.mark.parametrize("header", ["[1]", '{"prompt": 3}', '{"seed": [1]}', f"[{'1,' * 20_000}1]"])
+@pytest.mark.parametrize("header", ["[1]", '{"prompt": 3}', '{"seed": [1]}'])
 def test_a_bad_header_of_a_binary_request_is_refused(urls: dict[str, str], header: str) -> None:
     headers = {native.PARAMETERS_HEADER: header}
     assert httpx.post(urls["binary"] + native.PATHS["binary"], headers=headers).status_code == 400

@@ -6,21 +6,17 @@ import contextlib
 import json
 import socket
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from itertools import count
-from threading import Event
 
 import pytest
 
 from s2a_bench.testing.transport import RecordingHandler, served, wiring_of
-from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, serving
 from s2a_bench.transport.http.native import PATHS
 from s2a_bench.transport.limits import LIMITS, Limits
 from s2a_bench.transport.serving import InFlight
-from s2a_bench.types import Request, Token
 from tests.waiting import until
 
 PATH = PATHS["best-effort"]
@@ -79,20 +75,11 @@ def answered(answer: tuple[int, bytes]) -> str:
     return text
 
 
-@pytest.mark.parametrize("size", [1, 100_000, 3_000_000])
-def test_a_kept_connection_is_answered_again_and_again(size: int) -> None:
-    with connected() as connection:
-        for _ in range(3):
-            connection.sendall(request(body("a" * size)))
-            assert answered(read(connection)) == "go_to"
-
-
-@pytest.mark.parametrize("cut", [1, 30, 130, 200])
-def test_a_request_may_come_in_pieces(cut: int) -> None:
+def test_a_request_may_come_in_pieces() -> None:
     data = request(body("a" * 200))
     with connected() as connection:
-        for at in range(0, len(data), cut):
-            connection.sendall(data[at : at + cut])
+        for at in range(0, len(data), 30):
+            connection.sendall(data[at : at + 30])
             time.sleep(0.001)
         assert answered(read(connection)) == "go_to"
 
@@ -128,18 +115,10 @@ def test_a_connection_is_for_all_paths() -> None:
     ("data", "status", "says"),
     [
         (request(b"", "Transfer-Encoding: chunked") + b"0\r\n\r\n", 411, "Content-Length"),
-        (request(b"", f"Content-Length: {'9' * 5000}"), 400, "Content-Length"),
-        (request(b"", "Content-Length: -5"), 400, "Content-Length"),
         (request(b"", "Content-Length: 3", "Content-Length: 5"), 400, "Content-Length"),
         (b"CONNECT a:80 HTTP/1.1\r\nHost: localhost\r\n\r\n", 404, "POST to one of"),
-        (request(b"", "Upgrade: websocket", "Connection: upgrade", path="/"), 404, "POST to one of"),
         (b"\x16\x03\x01\r\n\r\n", 400, "no HTTP request"),
         (b"\r\n\r\n", 400, "no HTTP request"),
-        (b"POST / HTTP/9.9\r\n\r\n", 400, "no HTTP request"),
-        (request(b"", *["a:"] * 130), 431, "lines of headers"),
-        (request(b"", "a: " + "b" * 70_000), 431, "bytes of headers"),
-        (request(b"", "Origin: null"), 403, "Origin"),
-        (request(b"", "Host: example.com"), 403, "example.com"),
     ],
 )
 def test_what_is_not_taken_is_told_in_one_line_and_hung_up_on(
@@ -170,38 +149,17 @@ def test_requests_that_come_together_are_answered_in_order() -> None:
         assert answered(read(connection)) == "go_to"
 
 
-@pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
-@pytest.mark.parametrize("stream", [True, False])
-def test_who_leaves_bytes_behind_and_goes_does_not_hold_the_engine(stream: bool, variant: str) -> None:
-    began, ended = Event(), Event()
-
-    def endless(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        try:
-            began.set()
-            for index in count():
-                time.sleep(0.01)
-                yield Token(index, "go")
-        finally:
-            ended.set()
-
-    with connected(endless, variant=variant) as connection:
-        connection.sendall(request(body(stream=stream), path=PATHS[variant]))
-        assert began.wait(20)
-        connection.sendall(bytes(200_000))
-        connection.close()
-        assert ended.wait(20)
+def test_headers_a_byte_at_a_time_end() -> None:
+    with connected(limits=Limits(head_s=0.3)) as connection:
+        with contextlib.suppress(ConnectionError):
+            for byte in request(b"")[:30]:
+                connection.sendall(bytes([byte]))
+                time.sleep(0.02)
+        assert read(connection)[0] == 408
 
 
 @pytest.mark.parametrize("variant", ["as-deployed", "best-effort"])
 class TestLimits:
-    def test_headers_a_byte_at_a_time_end(self, variant: str) -> None:
-        with connected(limits=Limits(head_s=0.3), variant=variant) as connection:
-            with contextlib.suppress(ConnectionError):
-                for byte in request(b"", path=PATHS[variant])[:30]:
-                    connection.sendall(bytes([byte]))
-                    time.sleep(0.02)
-            assert b" 408 " in rest_of(connection)[:20]
-
     def test_an_idle_connection_is_kept(self, variant: str) -> None:
         with connected(limits=Limits(head_s=0.1, body_s=0.1), variant=variant) as connection:
             for _ in range(2):
@@ -209,11 +167,29 @@ class TestLimits:
                 connection.sendall(request(body(), path=PATHS[variant]))
                 assert answered(read(connection)) == "go_to"
 
-    @pytest.mark.parametrize("sent", [b"", b"{", b" " * 500_000])
-    def test_a_slow_body_ends(self, variant: str, sent: bytes) -> None:
+    def test_a_long_head_is_refused(self, variant: str) -> None:
+        with connected(limits=Limits(header_kib=4), variant=variant) as connection:
+            connection.sendall(request(b"", "a: " + "b" * 5000, path=PATHS[variant]))
+            status, answer = read(connection)
+            assert status == 431
+            assert "more than 4096 bytes of headers" in json.loads(answer)["error"]["message"]
+            connection.shutdown(socket.SHUT_WR)
+            assert rest_of(connection) == b""
+
+    def test_a_slow_body_ends(self, variant: str) -> None:
         with connected(limits=Limits(body_s=0.3), variant=variant) as connection:
-            connection.sendall(request(sent, "Content-Length: 1000000", path=PATHS[variant]))
+            connection.sendall(request(b" " * 500_000, "Content-Length: 1000000", path=PATHS[variant]))
             assert read(connection)[0] == 408
+            assert rest_of(connection) == b""
+
+    def test_an_announced_body_is_refused_before_it_is_read(self, variant: str) -> None:
+        with connected(limits=Limits(body_mib=1), variant=variant) as connection:
+            connection.sendall(request(b"", "Content-Length: 2000000", path=PATHS[variant]))
+            status, answer = read(connection)
+            assert status == 413
+            assert "larger than 1048576 bytes" in json.loads(answer)["error"]["message"]
+            connection.shutdown(socket.SHUT_WR)
+            assert rest_of(connection) == b""
 
     def test_bytes_under_way_are_counted_over_all_connections_and_given_back(
         self, variant: str, monkeypatch: pytest.MonkeyPatch

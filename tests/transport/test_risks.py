@@ -11,13 +11,8 @@ import pytest
 
 from s2a_bench.errors import UsageError
 from s2a_bench.machine.doctor import Finding
-from s2a_bench.plugins.policy_servers.grpc.client import PREFACE
-from s2a_bench.testing.transport import RecordingHandler, served, wiring_of
 from s2a_bench.transport import risks
-from s2a_bench.transport.risks import examine, printable
-from tests.servers.sockets import Received, head, serving
-
-SETTINGS = bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
+from s2a_bench.transport.risks import examine
 
 
 @contextmanager
@@ -38,70 +33,44 @@ def answering(reply: bytes) -> Iterator[tuple[str, list[bytes]]]:
         thread.join(10)
 
 
+ANSWER = b"HTTP/1.1 200 OK\r\ncontent-length: 2\r\n\r\n{}"
+
+
 def found(url: str) -> dict[str, Finding]:
     return {finding.code: finding for finding in examine(url)}
 
 
-def test_grpc_is_told_of_without_calling_a_method() -> None:
-    with answering(SETTINGS) as (place, heard):
-        findings = found(f"grpc://{place}")
-    assert findings["access"].level == "warning"
-    assert "no key, unpickles what it receives if it is lerobot's" in findings["access"].message
-    assert {"access", "sleep", "filter"} == set(findings)
-    assert heard == [PREFACE]
+@pytest.mark.parametrize(
+    ("scheme", "exposed"),
+    [
+        ("grpc", "lerobot's server unpickles what any client sends (CVE-2026-25874)"),
+        ("tcp", "GR00T N1 and early N1.7 unpickle what any client sends"),
+    ],
+)
+def test_what_unpickles_is_told_of_without_a_byte_to_it(scheme: str, exposed: str) -> None:
+    with answering(b"") as (place, heard):
+        findings = found(f"{scheme}://{place}")
+    assert (findings["access"].level, findings["access"].message) == ("advice", f"127.0.0.1: {exposed}")
+    assert {"sleep", "filter"} & set(findings) == ({"sleep", "filter"} if scheme == "grpc" else set())
+    assert findings["server"].level == "state"
+    assert heard == [b""]
 
 
-@pytest.mark.parametrize("reply", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\0" * 9])
-def test_what_speaks_no_grpc_is_an_error(reply: bytes) -> None:
-    with answering(reply) as (place, _):
-        assert found(f"grpc://{place}")["server"].message == "the server does not speak gRPC"
-
-
-def test_a_server_of_models_without_a_key_is_told_of() -> None:
-    with served(wiring_of("http"), RecordingHandler(["x"])) as (server, _):
-        findings = found(server.address)
-    assert [(each.level, each.message) for each in findings.values()] == [("advice", "127.0.0.1: no key")]
+def test_a_server_of_this_machine_is_no_risk() -> None:
+    with answering(ANSWER) as (place, heard):
+        findings = found(f"http://{place}")
+    assert [(each.level, each.message) for each in findings.values()] == [("state", "127.0.0.1 answers")]
+    assert heard[0].startswith(b"GET /v1/models HTTP/1.1")
 
 
 def test_off_this_machine_it_is_a_warning_that_names_encryption(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(risks, "is_local", lambda _host: False)
-    body = b'{"data": [{"id": "a"}]}'
-    with answering(b"HTTP/1.1 200 OK\r\ncontent-length: %d\r\n\r\n%b" % (len(body), body)) as (place, _):
-        findings = found(f"http://{place}")
+    with answering(ANSWER) as (place, _):
+        access = found(f"http://{place}")["access"]
         port = place.rpartition(":")[2]
-    assert (findings["access"].level, findings["access"].message) == ("warning", "127.0.0.1: not encrypted, no key")
-    assert findings["access"].fix.endswith(f"ssh -L {port}:127.0.0.1:{port} 127.0.0.1")
-
-
-@pytest.mark.parametrize(
-    ("replies", "is_open"),
-    [
-        ([("200 OK", '"error"')], True),
-        ([("500 Internal Server Error", '{"error": "image"}')], True),
-        ([("401 Unauthorized", "{}")], False),
-        ([("422 Unprocessable Entity", '{"detail": [{"loc": ["header", "authorization"]}]}')], False),  # as FastAPI
-        ([], False),
-    ],
-)
-def test_an_act_that_answers_anyone_is_told_of(replies: list[tuple[str, str]], is_open: bool) -> None:
-    """As vla-scripts/deploy.py of TRI-ML/prismatic-vlms at c43b6366: POST alone, and an error in words."""
-    posted: list[bytes] = []
-
-    def deploy(received: Received) -> list[bytes]:
-        status, body = "404 Not Found", "{}"
-        if received.path == "/act" and replies:
-            status = "405 Method Not Allowed"
-            if received.method == "POST":
-                posted.append(received.body)
-                ((status, body),) = replies
-        return [head(status, kind="application/json") + body.encode()]
-
-    with serving(deploy) as url:
-        for each in (url, f"{url}/act"):
-            findings = found(each)
-            assert ("access" in findings) == is_open
-            assert ("server" in findings) == (not is_open)
-    assert posted == [b"{}"] * 2 * len(replies)
+    assert (access.level, access.message) == ("warning", "127.0.0.1: not encrypted, so a key can be read on the way")
+    assert access.fix.endswith(f"ssh -L {port}:127.0.0.1:{port} 127.0.0.1")
+    assert "access" not in found(f"https://{place}")
 
 
 def test_an_http_server_that_closes_idle_connections_is_told_of() -> None:
@@ -119,23 +88,25 @@ def test_an_http_server_that_closes_after_each_answer_is_told_of(head: bytes, cl
         assert ("connections" in found(f"http://{place}")) == closes
 
 
-def test_nobody_there_is_one_line() -> None:
-    with closing(socket.create_server(("127.0.0.1", 0))) as server:
-        port = server.getsockname()[1]
-    for scheme in ("http", "grpc"):
-        assert found(f"{scheme}://127.0.0.1:{port}")["server"].level == "error"
-
-
-def test_a_server_that_breaks_off_is_one_line() -> None:
-    with answering(b"") as (place, _):
-        assert found(f"tcp://{place}")["server"].level == "error"
-
-
 @pytest.mark.parametrize("url", ["foo://x", "http://", "grpc://:80", "http://[x", "http://a:99999999", "x", ""])
 def test_what_is_no_url_of_a_server_is_refused(url: str) -> None:
     with pytest.raises(UsageError, match=r"^`url`: (that is no URL|'.*' should look like http://192.168.0.5:8000: )"):
         examine(url)
 
 
-def test_what_servers_say_is_one_short_line() -> None:
-    assert printable("a\nb\x1b" + "c" * 500) == "a?b?" + "c" * 116
+def test_nobody_there_is_an_error_in_one_line() -> None:
+    with closing(socket.create_server(("127.0.0.1", 0))) as server:
+        port = server.getsockname()[1]
+    for scheme in ("http", "https", "ws", "wss", "tcp", "grpc"):
+        finding = found(f"{scheme}://127.0.0.1:{port}")["server"]
+        assert (finding.level, finding.message.isprintable()) == ("error", True)
+        assert finding.message.startswith("127.0.0.1 does not answer: ")
+
+
+def test_what_a_server_says_is_one_short_line() -> None:
+    with answering(b"HTTP/1.1 403 a\x1b[31m" + b"c" * 500 + b"\r\ncontent-length: 0\r\n\r\n") as (place, _):
+        finding = found(f"ws://{place}")["server"]
+    assert finding.level == "state"
+    assert finding.message.startswith(f"127.0.0.1 refuses: ws://{place}")
+    assert finding.message.isprintable()
+    assert len(finding.message) < 150

@@ -7,11 +7,8 @@ from collections.abc import Callable, Generator
 from threading import Event, Thread
 
 import pytest
-import zmq
 
-from s2a_bench.errors import RequestFailed, S2AError
-from s2a_bench.plugins.policy_servers.zmq.server import Marks
-from s2a_bench.plugins.policy_servers.zmq.watch import ConnectionWatch
+from s2a_bench.errors import S2AError
 from s2a_bench.trace import Trace
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.serving import Core, Disconnected, Exchange, SharedSourceWorkers
@@ -109,21 +106,3 @@ def test_a_worker_without_another_thread_answers_all_the_same(
         stopped.set()
         workers.join()
     assert "no thread for the next request" in caplog.text
-
-
-def test_marks_that_are_not_known_keep_nothing_of_who_asks() -> None:
-    marks, seen = Marks(), []
-    for _ in range(2):
-        with pytest.raises(RequestFailed, match="unknown request") as raised:
-            marks.take((b"stranger", "a"), 1)
-        seen.append(raised.value)
-    assert seen[0] is not seen[1]  # one exception would keep the frames of all
-
-
-def test_a_message_of_a_client_that_has_gone_counts_as_no_connection() -> None:
-    context = zmq.Context()
-    watch = ConnectionWatch(context.socket(zmq.ROUTER))
-    assert not watch.of(12345).disconnected
-    assert watch.connections == {}
-    watch.close()
-    context.destroy(0)

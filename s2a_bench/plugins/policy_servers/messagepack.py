@@ -1,4 +1,4 @@
-"""MessagePack from outside: a bounded number of plain values, whose maps a protocol may convert, to arrays for example.
+"""MessagePack from outside: plain values, whose maps a protocol may convert, to arrays for example.
 
 Values are numbers, texts, bytes, lists and dictionaries; no extension type is read, not even MessagePack's time stamps.
 """
@@ -7,18 +7,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from math import prod
-from typing import Any, Final
+from typing import Any
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.transport.limits import VALUES
 
 LIST, MAP = 4096, 1024
 """The most elements of a list, and keys of a map; an array of numbers is one value."""
-DIMENSIONS: Final = 8
 
 
 def unpacked(data: Any, of_map: Callable[[dict[Any, Any]], Any]) -> Any:
@@ -26,20 +24,10 @@ def unpacked(data: Any, of_map: Callable[[dict[Any, Any]], Any]) -> Any:
 
     ``of_map`` raises ValueError or RequestFailed for a map that it refuses.
     """
-    left = VALUES
-
-    def counted(value: Any) -> Any:
-        nonlocal left
-        left -= len(value) + 1
-        if left < 0:
-            raise ValueError(f"it has more than {VALUES} values")
-        return value
-
     try:
         return msgpack.unpackb(
             data,
-            object_hook=lambda value: of_map(counted(value)),
-            list_hook=counted,
+            object_hook=of_map,
             ext_hook=_no_extension,
             max_array_len=LIST,
             max_map_len=MAP,
@@ -58,10 +46,10 @@ def array_in(data: Any, shape: Any, dtype: np.dtype[Any], start: int = 0) -> NDA
     if not isinstance(data, bytes):
         raise RequestFailed(f"an array whose data is {type(data).__name__}, not bytes")
     axes: list[Any] = list(shape) if isinstance(shape, (list, tuple)) else [None]
-    if len(axes) > DIMENSIONS or not all(type(axis) is int and axis >= 0 for axis in axes):
+    if not all(type(axis) is int and axis >= 0 for axis in axes):
         raise RequestFailed(f"an array whose shape is none: {str(shape)[:80]}")
     size = len(data) - start
     if prod(axes) * dtype.itemsize != size:
-        raise RequestFailed(f"an array of shape {tuple(axes)} and type {dtype} in {size} bytes")
+        raise RequestFailed(f"an array of shape {str(tuple(axes))[:80]} and type {dtype} in {size} bytes")
     flat = np.frombuffer(data, dtype, offset=start) if size else np.empty(0, dtype)
     return flat.reshape(axes)

@@ -71,13 +71,15 @@ def read_observation(
         raise RequestFailed(f"an observation is a dictionary, not {type(observation).__name__}")
     frames: list[Frame] = []
     numbers: list[Any] = []
-    count, first, prompt = 0, None, None
+    count, first, prompt, pixels = 0, None, None, limits.pixels
     for key, value in _leaves(observation, "", 0):
         if isinstance(value, str):
             first = value if first is None else first
             prompt = value if prompt is None and key.rpartition(".")[2] == PROMPT else prompt
         elif isinstance(value, bytes) or (isinstance(value, np.ndarray) and value.dtype == np.uint8):
-            frames += _pictures(key, value, trace, limits)
+            pictures = _pictures(key, value, trace, pixels)
+            pixels -= sum(picture.pixel_count for picture in pictures)
+            frames += pictures
         elif isinstance(value, (float, np.floating)) or (isinstance(value, np.ndarray) and value.dtype.kind == "f"):
             row = np.asarray(value).reshape(-1)
             count += row.size
@@ -105,13 +107,13 @@ def _leaves(value: Any, path: str, depth: int) -> Iterator[tuple[str, Any]]:
         yield path, value
 
 
-def _pictures(key: str, value: Any, trace: Trace, limits: Limits) -> Sequence[Frame]:
+def _pictures(key: str, value: Any, trace: Trace, most_pixels: int) -> Sequence[Frame]:
     data = value if isinstance(value, bytes) else value.reshape(-1)
     if data is value or value.ndim == 1 or (len(data) == value.shape[-1] and len(data) != COLOURS):
         if not len(data):
             raise RequestFailed(f"{key}: an empty picture")
         try:
-            return [decoded("image", memoryview(data), trace, limits)]
+            return [decoded("image", memoryview(data), trace, most_pixels)]
         except RequestFailed as error:
             raise RequestFailed(f"{key}: {error}") from error
     shape = value.shape
@@ -119,7 +121,7 @@ def _pictures(key: str, value: Any, trace: Trace, limits: Limits) -> Sequence[Fr
     if not last and not (value.ndim >= COLOURS and shape[-3] == COLOURS):
         raise RequestFailed(f"{key}: a picture of shape {shape}; they are (H, W, 3), (3, H, W) or a JPEG's bytes")
     height, width = shape[-3:-1] if last else shape[-2:]
-    check_pixels(width, height, limits)
+    check_pixels(width, height, most_pixels)
     several = value.reshape(-1, *shape[-3:])
     if len(several) > PICTURES:
         raise RequestFailed(f"{key}: {len(several)} pictures; at most {PICTURES} are taken")

@@ -39,8 +39,6 @@ OPEN_MS: Final = 5000
 """So long a router may take to say what it is."""
 SEND_US: Final = 5_000_000
 """A peer that reads nothing for so long is hung up on."""
-SEEN_AT_MOST: Final = 65_536
-"""So many endpoints of others are counted."""
 HELD_BYTES: Final = 256 << 20
 """What waits in one inbox may be so large; what comes then is dropped."""
 EACH_BYTES: Final = 1024
@@ -116,7 +114,6 @@ class Node:
         self._numbers = count(1)
         self._known: dict[tuple[str, str], dict[str, names.Entity]] = {}
         """(kind, name) -> token -> what it tells."""
-        self._count, self._once = 0, LogOnce(_log)
         self._lock = Lock()
         with refusals("node"):
             self._liveliness = session.liveliness()
@@ -171,14 +168,10 @@ class Node:
         at = (entity.kind, entity.name)
         with self._lock:
             of_name = self._known.setdefault(at, {})
-            before = len(of_name)
-            if sample.kind != zenoh.SampleKind.PUT:
-                of_name.pop(token, None)
-            elif self._count < SEEN_AT_MOST:
+            if sample.kind == zenoh.SampleKind.PUT:
                 of_name[token] = entity
             else:
-                self._once.warning("", "more than %d endpoints are announced: the rest are not counted", SEEN_AT_MOST)
-            self._count += len(of_name) - before
+                of_name.pop(token, None)
             if not of_name:
                 del self._known[at]
 

@@ -19,7 +19,7 @@ class ReportConfig(Options):
 
     runs: list[Path] = option(..., "run folders, or the folder of a sweep; several side by side", argument=True)
     output: Path | None = option(None, "the page, one HTML file [default: report.html, if there is no other output]")
-    latex: Path | None = option(None, "folder for LaTeX tables (booktabs, siunitx) and figures as PDF")
+    latex: Path | None = option(None, "folder for LaTeX tables (booktabs) and figures as PDF")
     csv: Path | None = option(None, "folder for CSV tables with every digit")
     markdown: Path | None = option(None, "all tables as one Markdown file")
     against: str = against("add {}'s claims, each with a verdict and its evidence")

@@ -22,7 +22,7 @@ from s2a_bench.store.sweep import is_sweep
 from s2a_bench.text import visible
 from s2a_bench.writers.csv_text import CsvTable
 from s2a_bench.writers.figures import caption_of
-from s2a_bench.writers.latex import document, escape, to_siunitx
+from s2a_bench.writers.latex import document, escape, to_float
 from s2a_bench.writers.style import WIDTH_IN, paper_column
 from s2a_bench.writers.tables import Note, markdown_text, to_markdown
 
@@ -136,12 +136,12 @@ def _latex(report: Report, drawn: dict[str, dict[str, DrawnFigure]]) -> Iterator
     sections = []
     if report.judged:
         table = report.judged.table(report.origins.line)
-        yield "claims.tex", to_siunitx(table, ("18mm", "34mm", "44mm", "20mm", "46mm", "78mm"), long=True)
+        yield "claims.tex", to_float(table, ("18mm", "34mm", "44mm", "20mm", "46mm", "78mm"), long=True)
         sections.append(r"\input{claims}")
     for chapter in report.chapters:
         lines = [f"\\section*{{{escape(chapter.title)}}}"]
         for name, table in chapter.content.tables.items():
-            yield f"{chapter.name}/{name}.tex", to_siunitx(table, long=len(table.rows) > _LONG_ROWS)
+            yield f"{chapter.name}/{name}.tex", to_float(table, long=len(table.rows) > _LONG_ROWS)
             lines.append(f"\\input{{{chapter.name}/{name}}}")
         for name, figure in drawn.get(chapter.name, {}).items():
             if figure.pdf:

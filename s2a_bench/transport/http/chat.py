@@ -10,7 +10,7 @@ from s2a_bench.facts import PROMPT_N
 from s2a_bench.trace import Trace
 from s2a_bench.transport.chunks import request_of, state_of
 from s2a_bench.transport.http import native
-from s2a_bench.transport.limits import Limits, check_values, text
+from s2a_bench.transport.limits import Limits, text
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.serving import Disconnected, Exchange
 from s2a_bench.types import Action, Frame, Piece, Request
@@ -32,13 +32,14 @@ def of_picture(headers: Headers, body: Buffer, trace: Trace, limits: Limits) -> 
     fields = _parsed(values.get(native.PARAMETERS_HEADER, "").encode(), f"header {native.PARAMETERS_HEADER}", trace)
     if not (isinstance(fields, dict) and isinstance(prompt := fields.get("prompt", ""), str)):
         raise RequestFailed(f"header {native.PARAMETERS_HEADER} should be an object whose prompt is text")
-    pictures = _cut(fields.get("pictures"), values.get("content-type", ""), body)
-    images = tuple(decoded(kind, data, trace, limits) for kind, data in pictures)
-    return _request(fields, prompt, images, limits)
+    images, pixels = list[Frame](), limits.pixels
+    for kind, data in _cut(fields.get("pictures"), values.get("content-type", ""), body):
+        images.append(decoded(kind, data, trace, pixels))
+        pixels -= images[-1].pixel_count
+    return _request(fields, prompt, tuple(images), limits)
 
 
 def _parsed(document: bytes, what: str, trace: Trace) -> Any:
-    check_values(document)
     try:
         fields = native.FAST.loads(document)
     except ValueError as error:
@@ -67,7 +68,7 @@ def _cut(pictures: Any, media_type: str, body: Buffer) -> list[tuple[str, Buffer
 
 
 def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) -> tuple[Request, bool]:
-    images: list[Frame] = []
+    images, pixels = list[Frame](), limits.pixels
     texts: list[str] = []
     try:
         if not fields["messages"]:
@@ -82,7 +83,8 @@ def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) ->
                 media_type, encoded = native.split_data_uri(part["image_url"]["url"])
                 data = codec.from_base64(encoded)
                 trace.mark("base64_decode")
-                images.append(decoded(media_type, data, trace, limits))
+                images.append(decoded(media_type, data, trace, pixels))
+                pixels -= images[-1].pixel_count
         prompt = "\n".join(texts)
     except (ValueError, KeyError, TypeError) as error:  # binascii.Error is a ValueError
         raise RequestFailed(f"messages: {error!r}") from error

@@ -24,12 +24,13 @@ from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Client, Wiring
 from s2a_bench.transport.http import HEADERS_MS, THINKING_MS, THINKING_PIECES, native
-from s2a_bench.transport.http.clients import BoundedClient, HttpResponse, LeanClient
-from s2a_bench.transport.http.detect import body_of, met
+from s2a_bench.transport.http.clients import HttpResponse, LeanClient, pieces, usual_client
+from s2a_bench.transport.http.detect import met, text_of
 from s2a_bench.transport.http.dialects import NATIVE, Event, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_MODEL
 from s2a_bench.transport.http.dialects.decoder import Decoder, error_in
 from s2a_bench.transport.http.options import HttpOptions, merged, read_patch
+from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
 from s2a_bench.transport.pictures import encoded
 from s2a_bench.types import Piece, Request, Token
@@ -67,15 +68,11 @@ class HttpClient(Client):
         named = {"model": self._model} if self._model not in {self._wiring.options.served_model, NO_MODEL} else {}
         return {"url": self._url, "dialect": self._dialect.name, **named}
 
-    def _new_client(self) -> BoundedClient | LeanClient:
+    def _new_client(self) -> httpx.Client | LeanClient:
         """Build the client of the variant; over TLS every variant has httpx, whose TLS context alone takes 20 ms."""
-        wiring = self._wiring
-        bounds, timeout_s, tls = wiring.bounds(wiring.address, 0), wiring.timeout_s, wiring.address.startswith("https:")
-        if wiring.variant in {native.BEST_EFFORT, native.BINARY} and not tls:
-            return LeanClient(bounds, timeout_s)
-        # a connection is kept, however long a turn of the other cells takes; only a cloud's server may need the proxy
-        # and the certificates of the environment
-        return BoundedClient(bounds, timeout=timeout_s, trust_env=tls, limits=httpx.Limits(keepalive_expiry=None))
+        address = self._wiring.address
+        lean = self._wiring.variant in {native.BEST_EFFORT, native.BINARY} and not address.startswith("https:")
+        return LeanClient() if lean else usual_client(address, self._wiring.timeout_s)
 
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         """Encode and send the request and yield the streamed pieces.
@@ -89,10 +86,13 @@ class HttpClient(Client):
             client = self._new_client()
             trace.mark("connect")
         packed_ns = trace.marks[-1][1]
-        client.bounds = bounds = self._wiring.bounds(self._wiring.address, request.max_tokens)
+        bounds = self._wiring.bounds(self._wiring.address, request.max_tokens)
+        timeout_s = min(self._wiring.timeout_s, bounds.left_s())
         try:
-            with self._translated(), ExitStack() as stack:
-                post: Callable[[], Any] = partial(client.stream, "POST", self._url, content=body, headers=headers)
+            with self._translated(bounds), ExitStack() as stack:
+                post: Callable[[], Any] = partial(
+                    client.stream, "POST", self._url, content=body, headers=headers, timeout=timeout_s
+                )
                 try:
                     response: HttpResponse = stack.enter_context(post())
                 except (httpx.RemoteProtocolError, httpx.ReadError, httpx.WriteError):
@@ -101,21 +101,21 @@ class HttpClient(Client):
                     trace.facts[RECONNECTS] = 1.0
                     response = stack.enter_context(post())
                 headers_ns = now_ns()
-                self._check(response)
-                for token in self._tokens(response, trace, headers_ns, packed_ns):
+                blocks = pieces(response, bounds)
+                self._check(response, blocks)
+                for token in self._tokens(self._events(response, blocks), trace, headers_ns, packed_ns):
                     bounds.count_piece()
                     yield token
         finally:
             if client is not self._client:
                 client.close()
 
-    def _check(self, response: HttpResponse) -> None:
+    def _check(self, response: HttpResponse, body: Iterator[bytes]) -> None:
         kind = response.headers.get("content-type", "")
         expected = self._dialect.media_type
         good = (expected, native.BLOCKS) if self._dialect.name == NATIVE else (expected,)
         if response.status_code != httpx.codes.OK or not kind.startswith(good):
-            text = body_of(response, ERROR_LIMIT, self._wiring.timeout_s)
-            raise refusal(self._url, response, text, self._options, expected)
+            raise refusal(self._url, response, text_of(body, ERROR_LIMIT), self._options, expected)
         if (coding := response.headers.get("content-encoding", "identity")) != "identity":
             raise RequestFailed(f"{self._url} compressed its answer ({coding}) without being asked to")
 
@@ -153,21 +153,21 @@ class HttpClient(Client):
             return bodies, {**headers, "content-length": str(sum(map(len, bodies)))}
         return (bodies[0] if bodies else b""), headers
 
-    def _tokens(self, response: HttpResponse, trace: Trace, headers_ns: int, packed_ns: int) -> Iterator[Piece]:
+    def _tokens(self, events: Iterator[Event], trace: Trace, headers_ns: int, packed_ns: int) -> Iterator[Piece]:
         """Yield the pieces of an answer; after the last, complete the trace."""
         first_ns, thinking_ns, thoughts, index, finished = 0, 0, 0, 0, False
-        for event in self._events(response):
+        for event in events:
             if event.error:
                 advice = advice_for(event.status, event.error, self._options)
                 raise RequestFailed(f"{self._url}: {event.error}{'; ' if advice else ''}{advice}")
             if event.thinking:
                 thinking_ns = thinking_ns or now_ns()
                 thoughts += 1
-            pieces = event.actions if event.text is None else (Token(index, event.text, event.token_id),)
-            if pieces:
+            new = event.actions if event.text is None else (Token(index, event.text, event.token_id),)
+            if new:
                 first_ns = first_ns or now_ns()
-                yield from pieces
-                index += len(pieces)
+                yield from new
+                index += len(new)
             finished = finished or bool(event.finish)
             trace.learn(event.facts)
             if event.remote is not None:
@@ -195,14 +195,14 @@ class HttpClient(Client):
         else:
             trace.marks.append(("server", first_ns))
 
-    def _events(self, response: HttpResponse) -> Iterator[Event]:
+    def _events(self, response: HttpResponse, body: Iterator[bytes]) -> Iterator[Event]:
         """Yield the events of an answer; comments and incomplete events count as silence."""
         if response.headers.get("content-type") == native.BLOCKS:
             decoder = Decoder(self._dialect, native.read_block, native.Blocks)
         else:
             decoder = Decoder(self._dialect, self._codec.loads)
         event_ns, patience_ns = now_ns(), int(self._wiring.timeout_s * 1e9)
-        for data in response.iter_raw():
+        for data in body:
             for event in decoder.feed(data):
                 yield event
                 event_ns = now_ns()
@@ -211,13 +211,14 @@ class HttpClient(Client):
         yield from decoder.end()
 
     @contextmanager
-    def _translated(self) -> Iterator[None]:
+    def _translated(self, bounds: Bounds) -> Iterator[None]:
         url = self._url
         try:
             yield
         except httpx.ConnectError as error:
             raise ServerDied(f"nothing answers at {url}: {error}") from error
         except httpx.TimeoutException as error:
+            bounds.left_s()
             raise RequestFailed(f"{url} was silent for too long: {type(error).__name__}", starting=True) from error
         except httpx.RequestError as error:
             if not self._alive():

@@ -4,26 +4,24 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping
 from functools import partial
 from typing import Any
 from urllib.parse import SplitResult, urlsplit, urlunsplit
 
 import httpx
 
-from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, S2AError, ServerDied
+from s2a_bench.errors import RequestFailed, ServerDied
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.trace import FACT_LIMIT
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.http.clients import BoundedClient, HttpResponse
-from s2a_bench.transport.http.dialects import DIALECTS, NATIVE, open_dialect
+from s2a_bench.transport.http.clients import pieces, usual_client
+from s2a_bench.transport.http.dialects import NATIVE, open_dialect
 from s2a_bench.transport.http.dialects.common import NO_LIST, NO_MODEL, Dialect, endpoint, first_model
 from s2a_bench.transport.http.options import HttpOptions
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, idle_cut
+from s2a_bench.transport.risks import PATIENCE_S, idle_cut
 
 OWNERS = {"llamacpp": "llama-server", "vllm": "vllm", "s2a-bench": NATIVE}
 """``owned_by`` of the first model -> dialect. Ollama gives ``library``, clouds their names: plain OpenAI."""
@@ -51,9 +49,9 @@ def met(base: str, key: str, options: HttpOptions) -> tuple[Dialect, str, str]:
     return dialect, dialect.url(base, model), model
 
 
-def probe(url: str) -> BoundedClient:
+def probe(url: str) -> httpx.Client:
     """Return a client for requests that are not measured."""
-    return BoundedClient(Bounds(url, PATIENCE_S, 0), timeout=PATIENCE_S, trust_env=url.startswith("https:"))
+    return usual_client(url, PATIENCE_S)
 
 
 def cache_hits(wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
@@ -74,62 +72,44 @@ def cache_hits(wiring: Wiring[HttpOptions]) -> Mapping[str, float]:
     return hits
 
 
-def examine(parts: SplitResult) -> Iterator[Finding | str]:
-    """Request the list of models without a key, and where there is none an action of no observation."""
-    url, model, why = urlunsplit(parts), "", ""
-    heads: list[httpx.Response] = []
+def examine(parts: SplitResult) -> Iterator[Finding]:
+    """Request the list of models without a key: its headers show how the server treats its connections."""
+    url = endpoint(urlunsplit(parts).removesuffix("/chat/completions"), "/v1", "/models")
     try:
-        with probe(url) as client:
-            client.event_hooks["response"] = [heads.append]
-            _, model = first_model(url, partial(_json, client, {}))
-    except ServerDied as error:
-        raise OSError(str(error).rpartition(": ")[2]) from error
-    except (*NO_LIST, S2AError, httpx.HTTPError, httpx.InvalidURL) as error:
-        why = f": {error}"
-    for head in heads[-1:]:
-        if idle := re.search(r"timeout=(\d{1,6})", head.headers.get("keep-alive", "")):
-            yield idle_cut(int(idle[1]), "send requests more often, or start the server with a longer keep-alive")
-        if head.is_success and (head.http_version == "HTTP/1.0" or head.headers.get("connection") == "close"):
-            what = "it closes the connection after each answer: each request connects first"
-            yield Finding("connections", "advice", what, "let the server, or a proxy before it, keep connections")
-    if model or (not why and _acts(url)):
-        yield NO_KEY
-    else:
-        yield Finding("server", "state", f"it answers, and shows no list of models without a key{why}")
+        with probe(url) as client, client.stream("GET", url) as response:
+            closes = response.http_version == "HTTP/1.0" or response.headers.get("connection") == "close"
+            idle = re.search(r"timeout=(\d{1,6})", response.headers.get("keep-alive", ""))
+    except (httpx.HTTPError, httpx.InvalidURL) as error:
+        raise OSError(str(error)) from error
+    if idle:
+        yield idle_cut(int(idle[1]), "send requests more often, or start the server with a longer keep-alive")
+    if closes and response.is_success:
+        what = "it closes the connection after each answer: each request connects first"
+        yield Finding("connections", "advice", what, "let the server, or a proxy before it, keep connections")
 
 
-def _acts(base: str) -> bool:
-    """Return whether a policy takes POST alone, and from everybody an object whose refusal needs no model."""
-    for url in (endpoint(base, "", each.path) for _, each in DIALECTS.loaded() if each.takes_task):
-        with suppress(S2AError, httpx.HTTPError), probe(url) as client:
-            if client.get(url).status_code == httpx.codes.METHOD_NOT_ALLOWED:
-                return client.post(url, json={}).status_code in {200, 400, 500}
-    return False
-
-
-def _json(client: BoundedClient, headers: dict[str, str], url: str) -> Any:
+def _json(client: httpx.Client, headers: dict[str, str], url: str) -> Any:
     try:
         return json.loads(_text(client, headers, url))
     except (RequestFailed, httpx.HTTPError, httpx.InvalidURL) as error:
         raise ValueError(str(error)) from error
 
 
-def _text(client: BoundedClient, headers: dict[str, str], url: str) -> str:
+def _text(client: httpx.Client, headers: dict[str, str], url: str) -> str:
     """Return the body of a GET; raises ServerDied if nothing answers, RequestFailed if the answer does not end."""
-    client.bounds = Bounds(url, PATIENCE_S, 0)
     try:
         with client.stream("GET", url, headers=headers) as response:
             response.raise_for_status()
-            return body_of(response, LIMIT, PATIENCE_S)
+            return text_of(pieces(response, Bounds(url, PATIENCE_S, 0)), LIMIT)
     except httpx.ConnectError as error:
         raise ServerDied(f"nothing answers at {url}: {error}") from error
 
 
-def body_of(response: HttpResponse, limit: int, patience_s: float) -> str:
-    """Return a body's first ``limit`` bytes, as far as they arrive in time, as text."""
-    body, deadline = bytearray(), now_ns() + int(patience_s * 1e9)
-    for data in response.iter_raw():
-        body += data
-        if len(body) >= limit or now_ns() > deadline:
+def text_of(body: Iterable[bytes], limit: int) -> str:
+    """Return a body's first ``limit`` bytes as text."""
+    data = bytearray()
+    for piece in body:
+        data += piece
+        if len(data) >= limit:
             break
-    return body[:limit].decode("utf-8", "replace")
+    return data[:limit].decode("utf-8", "replace")

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from http import HTTPStatus
-from socket import IPPROTO_TCP, MSG_DONTWAIT, TCP_NODELAY
+from socket import IPPROTO_TCP, TCP_NODELAY
 from typing import Any, Final
 
 import httptools
@@ -27,8 +27,6 @@ from s2a_bench.transport.limits import Limits
 from s2a_bench.types import Request
 
 PIECE: Final = 1 << 16
-EARLY: Final = 1 << 20
-"""The most bytes that may follow a request before its answer."""
 END: Final = b"\r\n\r\n"
 CONTINUE: Final = b"HTTP/1.1 100 Continue\r\n\r\n"
 READS: Final[Mapping[str, Reads]] = {
@@ -42,8 +40,6 @@ class Head:
     """A request's head, parsed from its bytes with the empty line; raises Refused."""
 
     def __init__(self, data: bytes) -> None:
-        if data.count(b"\n") > native.LINES:
-            raise Refused(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, f"more than {native.LINES} lines of headers")
         self.headers: list[tuple[str, str]] = []
         self._url, self._complete = b"", False
         parser = httptools.HttpRequestParser(self)
@@ -100,14 +96,10 @@ class FastServer(WebServer):
             while early is not None:
                 with ExitStack() as held:
                     early = self._answer(wire, early, held)
-        except Refused as error:
-            refused = error
-        except S2AError as error:  # too many bytes
-            refused = Refused(*native.refusal_of(error))
-        else:
-            return
-        wire.sendall(refused.answer)
-        wire.linger()
+        except (Refused, S2AError) as error:
+            refused = error if isinstance(error, Refused) else Refused(*native.refusal_of(error))
+            wire.sendall(refused.answer)
+            wire.linger()
 
     def _answer(self, wire: Wire, early: bytes, held: ExitStack) -> bytes | None:
         """Answer one request that begins with ``early``; return the first bytes of the next, None to close."""
@@ -134,19 +126,18 @@ class FastServer(WebServer):
         except TimeoutError:
             message = f"the body took more than {limits.body_s:g} s"
             raise Refused(HTTPStatus.REQUEST_TIMEOUT, message) from None
-        exchange = FastExchange(wire, head, reads, body, rest[size:], limits)
+        exchange = FastExchange(wire, head, reads, body, limits)
         exchange.trace.mark("network")
         del body  # the exchange frees it once it is read
         exchange.held = held
         wire.read_until(0)
         self._core.answer(exchange)
-        return bytes(exchange.early) if exchange.keep else None
+        return rest[size:] if exchange.keep else None
 
     def _head(self, wire: Wire, early: bytes) -> tuple[bytes, bytes]:
         """Return a head and the bytes after it; nothing if the client has closed, or sends none for an hour."""
-        data, limits, searched, ends_ns = bytearray(early), self._core.limits, 0, 0
-        while (end := data.find(END, searched)) < 0:
-            searched = max(0, len(data) - len(END))
+        data, limits, ends_ns = bytearray(early), self._core.limits, 0
+        while (end := data.find(END)) < 0:
             if len(data) > limits.header_bytes:
                 break
             if data and not ends_ns:
@@ -194,23 +185,15 @@ def _body(wire: Wire, begun: bytes, size: int, count: Callable[[int], None]) -> 
 class FastExchange(ChatExchange):
     """A request with its body; a stream has chunked encoding, or for HTTP/1.0 ends with the connection."""
 
-    def __init__(self, wire: Wire, head: Head, reads: Reads, body: memoryview, early: bytes, limits: Limits) -> None:
+    def __init__(self, wire: Wire, head: Head, reads: Reads, body: memoryview, limits: Limits) -> None:
         super().__init__(native.FAST)
         self.takes_blocks = reads is of_picture
         self.keep = False
         """Whether the connection may be kept: set once the answer is sent."""
-        self.early = bytearray(early)
-        """The first bytes of the next request."""
         self._wire, self._head, self._reads, self._body, self._limits = wire, head, reads, body, limits
 
     def disconnected(self) -> bool:
-        try:
-            self.early += self._wire.socket.recv(PIECE, MSG_DONTWAIT)
-        except BlockingIOError:
-            pass
-        except OSError:
-            return True
-        return self._wire.disconnected() or len(self.early) > EARLY
+        return self._wire.disconnected()
 
     def read(self) -> tuple[Request, bool]:
         body, self._body = self._body, memoryview(b"")

@@ -44,8 +44,6 @@ SCHEME = "Bearer"
 HEALTH, MODELS = "/health", "/v1/models"
 KEEP_ALIVE_S: Final = 3600
 """A client that waits for its turn in an interleaved run keeps its connection."""
-LINES: Final = 128
-"""The most lines of a head: even a short header costs a few hundred bytes of objects."""
 
 PARAMETERS_HEADER = "s2a-request"
 """Binary variant: this header has the parameters as ASCII JSON, the body the picture's bytes."""
@@ -105,11 +103,16 @@ def json_answer(status: int, value: Any, headers: Mapping[str, str] | None = Non
 
 
 class Refused(Exception):
-    """A request is refused with `answer`, bytes of HTTP, and its connection closed: the next bytes are unknown."""
+    """A request is refused, and its connection closed: the next bytes are unknown."""
 
     def __init__(self, status: int, message: str, headers: Mapping[str, str] | None = None) -> None:
         super().__init__(message)
-        self.answer = json_answer(status, error_json(status, message), headers, keep=False)
+        self.status, self.headers = status, headers or {}
+
+    @property
+    def answer(self) -> bytes:
+        """Return the answer as bytes of HTTP."""
+        return json_answer(self.status, error_json(self.status, str(self)), self.headers, keep=False)
 
 
 def admit(access: Access, path: str, headers: Iterable[tuple[str, str]]) -> None:

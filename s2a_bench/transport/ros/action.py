@@ -26,7 +26,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.ros import wire
-from s2a_bench.transport.ros.camera import POLL_S, picture_message, picture_of
+from s2a_bench.transport.ros.camera import POLL_S, picture_message, pictures_of
 from s2a_bench.transport.ros.exchange import RosExchange, Shared
 from s2a_bench.transport.ros.joining import RosClient, join, namespace_of
 from s2a_bench.transport.ros.options import RosOptions
@@ -242,7 +242,7 @@ class GoalExchange(RosExchange):
         return Request(
             id=self._id,
             prompt=message.prompt.replace(MEDIA_MARKER, ""),
-            images=tuple(picture_of(image, self.trace, self._source.limits) for image in llama.goal_images(message)),
+            images=pictures_of(llama.goal_images(message), self.trace, self._source.limits),
             max_tokens=self._source.max_tokens,
             grammar=sampling.grammar,
             seed=0 if seed == NO_SEED else seed,

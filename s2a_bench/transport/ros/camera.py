@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from threading import Lock, Thread
@@ -53,14 +54,24 @@ def picture_message(frame: Frame, payload: str, offset_ns: int, trace: Trace) ->
     return ros.IMAGE, ros.image_message(bgr_of(frame, trace) if payload == "raw" else frame, stamp_ns, FRAME_ID)
 
 
-def picture_of(message: Any, trace: Trace, limits: Limits = LIMITS) -> Frame:
+def picture_of(message: Any, trace: Trace, most_pixels: int = LIMITS.pixels) -> Frame:
     """Turn a received image message into an RGB frame; its stamp is ROS time. Raises TransportError."""
     if hasattr(message, "format"):
-        frame = decompressed(message, limits.pixels)
+        frame = decompressed(message)
+        check_pixels(frame.width, frame.height, most_pixels)
         trace.mark("image_decode")
         return rgb_of(frame, trace)
-    check_pixels(message.width, message.height, limits)
+    check_pixels(message.width, message.height, most_pixels)
     return rgb_of(ros.frame_of_image(message), trace)
+
+
+def pictures_of(messages: Iterable[Any], trace: Trace, limits: Limits) -> tuple[Frame, ...]:
+    """Turn the image messages of one request, which share its pixels, into RGB frames."""
+    frames, pixels = list[Frame](), limits.pixels
+    for message in messages:
+        frames.append(picture_of(message, trace, pixels))
+        pixels -= frames[-1].pixel_count
+    return tuple(frames)
 
 
 class CameraPublisher:
@@ -241,7 +252,7 @@ class CameraCache:
             count = self._count
         message = camera.unpack(packed)
         trace.mark("cdr_parse")
-        frame = picture_of(message, trace, self.limits)
+        frame = picture_of(message, trace, self.limits.pixels)
         with self._lock:
             if self._newest is None or count > self._newest.count:
                 self._newest = CachedFrame(frame, trace.marks, count)

@@ -16,7 +16,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport.chunks import state_of
 from s2a_bench.transport.limits import Bounds, Limits, whole_number
 from s2a_bench.transport.ros import wire
-from s2a_bench.transport.ros.camera import picture_message, picture_of
+from s2a_bench.transport.ros.camera import picture_message, pictures_of
 from s2a_bench.transport.ros.exchange import RosExchange, Shared
 from s2a_bench.transport.ros.joining import RosClient
 from s2a_bench.types import Piece, Request, Token
@@ -122,8 +122,7 @@ class TopicExchange(RosExchange):
     def request(self) -> Request:
         message, limits = self._message, self._source.limits
         whole_number("max_tokens", int(message.max_tokens), 1, limits.answer_tokens, 0)
-        pictures = (*message.images, *message.compressed_images)
-        images = tuple(picture_of(picture, self.trace, limits) for picture in pictures)
+        images = pictures_of((*message.images, *message.compressed_images), self.trace, limits)
         name, state = message.id.rpartition("#")[0] or message.id, state_of(message.state)
         return Request(name, message.prompt, images, message.max_tokens, message.grammar, message.seed, state=state)
 

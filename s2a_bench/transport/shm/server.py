@@ -15,11 +15,12 @@ import orjson
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, S2AError, TooLarge, TransportError
+from s2a_bench.frames import MOST_PIXELS
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.chunks import request_of, state_of
 from s2a_bench.transport.connections import Connections, Wire, wait_at_most
-from s2a_bench.transport.limits import Limits, check_pixels, check_values, text, whole_number
+from s2a_bench.transport.limits import Limits, check_pixels, text, whole_number
 from s2a_bench.transport.pictures import decoded, rgb_of
 from s2a_bench.transport.serving import Core, Disconnected, Exchange
 from s2a_bench.transport.shm import ShmOptions
@@ -56,7 +57,6 @@ def size_of(memory: SharedMemory, at: int, length: int) -> int:
 def request_at(memory: SharedMemory, at: int, length: int, limits: Limits, trace: Trace) -> Request:
     """Copy and parse a header, and read its pictures as the engine takes them; raises RequestFailed."""
     header = memory.map[at : at + length]
-    check_values(header)
     try:
         fields = orjson.loads(header)
     except ValueError as error:
@@ -64,27 +64,26 @@ def request_at(memory: SharedMemory, at: int, length: int, limits: Limits, trace
     if not isinstance(fields, dict) or not isinstance(pictures := fields.get("images", []), list):
         raise RequestFailed("the header should be an object whose images are a list")
     trace.mark("header_parse")
-    images, begin, pixels = [], 0, limits
+    images, begin, pixels = [], 0, limits.pixels
     for about in pictures:
         size = about.get("bytes") if isinstance(about, dict) else None
         if type(size) is not int or size <= 0 or begin + size > at:
             raise RequestFailed("a picture should lie before the header")
         images.append(_picture(memory, about, begin, trace, pixels))
-        if len(pictures) > 1:  # what the first ones leave to the others
-            pixels = pixels.but(pixels=max(1, pixels.pixels - images[-1].width * images[-1].height))
+        pixels -= images[-1].pixel_count
         begin += size
     name, prompt = (text(key, fields.get(key)) for key in ("id", "prompt"))
     return request_of(fields, limits, name, prompt, tuple(images), state_of(fields.get("state") or ()))
 
 
-def _picture(memory: SharedMemory, about: dict[str, Any], begin: int, trace: Trace, limits: Limits) -> Frame:
+def _picture(memory: SharedMemory, about: dict[str, Any], begin: int, trace: Trace, most_pixels: int) -> Frame:
     """Convert a picture; raw pixels are read where they lie, a file that has a size of its own is copied first."""
     encoding = text("encoding", about.get("encoding"))
     end = begin + about["bytes"]
     if encoding not in BYTES_A_PIXEL:
-        return decoded(encoding, memory.map[begin:end], trace, limits)
-    width, height = (whole_number(side, about.get(side), 1, limits.pixels, 0) for side in ("width", "height"))
-    check_pixels(width, height, limits)
+        return decoded(encoding, memory.map[begin:end], trace, most_pixels)
+    width, height = (whole_number(side, about.get(side), 1, MOST_PIXELS, 0) for side in ("width", "height"))
+    check_pixels(width, height, most_pixels)
     channels = BYTES_A_PIXEL[encoding]
     if end - begin != width * height * channels:
         raise RequestFailed(f"{end - begin} bytes are no {encoding} picture of {width}x{height}")

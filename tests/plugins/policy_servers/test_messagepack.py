@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.plugins.policy_servers.messagepack import MAP, VALUES
+from s2a_bench.plugins.policy_servers.messagepack import LIST, MAP
 from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
 from s2a_bench.plugins.policy_servers.zmq import wire
 from s2a_bench.plugins.policy_servers.zmq.wire import pack
@@ -20,22 +20,16 @@ from s2a_bench.plugins.policy_servers.zmq.wire import pack
 HOSTILE = {
     "nothing": b"",
     "half a message": msgpack.packb({"a": bytes(9)})[:-5],
-    "two messages": b"\x01\x01",
     "no message": b"\xc1",
     "no UTF-8": b"\xa2\xff\xfe",
     "a list of 2^32 elements": b"\xdd\xff\xff\xff\xff",
-    "a map of 2^32 keys": b"\xdf\xff\xff\xff\xff",
-    "bytes of 2^32": b"\xc6\xff\xff\xff\xff",
     "deep lists": b"\x91" * 100_000,
-    "very many lists": (b"\xdc\x0f\xff" + b"\x90" * 4095) * 64,
-    "very many maps": b"\xdc\x0f\xff" + (b"\xdc\x0f\xff" + b"\x80" * 4095) * 4095,
-    "a key that is a number": b"\x81\x01\x01",
+    "deep maps": b"\x81\xa1a" * 100_000,
     "a key that is a list": b"\x81\x90\x01",
     "half a surrogate pair": b"\x81\xa8endpoint\xa3\xed\xa0\x80",
     "an extension": msgpack.packb(msgpack.ExtType(5, b"abc")),
     "an extension of no bytes": b"\xc7\x00\x05",
     "a time stamp": b"\xc7\x0c\xff" + struct.pack(">Iq", 1, -1),
-    "a time stamp of no bytes": b"\xc7\x00\xff",
 }
 
 
@@ -53,12 +47,12 @@ def test_bytes_that_are_no_message_are_refused_in_a_line(name: str, read: Callab
 
 
 @pytest.mark.parametrize("read", [unpackb, unpack])
-def test_a_message_has_not_more_values_than_are_read(read: Callable[[bytes], Any]) -> None:
-    read(msgpack.packb({str(number): 0 for number in range(MAP)}))
+def test_lists_and_maps_have_not_more_elements_than_are_read(read: Callable[[bytes], Any]) -> None:
+    read(msgpack.packb({str(number): [0] * LIST for number in range(MAP)}))
     with pytest.raises(RequestFailed, match="no message"):
         read(msgpack.packb({str(number): 0 for number in range(MAP + 1)}))
-    with pytest.raises(RequestFailed, match=f"more than {VALUES} values"):
-        read(msgpack.packb([[0] * 4000 for _ in range(20)]))
+    with pytest.raises(RequestFailed, match="no message"):
+        read(msgpack.packb([0] * (LIST + 1)))
 
 
 Write = Callable[[Any], bytes]
@@ -126,30 +120,22 @@ def generic(data: Any, dtype: Any) -> bytes:
 
 
 ARRAYS_THAT_ARE_NONE = {
-    "half a message": packb({"a": np.zeros(9)})[:-5],
     "objects": ndarray(dtype="|O", shape=(1,)),
     "records": ndarray(dtype="|V8", shape=(1,)),
-    "records by a comma": ndarray(dtype="f4,f4", shape=(1,)),
     "complex numbers": ndarray(dtype="<c8", shape=(1,)),
     "a type that is none": ndarray(dtype="<f5"),
     "a type of no bytes": ndarray(b"", "S0", (1 << 40,)),
     "a type that is bytes": ndarray(dtype=b"<f4"),
-    "a type that is a list": ndarray(dtype=[["a", "<f4"]]),
     "a type of 20 digits": ndarray(dtype="S" + "9" * 20),
     "a shape that is larger": ndarray(shape=(1 << 40,)),
-    "a shape that is smaller": ndarray(shape=(1,)),
     "a shape that overflows": ndarray(shape=(1 << 62, 1 << 62, 0, 4)),
     "a shape below zero": ndarray(shape=(-1, -2)),
-    "a shape of fractions": ndarray(shape=(2.0,)),
     "a shape of truths": ndarray(b"1234", shape=(True,)),
-    "a shape of many axes": ndarray(shape=(1,) * 40),
+    "a shape of many axes": ndarray(b"1234", shape=(1,) * 70),
     "a shape that is none": ndarray(shape="2"),
     "data that is text": ndarray("12345678"),
-    "data that is missing": msgpack.packb({b"__ndarray__": True}),
     "a number that is text": generic("a" * 100, "<f4"),
-    "a number that is a list": generic([1, 2], "<f4"),
     "a number beyond its type": generic(1 << 40, "|i1"),
-    "bytes of a number": generic(1 << 30, "|S5"),
     "a key that is an array": b"\x81" + ndarray() + b"\x01",
 }
 
@@ -171,10 +157,6 @@ def test_the_keys_of_an_array_may_be_texts() -> None:
         unpackb(msgpack.packb({**plain, "dtype": "|O"}))
 
 
-def test_a_number_beyond_its_type_is_infinite() -> None:
+def test_a_number_beyond_its_type_is_infinite_and_arrays_are_read_only() -> None:
     assert np.isinf(unpackb(generic(1e300, "<f4")))
-
-
-def test_what_is_read_cannot_be_changed_and_shares_no_memory_with_others() -> None:
-    got = unpackb(ndarray())
-    assert not got.flags.writeable
+    assert not unpackb(ndarray()).flags.writeable

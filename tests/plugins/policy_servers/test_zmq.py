@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import io
 import json
-import pickle
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -23,7 +22,6 @@ from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.frames.convert import yuyv_to_rgb
-from s2a_bench.plugins.policy_servers.zmq.watch import ConnectionWatch
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
@@ -31,7 +29,6 @@ from s2a_bench.trace import budget
 from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
-from s2a_bench.transport.risks import examine
 from s2a_bench.types import Request
 from tests.transport.test_every_server import Gate
 from tests.waiting import until
@@ -100,7 +97,7 @@ def plain(address: str, packb: Any = FILES["packb"], unpackb: Any = FILES["unpac
 def policy(
     answers: Callable[[Any], Any], packb: Any = FILES["packb"], unpackb: Any = FILES["unpackb"]
 ) -> Iterator[str]:
-    """A server as GR00T's: a REP socket, one request after the other; bytes and None are sent as they are, or not."""
+    """A server as GR00T's: a REP socket, one request after the other; bytes are sent as they are, None ends it."""
     context, over = zmq.Context(), Event()
     peer = context.socket(zmq.REP)
     peer.rcvtimeo, peer.linger = 50, 0
@@ -114,8 +111,9 @@ def policy(
                 continue
             answer = answers(request)
             if answer is None:
-                return
+                break
             peer.send(answer if isinstance(answer, bytes) else packb(answer))
+        peer.close()
 
     thread = Thread(target=serve)
     thread.start()
@@ -155,32 +153,24 @@ def strands() -> Any:
 
 
 class TestClientsOfOthers:
-    def test_the_client_of_strands_robots_is_answered(self, strands: Any) -> None:
-        handler = RecordingHandler(list(CHUNK))
-        with serving(handler) as server:
-            client = strands.GR00TClient("127.0.0.1", int(server.address.rpartition(":")[2]))
-            assert client.ping()
-            answer = client.get_action(flat())
-            client.__del__()
-        np.testing.assert_array_equal(answer["action.robot"], CHUNK)
-        (got,) = handler.requests
-        assert got.prompt == "pick it up"
-        assert got.state == (0.0, 1.0, 2.0, 3.0, 4.0, 0.5)
-        assert [image.data.shape for image in got.images] == [(48, 64, 3)]
-        assert (got.images[0].data == 7).all()
-
-    def test_its_policy_moves_a_robot_by_our_answers(self, strands: Any) -> None:
+    def test_the_client_of_strands_robots_is_answered_and_its_policy_moves_a_robot(self, strands: Any) -> None:
         joints = [f"joint_{number}" for number in range(6)]
         handler = RecordingHandler(list(np.arange(12, dtype=np.float32).reshape(2, 6)))
         with serving(handler) as server:
             theirs = strands.Gr00tPolicy("so100", "127.0.0.1", int(server.address.rpartition(":")[2]))
+            assert theirs.client.ping()
+            answer = theirs.client.get_action(flat())
             theirs.set_robot_state_keys(joints)
             seen = {"webcam": np.zeros((48, 64, 3), np.uint8), **dict.fromkeys(joints, 0.25)}
             moves = asyncio.run(theirs.get_actions(seen, "go home"))
             theirs.client.__del__()
+        np.testing.assert_array_equal(answer["action.robot"], handler.answer)
+        first, second = handler.requests
+        assert (first.prompt, first.state) == ("pick it up", (0.0, 1.0, 2.0, 3.0, 4.0, 0.5))
+        assert [image.data.shape for image in first.images] == [(48, 64, 3)]
+        assert (first.images[0].data == 7).all()
         assert [list(move.values()) for move in moves] == [[0, 1, 2, 3, 4, 5], [6, 7, 8, 9, 10, 11]]
-        assert handler.requests[0].state == (0.25,) * 6
-        assert handler.requests[0].prompt == "go home"
+        assert (second.prompt, second.state) == ("go home", (0.25,) * 6)
 
     def test_n1_5_is_answered_flat_with_a_batch_where_it_has_one(self) -> None:
         with serving(RecordingHandler(list(CHUNK))) as server, plain(server.address) as call:
@@ -205,6 +195,7 @@ class TestClientsOfOthers:
             assert call("ping") == {"status": "ok", "message": "Server is running"}
             assert call("reset", {"options": None}) == {}
             assert "Unknown endpoint: 'dance'" in call("dance")["error"]
+            assert "stop its process" in call("kill")["error"]
             configs = call("get_modality_config")
         assert set(configs) == {"video", "state", "action", "language"}
         assert configs["language"]["as_json"]["modality_keys"] == [TASK]
@@ -225,21 +216,20 @@ class TestClientsOfOthers:
         video = configs["video"]["as_json"]
         assert (json.loads(video) if layout == "n1.5" else video)["modality_keys"] == [key]
 
-    def test_nobody_ends_the_server_over_the_network(self) -> None:
-        with serving(RecordingHandler([])) as server, plain(server.address) as call:
-            assert "stop its process" in call("kill")["error"]
-            assert call("ping")["status"] == "ok"
-
-    def test_marks_are_for_who_said_an_id_and_once(self) -> None:
-        with serving(RecordingHandler(list(CHUNK))) as server, plain(server.address) as call:
-            call("get_action", flat())
-            assert "unknown request" in call("s2a_marks", s2a={"id": "observation-0"})["error"]
-            call("get_action", flat(), s2a={"id": "mine"})
-            assert len(call("s2a_marks", s2a={"id": "mine"})["s2a"]["token_ns"]) == 4
-            assert "unknown request" in call("s2a_marks", s2a={"id": "mine"})["error"]
-            with plain(server.address) as other:
-                call("get_action", flat(), s2a={"id": "mine"})
-                assert "unknown request" in other("s2a_marks", s2a={"id": "mine"})["error"]
+    def test_marks_follow_the_chunk_for_who_sends_an_extension_alone(self) -> None:
+        context = zmq.Context()
+        with serving(RecordingHandler(list(CHUNK))) as server:
+            peer = context.socket(zmq.DEALER)
+            peer.rcvtimeo = 20_000
+            peer.connect(server.address)
+            answers = []
+            for more in ({}, {"s2a": {"id": "mine"}}):
+                peer.send_multipart([b"", FILES["packb"]({"endpoint": "get_action", "data": flat(), **more})])
+                answers.append(peer.recv_multipart())
+            marks = FILES["unpackb"](peer.recv_multipart()[1])
+            context.destroy(0)
+        assert answers[0] == answers[1] == [b"", FILES["packb"]({"action.robot": CHUNK})]
+        assert len(marks["s2a"]["token_ns"]) == len(CHUNK)
 
 
 class TestServer:
@@ -261,34 +251,10 @@ class TestServer:
         handler = RecordingHandler(list(CHUNK))
         with serving(handler, api_key_env="ROBOT_KEY") as server, plain(server.address) as call:
             for wrong in ({}, {"api_token": "wrong"}, {"api_token": None}, {"api_token": [KEY]}):
-                for endpoint in ("ping", "get_action", "get_modality_config", "kill", "s2a_marks"):
+                for endpoint in ("ping", "get_action", "get_modality_config", "kill"):
                     assert "Unauthorized" in call(endpoint, flat(), **wrong)["error"]
             assert call("ping", api_token=KEY)["status"] == "ok"
         assert handler.requests == []
-
-
-class TestWatch:
-    def test_a_message_is_of_the_connection_that_has_the_descriptor_now(self) -> None:
-        context = zmq.Context()
-        router = context.socket(zmq.ROUTER)
-        watch = ConnectionWatch(router)
-        port = router.bind_to_random_port("tcp://127.0.0.1")
-        descriptors = []
-        for _ in range(3):
-            peer = context.socket(zmq.REQ)
-            peer.connect(f"tcp://127.0.0.1:{port}")
-            peer.send(b"go")
-            descriptor = router.recv_multipart(copy=False)[-1].get(zmq.SRCFD)
-            connection = watch.of(descriptor)
-            watch.hear()
-            assert not connection.disconnected
-            descriptors.append(descriptor)
-            watch.monitor.poll(0)
-            peer.close(0)
-            until(lambda: bool(watch.monitor.poll(1)))  # it has gone, and that is not heard yet
-        watch.close()
-        context.destroy(0)
-        assert len(set(descriptors)) < 3
 
 
 class TestBlackBox:
@@ -343,7 +309,7 @@ class TestBlackBox:
                 given_up.wait(20)
             return [{"robot": (CHUNK + calls[-1])[np.newaxis]}, {}]
 
-        with policy(answers) as url, robot("", url=url, layout="n1.6", timeout_s=2) as client:
+        with policy(answers) as url, robot("", url=url, layout="n1.6", timeout_s=1) as client:
             with pytest.raises(RequestFailed, match="silent"):
                 ask(client, Request("a", "go"))
             given_up.set()
@@ -360,17 +326,27 @@ class TestBlackBox:
         ):
             ask(client, Request("a", "go"))
 
-    def test_a_server_that_dies_is_told_at_once(self) -> None:
-        alive = Event()
-        alive.set()
+    @pytest.mark.parametrize(("dies", "error"), [(False, "broke the connection"), (True, "has ended")])
+    def test_a_server_that_goes_is_told_at_once(self, dies: bool, error: str) -> None:
+        dead = Event()
         with (
-            policy(lambda _: alive.clear()) as url,
-            closing(open_client(wiring_of("zmq/gr00t", url, timeout_s=30), alive.is_set)) as client,
-            pytest.raises(ServerDied),
+            policy(lambda _: dead.set() if dies else None) as url,
+            closing(open_client(wiring_of("zmq/gr00t", url, timeout_s=3000), lambda: not dead.is_set())) as client,
+            pytest.raises((RequestFailed, ServerDied), match=error),
         ):
             ask(client, Request("a", "go"))
 
-    @pytest.mark.parametrize("url", ["http://a:1", "tcp://", "tcp://a", "tcp://a:1/x", "tcp://a:b", "tcp://u:p@a:1"])
+    def test_a_server_that_is_started_anew_is_connected_to_anew(self) -> None:
+        with serving(RecordingHandler(list(CHUNK))) as server, robot(server.address) as client:
+            ask(client, Request("a", "go"))
+            server.stop()
+            until(lambda: not client._link.stands())  # type: ignore[attr-defined]
+            with served(wiring_of("zmq/gr00t", server.address.partition("//")[2]), RecordingHandler(list(CHUNK))):
+                actions, trace = ask(client, Request("b", "go"))
+        assert len(actions) == len(CHUNK)
+        assert trace.facts["reconnects"] == 1.0
+
+    @pytest.mark.parametrize("url", ["http://a:1", "tcp://a", "tcp://a:1/x", "tcp://u:p@a:1"])
     def test_other_urls_are_refused(self, url: str) -> None:
         with pytest.raises(UsageError, match="`url`"):
             one_pipeline("zmq", url=url)
@@ -411,9 +387,7 @@ class TestLayoutOfAServer:
                 ask(client, Request(f"{number}", "go", (yuyv_frame(),)))
         assert answers.endpoints == ["get_modality_config", "get_action", "get_action"]
 
-    @pytest.mark.parametrize(
-        "answer", [configs("__ModalityConfig_class__"), {}, {"error": "Unknown endpoint"}, {"state": np.zeros(2)}, [1]]
-    )
+    @pytest.mark.parametrize("answer", [configs("__ModalityConfig_class__"), {"error": "Unknown endpoint"}, [1]])
     def test_all_others_have_n1_6s_sent(self, answer: Any) -> None:
         answers = Policy(answer)
         with policy(answers) as url, robot("", url=url) as client:
@@ -421,12 +395,8 @@ class TestLayoutOfAServer:
             ask(client, Request("a", "go", (yuyv_frame(),)))
         assert answers.endpoints == ["get_modality_config", "get_action"]
 
-    def test_n1_5s_configurations_are_text_and_its_observations_flat(self, tmp_path: Path) -> None:
+    def test_n1_5s_configurations_are_text_and_its_observations_flat(self) -> None:
         keys = {"video": ["video.front"], "state": ["state.single_arm", "state.gripper"], "language": [TASK]}
-        template = tmp_path / "arm.json"
-        parts = {"state.single_arm": ["{state:0:2}"], "state.gripper": ["{state:2:3}"]}
-        template.write_text(json.dumps({"video.front": ["{image}"], **parts, TASK: ["{prompt}"]}))
-
         seen: list[Any] = []
 
         def answers(request: Any) -> Any:
@@ -436,26 +406,20 @@ class TestLayoutOfAServer:
                 return {name: {"__ModalityConfig_class__": True, "as_json": json.dumps(told[name])} for name in told}
             if request["endpoint"] == "ping":
                 return {"status": "ok", "message": "Server is running"}
-            for key in (key for each in keys.values() for key in each if key not in request["data"]):
-                return {"error": str(KeyError(key))}
-            seen.append({key: np.shape(value) for key, value in request["data"].items()})
+            seen.append({key: np.shape(request["data"][key]) for each in keys.values() for key in each})
             return {"action.single_arm": CHUNK[:, :2], "action.gripper": CHUNK[:, 2]}
 
-        with policy(answers) as url:
-            with robot("", url=url) as client:
-                assert client.describe() == {"url": url, "template": "get_modality_config", "layout": "n1.5"}
-                ask(client, numbered(6, 1))
-            with robot("", url=url, template=str(template)) as client:
-                actions, _ = ask(client, Request("a", "go", (yuyv_frame(),), state=(1, 2, 3)))
-            assert [each.message for each in examine(url)] == ["127.0.0.1: no key"]
+        with policy(answers) as url, robot("", url=url) as client:
+            assert client.describe() == {"url": url, "template": "get_modality_config", "layout": "n1.5"}
+            actions, _ = ask(client, numbered(6, 1))
         np.testing.assert_array_equal(np.stack([action.values for action in actions]), CHUNK)  # type: ignore[union-attr]
-        common = {"video.front": (1, 48, 64, 3), "state.gripper": (1, 1), TASK: (1,)}
-        assert seen == [{**common, "state.single_arm": (1, 5)}, {**common, "state.single_arm": (1, 2)}]
+        assert seen == [
+            {"video.front": (1, 48, 64, 3), "state.single_arm": (1, 5), "state.gripper": (1, 1), TASK: (1,)}
+        ]
 
     def test_the_key_goes_with_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("ROBOT_KEY", KEY)
-        answers = Policy({})
-        with policy(answers) as url, robot("", url=url, api_key_env="ROBOT_KEY"):
+        with policy(answers := Policy({})) as url, robot("", url=url, api_key_env="ROBOT_KEY"):
             assert answers.requests == [{"endpoint": "get_modality_config", "api_token": KEY}]
 
     @pytest.mark.parametrize(
@@ -594,7 +558,6 @@ class TestEmbodiments:
             ),
             ("libero_panda", 8, 3, "get_modality_config has places for 2 pictures, not 3$"),
             ("libero_panda", 6, 2, r"x \(1\), .* gripper \(\?\), not 6 numbers; change `state`, or give `template`$"),
-            ("unitree_g1", 44, 1, r"left_leg \(6\), .* right_hand \(\?\), not 44 numbers"),
             ("oxe_droid", 0, 2, r"joint_position \(\?\), gripper_position \(1\), not 0 numbers"),
             ("two unknown", 9, 1, r"eef_position \(\?\), eef_rotation \(\?\), not 9 numbers; give `template`$"),
         ],
@@ -615,46 +578,6 @@ class TestEmbodiments:
                 ask(client, numbered(6, 2))
         shapes = {key: part.shape for key, part in server.seen["state"].items()}
         assert shapes == {"single_arm": (1, 1, 5), "gripper": (1, 1, 1)}
-
-
-class TestDangers:
-    @pytest.mark.parametrize(
-        ("configured", "may"),
-        [
-            ({"status": "ok"}, ", may unpickle what it receives (early GR00T N1.7)"),
-            (configs("__ModalityConfig__"), ", may unpickle what it receives (early GR00T N1.7)"),
-            (configs("__ModalityConfig_class__"), ""),
-        ],
-    )
-    def test_which_gr00t_answers_everybody_a_ping_and_its_configurations_tell(self, configured: Any, may: str) -> None:
-        answers = Policy(configured)
-        with policy(answers) as url:
-            (found,) = examine(url)
-        assert answers.requests == [{"endpoint": "ping"}, {"endpoint": "get_modality_config"}]
-        assert (found.level, found.message) == ("advice", f"127.0.0.1: no key{may}")
-
-    @pytest.mark.parametrize("answer", [b"ERROR", b"PK\x03\x04" + bytes(9), pickle.dumps({"status": "ok"})])
-    def test_n1_is_known_by_its_answer_to_a_ping(self, answer: bytes) -> None:
-        requests: list[Any] = []
-        with policy(lambda request: requests.append(request) or answer) as url:  # type: ignore[func-returns-value]
-            (found,) = examine(url)
-        assert requests == [{"endpoint": "ping"}]
-        assert found.level == "warning"
-        assert "127.0.0.1: unpickles what it receives (GR00T N1," in found.message
-
-    @pytest.mark.parametrize("answer", [b"hello", [1], msgpack.packb(5)])
-    def test_what_is_no_gr00t_is_an_error(self, answer: Any) -> None:
-        with policy(lambda _: answer) as url:
-            assert [(finding.code, finding.level) for finding in examine(url)] == [("server", "error")]
-
-    def test_a_key_is_no_danger(self) -> None:
-        with policy(lambda _: {"error": "Unauthorized: Invalid API token"}) as url:
-            found = {finding.code: finding for finding in examine(url)}
-        assert "no key" not in found["access"].message
-        assert "Invalid API token" in found["server"].message
-
-    def test_where_nothing_answers_it_is_told(self) -> None:
-        assert [finding.level for finding in examine("tcp://127.0.0.1:1") if finding.code == "server"] == ["error"]
 
 
 def test_it_carries_actions_and_state_alone() -> None:

@@ -81,12 +81,6 @@ class Trap:
         return pytest.fail, ("it was unpickled",)
 
 
-def test_nothing_is_unpickled() -> None:
-    for data in (pickle.dumps(Trap()), saved(np.array([Trap()], object), allow_pickle=True)):
-        with pytest.raises(RequestFailed):
-            unpack(msgpack.packb({"__ndarray_class__": True, "as_npy": data}))
-
-
 @pytest.fixture
 def peer() -> Any:
     return pytest.importorskip("msgpack_numpy")
@@ -124,7 +118,8 @@ def test_keys_of_a_map_are_texts_or_bytes(kind: Any) -> None:
 
 
 def test_a_dictionary_that_is_no_array_stays_one() -> None:
-    for fields in ({"nd": True}, {"nd": 5, "data": b"a"}, {"data": b"a", "type": "<f4", "shape": [1]}):
+    config = {"__ModalityConfig_class__": True, "as_json": "{}"}
+    for fields in (config, {"nd": True}, {"nd": 5, "data": b"a"}, {"data": b"a", "type": "<f4", "shape": [1]}):
         assert unpack(pack(fields)) == fields
 
 
@@ -148,12 +143,13 @@ def test_a_map_that_lies_is_refused_in_a_line(fields: dict[str, Any], why: str) 
         assert len(str(failed.value)) < 200
 
 
-def test_a_pickle_in_a_map_is_refused_unread(peer: Any) -> None:
-    message = peer.packb(np.array([Trap()], object))
-    with pytest.raises(RequestFailed, match=r"kind 'O'.*nothing is unpickled"):
-        unpack(message)
-    with pytest.raises(RequestFailed, match=r"kind 'V'.*nothing is unpickled"):
-        unpack(peer.packb(np.zeros(2, "i4,f4")))
+def test_nothing_is_unpickled(peer: Any) -> None:
+    for data in (pickle.dumps(Trap()), saved(np.array([Trap()], object), allow_pickle=True)):
+        with pytest.raises(RequestFailed):
+            unpack(msgpack.packb({"__ndarray_class__": True, "as_npy": data}))
+    for kind, array in (("O", np.array([Trap()], object)), ("V", np.zeros(2, "i4,f4"))):
+        with pytest.raises(RequestFailed, match=f"kind '{kind}'.*nothing is unpickled"):
+            unpack(peer.packb(array))
 
 
 def test_the_marks_of_a_message_are_those_of_its_arrays_and_configurations() -> None:
@@ -170,11 +166,6 @@ def test_the_marks_of_a_message_are_those_of_its_arrays_and_configurations() -> 
     assert read(msgpack.packb([msgpack.unpackb(pack(array)), MAP]))[1] == {"n1.6", "n1.7"}
 
 
-def test_no_other_class_becomes_anything() -> None:
-    told = {"__ModalityConfig_class__": True, "as_json": "{}"}
-    assert unpack(pack(told)) == told
-
-
 def lying(shape: str, descr: str = "'|u1'", version: bytes = b"\x01\x00") -> bytes:
     """A file of 12 bytes whose header may lie."""
     text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}".encode()
@@ -187,7 +178,10 @@ def lying(shape: str, descr: str = "'|u1'", version: bytes = b"\x01\x00") -> byt
         *("text", 5, None, b"", b"\x93NUMPY", b"\x93NUMPY\x01\x00\xff\xff{", b"\x93NUMPY\x02\x00\xff\xff\xff\xff{"),
         lying("(12,)", version=b"\x09\x00"),
         *(lying("(1,)", descr) for descr in ("[('a', '<i4'), ('b', '|O')]", "__import__('os').system('true')")),
-        *map(lying, ["(3,)", "(-1, 4, 3)", "('a',)", f"({10**30}, {10**30})", f"(0, {2**60}, 3)", f"({'1, ' * 1000})"]),
+        *map(
+            lying,
+            ["(3,)", "(13,)", "(-1, 4, 3)", "('a',)", f"({10**30}, {10**30})", f"(0, {2**60}, 3)", f"({'1, ' * 1000})"],
+        ),
     ],
     ids=lambda file: repr(file)[:60],
 )
@@ -196,13 +190,6 @@ def test_a_file_that_is_none_is_refused_in_a_line(file: Any) -> None:
         array_of(file)
     assert str(failed.value).isprintable()
     assert len(str(failed.value)) < 200
-
-
-@pytest.mark.parametrize("size", [-1, 1, 100])
-def test_a_file_is_as_long_as_it_says(size: int) -> None:
-    data = saved(np.zeros(10, np.float32))
-    with pytest.raises(RequestFailed, match="an array of shape"):
-        array_of(data[:size] if size < 0 else data + bytes(size))
 
 
 @pytest.mark.parametrize(

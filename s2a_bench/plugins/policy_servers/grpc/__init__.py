@@ -38,7 +38,11 @@ class Grpc(PolicyTransport[GrpcOptions]):
     serves = False
     payloads = ("raw",)
     stages: ClassVar[dict[str, str]] = {"pickle_pack": "pack", "send": "network", "pickle_parse": "parse"}
-    urls = Urls(GrpcOptions.SCHEMES, examine="s2a_bench.plugins.policy_servers.grpc.client:examine")
+    urls = Urls(
+        GrpcOptions.SCHEMES,
+        examine="s2a_bench.plugins.policy_servers.grpc.client:examine",
+        unpickles="lerobot's server unpickles what any client sends (CVE-2026-25874)",
+    )
     needs = ("grpc", "grpc")
     client_class = "s2a_bench.plugins.policy_servers.grpc.client:GrpcClient"
     facts = (PAYLOAD_BYTES, PAYLOAD_DOWN_BYTES, RECONNECTS, GET_ACTIONS_MS)

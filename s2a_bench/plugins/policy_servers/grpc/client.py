@@ -7,7 +7,6 @@ last one. The server holds one policy, which its last client named, and one obse
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Callable, Iterator
 from typing import Any, Final
@@ -26,7 +25,7 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.limits import MIB, Bounds
-from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, UNPICKLES
+from s2a_bench.transport.risks import connect
 from s2a_bench.types import Piece, Request
 
 SERVICE, LOAD = "/transport.AsyncInference/", "SendPolicyInstructions"
@@ -39,8 +38,6 @@ NO_CHUNK: Final = (
     "answered without a chunk: its policy raised an error, which only its log has, or no observation reached it within "
     "its --obs_queue_timeout (2 s), as another client took it"
 )
-PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
-"""The connection preface of HTTP/2 and an empty SETTINGS frame (RFC 9113, 3.4 and 6.5), whose header has 9 bytes."""
 _LOADED: Final[dict[str, dict[str, Any]]] = {}
 """URL -> the policy that a client of this process, which is open, named last: cells of a run may name others."""
 
@@ -60,7 +57,6 @@ class GrpcClient(PolicyClient[GrpcOptions]):
             answer = self._exchanged(channel, body, bounds, trace)
         except grpc.RpcError as error:
             raise self._reason(error) from error
-        bounds.count_bytes(len(answer))
         trace.facts[PAYLOAD_DOWN_BYTES] = len(answer)
         if not answer:
             _LOADED.pop(self._url, None)  # a server that was started again has no policy
@@ -143,20 +139,13 @@ class GrpcClient(PolicyClient[GrpcOptions]):
             self._channel = None
 
 
-def examine(parts: SplitResult) -> Iterator[Finding | str]:
-    """Find out whether the server speaks HTTP/2, as lerobot's does; no method is called, as `Ready` would reset it."""
-    with socket.create_connection((parts.hostname or "", parts.port or 8080), PATIENCE_S) as connection:
-        connection.sendall(PREFACE)
-        head = connection.makefile("rb").read(9)
-    if head[3:4] != b"\x04":  # the type of SETTINGS
-        yield Finding("server", "error", "the server does not speak gRPC", "name another scheme, or another port")
-        return
+def examine(parts: SplitResult) -> Iterator[Finding]:
+    """Yield what holds for every server of lerobot's; no method is called, as `Ready` would reset it."""
+    yield from connect(parts)
     what = "lerobot's policy server answers no sooner than 33 ms after a request, unless it was started otherwise"
     yield Finding("sleep", "advice", what, "start it with --inference_latency=0; runs warn of it (padded-answers)")
     what = "lerobot's policy server drops, silently, an observation without must_go whose state is near the last one's"
     yield Finding("filter", "advice", what, "set must_go, as s2a-bench does, or measure with a state that changes")
-    yield NO_KEY
-    yield f"{UNPICKLES} if it is lerobot's (CVE-2026-25874)"
 
 
 def message_of(data: bytes | memoryview, field: int = 1) -> bytes:

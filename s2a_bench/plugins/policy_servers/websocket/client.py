@@ -15,10 +15,9 @@ from urllib.parse import SplitResult, urlsplit, urlunsplit
 
 import numpy as np
 from PIL import Image
-from websockets.extensions.permessage_deflate import ClientPerMessageDeflateFactory
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, S2AError, ServerDied, UsageError
+from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.facts import INFER_MS, PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.machine.doctor import Finding
 from s2a_bench.plugins.policy_servers import observed
@@ -26,7 +25,7 @@ from s2a_bench.plugins.policy_servers.observation import CAMERAS, EXTENSION, Ext
 from s2a_bench.plugins.policy_servers.policy_client import PolicyClient, policy_picture
 from s2a_bench.plugins.policy_servers.websocket import STREAM, STREAM_PATH, TIMING, WebsocketOptions, codec
 from s2a_bench.plugins.policy_servers.websocket.codec import packb, unpackb
-from s2a_bench.plugins.policy_servers.websocket.link import REFUSED, BoundedConnection, Broken
+from s2a_bench.plugins.policy_servers.websocket.link import Broken, Link
 from s2a_bench.provenance import Provenance
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
@@ -34,7 +33,7 @@ from s2a_bench.transport import Wiring
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
-from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, idle_cut
+from s2a_bench.transport.risks import PATIENCE_S, idle_cut
 from s2a_bench.types import Action, Frame, Piece, Request
 
 
@@ -51,7 +50,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         key = read_key(wiring.options.api_key_env)
         self._headers = {"Authorization": f"{codec.SCHEME} {key}"} if key else {}
         self._headers[codec.MARKS_HEADER] = "1"
-        self._link: BoundedConnection | None = None
+        self._link: Link | None = None
         self._metadata: dict[str, str] = {}
         self._ignored: list[tuple[int, str]] = []
         self._provenance: dict[str, str] = {}
@@ -101,31 +100,31 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         trace.mark("connect")
         return self._exchanged(link, body, cameras)
 
-    def _connected(self, bounds: Bounds) -> BoundedConnection:
+    def _connected(self, bounds: Bounds) -> Link:
         self._link = None
-        link = BoundedConnection(self._url, self._headers, bounds, self._wiring.timeout_s, self._server.idle_s)
+        link = Link(self._url, self._headers, bounds, self._wiring.timeout_s, self._server.idle_s)
         try:
             if self._server.greets:
                 self._greeted(link)
             if self._server.reset is not None:
-                link.send_in_time(packb(self._server.reset))
+                link.send(packb(self._server.reset))
                 self._ready(link.receive())
         except BaseException:
-            link.close_socket()
+            link.abandon()
             raise
         self._link = link
         return link
 
-    def _exchanged(self, link: BoundedConnection, body: bytes, cameras: int) -> bytes:
+    def _exchanged(self, link: Link, body: bytes, cameras: int) -> bytes:
         for index, path in self._ignored:
             if index < cameras:
                 known, cure = ", ".join(map(repr, self._listed)), "take a template with these keys, or write one"
                 name = self._template.name
                 raise UsageError(f"`template` {name}: the server ignores '{path}', it reads {known}; {cure}")
-        link.send_in_time(body)
+        link.send(body)
         return self._message(link)
 
-    def _greeted(self, link: BoundedConnection) -> None:
+    def _greeted(self, link: Link) -> None:
         metadata = unpackb(self._message(link))
         if not isinstance(metadata, dict):
             raise RequestFailed(f"{self._url}: its metadata is {type(metadata).__name__}, not a dictionary")
@@ -148,7 +147,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         elif answer.lstrip().startswith("Traceback"):
             raise self._failed(answer)
 
-    def _message(self, link: BoundedConnection) -> bytes:
+    def _message(self, link: Link) -> bytes:
         """Return the next binary message; a text is an error."""
         message = link.receive()
         if isinstance(message, str):
@@ -206,7 +205,7 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
 
     def _abandon(self) -> None:
         if self._link is not None:
-            self._link.close_socket()
+            self._link.abandon()
             self._link = None
 
     def close(self) -> None:
@@ -215,38 +214,19 @@ class WebsocketClient(PolicyClient[WebsocketOptions]):
         self._abandon()
 
 
-def examine(parts: SplitResult) -> Iterator[Finding | str]:
-    """Shake hands without a key, and at templates' paths if that is refused; no request is sent."""
+def examine(parts: SplitResult) -> Iterator[Finding]:
+    """Shake hands without a key, offering compression; no request is sent."""
     servers = {name: template_of(name).server for name in names()}
-    given, why, compresses = parts.path or "/", "", None
-    for path in (given, *sorted({each.path or "/" for each in servers.values()} - {given})):
-        url = urlunsplit(parts._replace(path=path))
-        bounds, offered = Bounds(url, PATIENCE_S, 0), [ClientPerMessageDeflateFactory()]
-        try:
-            with closing(BoundedConnection(url, {}, bounds, PATIENCE_S, extensions=offered)) as link:
-                with suppress(RequestFailed):  # as of servers that wait for their client's first message
-                    link.receive()
-                compresses = bool(link.protocol.extensions)
-                break
-        except ServerDied as error:
-            raise OSError(str(error).rpartition(": ")[2]) from error
-        except S2AError as error:
-            why = str(error) if REFUSED not in str(error) else why or str(error)
-            if REFUSED not in why:
-                break
-    if compresses is None:
-        yield Finding("server", "state", f"it answers, and refuses a client without a key: {why}")
-        return
-    if why:
-        yield Finding("path", "advice", f"{why}; it lets clients in at {path}", f"name {url}")
-    if compresses:
-        what = "it compresses for clients that offer it, as libraries do by default: each observation is deflated first"
-        cure = "connect with compression=None, as the clients of openpi and s2a-bench do, or turn it off in the server"
-        yield Finding("compression", "advice", what, cure)
-    if cut := {name: each.idle_s for name, each in servers.items() if each.idle_s and each.path == path.rstrip("/")}:
+    path = parts.path.rstrip("/")
+    if cut := {name: each.idle_s for name, each in servers.items() if each.idle_s and each.path == path}:
         cure = f"--template {' or '.join(cut)}, of servers with this path: it keeps the connection open"
         yield idle_cut(min(cut.values()), cure)
-    yield NO_KEY
+    url = urlunsplit(parts)
+    with closing(Link(url, {}, Bounds(url, PATIENCE_S, 0), PATIENCE_S, compression="deflate")) as link:
+        if link.compresses:
+            what = "it compresses for clients that offer it, as libraries do: each observation is deflated first"
+            cure = "connect with compression=None, as openpi's and s2a-bench's clients do, or turn it off in the server"
+            yield Finding("compression", "advice", what, cure)
 
 
 def _kind(answer: Any) -> str:

@@ -37,7 +37,11 @@ class Zmq(ListeningTransport[ZmqOptions], PolicyTransport[ZmqOptions]):
     name = "zmq"
     options = ZmqOptions
     variants = (GR00T,)
-    urls = Urls(ZmqOptions.SCHEMES, examine="s2a_bench.plugins.policy_servers.zmq.client:examine")
+    urls = Urls(
+        ZmqOptions.SCHEMES,
+        examine="s2a_bench.transport.risks:connect",
+        unpickles="GR00T N1 and early N1.7 unpickle what any client sends",
+    )
     needs = ("zmq", "msgpack", "zmq")
     client_class = "s2a_bench.plugins.policy_servers.zmq.client:ZmqClient"
     server_class = "s2a_bench.plugins.policy_servers.zmq.server:ZmqServer"

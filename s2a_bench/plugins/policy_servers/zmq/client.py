@@ -1,50 +1,43 @@
 """The client of GR00T's protocol: fill the template, pack, send, read the chunk, and mark each step.
 
-A REQ socket takes one answer a request, so the client requests our server's marks once it has the chunk; a server that
-runs already is ours if its modality configurations say so. A foreign one sends none: all from the last byte that was
-packed to the chunk is the stage `server`. A socket whose request failed is thrown away, for it would wait for that
-answer for ever.
+Our server sends its marks as a second message behind the chunk; a server that runs already is ours if its modality
+configurations say so. A foreign one sends none: all from the last byte that was packed to the chunk is the stage
+`server`. A connection whose request failed is thrown away, so that no late answer is taken for the next one's.
 """
 
 from __future__ import annotations
 
+import socket
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from typing import Any, Final
-from urllib.parse import SplitResult, urlunsplit
+from urllib.parse import urlsplit
 
 import zmq
 
 from s2a_bench.clock import now_ns
-from s2a_bench.errors import RequestFailed, ServerDied, TransportError
+from s2a_bench.errors import RequestFailed, ServerDied
 from s2a_bench.facts import PAYLOAD_BYTES, RECONNECTS
 from s2a_bench.frames.convert import yuyv_to_rgb
-from s2a_bench.machine.doctor import Finding
 from s2a_bench.plugins.policy_servers import observed
 from s2a_bench.plugins.policy_servers.observation import EXTENSION
 from s2a_bench.plugins.policy_servers.policy_client import PolicyClient
 from s2a_bench.plugins.policy_servers.zmq import ZMQ, ZmqOptions, layouts
-from s2a_bench.plugins.policy_servers.zmq.watch import ConnectionWatch
 from s2a_bench.plugins.policy_servers.zmq.wire import PictureFile, pack, read
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.limits import Bounds
-from s2a_bench.transport.listening import in_url, read_key
-from s2a_bench.transport.risks import NO_KEY, PATIENCE_S, UNPICKLES, printable
+from s2a_bench.transport.listening import read_key
 from s2a_bench.types import Frame, Piece, Pixels, Request
 
 ANSWER_BYTES: Final = 16 << 20
 """Most bytes of an answer; libzmq takes no more."""
 POLL_MS: Final = 20
 """How often a waiting request checks its connection."""
-LONGEST_S: Final = 86_400
-"""The longest `retry_after_s` that counts."""
 KEPT_FILES: Final = 16
 """Most pictures whose memory is kept for the next request."""
 WRONG_POLICY: Final = b"ERROR"
 """The reply of some GR00T servers that serve another kind of policy."""
-N1: Final = WRONG_POLICY, b"PK\x03\x04", *(bytes((0x80, protocol)) for protocol in range(2, 6))
-"""How answers of GR00T N1 begin: its only error, an archive of torch.save, a pickle."""
 
 
 class ZmqClient(PolicyClient[ZmqOptions]):
@@ -53,7 +46,7 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         super().__init__(wiring, alive)
         self._key = read_key(wiring.options.api_key_env)
         self._files: dict[tuple[int, int, int], PictureFile] = {}
-        self._link: ReqSocket | None = None
+        self._link: Dealer | None = None
         self._connected = False
         self._layout: str = wiring.options.layout
         answer: Any = None
@@ -66,8 +59,7 @@ class ZmqClient(PolicyClient[ZmqOptions]):
     def _configurations(self) -> tuple[Any, set[str]]:
         """Return the server's modality configurations and their marks: its layout, and whether it is ours."""
         bounds = self._wiring.bounds(self._url, 1)
-        with closing(ReqSocket(self._url, self._wiring.timeout_s, self._alive)) as link:
-            link.greet(bounds)
+        with closing(Dealer(self._url, self._wiring.timeout_s, self._alive, bounds)) as link:
             return self._read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES, **self._token()}), bounds))
 
     def _answer(self, request: Request, bounds: Bounds, trace: Trace) -> Iterator[Piece]:
@@ -76,19 +68,17 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         seen_ns = now_ns()
         yield from actions
         if self._native:
-            wanted = {layouts.ENDPOINT: layouts.MARKS, EXTENSION: {"id": request.id}, **self._token()}
-            trace.receive(observed.remote_of(self._checked(link.exchange(pack(wanted), bounds))))
+            trace.receive(observed.remote_of(self._checked(link.receive(bounds))))
         trace.marks.append(("return" if self._native else "server", seen_ns))
 
-    def _open(self, bounds: Bounds, trace: Trace) -> ReqSocket:
+    def _open(self, bounds: Bounds, trace: Trace) -> Dealer:
         """Return the kept connection, or a new one that both sides have greeted over, marking `connect`."""
         if self._link is not None and not self._link.stands():
             self.close()
         if self._link is None:
             if self._connected:
                 trace.facts[RECONNECTS] = 1.0
-            self._link = ReqSocket(self._url, self._wiring.timeout_s, self._alive)
-            self._link.greet(bounds)
+            self._link = Dealer(self._url, self._wiring.timeout_s, self._alive, bounds)
             self._connected = True
             trace.mark("connect")
         return self._link
@@ -134,8 +124,8 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         answer, _ = self._read(message)
         if isinstance(answer, dict) and layouts.ERROR in answer:
             wait_s = answer.get(layouts.RETRY)
-            patient = isinstance(wait_s, (int, float)) and 0 <= wait_s <= LONGEST_S
-            raise self._failed(str(answer[layouts.ERROR]), wait_s if patient else None)
+            number = isinstance(wait_s, (int, float)) and wait_s > 0
+            raise self._failed(str(answer[layouts.ERROR]), wait_s if number else None)
         return answer
 
     def describe(self) -> dict[str, str]:
@@ -143,90 +133,69 @@ class ZmqClient(PolicyClient[ZmqOptions]):
         return {**super().describe(), **template, "layout": self._layout}
 
 
-def examine(parts: SplitResult) -> Iterator[Finding | str]:
-    """Ping without a key; if that is answered, read how its configurations are marked."""
-    url = urlunsplit((parts.scheme, f"{in_url(parts.hostname or '')}:{parts.port or 5555}", "", "", ""))
-    bounds = Bounds(url, 3 * PATIENCE_S, 0)
-    with closing(ReqSocket(url, PATIENCE_S, lambda: True)) as link:
-        link.greet(bounds)
-        pong = link.exchange(pack({layouts.ENDPOINT: layouts.PING}), bounds)
-        if pong.startswith(N1):
-            yield f"{UNPICKLES} (GR00T N1, whose protocol s2a-bench does not speak)"
-            return
-        answer, marks = read(pong)
-        if not isinstance(answer, dict):
-            raise RequestFailed(f"{url} answers a ping with {type(answer).__name__}, which GR00T's servers do not")
-        if layouts.ERROR in answer:
-            error = printable(str(answer[layouts.ERROR]))
-            yield Finding("server", "state", f"it answers, and refuses requests without a key: {error}")
-        else:
-            yield NO_KEY
-            _, marks = read(link.exchange(pack({layouts.ENDPOINT: layouts.MODALITIES}), bounds))
-    if not marks & {layouts.N1_5, layouts.N1_6}:
-        yield "may unpickle what it receives (early GR00T N1.7)"
+class Dealer:
+    """One DEALER socket and its connection, bounded in time and bytes, that speaks as a REQ socket does.
 
+    libzmq connects once (no RECONNECT_IVL) and lets a message in only after both sides have greeted (IMMEDIATE), so
+    the socket takes messages (POLLOUT) for as long as the connection stands.
+    """
 
-class ReqSocket:
-    """One REQ socket and its connection, bounded in time and bytes."""
-
-    def __init__(self, url: str, timeout_s: float, alive: Callable[[], bool]) -> None:
-        """Begin to connect; raises TransportError for a URL that is none."""
+    def __init__(self, url: str, timeout_s: float, alive: Callable[[], bool], bounds: Bounds) -> None:
+        """Connect, and wait until both sides have greeted; raises ServerDied or RequestFailed."""
         self._url, self._timeout_s, self._alive = url, timeout_s, alive
         self._context = zmq.Context()
-        self._socket = self._context.socket(zmq.REQ)
+        self._socket = self._context.socket(zmq.DEALER)
         self._socket.linger = 0
         self._socket.maxmsgsize = ANSWER_BYTES
-        self._socket.rcvtimeo = self._socket.sndtimeo = max(1, round(timeout_s * 1e3))
+        self._socket.immediate = True
+        self._socket.reconnect_ivl = -1
         self._socket.ipv6 = "[" in url
-        self._watch = ConnectionWatch(self._socket)
-        self._poller = zmq.Poller()
-        self._poller.register(self._watch.monitor, zmq.POLLIN)
-        self._poller.register(self._socket, zmq.POLLIN)
         try:
+            self._check_port(min(timeout_s, bounds.left_s()))
             self._socket.connect(url)
-        except zmq.ZMQError as error:
+            self._wait(zmq.POLLOUT, bounds)
+        except BaseException:
             self.close()
-            raise TransportError(f"`url`: cannot connect to {url}: {error.strerror}") from error
+            raise
 
     def stands(self) -> bool:
-        self._watch.hear()
-        return bool(self._watch.connections)
-
-    def greet(self, bounds: Bounds) -> None:
-        """Wait until both sides have greeted; raises ServerDied or RequestFailed."""
-        self._wait(bounds, greeting=True)
+        return bool(self._socket.poll(0, zmq.POLLOUT))
 
     def exchange(self, body: memoryview, bounds: Bounds) -> bytes:
         try:
-            self._socket.send(body, copy=False)
-            self._wait(bounds)
-            answer: bytes = self._socket.recv(zmq.NOBLOCK)
-            more = bool(self._socket.rcvmore)  # the rest goes with the socket
+            self._socket.send_multipart([b"", body], zmq.NOBLOCK, copy=False)
         except zmq.ZMQError as error:
             raise RequestFailed(f"{self._url}: {error.strerror}") from error
-        bounds.count_bytes(len(answer))
-        if more:
-            raise RequestFailed(f"{self._url} answered with several frames, not one")
-        return answer
+        return self.receive(bounds)
 
-    def _wait(self, bounds: Bounds, *, greeting: bool = False) -> None:
-        """Wait for an answer, or for the end of the ``greeting``; raises what says why waiting has to end."""
-        ends_ns, watch = now_ns() + round(min(self._timeout_s, bounds.left_s()) * 1e9), self._watch
-        while self._socket not in dict(self._poller.poll(POLL_MS)):
-            watch.hear()
-            if greeting and any(connection.ready for connection in watch.connections.values()):
-                return
-            if watch.refused and not watch.met:
-                raise ServerDied(f"nothing answers at {self._url}")
+    def receive(self, bounds: Bounds) -> bytes:
+        """Return the next message."""
+        self._wait(zmq.POLLIN, bounds)
+        frames = self._socket.recv_multipart()
+        if len(frames) != 2:  # noqa: PLR2004 - an empty one, and the message
+            raise RequestFailed(f"{self._url} answered with {len(frames)} frames, not with an empty one and a message")
+        bounds.count_bytes(len(frames[1]))
+        return frames[1]
+
+    def _check_port(self, seconds: float) -> None:
+        """Raise ServerDied if nothing listens: libzmq does not tell."""
+        parts = urlsplit(self._url)
+        try:
+            socket.create_connection((parts.hostname or "", parts.port or 0), seconds).close()
+        except OSError as error:
+            raise ServerDied(f"nothing answers at {self._url}: {error.strerror or error}") from error
+
+    def _wait(self, event: int, bounds: Bounds) -> None:
+        """Wait until the socket can be written or read; raises what says why waiting has to end."""
+        ends_ns = now_ns() + round(min(self._timeout_s, bounds.left_s()) * 1e9)
+        while not self._socket.poll(POLL_MS, event):
             if not self._alive():
                 raise ServerDied(f"the server at {self._url} has ended")
-            if watch.met and not watch.connections:
-                doubt = "; is it a ZeroMQ peer?" if greeting else ""
-                raise RequestFailed(f"{self._url} broke the connection{doubt}", starting=True)
+            if event == zmq.POLLIN and not self.stands():
+                raise RequestFailed(f"{self._url} broke the connection", starting=True)
             bounds.left_s()
             if now_ns() > ends_ns:
                 raise RequestFailed(f"{self._url} was silent for too long: {self._timeout_s:g} s", starting=True)
 
     def close(self) -> None:
-        self._watch.close()
         self._context.destroy(0)

@@ -5,8 +5,8 @@ N1.5 is flat: ``video.<camera>`` (T, H, W, 3) uint8, ``state.<part>`` (T, D), ``
 in front, as (B, T, H, W, 3), (B, T, D), [[text]]; its answer is [{part: (B, H, D)}, info]. N1.7 nests as N1.6 does, and
 packs arrays and marks configurations in another way (`wire`). Our server reads all of them, and answers in the same.
 
-A request of our client has what `observed` adds beside GR00T's keys. Once it is answered the client asks
-`MARKS`, by that request's id, for what the server marked; nothing of it is measured.
+A request of our client has what `observed` adds beside GR00T's keys. Its answer is followed by a second message, what
+the server marked; nothing of it is measured.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from s2a_bench.plugins.policy_servers.observation import EXTENSION, VALUES, Temp
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.types import Action, Vector
 
-MARKS: Final = "s2a_marks"
 GET_ACTION, PING, RESET, MODALITIES, KILL = "get_action", "ping", "reset", "get_modality_config", "kill"
 ENDPOINT, DATA, TOKEN, ERROR, RETRY = "endpoint", "data", "api_token", "error", "retry_after_s"
 AUTO, N1_5, N1_6, N1_7 = "auto", "n1.5", "n1.6", "n1.7"

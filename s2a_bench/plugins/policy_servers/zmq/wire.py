@@ -28,12 +28,8 @@ ARRAY, FILE = "__ndarray_class__", "as_npy"
 SMALL: Final = 1 << 16
 """Bytes that a message without large pictures takes, or fewer."""
 NO_FILES: Final[Mapping[int, PictureFile]] = {}
-HEAD: Final = 4096
-"""Bytes of the longest header that is read; NumPy's own take 128."""
 BEFORE: Final = 128
 """Bytes of the header of a picture, and of most."""
-PREFIX: Final = {b"\x01\x00": 10, b"\x02\x00": 12, b"\x03\x00": 12}
-"""Version -> bytes before the header's text: the magic, the version, the text's length."""
 
 _NUMBERS = re.compile(r"[<>|=](b1|[iu][1248]|f[248])")
 """What msgpack-numpy calls types of numbers."""
@@ -129,33 +125,25 @@ def array_of(data: Any) -> NDArray[Any]:
     """Return the read-only array in a file, not copied; raises RequestFailed for other bytes, types and sizes."""
     if not isinstance(data, bytes):
         raise RequestFailed(f"an array whose as_npy is {type(data).__name__}, not bytes")
-    start, shape, fortran, dtype = _read_head(_head_in(data))
-    return array_in(data, shape[::-1], dtype, start).T if fortran else array_in(data, shape, dtype, start)
-
-
-def _head_in(data: bytes) -> bytes:
-    version = data[6:8]
-    prefix = PREFIX.get(version, 0) if data.startswith(npy.MAGIC_PREFIX) else 0
-    if not prefix or len(data) < prefix:
-        raise RequestFailed(f"{len(data)} bytes that are no NumPy file")
-    length = int.from_bytes(data[8:prefix], "little")
-    if length > HEAD or len(data) < prefix + length:
-        raise RequestFailed(f"a NumPy file whose header has {length} bytes")
-    return data[: prefix + length]
+    text = 10 if data[6:7] == b"\x01" else 12  # where the header's text begins, behind its length
+    head = data[: text + int.from_bytes(data[8:text], "little")]
+    shape, fortran, dtype = _read_head(head)
+    array = array_in(data, shape[::-1] if fortran else shape, dtype, len(head))
+    return array.T if fortran else array
 
 
 @lru_cache(64)
-def _read_head(head: bytes) -> tuple[int, tuple[int, ...], bool, np.dtype[Any]]:
-    """Return where the array begins, its shape, whether it is in Fortran's order, and its type."""
+def _read_head(head: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Return the shape of the array behind a file's head, whether it is in Fortran's order, and its type."""
     file, wrong = io.BytesIO(head), RequestFailed(f"a NumPy file of {head[10:90]!r}; numbers are taken, nothing else")
-    read = npy.read_array_header_1_0 if npy.read_magic(file) == (1, 0) else npy.read_array_header_2_0
     try:
+        read = npy.read_array_header_1_0 if npy.read_magic(file) == (1, 0) else npy.read_array_header_2_0
         shape, fortran, dtype = read(file)
     except Exception as error:  # NumPy's reader raises whatever Python's tokenizer does
         raise wrong from error
     if dtype.kind not in "biuf":
         raise wrong
-    return len(head), shape, fortran, dtype
+    return shape, fortran, dtype
 
 
 @lru_cache(64)
