@@ -59,6 +59,12 @@ def test_numbers_and_texts_that_are_none_are_refused_by_name_and_hold_no_engine(
         assert whole.json()["usage"]["completion_tokens"] == 1
 
 
+def test_a_raw_picture_of_negative_sides_is_refused() -> None:
+    headers = {PARAMETERS_HEADER: "{}", "content-type": "application/x-raw;width=-1;height=-3;encoding=bgr8"}
+    with serving(RecordingHandler(["a"]), "http/binary") as url:
+        assert httpx.post(url + PATHS["binary"], content=b"abc" * 3, headers=headers).status_code == 400
+
+
 def test_leaving_twice_lets_one_run_not_two() -> None:
     turns = Turns()
     first, second, third = (turns.join() for _ in range(3))

@@ -35,9 +35,8 @@ def chat(path: str, prompt: str = '"go on"', fields: str = '"max_tokens": 3') ->
 
 
 @cache
-def bomb() -> bytes:
-    """Return a PNG of 900 million pixels of one bit, made without its pixels: 110 kB, and 2.7 GB once decoded."""
-    width = height = 30_000
+def png_of_zeros(width: int, height: int) -> bytes:
+    """Return a PNG of one bit a pixel, made without its pixels: 30000x30000 are 110 kB, and 2.7 GB once decoded."""
     pack = zlib.compressobj(9)
     rows = b"".join(pack.compress(bytes(1 + (width + 7) // 8)) for _ in range(height)) + pack.flush()
 
@@ -46,6 +45,11 @@ def bomb() -> bytes:
 
     ihdr = struct.pack(">IIBBBBB", width, height, 1, 0, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", ihdr) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+
+
+def bomb() -> bytes:
+    """Return a small picture of 900 million pixels."""
+    return png_of_zeros(30_000, 30_000)
 
 
 def picture(path: str, data: bytes) -> bytes:
