@@ -1,11 +1,10 @@
-"""*As deployed*: FastAPI on uvicorn with httptools, like llama-cpp-python's server and most robot code.
+"""*As deployed*: FastAPI on uvicorn with h11, like llama-cpp-python's server and most robot code.
 
 It has a pydantic body, the standard library's JSON and Base64, and computes answers on a thread pool.
 
-uvicorn bounds the number of connections that are answered. `Admission` bounds the body and its time, and lets the
-headers decide on access: FastAPI gets a request that is admitted and complete. A head is bounded once it is complete.
-Until then, its length and time have no bound, nor has an answer that its client does not read: h11, the other protocol
-of uvicorn, bounds the length, and takes 0.1-0.5 ms more for a raw picture of 640x480.
+uvicorn bounds the number of connections and the length of a head. `Admission` bounds the body and its time, and lets
+the headers decide on access: FastAPI gets a request that is admitted and complete. The time of a head, and of an answer
+that its client does not read, has no bound beside the number of connections.
 """
 
 from __future__ import annotations
@@ -71,11 +70,9 @@ class Admission:
         limits, pieces, size = self._core.limits, [], 0
         headers = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"]]
         native.admit(self._access, scope["path"], headers)
-        if (head_bytes := sum(len(name) + len(value) for name, value in headers)) > limits.header_bytes:
-            raise Refused(431, f"more than {limits.header_bytes} bytes of headers")
         _check_size(int(dict(headers).get("content-length", 0)), limits)
         count = held.enter_context(self._core.in_flight.counted())
-        count(head_bytes)
+        count(sum(len(name) + len(value) for name, value in headers))
         with anyio.move_on_after(limits.body_s):
             while (message := await receive())["type"] != "http.disconnect":
                 pieces.append(message.get("body", b""))
@@ -225,19 +222,20 @@ class HttpServer(WebServer):
         config = uvicorn.Config(
             application(self._core, self._access, documented=wiring.options.api_docs),
             loop="uvloop",
-            http="httptools",
+            http="h11",
             ws="none",
             log_level="error",
             access_log=False,
             lifespan="off",
             limit_concurrency=wiring.limits.connections + 1,  # it refuses from this number on
+            h11_max_incomplete_event_size=wiring.limits.header_bytes,
             timeout_graceful_shutdown=1,
             timeout_keep_alive=native.KEEP_ALIVE_S,
         )
         self._server = uvicorn.Server(config)
 
     def describe(self) -> dict[str, str | int]:
-        return {"server": "uvicorn", "version": uvicorn.__version__, "loop": "uvloop", "http": "httptools"}
+        return {"server": "uvicorn", "version": uvicorn.__version__, "loop": "uvloop", "http": "h11"}
 
     def serve(self) -> None:
         """Serve on another thread: on the main one uvicorn handles the signals, as the process of the server does."""
