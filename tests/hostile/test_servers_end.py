@@ -7,6 +7,8 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from threading import Thread
 
@@ -33,10 +35,19 @@ def child_of(process: subprocess.Popen[bytes]) -> int:
     return int(Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()[0])
 
 
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
-def test_the_process_of_serve_ends_with_it(number: signal.Signals) -> None:
+@contextmanager
+def serve() -> Iterator[subprocess.Popen[bytes]]:
     line = command("serve", "http", "--engine", "echo", "--port", "0")
     with subprocess.Popen(line, stdout=subprocess.PIPE) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
+def test_the_process_of_serve_ends_with_it(number: signal.Signals) -> None:
+    with serve() as process:
         assert process.stdout.readline()
         child = child_of(process)
         process.send_signal(number)
@@ -46,7 +57,7 @@ def test_the_process_of_serve_ends_with_it(number: signal.Signals) -> None:
 
 @pytest.mark.slow
 def test_a_signal_while_it_starts_leaves_nothing() -> None:
-    with subprocess.Popen(command("serve", "http", "--engine", "echo", "--port", "0")) as process:
+    with serve() as process:
         children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
         until(lambda: bool(children.read_text()))
         child = child_of(process)
