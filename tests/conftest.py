@@ -96,6 +96,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
         def _split_scope(self, nodeid: str) -> str:
             return "tests/hostile" if nodeid.startswith("tests/hostile/") else nodeid.partition("::")[0]
 
+    config.option.loadscopereorder = False  # files of few tests start processes: by their number they would all be last
     return Files(config, log)
 
 
