@@ -49,11 +49,9 @@ def child_of(process: subprocess.Popen[str]) -> int:
     return int(Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()[0])
 
 
-def test_ros_answers_goals_and_publishes_tokens_and_is_started_again_where_it_died(
-    start: Start, dds_domain: int, tmp_path: Path
-) -> None:
+def test_ros_answers_goals_and_publishes_tokens(start: Start, dds_domain: int, tmp_path: Path) -> None:
     (tmp_path / "node.toml").write_text('engine = "echo"\nnamespace = "/from_file"\nmax-tokens = 5\n')
-    process, line = start("ros", "--config", str(tmp_path / "node.toml"), "--namespace", "/robot_llama", *ONE_BY_ONE)
+    _, line = start("ros", "--config", str(tmp_path / "node.toml"), "--namespace", "/robot_llama", *ONE_BY_ONE)
     assert "/robot_llama/generate_response" in line  # flags win
     assert "engine echo" in line
     middleware = open_middleware(domain_id=dds_domain)
@@ -70,9 +68,13 @@ def test_ros_answers_goals_and_publishes_tokens_and_is_started_again_where_it_di
     finally:
         client.close()
         middleware.close()
+
+
+def test_a_ros_server_that_died_is_started_again_at_once(start: Start, dds_domain: int) -> None:
+    process, line = start("ros", "--engine", "echo", "--namespace", "/reborn", "--max-tokens", "5", *ONE_BY_ONE)
     os.kill(child_of(process), signal.SIGKILL)
     assert process.stdout.readline() == line
-    client = open_client(wiring_of("ros/action", "/robot_llama", domain_id=dds_domain))
+    client = open_client(wiring_of("ros/action", "/reborn", domain_id=dds_domain))
     try:
         tokens, _ = ask(client, Request("a", "go to the kitchen", (yuyv_frame(),)))
         assert len(tokens) == 5
