@@ -34,7 +34,11 @@ from tests.hostile.wires import http, ros, shm, websocket, zmq
 
 CLIENTS = {
     "http": ("http", http.CLIENTS + http.LARGE, ("http", "http", "http")),
-    "http/best-effort": ("http", http.FAST + http.FAST_LARGE, ("http/best-effort", "http/binary", "http/binary")),
+    "http/best-effort": (
+        "http/best-effort",
+        http.FAST + http.FAST_LARGE,
+        ("http/best-effort", "http/binary", "http/binary"),
+    ),
     "ros": ("ros", ros.CLIENTS + ros.LARGE, ("ros/topic", "ros/topic", "ros/action")),
     "shm": ("shm", shm.CLIENTS + shm.LARGE, ("shm", "shm", "shm")),
     "websocket": ("websocket", websocket.CLIENTS + websocket.LARGE, ("websocket", "websocket/openpi-stream")),
@@ -106,7 +110,7 @@ class Result:
 def served(transport: str, engine: str, log: Path) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Run `serve`, which ends with the context; yield its process and address."""
     line = [sys.executable, "-m", "s2a_bench", "serve", transport, "--engine", engine]
-    line += ["--port", "0"] if transport in PORTS else []
+    line += ["--port", "0"] if transport.partition("/")[0] in PORTS else []
     line += ["--namespace", f"/soak_{os.getpid()}", "--max-tokens", str(TOKENS)] if transport == "ros" else []
     with (
         log.open("a") as errors,
@@ -117,7 +121,7 @@ def served(transport: str, engine: str, log: Path) -> Iterator[tuple[subprocess.
             if not select.select([process.stdout], [], [], READY_S)[0]:
                 raise TimeoutError(f"the server printed nothing for {READY_S:g} s")
             first = process.stdout.readline()
-            if (address := re.search(ADDRESSES.get(transport, r"tcp://[\d.:]+"), first)) is None:
+            if (address := re.search(ADDRESSES.get(transport.partition("/")[0], r"tcp://[\d.:]+"), first)) is None:
                 raise RuntimeError(f"the server printed no address: {first}")
             yield process, address[0]
         finally:
