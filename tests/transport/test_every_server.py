@@ -305,35 +305,6 @@ def test_a_connection_too_many_is_refused(name: str) -> None:
         until(lambda: answered(None))
 
 
-@on_ports
-def test_off_this_machine_a_key_is_needed_or_none_is_asked_for(name: str) -> None:
-    handler = recorder(name)
-    with pytest.raises(UsageError, match=r"`host`: others reach 0.0.0.0; .*`api_key_env`, .*`no_auth`"):
-        open_server(wiring_of(name, "0.0.0.0:0"), handler)
-    with pytest.raises(UsageError, match=r"`no_auth` .* `api_key_env`"):
-        wiring_of(name, no_auth=True, api_key_env="MY_KEY")
-    with pytest.raises(UsageError, match="`api_key_env`: the environment has no such variable"):
-        open_server(wiring_of(name, api_key_env="NO_KEY"), handler)
-    with served(wiring_of(name, "0.0.0.0:0", no_auth=True), handler) as (server, _):
-        assert server.address
-
-
-@on_ports
-def test_a_key_is_sent_and_who_has_none_is_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MY_KEY", "s3cret-robot-key")
-    handler = recorder(name)
-    with served(wiring_of(name, api_key_env="MY_KEY"), handler) as (server, _):
-        with closing(open_client(wiring_of(name, server.address, api_key_env="MY_KEY"))) as client:
-            assert len(ask(client, Request("a", "go"))[0]) == 3
-        with (
-            closing(open_client(wiring_of(name, server.address))) as stranger,
-            pytest.raises(RequestFailed, match=r"401|Unauthorized") as refused,
-        ):
-            ask(stranger, Request("b", "go"))
-        assert "s3cret" not in str(refused.value)
-    assert len(handler.requests) == 1
-
-
 def has_ipv6() -> bool:
     try:
         socket.create_server(("::1", 0), family=socket.AF_INET6).close()
