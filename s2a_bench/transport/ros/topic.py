@@ -51,7 +51,6 @@ class TopicClient(RosClient):
                 )
             if token.last:
                 break
-            bounds.count_piece()
             pieces = wire.pieces_of(token)
             if not expected:
                 trace.mark("return")

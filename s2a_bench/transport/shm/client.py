@@ -47,7 +47,6 @@ class ShmClient(Client):
                 if isinstance(part, (Token, Action)):
                     if not part.index:
                         trace.mark("return")
-                    bounds.count_piece()
                     yield part
                     continue
                 done = True

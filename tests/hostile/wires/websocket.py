@@ -115,10 +115,5 @@ SERVERS: tuple[Case[Trap], ...] = (
         ),
         FAILED,
     ),
-    Case(
-        "a chunk of 100,000 actions",
-        _greets(tells({"actions": array(bytes(400_000), (100_000, 1))})),
-        "^RequestFailed: .*does not stop",
-    ),
     Case("partial frames without end", _greets(again=[tells({"type": "partial", **CHUNK}) * 100]), FAILED),
 )
