@@ -132,8 +132,6 @@ def deep() -> Any:
         ({"a": 1, "a?": 2}, "a is twice there"),
         ({"?": 1}, "empty"),
         ({"a": "\ud800"}, "a is no Unicode text"),
-        ({"a": [0] * 2000}, "exceeds the limits of a template"),
-        (deep(), "exceeds the limits of a template"),
         ({"s2a": {"anser": "x"}}, "s2a: anser: there is no such key; did you mean answer"),
         ({"s2a": {"path": "no/slash"}}, "s2a: path: 'no/slash' should match pattern"),
         ({"s2a": {"idle_s": 0}}, "s2a: idle_s: 0 should be greater than or equal to 1"),
@@ -183,7 +181,6 @@ def test_toml_and_json_say_the_same(tmp_path: Path) -> None:
         ("a.json", "[" * 50_000, "too deep"),
         ("a.toml", "a = ", "no TOML"),
         ("a.toml", "a = 2020-01-01", "which no observation can hold"),
-        ("a.toml", "#" * 70_000, "longer than 65536 letters"),
     ],
 )
 def test_a_file_that_cannot_be_read_is_refused_in_a_line(tmp_path: Path, name: str, text: str, says: str) -> None:
@@ -254,8 +251,6 @@ def test_the_pictures_of_a_request_share_its_pixels() -> None:
         ({"a": np.zeros((4, 0, 3), np.uint8)}, "0x4 is empty"),
         ({"a": b"abc"}, "a: the 3 bytes .*: neither a JPEG nor a PNG"),
         ({"a": b""}, "a: an empty picture"),
-        ({"a": np.zeros((99, 2, 2, 3), np.uint8)}, "a: 99 pictures"),
-        ({"a": [PICTURE] * 99}, "more than 64 pictures"),
         ({"a": np.zeros((64, 64, 3))}, "a: a state of more than 4096 numbers; pictures are uint8"),
         ({"a": float("nan")}, "not finite"),
         ({"prompt": "\ud800"}, "no Unicode text"),
