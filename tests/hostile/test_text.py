@@ -96,21 +96,13 @@ class TestLetters:
 
 def variants(key: str) -> list[str]:
     """The ways in which a server may send a key back."""
-    inside = [base64.b64encode(("x" * n + key + "yz").encode()).decode() for n in range(4)]
     return [
         key,
-        key.upper(),
-        key.lower(),
         quote(key, safe=""),
-        quote(key, safe="").lower(),
-        quote(quote(key, safe="")),
-        "".join(f"%{ord(letter):02X}" for letter in key),
+        json.dumps(key),
         json.dumps(key).replace("/", "\\/"),
-        "".join(f"\\u{ord(letter):04x}" for letter in key),
         base64.b64encode(key.encode()).decode(),
-        base64.urlsafe_b64encode(key.encode()).decode(),
         base64.b64encode(f"Bearer {key}".encode()).decode().rstrip("="),
-        *inside,
     ]
 
 
