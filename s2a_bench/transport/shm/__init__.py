@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import sys
 from collections.abc import Iterable, Mapping
 from typing import ClassVar
@@ -51,8 +50,8 @@ class Shm(Transport[ShmOptions]):
 
 def unavailable() -> str:
     """Return why memory without a name cannot be had or handed over here, or nothing."""
-    there = hasattr(os, "memfd_create") and hasattr(socket, "SO_PEERCRED")
-    return "" if there else f"it needs Linux (memfd_create, SO_PEERCRED); this is {sys.platform}"
+    there = hasattr(os, "memfd_create")
+    return "" if there else f"it needs Linux (memfd_create); this is {sys.platform}"
 
 
 def shared_memory(machine: Machine) -> Finding | None:  # noqa: ARG001 - the system of this process

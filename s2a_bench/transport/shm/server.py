@@ -35,7 +35,7 @@ from s2a_bench.transport.shm.memory import (
     refusal,
 )
 from s2a_bench.transport.shm.pieces import packed
-from s2a_bench.transport.shm.unix_socket import listen, may_ask
+from s2a_bench.transport.shm.unix_socket import listen
 from s2a_bench.types import Frame, Piece, Request
 
 HEADER_BYTES: Final = 1 << 20
@@ -115,8 +115,6 @@ class ShmServer:
         link, limits = wire.socket, self._core.limits
         try:
             wait_at_most(link, limits.head_s)
-            if not may_ask(link):
-                raise TransportError("this server answers its own user only")
             requests = accept(link, in_steps(limits.body_bytes))
             writer = Writer(wire, offer(link, ANSWER_BYTES))
             wait_at_most(link, 0)
