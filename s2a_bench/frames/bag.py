@@ -68,8 +68,6 @@ def _open(path: str) -> Any:
     try:
         reader = Reader(path)
         reader.open()
-        if not all(isinstance(name, str) for each in reader.connections for name in (each.topic, each.msgtype)):
-            raise ValueError("a topic's name or type is no text")
     except Exception as error:  # rosbags raises any exception on a damaged file
         raise SourceError(f"`source`: {_unreadable(path, error)}") from error
     return reader
@@ -90,8 +88,7 @@ def _connection(connections: list[Any], path: str, topic: str) -> Any:
 
 
 def _unreadable(path: str, error: Exception) -> str:
-    reason = " ".join(str(error).split()) or type(error).__name__
-    reason = "".join(letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in reason[:MOST_QUOTED])
+    reason = " ".join(str(error).split())[:MOST_QUOTED] or type(error).__name__
     return (
         f"{path} is no recording that can be read ({reason}); it should be a rosbag2 folder, "
         "a .mcap or a .db3 file. `mcap recover` repairs an .mcap that was cut short, `ros2 bag reindex` a folder"
