@@ -59,7 +59,7 @@ def shared_memory(machine: Machine) -> Finding | None:  # noqa: ARG001 - the sys
     why = unavailable()
     if not why:
         try:
-            os.close(os.memfd_create("s2a_bench", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING))
+            os.close(os.memfd_create("s2a_bench", os.MFD_CLOEXEC))
         except OSError as error:
             why = f"memfd_create: {error.strerror}"
     return Finding("shared-memory", "advice", f"--transport shm cannot run: {why}", "leave it out") if why else None

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import socket
-import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from threading import Event
@@ -15,7 +13,6 @@ from typing import Any, TypeAlias
 from s2a_bench.transport import Wiring
 from s2a_bench.transport.shm.memory import HELLO, MAGIC, PLACE
 from s2a_bench.transport.shm.pieces import unpacked
-from s2a_bench.transport.shm.server import HEADER_BYTES
 from s2a_bench.types import Action, Token
 from tests.hostile.suite import Attack, Case
 from tests.hostile.wires.http import png_of_zeros
@@ -23,16 +20,13 @@ from tests.hostile.wires.http import png_of_zeros
 ODD: tuple[Any, ...] = (-1, 1.5, [], 1 << 40)
 Does: TypeAlias = "Callable[[socket.socket], None]"
 MIB = 1 << 20
-SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
 
 
-def file_of(size: int, content: bytes = b"", *, sealed: bool = True) -> int:
+def file_of(size: int, content: bytes = b"") -> int:
     """Return anonymous memory."""
-    file = os.memfd_create("hostile", os.MFD_ALLOW_SEALING)
+    file = os.memfd_create("hostile")
     os.ftruncate(file, size)
     os.pwrite(file, content, 0)
-    if sealed:
-        fcntl.fcntl(file, fcntl.F_ADD_SEALS, SEALS)
     return file
 
 
@@ -93,7 +87,7 @@ def asks(
 def fields(**more: Any) -> bytes:
     """Return a header."""
     return json.dumps(
-        {"id": "a", "prompt": "go", "max_tokens": 2, "grammar": "", "seed": 0, "images": [], **more}
+        {"id": "a", "prompt": "go", "max_tokens": 2, "grammar": "", "seed": 0, "state": [], "images": [], **more}
     ).encode()
 
 
@@ -122,23 +116,6 @@ def sends(*packets: bytes) -> Does:
     return does
 
 
-def truncates(link: socket.socket) -> None:
-    """Offer memory and cut it off afterwards, which reading it would not outlive."""
-    file = file_of(MIB, fields(), sealed=False)
-    socket.send_fds(link, [HELLO.pack(MAGIC, MIB)], [file])
-    with suppress(OSError):
-        os.ftruncate(file, 0)
-    link.send(PLACE.pack(0, len(fields())))
-    os.close(file)
-
-
-def on_a_disk(link: socket.socket) -> None:
-    """Offer a file that has a name."""
-    with tempfile.TemporaryFile() as file:
-        file.truncate(4096)
-        hello(link, os.dup(file.fileno()), 4096)
-
-
 def does_not_read(link: socket.socket) -> None:
     """Ask for more than the memory holds, and read nothing."""
     header = fields(max_tokens=60_000)
@@ -151,29 +128,19 @@ def does_not_read(link: socket.socket) -> None:
 CLIENTS: tuple[Case[Attack], ...] = (
     Case("silence", attack(sends(), seconds=1)),
     Case("gone at once", attack(goes)),
-    Case("request without memory", attack(sends(PLACE.pack(64, 10))), "no offer"),
+    Case("request without memory", attack(sends(PLACE.pack(64, 10))), "no s2a-bench"),
     Case("memory without a file", attack(lambda link: hello(link, -1, 4096)), "should be one file"),
     Case("1 TiB of memory", attack(lambda link: hello(link, file_of(4096), 1 << 40)), "at most"),
-    Case("more memory than the file has", attack(lambda link: hello(link, file_of(4096), MIB)), "its size may change"),
-    Case("a file on a disk as memory", attack(on_a_disk), "is no memory"),
-    Case("memory that may shrink", attack(lambda link: hello(link, file_of(MIB, fields(), sealed=False), MIB)), "may"),
-    Case("memory that shrinks", attack(truncates)),
-    Case("header across the end", asks(fields(), at=1), "cannot be"),
-    Case("header of 5 MiB", asks(b"[" + b"{}," * (5 * MIB // 3) + b"{}]"), "cannot be"),
-    Case("200,000 pictures", asks(fields(images=[{}] * (HEADER_BYTES // 5))), "should lie before the header"),
-    Case("no JSON", asks(b"{]" * 50), "no JSON"),
-    Case("deep JSON", asks(b"[" * 100_000), "no JSON: depth limit exceeded"),
-    Case("a list", asks(b"[1, 2]"), "should be an object"),
-    Case("image that is no object", asks(fields(images=[7])), "should lie before the header"),
-    Case("picture after the header", asks(picture(bytes=1 << 30), bytes(24)), "should lie before the header"),
-    Case("picture of other sides", asks(picture(width=5), bytes(24)), "are no bgr8 picture of 5x2"),
+    Case("more memory than the file has", attack(lambda link: hello(link, file_of(4096), MIB))),
+    Case("no JSON", asks(b"{]" * 50), "internal error"),
+    Case("deep JSON", asks(b"[" * 100_000), "internal error"),
+    Case("picture of other sides", asks(picture(width=5), bytes(24)), "internal error"),
     Case("unknown encoding", asks(picture(encoding="tiff"), bytes(24)), "neither a JPEG nor a PNG"),
     Case(
         "ten pictures of 36 megapixels",
         asks(*encoded(*[png_of_zeros(6000, 6000)] * 10), seconds=30),
         "at most .* pixels",
     ),
-    Case("half a surrogate", asks(fields().replace(b'"go"', b'"\\ud800"')), "no JSON|surrogate"),
     *(Case(f"max_tokens {value}", asks(fields(max_tokens=value)), "max_tokens") for value in ODD),
     *(Case(f"state {value}", asks(fields(state=value)), "the state") for value in (7, ["x"], [[1]], {"a": 1}, [1e39])),
     Case("reads nothing", attack(does_not_read)),
