@@ -35,7 +35,6 @@ CAMERAS: Final = 64
 """The most pictures of a template."""
 PICTURE_ROOTS: Final = "", "images.", "observation.images.", "input.images.", "input.observation.images."
 """What may stand before the names of pictures that a server lists (SGLang)."""
-WHOLE: Final = range(-(1 << 63), 1 << 64)
 
 _PLACE = re.compile(
     r"\{(?:(?P<all>images)|(?P<picture>image)(?::(?P<image>\d{1,3}))?(?:\|(?P<form>\w+))?"
@@ -158,7 +157,7 @@ class Template:
             return self._list(value, path)
         if isinstance(value, str):
             return self._text(value, path)
-        if not (value is None or isinstance(value, (bool, float)) or (isinstance(value, int) and value in WHOLE)):
+        if not (value is None or isinstance(value, (bool, int, float))):
             self._refuse(path, f"is {value!r}, which no observation can hold")
         return lambda _: value
 
@@ -167,8 +166,8 @@ class Template:
         for key, value in table.items():
             name = key.removesuffix("?")
             inner = f"{path}.{name}" if path else name
-            if not name or name in made or not _is_text(name):
-                self._refuse(inner, "is twice there, empty, or no Unicode text")
+            if not name or name in made:
+                self._refuse(inner, "is twice there, or empty")
             made[name] = self._value(value, inner), name != key
 
         def make(values: _Values) -> dict[str, Any]:
@@ -200,8 +199,6 @@ class Template:
         return make
 
     def _text(self, text: str, path: str) -> _Make:
-        if not _is_text(text):
-            self._refuse(path, "is no Unicode text")
         if place := _PLACE.fullmatch(text):
             if place["all"]:
                 return self._pictures(path)
@@ -305,10 +302,6 @@ def _keyed(name: str, value: Any, names: Sequence[str]) -> dict[str, Any]:
         known = f"{len(names)} pictures ({', '.join(names)})"
         raise RequestFailed(f"the server reads {known}, not {len(value)}; see `cameras`")
     return {name.removesuffix(ANY) + key: picture for key, picture in zip(names, value, strict=False)}
-
-
-def _is_text(text: str) -> bool:
-    return not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def _readable(name: str) -> str:
