@@ -25,9 +25,15 @@ os.environ.pop("COLUMNS", None)  # tables are as wide as where nobody says
 pytest.register_assert_rewrite("tests.ros.action_suite", "tests.ros.middleware_suite")
 
 # These machines are shared: time is not judged. What is drawn is the same each time, as what judges a change must be;
-# S2A_RANDOM=1 draws anew, and so does `make fuzz`.
+# S2A_RANDOM=1 draws anew, and so does `make fuzz`. `make test` draws a quarter of what `make test-all` and CI do.
 settings.register_profile("s2a", deadline=None, derandomize="S2A_RANDOM" not in os.environ)
-settings.load_profile("s2a")
+settings.register_profile("quick", settings.get_profile("s2a"), max_examples=25)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Choose how many examples of a property are drawn, before a module with properties is imported."""
+    quick = config.getoption("markexpr") == "not slow" and "S2A_RANDOM" not in os.environ
+    settings.load_profile("quick" if quick else "s2a")
 
 
 @pytest.fixture
@@ -90,6 +96,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
         def _split_scope(self, nodeid: str) -> str:
             return "tests/hostile" if nodeid.startswith("tests/hostile/") else nodeid.partition("::")[0]
 
+    config.option.loadscopereorder = False  # files of few tests start processes: by their number they would all be last
     return Files(config, log)
 
 

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from s2a_bench.inference import EngineConfig
 from s2a_bench.machine.doctor import Machine, host
 from s2a_bench.machine.resources import Unreadable
 from s2a_bench.machine.resources.nvidia import Nvml
-from tests.cli.program import refused
+from tests.cli.program import called, refused
 from tests.cli.test_imports import OPTIONAL
 
 if sys.version_info >= (3, 11):
@@ -30,13 +31,29 @@ ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-def without(modules: set[str], folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run a command where some modules cannot be found, by its server processes neither."""
+EVERY = """
+import sys
+from pathlib import Path
+from s2a_bench.cli import main
+
+for line in {lines}:
+    runs = [str(path) for path in Path("results").glob("*-latency-*")]
+    sys.argv = ["s2a-bench", *(runs[0] if word == "RUN" else word for word in line)]
+    try:
+        main()
+    except SystemExit as ended:
+        print("exit code", ended.code, "of", line[0], flush=True)
+"""
+"""Runs commands one after another; RUN is the folder of the first."""
+
+
+def without(modules: set[str], folder: Path, *lines: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """Run commands where some modules cannot be found, by their server processes neither."""
     site, inherited = folder / "site", os.environ.get("PYTHONPATH", "")
     site.mkdir(exist_ok=True)
     (site / "sitecustomize.py").write_text(f"import sys\nsys.modules.update(dict.fromkeys({modules}))\n")
     return subprocess.run(
-        [sys.executable, "-m", "s2a_bench", *arguments],
+        [sys.executable, "-c", EVERY.format(lines=lines)],
         cwd=folder,
         env=os.environ | {"PYTHONPATH": f"{site}:{ROOT}:{inherited}", "S2A_BENCH_CACHE": str(folder / "cache")},
         capture_output=True,
@@ -83,62 +100,51 @@ def test_a_missing_library_is_one_line_with_the_command_and_leaves_nothing(
 
 def test_a_sweep_is_listed_without_extras_and_names_all_of_them_at_once(tmp_path: Path) -> None:
     missing = {"msgpack", "websockets", "zmq", "zenoh"}
-    listed = without(missing, tmp_path, "sweep", "transports", "--dry-run")
+    done = without(missing, tmp_path, ("sweep", "transports", "--dry-run"), ("sweep", "transports"))
     hint = "pip install '.[websocket,zmq,zenoh]' in the clone of s2a-bench"
-    assert listed.returncode == 0
-    assert "48 of 48 cells to run" in listed.stdout
-    assert listed.stderr.endswith(f"its cells need packages that are not installed; {hint}\n")
-    started = without(missing, tmp_path, "sweep", "transports")
-    assert (started.returncode, started.stderr) == (1, f"error: {listed.stderr}")
+    assert "48 of 48 cells to run" in done.stdout
+    assert done.stdout.endswith("exit code 0 of sweep\nexit code 1 of sweep\n")
+    *_, listed, started = done.stderr.splitlines()
+    assert listed.endswith(f"its cells need packages that are not installed; {hint}")
+    assert started == f"error: {listed}"
     assert not (tmp_path / "results").exists()
 
 
-@pytest.mark.parametrize("transport", ["http", "ros"])
-def test_a_server_without_a_library_says_so_in_one_line(transport: str, tmp_path: Path) -> None:
-    done = without({"llama_cpp"}, tmp_path, "serve", transport)
-    assert (done.returncode, done.stdout) == (1, "")
+def test_a_server_without_a_library_says_so_in_one_line(tmp_path: Path) -> None:
+    done = without({"llama_cpp"}, tmp_path, ("serve", "http"))
+    assert done.stdout == "exit code 1 of serve\n"
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"error: {extras.purposes()['llama']}: the package llama_cpp is not installed; pip install")
 
 
-@pytest.fixture(scope="module")
-def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Measure once without any extra."""
-    folder = tmp_path_factory.mktemp("bare")
-    few = ("--requests", "3", "--warmup", "1", "--max-tokens", "4", "--size", "64x48")
-    done = without(OPTIONAL, folder, "latency", "--transport", "loopback,http", *few)
-    assert done.returncode == 0, done.stderr
+CORE = [
+    "latency --transport loopback,http --requests 3 --warmup 1 --max-tokens 4 --size 64x48",
+    "timeline --profile rtx-4080 --tokens-per-skill 6 --data-only",
+    "boundary --data-only",
+    "ccrb --data-only",
+    "chunks --cycles 100 --data-only",
+    "doctor",
+    "report RUN",
+    "compare RUN RUN",
+    "profile list",
+    "serve --help",
+]
+
+
+def test_the_core_needs_no_extra_and_the_echo_engine_answers(tmp_path: Path) -> None:
+    done = without(OPTIONAL, tmp_path, *map(str.split, CORE))
+    ends = [line for line in done.stdout.splitlines() if line.startswith("exit code ")]
+    assert ends == [f"exit code 0 of {line.split()[0]}" for line in CORE], done.stderr
+    assert "Traceback" not in done.stderr
     assert "Echo engine" in done.stdout
     (advice,) = (line for line in done.stderr.splitlines() if "pip install" in line)
     assert advice.endswith("the echo engine answers, without a model; pip install '.[llama]' in the clone of s2a-bench")
-    return folder
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("latency", "--engine", "echo", "--transport", "loopback,http", "--requests", "3", "--data-only"),
-        ("timeline", "--profile", "rtx-4080", "--tokens-per-skill", "6"),
-        ("boundary", "--data-only"),
-        ("ccrb", "--data-only"),
-        ("chunks", "--cycles", "100", "--data-only"),
-        ("doctor",),
-        ("report", "RUN"),
-        ("compare", "RUN", "RUN"),
-        ("profile", "list"),
-        ("serve", "--help"),
-    ],
-    ids=" ".join,
-)
-def test_the_core_needs_no_extra(arguments: tuple[str, ...], bare: Path, tmp_path: Path) -> None:
-    (run,) = (bare / "results").iterdir()
-    done = without(OPTIONAL, tmp_path, *(str(run) if word == "RUN" else word for word in arguments))
-    assert done.returncode == 0, done.stderr
-    assert "Traceback" not in done.stderr
-
-
-def test_a_black_box_needs_no_extra(tmp_path: Path) -> None:
-    done = without(OPTIONAL, tmp_path, *BLACK_BOX)
+def test_a_black_box_needs_no_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in OPTIONAL:
+        monkeypatch.setitem(sys.modules, name, None)
+    done = called(*BLACK_BOX, code=1)
     assert "nothing answers at http://127.0.0.1:9" in done.stderr
     assert "pip install" not in done.stderr
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -60,17 +61,22 @@ def within(name: str, module: str) -> bool:
     return name == module or name.startswith(f"{module}.")
 
 
+@cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+
+
+@cache
 def imports_of(path: Path) -> set[str]:
-    return imported(list(ast.walk(ast.parse(path.read_text(encoding="utf-8")))))
+    return imported(nodes_of(path))
 
 
 def named(path: Path) -> Iterator[str]:
     """Yield what a module names that it should not have to."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    nodes = list(ast.walk(tree))
+    nodes = nodes_of(path)
     prose = {id(node.value) for node in nodes if isinstance(node, ast.Expr)}
     where = path.relative_to(ROOT).as_posix()
-    modules = set() if where.startswith("s2a_bench/plugins/") else imported(nodes)  # of a plug-in: the test below
+    modules = set() if where.startswith("s2a_bench/plugins/") else imports_of(path)  # of a plug-in: the test below
     texts = {
         node.value
         for node in nodes

@@ -1,4 +1,4 @@
-"""Every relative link of the pages leads to a file and a heading, and no page by hand is long."""
+"""Pages stay findable and short: every link leads to a file and a heading, every page is reached from the list."""
 
 from __future__ import annotations
 
@@ -7,8 +7,14 @@ from pathlib import Path
 from typing import Final
 
 import pytest
+from ruamel.yaml import YAML
+
+import s2a_bench
 
 ROOT: Final = Path(__file__).parent.parent
+DOCS: Final = ROOT / "docs"
+README: Final = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGE: Final = re.compile(r"\]\(([\w./-]+\.md)(?:#[\w-]*)?\)")
 FENCE: Final = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
 CODE: Final = re.compile(r"`[^`\n]*`")
 LINK: Final = re.compile(r"\]\(([^)\s]+)\)|<(?:img|a)[^>]* (?:src|href)=\"([^\"]+)\"")
@@ -48,7 +54,7 @@ def test_every_relative_link_of_a_page_leads_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(target), f"{link}: {target.name} has no such heading"
 
 
-@pytest.mark.parametrize("page", sorted((ROOT / "docs").glob("*.md")), ids=lambda page: page.name)
+@pytest.mark.parametrize("page", sorted(DOCS.glob("*.md")), ids=lambda page: page.name)
 def test_a_page_is_about_one_subject(page: Path) -> None:
     assert len(page.read_text(encoding="utf-8").splitlines()) <= LINES, "split it by subject"
 
@@ -59,3 +65,38 @@ def test_anchors_are_those_that_github_makes(tmp_path: Path) -> None:
         '# `--live`: tokens of a model\n## Files and `--json`\n## A\n## A\n```\n# no\n```\n<a id="x"></a>\n'
     )
     assert anchors(page) == {"--live-tokens-of-a-model", "files-and---json", "a", "a-1", "x"}
+
+
+def linked(page: Path) -> set[Path]:
+    """Return the pages that a page links to."""
+    return {(page.parent / name).resolve() for name in PAGE.findall(page.read_text(encoding="utf-8"))}
+
+
+def test_the_readme_is_short_and_links_little_after_its_first_screen() -> None:
+    minute = README.index("\n## A minute\n")
+    after = README[README.index("```\n", README.index("```", minute) + 3) :]
+    assert len(README.splitlines()) <= 130
+    assert len(re.findall(r"\]\(", after)) <= 16, "15 links, and the figure of the first screen"
+
+
+def test_every_page_is_reached_from_the_list_of_pages() -> None:
+    found, ahead = set[Path](), {DOCS / "README.md"}
+    while ahead:
+        found |= ahead
+        ahead = {each for page in ahead for each in linked(page) if each.is_relative_to(DOCS)} - found
+    assert found == set(DOCS.rglob("*.md"))
+
+
+def test_the_readme_and_the_list_name_every_situation_and_each_fits_on_a_page() -> None:
+    situations = set((DOCS / "situations").glob("*.md"))
+    assert situations <= linked(DOCS / "README.md")
+    assert situations <= linked(ROOT / "README.md")
+    assert all(len(page.read_text(encoding="utf-8").splitlines()) <= 80 for page in situations)
+
+
+def test_the_citation_is_of_this_version_and_of_the_paper_that_the_pages_name() -> None:
+    citation = YAML(typ="safe").load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    (paper,) = citation["references"]
+    assert (citation["version"], citation["license"]) == (s2a_bench.__version__, "Apache-2.0")
+    for page in (README, (DOCS / "policies.md").read_text(encoding="utf-8")):
+        assert paper["title"] in page

@@ -13,10 +13,6 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from s2a_bench.testing.transport import RecordingHandler
-from tests.servers.sockets import serving
-from tests.servers.speakers import Ollama, answering
-
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -41,19 +37,21 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(target), str(ROOT), os.environ.get("PYTHONPATH", "")])}
 
 
-@pytest.fixture
-def command(installed: dict[str, str], tmp_path: Path) -> Command:
-    """Run s2a-bench with the package there, below a folder of this test's own."""
+def command_in(folder: Path, installed: dict[str, str]) -> Command:
+    """Return what runs s2a-bench with the package there, in a folder."""
 
     def run(*args: str, code: int = 0) -> subprocess.CompletedProcess[str]:
         line = [sys.executable, "-m", "s2a_bench", *args]
-        done = subprocess.run(
-            line, capture_output=True, text=True, check=False, env=installed, cwd=tmp_path, timeout=240
-        )
+        done = subprocess.run(line, capture_output=True, text=True, check=False, env=installed, cwd=folder, timeout=240)
         assert done.returncode == code, done.stderr
         return done
 
     return run
+
+
+@pytest.fixture
+def command(installed: dict[str, str], tmp_path: Path) -> Command:
+    return command_in(tmp_path, installed)
 
 
 def folder_of(done: subprocess.CompletedProcess[str], tmp_path: Path) -> Path:
@@ -62,12 +60,13 @@ def folder_of(done: subprocess.CompletedProcess[str], tmp_path: Path) -> Path:
     return max((tmp_path / "results").iterdir(), key=lambda path: path.stat().st_mtime_ns)
 
 
-@pytest.fixture
-def measured(command: Command, tmp_path: Path) -> Path:
-    """Measure the toy transport beside loopback."""
-    done = command("latency", "--transport", "toy,loopback", *SMALL)
-    assert re.search(r"toy_frame", done.stdout)
-    folder = folder_of(done, tmp_path)
+@pytest.fixture(scope="module")
+def measured(installed: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Measure the toy transport beside loopback, with its camera."""
+    place = tmp_path_factory.mktemp("measured")
+    done = command_in(place, installed)("latency", "--transport", "toy,loopback", "--source", "toy-stripes", *SMALL)
+    assert "toy_frame" in done.stdout
+    folder = folder_of(done, place)
     assert "ratio to" in (folder / "tables" / "summary.md").read_text()
     return folder
 
@@ -82,38 +81,33 @@ def test_its_tests_are_the_shipped_suites(installed: dict[str, str]) -> None:
     assert int(passed[1]) > 30
 
 
-def test_its_transport_is_measured_with_stages_of_its_own(measured: Path) -> None:
+def test_what_it_adds_is_measured_compared_and_reported(measured: Path, command: Command, tmp_path: Path) -> None:
     samples = pd.read_csv(measured / "samples.csv")
-    toy = samples[samples["cell"] == "toy"]
+    toy, loopback = (samples[samples["cell"] == name] for name in ("toy", "loopback"))
     assert (toy["toy_frame_ns"] > 0).all()
     assert (toy["toy_unframe_ns"] > 0).all()
     assert (toy["rgb_source"] == toy["rgb_engine"]).all()
-    loopback = samples[samples["cell"] == "loopback"]
     assert loopback["toy_frame_ns"].isna().all()
+    assert {json.loads(facts)["toy_messages"] for facts in toy["facts"]} == {4.0}
     stages = pd.read_csv(measured / "tables" / "stages.csv")
     assert set(stages[stages["stage"] == "toy_frame"]["group"]) == {"pack"}
     ratios = pd.read_csv(measured / "tables" / "ratios.csv")
     assert {("toy", "loopback")} == set(zip(ratios["of"], ratios["to"], strict=True))
     assert (measured / "figures" / "stages.png").exists()
-
-
-def test_a_fact_of_its_transport_is_in_manifest_samples_and_table(measured: Path) -> None:
-    facts = json.loads((measured / "manifest.json").read_text())["facts"]
-    assert facts["toy_messages"] == {"unit": "messages", "about": "messages of the answer"}
-    samples = pd.read_csv(measured / "samples.csv")
-    assert {json.loads(facts)["toy_messages"] for facts in samples[samples["cell"] == "toy"]["facts"]} == {4.0}
     assert "| toy_messages | messages | 4.00 |" in (measured / "tables" / "facts.md").read_text()
+    manifest = json.loads((measured / "manifest.json").read_text())
+    assert manifest["facts"]["toy_messages"] == {"unit": "messages", "about": "messages of the answer"}
 
-
-def test_its_runs_are_compared_and_reported(measured: Path, command: Command, tmp_path: Path) -> None:
-    again = folder_of(command("latency", "--transport", "toy,loopback", *SMALL), tmp_path)
-    whole = json.loads(command("compare", str(measured), str(again), "--metric", "toy_frame", "--json").stdout)
+    done = command("latency", "--transport", "toy,loopback", *SMALL, "--json")
+    assert "toy_frame" in json.loads(done.stdout)["cells"][0]["stages_ms"]
+    again = folder_of(done, tmp_path)
+    flags = ("--unlike", "--metric", "toy_frame", "--json")
+    whole = json.loads(command("compare", str(measured), str(again), *flags).stdout)
     assert {comparison["cell"] for comparison in whole["comparisons"]} == {"toy"}
-    command("report", str(measured), "--output", str(tmp_path / "report.html"))
+    command("report", str(measured), "--output", "report.html")
     page = (tmp_path / "report.html").read_text()
     assert "toy_frame" in page
     assert "toy_messages" in page
-    json.loads(command("latency", "--transport", "toy", "--json", *SMALL).stdout)["cells"][0]["stages_ms"]["toy_frame"]
 
 
 def test_an_option_of_its_transport_is_part_of_the_name(command: Command) -> None:
@@ -131,28 +125,6 @@ def test_its_server_runs_by_name(installed: dict[str, str], tmp_path: Path) -> N
         server.terminate()
         assert server.wait(20) == 0
     assert re.search(r"toy at 127\.0\.0\.1:\d+; engine echo", line)
-
-
-def test_its_frame_source_is_a_camera(command: Command, tmp_path: Path) -> None:
-    done = command("latency", "--transport", "loopback", "--source", "toy-stripes", *SMALL)
-    assert json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())["state"] == "finished"
-
-
-def test_its_middleware_carries_the_ros_transport(command: Command, tmp_path: Path, dds_domain: int) -> None:
-    pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
-    domain = ("--domain-id", str(dds_domain))
-    done = command("latency", "--transport", "ros/topic", "--middleware", "toy-dds", *domain, *SMALL)
-    manifest = json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())
-    assert manifest["configuration"]["pipelines"]["ros/topic"]["middleware"] == "toy-dds"
-    assert manifest["servers"]["ros"]["transport"]["middleware"] == "cyclonedds"
-    named = command("latency", "--transport", "ros/topic?middleware=toy-dds,loopback", *domain, *SMALL)
-    samples = pd.read_csv(folder_of(named, tmp_path) / "samples.csv")
-    assert "ros/topic?middleware=toy-dds" in set(samples["cell"])
-    assert samples["error"].isna().all()
-    unknown = command("latency", "--transport", "ros", "--middleware", "toy", *SMALL, code=2)
-    assert "--middleware: 'toy' is none of cyclonedds, rclpy, toy-dds, zenoh" in unknown.stderr
-    absent = command("latency", "--transport", "loopback", "--source", "ros:/no_camera?middleware=toy", code=2)
-    assert "middleware = 'toy' is none of cyclonedds, rclpy, toy-dds, zenoh" in absent.stderr
 
 
 def test_its_policy_takes_its_parameter(command: Command) -> None:
@@ -258,30 +230,6 @@ def test_its_world_is_driven(command: Command) -> None:
     assert "--lane-change: the toy-world simulator knows one lane" in one_lane
 
 
-def test_its_dialect_is_asked(command: Command, tmp_path: Path) -> None:
-    class Speaker(Ollama):
-        path = "/toy/chat"
-
-    handler = RecordingHandler(["one", " two", " three"])
-    spoken = ["--dialect", "toy-chat", "--served-model", "toy", "--transport", "http"]
-    with serving(answering(Speaker(), handler)) as url:
-        done = command("latency", "--url", url, *spoken, "--size", "64x48", "--requests", "3", "--warmup", "1")
-    samples = pd.read_csv(folder_of(done, tmp_path) / "samples.csv")
-    assert len(handler.requests) == len(samples) == 4 * samples["cell"].nunique()
-    assert samples["error"].isna().all()
-    assert json.loads(samples["facts"][0])["predicted_ms"] == 30
-
-
-def test_its_dialect_is_known_by_name(command: Command) -> None:
-    spoken = ["--dialect", "toy-chat", "--served-model", "toy"]
-    done = command("latency", "--url", "http://127.0.0.1:9", *spoken, "--transport", "http", *SMALL, code=1)
-    assert "nothing answers at http://127.0.0.1:9/toy/chat" in done.stderr
-    closed = ("latency", "--url", "http://127.0.0.1:9", "--transport", "http", "--toy-channel", "blue", *SMALL)
-    assert "nothing answers at http://127.0.0.1:9/toy/chat/blue" in command(*closed, *spoken, code=1).stderr
-    refused = command(*closed, "--dialect", "openai", code=2).stderr
-    assert "--toy-channel: the dialect 'openai' takes none; leave it out, or choose --dialect toy-chat" in refused
-
-
 def test_its_experiment_is_a_command_and_a_function(
     command: Command, installed: dict[str, str], tmp_path: Path
 ) -> None:
@@ -306,40 +254,6 @@ def test_its_experiment_is_a_command_and_a_function(
     assert done.stdout.strip() == "1", done.stderr
 
 
-def test_its_surroundings_are_options_manifest_and_columns(command: Command, tmp_path: Path) -> None:
-    done = command("latency", "--transport", "loopback", "--toy-room", "34.3", *SMALL, "--json")
-    assert json.loads(done.stdout)["cells"][0]["toy_walk_ms"]["median"] == pytest.approx(100)
-    manifest = json.loads((folder_of(done, tmp_path) / "manifest.json").read_text())
-    assert (manifest["toy_room"], manifest["configuration"]["toy_room"]) == (34.3, 34.3)
-    assert "entering the room" in done.stderr
-    assert "--toy-room has place for three" in command("latency", "--toy-room", "1", *SMALL, code=2).stderr
-
-
-def test_its_command_is_one_of_the_commands(command: Command) -> None:
-    assert re.search("toy-hello +Greet somebody.", command("--help").stdout)
-    assert command("toy-hello", "--name", "you").stdout == "hello, you\n"
-    assert json.loads(command("toy-hello", "--json").stdout) == {"hello": "robot"}
-
-
-def test_its_reference_stands_beside_measurements_and_its_claim_is_judged(
-    measured: Path, command: Command, tmp_path: Path
-) -> None:
-    about = "".join(command("latency", "--help-all").stdout.split())
-    assert "toy-study:drawthetoy-study'svaluesbesideours" in about
-    done = command("latency", "--transport", "loopback", "--against", "toy-study", *SMALL)
-    assert "Grey: of toys." in (folder_of(done, tmp_path) / "figures" / "captions.md").read_text()
-    outputs = ("--output", "page.html", "--csv", "csv", "--markdown", "all.md", "--latex", "tex")
-    done = command("report", str(measured), "--against", "toy-study", *outputs)
-    assert done.stdout.startswith("the toy study's claims: 1 supported")
-    (row,) = pd.read_csv(tmp_path / "csv" / "claims.csv").to_dict("records")
-    assert (row["verdict"], row["claim"], row["evidence"]) == ("supported", "Toys end", f"{measured.name} is finished.")
-    page = (tmp_path / "page.html").read_text()
-    assert "1 claims of a study of toys: 1 supported." in page
-    assert "met, state: finished" in page
-    assert "## The toy study's claims" in (tmp_path / "all.md").read_text()
-    assert "Toys end" in (tmp_path / "tex" / "claims.tex").read_text()
-
-
 def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
     installed: dict[str, str], tmp_path: Path
 ) -> None:
@@ -362,10 +276,7 @@ def test_a_package_that_does_not_load_is_one_line_and_spoils_no_other_command(
 
     assert "Check this machine" in run("--help").stdout  # the name of a command that there is counts for nothing
     assert run("boundary", "--points", "3").returncode == 0
-    middleware = ("latency", "--transport", "ros?middleware=broken", *SMALL)
-    transport = ("latency", "--transport", "broken", *SMALL)
-    reference = ("latency", "--against", "broken", *SMALL)
-    for args in (("broken",), ("lost",), transport, middleware, reference, ("timeline", "--policy", "broken")):
+    for args in (("broken",), ("lost",), ("latency", "--against", "broken"), ("timeline", "--policy", "broken")):
         done = run(*args)
         assert done.returncode == 2
         assert "the package s2a-broken does not load: ModuleNotFoundError" in done.stderr

@@ -19,7 +19,7 @@ from s2a_bench.policy.stepping import Stream, follow, step
 EXACT = 1e-9
 """Tolerance, in seconds, between two ways to add up the same times."""
 
-shared = settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+shared = settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def draw(seed: int, n_skills: int, tokens_per_skill: int, rho: float, plans: int, gap_cv: float = 0.3) -> Plans:

@@ -71,9 +71,3 @@ def test_one_that_declares_nothing_can_do_nothing(offer: ModuleType, able: Any, 
     offer.arm = lambda skills: skills  # type: ignore[attr-defined]
     with pytest.raises(UsageError, match=f"`robot`: arm {lacks}; "):
         kind("arm", able)
-
-
-def test_one_that_cannot_be_loaded_says_which(offer: ModuleType) -> None:
-    del offer
-    with pytest.raises(UsageError, match="`robot`: 'arm' of the package somebodys_arm:arm does not load"):
-        kind("arm", SkillKind)

@@ -28,6 +28,7 @@ def test_a_written_run_is_whole_and_its_stages_add_up(tmp_path: Path) -> None:
     assert load(tmp_path / "run").all_samples.equals(rows)
 
 
+@pytest.mark.slow
 def test_a_line_a_way_to_look_at_a_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -18,6 +18,7 @@ def shares(row: str) -> list[float]:
     return [float(number) for number in re.findall(r"([\d.]+) \[", row)]
 
 
+@pytest.mark.slow
 def test_every_prompt_is_printed_with_its_plans_and_gaps(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -39,6 +39,7 @@ def called(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
         patch.setattr(sys, "argv", ["s2a-bench", *map(str, arguments)])
         patch.setattr(signal, "signal", lambda *_: None)
+        patch.setattr(sys, "unraisablehook", sys.unraisablehook)  # it is this process's own again afterwards
         patch.setattr(tuning, "allowed", nullcontext)
         with pytest.raises(SystemExit) as ended:
             main()

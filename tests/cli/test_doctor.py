@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 from pathlib import Path
 
 import jsonschema
@@ -14,20 +12,15 @@ from typer.testing import CliRunner
 from s2a_bench.cli import app
 from s2a_bench.machine.doctor import Finding, Level
 from s2a_bench.machine.resources import RESOURCES
-from tests.cli.program import only_run, program
+from tests.cli.program import called, only_run, printed
 from tests.made_runs import SCHEMA
 
 SMALL = ["--size", "64x48", "--requests", "4", "--warmup", "1", "--data-only"]
-ECHO = ["latency", "--engine", "echo", "--transport", "http,loopback", *SMALL]
-
-
-def s2a_bench(*arguments: str | Path, code: int = 0, **environ: str) -> subprocess.CompletedProcess[str]:
-    return program(*arguments, code=code, env={**os.environ, **environ})
+ECHO = ["latency", "--engine", "echo", *SMALL]
 
 
 def test_json_is_one_object_that_the_schema_describes() -> None:
-    facts = json.loads(s2a_bench("doctor", "--json").stdout)
-    jsonschema.Draft202012Validator(SCHEMA).validate(facts)
+    facts = printed(called("doctor", "--json"))
     assert facts["command"] == "doctor"
     for key in ("checks", "worst"):
         with pytest.raises(jsonschema.ValidationError):
@@ -51,7 +44,8 @@ def test_the_exit_code_is_the_severitys(level: Level, plain: int, strict: int, m
 
 
 def test_a_run_samples_resources_and_says_what_that_cost(tmp_path: Path) -> None:
-    done = s2a_bench(*ECHO, "--verbose", "--sample-resources", "50", "--output", str(tmp_path))
+    flags = ("--transport", "http,loopback", "--latency", "50", "--verbose", "--sample-resources", "50")
+    done = called(*ECHO, *flags, "--output", tmp_path)
     assert "sampling takes" in done.stdout
     run = only_run(tmp_path)
     resources = run.manifest["resources"]
@@ -72,7 +66,7 @@ def test_a_run_samples_resources_and_says_what_that_cost(tmp_path: Path) -> None
 
 
 def test_sampling_can_be_left_out(tmp_path: Path) -> None:
-    s2a_bench(*ECHO, "--sample-resources", "0", "--output", str(tmp_path))
+    called(*ECHO, "--transport", "loopback", "--sample-resources", "0", "--output", tmp_path)
     run = only_run(tmp_path)
     assert run.manifest["resources"] == {}
     assert not list(run.path.glob("resources*"))

@@ -47,12 +47,10 @@ def test_help_is_code_zero_and_names_every_flag(path: tuple[str, ...]) -> None:
     ("command", "headings"),
     [
         ("latency", ["Transport", "Pictures", "Model", "Requests", "Options"]),
-        ("throughput", ["Transport", "Pictures", "Model", "Requests", "Options"]),
         (
             "timeline",
             ["Modes", "Policies", "Plans", f"Tokens that are modelled (not {LIVE})", f"Transport ({LIVE})", "Options"],
         ),
-        ("chunks", ["Modes", "Control loop", f"Transport ({LIVE})", "Options"]),
         ("ccrb", ["Modes", "Policies", "Drives", "Scenario", f"Drives (not {LIVE} or --closed-loop)", "Options"]),
         ("serve", ["Arguments", "Model", "Transport", "ROS 2", "Options"]),
     ],

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from s2a_bench.boards.profile import read_profile, to_toml
-from tests.cli.program import called, printed, program, refused
+from tests.cli.program import called, printed, refused
 
 SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schema/s2a-bench-profile-1.json").read_text())
 FAST = {
@@ -27,7 +27,6 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "profiles").mkdir()
     (tmp_path / "profiles" / "fast.toml").write_text(to_toml(FAST))
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[2]))
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     monkeypatch.setenv("S2A_BENCH_CACHE", str(tmp_path / "cache"))
     return tmp_path
@@ -69,7 +68,7 @@ def test_capture_measures_this_machine_which_match_then_finds(home: Path) -> Non
     none = called("profile", "match", code=1)
     assert "no profile is of this board" in none.stdout
     flags = ["--threads", "1", "--requests", "5", "--warmup", "1", "--tokens", "12", "--size", "64x48"]
-    done = program("profile", "capture", "here", *flags, "--title", "My board", "--json")
+    done = called("profile", "capture", "here", *flags, "--title", "My board", "--json")
     (made,) = printed(done, SCHEMA)["profiles"]
     assert made["file"] == "profiles/here.toml"
     assert (made["recorded"], made["dummy"], made["title"]) == (55, True, "My board")

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from s2a_bench.store.run import StoredRun
 from s2a_bench.testing.transport import RecordingHandler
-from tests.cli.program import command, only_run, program
+from tests.cli.program import called, command, only_run
 from tests.servers.sockets import serving as serving_socket
 from tests.servers.speakers import Cloud, answering
 
-SMALL = ("--size", "64x48", "--requests", "5", "--warmup", "1", "--max-tokens", "3")
+SMALL = ("--size", "64x48", "--requests", "2", "--warmup", "1", "--max-tokens", "3", "--data-only")
 
 
 @contextmanager
@@ -31,7 +31,7 @@ def serving(*arguments: str) -> Iterator[str]:
 
 def measured(output: Path, *arguments: str) -> tuple[StoredRun, str]:
     """Measure and return the run with what was printed."""
-    done = program("latency", *SMALL, *arguments, "--output", output)
+    done = called("latency", *SMALL, *arguments, "--output", output)
     return only_run(output), done.stdout
 
 
@@ -49,9 +49,7 @@ def test_a_replay_behind_a_url_is_emulated(tmp_path: Path) -> None:
 
 def test_a_server_that_does_not_tell_is_unknown_never_the_default(tmp_path: Path) -> None:
     with serving_socket(answering(Cloud(), RecordingHandler(["x", "y"]))) as url:
-        run, output = measured(
-            tmp_path, "--transport", "http/as-deployed", "--url", url, "--dialect", "openai", "--data-only"
-        )
+        run, output = measured(tmp_path, "--transport", "http/as-deployed", "--url", url, "--dialect", "openai")
     assert set(run.samples["engine"]) == {"unknown"}
     assert [(origin.known, origin.link) for origin in run.origins.cells.values()] == [(False, "real")]
     assert "engine UNKNOWN" in output

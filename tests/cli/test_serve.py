@@ -45,10 +45,16 @@ def start() -> Iterator[Start]:
         yield run
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ros_answers_goals_and_publishes_tokens(start: Start, dds_domain: int, number: signal.Signals) -> None:
-    process, line = start("ros", "--engine", "echo", "--namespace", "/robot_llama", "--max-tokens", "5", *ONE_BY_ONE)
-    assert "/robot_llama/generate_response" in line
+def child_of(process: subprocess.Popen[str]) -> int:
+    """The process that serves."""
+    return int(Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()[0])
+
+
+def test_ros_answers_goals_and_publishes_tokens(start: Start, dds_domain: int, tmp_path: Path) -> None:
+    (tmp_path / "node.toml").write_text('engine = "echo"\nnamespace = "/from_file"\nmax-tokens = 5\n')
+    _, line = start("ros", "--config", str(tmp_path / "node.toml"), "--namespace", "/robot_llama", *ONE_BY_ONE)
+    assert "/robot_llama/generate_response" in line  # flags win
+    assert "engine echo" in line
     middleware = open_middleware(domain_id=dds_domain)
     plotted = middleware.subscription("/robot_llama/token", ros.TOKEN, QoS(0))
     client = open_client(wiring_of("ros/action", "/robot_llama", domain_id=dds_domain))
@@ -63,40 +69,6 @@ def test_ros_answers_goals_and_publishes_tokens(start: Start, dds_domain: int, n
     finally:
         client.close()
         middleware.close()
-    process.send_signal(number)
-    assert process.wait(30) == 0
-
-
-def test_limits_are_flags_and_keys_of_the_file(start: Start, tmp_path: Path) -> None:
-    (tmp_path / "limits.toml").write_text('answer-timeout = 0.5\nlatency = "1000"\nmax-body-mib = 0.01\n')
-    _, line = start(
-        "http", "--engine", "echo", "--port", "0", "--config", str(tmp_path / "limits.toml"), "--max-body-mib", "1"
-    )
-    url = line.split()[2].rstrip(";")
-    body = {"messages": [{"role": "user", "content": "a" * 100_000}], "max_tokens": 4}
-    assert httpx.post(url, json=body).status_code == 504
-    assert httpx.post(url, content=bytes((1 << 20) + 1)).status_code == 413
-
-
-def child_of(process: subprocess.Popen[str]) -> int:
-    """The process that serves."""
-    return int(Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()[0])
-
-
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
-def test_a_server_that_died_is_started_again_once(start: Start, number: signal.Signals) -> None:
-    process, line = start("http", "--engine", "echo", "--port", "0")
-    url = line.split()[2].rstrip(";")
-    body = {"messages": [{"role": "user", "content": "hello robot"}], "max_tokens": 2}
-    os.kill(child_of(process), number)
-    assert f"died, killed by signal {number}; it is started again, once" in process.stderr.readline()
-    assert process.stdout.readline() == line
-    assert httpx.post(url, json=body).status_code == 200
-    os.kill(child_of(process), number)
-    assert process.wait(30) == 1
-    lines = process.stderr.read().splitlines()
-    assert len(lines) == 1
-    assert f"died, killed by signal {number}" in lines[0]
 
 
 def test_a_ros_server_that_died_is_started_again_at_once(start: Start, dds_domain: int) -> None:
@@ -111,7 +83,33 @@ def test_a_ros_server_that_died_is_started_again_at_once(start: Start, dds_domai
         client.close()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGKILL])
+def test_limits_are_flags_and_keys_of_the_file(start: Start, tmp_path: Path) -> None:
+    (tmp_path / "limits.toml").write_text('answer-timeout = 0.5\nlatency = "1000"\nmax-body-mib = 0.01\n')
+    _, line = start(
+        "http", "--engine", "echo", "--port", "0", "--config", str(tmp_path / "limits.toml"), "--max-body-mib", "1"
+    )
+    url = line.split()[2].rstrip(";")
+    body = {"messages": [{"role": "user", "content": "a" * 100_000}], "max_tokens": 4}
+    assert httpx.post(url, json=body).status_code == 504
+    assert httpx.post(url, content=bytes((1 << 20) + 1)).status_code == 413
+
+
+def test_a_server_that_died_is_started_again_once(start: Start) -> None:
+    process, line = start("http", "--engine", "echo", "--port", "0")
+    url = line.split()[2].rstrip(";")
+    body = {"messages": [{"role": "user", "content": "hello robot"}], "max_tokens": 2}
+    os.kill(child_of(process), signal.SIGSEGV)
+    assert "died, killed by signal 11; it is started again, once" in process.stderr.readline()
+    assert process.stdout.readline() == line
+    assert httpx.post(url, json=body).status_code == 200
+    os.kill(child_of(process), signal.SIGSEGV)
+    assert process.wait(30) == 1
+    lines = process.stderr.read().splitlines()
+    assert len(lines) == 1
+    assert "died, killed by signal 11" in lines[0]
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
 def test_its_process_ends_with_it(start: Start, number: signal.Signals) -> None:
     process, _ = start("http", "--engine", "echo", "--port", "0")
     child = child_of(process)
@@ -128,13 +126,6 @@ def test_a_signal_while_it_starts_leaves_nothing() -> None:
     process.terminate()
     assert process.wait(30) == 0
     until(lambda: ended(child))
-
-
-def test_a_file_gives_the_settings_and_flags_win(start: Start, tmp_path: Path) -> None:
-    (tmp_path / "node.toml").write_text('engine = "echo"\nnamespace = "/from_file"\nresult-timeout = 5\n')
-    _, line = start("ros", "--config", str(tmp_path / "node.toml"), "--namespace", "/from_flag")
-    assert "/from_flag/generate_response" in line
-    assert "engine echo" in line
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -15,7 +14,7 @@ import pytest
 
 from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.types import Token
-from tests.cli.program import command, only_run, printed, program
+from tests.cli.program import called, command, only_run, printed
 from tests.servers.sockets import Received, head, serving
 from tests.servers.speakers import Cloud, Ollama, answering
 
@@ -24,11 +23,11 @@ KEY = "sekret-0123456789"
 
 
 def run(*arguments: str, output: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "MY_KEY": KEY}
-    return program("latency", *SMALL, *arguments, "--output", output, code=code, env=environment)
+    return called("latency", *SMALL, *arguments, "--output", output, code=code)
 
 
-def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path) -> None:
+def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MY_KEY", KEY)
     keys = []
     reply = answering(Ollama(), RecordingHandler(["go", "_to"]))
 
@@ -54,16 +53,6 @@ def test_ollama_is_measured_and_its_key_is_kept_nowhere(tmp_path: Path) -> None:
     assert all(json.loads(row["facts"])["outside_model_ms"] == pytest.approx(10.0) for row in rows)
     assert not [path for path in folder.rglob("*") if path.is_file() and KEY.encode() in path.read_bytes()]
     assert KEY not in done.stdout + done.stderr
-
-
-def test_a_run_that_is_refused_waits_as_asked_and_ends_with_the_reason(tmp_path: Path) -> None:
-    reply = [head("429 Too Many Requests", "application/json", "Retry-After: 0.01"), Cloud().refusal(429, "slow down")]
-    with serving(lambda _: reply) as url:
-        flags = ("--url", url, "--dialect", "openai", "--transport", "http/best-effort", "--requests", "9")
-        done = run(*flags, output=tmp_path, code=1)
-    assert "waiting 0.01 s for the server of http/best-effort" in done.stderr
-    last = done.stderr.strip().splitlines()[-2:]
-    assert any("failed 5 times in a row" in line and "answered 429: slow down" in line for line in last)
 
 
 def test_a_request_under_way_when_the_run_is_interrupted_has_its_row(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from s2a_bench import cli
 from s2a_bench.cli import shortage
 from tests.cli.program import command, only_run, refused
 
-LATENCY = ["latency", "--engine", "echo", "--transport", "http,loopback", "--size", "64x48", "--data-only"]
+LATENCY = ["latency", "--engine", "echo", "--transport", "loopback", "--size", "64x48", "--data-only"]
 
 
 def run(kind: int, limit: int, output: Path, *more: str) -> list[str]:

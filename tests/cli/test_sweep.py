@@ -157,8 +157,7 @@ def test_a_measured_cell_runs_in_a_process_of_its_own_and_says_why_it_failed(tmp
         'command = "latency"\n[settings]\nengine = "echo"\ntransport = "loopback"\nrequests = 3\nwarmup = 0\n'
         '[grid]\nsource = ["synthetic", "video:/no/such/file.mp4"]\n'
     )
-    done = sweep(file, "--output", tmp_path / "results", "--json", code=1)
-    found = printed(done)
+    found = printed(called("sweep", file, "--output", tmp_path / "results", "--json", code=1))
     good, bad = found["cells"]
     assert (good["state"], good["error"], good["virtual"]) == ("finished", None, False)
     assert len(read_run(Path(good["run"])).samples) == 3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -13,8 +12,8 @@ from s2a_bench.store.run import StoredRun
 from s2a_bench.transport import TRANSPORTS
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import _OTHER_STYLES
+from tests.made_runs import MakeRun
 
-MakeRun = Callable[..., StoredRun]
 FIXED = {"http/binary": 1.0, "ros/topic": 0.2, "loopback": 0.1}
 A_MB = {"http/binary": 0.3, "ros/topic": 0.9, "loopback": 0.2}
 

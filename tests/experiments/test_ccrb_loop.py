@@ -21,7 +21,7 @@ from s2a_bench.experiments.ccrb.config import CcrbClosedLoop, CcrbLiveLoop, Driv
 from s2a_bench.experiments.ccrb.drives import Prepared, TableRows, loop_rows, motion_of
 from s2a_bench.experiments.ccrb.live import run_live_loop
 from s2a_bench.experiments.ccrb.loop import ClosedLoop, CommandedEgo, replayed
-from s2a_bench.experiments.ccrb.rows import ROLLOUTS, TRAJECTORIES
+from s2a_bench.experiments.ccrb.rows import ROLLOUTS
 from s2a_bench.experiments.ccrb.run import resolve
 from s2a_bench.frames import FrameSource
 from s2a_bench.inference import EngineConfig
@@ -34,7 +34,6 @@ from s2a_bench.scenario.ccrb.options import CcrbOptions
 from s2a_bench.scenario.ccrb.studies import draw
 from s2a_bench.scenario.embedded import Embedded
 from s2a_bench.scenario.longitudinal import Longitudinal
-from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Frame, Piece, Request
@@ -63,7 +62,7 @@ def differ_m(one: Driven, other: Driven) -> float:
     return max(abs(float(getattr(one.outcomes, name)[0] - getattr(other.outcomes, name)[0])) for name in names)
 
 
-@pytest.mark.parametrize("number", range(20))
+@pytest.mark.parametrize("number", range(6))
 def test_on_the_same_arrivals_a_loop_ends_as_its_roll_out(number: int) -> None:
     config = scenario(number)
     ready, name = resolve(config).ready, COMPARED[number % 3]
@@ -91,7 +90,7 @@ def test_motion_does_not_depend_on_when_the_first_sample_was() -> None:
     assert motion_of(replace(path, time_s=path.time_s + 0.013)) == pytest.approx(motion_of(path))
 
 
-@pytest.mark.parametrize("number", range(4))
+@pytest.mark.parametrize("number", range(2))
 def test_a_step_as_on_the_clock_changes_gaps_by_decimetres_at_most(number: int) -> None:
     config, world = scenario(number), Longitudinal()
     ready, world.step_s = resolve(config).ready, 0.02
@@ -127,20 +126,6 @@ def test_in_real_time_a_loop_ends_as_the_roll_out_of_the_arrivals_that_it_had(
     assert loops["min_front_gap_m"].to_numpy() == pytest.approx(rollouts["min_front_gap_m"].to_numpy(), abs=1.0)
     assert loops["min_rear_gap_m"].to_numpy() == pytest.approx(rollouts["min_rear_gap_m"].to_numpy(), abs=1.0)
     assert loops["start_ns"].to_numpy() == pytest.approx(rollouts["start_ns"].to_numpy(), abs=200e6)
-
-
-def test_each_policy_has_a_request_of_its_own_with_the_same_seed(fast_board: str, tmp_path: Path) -> None:
-    options = CcrbOptions(n_skills=3, speed_kmh=20)
-    stored = run(tmp_path, scenario=options, profile=fast_board, policies=("naive", "wait-then-act"))
-    skills = stored.table(SKILLS)
-    assert list(skills.groupby("cell", sort=False)["request_id"].nunique()) == [1, 1]
-    assert skills["request_id"].nunique() == 2
-    assert set(stored.manifest["requests"]) == set(skills["request_id"])
-    assert list(skills["text"][:3]) == ["set_speed(13.3)", "set_speed(6.7)", "set_speed(0)"]
-    assert stored.manifest["configuration"]["time"] == "monotonic"
-    paths = stored.table(TRAJECTORIES)
-    assert 0 <= paths.groupby("cell")["at_ns"].min().max() < 200e6
-    assert len(by_study(stored, "point")) == len(by_study(stored, "rollout")) == 2
 
 
 class Heavy(Longitudinal):
@@ -241,9 +226,9 @@ def test_a_world_that_is_lost_ends_the_run_and_keeps_what_was_driven(
         monkeypatch.setattr(Longitudinal, "step", lost)
 
     monkeypatch.setattr("s2a_bench.experiments.ccrb.live.loop_rows", lose)
-    options = CcrbOptions(n_skills=3, speed_kmh=20)
+    options = CcrbOptions(n_skills=3, speed_kmh=20, t_nom_s=0.4)
     with pytest.raises(TransportError, match="`simulator`: the server is gone"):
-        run(tmp_path, scenario=options, profile=fast_board, policies=("naive", "wait-then-act", "stream-to-act"))
+        run(tmp_path, scenario=options, profile=fast_board, policies=("naive", "wait-then-act"))
     (folder,) = tmp_path.glob("*-ccrb-*")
     assert list(by_study(read_run(folder), "point").index) == ["naive"]
     assert not [each for each in threads() if each.name.startswith("world")]
@@ -251,7 +236,7 @@ def test_a_world_that_is_lost_ends_the_run_and_keeps_what_was_driven(
 
 def ends_interrupted(folder: Path, profile: str) -> None:
     with pytest.raises(KeyboardInterrupt):
-        run(folder, scenario=CcrbOptions(n_skills=3, speed_kmh=20), profile=profile)
+        run(folder, scenario=CcrbOptions(n_skills=3, speed_kmh=20, t_nom_s=0.4), profile=profile)
     assert not [each for each in threads() if each.name.startswith("world")]
 
 

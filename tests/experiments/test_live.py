@@ -34,6 +34,7 @@ from s2a_bench.policy import Plans
 from s2a_bench.policy.conformal import TrackedPolicy
 from s2a_bench.store.requests import SKILLS
 from s2a_bench.store.run import StoredRun, read_run
+from s2a_bench.testing import NullProgress
 from s2a_bench.trace import Trace
 from s2a_bench.transport.loopback.in_process import LoopbackClient
 from s2a_bench.types import Frame, Request, Token
@@ -42,25 +43,13 @@ from tests.made_runs import SCHEMA
 THREE = ("naive", "wait-then-act", "stream-to-act")
 
 
-class Watched:
+class Watched(NullProgress):
     """Looks at every scene and keeps it."""
+
+    folder: Path
 
     def __init__(self) -> None:
         self.scenes: list[Scene] = []
-        self.lines: list[str] = []
-
-    def opened(self, folder: Path) -> None:
-        self.folder = folder
-
-    def say(self, line: str) -> None:
-        self.lines.append(line)
-
-    def stage(self, text: str) -> None:
-        self.lines.append(text)
-
-    def expect(self, samples: int) -> None: ...
-
-    def advance(self) -> None: ...
 
     def watch(self, scene: Scene) -> AbstractContextManager[None]:
         self.scenes.append(scene)
@@ -177,7 +166,7 @@ def test_a_real_model_is_held_to_its_grammar_and_its_pace(
     assert first != second  # every plan has a seed of its own
 
 
-@pytest.mark.parametrize("tokens", [0, 1, 5, 6, 7, 20, 47])
+@pytest.mark.parametrize("tokens", [0, 5, 6, 47])
 def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
     config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, tokens: int
 ) -> None:
@@ -205,20 +194,6 @@ def test_a_stream_that_dies_is_told_and_what_ran_is_kept(
     assert next(found["started"] for name, found in executions.items() if "wait-then-act" in name) == 0
     assert len(run.table(TIMELINES)) == len([found for found in executions.values() if found["started"]])
     assert len(run.tokens) == tokens
-
-
-def test_prose_is_not_executed(config: TimelineLive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def prose(self: ReplayEngine, request: Request) -> Iterator[Token]:
-        del self, request
-        yield from (
-            Token(index, text) for index, text in enumerate(["Sure", "!", " Here is", " the plan:", "\n", "1."])
-        )
-
-    monkeypatch.setattr(ReplayEngine, "generate", prose)
-    run, _ = live(config, tmp_path)
-    executions = run.manifest["executions"].values()
-    assert [(found["outcome"], found["started"]) for found in executions] == [("invalid-line", 0)] * 3
-    assert run.table(TIMELINES).empty
 
 
 def test_a_server_that_dies_ends_the_run_but_not_in_the_middle_of_a_skill(
@@ -411,7 +386,7 @@ def test_lambda_is_followed_live_by_each_policy(
     config: TimelineLive, taught: list[TrackedPolicy], tmp_path: Path
 ) -> None:
     policies = ("stream-to-act", "stream-to-act?detect=True", "naive")
-    live(requesting(config, requests=2).but(policies=policies, track=True), tmp_path)
+    live(requesting(config, requests=2).but(policies=policies, track=True, n_skills=(3,)), tmp_path)
     assert [each.made.detect for each in taught] == [False, True] * 2
     assert taught[:2] == taught[2:]
     for each in taught[:2]:

@@ -6,12 +6,10 @@ import pytest
 from s2a_bench.experiments.requests import cells_of
 from s2a_bench.stats import summary_of
 from s2a_bench.store.requests import SampleRow
-from s2a_bench.store.run import StoredRun
 from s2a_bench.trace import path_of
 from s2a_bench.writers.tables import Note
-from tests.made_runs import STAGES
+from tests.made_runs import STAGES, MakeRun
 
-MakeRun = Callable[..., StoredRun]
 HAND = {
     "ros/topic": {"capture": 1, "cdr_pack": 2, "": 0.5, "network": 3, "inference": 100, "return": 1.5},
     "http/as-deployed": {
@@ -133,11 +131,6 @@ def test_a_llama_server_is_compared_without_model_where_both_tell_it(make_run: M
     assert found == {"e2e_without_model": pytest.approx(35.4 / 28), "e2e": pytest.approx(115.4 / 108)}
 
 
-def test_a_black_box_has_no_ratio_without_inference(make_run: MakeRun, black_box: Any) -> None:
-    run = make_run({"http/black-box": black_box, "ros/topic": HAND["ros/topic"]}, n=3)
-    assert [metric for metric, *_ in cells_of(run).ratios] == ["e2e"]
-
-
 def test_what_did_not_really_answer_is_said(make_run: MakeRun) -> None:
     def note(**facts: Any) -> Note:
         return cells_of(make_run(HAND, n=1, **facts)).engine_note
@@ -157,5 +150,7 @@ def test_what_did_not_really_answer_is_said(make_run: MakeRun) -> None:
         "EMULATED: replayed profile agx (constant gaps, the paper's rate)"
     )
     assert note(engine="llama", manifest={"model": {"dummy": True}}) == "dummy weights"
+    unseen = {"engine": "llama", "dummy": True, "pictures": "not seen"}
+    assert note(engine="llama", manifest={"model": unseen}) == "dummy weights, picture not seen"
     assert note(engine="llama", manifest={"model": {"dummy": False}}) == ""
     assert note(engine="llama") == ""

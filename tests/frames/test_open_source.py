@@ -27,13 +27,10 @@ def test_an_unknown_scheme_lists_those_there_are(spec: str) -> None:
     assert all(scheme in message for scheme in SOURCES)
 
 
-@pytest.mark.parametrize(("scheme", "where"), [("video", "FILE"), ("images", "FOLDER"), ("v4l2", "DEVICE")])
-def test_a_scheme_without_its_path_is_refused(scheme: str, where: str) -> None:
-    with pytest.raises(UsageError, match=f"`source`: '{scheme}' should be {scheme}:{where}"):
-        open_source(scheme, 64, 48)
-
-
-def test_a_path_for_the_synthetic_camera_is_refused() -> None:
+def test_a_scheme_has_its_path_and_no_other() -> None:
+    for scheme, where in (("video", "FILE"), ("images", "FOLDER"), ("v4l2", "DEVICE")):
+        with pytest.raises(UsageError, match=f"`source`: '{scheme}' should be {scheme}:{where}"):
+            open_source(scheme, 64, 48)
     with pytest.raises(UsageError, match="should be plain 'synthetic'"):
         open_source("synthetic:x", 64, 48)
 

@@ -38,17 +38,14 @@ def power_slope(luma: NDArray[np.uint8]) -> float:
     return float(np.polyfit(np.log(band), np.log(mean[band]), 1)[0])
 
 
-def test_another_seed_gives_another_scene() -> None:
+def test_the_scene_moves_and_another_seed_gives_another() -> None:
     one, other = (frames(1, seed=seed)[0].data for seed in (3, 4))
     assert np.mean(one != other) > 0.9
-
-
-def test_the_scene_moves() -> None:
     first, _, later = (frame.data for frame in frames(3, step=5))
     assert np.mean(first != later) > 0.5
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_vga_jpeg_weighs_what_a_photograph_does(seed: int) -> None:
     for frame in frames(4, 640, 480, step=40, seed=seed):
         assert 40_000 < encode_jpeg(to_bgr(frame)).nbytes < 150_000
@@ -61,14 +58,14 @@ def test_larger_jpegs_weigh_as_much_per_pixel_or_somewhat_less(size: tuple[int, 
     assert 1.0 < bits_per_pixel < 3.9
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_power_falls_with_frequency_as_in_natural_pictures(seed: int) -> None:
     [frame] = frames(1, 640, 480, seed=seed)
     assert -3.0 < power_slope(frame.data[..., 0]) < -1.2
 
 
 def test_contrast_is_neither_flat_nor_clipped() -> None:
-    for seed in range(4):
+    for seed in range(2):
         luma, chroma = np.moveaxis(frames(1, 640, 480, seed=seed)[0].data, -1, 0)
         assert 20 < luma.std() < 70
         assert np.mean((luma <= 16) | (luma >= 235)) < 0.05
@@ -83,18 +80,15 @@ def test_chroma_lies_in_pairs_of_u_and_v() -> None:
     assert np.abs(u - v).mean() > 5
 
 
-@pytest.mark.parametrize("size", [(641, 480), (14, 16), (16, 15)])
-def test_odd_and_tiny_sizes_are_refused(size: tuple[int, int]) -> None:
-    with pytest.raises(UsageError, match=f"`size`: {size[0]}x{size[1]} should"):
-        SyntheticCamera("", *size)
+def test_odd_and_tiny_sizes_and_rates_that_are_none_are_refused() -> None:
+    for size in ((641, 480), (14, 16), (16, 15)):
+        with pytest.raises(UsageError, match=f"`size`: {size[0]}x{size[1]} should"):
+            SyntheticCamera("", *size)
+    for fps in (0.0, -1.0, float("nan")):
+        with pytest.raises(UsageError, match="`fps`"):
+            SyntheticCamera("", 64, 48, fps=fps)
 
 
 @pytest.mark.parametrize("size", [(16, 16), (18, 200), (400, 17)])
 def test_small_and_long_sizes_work(size: tuple[int, int]) -> None:
     assert len({frame.data.tobytes() for frame in frames(5, *size, step=20)}) > 1
-
-
-@pytest.mark.parametrize("fps", [0.0, -1.0, float("nan")])
-def test_a_rate_that_is_none_is_refused(fps: float) -> None:
-    with pytest.raises(UsageError, match="`fps`"):
-        SyntheticCamera("", 64, 48, fps=fps)

@@ -20,6 +20,7 @@ from s2a_bench.transport.ros.joining import namespace_of
 
 PROGRAM = Path(sys.executable)
 URL = {"http": {"url": "http://x"}}
+LLAMA_SERVER = {"http": {"llama_server": PROGRAM}}
 
 
 def names(config: RequestsConfig) -> list[str]:
@@ -62,29 +63,6 @@ def test_llama_cpps_own_server_is_a_cell_where_it_has_the_same_to_do(
         assert (program is not None) is (cell.variant == "llama-server")
 
 
-def test_a_named_llama_server_adds_its_cell() -> None:
-    config = RequestsConfig(options={"http": {"llama_server": PROGRAM}})
-    assert names(config)[:4] == [f"http/{name}" for name in http.VARIANTS]
-    assert [cell.black_box for cell in config.pipelines[:4]] == [False, False, False, True]
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({}, "there is none on PATH"),
-        ({"engine": EngineConfig(name="echo"), "options": {"http": {"llama_server": PROGRAM}}}, "runs a model"),
-        (
-            {"payload": "raw", "options": {"http": {"llama_server": PROGRAM}}},
-            "can send a picture as jpeg, jpeg-preencoded, not as raw",
-        ),
-        ({"options": {"http": {"url": "http://x"}}}, "leave it out with `url`"),
-    ],
-)
-def test_named_it_is_an_error_where_it_cannot_be(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        RequestsConfig(transports=("http/llama-server",), **options)
-
-
 @pytest.mark.usefixtures("llama_server_alone")
 def test_without_our_own_engine_its_cell_and_servers_that_run_already_are_measured_alone() -> None:
     lines: list[str] = []
@@ -114,11 +92,6 @@ def test_without_our_own_engine_what_is_named_is_refused_rather_than_left_out(
         answered(RequestsConfig(**options), pytest.fail)
 
 
-def test_of_two_urls_both_are_asked_or_refused() -> None:
-    with pytest.raises(UsageError, match="`url` needs http among `transport`"):
-        LatencyConfig(transports="websocket?url=ws://127.0.0.1:1", url="http://127.0.0.1:2")
-
-
 MODEL = ({"model": Path("m.gguf")}, {"mmproj": Path("p.gguf")}, {"gpu_layers": -1})
 
 
@@ -138,29 +111,39 @@ def test_a_model_is_never_answered_for_by_another_engine(
         RequestsConfig(transports="http", engine=given, url="http://127.0.0.1:1")
 
 
+def test_options_reach_their_cells() -> None:
+    options = {"http": {"connection": "per-request"}}
+    (cell,) = RequestsConfig(transports=("http/binary",), options=options).pipelines
+    assert cell.options.connection == "per-request"  # type: ignore[attr-defined]
+    (cell,) = RequestsConfig(transports="ros", options={"ros": {"action": "/llama/generate"}}).pipelines
+    assert cell.options.external_address == "/llama/generate"
+    assert RequestsConfig(options=URL).foreign == "url"
+
+
+OURS = ["http/as-deployed raw", "http/best-effort raw", "http/binary raw", "ros/topic raw"]
+
+
 @pytest.mark.parametrize(
-    ("options", "wanted"),
+    ("fields", "cells"),
     [
-        ({"transports": "http/best-effort"}, "http/llama-server"),
-        ({"transports": "ros"}, "http"),
+        ({}, OURS),
+        ({"transports": ("loopback", "http/binary"), "payload": "raw"}, ["loopback ", "http/binary raw"]),
+        ({"options": LLAMA_SERVER}, [*OURS[:3], "http/llama-server jpeg, foreign", *OURS[3:]]),
+        ({"options": URL}, ["http/as-deployed jpeg, foreign", "http/best-effort jpeg, foreign", "ros/topic raw"]),
+        (
+            {"transports": ("http/as-deployed", "ros", "loopback"), "url": "http://x"},
+            ["http/as-deployed jpeg, foreign", "ros/topic raw", "loopback "],
+        ),
+        (
+            {"transports": "http/as-deployed", "options": {"http": {"url": "http://x", "dialect": "openvla"}}},
+            ["http/as-deployed raw, foreign"],
+        ),
+        ({"transports": "ros", "options": {"ros": {"action": "/llama/generate"}}}, ["ros/action raw, foreign"]),
     ],
 )
-def test_a_llama_server_that_no_cell_runs_is_refused(options: dict[str, Any], wanted: str) -> None:
-    with pytest.raises(UsageError, match=f"`llama_server` needs {wanted} among `transport`"):
-        RequestsConfig(options={"http": {"llama_server": "x"}}, **options)
-
-
-def test_all_http_variants_and_ros_are_shown_unless_told() -> None:
-    assert names(RequestsConfig()) == ["http/as-deployed", "http/best-effort", "http/binary", "ros/topic"]
-
-
-def test_cells_follow_the_flags() -> None:
-    options = {"http": {"connection": "per-request"}}
-    config = RequestsConfig(transports=("loopback", "http/binary"), options=options, payload="raw")
-    loopback, http = config.pipelines
-    assert (loopback.name, loopback.payload) == ("loopback", "")
-    assert (http.name, http.payload) == ("http/binary", "raw")
-    assert http.options.connection == "per-request"  # type: ignore[attr-defined]
+def test_every_cell_sends_what_it_can_to_our_servers_and_foreign_ones(fields: dict[str, Any], cells: list[str]) -> None:
+    pipelines = RequestsConfig(**fields).pipelines
+    assert [f"{cell.name} {cell.payload}{', foreign' * cell.black_box}" for cell in pipelines] == cells
 
 
 HTTP_AND_ROS = ["http/binary", "http/binary?payload=jpeg", "ros/topic", "ros/topic?payload=jpeg"]
@@ -197,38 +180,10 @@ def test_a_url_alone_is_asked_over_the_transport_that_its_scheme_names(url: str,
     assert names(answered(config, pytest.fail)) == cells
 
 
-def test_what_cannot_carry_the_usual_payload_keeps_its_own() -> None:
-    cells = RequestsConfig(transports=("http/as-deployed", "ros", "loopback"), url="http://x").pipelines
-    assert [cell.payload for cell in cells] == ["jpeg", "raw", ""]
-
-
 def test_a_namespace_in_a_url_names_our_server_there() -> None:
     (cell,) = RequestsConfig(url="ros:///robot/llama", clock="ptp").pipelines
     assert (cell.transport.name, cell.variant, cell.options.external_address) == ("ros", "topic", "/robot/llama")
     assert namespace_of(cell.wiring(cell.options.external_address)) == "/robot/llama"
-
-
-def test_a_foreign_action_is_the_only_ros_cell() -> None:
-    options = {"ros": {"action": "/llama/generate_response"}}
-    config = RequestsConfig(transports="ros", options=options)
-    (cell,) = config.pipelines
-    assert (cell.name, cell.black_box) == ("ros/action", True)
-    assert cell.options.external_address == "/llama/generate_response"
-
-
-def test_a_black_box_is_asked_without_the_binary_variant() -> None:
-    config = RequestsConfig(options={"http": {"url": "http://localhost:8080"}})
-    assert names(config) == ["http/as-deployed", "http/best-effort", "ros/topic"]
-    assert config.pipelines[0].black_box
-    assert config.foreign == "url"
-
-
-def test_a_black_box_gets_what_its_dialect_takes() -> None:
-    config = RequestsConfig(
-        transports=("http/as-deployed",), options={"http": {"url": "http://x", "dialect": "openvla"}}
-    )
-    assert names(config) == ["http/as-deployed"]
-    assert config.pipelines[0].payload == "raw"
 
 
 @pytest.mark.parametrize(
@@ -237,6 +192,15 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"transports": ()}, "`transport`: name at least one of http, ros, loopback"),
         ({"transports": ("http/fast",)}, "`transport`: 'fast' is none of http's as-deployed, best-effort, binary"),
         ({"transports": ("loopback/fast",)}, "`transport`: 'fast' is none of loopback's none: it has no variants"),
+        ({"transports": "http/llama-server"}, "there is none on PATH"),
+        (
+            {"transports": "http/llama-server", "payload": "raw", "options": LLAMA_SERVER},
+            "can send a picture as jpeg, jpeg-preencoded, not as raw",
+        ),
+        ({"transports": "http/llama-server", "options": URL}, "leave it out with `url`"),
+        ({"transports": "http/best-effort", "options": LLAMA_SERVER}, "`llama_server` needs http/llama-server among"),
+        ({"transports": "ros", "options": LLAMA_SERVER}, "`llama_server` needs http among `transport`"),
+        ({"transports": "ros", "url": "http://x"}, "`url` needs http among"),
         ({"transports": "ros/service"}, "`transport`: 'service' is none of ros's topic, action"),
         ({"payload": "yuyv"}, "`payload`: http/as-deployed can send a picture as jpeg, jpeg-preencoded, png, raw"),
         ({"payload": "yuyv"}, "http/as-deployed?payload=jpeg"),
@@ -286,10 +250,7 @@ def test_a_black_box_gets_what_its_dialect_takes() -> None:
         ({"options": {"http": {"url": "http://x", "api_key_env": "NO_KEY"}}}, "`api_key_env`: the environment has no"),
         ({"options": {"http": {"url": "http://u:p@x"}}}, "`url`: leave the password out"),
         ({"options": URL, "transports": "http/binary"}, "`transport` http/binary needs our own server"),
-        (
-            {"options": {"http": {"llama_server": PROGRAM}}, "engine": EngineConfig(name="echo")},
-            "`llama_server` runs a model",
-        ),
+        ({"options": LLAMA_SERVER, "engine": EngineConfig(name="echo")}, "`llama_server` runs a model"),
         ({"url": "ros://llama"}, "'ros://llama' should look like ros:///llama"),
         ({"options": {"ros": {"url": "ros:///a", "action": "/b"}}}, "`url` and `action` name two servers"),
         ({"clock": "chrony"}, "`clock` is about a server of ours on another host; name it with `url`"),

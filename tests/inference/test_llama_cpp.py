@@ -43,15 +43,6 @@ def text(engine: Engine, **request: object) -> str:
     return "".join(token.text for token in ask(engine, **request))  # type: ignore[arg-type]
 
 
-def test_a_dummy_always_writes_max_tokens(shared: LlamaCppEngine) -> None:
-    for seed in range(4):
-        assert len(ask(shared, max_tokens=100, seed=seed)) == 100
-
-
-def test_seeds_differ(shared: LlamaCppEngine) -> None:
-    assert len({text(shared, seed=seed, max_tokens=16) for seed in range(4)}) == 4
-
-
 def test_what_a_request_wants_of_sampling_replaces_the_engines_own(shared: LlamaCppEngine) -> None:
     coldest = [text(shared, seed=seed, sampling=(("temp", 0.0),)) for seed in (1, 2)]
     assert coldest[0] == coldest[1]

@@ -44,12 +44,6 @@ def test_two_processes_may_make_it_at_once(tmp_path: Path, monkeypatch: pytest.M
     assert len(list((tmp_path / "models" / "dummy-tiny").iterdir())) == 2
 
 
-def test_a_missing_file_is_named_with_its_flag(tiny: EngineConfig, tmp_path: Path) -> None:
-    model, _ = paths(tiny)
-    assert refusal(tmp_path / "no.gguf").startswith(f"`model` {tmp_path}/no.gguf: no such file")
-    assert refusal(model, tmp_path / "no.gguf").startswith(f"`mmproj` {tmp_path}/no.gguf: no such file")
-
-
 @pytest.mark.parametrize(
     ("content", "says"),
     [
@@ -66,8 +60,14 @@ def test_a_file_of_another_kind_or_with_noise_in_it_is_told(tmp_path: Path, cont
     assert says in refusal(path)
 
 
-def test_a_folder_is_not_a_model(tmp_path: Path) -> None:
+def test_a_file_that_is_missing_or_in_the_others_place_is_named(tiny: EngineConfig, tmp_path: Path) -> None:
+    model, mmproj = paths(tiny)
+    assert refusal(tmp_path / "no.gguf").startswith(f"`model` {tmp_path}/no.gguf: no such file")
+    assert refusal(model, tmp_path / "no.gguf").startswith(f"`mmproj` {tmp_path}/no.gguf: no such file")
     assert "cannot be read" in refusal(tmp_path)
+    assert "give it as `mmproj`" in refusal(mmproj, model)
+    assert "give it as `model`" in refusal(model, model)
+    assert "needs the language model too" in refusal(None, mmproj)
 
 
 @pytest.mark.parametrize("share", [0.0005, 0.001, 0.5, 0.9999])
@@ -81,12 +81,6 @@ def test_a_file_cut_short_is_told_apart_from_a_whole_one(tiny: EngineConfig, tmp
         assert "cut short" in message
 
 
-def test_the_two_files_are_not_exchangeable(tiny: EngineConfig) -> None:
-    model, mmproj = paths(tiny)
-    assert "give it as `mmproj`" in refusal(mmproj, model)
-    assert "give it as `model`" in refusal(model, model)
-
-
 def test_a_language_model_alone_is_a_text_model(tiny: EngineConfig, tmp_path: Path) -> None:
     model, mmproj = paths(tiny)
     alone = tmp_path / "model.gguf"
@@ -97,10 +91,6 @@ def test_a_language_model_alone_is_a_text_model(tiny: EngineConfig, tmp_path: Pa
     assert resolve(EngineConfig(model=alone)) == (alone, tmp_path / "mmproj-a.gguf")
     (tmp_path / "mmproj-b.gguf").symlink_to(mmproj)
     assert "(mmproj-a.gguf, mmproj-b.gguf); choose one" in refusal(alone)
-
-
-def test_an_mmproj_alone_is_not_enough(tiny: EngineConfig) -> None:
-    assert "needs the language model too" in refusal(None, paths(tiny)[1])
 
 
 def test_an_mmproj_that_only_hears_is_refused(tiny: EngineConfig, tmp_path: Path) -> None:

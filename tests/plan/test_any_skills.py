@@ -4,7 +4,7 @@ import random
 import re
 from collections.abc import Callable
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.plan_text import text_of
@@ -61,7 +61,6 @@ TOKENIZERS: dict[str, Callable[[], Tokenize]] = {
 
 
 @given(skill_sets(), st.sampled_from(list(TOKENIZERS)), st.integers(1, 8), st.sampled_from([1, 8, 12]), st.randoms())
-@settings(max_examples=150, deadline=None)
 def test_a_format_is_exact_and_can_be_read_or_is_refused(
     skills: SkillSet, tokenizer: str, tokens: int, n_skills: int, rng: random.Random
 ) -> None:

@@ -18,9 +18,7 @@ from s2a_bench.plan import (
     prompt,
 )
 from studies.validity import Cost, cost_of
-
-GRANULARITIES = (6, 4, 2, 1)
-"""Tokens a skill in the paper (section IV-E)."""
+from tests.plan.conftest import GRANULARITIES
 
 
 def many(count: int) -> SkillSet:

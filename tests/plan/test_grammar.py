@@ -1,12 +1,29 @@
 import random
+from collections.abc import Iterator
 
 import pytest
 
 from benchmarks.plan_text import text_of
 from s2a_bench.errors import UsageError
+from s2a_bench.inference import EngineConfig
+from s2a_bench.inference.llama_cpp import LlamaCppEngine
 from s2a_bench.inference.llama_decode import grammar_error
 from s2a_bench.inference.tokenizer import Tokenizer
-from s2a_bench.plan import Format, Parser, SkillParsed, Tokenize, grammar, load_skills, paper_format, parse_skills
+from s2a_bench.plan import (
+    Format,
+    Parser,
+    SkillParsed,
+    SkillSet,
+    Tokenize,
+    choose_format,
+    grammar,
+    load_skills,
+    paper_format,
+    parse_skills,
+    prompt,
+)
+from s2a_bench.types import Request
+from tests.plan.conftest import GRANULARITIES
 from tests.plan.gbnf import Gbnf
 
 
@@ -82,3 +99,30 @@ t_nom_s = 1
 def test_a_plan_has_a_skill(format_: Format) -> None:
     with pytest.raises(UsageError, match="at least one skill, not 0"):
         grammar(format_, 0)
+
+
+@pytest.fixture(scope="module")
+def engine(tiny: EngineConfig) -> Iterator[LlamaCppEngine]:
+    engine = LlamaCppEngine(tiny)
+    yield engine
+    engine.close()
+
+
+@pytest.mark.parametrize("size", GRANULARITIES)
+@pytest.mark.parametrize("pinned", [False, True])
+def test_a_model_under_the_grammar_writes_n_skills_of_l_tokens(
+    engine: LlamaCppEngine, of_bytes: Tokenizer, skills: SkillSet, size: int, pinned: bool
+) -> None:
+    format_ = choose_format(skills, size, of_bytes)
+    gbnf = grammar(format_, 8, of_bytes if pinned else None)
+    for seed in range(2):
+        parser = Parser(format_)
+        events = []
+        request = Request("r", prompt(format_, 8, "Go."), max_tokens=300, grammar=gbnf, seed=seed)
+        for count, token in enumerate(engine.generate(request)):
+            found = parser.feed(token.text)
+            assert bool(found) == ((count + 1) % size == 0)
+            events += found
+        assert parser.close() == []
+        assert all(isinstance(event, SkillParsed) for event in events)
+        assert [event.piece for event in events] == [size * at - 1 for at in range(1, 9)]

@@ -6,7 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.plan import (
@@ -98,7 +98,6 @@ def cuts(draw: st.DrawFn, data: bytes) -> list[bytes]:
 
 
 @given(answers(), st.data())
-@settings(max_examples=200, deadline=None)
 def test_any_chunking_gives_the_same_skills(answer: tuple[Format, bytes], data: st.DataObject) -> None:
     format_, text = answer
     whole = without_chunks(parse(format_, [text]))
@@ -122,7 +121,6 @@ def obvious(format_: Format, text: str) -> Iterator[str]:
 
 
 @given(answers().filter(lambda answer: answer[0].delimiter == "\n"))
-@settings(max_examples=200, deadline=None)
 def test_it_finds_what_an_obvious_reader_finds(answer: tuple[Format, bytes]) -> None:
     format_, data = answer
     text = data.decode(errors="replace")
@@ -133,7 +131,6 @@ def test_it_finds_what_an_obvious_reader_finds(answer: tuple[Format, bytes]) -> 
 
 
 @given(formats, st.binary(max_size=2000), st.integers(1, 50))
-@settings(max_examples=200, deadline=None)
 def test_no_bytes_break_it_and_what_it_keeps_is_bounded(format_: Format, data: bytes, size: int) -> None:
     parser = Parser(format_)
     events = []
@@ -147,7 +144,6 @@ def test_no_bytes_break_it_and_what_it_keeps_is_bounded(format_: Format, data: b
 
 
 @given(formats, st.text(st.characters(exclude_categories=()), max_size=200))
-@settings(deadline=None)
 def test_no_text_breaks_it_surrogates_included(format_: Format, text: str) -> None:
     assert not {"\ufffd"} & set("".join(calls(parse(format_, [text]))))
 
@@ -158,7 +154,7 @@ def test_a_lone_surrogate_is_not_the_code_that_python_replaces_it_with() -> None
     assert calls(parse(stream, ["\ud800"])) == []
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", ["paper household", "4 household", "1 household", "pairs", "küche"])
 @pytest.mark.parametrize("piece", [b"x", b" ", b"\xff", b"1", b"(", b"\n", b"go_to(kitchen)\n"])
 def test_work_grows_with_the_length_only(name: str, piece: bytes) -> None:
     def work(data: bytes, size: int) -> int:

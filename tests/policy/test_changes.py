@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.policy.changes import ChangeWatch, learned_along
@@ -31,7 +31,6 @@ STRETCHES = st.lists(st.tuples(st.sampled_from([0.02, 0.1, 0.2, 0.4, 0.9]), st.i
 """Gaps in s, and how many of them follow one another."""
 
 
-@settings(deadline=None, max_examples=80)
 @given(stretches=STRETCHES, plan_cv=st.floats(0.02, 1.0), token_cv=st.floats(0.05, 0.5), seed=st.integers(0, 99))
 def test_it_is_the_plain_rule_for_plans_side_by_side(
     stretches: list[tuple[float, int]], plan_cv: float, token_cv: float, seed: int

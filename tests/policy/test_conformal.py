@@ -14,9 +14,10 @@ from scipy import signal, stats
 
 from s2a_bench.boards.gaps import Markov
 from s2a_bench.errors import UsageError
-from s2a_bench.policy import Plans
+from s2a_bench.policy import Plans, conformal
 from s2a_bench.policy.conformal import (
     GRID,
+    TrackedPolicy,
     Tracker,
     calibrate,
     choose,
@@ -29,7 +30,8 @@ from s2a_bench.policy.conformal import (
 )
 from s2a_bench.policy.estimator import GapPrior
 from s2a_bench.policy.nominal import Naive
-from s2a_bench.policy.stream_to_act import StreamToAct
+from s2a_bench.policy.stream_to_act import EarlyStart, StreamToAct
+from s2a_bench.stats.seeds import generator
 from studies.worlds import World
 
 WORLD = World(4.8, 0.5, 2, 4, 0.25)
@@ -240,15 +242,38 @@ def test_tracking_begins_with_the_calibration_and_keeps_as_many_scores() -> None
         Tracker([])
 
 
-def test_stalls_raise_the_caution_and_calm_lowers_it() -> None:
-    tracker = Tracker(np.linspace(0, 4, 400), 0.01)
-    before = tracker.caution
-    tracker.learn(0.0, stalled=True)
-    assert tracker.caution > before
-    for _ in range(5):
-        tracker.learn(0.0, stalled=True)
-    assert tracker.caution == math.inf
-    for _ in range(2000):
-        tracker.learn(float(np.linspace(0, 4, 400)[_ % 400]), stalled=False)
-    assert tracker.caution <= before
-    assert tracker.level <= 0.02
+SLOW_WORLD = World(0.58, 3.0, 1, 8, 1.0)
+TRACKED = SLOW_WORLD.draw(generator(0, "tracking"), 60)
+
+
+def begin(policy: StreamToAct | None = None) -> TrackedPolicy:
+    assert TRACKED.token_s is not None
+    return TrackedPolicy.begin(replace(policy or StreamToAct(), prior=GapPrior.fit(TRACKED.token_s)), TRACKED, 0.02)
+
+
+def slow(plans: int) -> Plans:
+    return SLOW_WORLD.draw(generator(1, "tracking"), plans, 1.8)
+
+
+@pytest.mark.parametrize("policy", [StreamToAct(), StreamToAct(detect=True), EarlyStart()])
+def test_arrays_are_plans_one_after_another(policy: StreamToAct) -> None:
+    plans, together, alone = slow(16), begin(policy), begin(policy)
+    cautions, schedule = together.follow(plans)
+    assert len(set(cautions)) > 1
+    for column, caution in enumerate(cautions):
+        plan = take(plans, np.array([column]))
+        assert alone.policy.caution == caution
+        np.testing.assert_array_equal(alone.policy.schedule(plan).start_s[:, 0], schedule.start_s[:, column])
+        alone.learn(plan, stalled=bool(stalled(alone.policy.schedule(plan))[0]))
+    assert (together.tracker.level, together.policy) == (alone.tracker.level, alone.policy)
+
+
+def test_plans_that_do_not_fit_the_memory_at_once_are_the_same_plans(monkeypatch: pytest.MonkeyPatch) -> None:
+    plans, whole, parts = slow(14), begin(), begin()
+    cautions, schedule = whole.follow(plans)
+    monkeypatch.setattr(conformal, "AT_ONCE", 6)
+    again, in_parts = parts.follow(plans)
+    assert again.tolist() == cautions.tolist()
+    np.testing.assert_array_equal(in_parts.start_s, schedule.start_s)
+    np.testing.assert_array_equal(in_parts.duration_s, schedule.duration_s)
+    assert (parts.tracker.level, parts.policy) == (whole.tracker.level, whole.policy)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from s2a_bench.boards.gaps import Lognormal, Markov
+from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.errors import UsageError
 from s2a_bench.policy.estimator import VAGUE, GapPrior
 
@@ -50,17 +50,6 @@ def test_fitting_finds_the_spreads_that_the_plans_were_drawn_with() -> None:
     assert prior.mean_s == pytest.approx(0.5 * math.exp(0.005), rel=0.01)
     assert prior.plan_cv == pytest.approx(0.1, rel=0.05)
     assert prior.token_cv == pytest.approx(0.2, rel=0.05)
-
-
-def test_bursts_count_with_the_spread_of_their_sums() -> None:
-    rng = np.random.default_rng(4)
-    bursty = Markov(0.2, 0.2, pause_share=0.02, pause_ratio=10.0, pause_tokens=4.0)
-    token_s = np.cumsum(bursty.sample(rng, 192, 2000), axis=0)
-    single = float((np.diff(token_s, axis=0)).std()) / 0.2
-    fitted = GapPrior.fit(token_s).token_cv
-    long_sums = float(bursty.sample(rng, 1000, 2000).sum(axis=0).std()) / 0.2 / 1000**0.5
-    assert fitted > 1.5 * single
-    assert fitted == pytest.approx(long_sums, rel=0.15)
 
 
 def test_what_a_gap_varies_is_told_by_sums_over_about_the_square_root_of_their_number() -> None:

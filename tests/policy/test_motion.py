@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.policy.metrics import jerk, peak_jerk, rms_jerk, sparc, speed_profile
@@ -56,7 +56,6 @@ def arc_length(speed: list[float], sample_s: float, padding: int, cutoff_hz: flo
     return -sum(math.hypot((hz2 - hz1) / width_hz, two - one) for (hz1, one), (hz2, two) in pairwise(band))
 
 
-@settings(deadline=None, max_examples=40)
 @given(
     speed=st.lists(st.floats(0.1, 2.0), min_size=3, max_size=20),
     cutoff_hz=st.sampled_from([1.0, 2.5, 6.0]),
@@ -68,15 +67,6 @@ def test_sparc_is_the_length_of_the_spectrum_s_curve_up_to_the_cutoff(
 ) -> None:
     found = sparc(np.array(speed), 0.05, padding=padding, cutoff_hz=cutoff_hz, threshold=threshold)
     assert found == pytest.approx(arc_length(speed, 0.05, padding, cutoff_hz, threshold))
-
-
-def test_a_stop_halfway_is_less_smooth_by_every_measure() -> None:
-    once = minimum_jerk(4.0, 0.01)
-    half = minimum_jerk(1.5, 0.01) / 2
-    halting = np.concatenate([half, np.zeros(100), half])
-    assert sparc(halting, 0.01) < sparc(once, 0.01) - 0.1
-    assert rms_jerk(halting, 0.01) > rms_jerk(once, 0.01)
-    assert peak_jerk(halting, 0.01) > peak_jerk(once, 0.01)
 
 
 @pytest.mark.parametrize("speed", [[], [0.0, 0.0, 0.0]])

@@ -1,4 +1,4 @@
-"""The table of policies, and what is particular to the three that learn nothing."""
+"""Every policy keeps the contract; the table of policies, and what is particular to the three that learn nothing."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
-from s2a_bench.policy import Plans, PlanShape, Policy, Start, Stepper, Timing, policy, stepping
+from s2a_bench.policy import POLICIES, Plans, PlanShape, Policy, Start, Stepper, Timing, policy, stepping
+from s2a_bench.policy import policy as build
 from s2a_bench.policy.nominal import NominalQueue
 from s2a_bench.policy.schedule import work_conserving
 from s2a_bench.policy.stepping import Stream, follow
-from s2a_bench.testing.policy import EXACT, draw
+from s2a_bench.policy.stream_to_act import StreamToAct
+from s2a_bench.testing.policy import EXACT, PolicySuite, draw
 
 SKILL = Timing(1.0, 0.8, 1.5)
 
@@ -58,7 +60,6 @@ def test_clairvoyant_waits_for_its_start_with_skills_in_hand() -> None:
     assert stepper.decide(3.0) == Start(1.0, 1.0)
 
 
-@settings(deadline=None, max_examples=100)
 @given(
     st.sampled_from(["naive", "wait-then-act", "s2a-clairvoyant"]),
     st.lists(st.tuples(st.integers(0, 4), st.integers(0, 4)), min_size=1, max_size=7),
@@ -146,3 +147,17 @@ def test_a_stepper_that_gives_up_is_refused(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(AfterTwo, "stepper", lambda _self, _shape: Wrong(answer=math.inf))
     with pytest.raises(ValueError, match="after-two ended with 0 of 3 skills"):
         AfterTwo().schedule(draw(5, 3, 2, 1.3, 1))
+
+
+@pytest.mark.parametrize("name", POLICIES)
+class TestDefaults(PolicySuite):
+    @pytest.fixture
+    def policy(self, name: str) -> Policy:
+        return build(name)
+
+
+@pytest.mark.parametrize("caution", [0.0, math.inf])
+class TestStreamToAct(PolicySuite):
+    @pytest.fixture
+    def policy(self, caution: float) -> Policy:
+        return StreamToAct(caution=caution)

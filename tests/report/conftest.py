@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,9 +11,8 @@ import pytest
 
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.run import StoredRun
-from tests.made_runs import spoken_run
+from tests.made_runs import MakeRun, spoken_run
 
-MakeRun = Callable[..., StoredRun]
 REAL = Provenance("llama", "MiniCPM-V 2.6", "ab", "Q4_K_M", "real", "measured", link="real")
 
 

@@ -88,8 +88,8 @@ class MiddlewareSuite:
         got = [subscription.unpack(subscription.take(5)).data for _ in sent]
         assert got == sent
 
-    @pytest.mark.parametrize(("width", "height"), [(640, 480), (1920, 1080)])
-    def test_a_raw_image_arrives_unchanged(self, join: Join, width: int, height: int) -> None:
+    def test_a_raw_image_arrives_unchanged(self, join: Join) -> None:
+        width, height = 1920, 1080
         publisher, subscription = self.pair(join, "/test/image", ros.IMAGE, QoS(1))
         pixels = np.random.default_rng(1).integers(0, 256, (height, width, 3), np.uint8)
         message = ros.image_message(Frame(0, 0, width, height, "bgr8", pixels), 5_000_000_001, "camera")

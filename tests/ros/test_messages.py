@@ -34,29 +34,6 @@ def test_received_pixels_are_a_view_not_a_copy() -> None:
     assert np.shares_memory(image.data, np.frombuffer(cdr, np.uint8))
 
 
-def image(**fields: Any) -> Any:
-    frame = Frame(0, 0, 4, 2, "bgr8", np.arange(24, dtype=np.uint8).reshape(2, 4, 3))
-    message = ros.image_message(frame, 0, "c")
-    for name, value in fields.items():
-        setattr(message, name, value)
-    return message
-
-
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"encoding": "bayer_rggb16"}, "'bayer_rggb16' is none of bgr8, rgb8, bgra8"),
-        ({"encoding": "16UC1"}, "'16UC1' is depth, .* give it the camera's colour topic"),
-        ({"encoding": "32FC1"}, "'32FC1' is depth"),
-        ({"height": 3}, "image of 4x3 bgr8 has 24 bytes"),
-        ({"step": 6}, "image of 4x2 bgr8"),
-    ],
-)
-def test_an_impossible_image_is_refused(fields: dict[str, Any], message: str) -> None:
-    with pytest.raises(TransportError, match=message):
-        ros.frame_of_image(image(**fields))
-
-
 @pytest.mark.parametrize("cdr", [b"", b"\0\1\0\0", b"\0\1\0\0\xff\xff\xff\x7f", bytes(64)])
 def test_foreign_bytes_are_refused(cdr: bytes) -> None:
     with pytest.raises(TransportError, match="no s2a_msgs/msg/Request"):

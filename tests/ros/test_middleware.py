@@ -9,7 +9,6 @@ import pytest
 
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros import MIDDLEWARES, QoS, default_middleware, open_middleware
-from s2a_bench.ros.messages import type_hash
 from tests.ros.middleware_suite import STRING, MiddlewareSuite, wait_matched
 
 cyclonedds = pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
@@ -17,23 +16,6 @@ cyclonedds = pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for
 
 class TestCyclone(MiddlewareSuite):
     """In a domain of Cyclone DDS."""
-
-
-def test_endpoints_look_like_those_of_ros(dds_domain: int) -> None:
-    from cyclonedds.core import Policy
-
-    middleware = open_middleware("cyclonedds", domain_id=dds_domain)
-    writer = middleware.publisher("/camera/image_raw", "sensor_msgs/msg/Image", QoS(1)).entity  # type: ignore[attr-defined]
-    try:
-        assert writer.topic.name == "rt/camera/image_raw"
-        assert writer.topic.typename == "sensor_msgs::msg::dds_::Image_"
-        qos = writer.get_qos()
-        assert Policy.Reliability.Reliable(2**63 - 1) in qos
-        assert Policy.History.KeepLast(1) in qos
-        assert Policy.Durability.Volatile in qos
-        assert bytes(qos[Policy.Userdata].data) == f"typehash={type_hash('sensor_msgs/msg/Image')};".encode()
-    finally:
-        middleware.close()
 
 
 def test_a_domain_takes_one_configuration_per_process(dds_domain: int) -> None:

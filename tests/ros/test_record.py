@@ -125,7 +125,7 @@ def test_what_was_recorded_before_an_error_is_kept(tmp_path: Path) -> None:
     assert texts(tmp_path / "run.mcap") == ["kept"]
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
+def test_nothing_is_overwritten_and_what_is_in_the_way_is_named(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     path.write_text("precious")
     with pytest.raises(StoreError, match=r"^`record`: .*run\.mcap exists already"):
@@ -133,19 +133,12 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     assert path.read_text() == "precious"
     with pytest.raises(StoreError, match=r"^`record`: \. exists already"):
         BagRecorder(Path())
-
-
-def test_remains_of_a_killed_run_are_named(tmp_path: Path) -> None:
-    recorder = BagRecorder(tmp_path / "run.mcap")
-    with pytest.raises(StoreError, match=r"run\.mcap\.recording.* exists already"):
-        BagRecorder(tmp_path / "run.mcap")
-    recorder.close()
-
-
-def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match=r"^`record`: cannot write .*run\.mcap: "):
-        BagRecorder(tmp_path / "file" / "run.mcap")
+        BagRecorder(path / "run.mcap")
+    recorder = BagRecorder(tmp_path / "killed.mcap")
+    with pytest.raises(StoreError, match=r"killed\.mcap\.recording.* exists already"):
+        BagRecorder(tmp_path / "killed.mcap")
+    recorder.close()
 
 
 def test_closing_twice_is_fine_and_writing_afterwards_is_not(tmp_path: Path) -> None:

@@ -1,29 +1,24 @@
-"""Remapped names: what rules mean, and a middleware that keeps its contract under other names."""
+"""Remapped names: what rules mean, and a middleware whose every end is under its other name."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from s2a_bench.errors import UsageError
+from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.ros import QoS, open_middleware
+from s2a_bench.ros import messages as ros
+from s2a_bench.ros.llama import GENERATE_RESPONSE
 from s2a_bench.ros.remap import Remapped, table
 from s2a_bench.testing.transport import wiring_of
 from s2a_bench.transport.ros.joining import remapped
 from s2a_bench.transport.ros.options import RosOptions
-from tests.ros.action_suite import CANCEL, NAME, ActionSuite
-from tests.ros.middleware_suite import STRING, Join, MiddlewareSuite, joining, text, wait_matched
+from tests.ros.middleware_suite import LIST, STRING, WAIT_S, joining, until, wait_matched
 
 pytest.importorskip("cyclonedds", reason="cyclonedds has wheels for x86-64 only")
 
-RULES = {
-    NAME: "/elsewhere/answer",
-    CANCEL: "/elsewhere/answer/_action/cancel_goal",
-    "/test/order": "/other/order",
-    "/picky": "/picky",
-}
+RULES = {name: "/other" + name for name in ("/order", "/answer", "/ours", "/theirs")}
 
 
 @pytest.mark.parametrize(
@@ -63,27 +58,34 @@ def test_what_is_no_rule_is_refused(rule: str) -> None:
         RosOptions(remap=(rule,))
 
 
-@pytest.fixture
-def join(dds_domain: int) -> Iterator[Join]:
-    with joining(lambda: Remapped(open_middleware("cyclonedds", domain_id=dds_domain), RULES)) as join:
-        yield join
-
-
-class TestRemapped(MiddlewareSuite):
-    """Topics and services under other names."""
-
-
-class TestRemappedActions(ActionSuite):
-    """An action under another name."""
-
-
-def test_peers_find_what_is_remapped_under_its_other_name(join: Join, dds_domain: int) -> None:
-    publisher = join().publisher("/test/order", STRING, QoS())
-    plain = open_middleware("cyclonedds", domain_id=dds_domain)
-    try:
-        subscription = plain.subscription("/other/order", STRING, QoS())
-        wait_matched(publisher, subscription)
-        publisher.send(publisher.pack(text("x")))
-        assert subscription.unpack(subscription.take(5)).data == "x"
-    finally:
-        plain.close()
+def test_every_end_meets_those_of_its_other_name(dds_domain: int) -> None:
+    """In both directions, between a node that is remapped and one that is not; what has no rule keeps its name."""
+    with joining(lambda: open_middleware("cyclonedds", domain_id=dds_domain)) as join:
+        plain, inner = join(), join()
+        ours = Remapped(inner, RULES)
+        assert ours.describe() == inner.describe()
+        publishers = []
+        for one, name, other, other_name in (
+            (ours, "/order", plain, "/other/order"),
+            (plain, "/other/answer", ours, "/answer"),
+            (ours, "/same", plain, "/same"),
+        ):
+            publishers.append(one.publisher(name, STRING, QoS()))
+            wait_matched(publishers[-1], other.subscription(other_name, STRING, QoS()))
+        until(lambda: {"/other/order", "/other/answer", "/same"} <= {offer.topic for offer in ours.offers()})
+        for name, server, client, other in (
+            ("/ours", ours.service, plain.service_client, "/other/ours"),
+            ("/other/theirs", plain.service, ours.service_client, "/theirs"),
+        ):
+            server(name, LIST, lambda _: ros.default(LIST + "_Response"))
+            assert client(other, LIST).call(ros.default(LIST + "_Request"), WAIT_S).result.names == []
+        for name, act, ask, other in (
+            ("/ours", ours.action_server, plain.action_client, "/other/ours"),
+            ("/other/theirs", plain.action_server, ours.action_client, "/theirs"),
+        ):
+            kept = act(name, GENERATE_RESPONSE)
+            assert ask(other, GENERATE_RESPONSE).wait_for_server(WAIT_S)
+            del kept
+        ours.close()
+        with pytest.raises(TransportError, match="closed"):
+            inner.subscription("/late", STRING, QoS())

@@ -26,6 +26,7 @@ from s2a_bench.scenario.embedded import Embedded
 from s2a_bench.scenario.ros import EgoParameters, RosEgo, message
 from s2a_bench.testing.simulator import SPEED, START, SimulatorSuite, command
 from tests.scenario.carla_stand_in import CONTROL, NATIVE, PLAIN, STAMPED, RosWorld
+from tests.suites import once
 
 SPOKEN = {
     "": (CONTROL, *NATIVE),
@@ -97,6 +98,7 @@ def farthest(one: Driven, other: Driven) -> tuple[float, float]:
     return position, speed
 
 
+@once
 class TestContract(SimulatorSuite):
     """What a simulator keeps, driven and seen over ROS."""
 
@@ -109,8 +111,9 @@ class TestContract(SimulatorSuite):
         return meeting.ego(meeting.world())
 
 
-@pytest.mark.parametrize("more", ["", "&message=ackermann"])
-@pytest.mark.parametrize("policy", [Clairvoyant(), WaitThenAct()], ids=["stream", "wait"])
+@pytest.mark.parametrize(
+    ("more", "policy"), [("", Clairvoyant()), ("&message=ackermann", WaitThenAct())], ids=["stream", "wait"]
+)
 def test_a_drive_over_ros_is_the_direct_one_but_for_single_precision_and_the_held_brake(
     meeting: Meeting, more: str, policy: Policy
 ) -> None:
@@ -124,6 +127,7 @@ def test_a_drive_over_ros_is_the_direct_one_but_for_single_precision_and_the_hel
     assert speed < 0.1
 
 
+@once
 @pytest.mark.parametrize("more", SPOKEN)
 def test_each_preset_speaks_and_looks_under_the_names_of_its_own(meeting: Meeting, more: str) -> None:
     type_name, commands, pictures = SPOKEN[more]
@@ -140,6 +144,7 @@ def test_each_preset_speaks_and_looks_under_the_names_of_its_own(meeting: Meetin
         assert (drive_.acceleration, drive_.speed, drive_.steering_angle) == (-2.0, pytest.approx(8.0), 0.0)
 
 
+@once
 def test_all_but_the_commands_is_the_wrapped_world(meeting: Meeting) -> None:
     world = meeting.world()
     ego = meeting.ego(world)
@@ -149,6 +154,7 @@ def test_all_but_the_commands_is_the_wrapped_world(meeting: Meeting) -> None:
     assert world.closed == 1
 
 
+@once
 def test_a_step_that_a_run_chooses_is_the_wrapped_worlds(meeting: Meeting) -> None:
     ego = meeting.ego(meeting.world())
     ego.step_s = 0.02
@@ -156,6 +162,7 @@ def test_a_step_that_a_run_chooses_is_the_wrapped_worlds(meeting: Meeting) -> No
     assert ego.step(command()).position_m[:, 0] == pytest.approx(START[:, 0] + 0.2)
 
 
+@once
 def test_pictures_are_of_the_cars_as_they_were_placed_and_as_they_drive_on(meeting: Meeting) -> None:
     ego = meeting.ego(meeting.world())
     camera = ego.camera(160, 120)
@@ -189,6 +196,7 @@ def test_a_command_that_nobody_takes_is_one_line(meeting: Meeting) -> None:
     assert line.endswith("command, domain_id or middleware (?preset=bridge)")
 
 
+@once
 def test_a_picture_that_never_comes_is_one_line(meeting: Meeting) -> None:
     ego = meeting.ego(meeting.world(), "&picture=/carla/hero/front/image", wait_s=1)
     with pytest.raises(SourceError) as error:
@@ -199,6 +207,7 @@ def test_a_picture_that_never_comes_is_one_line(meeting: Meeting) -> None:
     assert "of the ego)" in line
 
 
+@once
 def test_a_world_that_stops_showing_pictures_is_one_line(meeting: Meeting) -> None:
     world = meeting.world()
     ego = meeting.ego(world, wait_s=1)
@@ -208,6 +217,7 @@ def test_a_world_that_stops_showing_pictures_is_one_line(meeting: Meeting) -> No
         ego.place(START, SPEED)
 
 
+@once
 def test_a_closed_camera_leaves_the_world_alone(meeting: Meeting) -> None:
     world = meeting.world()
     ego = meeting.ego(world, wait_s=1)
@@ -217,6 +227,7 @@ def test_a_closed_camera_leaves_the_world_alone(meeting: Meeting) -> None:
     assert ego.step(command()).position_m[LEAD, 0] == pytest.approx(40.05)
 
 
+@once
 def test_a_world_that_breaks_while_the_camera_opens_says_so(meeting: Meeting) -> None:
     world = meeting.world()
     world.breaks = TransportError("the server has left")

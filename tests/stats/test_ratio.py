@@ -47,11 +47,8 @@ def test_the_ratio_is_that_of_the_medians() -> None:
     ("n", "correlation", "shared", "least"),
     [
         (10, 0.0, 0.0, 183),  # of Binomial(200, 0.95), below 183 are 1 in 100
-        (10, 0.4, 0.8, 183),
         (20, 0.4, 0.0, 174),  # too short to tell how alike neighbours are: 9 in 10
-        (50, 0.0, 0.0, 183),
         (50, 0.4, 0.8, 183),
-        (200, 0.4, 0.0, 183),
         (200, 0.8, 0.8, 183),
     ],
 )
@@ -119,7 +116,7 @@ def launches(rng: np.random.Generator, n: int, spread: float, runs: int = 15) ->
     return cells
 
 
-@pytest.mark.parametrize("spread", [0.04, 0.08, 0.13])
+@pytest.mark.parametrize("spread", [0.04, 0.13])
 def test_over_launches_the_interval_covers_what_one_launch_cannot_know(spread: float) -> None:
     rng = np.random.default_rng(5)
     covered = alone = 0
@@ -132,7 +129,7 @@ def test_over_launches_the_interval_covers_what_one_launch_cannot_know(spread: f
             one = ratio_of_launches(above, below, seed)
             alone += one.low <= 6 <= one.high
     assert 366 <= covered <= 393  # 99 of 100 of Binomial(400, 0.95)
-    assert alone <= {0.04: 94, 0.08: 82, 0.13: 65}[spread]
+    assert alone <= {0.04: 94, 0.13: 65}[spread]
 
 
 def test_over_launches_the_ratio_is_the_geometric_mean_with_students_interval() -> None:

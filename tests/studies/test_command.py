@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 
 from s2a_bench.store.run import read_run
+from studies.__main__ import main
 from studies.rows import STUDY_CELLS
 from tests.studies.program import ROOT, run
 
 
 def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
-    done = run("misfit", "--plans", "100", "--calibration-plans", "100", output=tmp_path)
+    done = run("misfit", "--plans", "20", "--calibration-plans", "100", output=tmp_path)
     assert "Wrong beliefs" in done.stdout
     assert (
         "warning [few-calibration-plans]: 100 calibration plans are few: one lambda may stall up to 6.7%" in done.stderr
@@ -27,7 +28,7 @@ def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
     assert (folder / "studies.parquet").exists()
     rows = kept.table(STUDY_CELLS)
     assert len(rows) == 3 * 17
-    assert (rows["plans"] == 100).all()
+    assert (rows["plans"] == 20).all()
     for name in ("| N -2 |", "| L x 1.25 |", "| gap x 2 |"):
         assert name in done.stdout
     for name in ("figures/misfit.png", "figures/misfit.pdf", "tables/wrong-beliefs.md", "tables/misfit.csv"):
@@ -44,8 +45,13 @@ def test_a_study_prints_its_tables_and_keeps_its_rows(tmp_path: Path) -> None:
         (["validity", "--task", "@/no/such/file"], "--task: cannot read /no/such/file"),
     ],
 )
-def test_wrong_use_is_one_line_and_leaves_nothing_behind(arguments: list[str], message: str, tmp_path: Path) -> None:
-    assert message in run(*arguments, output=tmp_path, code=2).stderr.splitlines()[-1]
+def test_wrong_use_is_one_line_and_leaves_nothing_behind(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([*arguments, "--output", str(tmp_path)])
+    assert ended.value.code == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
     assert list(tmp_path.iterdir()) == []
 
 

@@ -176,7 +176,7 @@ def test_too_short_a_plan_believed_stalls_and_too_long_a_one_is_late() -> None:
 
 
 def test_rare_stalls_cost_more_under_pauses_than_under_even_jitter() -> None:
-    config = StudyConfig(name="frontier", plans=500, calibration_plans=200)
+    config = StudyConfig(name="frontier", plans=200, calibration_plans=100)
     world = World(4.8, 0.5, 6, 8, 1.0)
     costs = {}
     for gaps in study_frontier.families(1 / 4.8, (0.2, 0.1, 0.3)):
@@ -208,10 +208,10 @@ def test_a_study_is_kept_and_shown(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for module in (study_targets, study_frontier, study_drift, study_misfit, study_shift, study_split):
-        monkeypatch.setattr(module, "WORLDS", HARDEST[:1])
-    monkeypatch.setattr(study_drift, "REFIT", 32)
+        monkeypatch.setattr(module, "WORLDS", [World(4.8, 0.5, 4, 3, 1.0)])
+    monkeypatch.setattr(study_drift, "REFIT", 8)
     progress = NullProgress()
-    config = StudyConfig(name=name, plans=64, calibration_plans=100)
+    config = StudyConfig(name=name, plans=24, calibration_plans=100)
     folder = run_study(config, tmp_path, progress)
     assert folder == progress.folder
     assert progress.done == len(cells_of(config))

@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
-from itertools import product
+from itertools import cycle, product
 from pathlib import Path
 from typing import Any
 
@@ -226,19 +226,20 @@ class Fake:
 
     width = 3
 
-    def __init__(self, go: Callable[[SweepCell], str] = lambda _: "", machine: dict[str, Any] | None = None) -> None:
+    def __init__(self, go: Callable[[SweepCell], str] = lambda _: "", *machines: dict[str, Any]) -> None:
         self.go = go
-        self.machine = machine or {"host": "h", "cpu": "c"}
+        self.machines = cycle(machines or [{"host": "h", "cpu": "c"}])
         self.ran: list[SweepCell] = []
 
     def submit(self, cell: SweepCell, folder: Path) -> Future[Outcome]:
         future: Future[Outcome] = Future()
         self.ran.append(cell)
         error = self.go(cell)
+        machine = next(self.machines)
         folder.mkdir(parents=True)
-        with RunWriter.create(folder, "fly", {"environment": self.machine}, ()):
+        with RunWriter.create(folder, "fly", {"environment": machine}, ()):
             pass
-        future.set_result(Outcome(error, 0.5, "now", self.machine))
+        future.set_result(Outcome(error, 0.5, "now", machine))
         return future
 
     def collect(self, future: Future[Outcome], folder: Path) -> Outcome:
@@ -358,14 +359,7 @@ def test_boards_have_lanes_of_their_own_and_one_cell_at_a_time(folder: Path) -> 
     plan = plan_of(
         *({"rate": rate, "board": board, "live": True} for rate in (1, 2) for board in ("a", "b")), boards=None
     )
-    under_way: list[list[str]] = []
-
-    class Slow(Fake):
-        def submit(self, cell: SweepCell, folder: Path) -> Future[Outcome]:
-            under_way.append([cell.board])
-            return super().submit(cell, folder)
-
-    workers = Slow()
+    workers = Fake()
     sit(folder, workers, plan=plan)
     assert sorted(cell.board for cell in workers.ran[:2]) == ["a", "b"]  # both boards at once, then both again
     assert sorted(cell.board for cell in workers.ran[2:]) == ["a", "b"]
@@ -373,14 +367,7 @@ def test_boards_have_lanes_of_their_own_and_one_cell_at_a_time(folder: Path) -> 
 
 def test_a_board_that_is_another_machine_later_is_not_mixed_in(folder: Path) -> None:
     plan = plan_of({"rate": 1, "board": "orin", "live": True}, {"rate": 2, "board": "orin", "live": True}, boards=None)
-    twins = iter(({"host": "a", "cpu": "x"}, {"host": "b", "cpu": "y"}))
-
-    class Changing(Fake):
-        def submit(self, cell: SweepCell, folder: Path) -> Future[Outcome]:
-            self.machine = next(twins)
-            return super().submit(cell, folder)
-
-    sit(folder, Changing(), plan=plan)
+    sit(folder, Fake(lambda _: "", {"host": "a", "cpu": "x"}, {"host": "b", "cpu": "y"}), plan=plan)
     sweep = read_sweep(folder)
     assert sorted(sweep.cells["error"]) == ["", "orin is another machine than before: cpu is y, was x"]
     assert sweep.manifest["machines"].keys() == {"a", "b"}

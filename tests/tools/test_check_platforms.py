@@ -62,7 +62,7 @@ def test_wheels_of_every_older_system_are_taken() -> None:
     assert "manylinux_2_36" not in flags
 
 
-@pytest.mark.parametrize("target", check.TARGETS, ids=str)
+@pytest.mark.parametrize("target", [JETPACK, JAZZY], ids=str)
 def test_this_pip_takes_the_targets_markers(target: check.Target) -> None:
     command = [sys.executable, "-c", check.AS_TARGET, json.dumps(target.markers()), "--version"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""Every transport and variant of the registry keeps the contract, with each of its payloads and connections."""
+"""Every transport and variant of the registry keeps the contract; each payload and connection what concerns it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from s2a_bench.testing.transport import TransportSuite, wiring_of
 from s2a_bench.transport import PAYLOADS, Wiring, paths
 from s2a_bench.transport.http import LLAMA_SERVER
 from s2a_bench.transport.pipeline import Pipeline, pipelines
+from tests.suites import only
 
 ENCODED: Final = [payload for payload in PAYLOADS if payload != "jpeg-preencoded"]
 OURS: Final = [
@@ -29,8 +30,7 @@ PECULIAR: Final[dict[tuple[str, str], dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("pipeline", OURS, ids=lambda pipeline: f"{pipeline.name}:{pipeline.payload}")
-class TestEvery(TransportSuite):
+class OfPipeline(TransportSuite):
     @pytest.fixture
     def wiring(self, pipeline: Pipeline, dds_domain: int) -> Wiring[Any]:
         vars(self).update(PECULIAR.get((pipeline.transport.name, pipeline.variant), {}))
@@ -40,7 +40,35 @@ class TestEvery(TransportSuite):
         return wiring_of(pipeline.name.partition("?")[0], max_tokens=2000, **options)
 
 
+PLAIN: Final = [pipeline for pipeline in OURS if "?" not in pipeline.name]
+CODED: Final = [pipeline for pipeline in OURS if "?" in pipeline.name]
+
+
+@pytest.mark.parametrize("pipeline", PLAIN, ids=lambda pipeline: pipeline.name)
+class TestEvery(OfPipeline):
+    """Each variant, with its default payload."""
+
+
+@pytest.mark.parametrize("pipeline", CODED, ids=lambda pipeline: pipeline.name)
+@only(
+    "test_the_picture_arrives_as_rgb",
+    "test_several_pictures_and_the_state_reach_the_handler",
+    "test_every_stage_takes_time",
+    "test_stages_and_residual_sum_to_the_whole",
+    "test_the_payload_weighs_as_much_as_its_pictures",
+)
+class TestEveryPayload(OfPipeline):
+    """What a picture's encoding has to do with."""
+
+
 @pytest.mark.parametrize("connection", ["per-request", "client-per-request"])
+@only(
+    "test_tokens_arrive_in_order_with_text_and_id",
+    "test_every_stage_takes_time",
+    "test_an_engine_that_refuses_fails_this_request_only",
+    "test_a_request_can_be_left_early",
+    "test_closing_twice_does_no_harm",
+)
 class TestHttpConnections(TransportSuite):
     lacks = OF_LLAMA_SERVER
 
@@ -49,8 +77,16 @@ class TestHttpConnections(TransportSuite):
         return wiring_of("http/best-effort?payload=raw", connection=connection)
 
 
-@pytest.mark.parametrize("layout", ["n1.7", "n1.5"])
-@pytest.mark.parametrize("payload", ["raw", "png"])
+@pytest.mark.parametrize(("layout", "payload"), [("n1.7", "raw"), ("n1.5", "raw"), ("n1.5", "png")])
+@only(
+    "test_what_a_server_process_is_told_survives_json",
+    "test_actions_arrive_in_order_with_every_bit",
+    "test_several_pictures_and_the_state_reach_the_handler",
+    "test_every_field_of_a_request_reaches_the_handler",
+    "test_the_picture_arrives_as_rgb",
+    "test_every_stage_takes_time",
+    "test_an_engine_that_refuses_fails_this_request_only",
+)
 class TestZmqLayouts(TransportSuite):
     whole = True
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Generator
 from contextlib import ExitStack
 from dataclasses import replace
@@ -15,7 +14,6 @@ import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, TransportError
-from s2a_bench.ros import QoS, open_middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.service import READER_QOS
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
@@ -23,11 +21,10 @@ from s2a_bench.trace import RESIDUAL, Trace, budget
 from s2a_bench.transport import Client, Handler, Wiring, open_client, open_server
 from s2a_bench.transport.limits import LIMITS
 from s2a_bench.transport.ros import topic
-from s2a_bench.transport.ros.camera import CAMERA
 from s2a_bench.transport.ros.joining import join
 from s2a_bench.transport.ros.wire import REQUEST_QOS, request_message
 from s2a_bench.transport.serving import Queued
-from s2a_bench.types import Frame, Request, Token
+from s2a_bench.types import Request, Token
 from tests.waiting import until
 
 
@@ -94,55 +91,6 @@ def test_a_client_is_a_camera_from_when_it_is_used_as_one(stack: ExitStack, wiri
     for count, client in enumerate(clients, 1):
         assert client.camera is client.camera
         until(lambda count=count: publishers() == count)  # type: ignore[misc]  # bound at once
-
-
-def test_a_frame_that_cannot_be_does_not_end_the_camera(stack: ExitStack, wiring: Wiring[Any], dds_domain: int) -> None:
-    handler = RecordingHandler(["x"])
-    serve(stack, wiring, handler)
-    client = connect(stack, wiring)
-    middleware = open_middleware(domain_id=dds_domain)
-    stack.callback(middleware.close)
-    publisher = middleware.publisher("/test_ros" + CAMERA, ros.IMAGE, QoS(1))
-    deadline = now_ns() + 20_000_000_000
-    while not publisher.matched():
-        assert now_ns() < deadline
-    odd = Frame(0, 0, 3, 2, "yuv422_yuy2", np.zeros((2, 3, 2), np.uint8))
-    empty = Frame(0, 0, 0, 0, "mono8", np.zeros((0, 0), np.uint8))
-    for bad in (odd, empty):
-        publisher.send(publisher.pack(ros.image_message(bad, 1, "camera")))
-    assert client.camera is not None
-    frame, trace = yuyv_frame(), Trace()
-    client.camera.publish(frame, trace)
-    ask_until_seen(client, handler, client.camera.stamp_ns(frame))
-
-
-@pytest.mark.parametrize("variant", ["topic", "action"])
-def test_a_frame_that_came_too_long_ago_fails_the_request_and_its_age_is_told(
-    stack: ExitStack, dds_domain: int, variant: str
-) -> None:
-    wiring = wiring_of(f"ros/{variant}", "/test_age", domain_id=dds_domain, max_frame_age=0.3)
-    serve(stack, wiring, RecordingHandler(["x"]))
-    client = connect(stack, wiring)
-    assert client.camera is not None
-    frame = replace(yuyv_frame(), stamp_ns=now_ns() - 5_000_000_000)
-    client.camera.publish(frame, Trace())
-    error, trace = ask_until_refused(client)
-    assert re.search(r"newest frame came \d+\.\d s ago, more than `max_frame_age` 0\.3 s", error)
-    assert trace.facts["stale_frames"] == 1
-    assert trace.facts["camera_age_ms"] > 300
-    assert trace.facts["camera_stamp_age_ms"] > trace.facts["camera_age_ms"] + 4_000
-
-
-def ask_until_refused(client: Client) -> tuple[str, Trace]:
-    """Ask without a picture until that fails; return why."""
-    deadline = now_ns() + 20_000_000_000
-    while now_ns() < deadline:
-        trace = Trace()
-        try:
-            list(client.request(Request("a", "plan"), trace))
-        except RequestFailed as error:
-            return str(error), trace
-    raise AssertionError("no request failed")
 
 
 def test_a_waiting_request_is_about_the_frame_that_is_the_newest_when_its_turn_comes(

@@ -19,12 +19,14 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.action import Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
+from s2a_bench.trace import Trace
 from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.ros import camera as camera_module
 from s2a_bench.transport.ros.camera import CAMERA, CAMERA_QOS, CLOCK_QOS
 from s2a_bench.transport.ros.joining import join
 from s2a_bench.transport.ros.node import ARRAY, Level
 from s2a_bench.types import Frame, Request
+from tests.suites import once
 from tests.waiting import until
 
 TOPIC = "/robot/camera/image_raw"
@@ -125,6 +127,7 @@ def test_a_request_on_the_topic_fails_too_and_is_answered_again_once_the_publish
     del kept
 
 
+@once
 def test_diagnostics_warn_of_a_camera_whose_frames_do_not_come(robot: Robot) -> None:
     diagnostics = robot.peer.subscription("/diagnostics", ARRAY, QoS())
     status = robot.diagnosed(diagnostics, "^no camera: no publisher on its topics$")
@@ -137,6 +140,7 @@ def test_diagnostics_warn_of_a_camera_whose_frames_do_not_come(robot: Robot) -> 
     assert status.level == Level.WARN
 
 
+@once
 @pytest.mark.parametrize("variant", ["topic", "action"])
 def test_without_a_publisher_text_is_answered_and_the_log_says_once_that_there_is_no_camera(
     robot: Robot, caplog: pytest.LogCaptureFixture, variant: str
@@ -164,6 +168,7 @@ def test_a_request_waits_for_the_first_frame_of_a_publisher_that_has_just_appear
     assert [[image.stamp_ns for image in request.images] for request in robot.handler.requests] == [[7]]
 
 
+@once
 def test_frames_that_cannot_be_used_are_named_as_the_reason(robot: Robot) -> None:
     client, publisher = robot.client(), robot.camera()
     depth = replace(ros.image_message(Frame(0, 0, 2, 2, "mono8", np.zeros((2, 2), np.uint8)), 1, "c"), encoding="16UC1")
@@ -173,6 +178,7 @@ def test_frames_that_cannot_be_used_are_named_as_the_reason(robot: Robot) -> Non
     assert re.search(reason, refusal(client))
 
 
+@once
 def test_the_log_has_each_reason_once_whatever_their_order(robot: Robot, caplog: pytest.LogCaptureFixture) -> None:
     publisher, cache = robot.camera(), robot.server._cache
     good = ros.image_message(Frame(0, 0, 4, 4, "mono8", np.zeros((4, 4), np.uint8)), 1, "c")
@@ -222,6 +228,7 @@ def test_a_best_effort_camera_that_a_reliable_server_does_not_match_is_no_missin
     assert why.endswith("; a best-effort publisher is received with qos sensor_data")
 
 
+@once
 def test_an_old_frame_is_told_of_with_buffers_while_there_is_a_publisher(
     robot: Robot, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -231,8 +238,11 @@ def test_an_old_frame_is_told_of_with_buffers_while_there_is_a_publisher(
     cache = robot.server._cache
     until(lambda: cache._newest is not None and now_ns() - cache._newest.received_ns > 300_000_000)
     for _ in range(2):
-        why = refusal(client)
-        assert re.search(rf"more than `max_frame_age` 0\.3 s: 1 publisher on {TOPIC}, no frame comes: look at", why)
+        trace, came = Trace(), r"newest frame came \d+\.\d s ago, more than `max_frame_age` 0\.3 s"
+        with pytest.raises(RequestFailed, match=f"{came}: 1 publisher on {TOPIC}, no frame comes: look at"):
+            list(client.request(Request("a", "plan"), trace))
+        assert trace.facts["stale_frames"] == 1
+        assert 300 < trace.facts["camera_age_ms"] < trace.facts["camera_stamp_age_ms"] - 4_000  # by a stamp of 1970
     assert len(logged(caplog, "newest frame came")) == 1
     other.close()
     until(lambda: robot.server._cache._publishers().get("/robot" + CAMERA, 0) == 0)

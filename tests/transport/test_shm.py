@@ -36,8 +36,6 @@ from s2a_bench.types import Action, Frame, Request, Token
 from tests.hostile.asking import usage
 from tests.waiting import until
 
-NOBODY = 65534
-
 
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -251,33 +249,6 @@ def test_the_memory_of_a_long_answer_is_given_back() -> None:
         writer.send(b"x" * (2 * STEP_BYTES))
         writer.begin()
         assert answers.map[: 2 * STEP_BYTES] == bytes(2 * STEP_BYTES)
-
-
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody else")
-def test_another_user_of_the_machine_gets_no_memory(tmp_path: Path) -> None:
-    path = tmp_path / "robot.sock"
-    for folder in (tmp_path, *tmp_path.parents):
-        if folder.name.startswith(("pytest", "popen", "test")):
-            folder.chmod(0o755)
-    for connect in connector(wiring_of("shm", str(path))):
-        connect(RecordingHandler(["x"]))
-        child = os.fork()
-        if not child:
-            os._exit(_as_nobody(str(path)))
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 1
-
-
-def _as_nobody(path: str) -> int:
-    """Return 1 where the socket cannot be opened, 0 otherwise."""
-    os.setgid(NOBODY)
-    os.setuid(NOBODY)
-    link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    link.settimeout(10)
-    try:
-        link.connect(path)
-    except PermissionError:
-        return 1
-    return 0
 
 
 def test_memory_above_the_limit_is_refused() -> None:

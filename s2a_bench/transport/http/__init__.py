@@ -25,7 +25,7 @@ from s2a_bench.transport.listening import ListeningTransport, read_key
 VARIANTS = ("as-deployed", "best-effort", "binary", "llama-server")
 BINARY, LLAMA_SERVER = VARIANTS[2:]
 FAST = VARIANTS[1:3]
-PACKAGES = "fastapi", "httptools", "httpx", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"
+PACKAGES = "fastapi", "h11", "httptools", "httpx", "orjson", "pybase64", "starlette", "uvicorn", "uvloop"
 
 HEADERS_MS = Fact("headers_ms", "ms", "last byte packed to the headers of a black box's answer")
 THINKING_PIECES = Fact("thinking_pieces", "", "messages of the answer that were thinking")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -16,7 +15,7 @@ from s2a_bench.boards.gaps import Lognormal
 from s2a_bench.experiments.boundary.config import BoundaryConfig
 from s2a_bench.experiments.boundary.rows import BOUNDARY
 from s2a_bench.experiments.boundary.run import NaiveTrial, rows, run_boundary
-from s2a_bench.experiments.boundary.view import BoardPoints, build_boundary, disagreements, show
+from s2a_bench.experiments.boundary.view import disagreements, show
 from s2a_bench.experiments.cells import Cells
 from s2a_bench.policy import Plans, policy
 from s2a_bench.policy.conformal import ANY_STALL_S
@@ -47,7 +46,7 @@ def drawn(run: StoredRun) -> Figure:
         return show(run).figures["boundary"]()
 
 
-@settings(max_examples=40)
+@settings(max_examples=15)
 @given(
     n_skills=st.integers(2, 40),
     t_nom_s=st.floats(0.1, 10),
@@ -129,17 +128,6 @@ def test_the_figure_draws_both_lines_every_trial_and_every_board(even: StoredRun
     ]
     figure.draw_without_rendering()
     assert all(text.get_window_extent().x0 > axes.bbox.x1 for text in axes.texts)  # none lies on a marker
-
-
-def test_the_figure_is_drawn_from_points() -> None:
-    points = {trial.duration: list(rows(trial, (1, 2), (1.1, 4.0))) for trial in (T_NOM, T_MIN)}
-    grid = {duration: pd.DataFrame([asdict(row) for row in tried]) for duration, tried in points.items()}
-    board = BoardPoints("mine", "My board", "measured", 3.0, list(rows(T_NOM, (2, 4), (3.0,), "mine")))
-    axes = build_boundary(("A title",), grid, [board], random=False).axes[0]
-    filled, empty = (line.get_xydata().tolist() for line in axes.lines if line.get_marker() == "s")
-    assert (filled, empty) == ([[2, 3.0]], [[4, 3.0]])
-    trials = {each.get_label(): each.get_offsets().tolist() for each in axes.collections if each.get_offsets().any()}
-    assert trials == {"trial: no stall": [[1, 1.1], [1, 4.0], [2, 4.0]], "trial: stalls": [[2, 1.1]]}
 
 
 def test_with_jitter_the_share_is_shaded_and_has_a_scale(jittery: StoredRun) -> None:

@@ -58,7 +58,7 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Live:
     (folder / "fast.toml").write_text(to_toml({**facts, "gaps": {"family": "constant"}}))
     engine = EngineConfig(name="replay", profile=str(folder / "fast.toml"))
     requests = DrivingRequests(transports="http/binary", engine=engine, record=folder / "run.mcap")
-    made = run(folder, CcrbLiveLoop(requests=requests, scenario=CcrbOptions(n_skills=3, speed_kmh=20)))
+    made = run(folder, CcrbLiveLoop(requests=requests, scenario=CcrbOptions(n_skills=3, speed_kmh=20, t_nom_s=0.4)))
     return Live(made, folder / "run.mcap")
 
 
@@ -134,6 +134,16 @@ def test_a_world_slower_than_the_clock_is_told_with_its_factor(
     assert [told in note for note in slow] == [True] * bool(told)
     assert [note.labels for note in slow] == [("world slower than the clock",)] * bool(told)  # type: ignore[attr-defined]
     assert ("slower than the clock" in " ".join(caption_of(show(made).figures["scenario"]()))) is bool(told)
+
+
+def test_each_policy_has_a_request_of_its_own_and_its_roll_out_beside_it(live: Live) -> None:
+    skills = live.run.table(SKILLS)
+    assert list(skills.groupby("cell", sort=False)["request_id"].nunique()) == [1, 1, 1]
+    assert skills["request_id"].nunique() == 3
+    assert set(live.run.manifest["requests"]) == set(skills["request_id"])
+    assert live.run.manifest["configuration"]["time"] == "monotonic"
+    assert 0 <= live.run.table(TRAJECTORIES).groupby("cell")["at_ns"].min().max() < 200e6
+    assert live.run.table(ROLLOUTS)["study"].value_counts().to_dict() == {"point": 3, "rollout": 3}
 
 
 def test_each_policys_request_has_its_stages_and_they_add_up(virtual: StoredRun, live: Live) -> None:

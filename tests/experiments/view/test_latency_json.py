@@ -9,12 +9,10 @@ from s2a_bench.experiments.latency import EXPERIMENT
 from s2a_bench.experiments.latency.metrics import latency_json
 from s2a_bench.experiments.requests import cells_of
 from s2a_bench.store.requests import SampleRow
-from s2a_bench.store.run import StoredRun
 from s2a_bench.trace import GROUPS, path_of
 from s2a_bench.transport import TRANSPORTS
-from tests.made_runs import SCHEMA
+from tests.made_runs import SCHEMA, MakeRun
 
-MakeRun = Callable[..., StoredRun]
 WARNING = {"code": "cpu-governor", "message": "the governor is powersave", "advice": "set it to performance"}
 
 

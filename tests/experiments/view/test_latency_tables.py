@@ -21,9 +21,8 @@ from s2a_bench.store.run import RunWriter, StoredRun, read_run
 from s2a_bench.trace import path_of
 from s2a_bench.writers.latex import to_latex
 from s2a_bench.writers.tables import interval, mean_sd, number, to_markdown
-from tests.made_runs import STAGES, known
+from tests.made_runs import STAGES, MakeRun, known
 
-MakeRun = Callable[..., StoredRun]
 NONE = "\N{EN DASH}"
 HAND = {
     "http/as-deployed": {"capture": 1, "image_encode": 3, "base64_encode": 2, "network": 18, "inference": 100, "": 1.5},
@@ -55,12 +54,6 @@ def test_without_model_reads_as_a_sum_where_it_is_told(make_run: MakeRun) -> Non
     assert group_table(cells_of(run)).header[-5:] == ("e2e w/o infer.", "preproc.", "e2e w/o model", "infer.", "e2e")
     assert "e2e less the prompt_ms it reports, which is assumed to be all" in " ".join(printed(run).split())
     assert show(run).sentences[-1].startswith("Without model, http/llama-server takes 1.39 times as long as ros/topic")
-
-
-def test_an_engine_that_tells_no_preprocessing_has_no_rows_about_it(make_run: MakeRun) -> None:
-    run = make_run(HAND, n=4, spread=0)
-    assert not {"preprocess", "e2e without model"} & {row[1] for row in stage_table(cells_of(run)).rows}
-    assert "summary-model" not in show(run).tables
 
 
 @pytest.mark.parametrize(
@@ -262,8 +255,7 @@ def test_a_folder_that_cannot_be_written_is_named(make_run: MakeRun, folder: str
         write_shown(run, EXPERIMENT.show(run))
 
 
-@pytest.mark.parametrize("count", [1, 2, 6])
-@pytest.mark.parametrize("width", [60, 80, 120])
+@pytest.mark.parametrize(("count", "width"), [(1, 120), (2, 80), (6, 60)])
 def test_the_terminal_shows_the_stages_what_they_say_and_where_the_rest_is(
     make_run: MakeRun, plausible: dict[str, Any], black_box: Any, count: int, width: int
 ) -> None:

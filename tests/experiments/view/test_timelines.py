@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from s2a_bench.experiments.timeline.build_rows import timeline_rows
-from s2a_bench.experiments.timeline.rows import TIMELINES, TimelineRow
-from s2a_bench.experiments.timeline.view.cells import Timelines, origin_notes, timelines_json, timelines_of
+from s2a_bench.experiments.timeline.rows import TIMELINES
+from s2a_bench.experiments.timeline.view.cells import origin_notes, timelines_json, timelines_of
 from s2a_bench.experiments.timeline.view.figures import build_timelines
 from s2a_bench.experiments.timeline.view.tables import (
     execution_table,
@@ -26,10 +25,8 @@ from s2a_bench.harness.timelines.rows import skill_rows, token_rows
 from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.schedule import safe_start, work_conserving
-from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.store.requests import SKILLS, TOKENS, TokenRow
 from s2a_bench.store.run import RunWriter, StoredRun, read_run
-from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
 from s2a_bench.writers.tables import TextTable
 
@@ -110,13 +107,6 @@ def test_a_panel_shows_each_skill_and_each_stall_where_it_was(computed: StoredRu
     assert [first[lane].get_x() for lane in (1, 2, 3)] == pytest.approx([1.75, 10.5, 3.5])
 
 
-def test_the_figure_says_what_is_emulated_and_assumed(computed: StoredRun, live: StoredRun) -> None:
-    caption = " ".join(caption_of(drawn(computed)))
-    assert "EMULATED in virtual time" in caption
-    assert "our assumption" in caption
-    assert "EMULATED" not in " ".join(caption_of(drawn(live)))
-
-
 def test_the_legend_explains_only_what_is_drawn(computed: StoredRun, live: StoredRun) -> None:
     def labels(run: StoredRun) -> set[str]:
         return {text.get_text() for text in drawn(run).legends[0].get_texts()}
@@ -133,17 +123,6 @@ def test_requests_of_their_own_have_their_tokens_in_their_lanes(live: StoredRun)
     assert [segments[0][0][0] for segments in ticks] == pytest.approx(
         [0.5 + 1 / 4.8 + shift for shift in (0, 0.1, 0.2)]
     )
-
-
-def test_a_figure_is_of_rows_and_needs_no_run() -> None:
-    plans, setting = plans_of(6), PlanSetting("orin", "Orin", 4.8, 0.5, 6, 8, 1.0)
-    schedule = Schedule(work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[0]), plans.nominal_s)
-    rows, skills = timeline_rows(setting, "naive", plans, schedule, ["a"]), skill_rows("a", plans, schedule, ["a"])
-    cell = Timelines(pd.DataFrame(rows), TimelineRow, Origins(Provenance()), skills, uniform(0.5, 1, 4.8, 48)[:, 0])
-    with paper_column():
-        figure = build_timelines([cell], ["A note."])
-    assert len(bars(figure.axes[0], hatched=False)) == 8
-    assert caption_of(figure) == ("Execution timelines: N = 8 skills, T_nom = 1 s", "A note.")
 
 
 def column(table: TextTable, name: str) -> list[str]:

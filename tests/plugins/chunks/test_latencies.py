@@ -64,7 +64,8 @@ def test_a_run_gives_each_cell_until_its_last_token_without_warm_ups(make_run: M
 
 def exported(folder: Path, **options: Any) -> list[dict[str, str]]:
     file = folder / "delays.csv"
-    run_virtual(ChunksVirtual(export_delays=file, **options), folder / "runs", NullProgress())
+    settings = {"robot": "", "rules": "", **options}
+    run_virtual(ChunksVirtual(export_delays=file, **settings), folder / "runs", NullProgress())
     with file.open(newline="") as text:
         return list(csv.DictReader(text))
 
@@ -85,7 +86,7 @@ def test_drawn_latencies_are_written_with_their_d_and_read_back(rounding: str, t
 
 
 def test_what_is_replayed_is_what_was_exported(tmp_path: Path) -> None:
-    first = {"modes": "queue?trigger=4", "rules": "", "cycles": 200}
+    first = {"modes": "queue?trigger=4", "rules": "", "cycles": 200, "robot": ""}
     one = read_run(run_virtual(ChunksVirtual(export_delays=tmp_path / "d.csv", **first), tmp_path, NullProgress()))
     again = read_run(run_virtual(ChunksVirtual(latency=str(tmp_path / "d.csv"), **first), tmp_path, NullProgress()))
     columns = [name for name in one.table(REQUESTS).columns if name != "cell"]
@@ -96,7 +97,7 @@ def test_what_is_replayed_is_what_was_exported(tmp_path: Path) -> None:
 def test_of_a_measured_run_the_times_of_its_marks_are_written_in_their_order(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run(n=8)
     cell = str(run.samples["cell"].iloc[0])
-    rows = exported(tmp_path, latency=f"{run.path}#{cell}", rules="")
+    rows = exported(tmp_path, latency=f"{run.path}#{cell}")
     assert len(rows) == 8
     for row in rows:
         times = [int(row[name]) for name in ("observation_ns", "sent_ns", "server_in_ns", "server_out_ns")]
@@ -108,9 +109,9 @@ def test_of_a_measured_run_the_times_of_its_marks_are_written_in_their_order(mak
 def test_a_run_has_to_be_told_which_of_its_cells(make_run: MakeRun, tmp_path: Path) -> None:
     run = make_run(n=4)
     with pytest.raises(UsageError, match=r"`export_delays`: 5 sources of `latency`, .*; name one of them"):
-        exported(tmp_path, latency=str(run.path), rules="")
+        exported(tmp_path, latency=str(run.path))
     with pytest.raises(UsageError, match="has no cell 'pigeon', only "):
-        exported(tmp_path, latency=f"{run.path}#pigeon", rules="")
+        exported(tmp_path, latency=f"{run.path}#pigeon")
 
 
 def test_a_place_that_is_none_is_refused_before_anything_is_computed(tmp_path: Path) -> None:

@@ -74,17 +74,10 @@ def test_a_step_has_the_textbook_s_response() -> None:
     since = np.arange(60) * PERIOD_S * 4 * math.pi
     np.testing.assert_allclose(motion.position[1:, 0, 0], 1 - (1 + since) * np.exp(-since), atol=1e-9)
     assert motion.acceleration.max() == pytest.approx((4 * math.pi) ** 2)
+    assert not motion.jerk[0].any()
     assert motion.jerk[1, 0, 0] == pytest.approx((4 * math.pi) ** 2 / PERIOD_S)
     overshoot = Plant(frequency_hz=2, damping=0.5).respond(actions, PERIOD_S).position.max()
     assert overshoot == pytest.approx(1 + math.exp(-math.pi / math.sqrt(3)), rel=1e-3)
-
-
-@given(plants, numbers, st.integers(1, 30))
-def test_it_stays_where_the_first_action_puts_it(plant: Plant, where: float, ticks: int) -> None:
-    motion = plant.respond(np.full((ticks, 1), where), PERIOD_S)
-    assert (motion.position == where).all()
-    assert not motion.velocity.any()
-    assert not motion.jerk.any()
 
 
 def test_before_its_first_action_it_does_not_move() -> None:

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pandas as pd
 import pytest
@@ -23,24 +23,24 @@ from s2a_bench.experiments.ccrb.run import run_ccrb
 from s2a_bench.experiments.timeline.config import TimelineComputed
 from s2a_bench.experiments.timeline.rows import TIMELINES
 from s2a_bench.experiments.timeline.run import run_timeline
-from s2a_bench.plugins.paper.claims import CONTRADICTED, SUPPORTED, UNDECIDED
+from s2a_bench.plugins.paper.claims import CONTRADICTED, SUPPORTED, UNDECIDED, judge
 from s2a_bench.plugins.paper.claims.plans import after, timelines
 from s2a_bench.plugins.paper.claims.requests import change
-from s2a_bench.plugins.paper.claims.table import judge_claims
+from s2a_bench.plugins.paper.claims.table import CLAIMS
 from s2a_bench.provenance import Origins, Provenance
 from s2a_bench.report.verdicts import ClaimVerdict
-from s2a_bench.store.requests import SampleRow
 from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
+from tests.plugins.paper.test_claims import MakeRow, MakeRun, bodies
 from tests.report.conftest import REAL
 
-MakeRun = Callable[..., StoredRun]
 Made = Callable[["Kit"], StoredRun]
 ORIN = {"board": "NVIDIA Jetson AGX Orin Developer Kit"}
 RTX = {"cpu": "AMD Ryzen 9", "gpus": [{"name": "NVIDIA GeForce RTX 4080"}]}
 GPU = {"gpu_layers": -1, "gpu_offload_supported": True, "model": "/m/MiniCPM-V-2_6-Q4_K_M.gguf", "model_sha256": "ab"}
 CPU = GPU | {"gpu_layers": 0, "gpu_offload_supported": False}
 LLAMA = "http/llama-server"
+LONGER = "HTTP/JSON takes longer end to end than ROS 2-native"
 LLAMA_SERVER = replace(REAL, engine="llama-server", model="/m/MiniCPM-V-2_6-Q4_K_M.gguf", quantisation="")
 DUMMY = replace(REAL, model="MiniCPM-V 2.6 DUMMY", weights="dummy")
 REPLAY = replace(DUMMY, engine="replay", tokens="emulated", profile="rtx-4080")
@@ -49,12 +49,18 @@ REPLAY = replace(DUMMY, engine="replay", tokens="emulated", profile="rtx-4080")
 class Kit:
     """Makes runs."""
 
+    computed: ClassVar[dict[str, StoredRun]] = {}
+
     def __init__(self, root: Path, beside: MakeRun, spoken: MakeRun) -> None:
         self.root, self.beside, self.spoken = root, beside, spoken
 
     def timeline(self, **settings: Any) -> StoredRun:
-        """Compute a timeline run."""
-        return read_run(run_timeline(TimelineComputed(**settings), self.root, NullProgress()))
+        """Compute a timeline run, once of the same settings."""
+        key = repr(sorted(settings.items()))
+        if key not in self.computed:
+            run = run_timeline(TimelineComputed(**settings), self.root, NullProgress())
+            self.computed[key] = read_run(run)
+        return self.computed[key]
 
     def live(self, provenance: Provenance, rate: float, **facts: Any) -> StoredRun:
         """Make a live run of the four L, with timings as one at that rate has them."""
@@ -115,8 +121,14 @@ def kit(tmp_path: Path, beside: MakeRun, spoken: MakeRun) -> Kit:
     return Kit(tmp_path, beside, spoken)
 
 
-def verdicts(*runs: StoredRun) -> dict[str, ClaimVerdict]:
-    return {each.claim: each for each in judge_claims(runs)}
+def verdicts(about: str, *runs: StoredRun) -> dict[str, ClaimVerdict]:
+    """Judge the claims whose place and text match."""
+    return {each.text: judge(each, runs) for each in CLAIMS if re.search(about, f"{each.where}: {each.text}")}
+
+
+def verdict(claim: str, *runs: StoredRun) -> ClaimVerdict:
+    (found,) = verdicts(re.escape(claim), *runs).values()
+    return found
 
 
 NO_EVIDENCE: dict[str, dict[str, tuple[Made, str]]] = {
@@ -223,9 +235,9 @@ NO_EVIDENCE: dict[str, dict[str, tuple[Made, str]]] = {
 )
 def test_what_is_no_evidence_decides_nothing_and_says_what_is_missing(kit: Kit, claims: str, case: str) -> None:
     make, missing = NO_EVIDENCE[claims][case]
-    found = {text: each for text, each in verdicts(make(kit)).items() if claims in text and each.evidence}
+    found = [each for each in verdicts(re.escape(claims), make(kit)).values() if each.evidence]
     assert found
-    for each in found.values():
+    for each in found:
         assert each.verdict == UNDECIDED, each.claim
         assert not each.tested
         (finding,) = each.evidence
@@ -267,15 +279,15 @@ EVIDENCE: dict[str, tuple[Made, dict[str, str]]] = {
         lambda kit: kit.latency(
             options={"http/as-deployed": {"payload": "jpeg-preencoded"}, "ros/topic": {"payload": "raw"}}
         ),
-        {"HTTP/JSON takes longer end to end than ROS 2-native": SUPPORTED},
+        {LONGER: SUPPORTED},
     ),
     "the paper's ratio, replayed on both sides": (
         lambda kit: kit.latency(manifest={"provenance": Origins(REPLAY).to_manifest()}),
-        {"HTTP/JSON takes longer end to end than ROS 2-native": SUPPORTED},
+        {LONGER: SUPPORTED},
     ),
     "llama-server whose preprocessing alone is longer": (
         lambda kit: kit.beside_llama_server(without_model_ms=30),
-        {"HTTP/JSON takes longer end to end than ROS 2-native": CONTRADICTED},
+        {LONGER: CONTRADICTED},
     ),
     "half the paper's ratio": (
         lambda kit: kit.latency(ratio=3.3),
@@ -291,8 +303,8 @@ EVIDENCE: dict[str, tuple[Made, dict[str, str]]] = {
 @pytest.mark.parametrize("case", EVIDENCE)
 def test_evidence_decides_by_its_intervals(kit: Kit, case: str) -> None:
     make, wanted = EVIDENCE[case]
-    found = verdicts(make(kit))
-    assert {text: found[text].verdict for text in wanted} == wanted
+    run = make(kit)
+    assert {text: verdict(text, run).verdict for text in wanted} == wanted
 
 
 @pytest.mark.parametrize(
@@ -309,10 +321,10 @@ def test_evidence_decides_by_its_intervals(kit: Kit, case: str) -> None:
 def test_plans_with_other_settings_than_the_chosen_are_measured_and_not_judged(
     kit: Kit, settings: dict[str, Any], shown: str
 ) -> None:
-    found = verdicts(kit.timeline(profiles=("jetson-agx-orin",), **settings))
-    concerned = [each for text, each in found.items() if text.startswith("AGX Orin: ") or "fast and smooth" in text]
+    run = kit.timeline(profiles=("jetson-agx-orin",), **settings)
+    concerned = verdicts(": AGX Orin: |fast and smooth", run)
     assert len(concerned) == 4
-    for each in concerned:
+    for each in concerned.values():
         (finding,) = each.evidence
         assert (each.verdict, each.tested) == (UNDECIDED, False)
         assert [need.text.partition(" (needs ")[0] for need in finding.needs if not need.met] == [f"settings: {shown}"]
@@ -321,7 +333,7 @@ def test_plans_with_other_settings_than_the_chosen_are_measured_and_not_judged(
 
 
 @pytest.mark.parametrize(
-    ("quantisation", "rate", "verdict"),
+    ("quantisation", "rate", "wanted"),
     [
         ("Q4_K", 20.0, CONTRADICTED),
         ("Q4_K", 50.0, UNDECIDED),
@@ -334,10 +346,10 @@ def test_plans_with_other_settings_than_the_chosen_are_measured_and_not_judged(
     ],
 )
 def test_a_rate_that_no_quantisation_explains_contradicts(
-    kit: Kit, quantisation: str, rate: float, verdict: str
+    kit: Kit, quantisation: str, rate: float, wanted: str
 ) -> None:
     run = kit.rates(replace(REAL, quantisation=quantisation), rate)
-    assert verdicts(run)["RTX 4080: 34.2 tokens/s"].verdict == verdict
+    assert verdict("RTX 4080: 34.2 tokens/s", run).verdict == wanted
 
 
 def stalling(run: StoredRun, every: int) -> StoredRun:
@@ -351,7 +363,7 @@ def stalling(run: StoredRun, every: int) -> StoredRun:
 def test_runs_that_disagree_are_undecided_and_both_are_listed_in_any_order(kit: Kit) -> None:
     one, other = kit.latency(), kit.latency(ratio=3.3)
     for runs in ((one, other), (other, one)):
-        judged = verdicts(*runs)["101.8 against 15.5 ms: 6.57 times as long, on a Jetson AGX Orin"]
+        judged = verdict("101.8 against 15.5 ms: 6.57 times as long, on a Jetson AGX Orin", *runs)
         assert judged.verdict == UNDECIDED
         assert judged.tested
         assert judged.notes[-1].startswith("Runs disagree")
@@ -360,20 +372,19 @@ def test_runs_that_disagree_are_undecided_and_both_are_listed_in_any_order(kit: 
 
 
 def test_what_a_llama_server_does_not_show_is_not_judged_by_stages(kit: Kit) -> None:
-    found = verdicts(kit.beside_llama_server())
-    (finding,) = found["ROS latency is dominated by lightweight colour conversions"].evidence
+    run = kit.beside_llama_server()
+    (finding,) = verdict("ROS latency is dominated by lightweight colour conversions", run).evidence
     assert [need.text for need in finding.needs if not need.met] == ["stages: hidden by http/llama-server (needs seen)"]
-    assert found["HTTP/JSON takes longer end to end than ROS 2-native"].evidence
+    assert verdict(LONGER, run).evidence
 
 
 def test_cells_of_one_run_are_judged_each(kit: Kit) -> None:
     run = kit.latency()
     rows = run.samples
     other = rows[rows["pipeline"] == "http"].assign(cell="http/as-deployed?payload=png", payload="png")
-    both = replace(run, tables=run.tables | {"samples": pd.concat([rows, other], ignore_index=True)})
-    assert verdicts(both)["HTTP/JSON takes longer end to end than ROS 2-native"].verdict == SUPPORTED
-    turned = replace(run, tables=run.tables | {"samples": pd.concat([other, rows], ignore_index=True)})
-    assert verdicts(turned)["HTTP/JSON takes longer end to end than ROS 2-native"].verdict == SUPPORTED
+    for samples in ([rows, other], [other, rows]):
+        both = replace(run, tables=run.tables | {"samples": pd.concat(samples, ignore_index=True)})
+        assert verdict(LONGER, both).verdict == SUPPORTED
 
 
 def test_policies_are_compared_plan_by_plan(kit: Kit) -> None:
@@ -388,16 +399,13 @@ def test_policies_are_compared_plan_by_plan(kit: Kit) -> None:
 
 
 PAGE = Path(__file__).parents[2] / "data" / "claims.md"
-MakeRow = Callable[..., SampleRow]
-SENT = {"convert": 10, "inference": 5, "return": 0}
 
 
-def claim_lines(*runs: StoredRun) -> list[str]:
-    """Return the text of every claim that these runs can judge, or nearly so."""
-    judged = [each for each in judge_claims(runs) if each.evidence]
-    texts = [f"- **{each.where}: {each.claim}**: {each.verdict}. {each.text} *{each.required}*" for each in judged]
-    names = sorted({run.path.name for run in runs}, key=len, reverse=True)
-    return [re.sub("|".join(map(re.escape, names)), "RUN", text) for text in texts]
+def claim_lines(about: str, run: StoredRun) -> list[str]:
+    """Return the text of every claim that matches and that this run can judge, or nearly so."""
+    judged = [each for each in verdicts(about, run).values() if each.evidence]
+    texts = [f"- **{each.where}: {each.claim}**: {each.verdict}. {each.text} *{each.required}*\n" for each in judged]
+    return [text.replace(run.path.name, "RUN") for text in texts]
 
 
 def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_row: MakeRow, tmp_path: Path) -> None:
@@ -406,11 +414,6 @@ def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_ro
 
     def boundary(**settings: object) -> StoredRun:
         return read_run(run_boundary(BoundaryConfig(**settings), tmp_path, NullProgress()))  # type: ignore[arg-type]
-
-    def bodies(coded: int, plain: int) -> StoredRun:
-        sizes = {"http/as-deployed": coded, "http/binary": plain}
-        rows = [make_row(name, SENT, 1, payload_bytes=size, request_id=name) for name, size in sizes.items()]
-        return make_run({}, extra=tuple(rows))
 
     orin = {"profiles": ("jetson-agx-orin",), "tokens_per_skill": (1, 2, 4, 6)}
     jitter = orin | {"jitter": "lognormal:cv=0.2", "plans": 60}
@@ -437,22 +440,22 @@ def test_what_is_said_of_claims_is_the_page(kit: Kit, make_run: MakeRun, make_ro
             manifest={"provenance": Origins(DUMMY, {"http/as-deployed": REPLAY}).to_manifest()},
         ),
         "Transports, llama-server (longer|6.57)": kit.beside_llama_server,
-        "Bodies": lambda: bodies(120_500, 90_000),
-        "Small bodies": lambda: bodies(66_666, 49_999),
-        "A rate (RTX|Orin: )": lambda: kit.rates(rate=34.0),
-        "Another rate (RTX)": lambda: kit.rates(rate=50.0),
-        "A rate of layers on CPU and GPU (RTX)": lambda: kit.rates(rate=34.0, model=GPU | {"gpu_layers": 8}),
-        "A rate of no layers on the GPU (RTX)": lambda: kit.rates(rate=34.0, model=GPU | {"gpu_layers": 0}),
-        "A rate of a server that does not tell (RTX)": lambda: kit.rates(None, 34.0, {}),
+        "Bodies": lambda: bodies(make_run, make_row, 90_000, 120_500),
+        "Small bodies": lambda: bodies(make_run, make_row, 49_999, 66_666),
+        "A rate (V-D, table II)": lambda: kit.rates(rate=34.0),
+        "Another rate (V-D, table II)": lambda: kit.rates(rate=50.0),
+        "A rate of layers on CPU and GPU (V-D, table II)": lambda: kit.rates(rate=34.0, model=GPU | {"gpu_layers": 8}),
+        "A rate of no layers on the GPU (V-D, table II)": lambda: kit.rates(rate=34.0, model=GPU | {"gpu_layers": 0}),
+        "A rate of a server that does not tell (V-D, table II)": lambda: kit.rates(None, 34.0, {}),
         "Boundary": boundary,
         "Boundary, all on one line (Below)": lambda: boundary(t_min=1.0),
         "CCRB": lambda: kit.ccrb(phase=True, phase_points=(3, 3)),
-        "CCRB of another follower, at one point (naive|Naive)": lambda: kit.ccrb(scenario={"follower": "idm"}),
+        "CCRB of another follower, at one point (V-F)": lambda: kit.ccrb(scenario={"follower": "idm"}),
     }
     page = "# What is said of the paper's claims\n"
     for title, made in runs.items():
         heading, _, about = title.rstrip(")").partition(" (")
-        page += f"\n## {heading}\n\n" + "".join(f"{each}\n" for each in claim_lines(made()) if re.search(about, each))
+        page += f"\n## {heading}\n\n" + "".join(claim_lines(about, made()))
     page = re.sub(r"off by \S+ s", "off by ~0 s", page)
     (tmp_path / "claims.md").write_text(page, "utf-8")
     lines = difflib.unified_diff(PAGE.read_text("utf-8").splitlines(), page.splitlines(), n=0, lineterm="")

@@ -58,8 +58,8 @@ EVEN: dict[str, dict[str, float]] = {
 
 
 def claim_of(text: str, *runs: StoredRun) -> ClaimVerdict:
-    (found,) = [judged for judged in judge_claims(runs) if text in judged.claim]
-    return found
+    (claim,) = [claim for claim in CLAIMS if text in claim.text]
+    return judge(claim, runs)
 
 
 def changed(run: StoredRun, **tables: pd.DataFrame) -> StoredRun:

@@ -22,13 +22,15 @@ from s2a_bench.errors import RequestFailed, ServerDied, UsageError
 from s2a_bench.experiments.latency.config import LatencyConfig
 from s2a_bench.experiments.latency.run import run_latency
 from s2a_bench.frames.convert import yuyv_to_rgb
+from s2a_bench.plugins.policy_servers.zmq.server import ZmqExchange
 from s2a_bench.store.run import read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
-from s2a_bench.trace import budget
+from s2a_bench.trace import Trace, budget
 from s2a_bench.transport import Client, Handler, Server, open_client
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.pipeline import one_pipeline
+from s2a_bench.transport.serving import Core
 from s2a_bench.types import Request
 from tests.transport.test_every_server import Gate
 from tests.waiting import until
@@ -216,20 +218,14 @@ class TestClientsOfOthers:
         video = configs["video"]["as_json"]
         assert (json.loads(video) if layout == "n1.5" else video)["modality_keys"] == [key]
 
-    def test_marks_follow_the_chunk_for_who_sends_an_extension_alone(self) -> None:
-        context = zmq.Context()
-        with serving(RecordingHandler(list(CHUNK))) as server:
-            peer = context.socket(zmq.DEALER)
-            peer.rcvtimeo = 20_000
-            peer.connect(server.address)
-            answers = []
-            for more in ({}, {"s2a": {"id": "mine"}}):
-                peer.send_multipart([b"", FILES["packb"]({"endpoint": "get_action", "data": flat(), **more})])
-                answers.append(peer.recv_multipart())
-            marks = FILES["unpackb"](peer.recv_multipart()[1])
-            context.destroy(0)
-        assert answers[0] == answers[1] == [b"", FILES["packb"]({"action.robot": CHUNK})]
-        assert len(marks["s2a"]["token_ns"]) == len(CHUNK)
+    @pytest.mark.parametrize("more", [{}, {"s2a": {"id": "mine"}}])
+    def test_marks_follow_the_chunk_for_who_sends_an_extension_alone(self, more: dict[str, Any]) -> None:
+        sent: list[bytes] = []
+        request = {"endpoint": "get_action", "data": flat(), **more}
+        exchange = ZmqExchange(lambda message: sent.append(bytes(message)), request, Trace(), Limits(), maps=False)
+        Core(RecordingHandler(list(CHUNK)), Limits()).answer(exchange)
+        assert sent[0] == FILES["packb"]({"action.robot": CHUNK})
+        assert [len(FILES["unpackb"](each)["s2a"]["token_ns"]) for each in sent[1:]] == [len(CHUNK)] * len(more)
 
 
 class TestServer:
@@ -404,8 +400,6 @@ class TestLayoutOfAServer:
             if request["endpoint"] == "get_modality_config":
                 told = {name: {"delta_indices": [0], "modality_keys": each} for name, each in keys.items()}
                 return {name: {"__ModalityConfig_class__": True, "as_json": json.dumps(told[name])} for name in told}
-            if request["endpoint"] == "ping":
-                return {"status": "ok", "message": "Server is running"}
             seen.append({key: np.shape(request["data"][key]) for each in keys.values() for key in each})
             return {"action.single_arm": CHUNK[:, :2], "action.gripper": CHUNK[:, 2]}
 

@@ -131,7 +131,7 @@ def test_a_dictionary_that_is_no_array_stays_one() -> None:
         ({"shape": [3]}, "an array of shape"),
         ({"shape": [-1, -2]}, "an array whose shape"),
         ({"shape": [1 << 60, 1 << 60]}, "an array of shape"),
-        *(({"shape": shape}, "shape") for shape in ([True, 2], [2.0], 2, None, [1] * 9 + [2])),
+        *(({"shape": shape}, "shape") for shape in ([True, 2], [2.0], 2, None)),
         ({"data": "text"}, "not bytes"),
         ({"data": None}, "not bytes"),
     ],

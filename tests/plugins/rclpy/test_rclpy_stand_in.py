@@ -28,6 +28,7 @@ from s2a_bench.types import Frame, Request
 from tests.plugins.rclpy.rclpy_stand_in import GRAPH, INTERFACES, PACKAGES, action, generated, modules
 from tests.ros.action_suite import NAME, ActionSuite
 from tests.ros.middleware_suite import Join, MiddlewareSuite, joining
+from tests.suites import only
 
 GLUE = ("client", "middleware", "node", "server", "types")
 
@@ -104,11 +105,24 @@ class TestRclpyGlue(MiddlewareSuite):
     """As far as the stand-in shows it."""
 
 
-@pytest.mark.parametrize("old", [True, False], ids=["until 7.1.7", "from 7.1.8"])
 class TestRclpyActionGlue(ActionSuite):
+    """As from rclpy 7.1.8 on."""
+
+
+@only(
+    "test_a_goal_is_accepted_answered_token_by_token_and_ends_with_its_result",
+    "test_an_aborted_goal_says_so",
+    "test_a_goal_is_cancelled_in_mid_stream",
+    "test_a_goal_cancelled_while_it_queues_does_not_start",
+    "test_a_result_can_be_asked_for_again_until_it_expires",
+    "test_a_client_that_left_harms_nobody",
+)
+class TestRclpyActionGlueUntil717(ActionSuite):
+    """How goals end, before."""
+
     @pytest.fixture(autouse=True)
-    def release(self, monkeypatch: pytest.MonkeyPatch, old: bool) -> None:
-        monkeypatch.setattr("tests.plugins.rclpy.rclpy_stand_in.OLD_ENDS", [True] * old)
+    def release(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("tests.plugins.rclpy.rclpy_stand_in.OLD_ENDS", [True])
 
 
 def test_an_image_is_published_as_ready_cdr_and_its_pixels_are_views_of_what_arrives(join: Join) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from s2a_bench.clock import SystemClock
+from s2a_bench.clock import SystemClock, VirtualClock
 from s2a_bench.errors import ClockMoved
 from s2a_bench.frames import open_source
 from s2a_bench.harness.config import RequestsConfig
@@ -49,12 +49,23 @@ class ElsewhereClient:
         trace.receive(Remote(ELSEWHERE, marks, [left_ns + self.ahead_ns], facts=self.facts))
 
 
+@pytest.fixture(autouse=True)
+def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exchange one after another instead of over a second."""
+    monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.SystemClock", VirtualClock)
+
+
+def session_of(client: ElsewhereClient, *surroundings: TwoHosts) -> Session:
+    feed = RequestFeed(open_source("synthetic", 64, 48, fps=30.0, seed=0), preencoded=False)
+    plan = resolve(RequestsConfig(), print).request
+    plan = replace(plan, surroundings=surroundings or plan.surroundings)
+    return Session(one_pipeline("http/as-deployed"), client, feed, plan, clocks={})
+
+
 @pytest.fixture
-def elsewhere() -> Iterator[tuple[ElsewhereClient, Session]]:
-    source, client = open_source("synthetic", 64, 48, fps=30.0, seed=0), ElsewhereClient()
-    feed, plan = RequestFeed(source, preencoded=False), resolve(RequestsConfig(), print).request
-    yield client, Session(one_pipeline("http/as-deployed"), client, feed, plan, clocks={})
-    source.close()
+def elsewhere() -> tuple[ElsewhereClient, Session]:
+    client = ElsewhereClient()
+    return client, session_of(client)
 
 
 def test_one_way_times_to_another_host_are_intervals_that_hold_the_truth(
@@ -106,13 +117,7 @@ def with_wall_clocks(client: ElsewhereClient, monkeypatch: pytest.MonkeyPatch, *
     monkeypatch.setattr("s2a_bench.plugins.two_hosts.clocks.WALL_CLOCKS", {"chrony": lambda: ours})
     theirs_ms = (ours.offset_ns - client.ahead_ns) / 1e6 + off_ms
     client.facts = {REALTIME_MS: theirs_ms, REALTIME_ERROR_MS: ours.error_ns / 1e6}
-    source, plan = open_source("synthetic", 64, 48, fps=30.0, seed=0), resolve(RequestsConfig(), print).request
-    feed = RequestFeed(source, preencoded=False)
-    plan = replace(plan, surroundings=(TwoHosts(system="chrony"),))
-    session = Session(one_pipeline("http/as-deployed"), client, feed, plan, clocks={})
-    measured = session.measure(Place(0, 0, warmup=False))
-    source.close()
-    return measured
+    return session_of(client, TwoHosts(system="chrony")).measure(Place(0, 0, warmup=False))
 
 
 def test_a_server_is_asked_for_its_wall_clock(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -33,13 +33,12 @@ from tests.ros.middleware_suite import WAIT_S
 pytest.importorskip("zenoh", reason="the extra zenoh is not installed")
 
 
-@pytest.mark.parametrize("payload", ["raw", "yuyv", "png"])
 class TestRosTopicOverZenoh(TransportSuite):
     lacks: ClassVar[frozenset[str]] = frozenset({"accept"})
 
     @pytest.fixture
-    def wiring(self, dds_domain: int, payload: str) -> Wiring[Any]:
-        return wiring_of("ros/topic?middleware=zenoh", domain_id=dds_domain, payload=payload)
+    def wiring(self, dds_domain: int) -> Wiring[Any]:
+        return wiring_of("ros/topic?middleware=zenoh", domain_id=dds_domain)
 
 
 class TestRosActionOverZenoh(TransportSuite):

@@ -29,6 +29,7 @@ from tests.ros.middleware_suite import (
     wait_matched,
 )
 from tests.ros.words import hears_them, served
+from tests.suites import only
 
 pytest.importorskip("zenoh", reason="the extra zenoh is not installed")
 names = importlib.import_module("s2a_bench.plugins.zenoh.names")
@@ -54,9 +55,9 @@ def router_apart(endpoint: str, domain: int) -> Iterator[Join]:
         yield join
 
 
-@pytest.fixture(params=[router_inside, router_apart])
-def join(request: pytest.FixtureRequest, endpoint: str, dds_domain: int) -> Iterator[Join]:
-    with request.param(endpoint, dds_domain) as join:
+@pytest.fixture
+def join(endpoint: str, dds_domain: int) -> Iterator[Join]:
+    with router_inside(endpoint, dds_domain) as join:
         yield join
 
 
@@ -67,11 +68,33 @@ def routed(endpoint: str, dds_domain: int) -> Iterator[Join]:
 
 
 class TestZenoh(MiddlewareSuite):
-    """With a session as the router, and with a router of its own."""
+    """With a session as the router; the tests below have a router of its own."""
 
 
 class TestZenohActions(ActionSuite):
-    """With a session as the router, and with a router of its own."""
+    """With a session as the router."""
+
+
+@only(
+    "test_publishers_are_told_with_type_and_reliability_until_they_leave",
+    "test_a_sender_hears_a_publisher_once_it_subscribes",
+    "test_services_answer_who_asked",
+)
+class TestZenohRouterApart(MiddlewareSuite):
+    @pytest.fixture
+    def join(self, routed: Join) -> Join:
+        return routed
+
+
+@only(
+    "test_all_goals_are_cancelled_at_once",
+    "test_two_clients_get_only_their_own",
+    "test_a_server_that_left_is_missed",
+)
+class TestZenohActionsRouterApart(ActionSuite):
+    @pytest.fixture
+    def join(self, routed: Join) -> Join:
+        return routed
 
 
 @pytest.fixture

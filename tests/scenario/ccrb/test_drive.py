@@ -59,8 +59,9 @@ def test_the_operating_point_is_within_a_tenth_of_what_is_listed(world: str, pol
             assert value[0] == pytest.approx(wanted, rel=0.1)
 
 
-@pytest.mark.parametrize("policy", POLICIES)
-@pytest.mark.parametrize("gap", GAPS)
+@pytest.mark.parametrize(
+    ("policy", "gap"), [*(("naive", gap) for gap in GAPS), ("wait", Cars().gap), ("stream", Cars().gap)]
+)  # naive alone has gaps
 def test_the_bare_integrator_agrees_with_the_full_simulator(policy: str, gap: str) -> None:
     bare, full = driven("longitudinal", policy, gap=gap), driven("embedded", policy, gap=gap)
     assert bare.outcomes.name(0) == full.outcomes.name(0)
@@ -72,14 +73,14 @@ def test_the_bare_integrator_agrees_with_the_full_simulator(policy: str, gap: st
 
 @laws
 def test_in_lock_step_roll_outs_come_out_as_alone(follower: str) -> None:
-    gaps, delays = np.array([8.0, 14.0, 20.0, 26.0]), np.array([0.9, 1.3, 1.3, 1.7])
+    gaps, delays = np.array([8.0, 14.0, 26.0]), np.array([0.9, 1.3, 1.7])
     alone = []
     for gap, delay in zip(gaps, delays, strict=True):
         cars = Cars(rear_gap_m=gap, reaction_s=delay, follower=follower)
         alone.append(drive(SIMULATORS["longitudinal"](), cars, braking_plan(cars, 5, 0.8), schedule("naive")).outcomes)
     cars = Cars(rear_gap_m=gaps, reaction_s=delays, follower=follower)
     each = schedule("naive")
-    many = Schedule(np.tile(each.start_s, (1, 4)), np.tile(each.duration_s, (1, 4)))
+    many = Schedule(np.tile(each.start_s, (1, 3)), np.tile(each.duration_s, (1, 3)))
     together = drive(SIMULATORS["longitudinal"](), cars, braking_plan(cars, 5, 0.8), many).outcomes
     assert together.code.tolist() == [int(one.code[0]) for one in alone]
     assert together.min_rear_gap_m == pytest.approx([one.min_rear_gap_m[0] for one in alone], abs=0.02)

@@ -223,8 +223,8 @@ def mean_value_analysis(robots: int, service_s: float, think_s: float) -> tuple[
 @pytest.mark.parametrize("acting", ["closed", "sync"])
 def test_exponential_service_times_have_their_mean_value_analysis(robots: int, acting: str) -> None:
     chosen = {
-        "closed": fleet(seconds=2000, think_ns=160 * MS),
-        "sync": fleet("sync", seconds=2000, horizon=40, rounding="ceil", period_ns=4 * MS),
+        "closed": fleet(seconds=1000, think_ns=160 * MS),
+        "sync": fleet("sync", seconds=1000, horizon=40, rounding="ceil", period_ns=4 * MS),
     }[acting]
     found = measured(chosen, robots, exponential(40 * MS))
     latency_s, rate = mean_value_analysis(robots, 0.04, 0.16 if acting == "closed" else 0.162)

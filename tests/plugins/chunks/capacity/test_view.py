@@ -20,18 +20,23 @@ from s2a_bench.writers.style import paper_column
 STALLED = "at most 1 % stalled ticks"
 
 
-def predicted(tmp_path: Path, service_ms: int, **options: Any) -> StoredRun:
+def predict(tmp_path: Path, service_ms: int = 40, **options: Any) -> Path:
     config = CapacityPredicted(predict=str(service_ms), robots="1..64", seconds=10, **options)
-    return read_run(run_predicted(config, tmp_path, NullProgress()))
+    return run_predicted(config, tmp_path, NullProgress())
 
 
-def measured(tmp_path: Path, service_ms: int, robots: int, driven: int = 16) -> StoredRun:
-    """Return a predicted run, beside which its fleets are also measured ones with the same values but one."""
-    run = predicted(tmp_path, service_ms)
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return predict(tmp_path_factory.mktemp("capacity"))
+
+
+def measured(folder: Path, driven: int = 16) -> StoredRun:
+    """Return a predicted run, beside which its fleets are also measured ones with the same values but of 9 robots."""
+    run = read_run(folder)
     fleets, knees = run.table(FLEETS), run.table(KNEES)
     own = fleets.assign(source="measured")
-    own.loc[own["robots"] == robots, ["stalled_low", "stalled_high"]] = 0.9, 1.0
-    twin = fleets.assign(cell=f"{service_ms}, instant, queue?trigger=8", source="twin")
+    own.loc[own["robots"] == 9, ["stalled_low", "stalled_high"]] = 0.9, 1.0
+    twin = fleets.assign(cell="40, instant, queue?trigger=8", source="twin")
     twin = twin[twin["robots"] >= driven].assign(within=twin["robots"] <= driven)
     run.tables[FLEETS.name] = type(fleets)(own.to_dict("records") + fleets.to_dict("records") + twin.to_dict("records"))
     run.tables[KNEES.name] = type(knees)(
@@ -42,8 +47,8 @@ def measured(tmp_path: Path, service_ms: int, robots: int, driven: int = 16) -> 
     return run
 
 
-def test_the_sentence_names_the_knee_its_interval_and_what_it_holds_for(tmp_path: Path) -> None:
-    shown = EXPERIMENT.show(measured(tmp_path, 40, robots=9))
+def test_the_sentence_names_the_knee_its_interval_and_what_it_holds_for(folder: Path) -> None:
+    shown = EXPERIMENT.show(measured(folder))
     assert list(shown.sentences) == [
         f"8 robots [7, 8] at 50 Hz, H 16, 40, queue?trigger=8, with {STALLED}.",
         f"predicted: 8 robots at 50 Hz, H 16, 40, queue?trigger=8, with {STALLED}; service times: as given.",
@@ -51,8 +56,8 @@ def test_the_sentence_names_the_knee_its_interval_and_what_it_holds_for(tmp_path
     ]
 
 
-def test_fleets_stand_by_their_number_of_robots_however_they_were_searched(tmp_path: Path) -> None:
-    shown = EXPERIMENT.show(measured(tmp_path, 40, robots=9))
+def test_fleets_stand_by_their_number_of_robots_however_they_were_searched(folder: Path) -> None:
+    shown = EXPERIMENT.show(measured(folder))
     table = shown.tables["capacity"]
     robots = [int(row[2]) for row in table.rows]
     assert robots == [1, 2, 4, 8, 9, 10, 12, 16] * 2 + [16]
@@ -65,8 +70,8 @@ def test_fleets_stand_by_their_number_of_robots_however_they_were_searched(tmp_p
     json.dumps(found)
 
 
-def test_a_fleet_whose_generator_was_late_is_no_measurement_in_table_and_sentence(tmp_path: Path) -> None:
-    run = measured(tmp_path, 40, robots=9)
+def test_a_fleet_whose_generator_was_late_is_no_measurement_in_table_and_sentence(folder: Path) -> None:
+    run = measured(folder)
     fleets = run.table(FLEETS)
     run.tables[FLEETS.name] = fleets.assign(clean=(fleets["robots"] != 9) | (fleets["source"] != "measured"))
     shown = EXPERIMENT.show(run)
@@ -78,8 +83,8 @@ def test_a_fleet_whose_generator_was_late_is_no_measurement_in_table_and_sentenc
     assert list(shown.sentences)[2].endswith("stalls holds the predicted one at 1, 2, 4, 8, 10, 12, 16 robots.")
 
 
-def test_a_fleet_that_the_generator_does_not_drive_by_its_twin_is_no_measurement_anywhere(tmp_path: Path) -> None:
-    run = measured(tmp_path, 40, robots=9, driven=8)
+def test_a_fleet_that_the_generator_does_not_drive_by_its_twin_is_no_measurement_anywhere(folder: Path) -> None:
+    run = measured(folder, driven=8)
     shown = EXPERIMENT.show(run)
     late = [(row[1], int(row[2])) for row in shown.tables["capacity"].rows if row[3] == "late"]
     assert late == [("", robots) for robots in (9, 10, 12, 16)]
@@ -95,8 +100,8 @@ def test_a_fleet_that_the_generator_does_not_drive_by_its_twin_is_no_measurement
     assert names == [f"40, queue?trigger=8, {robots} robots" for robots in (1, 2, 4, 8)]
 
 
-def test_without_a_fleet_that_was_driven_there_is_no_figure(tmp_path: Path) -> None:
-    run = measured(tmp_path, 40, robots=9)
+def test_without_a_fleet_that_was_driven_there_is_no_figure(folder: Path) -> None:
+    run = measured(folder)
     run.tables[FLEETS.name] = run.table(FLEETS).assign(clean=False)
     assert EXPERIMENT.show(run).figures == {}
 
@@ -112,21 +117,21 @@ def test_without_a_fleet_that_was_driven_there_is_no_figure(tmp_path: Path) -> N
         ({"source": "predicted", "robots": 8, "low": 8, "high": None}, "predicted: 8 robots or more at"),
     ],
 )
-def test_no_robot_is_said_where_one_was_too_many(tmp_path: Path, knee: dict[str, Any], sentence: str) -> None:
-    run = measured(tmp_path, 40, robots=9)
+def test_no_robot_is_said_where_one_was_too_many(folder: Path, knee: dict[str, Any], sentence: str) -> None:
+    run = measured(folder)
     run.tables[KNEES.name] = run.table(KNEES).iloc[:1].assign(**knee)
     assert next(iter(EXPERIMENT.show(run).sentences)).startswith(sentence)
 
 
 def test_the_sentence_about_plans_names_how_often_they_are_wanted(tmp_path: Path) -> None:
-    run = predicted(tmp_path, 250, plan_every_s=1.0)
+    run = read_run(predict(tmp_path, 250, plan_every_s=1.0))
     assert list(EXPERIMENT.show(run).sentences) == [
         "predicted: 4 robots with a plan every 1 s, 250, with at most 1 % stalled plans; service times: as given."
     ]
 
 
-def test_a_panel_has_the_values_of_its_fleets(tmp_path: Path) -> None:
-    run = predicted(tmp_path, 40)
+def test_a_panel_has_the_values_of_its_fleets(folder: Path) -> None:
+    run = read_run(folder)
     rows = sorted(run.table(FLEETS).to_dict("records"), key=lambda row: row["robots"])
     with paper_column():
         latency, stalled, age = EXPERIMENT.show(run).figures["capacity"]().axes
@@ -144,7 +149,7 @@ def test_a_panel_has_the_values_of_its_fleets(tmp_path: Path) -> None:
 
 def test_the_time_to_the_first_piece_is_shown_of_answers_that_stream(tmp_path: Path) -> None:
     for options, shown in (({}, False), ({"plan_every_s": 1.0}, True)):
-        run = predicted(tmp_path, 40, **options)
+        run = read_run(predict(tmp_path, **options))
         rows = run.table(FLEETS).assign(ttft_p99_ns=5_000_000)
         run.tables[FLEETS.name] = type(rows)(rows.to_dict("records"))
         header = EXPERIMENT.show(run).tables["capacity"].header
@@ -152,8 +157,8 @@ def test_the_time_to_the_first_piece_is_shown_of_answers_that_stream(tmp_path: P
 
 
 @pytest.mark.parametrize("service", [None, "as given"])
-def test_runs_of_before_have_one_service_for_all_cells_or_none(tmp_path: Path, service: str | None) -> None:
-    run = predicted(tmp_path, 40)
+def test_runs_of_before_have_one_service_for_all_cells_or_none(folder: Path, service: str | None) -> None:
+    run = read_run(folder)
     del run.manifest["service"]
     run.manifest.update({"service": service} if service else {})
     (sentence,) = EXPERIMENT.show(run).sentences
@@ -171,12 +176,12 @@ def test_a_figure_has_a_panel_for_what_its_robots_have(
     tmp_path: Path, options: dict[str, Any], panels: list[str]
 ) -> None:
     with paper_column():
-        figure = EXPERIMENT.show(predicted(tmp_path, 40, **options)).figures["capacity"]()
+        figure = EXPERIMENT.show(read_run(predict(tmp_path, **options))).figures["capacity"]()
     assert [axes.get_ylabel() for axes in figure.axes] == panels
 
 
-def test_knees_of_two_runs_are_compared(tmp_path: Path) -> None:
-    runs = measured(tmp_path / "a", 40, robots=9), predicted(tmp_path / "b", 40, modes=("queue?trigger=8", "sync"))
+def test_knees_of_two_runs_are_compared(folder: Path, tmp_path: Path) -> None:
+    runs = measured(folder), read_run(predict(tmp_path, modes=("queue?trigger=8", "sync")))
     compared = open_comparison(runs[:1], runs[1:], unlike=True, least=0.05)
     found = compare(compared, metrics_of(compared, ["knee"])).comparisons
     assert [(each.pair.name, each.change.baseline, each.change.other) for each in found] == [

@@ -152,7 +152,7 @@ class TestNumbers:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> StoredRun:
-    return ran(tmp_path_factory.mktemp("smooth"), cycles=400)
+    return ran(tmp_path_factory.mktemp("smooth"), cycles=400, robot="plant")
 
 
 class TestRuns:
@@ -174,14 +174,15 @@ class TestRuns:
             np.testing.assert_allclose(*both, rtol=0.1, atol=0.01)  # the mean that was drawn is not quite 80 ms
 
     def test_without_a_robot_there_are_none(self, tmp_path: Path) -> None:
-        run = ran(tmp_path, cycles=50, robot="")
+        run = ran(tmp_path, cycles=50)
         assert run.table(CHUNKS)[NAMES].isna().all().all()
         assert run.table(MEANS)["tracking_rms"].isna().all()
 
     def test_no_target_waits_for_actions_that_are_slowed_down(self, tmp_path: Path) -> None:
-        slowed = ran(tmp_path / "slowed", slow_down=2, cycles=50).table(CHUNKS)
+        slowed = ran(tmp_path / "slowed", slow_down=2, cycles=50, robot="plant").table(CHUNKS)
         assert slowed[NAMES].isna().all().all()
-        run = ran(tmp_path, latency="400", modes="queue", rules="calibrated", slowest=4.0, cycles=100)
+        options = {"latency": "400", "modes": "queue", "rules": "calibrated", "slowest": 4.0, "robot": "plant"}
+        run = ran(tmp_path, **options, cycles=100)
         table = run.table(CHUNKS).set_index("rule")
         assert table.loc["given", NAMES].notna().all()
         assert table.loc["calibrated", NAMES].isna().all()

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
@@ -22,11 +22,9 @@ from s2a_bench.plugins.chunks.testing.mode import ModeSuite
 from tests.plugins.chunks.modes.drawn import agree, cases, latencies, modes, plainly, settings_of_chunks
 
 named = pytest.mark.parametrize("name", MODES)
-many = settings(max_examples=300)
 
 
 @named
-@many
 @given(data=st.data())
 def test_ticks_are_those_of_a_robot_in_continuous_time(name: str, data: st.DataObject) -> None:
     made, latency_ns, setting = data.draw(cases(name))
@@ -42,14 +40,12 @@ def test_ticks_are_those_of_a_robot_in_continuous_time(name: str, data: st.DataO
 
 
 @named
-@many
 @given(data=st.data())
 def test_the_stepper_and_the_arrays_agree(name: str, data: st.DataObject) -> None:
     made, latency_ns, setting = data.draw(cases(name))
     agree(simulate(made, latency_ns, setting)[::-1], step(made, latency_ns, setting))
 
 
-@many
 @given(data=st.data(), setting=settings_of_chunks())
 def test_arrays_of_streamed_actions_are_the_stepper_s_at_any_gaps(data: st.DataObject, setting: ControlSetting) -> None:
     made, latency_ns = data.draw(modes(setting, "streamed")), data.draw(latencies(setting))
@@ -89,7 +85,6 @@ def test_cycles_are_what_ticks_add_up_to(name: str, data: st.DataObject) -> None
     assert cycles.settled.sum() == max(np.count_nonzero(cycles.executed) - 1, 0)
 
 
-@many
 @given(data=st.data())
 def test_blended_ages_are_those_of_the_weights(data: st.DataObject) -> None:
     made, latency_ns, setting = data.draw(cases("aggregate"))
@@ -103,12 +98,6 @@ def test_blended_ages_are_those_of_the_weights(data: st.DataObject) -> None:
         for tick, blend in enumerate(log.blends[: cycles.ticks])
     ]
     np.testing.assert_allclose(made.blended_age(cycles), ages, atol=1e-9)
-
-
-@given(data=st.data(), setting=settings_of_chunks())
-def test_sync_is_a_queue_that_is_empty_when_it_asks(data: st.DataObject, setting: ControlSetting) -> None:
-    latency_ns = data.draw(latencies(setting))
-    agree(simulate(Sync(), latency_ns, setting), simulate(Queue(), latency_ns, setting))
 
 
 def test_a_mode_by_hand() -> None:
@@ -171,29 +160,18 @@ def simulate(made: Mode, latency_ns: Any, setting: ControlSetting) -> tuple[Any,
     return made.ticks(latency_ns, setting), made.cycles(latency_ns, setting)
 
 
-@pytest.mark.parametrize("name", MODES)
-class TestDefaults(ModeSuite):
-    @pytest.fixture
-    def mode(self, name: str) -> Mode:
-        return mode(name)
-
-
 @pytest.mark.parametrize(
     "written",
     [
-        "queue?trigger=3",
+        *MODES,
         "queue?trigger=9&execute=4",
-        "sync?execute=2",
-        "streamed?trigger=2&gap_s=3e-8&start=naive",
         "streamed?trigger=2&gap_s=3e-8",
-        "streamed?trigger=2&gap_s=4e-9&execute=5",
         "replace?execute=3&under_way=many",
         "replace?execute=2&assumed=3",
-        "aggregate?trigger=3",
         "aggregate?trigger=7&kind=average",
     ],
 )
-class TestParameters(ModeSuite):
+class TestEachMode(ModeSuite):
     @pytest.fixture
     def mode(self, written: str) -> Mode:
         return mode(written)
@@ -207,7 +185,6 @@ def varied(draw: st.DrawFn) -> tuple[Varied, Any, ControlSetting]:
     return VariedQueue(Queue(0, execute), tuple(triggers)), draw(latencies(setting)), setting
 
 
-@settings(max_examples=300)
 @given(case=varied())
 def test_its_arrays_and_its_stepper_agree(case: tuple[Varied, Any, ControlSetting]) -> None:
     mode, latency_ns, setting = case

@@ -34,7 +34,7 @@ from s2a_bench.plugins.chunks.modes.trigger import (
 from s2a_bench.policy.conformal import EPSILON, Tracker
 
 MS = 1_000_000
-CALIBRATION, FRESH = 8_000, 100_000
+CALIBRATION = 8_000
 
 
 @dataclass(slots=True)
@@ -108,14 +108,14 @@ class Found:
     """Of the first action of a chunk, over the oracle's: the part of an age that the trigger decides."""
 
 
-def study(settings: int, *families: str, period_ns: int = 0) -> dict[str, Found]:
+def study(settings: int, *families: str, fresh: int = 20_000, period_ns: int = 0) -> dict[str, Found]:
     found: dict[str, Found] = {}
     for family, seed in product(families, range(settings)):
         latencies, setting = world(seed, family)
         if period_ns:
             setting = ControlSetting(period_ns, 10**6)
         known = draw(latencies, np.random.default_rng([seed, 2]), CALIBRATION)
-        fresh = draw(latencies, np.random.default_rng([seed, 3]), FRESH)
+        drawn = draw(latencies, np.random.default_rng([seed, 3]), fresh)
         chosen = {
             "oracle": oracle_ticks(law(latencies), setting),
             "high-confidence": ticks_of(calibrate(known).caution, setting),
@@ -125,7 +125,7 @@ def study(settings: int, *families: str, period_ns: int = 0) -> dict[str, Found]
         }
         ages = {}
         for rule, ticks in chosen.items():
-            cycles = Queue(ticks, ticks + 8).cycles(fresh, setting)
+            cycles = Queue(ticks, ticks + 8).cycles(drawn, setting)
             settled = cycles.settled
             ages[rule] = float((cycles.start_tick - cycles.request_tick)[settled].mean())
             each = found.setdefault(rule, Found())
@@ -138,11 +138,11 @@ def ticks_of(latency_ns: float, setting: ControlSetting) -> int:
     return trigger(float(latency_ns), setting, setting.horizon).ticks
 
 
-def judge(found: dict[str, Found]) -> None:
+def judge(found: dict[str, Found], fresh: int) -> None:
     for rule in ("high-confidence", "expected"):
         assert max(found[rule].stalls) <= 0.015
         assert np.median(found[rule].age) == pytest.approx(1, abs=0.1)
-    assert max(found["oracle"].stalls) <= 0.01 + 4 * (0.01 / FRESH) ** 0.5
+    assert max(found["oracle"].stalls) <= 0.01 + 4 * (0.01 / fresh) ** 0.5
     assert np.median(found["maximum"].age) > 1.3  # lerobot's rule: safe, and acts on older observations
     assert np.mean(found["maximum"].stalls) < 0.0005
     assert np.mean(np.array(found["mean"].stalls) > 0.015) > 0.9  # the mean rule: fresh, and stalls
@@ -150,19 +150,19 @@ def judge(found: dict[str, Found]) -> None:
 
 
 def test_a_calibrated_trigger_stalls_as_rarely_as_asked() -> None:
-    judge(study(8, "lognormal", "bimodal"))
+    judge(study(6, "lognormal", "bimodal"), 20_000)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("period_ns", [0, MS // 10], ids=["control rates", "as good as no grid"])
 def test_so_it_does_in_each_of_200_settings(period_ns: int) -> None:
-    found = study(100, "lognormal", "bimodal", period_ns=period_ns)
+    found = study(100, "lognormal", "bimodal", fresh=40_000, period_ns=period_ns)
     assert len(found["oracle"].stalls) == 200
-    judge(found)
+    judge(found, 40_000)
 
 
 def test_bursty_latencies_stall_as_rarely_as_asked_when_pooled() -> None:
-    found = study(60, "bursty")
+    found = study(20, "bursty")
     assert np.mean(found["high-confidence"].stalls) <= 0.015
     assert np.mean(found["expected"].stalls) <= 0.015
     assert np.median(found["high-confidence"].age) == pytest.approx(1, abs=0.1)
@@ -178,7 +178,7 @@ def stalled(triggers: Any, latency_ns: Any, setting: ControlSetting) -> Any:
 def test_tracking_brings_a_machine_that_drifts_back_to_epsilon(latencies: Gaps, scale: float) -> None:
     setting = ControlSetting(20 * MS, 64)
     known = draw(latencies, np.random.default_rng(1), CALIBRATION)
-    fresh = np.rint(draw(latencies, np.random.default_rng(2), 40_000) * scale).astype(np.int64)
+    fresh = np.rint(draw(latencies, np.random.default_rng(2), 20_000) * scale).astype(np.int64)
     rules: dict[str, TriggerRule] = {
         "fixed": Fixed(calibrate(known).caution),
         "tracked": Tracker(known.tolist()),
