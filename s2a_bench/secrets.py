@@ -10,7 +10,6 @@ import json
 import re
 from base64 import b64encode
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from typing import Any, Final
 from urllib.parse import quote
 
@@ -63,16 +62,10 @@ def struck(text: str, *, short: bool = True) -> str:
 
 
 def struck_pieces(texts: Sequence[str]) -> list[str]:
-    """Return the pieces of one text without the secrets, which may span several pieces."""
-    whole, patterns = "".join(texts), [*_long.values(), *_short.values()]
-    matches = list(re.finditer("|".join(patterns), whole)) if patterns else []
-    if not matches:
-        return list(texts)
-    letters = list(whole)
-    for match in matches:
-        letters[match.start() : match.end()] = [STRUCK] + [""] * (len(match[0]) - 1)
-    rest = iter(letters)
-    return ["".join(islice(rest, len(text))) for text in texts]
+    """Return the pieces of one text; if a secret is in it, perhaps over several, the first piece is all the rest."""
+    whole = "".join(texts)
+    shown = struck(whole)
+    return [*texts] if shown == whole else [shown, *[""] * (len(texts) - 1)]
 
 
 def _forms(secret: str) -> list[str]:

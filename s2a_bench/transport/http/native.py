@@ -86,8 +86,7 @@ def refusal_of(error: S2AError) -> tuple[int, str, dict[str, str]]:
 
 
 def error_json(status: int, message: str) -> dict[str, Any]:
-    shown = message.encode(errors="backslashreplace").decode()
-    return {"error": {"message": shown, "type": "invalid_request_error", "code": status}}
+    return {"error": {"message": message, "type": "invalid_request_error", "code": status}}
 
 
 def head_of(status: int, headers: Mapping[str, str], *, keep: bool) -> bytes:
