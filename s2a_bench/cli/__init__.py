@@ -6,6 +6,7 @@ The modules of this package import heavy libraries inside functions, so that ``-
 from __future__ import annotations
 
 import os
+import resource
 import select
 import signal
 import subprocess
@@ -97,6 +98,7 @@ def main() -> None:
     """Run the command line and exit: 0 done, 1 failed, 2 wrongly used, 130 interrupted."""
     _interrupt_on_signals()
     try:
+        check_limits()
         _note_missing_plug_ins()
         with tuning.allowed():
             code = app(args=folded(sys.argv[1:]), prog_name=app.info.name, standalone_mode=False)
@@ -152,6 +154,23 @@ def _enter_user_namespace() -> None:
     with suppress(OSError):
         if not subprocess.run([*enter, "true"], check=False, capture_output=True).returncode:  # noqa: S603
             os.execvp(enter[0], [*enter, sys.executable, "-m", "s2a_bench", *sys.argv[1:]])  # noqa: S606
+
+
+LEAST_FILES: Final = 64
+LEAST_BYTES: Final = 2**30
+"""Address space; with less, loading the numerical libraries ends the process."""
+
+
+def check_limits() -> None:
+    """Raise S2AError if this process may use too few files or too little address space for any command."""
+    files, space = (resource.getrlimit(kind)[0] for kind in (resource.RLIMIT_NOFILE, resource.RLIMIT_AS))
+    if files != resource.RLIM_INFINITY and files < LEAST_FILES:
+        raise S2AError(f"this process may open {files} files, and {LEAST_FILES} are needed; raise `ulimit -n`")
+    if space != resource.RLIM_INFINITY and space < LEAST_BYTES:
+        raise S2AError(
+            f"this process may use {space >> 20} MiB of address space, and {LEAST_BYTES >> 20} are needed; "
+            "raise `ulimit -v`"
+        )
 
 
 def shortage(error: Exception) -> str | None:

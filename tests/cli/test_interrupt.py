@@ -19,7 +19,7 @@ def command():
     Loan()
     time.sleep(20)
 
-cli._note_missing_plug_ins = command
+cli.check_limits = command
 cli.main()
 """
 IGNORED = """
@@ -27,7 +27,7 @@ import signal
 from s2a_bench import cli
 
 signal.signal(signal.SIGHUP, signal.SIG_IGN)
-cli._note_missing_plug_ins = lambda: signal.raise_signal(signal.SIGHUP)
+cli.check_limits = lambda: signal.raise_signal(signal.SIGHUP)
 cli.app = lambda **_: 7
 cli.app.info = cli.typer.models.TyperInfo()
 cli.main()

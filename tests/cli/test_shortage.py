@@ -35,6 +35,19 @@ def run(kind: int, limit: int, output: Path, *more: str) -> list[str]:
     return [*lines, last]
 
 
+@pytest.mark.parametrize("files", [10, 14, 63])
+def test_too_few_open_files_are_told_before_anything_begins(tmp_path: Path, files: int) -> None:
+    lines = run(resource.RLIMIT_NOFILE, files, tmp_path)
+    assert lines == [f"error: this process may open {files} files, and 64 are needed; raise `ulimit -n`"]
+    assert not list(tmp_path.iterdir())
+
+
+def test_too_little_address_space_is_told_before_anything_begins(tmp_path: Path) -> None:
+    (line,) = run(resource.RLIMIT_AS, 400 * 2**20, tmp_path)
+    assert "may use 400 MiB of address space, and 1024 are needed; raise `ulimit -v`" in line
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_file_that_may_not_grow_ends_the_run_with_its_samples(tmp_path: Path) -> None:
     lines = run(resource.RLIMIT_FSIZE, 600_000, tmp_path, "--requests", "1000000")
     assert "csv: File too large; samples so far are kept" in lines[-1]
