@@ -27,6 +27,9 @@ MATCH_POLL_S: Final = 0.01
 REACH_S: Final = 0.1
 """A server waits so long for the reader of a client that it does not reach yet, as rmw_cyclonedds does."""
 
+WARNED_AT_MOST: Final = 100
+"""Kinds of a warning that are logged: the errors of a camera's frames may differ in each."""
+
 _log = logging.getLogger(__name__)
 Taken = TypeVar("Taken")
 Caller = TypeVar("Caller")
@@ -154,8 +157,8 @@ class LogOnce:
         self._kinds: set[str] = set()
 
     def warning(self, kind: str, message: str, *values: Any) -> None:
-        """Log the first message of a ``kind``."""
-        if kind not in self._kinds:
+        """Log the first message of a ``kind``, of `WARNED_AT_MOST` kinds."""
+        if kind not in self._kinds and len(self._kinds) < WARNED_AT_MOST:
             self._kinds.add(kind)
             self._log.warning(message, *values)
 
