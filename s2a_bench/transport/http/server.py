@@ -67,16 +67,17 @@ class Admission:
 
     async def _whole(self, scope: Any, receive: Any, held: ExitStack) -> dict[str, Any]:
         """Return the request as one message. Raises Refused, TooLarge, Busy, Disconnected."""
-        limits, pieces = self._core.limits, []
+        limits, pieces, size = self._core.limits, [], 0
         headers = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"]]
         native.admit(self._access, scope["path"], headers)
-        if int(dict(headers).get("content-length", 0)) > limits.body_bytes:
-            raise TooLarge(f"the body is larger than {limits.body_bytes} bytes")
         count = held.enter_context(self._core.in_flight.counted())
         with anyio.move_on_after(limits.body_s):
             while (message := await receive())["type"] != "http.disconnect":
                 pieces.append(message.get("body", b""))
                 count(len(pieces[-1]))
+                size += len(pieces[-1])
+                if size > limits.body_bytes:
+                    raise TooLarge(f"the body is larger than {limits.body_bytes} bytes")
                 if not message.get("more_body"):
                     return {"type": "http.request", "body": b"".join(pieces), "more_body": False}
             raise Disconnected
