@@ -70,18 +70,23 @@ class Admission:
         limits, pieces, size = self._core.limits, [], 0
         headers = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"]]
         native.admit(self._access, scope["path"], headers)
+        _check_size(int(dict(headers).get("content-length", 0)), limits)
         count = held.enter_context(self._core.in_flight.counted())
         with anyio.move_on_after(limits.body_s):
             while (message := await receive())["type"] != "http.disconnect":
                 pieces.append(message.get("body", b""))
                 count(len(pieces[-1]))
                 size += len(pieces[-1])
-                if size > limits.body_bytes:
-                    raise TooLarge(f"the body is larger than {limits.body_bytes} bytes")
+                _check_size(size, limits)
                 if not message.get("more_body"):
                     return {"type": "http.request", "body": b"".join(pieces), "more_body": False}
             raise Disconnected
         raise Refused(408, f"the body took more than {limits.body_s:g} s")
+
+
+def _check_size(body_bytes: int, limits: Limits) -> None:
+    if body_bytes > limits.body_bytes:
+        raise TooLarge(f"the body is larger than {limits.body_bytes} bytes")
 
 
 async def _refuse(refused: Refused, receive: Any, send: Any) -> None:
