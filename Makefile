@@ -64,11 +64,11 @@ fuzz: setup
 	S2A_FUZZ_S=600 $(BIN)/python -m pytest tests/fuzz
 
 test-all: setup
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 2 $(PYTEST_FLAGS)
 
-# Everything that is tested against hostile peers, faults and load; `make test-all` has it with two transports' faults.
+# Every promise of docs/reliability.md, with the faults of all transports; `make test-all` has those of one.
 hostile: setup
-	S2A_HOSTILE=whole $(BIN)/python -m pytest tests/hostile -o junit_family=xunit1 --junitxml=hostile.xml
+	S2A_HOSTILE=whole $(BIN)/python -m pytest tests/hostile
 
 check: setup
 	$(BIN)/ruff check

@@ -47,7 +47,12 @@ TESTS = {
     "act": ["tests/act"],
     "store": ["tests/store", "tests/sweep/test_sweep.py"],
     "library.py": ["tests/test_library.py"],
-    "transport": ["tests/transport", "tests/harness/test_serving.py", "tests/machine/test_doctor.py"],
+    "transport": [
+        "tests/transport",
+        "tests/hostile/test_access.py",
+        "tests/harness/test_serving.py",
+        "tests/machine/test_doctor.py",
+    ],
     "plugins/policy_servers": ["tests/plugins/policy_servers"],
     "plugins/paper/claims": ["tests/plugins/paper"],
     "report/compare/gates.py": ["tests/report/test_compare.py"],

@@ -1,8 +1,7 @@
-"""What is killed, when, over which transport, and what comes of it: ``python -m benchmarks.faults [--docs]``.
+"""What is killed, when, over which transport, and what comes of it: ``python -m benchmarks.faults``.
 
 A server and its client are processes of their own; the fault falls at a moment of a request of 24 tokens, 40 ms each.
-Then the client must have ended with one line and within its bound, and the server must answer another client. With
-``--docs`` the table is written into docs/reliability.md.
+Then the client must have ended with one line and within its bound, and the server must answer another client.
 """
 
 from __future__ import annotations

@@ -66,6 +66,9 @@ def _open(path: str) -> Any:
     if not Path(path).exists():
         raise SourceError(f"`source`: no recording at {path}")
     try:
+        metadata = Path(path) / "metadata.yaml"
+        if metadata.is_file() and "<<" in metadata.read_text("utf-8"):
+            raise ValueError("metadata.yaml: merged keys (<<) are not read: a few could take endless time")
         reader = Reader(path)
         reader.open()
     except Exception as error:  # rosbags raises any exception on a damaged file

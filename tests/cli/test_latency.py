@@ -18,7 +18,6 @@ from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.trace import budget
 from tests.cli.program import called, command, printed
 from tests.cli.program import only_run as only
-from tests.waiting import ended, until
 
 DRAWN = ["--engine", "echo", "--quick", "--size", "64x48", "--requests", "4", "--warmup", "1", "--max-tokens", "3"]
 SMALL = [*DRAWN, "--data-only"]
@@ -166,18 +165,6 @@ def test_an_interrupt_keeps_the_samples_and_stops_the_servers(tmp_path: Path) ->
     for pid in servers:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
-
-
-def test_a_killed_harness_takes_its_servers_along_and_leaves_a_readable_run(tmp_path: Path) -> None:
-    process, folder = start_long(tmp_path, "--transport", "http,ros")
-    servers = [server["pid"] for server in read_run(folder).manifest["servers"].values()]
-    for pid in (process.pid, *servers):
-        opened = [str(link.readlink()) for link in Path(f"/proc/{pid}/fd").iterdir()]
-        assert "/shm/" not in " ".join([Path(f"/proc/{pid}/maps").read_text(), *opened])  # nothing to clean up later
-    process.kill()
-    process.communicate(timeout=60)
-    assert len(read_run(folder).samples) >= 29
-    until(lambda: all(map(ended, servers)), 60)  # they do not outlive the harness
 
 
 @pytest.mark.slow

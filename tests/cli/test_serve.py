@@ -20,7 +20,6 @@ from s2a_bench.testing.transport import ask, wiring_of, yuyv_frame
 from s2a_bench.transport import open_client
 from s2a_bench.types import Action, Request
 from tests.cli.program import command, refused
-from tests.waiting import ended, until
 
 ONE_BY_ONE = ("--ros-args", "-p", "feedback_interval:=0.0", "--")
 """The echo engine is faster than any model: without this its tokens share feedbacks."""
@@ -107,25 +106,6 @@ def test_a_server_that_died_is_started_again_once(start: Start) -> None:
     lines = process.stderr.read().splitlines()
     assert len(lines) == 1
     assert "died, killed by signal 11" in lines[0]
-
-
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
-def test_its_process_ends_with_it(start: Start, number: signal.Signals) -> None:
-    process, _ = start("http", "--engine", "echo", "--port", "0")
-    child = child_of(process)
-    process.send_signal(number)
-    assert process.wait(30) == (-number if number == signal.SIGKILL else 0)
-    until(lambda: ended(child))
-
-
-def test_a_signal_while_it_starts_leaves_nothing() -> None:
-    process = subprocess.Popen(command("serve", "http", "--engine", "echo", "--port", "0"))
-    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-    until(lambda: bool(children.read_text()))
-    child = child_of(process)
-    process.terminate()
-    assert process.wait(30) == 0
-    until(lambda: ended(child))
 
 
 @pytest.mark.parametrize(

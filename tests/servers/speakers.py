@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Iterator
 from itertools import chain, islice
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,40 +19,42 @@ from s2a_bench.types import Frame, Request, Token
 from tests.servers.sockets import Received, Reply, chunk, head, kept_head
 
 
-class Speaker(Protocol):
+class Speaker:
     """One dialect, spoken by a server."""
 
-    dialect: str
-    kind: str
-    path: str
+    dialect = ""
+    kind = "text/event-stream"
+    path = ""
 
     def read(self, received: Received) -> Request:
         """What was asked; raises for what the real server would refuse."""
-        ...
+        raise NotImplementedError
 
     def opening(self) -> bytes:
         """What comes before the first token."""
-        ...
+        return b""
 
-    def token(self, token: Token) -> bytes: ...
+    def token(self, token: Token) -> bytes:
+        raise NotImplementedError
 
     def closing(self, tokens: list[Token]) -> bytes:
         """What comes after the last: reason, usage, timings."""
-        ...
+        raise NotImplementedError
 
-    def bare_closing(self, tokens: list[Token]) -> bytes:
+    def bare_closing(self, _tokens: list[Token]) -> bytes:
         """The same without usage and timings."""
-        ...
+        raise NotImplementedError
 
-    def thinking(self, text: str) -> bytes: ...
+    def thinking(self, text: str) -> bytes:
+        raise NotImplementedError
 
     def error(self, message: str) -> bytes:
         """What comes instead of the rest when the model fails on the way."""
-        ...
+        raise NotImplementedError
 
-    def refusal(self, status: int, message: str) -> bytes:
+    def refusal(self, _status: int, message: str) -> bytes:
         """The body of a 4xx or 5xx."""
-        ...
+        return compact({"error": message})
 
 
 def compact(value: Any) -> bytes:
@@ -74,7 +76,7 @@ DATA_URI = re.compile(r"data:image/(?:jpeg|png);base64,(.*)", re.DOTALL)
 STANDARD_FIELDS = {"model", "stream", "stream_options", "max_tokens", "temperature", "top_p", "seed", "messages"}
 
 
-class Cloud:
+class Cloud(Speaker):
     """A strict cloud in OpenAI's dialect: it refuses every field that it does not know."""
 
     dialect = "openai"
@@ -109,21 +111,14 @@ class Cloud:
         return self._chunk({"reasoning": text})
 
     def usage(self, tokens: list[Token]) -> dict[str, Any]:
-        return {
-            "usage": {
-                "prompt_tokens": 12,
-                "completion_tokens": len(tokens),
-                "prompt_tokens_details": {"cached_tokens": 4},
-                "completion_tokens_details": {"reasoning_tokens": 0},
-            }
-        }
+        details = {"prompt_tokens_details": {"cached_tokens": 4}, "completion_tokens_details": {"reasoning_tokens": 0}}
+        return {"usage": {"prompt_tokens": 12, "completion_tokens": len(tokens), **details}}
 
     def closing(self, tokens: list[Token]) -> bytes:
         last = sse({"id": "c-1", "object": "chat.completion.chunk", "choices": [], **self.usage(tokens)})
         return self._chunk({}, "stop") + last + b"data: [DONE]\n\n"
 
-    def bare_closing(self, tokens: list[Token]) -> bytes:
-        del tokens
+    def bare_closing(self, _tokens: list[Token]) -> bytes:
         return self._chunk({}, "length") + b"data: [DONE]\n\n"
 
     def error(self, message: str) -> bytes:
@@ -168,20 +163,14 @@ class Vllm(Cloud):
         return super().read(received)
 
     def usage(self, tokens: list[Token]) -> dict[str, Any]:
-        metrics = {
-            "time_to_first_token_ms": 31.5,
-            "generation_time_ms": 80.0,
-            "queue_time_ms": 0.25,
-            "mean_itl_ms": 8.0,
-            "tokens_per_second": 125.0,
-        }
-        return {**super().usage(tokens), "metrics": metrics}
+        times = {"time_to_first_token_ms": 31.5, "generation_time_ms": 80.0, "queue_time_ms": 0.25, "mean_itl_ms": 8.0}
+        return {**super().usage(tokens), "metrics": {**times, "tokens_per_second": 125.0}}
 
     def error(self, message: str) -> bytes:
         return sse({"object": "error", "message": message, "type": "InternalServerError", "code": 500})
 
 
-class Ollama:
+class Ollama(Speaker):
     """Ollama's native chat."""
 
     dialect = "ollama"
@@ -199,9 +188,6 @@ class Ollama:
     def _line(self, message: dict[str, Any], **more: Any) -> bytes:
         return compact({"model": "m", "created_at": "2026-01-01T00:00:00Z", "message": message, **more}) + b"\n"
 
-    def opening(self) -> bytes:
-        return b""
-
     def token(self, token: Token) -> bytes:
         return self._line({"role": "assistant", "content": token.text}, done=False)
 
@@ -209,35 +195,22 @@ class Ollama:
         return self._line({"role": "assistant", "content": "", "thinking": text}, done=False)
 
     def closing(self, tokens: list[Token]) -> bytes:
-        return self._line(
-            {"role": "assistant", "content": ""},
-            done_reason="stop",
-            done=True,
-            total_duration=150_000_000,
-            load_duration=10_000_000,
-            prompt_eval_count=8,
-            prompt_eval_duration=100_000_000,
-            eval_count=len(tokens),
-            eval_duration=30_000_000,
-        )
+        counts = {"prompt_eval_count": 8, "eval_count": len(tokens)}
+        times = {"total": 150_000_000, "load": 10_000_000, "prompt_eval": 100_000_000, "eval": 30_000_000}
+        durations = {f"{name}_duration": duration for name, duration in times.items()}
+        return self._line({"role": "assistant", "content": ""}, done_reason="stop", done=True, **counts, **durations)
 
-    def bare_closing(self, tokens: list[Token]) -> bytes:
-        del tokens
+    def bare_closing(self, _tokens: list[Token]) -> bytes:
         return self._line({"role": "assistant", "content": ""}, done=True)
 
     def error(self, message: str) -> bytes:
         return compact({"error": message}) + b"\n"
 
-    def refusal(self, status: int, message: str) -> bytes:
-        del status
-        return compact({"error": message})
 
-
-class Tgi:
+class Tgi(Speaker):
     """Text Generation Inference's native stream; its last token is in the closing event, here a special one."""
 
     dialect = "tgi"
-    kind = "text/event-stream"
     path = "/generate_stream"
     marked = re.compile(r"!\[\]\((data:image/[^)]*)\)")
 
@@ -254,20 +227,14 @@ class Tgi:
     def _event(self, index: int, token: Token, text: str | None = None, **more: Any) -> bytes:
         special = token.text == "</s>"
         said = {"id": token.id, "text": token.text, "logprob": -0.5, "special": special}
-        return (
-            b"data:"
-            + compact({"index": index, "token": said, "generated_text": text, "details": None, **more})
-            + (b"\n\n")
-        )
+        event = {"index": index, "token": said, "generated_text": text, "details": None, **more}
+        return b"data:" + compact(event) + b"\n\n"
 
     def opening(self) -> bytes:
         return b":\n\n"
 
     def token(self, token: Token) -> bytes:
         return self._event(token.index + 1, token)
-
-    def thinking(self, text: str) -> bytes:
-        raise NotImplementedError
 
     def closing(self, tokens: list[Token]) -> bytes:
         details = {"finish_reason": "eos_token", "generated_tokens": len(tokens), "seed": 1, "input_length": 8}
@@ -280,16 +247,14 @@ class Tgi:
     def error(self, message: str) -> bytes:
         return b"data:" + compact({"error": message, "error_type": "generation"}) + b"\n\n"
 
-    def refusal(self, status: int, message: str) -> bytes:
-        del status
+    def refusal(self, _status: int, message: str) -> bytes:
         return compact({"error": message, "error_type": "validation"})
 
 
-class Gemini:
+class Gemini(Speaker):
     """Google's; the last chunk may carry text, and the body's end is the stream's."""
 
     dialect = "gemini"
-    kind = "text/event-stream"
     path = "/v1beta/models/default:streamGenerateContent?alt=sse"
 
     def read(self, received: Received) -> Request:
@@ -307,9 +272,6 @@ class Gemini:
         value = {"candidates": [candidate], "usageMetadata": usage, "modelVersion": "g", "responseId": "r"}
         return b"data: " + compact(value) + b"\r\n\r\n"
 
-    def opening(self) -> bytes:
-        return b""
-
     def token(self, token: Token) -> bytes:
         return self._chunk([{"text": token.text}], {"promptTokenCount": 8, "totalTokenCount": 8 + token.index})
 
@@ -320,14 +282,12 @@ class Gemini:
         usage = {"promptTokenCount": 8, "candidatesTokenCount": len(tokens), "totalTokenCount": 8 + len(tokens)}
         return self._chunk([{"text": ""}], usage, finishReason="STOP")
 
-    def bare_closing(self, tokens: list[Token]) -> bytes:
-        del tokens
+    def bare_closing(self, _tokens: list[Token]) -> bytes:
         return b'data: {"candidates":[{"finishReason":"MAX_TOKENS"}]}\r\n\r\n'
 
     def error(self, message: str) -> bytes:
-        return (
-            json.dumps({"error": {"code": 503, "message": message, "status": "UNAVAILABLE"}}, indent=2).encode() + b"\n"
-        )
+        error = {"code": 503, "message": message, "status": "UNAVAILABLE"}
+        return json.dumps({"error": error}, indent=2).encode() + b"\n"
 
     def refusal(self, status: int, message: str) -> bytes:
         return json.dumps([{"error": {"code": status, "message": message, "status": "X"}}], indent=2).encode()

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
+from functools import partial
 from threading import Event, Thread
 from typing import Any, Protocol
 
-import numpy as np
 import pytest
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import MessagesLost, RequestFailed, ServerDied, TransportError
-from s2a_bench.ros import ActionClient, ActionServer, Rejected, Result, ServerGoal, open_middleware
+from s2a_bench.ros import ActionClient, Rejected, Result, ServerGoal, open_middleware
 from s2a_bench.ros.action import ServedAction, Status
 from s2a_bench.ros.llama import GENERATE_RESPONSE, generate_goal, goal_images, text_result, token_feedback
 from s2a_bench.testing.transport import RecordingHandler, ask, connector, served, wiring_of, yuyv_frame
@@ -23,6 +23,9 @@ from s2a_bench.types import Request
 
 NODE = "/llama_ros/generate_response"
 Node = Callable[..., list[ServerGoal]]
+Answer = Callable[[ServerGoal], object]
+LEAVES = "leaves"
+"""What a node answers that ends with its goal."""
 
 
 @pytest.fixture
@@ -32,30 +35,30 @@ def foreign(dds_domain: int) -> Wiring[Any]:
 
 
 class Stranger(Protocol):
-    def __call__(self, name: str, handler: Handler, **more: Any) -> ActionClient: ...
+    def __call__(self, name: str, handler: Handler, version: str = ..., **more: Any) -> ActionClient: ...
 
 
 @pytest.fixture
 def stranger(dds_domain: int) -> Iterator[Stranger]:
-    """Serve under a name, and connect the action client of another node."""
+    """Serve under a name, and connect the action client of another node, which speaks a version."""
     with ExitStack() as stack:
 
-        def start(name: str, handler: Handler, **more: Any) -> ActionClient:
+        def start(name: str, handler: Handler, version: str = "6.0", **more: Any) -> ActionClient:
             stack.enter_context(served(wiring_of("ros/action", name, domain_id=dds_domain, **more), handler))
             middleware = stack.enter_context(closing(open_middleware(domain_id=dds_domain)))
-            client = middleware.action_client(name + "/generate_response", GENERATE_RESPONSE)
+            client = middleware.action_client(name + "/generate_response", GENERATE_RESPONSE, version)
             assert client.wait_for_server(20)
             return client
 
         yield start
 
 
-def result_of(client: ActionClient, goal: Any) -> tuple[int, str]:
-    """Send a goal; return its status and text."""
+def end_of(client: ActionClient, goal: Any) -> Result | Rejected:
+    """Send a goal; return how it ended."""
     client.send(client.pack(goal))
-    while not isinstance(event := client.next_event(20), Result):
+    while not isinstance(event := client.next_event(20), (Result, Rejected)):
         assert event is not None, "a goal never ended"
-    return event.status, client.unpack_result(event.packed).response.text
+    return event
 
 
 @pytest.fixture
@@ -63,36 +66,39 @@ def node(dds_domain: int) -> Iterator[Node]:
     """Run a node like llama_ros: it answers every goal with ten tokens, or as told."""
     with ExitStack() as stack:
 
-        def start(version: str = "6.0", answer: Callable[[ServerGoal], None] | None = None) -> list[ServerGoal]:
+        def start(version: str = "6.0", answer: Answer | None = None) -> list[ServerGoal]:
             middleware = open_middleware(domain_id=dds_domain, node_name="/llama_ros/llama_node")
             server = middleware.action_server(NODE, GENERATE_RESPONSE, version=version)
             goals: list[ServerGoal] = []
-            thread = Thread(target=serve, args=(server, version, goals, answer))
+            left = Event()
+
+            def serve() -> None:
+                while (goal := server.next_goal(60)) is not None:
+                    goals.append(goal)
+                    if (answer or partial(ten_tokens, version=version))(goal) == LEAVES:
+                        left.set()
+                        middleware.close()
+                        return
+
+            thread = Thread(target=serve)
             thread.start()
             stack.callback(middleware.close)
             stack.callback(thread.join)
-            stack.callback(server.interrupt)
+            stack.callback(lambda: left.is_set() or server.interrupt())
             return goals
 
         yield start
 
 
-def serve(
-    server: ActionServer, version: str, goals: list[ServerGoal], answer: Callable[[ServerGoal], None] | None
-) -> None:
-    while (goal := server.next_goal(60)) is not None:
-        goals.append(goal)
-        if answer is not None:
-            answer(goal)
-            continue
-        goal.accept()
-        goal.executing()
-        for number in range(10):
-            if goal.cancel_requested:
-                break
-            goal.feedback(token_feedback(f"t{number} ", number, version))
-        end = goal.canceled if goal.cancel_requested else goal.succeed
-        end(text_result("whole", [1], version))
+def ten_tokens(goal: ServerGoal, version: str) -> None:
+    goal.accept()
+    goal.executing()
+    for number in range(10):
+        if goal.cancel_requested:
+            break
+        goal.feedback(token_feedback(f"t{number} ", number, version))
+    end = goal.canceled if goal.cancel_requested else goal.succeed
+    end(text_result("whole", [1], version))
 
 
 @pytest.mark.parametrize("version", ["6.0", "4.4"])
@@ -134,18 +140,23 @@ def test_a_node_without_a_limit_is_cancelled_after_the_last_wanted_token(node: N
 
 
 @pytest.mark.parametrize(
-    ("answer", "message"),
+    ("answer", "error", "message"),
     [
-        (lambda goal: goal.reject(), "rejected the goal"),
-        (lambda goal: (goal.accept(), goal.executing(), goal.abort(text_result("no memory"))), "no memory"),
-        (lambda goal: (goal.accept(), goal.executing(), goal.abort(text_result(""))), "ended with status 6"),
+        (lambda goal: goal.reject(), RequestFailed, "rejected the goal"),
+        (
+            lambda goal: (goal.accept(), goal.executing(), goal.abort(text_result("no memory"))),
+            RequestFailed,
+            "no memory",
+        ),
+        (lambda goal: (goal.accept(), goal.executing(), goal.abort(text_result(""))), RequestFailed, "with status 6"),
+        (lambda goal: goal.accept() or LEAVES, ServerDied, "/llama_ros/generate_response has ended"),
     ],
 )
-def test_a_refusal_fails_the_request(
-    node: Node, foreign: Wiring[Any], answer: Callable[[ServerGoal], None], message: str
+def test_a_node_that_refuses_or_leaves_fails_the_request(
+    node: Node, foreign: Wiring[Any], answer: Answer, error: type[Exception], message: str
 ) -> None:
     node(answer=answer)
-    with closing(open_client(foreign)) as client, pytest.raises(RequestFailed, match=message):
+    with closing(open_client(foreign)) as client, pytest.raises(error, match=message):
         ask(client, Request("a", "plan"))
 
 
@@ -157,55 +168,28 @@ def test_feedback_that_does_not_arrive_is_a_message_lost(dds_domain: int, monkey
             ask(client, Request("a", "plan"))
 
 
-def test_a_node_that_leaves_is_noticed(foreign: Wiring[Any], dds_domain: int) -> None:
-    middleware = open_middleware(domain_id=dds_domain)
-    server = middleware.action_server(NODE, GENERATE_RESPONSE)
-    client = open_client(foreign)
-    left = Event()
-
-    def accept_and_leave() -> None:
-        goal = server.next_goal(20)
-        assert goal is not None
-        goal.accept()
-        middleware.close()
-        left.set()
-
-    thread = Thread(target=accept_and_leave)
-    thread.start()
-    try:
-        with pytest.raises(ServerDied, match="/llama_ros/generate_response has ended"):
-            ask(client, Request("a", "plan"))
-    finally:
-        thread.join()
-        client.close()
-    assert left.is_set()
-
-
 def test_no_node_is_said_so(foreign: Wiring[Any]) -> None:
     with pytest.raises(ServerDied, match="no action server appeared at /llama_ros/generate_response"):
         open_client(foreign, lambda: False)
 
 
-def test_our_server_stops_at_a_stop_word_and_borrows_no_seed(stranger: Stranger) -> None:
-    handler = RecordingHandler(["one ", "two ", "three ", "four "])
-    client = stranger("/test_stop", handler)
-    client.send(client.pack(generate_goal("count", stop=["three"])))
-    events = [client.next_event(20) for _ in range(5)]
-    result = client.unpack_result(events[-1].packed)  # type: ignore[union-attr]
-    assert events[-1].status == Status.SUCCEEDED  # type: ignore[union-attr]
-    assert result.response.text == "one two three "
-    np.testing.assert_array_equal(result.response.tokens, [7, 8, 9])
-    assert handler.requests[0].seed == 0
-
-
-def test_what_a_goal_wants_of_sampling_reaches_the_engine_or_fails_it(stranger: Stranger) -> None:
-    recorder = RecordingHandler(["x"])
+def test_our_server_heeds_what_a_goal_wants_of_sampling(stranger: Stranger) -> None:
+    recorder = RecordingHandler(["one ", "two ", "three ", "four "])
     handler = Queued.around(recorder)
     handler.honours = ("temp",)
     client = stranger("/test_sampling", handler)
-    ends = [result_of(client, generate_goal("p", **wish)) for wish in ({"temp": 0.25, "top_k": 3}, {"temp": -1.0})]
-    assert ends == [(Status.SUCCEEDED, "x"), (Status.ABORTED, "sampling_config.temp: -1 is not 0 to 100")]
-    assert [request.sampling for request in recorder.requests] == [(("temp", 0.25),)]
+    ends = []
+    for wish in ({"stop": ["three"]}, {"temp": 0.25, "top_k": 3}, {"temp": -1.0}):
+        end = end_of(client, generate_goal("p", **wish))
+        assert isinstance(end, Result)
+        response = client.unpack_result(end.packed).response
+        ends.append((end.status, response.text, list(response.tokens)))
+    assert ends == [
+        (Status.SUCCEEDED, "one two three ", [7, 8, 9]),
+        (Status.SUCCEEDED, "one two three four ", [7, 8, 9, 10]),
+        (Status.ABORTED, "sampling_config.temp: -1 is not 0 to 100", []),
+    ]
+    assert [(request.sampling, request.seed) for request in recorder.requests] == [((), 0), ((("temp", 0.25),), 0)]
 
 
 def test_tokens_faster_than_the_interval_share_a_feedback_and_none_is_lost(dds_domain: int) -> None:
@@ -241,23 +225,15 @@ def test_our_server_does_not_join_a_node_that_answers_already(node: Node, dds_do
         open_server(wiring_of("ros/action", "/llama_ros", domain_id=dds_domain), RecordingHandler(["x"]))
 
 
-@pytest.mark.parametrize(("served", "other"), [("4.4", "6.0"), ("6.0", "4.4")])
+@pytest.mark.parametrize(("spoken", "other"), [("4.4", "6.0"), ("6.0", "4.4")])
 def test_our_server_speaks_the_version_it_is_told_and_logs_who_speaks_another(
-    dds_domain: int, caplog: pytest.LogCaptureFixture, served: str, other: str
+    stranger: Stranger, dds_domain: int, caplog: pytest.LogCaptureFixture, spoken: str, other: str
 ) -> None:
-    wiring = wiring_of("ros/action", "/s2a", domain_id=dds_domain, llama_msgs=served)
-    with closing(connector(wiring)) as connecting:
-        recorder = RecordingHandler(["a ", "b"])
-        client = next(connecting)(recorder)
+    recorder = RecordingHandler(["a ", "b"])
+    foreign = stranger("/s2a", recorder, other, llama_msgs=spoken)
+    with closing(open_client(wiring_of("ros/action", "/s2a", domain_id=dds_domain))) as client:
         tokens, _ = ask(client, Request("a", "plan", (yuyv_frame(),), grammar='root ::= "x"'))
-        assert [token.text for token in tokens] == ["a ", "b"]
-        assert recorder.requests[0].grammar == 'root ::= "x"'
-        foreign = open_middleware(domain_id=dds_domain, node_name="/foreign")
-        try:
-            stranger = foreign.action_client("/s2a/generate_response", GENERATE_RESPONSE, other)
-            assert stranger.wait_for_server(20)
-            stranger.send(stranger.pack(generate_goal("plan", version=other)))
-            assert isinstance(stranger.next_event(20), Rejected)
-        finally:
-            foreign.close()
-    assert f"rejected: its client speaks llama_msgs {other}, this server {served} (--llama-msgs)" in caplog.text
+    assert [token.text for token in tokens] == ["a ", "b"]
+    assert recorder.requests[0].grammar == 'root ::= "x"'
+    assert isinstance(end_of(foreign, generate_goal("plan", version=other)), Rejected)
+    assert f"rejected: its client speaks llama_msgs {other}, this server {spoken} (--llama-msgs)" in caplog.text

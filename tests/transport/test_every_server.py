@@ -7,7 +7,7 @@ import socket
 from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
-from threading import Event, Thread
+from threading import Event, Thread, get_ident
 from typing import Protocol
 
 import numpy as np
@@ -46,17 +46,20 @@ class Gate:
         self.go = Event()
         self.began: list[str] = []
         self.ended: list[str] = []
+        self.threads: set[int] = set()
 
     def __call__(self, request: Request, trace: Trace) -> Generator[Piece, None, None]:
         self.began.append(request.prompt)
         trace.mark("inference")
         try:
             for index in range(self._pieces):
+                self.threads.add(get_ident())
                 trace.token_ns[:] = [now_ns()] * (index + 1 if index < 2 else 1)
                 yield Action(index, np.zeros(2, np.float32)) if self._acts else Token(index, "a")
                 assert self.go.wait(20)
                 Event().wait(0.001)
         finally:
+            self.threads.add(get_ident())
             self.ended.append(request.prompt)
 
 
@@ -217,6 +220,7 @@ def test_an_answer_whose_client_has_gone_ends(name: str) -> None:
         next(iter(client.request(Request("a", "for ever", max_tokens=60_000), Trace())))
         client.close()
         until(lambda: gate.ended)
+    assert len(gate.threads) == 1  # its own: the end may wait for the engine
 
 
 @pytest.mark.parametrize("name", ["http/as-deployed", "http/best-effort", "shm"])
@@ -227,19 +231,6 @@ def test_a_client_that_does_not_read_does_not_keep_the_engine(name: str) -> None
         next(iter(slow))
         assert len(ask(connect(), Request("b", "go", max_tokens=many))[0]) == many
         assert len([*slow]) == many - 1
-
-
-@every
-def test_clients_at_once_are_all_answered(name: str) -> None:
-    handler = recorder(name)
-    with serving(name, handler) as connect:
-        clients = [connect() for _ in range(4)]
-        askings = [Asking(client, "go") for client in clients]
-        for _ in range(5):
-            askings = [Asking(client, "go") for client, asking in zip(clients, askings, strict=True) if asking.end()]
-            assert [asking.error for asking in askings] == [""] * 4
-        assert [len(asking.end().pieces) for asking in askings] == [3] * 4
-    assert len(handler.requests) == 24
 
 
 @every
@@ -261,7 +252,7 @@ def test_what_breaks_inside_is_not_shown_and_fails_this_request_only(name: str) 
 
 
 @every
-def test_a_server_that_stops_ends_the_answer_under_way(name: str) -> None:
+def test_a_server_that_stops_ends_the_answer_under_way(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     gate = Gate(name, 10**9)
     server = open_server(wiring_of(name), gate)
     thread = Thread(target=server.serve)
@@ -274,6 +265,7 @@ def test_a_server_that_stops_ends_the_answer_under_way(name: str) -> None:
         thread.join(30)
         assert not thread.is_alive()
         assert asking.end().error
+    assert "Traceback" not in capsys.readouterr().err
 
 
 WITH_LIMITS = [
@@ -311,35 +303,6 @@ def test_a_connection_too_many_is_refused(name: str) -> None:
         until(lambda: answered(first))
         first.close()
         until(lambda: answered(None))
-
-
-@on_ports
-def test_off_this_machine_a_key_is_needed_or_none_is_asked_for(name: str) -> None:
-    handler = recorder(name)
-    with pytest.raises(UsageError, match=r"`host`: others reach 0.0.0.0; .*`api_key_env`, .*`no_auth`"):
-        open_server(wiring_of(name, "0.0.0.0:0"), handler)
-    with pytest.raises(UsageError, match=r"`no_auth` .* `api_key_env`"):
-        wiring_of(name, no_auth=True, api_key_env="MY_KEY")
-    with pytest.raises(UsageError, match="`api_key_env`: the environment has no such variable"):
-        open_server(wiring_of(name, api_key_env="NO_KEY"), handler)
-    with served(wiring_of(name, "0.0.0.0:0", no_auth=True), handler) as (server, _):
-        assert server.address
-
-
-@on_ports
-def test_a_key_is_sent_and_who_has_none_is_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("MY_KEY", "s3cret-robot-key")
-    handler = recorder(name)
-    with served(wiring_of(name, api_key_env="MY_KEY"), handler) as (server, _):
-        with closing(open_client(wiring_of(name, server.address, api_key_env="MY_KEY"))) as client:
-            assert len(ask(client, Request("a", "go"))[0]) == 3
-        with (
-            closing(open_client(wiring_of(name, server.address))) as stranger,
-            pytest.raises(RequestFailed, match=r"401|Unauthorized") as refused,
-        ):
-            ask(stranger, Request("b", "go"))
-        assert "s3cret" not in str(refused.value)
-    assert len(handler.requests) == 1
 
 
 def has_ipv6() -> bool:

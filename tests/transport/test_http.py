@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import base64
 import json
-from collections.abc import Generator, Iterator
+import socket
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
-from dataclasses import asdict, replace
-from itertools import count
-from threading import Event, Thread, get_ident
+from dataclasses import replace
 
-import cv2
 import httpx
-import numpy as np
 import pytest
 
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
-from s2a_bench.trace import Remote, Trace, budget
-from s2a_bench.transport import Handler, open_client, open_server
+from s2a_bench.trace import budget
+from s2a_bench.transport import Handler, open_client
 from s2a_bench.transport.http import native
 from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.transport.pipeline import one_pipeline
-from s2a_bench.types import Request, Token
+from s2a_bench.types import Request
+from tests.transport.test_every_server import Gate
 
 
 @pytest.fixture
@@ -70,12 +66,6 @@ def test_each_variant_has_its_stages_and_no_other(
     assert set(budget(trace.chain()).stages_ns) == COMMON | expected
 
 
-def test_a_new_client_per_request_shows_as_connect(url: str) -> None:
-    client = open_client(wiring_of("http/as-deployed", url, connection="client-per-request"))
-    _, trace = ask(client, Request("a", "plan"))
-    assert "connect" in budget(trace.chain()).stages_ns
-
-
 def test_our_own_server_is_known_by_its_url_and_keeps_its_marks(url: str) -> None:
     client = open_client(wiring_of("http/as-deployed", url=url))
     _, trace = ask(client, Request("a", "plan"))
@@ -84,41 +74,27 @@ def test_our_own_server_is_known_by_its_url_and_keeps_its_marks(url: str) -> Non
     assert set(budget(trace.chain()).stages_ns) == {"json_pack", "network", "json_parse", "inference", "return"}
 
 
-def test_marks_of_another_hosts_clock_are_not_mixed_with_ours(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.trace.clock_id", lambda: "another boot")
-    monkeypatch.setattr(Remote, "to_json", lambda remote: {**asdict(remote), "clock": "this boot"})
-    client = open_client(wiring_of("http/as-deployed", url))
-    _, trace = ask(client, Request("a", "plan"))
-    client.close()
-    assert set(budget(trace.chain()).stages_ns) == {"json_pack", "server"}
-
-
-@pytest.mark.parametrize(("connection", "connections"), [("keep-alive", 1), ("per-request", 3)])
+@pytest.mark.parametrize(
+    ("connection", "connections"), [("keep-alive", 1), ("per-request", 3), ("client-per-request", 3)]
+)
 def test_connections_are_kept_or_not(
-    handler: RecordingHandler, connection: str, connections: int, monkeypatch: pytest.MonkeyPatch
+    url: str, connection: str, connections: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import socket
-
     opened = []
     connect = socket.create_connection
     monkeypatch.setattr(socket, "create_connection", lambda *a, **k: opened.append(1) or connect(*a, **k))
-    with (
-        serving(handler) as url,
-        closing(open_client(wiring_of("http/as-deployed", url, connection=connection))) as client,
-    ):
-        for _ in range(3):
-            ask(client, Request("a", "plan"))
+    with closing(open_client(wiring_of("http/as-deployed", url, connection=connection))) as client:
+        traces = [ask(client, Request("a", "plan"))[1] for _ in range(3)]
     assert len(opened) == connections
+    shows = connection == "client-per-request"
+    assert [("connect" in budget(trace.chain()).stages_ns) for trace in traces] == [shows] * 3
 
 
 def test_the_whole_answer_comes_without_stream(url: str) -> None:
     body = {"messages": [{"role": "user", "content": "plan"}], "max_tokens": 2}
     answer = httpx.post(url + "/v1/chat/completions", json=body).json()
-    assert answer["choices"][0] == {
-        "index": 0,
-        "message": {"role": "assistant", "content": "go_to"},
-        "finish_reason": "length",
-    }
+    message = {"role": "assistant", "content": "go_to"}
+    assert answer["choices"] == [{"index": 0, "message": message, "finish_reason": "length"}]
     assert answer["usage"]["completion_tokens"] == 2
 
 
@@ -130,95 +106,50 @@ def test_the_stream_is_what_openai_clients_expect(url: str) -> None:
     assert [event["choices"][0]["delta"] for event in events[:-1]] == [{"content": "go"}, {"content": "_to"}, {}]
     assert events[-2]["choices"][0]["finish_reason"] == "stop"
     assert events[-1]["choices"] == []
-    assert [stage for stage, _ in events[-1]["s2a"]["marks"]] == [
-        "network",
-        "json_parse",
-        "json_parse",
-        "",
-        "inference",
-    ]
-
-
-def test_a_picture_from_a_plain_openai_client_is_decoded(url: str, handler: RecordingHandler) -> None:
-    picture = np.full((8, 8, 3), (255, 0, 0), np.uint8)  # blue in OpenCV's order
-    uri = "data:image/png;base64," + base64.b64encode(cv2.imencode(".png", picture)[1]).decode()
-    part = {"type": "image_url", "image_url": {"url": uri}}
-    httpx.post(url + "/v1/chat/completions", json={"messages": [{"role": "user", "content": [part]}]})
-    assert handler.requests[0].images[0].data[0, 0].tolist() == [0, 0, 255]
+    stages = [stage for stage, _ in events[-1]["s2a"]["marks"]]
+    assert stages == ["network", "json_parse", "json_parse", "", "inference"]
 
 
 @pytest.mark.parametrize(
-    ("variant", "body", "message"),
+    ("variant", "sent", "message"),
     [
-        ("as-deployed", b"{}", "body.messages"),
-        ("as-deployed", b"{", "JSON"),
-        ("best-effort", b"{", "no JSON"),
-        ("best-effort", b"{}", "messages"),
-        ("as-deployed", b'{"messages": []}', "messages"),
-        ("best-effort", b'{"messages": []}', "messages"),
-        ("best-effort", b'{"messages": [{"content": "go"}], "max_tokens": "many"}', "max_tokens"),
-        ("best-effort", b'{"messages": [{"content": [{"type": "text", "text": 3}]}]}', "messages"),
-        ("best-effort", b"[" * 20_001, "no JSON"),
-        ("binary", b"", "s2a-request"),
+        ("as-deployed", "{}", "body.messages"),
+        ("as-deployed", "{", "JSON"),
+        ("as-deployed", '{"messages": []}', "messages"),
+        ("best-effort", "{", "no JSON"),
+        ("best-effort", "{}", "messages"),
+        ("best-effort", '{"messages": []}', "messages"),
+        ("best-effort", '{"messages": [{"content": [{"type": "text", "text": 3}]}]}', "messages"),
+        ("binary", "", "s2a-request"),
+        ("binary", "[1]", "an object"),
+        ("binary", '{"prompt": 3}', "prompt"),
+        ("binary", '{"seed": [1]}', "seed"),
     ],
 )
-def test_a_bad_body_is_refused_with_the_reason(urls: dict[str, str], variant: str, body: bytes, message: str) -> None:
-    headers = {"content-type": "application/json"}
+def test_a_bad_body_or_header_is_refused_with_the_reason(
+    urls: dict[str, str], variant: str, sent: str, message: str
+) -> None:
+    headers, body = {"content-type": "application/json"}, sent
+    if variant == "binary" and sent:
+        headers, body = {native.PARAMETERS_HEADER: sent}, ""
     answer = httpx.post(urls[variant] + native.PATHS[variant], content=body, headers=headers)
     assert answer.status_code == 400
     assert message in answer.json()["error"]["message"]
 
 
-@pytest.mark.parametrize("header", ["[1]", '{"prompt": 3}', '{"seed": [1]}'])
-def test_a_bad_header_of_a_binary_request_is_refused(urls: dict[str, str], header: str) -> None:
-    headers = {native.PARAMETERS_HEADER: header}
-    assert httpx.post(urls["binary"] + native.PATHS["binary"], headers=headers).status_code == 400
-
-
-def test_an_answer_that_nobody_reads_any_more_ends_on_its_own_thread() -> None:
-    threads: list[int] = []
-    gone, ended = Event(), Event()
-
-    def endless(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        try:
-            for index in count():
-                threads.append(get_ident())
-                yield Token(index, "go")
-                if index:
-                    gone.wait(30)
-        finally:
-            threads.append(get_ident())
-            ended.set()
-
+def test_stopping_in_the_middle_of_an_answer_waits_for_no_engine(capsys: pytest.CaptureFixture[str]) -> None:
+    gate = Gate("http/as-deployed")
     body = {"messages": [{"role": "user", "content": "plan"}], "stream": True}
-    with serving(endless) as url:
-        with httpx.stream("POST", url + "/v1/chat/completions", json=body) as answer:
-            next(answer.iter_bytes())
-        gone.set()
-        assert ended.wait(30)
-    assert threads[-1] == threads[-2]  # not the loop's: the end may wait for the engine
-
-
-def test_stopping_in_the_middle_of_an_answer_leaves_no_traceback(capsys: pytest.CaptureFixture[str]) -> None:
-    over = Event()
-
-    def slow(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
-        yield Token(0, "go")
-        over.wait(30)
-        yield Token(1, "on")
-
-    server = open_server(wiring_of("http"), slow)
-    thread = Thread(target=server.serve)
-    thread.start()
-    body = {"messages": [{"role": "user", "content": "plan"}], "stream": True}
-    with httpx.stream("POST", server.address + "/v1/chat/completions", json=body) as answer:
+    with (
+        served(wiring_of("http"), gate) as (server, _),
+        httpx.stream("POST", server.address + "/v1/chat/completions", json=body) as answer,
+    ):
         pieces = answer.iter_bytes()
         next(pieces)
         server.stop()
         with pytest.raises(httpx.RemoteProtocolError):
             list(pieces)
-    over.set()
-    thread.join()
+        gate.go.set()
     stderr = capsys.readouterr().err
     assert "graceful shutdown exceeded" in stderr
     assert "Traceback" not in stderr
@@ -231,21 +162,13 @@ def test_a_bad_picture_is_refused_with_the_reason(url: str, uri: str) -> None:
     assert httpx.post(url + "/v1/chat/completions", json=body).status_code == 400
 
 
-def test_health_and_models_answer(urls: dict[str, str]) -> None:
+@pytest.mark.parametrize(("options", "status"), [({}, 404), ({"api_docs": True}, 200)])
+def test_health_and_models_answer_and_on_request_the_pages_of_fastapi(
+    urls: dict[str, str], handler: RecordingHandler, options: dict[str, bool], status: int
+) -> None:
     for url in urls.values():
         assert httpx.get(url + "/health").json() == {"status": "ok"}
         assert httpx.get(url + "/v1/models").json()["data"][0]["id"] == "s2a"
-
-
-@pytest.mark.parametrize(("options", "status"), [({}, 404), ({"api_docs": True}, 200)])
-def test_the_pages_of_fastapi_are_served_on_request_only(
-    handler: RecordingHandler, options: dict[str, bool], status: int
-) -> None:
     with served(wiring_of("http", **options), handler) as (server, _):
         for page in ("/openapi.json", "/docs", "/redoc"):
             assert httpx.get(server.address + page).status_code == status
-
-
-def test_best_effort_and_binary_share_a_server_and_as_deployed_has_its_own() -> None:
-    deployed, best_effort, binary = (one_pipeline(f"http/{name}").server for name in native.PATHS)
-    assert deployed != best_effort == binary

@@ -75,13 +75,35 @@ def answered(answer: tuple[int, bytes]) -> str:
     return text
 
 
-def test_a_request_may_come_in_pieces() -> None:
-    data = request(body("a" * 200))
+def slices(data: bytes, size: int) -> list[bytes]:
+    return [data[at : at + size] for at in range(0, len(data), size)]
+
+
+def of_every_path() -> list[bytes]:
+    header = 'S2A-Request: {"prompt": "a"}'
+    bodies = {path: b"" if path == PATHS["binary"] else body() for path in PATHS.values()}
+    return [request(data, header, f"Content-Length: {len(data)}", path=path) for path, data in bodies.items()]
+
+
+LARGE, UPGRADE = body("a" * 100_000), ("Upgrade: h2c", "Connection: Upgrade")
+
+
+@pytest.mark.parametrize(
+    ("pieces", "answers"),
+    [
+        (slices(request(body("a" * 200)), 30), 1),
+        ([*of_every_path(), *of_every_path()], 6),
+        ([request(body()) * 2 + request(LARGE) * 3 + request(body())[:-1], request(body())[-1:]], 6),
+        ([request(body(), f"Content-Length: {len(body())}", *UPGRADE)], 1),
+    ],
+    ids=["in pieces", "for all paths", "together", "an upgrade, which is ignored"],
+)
+def test_requests_of_a_connection_are_answered_in_order(pieces: list[bytes], answers: int) -> None:
     with connected() as connection:
-        for at in range(0, len(data), 30):
-            connection.sendall(data[at : at + 30])
+        for piece in pieces:
+            connection.sendall(piece)
             time.sleep(0.001)
-        assert answered(read(connection)) == "go_to"
+        assert [answered(read(connection)) for _ in range(answers)] == ["go_to"] * answers
 
 
 def test_who_expects_it_is_told_to_go_on() -> None:
@@ -100,15 +122,6 @@ def test_http_1_0_has_no_chunks_and_ends_with_the_connection(stream: bool) -> No
         head, _, answer = rest_of(connection).partition(b"\r\n\r\n")
         assert b"chunked" not in head
         assert answer.endswith(b"data: [DONE]\n\n") if stream else json.loads(answer)
-
-
-def test_a_connection_is_for_all_paths() -> None:
-    with connected() as connection:
-        for path in (*PATHS.values(), *PATHS.values()):
-            header = 'S2A-Request: {"prompt": "a"}'
-            data = b"" if path == PATHS["binary"] else body()
-            connection.sendall(request(data, header, f"Content-Length: {len(data)}", path=path))
-            assert answered(read(connection)) == "go_to"
 
 
 @pytest.mark.parametrize(
@@ -132,22 +145,6 @@ def test_what_is_not_taken_is_told_in_one_line_and_hung_up_on(
         assert says in json.loads(answer)["error"]["message"]
         assert rest_of(connection) == b""
     assert caplog.text == ""
-
-
-def test_an_upgrade_is_ignored() -> None:
-    data = body()
-    with connected() as connection:
-        connection.sendall(request(data, f"Content-Length: {len(data)}", "Upgrade: h2c", "Connection: Upgrade"))
-        assert answered(read(connection)) == "go_to"
-
-
-def test_requests_that_come_together_are_answered_in_order() -> None:
-    with connected() as connection:
-        connection.sendall(request(body("a" * 100_000)) * 3 + request(body())[:-1])
-        for _ in range(3):
-            assert answered(read(connection)) == "go_to"
-        connection.sendall(request(body())[-1:])
-        assert answered(read(connection)) == "go_to"
 
 
 def test_headers_that_stop_end() -> None:

@@ -1,19 +1,21 @@
-"""What a request of a client may cost: its pixels together, and how deep its document goes."""
+"""What a request of a client may cost: its pixels together."""
 
 from __future__ import annotations
 
 import json
 from base64 import b64encode
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames.convert import encode_png
+from s2a_bench.plugins.policy_servers.observed import read_observation
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Trace
 from s2a_bench.transport.http import native
-from s2a_bench.transport.http.chat import Reads, of_json, of_picture
+from s2a_bench.transport.http.chat import of_json, of_picture
 from s2a_bench.transport.limits import LIMITS
 from s2a_bench.transport.ros.camera import pictures_of
 
@@ -40,19 +42,12 @@ def over_ros(count: int, pixels: int) -> int:
     return len(pictures_of([message] * count, Trace(), LIMITS.but(pixels=pixels)))
 
 
-@pytest.mark.parametrize("read", [with_bodies, with_uris, over_ros])
-def test_the_pictures_of_a_request_share_its_pixels(read: object) -> None:
-    assert callable(read)
+def in_an_observation(count: int, pixels: int) -> int:
+    return len(read_observation({"a": [PNG] * count}, Trace(), LIMITS.but(pixels=pixels))[0])
+
+
+@pytest.mark.parametrize("read", [with_bodies, with_uris, over_ros, in_an_observation])
+def test_the_pictures_of_a_request_share_its_pixels(read: Callable[..., int]) -> None:
     assert read(3, pixels=300) == 3
     with pytest.raises(RequestFailed, match="a picture of 10x10; at most 99 pixels are taken"):
         read(3, pixels=299)
-
-
-@pytest.mark.parametrize("document", ["[" * 60_000, '{"a":' * 12_000])
-@pytest.mark.parametrize("read", [of_json, of_picture])
-def test_a_deep_document_is_refused_in_a_line(read: Reads, document: str) -> None:
-    """Our other servers are sent one in tests/hostile, and MessagePack has its own test."""
-    headers = [(native.PARAMETERS_HEADER, document)]
-    with pytest.raises(RequestFailed, match="is no JSON: depth limit exceeded") as refused:
-        read(headers, document.encode(), Trace(), LIMITS)
-    assert str(refused.value).isprintable()

@@ -73,6 +73,8 @@ def test_what_a_name_cannot_say_is_one_line(text: str, message: str) -> None:
 def test_cells_share_a_server_unless_it_would_be_told_something_else() -> None:
     one, two, three = pipelines(["ros/topic", "ros/action?payload=yuyv", "ros/topic?dds_tuning=default"])
     assert one.server == two.server != three.server
+    deployed, best_effort, binary = pipelines(["http"])
+    assert deployed.server != best_effort.server == binary.server
 
 
 def test_two_servers_of_one_transport_do_not_collide() -> None:

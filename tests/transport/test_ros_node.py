@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from typing import Any
 
@@ -19,7 +19,7 @@ from s2a_bench.ros import messages as ros
 from s2a_bench.ros.parameters import PARAMETER, SERVICE, value_message, value_of
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of, yuyv_frame
 from s2a_bench.trace import Trace
-from s2a_bench.transport import Wiring, open_client
+from s2a_bench.transport import Client, Wiring, open_client
 from s2a_bench.transport.ros.joining import join
 from s2a_bench.transport.ros.node import (
     ARRAY,
@@ -34,6 +34,7 @@ from s2a_bench.transport.ros.node import (
 from s2a_bench.transport.ros.server import RosServer
 from s2a_bench.transport.serving import STUCK_S, Queued
 from s2a_bench.types import Request
+from tests.waiting import until
 
 NODE = "/behaves/brain"
 WAIT_S = 20.0
@@ -47,10 +48,13 @@ def wiring(from_pypi: str, dds_domain: int) -> Wiring[Any]:
 
 
 @pytest.fixture
+def client(stack: ExitStack, wiring: Wiring[Any], server: RosServer) -> Client:
+    return stack.enter_context(closing(open_client(replace(wiring, address=server.address))))
+
+
+@pytest.fixture
 def peer(stack: ExitStack, wiring: Wiring[Any], server: RosServer) -> Middleware:
-    middleware = join(replace(wiring, address=server.address), "peer")
-    stack.callback(middleware.close)
-    return middleware
+    return stack.enter_context(closing(join(replace(wiring, address=server.address), "peer")))
 
 
 @pytest.fixture
@@ -71,12 +75,15 @@ def call(peer: Middleware, service: str, **fields: Any) -> Any:
 
 def received(subscription: Subscription, wanted: Callable[[Any], bool]) -> Any:
     """The first message that is wanted."""
-    deadline = now_ns() + int(WAIT_S * 1e9)
-    while now_ns() < deadline:
-        packed = subscription.take(0.2)
-        if packed is not None and wanted(message := subscription.unpack(packed)):
-            return message
-    raise AssertionError("it did not come")
+    found: list[Any] = []
+
+    def came() -> bool:
+        if packed := subscription.take(0.2):
+            found.append(subscription.unpack(packed))
+        return bool(found) and wanted(found[-1])
+
+    until(came)
+    return found[-1]
 
 
 @pytest.mark.usefixtures("server")
@@ -91,9 +98,7 @@ def test_the_options_are_parameters(peer: Middleware) -> None:
 
 def test_a_limit_can_be_set_while_it_runs_and_everybody_hears(peer: Middleware, server: RosServer) -> None:
     events = peer.subscription("/parameter_events", EVENT, QoS(depth=1000))
-    deadline = now_ns() + int(WAIT_S * 1e9)
-    while not events.matched():
-        assert now_ns() < deadline
+    until(events.matched)
     call(peer, "ListParameters")  # once that is answered, the server has found the subscription too
     wanted = {"max_tokens": 3, "feedback_interval": 0.25, "namespace": "/other"}
     parameters = [ros.default(PARAMETER, name=name, value=value_message(value)) for name, value in wanted.items()]
@@ -114,20 +119,15 @@ def test_what_is_logged_is_on_rosout_for_who_joins_later(peer: Middleware) -> No
     assert log.file.endswith("test_ros_node.py")
 
 
-def test_diagnostics_tell_of_requests_and_the_camera(
-    peer: Middleware, server: RosServer, stack: ExitStack, wiring: Wiring[Any]
-) -> None:
-    client = open_client(replace(wiring, address=server.address))
-    stack.callback(client.close)
+def test_diagnostics_tell_of_requests_and_the_camera(peer: Middleware, client: Client) -> None:
     diagnostics = peer.subscription("/diagnostics", ARRAY, QoS())
     assert client.camera is not None
     client.camera.publish(yuyv_frame(), Trace())
     assert ask(client, Request("a", "plan"))[0]
 
     def counted(array: Any) -> bool:
-        return all(
-            values_of(status)[key] == "1" for status, key in zip(array.status, ("requests", "frames"), strict=True)
-        )
+        requests, camera = map(values_of, array.status)
+        return requests["requests"] == camera["frames"] == "1"
 
     array = received(diagnostics, counted)
     requests, camera = array.status
@@ -139,10 +139,8 @@ def test_diagnostics_tell_of_requests_and_the_camera(
 
 
 def test_a_request_that_cannot_be_prepared_is_a_failure(
-    server: RosServer, stack: ExitStack, wiring: Wiring[Any], caplog: pytest.LogCaptureFixture
+    server: RosServer, client: Client, caplog: pytest.LogCaptureFixture
 ) -> None:
-    client = open_client(replace(wiring, address=server.address))
-    stack.callback(client.close)
     for _ in range(2):
         with pytest.raises(RequestFailed):
             ask(client, Request("a", "plan", max_tokens=0))
@@ -202,10 +200,8 @@ def test_diagnostics_survive_the_wire() -> None:
     (status,) = array.status
     assert ros.nanoseconds(array.header.stamp) == 5_000_000_007
     assert (status.level, status.name, status.message, values_of(status)) == (2, "a/b: c", "d", {"e": "0.5"})
-    generated = (
-        "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"  # in what rosidl made of Jazzy's file
-    )
-    assert ros.type_hash(ARRAY) == "RIHS01_" + generated
+    made_by_rosidl_of_jazzys_file = "5a8a36efb05fb25070fa0fb3810290c0e6cd4862b54a8fb975a1ee8dc55a333e"
+    assert ros.type_hash(ARRAY) == "RIHS01_" + made_by_rosidl_of_jazzys_file
 
 
 @pytest.mark.parametrize("from_pypi", ["cyclonedds"], indirect=True)

@@ -3,67 +3,54 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from threading import Event, Thread
 
 import pytest
 
 from s2a_bench.errors import S2AError
-from s2a_bench.trace import Trace
+from s2a_bench.testing.transport import RecordingHandler
 from s2a_bench.transport.limits import Limits
 from s2a_bench.transport.serving import Core, Disconnected, Exchange, SharedSourceWorkers
-from s2a_bench.types import Piece, Request, Token
+from s2a_bench.types import Piece, Request
 
 
 class Told(Exchange):
-    """Records its calls."""
+    """Has bytes in flight, and notes how many are left when it ends; may break in a call."""
 
-    def __init__(self, core: Core, *, has_gone: bool = False, breaks: str = "") -> None:
+    def __init__(self, core: Core, breaks: str = "") -> None:
         super().__init__()
         self.trace.mark("network")
-        self.calls: list[str] = []
         self.held.enter_context(core.in_flight.counted())(1000)
         self.held_at_end = -1
-        self._core, self._has_gone, self._breaks = core, has_gone, breaks
+        self._core, self._breaks = core, breaks
 
     def request(self) -> Request:
-        self.calls.append("request")
         return Request("a", "go on")
 
-    def accept(self) -> None:
-        self.calls.append("accept")
-
     def disconnected(self) -> bool:
-        return self._has_gone
+        return False
 
-    def send(self, piece: Piece) -> bool:
-        self.calls.append(piece.text)
+    def send(self, _piece: Piece) -> bool:
         if self._breaks == "send":
             raise Disconnected
         return True
 
     def end(self) -> None:
         self.held_at_end = self._core.in_flight.bytes
-        self.calls.append("end")
         if self._breaks == "end":
             raise Disconnected
 
     def fail(self, error: S2AError) -> None:
-        self.calls.append(str(error))
+        raise AssertionError from error
 
 
-def words(request: Request, trace: Trace) -> Generator[Piece, None, None]:
-    del request, trace
-    for index, text in enumerate(("go", "on")):
-        yield Token(index, text, -1)
+@pytest.fixture
+def core() -> Core:
+    return Core(RecordingHandler(["go", "on"]), Limits())
 
 
-def core_of(handler: Callable[[Request, Trace], Generator[Piece, None, None]] = words) -> Core:
-    return Core(handler, Limits())
-
-
-def test_its_bytes_are_given_back_before_the_end_which_may_wait_for_a_slow_client() -> None:
-    core = core_of()
+def test_its_bytes_are_given_back_before_the_end_which_may_wait_for_a_slow_client(core: Core) -> None:
     exchange = Told(core)
     assert core.in_flight.bytes == 1000
     core.answer(exchange)
@@ -71,8 +58,7 @@ def test_its_bytes_are_given_back_before_the_end_which_may_wait_for_a_slow_clien
 
 
 @pytest.mark.parametrize("breaks", ["send", "end"])
-def test_where_the_client_cannot_be_told_the_connection_is_to_be_closed(breaks: str) -> None:
-    core = core_of()
+def test_where_the_client_cannot_be_told_the_connection_is_to_be_closed(core: Core, breaks: str) -> None:
     assert not core.answer(Told(core, breaks=breaks))
     assert core.answer(Told(core))  # the engine is free
     assert core.in_flight.bytes == 0

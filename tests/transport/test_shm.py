@@ -33,7 +33,7 @@ from s2a_bench.transport.shm.memory import ANSWER_BYTES, HELLO, MAGIC, PLACE, ST
 from s2a_bench.transport.shm.pieces import packed, unpacked
 from s2a_bench.transport.shm.server import Writer
 from s2a_bench.types import Action, Frame, Request, Token
-from tests.hostile.asking import usage
+from tests.hostile.peers import usage
 from tests.waiting import until
 
 

@@ -1,4 +1,4 @@
-"""Hostile peers of our HTTP server and client."""
+"""Hostile peers of our HTTP servers and client."""
 
 from __future__ import annotations
 
@@ -6,41 +6,32 @@ import base64
 import json
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
 from functools import cache
 
 from s2a_bench.transport.http.native import PARAMETERS_HEADER, PATHS
-from tests.hostile.suite import Attack, Case
-from tests.hostile.tcp import CLIENTS as ANY_CLIENT
-from tests.hostile.tcp import crowd, sends, sends_made, servers
+from tests.hostile.peers import CLOSED, FORGED, MIB, NOISE, Case, Server, answers, crowd, sends
+from tests.servers.sockets import head as response
 
-CHAT = PATHS["as-deployed"]
-MIB = 1 << 20
 JSON = "Content-Type: application/json"
+CHUNKS = "Transfer-Encoding: chunked"
+REFUSED = "^HTTP/1.1 4"
+BUSY_OR_ANSWERED = f"^HTTP/1.1 (200|503) |^{CLOSED}"
 
 
-def head(*headers: str, path: str = CHAT, length: int | None = None) -> bytes:
+def head(*headers: str, path: str, length: int | None = None) -> bytes:
     """Return the head of a request whose connection is closed after its answer."""
     lengths = [] if length is None else [f"Content-Length: {length}"]
     lines = [f"POST {path} HTTP/1.1", "Host: localhost", "Connection: close", *headers, *lengths]
     return "\r\n".join([*lines, "", ""]).encode()
 
 
-def post(body: bytes, *headers: str, path: str = CHAT) -> bytes:
-    """Return a whole request."""
+def post(body: bytes, path: str, *headers: str) -> bytes:
     return head(*(headers or (JSON,)), path=path, length=len(body)) + body
 
 
-def chat(prompt: str = '"go on"', fields: str = "", path: str = CHAT) -> bytes:
+def chat(path: str, prompt: str = '"go on"', fields: str = '"max_tokens": 3') -> bytes:
     """Return a request whose prompt and further fields are JSON text."""
-    return post(
-        f'{{"messages": [{{"role": "user", "content": {prompt}}}]{fields and ", " + fields}}}'.encode(), path=path
-    )
-
-
-def binary(body: bytes, fields: str = "{}", kind: str = "image/png") -> bytes:
-    """Return a request of the variant whose body is the picture."""
-    return post(body, f"Content-Type: {kind}", f"{PARAMETERS_HEADER}: {fields}", path=PATHS["binary"])
+    return post(f'{{"messages": [{{"role": "user", "content": {prompt}}}], {fields}}}'.encode(), path)
 
 
 @cache
@@ -61,69 +52,99 @@ def bomb() -> bytes:
     return png_of_zeros(30_000, 30_000)
 
 
-def bomb_uri(path: str) -> Sequence[bytes]:
-    """Return a request with the bomb in a data URI."""
-    uri = "data:image/png;base64," + base64.b64encode(bomb()).decode()
-    return [chat(json.dumps([{"type": "image_url", "image_url": {"url": uri}}]), path=path)]
+def picture(path: str, data: bytes) -> bytes:
+    uri = "data:image/png;base64," + base64.b64encode(data).decode()
+    return chat(path, json.dumps([{"type": "image_url", "image_url": {"url": uri}}]))
 
 
-def parentheses(number: int) -> str:
-    """Return a grammar as deep as that."""
-    return json.dumps("root ::= " + "(" * number + '"a"' + ")" * number)
-
-
-REFUSED = "^HTTP/1.1 400 .*"
-GOES_ON = '"stream": true, "max_tokens": 5000'
-CHUNKS = "Transfer-Encoding: chunked"
-
-
-def _clients(path: str) -> Iterator[Case[Attack]]:
-    """Yield what both of our servers outlive, at a path that takes JSON."""
-    yield Case("half the headers, then gone", sends(head(path=path)[:40], then="goes"))
-    yield Case("half the body, then gone", sends(head(JSON, path=path, length=1000) + b"{", then="goes"))
-    yield Case(
-        "body a byte at a time", sends(head(JSON, path=path, length=1000), *[b" "] * 20, every_s=0.1, then="goes")
+def clients(variant: str) -> tuple[Case, ...]:
+    path = PATHS[variant]
+    goes_on = chat(path, fields='"stream": true, "max_tokens": 5000')
+    kept = chat(path).replace(b"Connection: close\r\n", b"")
+    both = head("Content-Length: 3", CHUNKS, path=path) + b"0\r\n\r\nGET / HTTP/1.1\r\n\r\n"
+    return (
+        Case("noise", sends(NOISE, b"\r\n\r\n"), f"{REFUSED}|^{CLOSED}"),
+        Case("half a head", sends(head(path=path)[:40], then="leaves")),
+        Case("half a body", sends(head(JSON, path=path, length=1000) + b"{", then="resets")),
+        Case("a length and chunks", sends(both)),
+        Case("200 requests in one piece", sends(kept * 200, chat(path)), CLOSED),
+        Case("no JSON", sends(post(b'{"messages": "\xff', path)), REFUSED),
+        Case("deep JSON", sends(post(b"[" * MIB, path)), REFUSED),
+        Case("half a surrogate pair", sends(chat(path, '"\\ud800"')), REFUSED),
+        Case("a number that is none", sends(chat(path, fields='"max_tokens": 1e99')), REFUSED),
+        Case("no picture", sends(picture(path, b"GIF89a" + bytes(100))), REFUSED),
+        Case("gone in the middle of an answer", sends(goes_on, then="leaves")),
+        Case("100 that come and go", crowd(100, sends(goes_on, then="resets"))),
     )
-    yield Case("1 GiB announced", sends(head(JSON, path=path, length=1 << 30), bytes(MIB)), "^HTTP/1.1 413 ")
-    yield Case("64 MiB of spaces", sends_made(lambda: [post(b" " * 64 * MIB, path=path)]), REFUSED)
+
+
+def large(variant: str) -> tuple[Case, ...]:
+    path = PATHS[variant]
     lines = [b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)]
-    yield Case("1 MiB of headers", sends(head(path=path)[:-2], *lines))
-    both = head("Content-Length: 3", CHUNKS, path=path)
-    yield Case("length and chunks", sends(both + b"0\r\n\r\nGET / HTTP/1.1\r\n\r\n"))
-    many = chat(path=path).replace(b"Connection: close\r\n", b"") * 200
-    yield Case("200 requests in one piece", sends(many, chat(path=path)))
-    yield Case("deep JSON", sends(post(b"[" * MIB, path=path)), REFUSED)
-    yield Case("picture of 900 million pixels", sends_made(lambda: bomb_uri(path)), REFUSED + "IMAGE_PIXELS")
-    yield Case("bad grammar", sends(chat(fields=f'"grammar": {parentheses(20_000)}', path=path)))
-    goes_on = chat(fields=GOES_ON, path=path)
-    yield Case("gone in the middle of an answer", sends(goes_on, then="goes"))
-    yield Case("100 clients that go", crowd(100, sends(goes_on, then="goes")))
-    yield Case("a page in a browser", sends(head("Origin: http://localhost", path=path, length=0)), "^HTTP/1.1 403 ")
-    stranger = head(path=path, length=0).replace(b"localhost", b"example.com")
-    yield Case("a name that means us", sends(stranger), "^HTTP/1.1 403 ")
+    unsaid = [head(JSON, CHUNKS, path=path), *[b"100000\r\n" + bytes(MIB) + b"\r\n"] * 1024]
+    return (
+        Case("1 GiB announced", sends(head(JSON, path=path, length=1 << 30), bytes(MIB)), REFUSED),
+        Case("1 GiB in chunks", sends(*unsaid), f"{REFUSED}|^{CLOSED}"),
+        Case("60 MiB of spaces", sends(lambda: post(b" " * 60 * MIB, path)), REFUSED),
+        Case("1 MiB of headers", sends(head(path=path)[:-2], *lines), f"{REFUSED}|^{CLOSED}"),
+        Case("a picture of 900 million pixels", sends(lambda: picture(path, bomb())), REFUSED),
+        Case("300 connections at once", crowd(300, sends(chat(path))), BUSY_OR_ANSWERED),
+    )
 
 
-FAST_CHAT = PATHS["best-effort"]
-CLIENTS: tuple[Case[Attack], ...] = (
-    *ANY_CLIENT,
-    *_clients(CHAT),
-    Case("1 GiB unsaid", sends(head(JSON, CHUNKS), *[b"100000\r\n" + bytes(MIB) + b"\r\n"] * 1024)),
-    Case("chunk of 2^64 bytes", sends(head(JSON, CHUNKS) + b"FFFFFFFFFFFFFFFF\r\nzz\r\n")),
+def binary(body: bytes, fields: str = "{}") -> bytes:
+    """Return a request of the variant whose body is the picture."""
+    return post(body, PATHS["binary"], "Content-Type: image/png", f"{PARAMETERS_HEADER}: {fields}")
+
+
+CLIENTS = clients("as-deployed")
+LARGE = large("as-deployed")
+FAST = (*clients("best-effort"), Case("deep parameters", sends(binary(b"", "[" * 50_000)), REFUSED))
+FAST_LARGE = (
+    *large("best-effort"),
+    Case("60 MiB of zeros as a picture", sends(lambda: binary(bytes(60 * MIB))), REFUSED),
+    Case("900 million pixels as the body", sends(lambda: binary(bomb())), REFUSED),
 )
-FAST: tuple[Case[Attack], ...] = (
-    *ANY_CLIENT,
-    *_clients(FAST_CHAT),
-    Case("64 MiB of zeros as pixels", sends_made(lambda: [binary(bytes(64 * MIB))]), REFUSED),
-    Case("deep parameters", sends(binary(b"", "[" * 50_000)), REFUSED),
-    Case(
-        "picture of 900 million pixels as the body",
-        sends_made(lambda: [binary(bomb())]),
-        REFUSED + "IMAGE_PIXELS",
+
+
+def delta(**fields: object) -> bytes:
+    """Return one chunk of a chat completion."""
+    choice = {"index": 0, "delta": fields, "finish_reason": None}
+    return b"data: " + json.dumps({"choices": [choice]}).encode() + b"\n\n"
+
+
+def compressed() -> bytes:
+    """Return 64 MiB in 64 kB."""
+    return zlib.compress(bytes(64 * MIB), 9, wbits=31)
+
+
+UNENDED = response().removesuffix(b"\r\n")
+BYTES = r"sent more than \d+ bytes for 8 tokens"
+LATE = r"did not end its answer within 1 s; see `deadline` and `max_tokens`"
+MANY = 1 << 12
+"""Messages sent at once: a test's server is slower than its client otherwise."""
+SERVERS = (
+    Server("silence", answers(), timeout_s=0.5),
+    Server("gone at once", answers(leaves=True)),
+    Server("noise", answers(NOISE)),
+    Server("endless zeros", answers(again=bytes(1 << 16))),
+    Server("endless headers", answers(UNENDED, again=b"X-More: x\r\n" * MANY), "broke the connection"),
+    Server("endless tokens", answers(response(), again=delta(content="go ") * MANY), BYTES),
+    Server("tokens, slowly", answers(response(), again=delta(content="go "), every_s=0.05), LATE, deadline_s=1.0),
+    Server("endless thoughts", answers(response(), again=delta(reasoning_content="hmm ") * MANY), BYTES),
+    Server("endless comments", answers(response(), again=b": ping\n\n" * MANY), BYTES),
+    Server("an endless line", answers(response(), b"data: ", again=b"x" * MANY), BYTES),
+    Server("an endless event", answers(response(), again=b"data: x\n" * MANY), BYTES),
+    Server("endless bare JSON", answers(response(), again=b"[\n" * MANY), BYTES),
+    Server("an endless refusal", answers(response("400 No", "text/plain"), again=b"no " * MANY), BYTES),
+    Server(
+        "a refusal, slowly", answers(response("400 No", "text/plain"), again=b"no ", every_s=0.05), LATE, deadline_s=1.0
+    ),
+    Server("a page", answers(response(kind="text/html"), b"<p>", leaves=True), "as text/html where"),
+    Server("a forged line", answers(response("400 No", "text/plain"), FORGED.encode(), leaves=True), "all is well"),
+    Server(
+        "a compressed answer",
+        answers(response("200 OK", "text/event-stream", "Content-Encoding: gzip"), lambda *_: compressed()),
+        r"compressed its answer \(gzip\)",
     ),
 )
-
-
-CONTROL = "\x1b[2J\r\nOK: all is well\x07\x00"
-
-SERVERS = servers("http://")
-"""The client also meets those of `tests/servers/hostile.py`, in `test_client`."""

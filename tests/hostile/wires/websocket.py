@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import re
+import socket
 from typing import Any
 
 import msgpack
+import numpy as np
 from websockets.frames import Frame, Opcode
 from websockets.utils import accept_key
 
 from s2a_bench.plugins.policy_servers.websocket.codec import OURS
-from tests.hostile.suite import FAILED, Attack, Case, Trap
-from tests.hostile.tcp import CLIENTS as ANY_CLIENT
-from tests.hostile.tcp import NOISE, Block, answers, crowd, sends, sends_made, servers
-from tests.hostile.wires.http import CONTROL, bomb
+from tests.hostile.peers import CLOSED, FORGED, MIB, NOISE, Attack, Case, Server, Step, Trap, answers, crowd, sends
+from tests.hostile.wires.http import bomb
 
-SCHEME = "ws://"
 KEY = "dGhlIHNhbXBsZSBub25jZQ=="
 
 
@@ -36,44 +35,53 @@ def announced(length: int, *, mask: bool = True) -> bytes:
     return b"\x82" + bytes([127 | mask << 7]) + length.to_bytes(8, "big") + b"mask" * mask
 
 
-def array(data: bytes, shape: Any) -> dict[bytes, Any]:
+def array(data: bytes = bytes(8), dtype: Any = "<f4", shape: Any = (2,)) -> dict[bytes, Any]:
     """Return what stands for an array."""
-    return {b"__ndarray__": True, b"data": data, b"dtype": "<f4", b"shape": shape}
+    return {b"__ndarray__": True, b"data": data, b"dtype": dtype, b"shape": shape}
 
 
-def says(value: Any) -> bytes:
-    """Return an observation in a frame."""
-    return frame(msgpack.packb(value))
+def says(value: Any, *, mask: bool = True) -> bytes:
+    """Return a message in a frame."""
+    return frame(msgpack.packb(value), mask=mask)
 
 
-def asked(*pieces: bytes, **more: Any) -> Attack:
+def asks(*pieces: Any, **more: Any) -> Attack:
     """Return a client that shakes hands and sends pieces."""
     return sends(upgrade(), *pieces, **more)
 
 
 GO = says({"prompt": "go on"})
-NO_MESSAGE = "that are no message"
+ERROR = "that are no message|no such picture|error|Error"
+LINES = [b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)]
+FRAGMENT = frame(bytes(MIB), Opcode.CONT, fin=False)
 
-CLIENTS: tuple[Case[Attack], ...] = (
-    *ANY_CLIENT,
-    Case(
-        "a handshake a byte at a time",
-        sends(*(bytes([byte]) for byte in upgrade()[:-2] + b"x: " + b"a" * 300), every_s=0.05),
-        "^$",
-    ),
-    Case("1 MiB of headers", sends(upgrade()[:-2], *[b"x-%d: %s\r\n" % (n, b"a" * 100) for n in range(10_000)])),
-    Case("a page of a browser", sends(upgrade("Origin: https://example.org")), "^HTTP/1.1 403 "),
-    Case(
-        "1 GiB announced in a frame", asked(announced(1 << 30), NOISE, first=1), "exceeds limit|too big|over size limit"
-    ),
-    Case("a picture of 900 million pixels", sends_made(lambda: [upgrade(), says({"image": bomb()})]), "IMAGE_PIXELS"),
-    Case("200 requests in one piece", asked(GO * 200), "actions"),
-    Case("gone in the middle of an answer", asked(GO, then="goes")),
-    Case("100 clients at once", crowd(100, asked(GO)), "actions"),
+CLIENTS = (
+    Case("noise", sends(NOISE), CLOSED),
+    Case("half a handshake", sends(upgrade()[:60], then="leaves")),
+    Case("another path of HTTP", sends(b"POST / HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\n\r\n{}"), CLOSED),
+    Case("a frame without a mask", asks(frame(b"abc", mask=False)), CLOSED),
+    Case("a frame of no kind", asks(b"\x8f\x80mask"), CLOSED),
+    Case("no MessagePack", asks(frame(b"\xc1")), ERROR),
+    Case("deep MessagePack", asks(frame(b"\x91" * 5000)), ERROR),
+    Case("a text that is no UTF-8", asks(frame(b"\xff\xfe", Opcode.TEXT)), f"{ERROR}|{CLOSED}"),
+    Case("an array of objects", asks(says({"state": array(dtype="|O")})), ERROR),
+    Case("pixels that are not there", asks(says({"image": array(b"", "|u1", (480, 640, 3))})), ERROR),
+    Case("200 requests in one piece", asks(GO * 200), "actions|at once"),
+    Case("gone in the middle of an answer", asks(GO, then="leaves")),
+    Case("100 that come and go", crowd(100, asks(GO, then="resets"))),
+)
+LARGE = (
+    Case("1 GiB announced in a frame", asks(announced(1 << 30), NOISE), CLOSED),
+    Case("256 MiB in fragments", asks(frame(b"", fin=False), *[FRAGMENT] * 256), CLOSED),
+    Case("60 MiB of zeros", asks(lambda: frame(bytes(60 * MIB))), ERROR),
+    Case("1 MiB of headers", sends(upgrade()[:-2], *LINES), CLOSED),
+    Case("pings whose pongs nobody reads", asks(*[frame(bytes(99), Opcode.PING) * 999] * 20, then="leaves")),
+    Case("a picture of 900 million pixels", asks(lambda: says({"image": bomb()})), ERROR),
+    Case("300 connections at once", crowd(300, asks(GO)), f"actions|at once|open already|{CLOSED}"),
 )
 
 
-def accepted(heard: bytes) -> bytes:
+def accepted(_connection: socket.socket, heard: bytes) -> bytes:
     """Return the answer to a handshake."""
     key = re.search(rb"Sec-WebSocket-Key: (\S+)", heard, re.IGNORECASE)
     accept = accept_key(key[1].decode() if key else "")
@@ -81,39 +89,23 @@ def accepted(heard: bytes) -> bytes:
     return "\r\n".join([*head, f"Sec-WebSocket-Accept: {accept}", "", ""]).encode()
 
 
-def tells(value: Any) -> bytes:
-    """Return a server's message."""
-    return frame(msgpack.packb(value), mask=False)
-
-
-def _answers(*pieces: Block, **more: Any) -> Trap:
-    return answers(*pieces, scheme=SCHEME, **more)
-
-
-def _greets(*pieces: Block, **more: Any) -> Trap:
+def greets(*steps: Step, **more: Any) -> Trap:
     """Return a server that shakes hands, greets as ours does, and then says what it says."""
-    return _answers(accepted, tells({"server": OURS}), *pieces, **more)
+    return answers(accepted, says({"server": OURS}, mask=False), *steps, **more)
 
 
-CHUNK = {"actions": array(bytes(24), (2, 3))}
-
-SERVERS: tuple[Case[Trap], ...] = (
-    *servers(SCHEME),
-    Case("a page", _answers(b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nhi"), "^RequestFailed: .*answered 200: hi"),
-    Case("a redirect", _answers(b"HTTP/1.1 302 Found\r\nLocation: ws://127.0.0.1:1/\r\n\r\n", then="goes"), FAILED),
-    Case("an accept that fits nothing", _answers(lambda _: accepted(b"")), "^RequestFailed: .*Accept"),
-    Case("a handshake, then silence", _answers(accepted), "^RequestFailed: .*silent"),
-    Case("a greeting that is no message", _answers(accepted, frame(b"\xc1", mask=False)), NO_MESSAGE),
-    Case("a greeting, then silence", _greets(), "^RequestFailed: .*silent"),
-    Case("a chunk, then marks that are none", _greets(tells(CHUNK), tells({"s2a": [5]})), "marks is none"),
-    Case("1 GiB announced in a frame", _greets(announced(1 << 30, mask=False), NOISE), FAILED),
-    Case("an error that forges lines", _greets(frame(CONTROL.encode(), Opcode.TEXT, mask=False)), "all is well"),
-    Case(
-        "an error without end",
-        _greets(
-            frame(b"", Opcode.TEXT, fin=False, mask=False), again=[frame(NOISE, Opcode.CONT, fin=False, mask=False)]
-        ),
-        FAILED,
-    ),
-    Case("partial frames without end", _greets(again=[tells({"type": "partial", **CHUNK}) * 100]), FAILED),
+CHUNK = {"actions": array(np.zeros(6, np.float32).tobytes(), shape=(2, 3))}
+SERVERS = (
+    Server("silence", answers(), timeout_s=0.5),
+    Server("noise", answers(NOISE)),
+    Server("a page", answers(b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nhi"), "^RequestFailed: .*answered 200"),
+    Server("endless headers", answers(b"HTTP/1.1 101 Yes\r\n", again=b"x: y\r\n" * 1000), timeout_s=0.5),
+    Server("an accept that fits nothing", answers(lambda *_: accepted(*_[:1], b"")), "^RequestFailed: .*Accept"),
+    Server("a greeting that is no message", answers(accepted, frame(b"\xc1", mask=False)), "no message"),
+    Server("a greeting, then silence", greets(), "^RequestFailed: .*silent", timeout_s=0.5),
+    Server("a frame with a mask", greets(frame(msgpack.packb(CHUNK))), timeout_s=0.5),
+    Server("marks that are none", greets(says(CHUNK, mask=False), says({"s2a": [5]}, mask=False)), "marks"),
+    Server("1 GiB announced in a frame", greets(announced(1 << 30, mask=False), NOISE)),
+    Server("a forged line", greets(frame(FORGED.encode(), Opcode.TEXT, mask=False)), "all is well"),
+    Server("endless pings", greets(again=frame(b"", Opcode.PING, mask=False) * 1000), timeout_s=0.5),
 )

@@ -1,37 +1,26 @@
-"""Hostile peers of our ZeroMQ server and client: any over TCP, and some that greet as ZMTP wants it."""
+"""Hostile peers of our ZeroMQ server and client, some of which greet as ZMTP wants it."""
 
 from __future__ import annotations
 
-import socket
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from threading import Thread
 from typing import Any
 
 import msgpack
 import numpy as np
 
 from s2a_bench.plugins.policy_servers.zmq.wire import file_of
-from s2a_bench.transport import Wiring
-from tests.hostile.suite import FAILED, PATIENCE_S, Attack, Case, Trap
-from tests.hostile.tcp import CLIENTS as ANY_CLIENT
-from tests.hostile.tcp import NOISE, answers, crowd, sends, servers
-from tests.hostile.wires.http import CONTROL, MIB
+from tests.hostile.peers import CLOSED, FORGED, MIB, NOISE, Attack, Case, Server, Trap, answers, crowd, hears, sends
+from tests.hostile.wires.http import bomb
 
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00" + b"NULL".ljust(20, b"\0") + bytes(32)
 """ZMTP 3.0 without security."""
 
 
-def command(name: bytes, data: bytes = b"") -> bytes:
-    """Return a command."""
-    body = bytes([len(name)]) + name + data
-    return bytes([4, len(body)]) + body
-
-
 def ready(kind: bytes) -> bytes:
     """Return a greeting and what follows it, for a socket of a kind."""
-    return GREETING + command(b"READY", b"\x0bSocket-Type" + struct.pack(">I", len(kind)) + kind)
+    name, data = b"READY", b"\x0bSocket-Type" + struct.pack(">I", len(kind)) + kind
+    body = bytes([len(name)]) + name + data
+    return GREETING + bytes([4, len(body)]) + body
 
 
 def frame(body: bytes, *, more: bool = False, said: int | None = None) -> bytes:
@@ -56,88 +45,60 @@ def npy(file: Any) -> dict[str, Any]:
     return {"__ndarray_class__": True, "as_npy": file}
 
 
-def request(data: Any = None, **fields: Any) -> bytes:
+def request(data: Any, **fields: Any) -> bytes:
     """Return a request for actions."""
-    return packed({"endpoint": "get_action", "data": data if data is not None else {}, **fields})
+    return packed({"endpoint": "get_action", "data": data, **fields})
 
 
-def asks(*bodies: bytes, **more: Any) -> Attack:
-    """Return a client that greets as a REQ socket, and sends one message once the server has greeted, too.
-
-    libzmq breaks with a peer that speaks before its own greeting is out.
-    """
-    return sends(ready(b"REQ"), message(*bodies), first=len(GREETING), **{"seconds": 0.5, **more})
+def greets(*pieces: Any, kind: bytes = b"REQ", **more: Any) -> Attack:
+    """Return a client that greets; what follows comes after the server's greeting, or libzmq breaks with it."""
+    return sends(ready(kind), *pieces, greeted=len(GREETING), **more)
 
 
 REFUSED = "error"
-FLOOD = frame(b"", more=True) * 100_000 + frame(b"")
+MOVES = message(packed([{"robot": np.zeros((1, 4, 7), np.float32)}, {}]))
 
-CLIENTS: tuple[Case[Attack], ...] = (
-    *ANY_CLIENT,
-    Case("half a message, then silence", sends(ready(b"REQ"), message(request())[:-5], seconds=1, first=len(GREETING))),
+CLIENTS = (
+    Case("noise", sends(NOISE), CLOSED),
+    Case("half a greeting", sends(GREETING[:20], then="leaves")),
+    Case("half a message", greets(message(request({}))[:-5], then="resets")),
+    Case("noise as a request", greets(message(NOISE)), REFUSED),
+    Case("deep MessagePack", greets(message(b"\x91" * 5000)), REFUSED),
+    Case("no endpoint", greets(message(packed({"endpoint": FORGED}))), "Unknown endpoint"),
+    Case("max_tokens -1", greets(message(request({}, s2a={"max_tokens": -1}))), REFUSED),
+    Case("an array that is no file", greets(message(request({"state.a": npy(NOISE)}))), REFUSED),
+    Case("a picture of one number", greets(message(request({"video.a": np.zeros(1, np.uint8)}))), REFUSED),
+    Case("gone without waiting", greets(message(request({})), then="resets")),
+    Case("100 clients at once", crowd(100, greets(message(request({})))), "robot|error"),
+)
+LARGE = (
+    Case("1 GiB announced", greets(frame(b"", more=True), frame(bytes(MIB), said=1 << 30)), CLOSED),
+    Case("60 MiB of zeros as a picture", greets(lambda: message(request({"video.a": bytes(60 * MIB)}))), REFUSED),
     Case(
-        "1 GiB announced in a frame",
-        sends(ready(b"REQ"), frame(b"", more=True), frame(bytes(MIB), said=1 << 30), first=len(GREETING)),
+        "a picture of 900 million pixels",
+        greets(lambda: message(request({"video.a": np.frombuffer(bomb(), np.uint8)}))),
+        REFUSED,
     ),
-    Case("100,000 frames before the message", sends(ready(b"REQ"), FLOOD, seconds=1, first=len(GREETING))),
-    Case("noise", asks(NOISE), REFUSED),
-    Case("an endpoint that is none", asks(packed({"endpoint": CONTROL})), r"Unknown endpoint: '\\x1b"),
-    Case("states without end", asks(request({"state.a": npy(file_of(np.zeros(1 << 20, np.float32)))})), REFUSED),
-    Case("gone without waiting", asks(request({}), then="resets")),
-    Case(
-        "100 clients at once",
-        crowd(100, sends(ready(b"REQ"), message(request({})), seconds=2, first=len(GREETING))),
-        "robot|error",
-    ),
-    Case(
-        "1000 requests of one who reads nothing",
-        sends(ready(b"DEALER"), message(request({})) * 1000, then="goes", first=len(GREETING)),
-    ),
+    Case("1000 requests, nothing read", greets(message(request({})) * 1000, kind=b"DEALER", then="leaves")),
 )
 
 
-def converses(*pieces: bytes) -> Trap:
-    """Return a server that greets as a REP socket, hears a request out, answers with pieces, and listens."""
-
-    def serve(listener: socket.socket) -> None:
-        with suppress(OSError):
-            while True:
-                connection, _ = listener.accept()
-                Thread(target=talk, args=(connection,), daemon=True).start()
-
-    def talk(connection: socket.socket) -> None:
-        with connection, suppress(OSError):
-            connection.settimeout(PATIENCE_S * 5)
-            connection.sendall(ready(b"REP"))
-            heard = b""
-            while b"get_action" not in heard and (data := connection.recv(1 << 16)):
-                heard += data
-            connection.sendall(b"".join(pieces))
-            while connection.recv(1 << 16):
-                pass
-
-    @contextmanager
-    def trap(_: Wiring[Any]) -> Iterator[str]:
-        with socket.create_server(("127.0.0.1", 0)) as listener:
-            Thread(target=serve, args=(listener,), daemon=True).start()
-            try:
-                yield "tcp://{}:{}".format(*listener.getsockname())
-            finally:
-                listener.shutdown(socket.SHUT_RDWR)
-
-    return trap
+def answered(*messages: bytes) -> Trap:
+    """Return a server that greets as a REP socket, and answers the first request."""
+    return answers(ready(b"REP"), hears(b"get_action"), *messages)
 
 
-MOVES = message(packed([{"robot": np.zeros((1, 4, 7), np.float32)}, {}]))
-
-SERVERS: tuple[Case[Trap], ...] = (
-    *servers("tcp://"),
-    Case("greeted, then silence", answers(ready(b"REP"), scheme="tcp://"), "^RequestFailed: .*silent"),
-    Case("100,000 frames", converses(FLOOD), "100001 frames"),
-    Case("noise", converses(message(NOISE)), FAILED),
-    Case("no actions", converses(message(packed([{}, {}]))), FAILED),
-    Case("an error that forges lines", converses(message(packed({"error": CONTROL}))), "^RequestFailed: .*all is well"),
-    Case("1 GiB announced in an answer", converses(frame(b"", more=True), frame(b"a", said=1 << 30)), FAILED),
-    Case("actions, then silence where the marks belong", converses(MOVES), "^RequestFailed: .*silent"),
-    Case("marks that are none", converses(MOVES, message(packed({"s2a": {"clock": 5}}))), "marks is none"),
+SERVERS = (
+    Server("silence", answers(), timeout_s=0.5),
+    Server("noise", answers(NOISE), timeout_s=0.5),
+    Server("greeted, then silence", answered(), "^RequestFailed: .*silent", timeout_s=0.5),
+    Server("another kind of socket", answers(ready(b"PUB")), timeout_s=0.5),
+    Server("noise as an answer", answered(message(NOISE))),
+    Server("100,000 frames", answered(frame(b"", more=True) * 100_000 + frame(b"")), "frames"),
+    Server("no actions", answered(message(packed([{}, {}])))),
+    Server("actions of sentences", answered(message(packed([{"robot": [["a", "b"]]}, {}])))),
+    Server("a forged line", answered(message(packed({"error": FORGED}))), "all is well"),
+    Server("an error of 15 MiB", answered(message(packed({"error": "no " * 5 * MIB})))),
+    Server("1 GiB announced", answered(frame(b"a", said=1 << 30)), timeout_s=0.5),
+    Server("marks that are none", answered(MOVES, message(packed({"s2a": 5}))), "marks|silent", timeout_s=0.5),
 )

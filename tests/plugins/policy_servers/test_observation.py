@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,12 @@ from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.frames.convert import encode_png
 from s2a_bench.plugins.policy_servers.observation import DEFAULT, EXTENSION, Template, names, template_of
 from s2a_bench.plugins.policy_servers.observed import (
-    extension_of,
     read_observation,
     remote_of,
-    request_of,
     take_extension,
 )
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport.limits import LIMITS, Limits
-from s2a_bench.types import Request
 
 FIRST, SECOND = (np.full((4, 6, 3), number, np.uint8) for number in (1, 2))
 STATE = tuple(float(number) for number in range(8))
@@ -31,65 +27,53 @@ def filled(content: Any, pictures: Any = (FIRST, SECOND), state: Any = (), promp
     return Template(content, "mine").fill(pictures, state, prompt)
 
 
-def test_places_become_pictures_state_and_prompt() -> None:
-    got = filled({"a": "{image}", "b": {"c": "{image:1}"}, "s": "{state}", "p": "{prompt}"}, state=STATE)
+def equal(got: Any, expected: Any) -> bool:
+    """Return True for the same values, whose arrays are of the same type."""
+    if isinstance(expected, dict):
+        return got.keys() == expected.keys() and all(equal(got[key], value) for key, value in expected.items())
+    if isinstance(expected, np.ndarray):
+        return got.dtype == expected.dtype and np.array_equal(got, expected)
+    return type(got) is type(expected) and bool(got == expected)
+
+
+def numbers(*values: float) -> Any:
+    return np.array(values, np.float32)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ({"a": "{image}", "b": {"c": "{image:1}"}}, {"a": FIRST, "b": {"c": SECOND}}),
+        ({"p": "{prompt}", "q": "Task: {prompt}; {{json}}"}, {"p": "{image}", "q": "Task: {image}; {json}"}),
+        ({"all": "{state}", "first": "{state::2}"}, {"all": numbers(*range(8)), "first": numbers(0, 1)}),
+        ({"arm": "{state:0:7}", "rest": "{state:7:}"}, {"arm": numbers(*range(7)), "rest": numbers(7)}),
+        ({"video": [["{image}"]], "s": [["{state:7:8}"]]}, {"video": FIRST[None, None], "s": numbers(7)[None, None]}),
+        ({"both": ["{image:0}", "{image:1}"]}, {"both": np.stack([FIRST, SECOND])}),
+        ({"language": [["{prompt}"]], "other": [1, 2.5]}, {"language": [["{image}"]], "other": [1, 2.5]}),
+        ({"flag": True, "none": None, "empty": []}, {"flag": True, "none": None, "empty": []}),
+        ({"a": "{image:0|CHW}"}, {"a": FIRST.transpose(2, 0, 1)}),
+        ({"a": "{image:1|bytes}"}, {"a": SECOND.tobytes()}),
+        ({"a": "{image}", "b?": "{image:2}", "c?": {"d": ["{state:7:9}"]}, "p?": "x"}, {"a": FIRST, "p": "x"}),
+        ({"c?": {"d": ["{state:7:8}"]}, "e?": "{images}"}, {"c": {"d": numbers(7)[None]}, "e": [FIRST, SECOND]}),
+    ],
+)
+def test_places_become_pictures_state_and_prompt_which_is_not_read_again(content: Any, expected: Any) -> None:
+    got = filled({"views?": "{images}", "state?": "{state}", **content}, state=STATE, prompt="{image}")
+    assert equal({key: got[key] for key in got.keys() - {"views", "state"}}, expected)
+
+
+def test_pictures_are_not_copied_but_for_their_colours_first() -> None:
+    got = filled({"a": "{image}", "video": [["{image}"]], "c": "{image:0|CHW}", "b": "{image:1}"})
     assert got["a"] is FIRST
-    assert got["b"]["c"] is SECOND
-    assert (got["s"].dtype, got["s"].tolist()) == (np.float32, list(STATE))
-    assert got["p"] == "go"
-
-
-def test_a_slice_of_the_state() -> None:
-    got = filled(
-        {"joints": "{state:0:7}", "gripper": "{state:7:8}", "rest": "{state:6:}", "head": "{state::2}"}, (), STATE
-    )
-    assert {key: value.tolist() for key, value in got.items()} == {
-        "joints": [0, 1, 2, 3, 4, 5, 6],
-        "gripper": [7],
-        "rest": [6, 7],
-        "head": [0, 1],
-    }
-
-
-def test_a_list_of_arrays_is_an_array_with_one_more_axis() -> None:
-    got = filled({"video": [["{image}"]], "both": ["{image:0}", "{image:1}"], "state": [["{state}"]]}, state=STATE)
-    assert got["video"].shape == (1, 1, 4, 6, 3)
-    assert np.shares_memory(got["video"], FIRST)  # no copy
-    np.testing.assert_array_equal(got["both"], np.stack([FIRST, SECOND]))
-    assert got["state"].shape == (1, 1, 8)
-
-
-def test_other_lists_and_values_stay_what_they_are() -> None:
-    content = {"language": [["{prompt}"]], "numbers": [1, 2.5], "flag": True, "none": None, "empty": []}
-    assert filled(content, ()) == {**content, "language": [["go"]]}
-
-
-def test_all_pictures_are_a_list_and_a_session_is_of_one_client() -> None:
-    content = {"views?": "{images}", "id": "{session}"}
-    assert filled(content)["views"] == [FIRST, SECOND]
-    assert set(filled(content, ())) == {"id"}
-    template = Template(content, "mine")
-    assert template.fill((), (), "")["id"] == template.fill((), (), "go")["id"]
-    assert len(template.fill((), (), "")["id"]) == 32
-    assert template.fill((), (), "") != Template(content, "mine").fill((), (), "")
-
-
-def test_a_prompt_stands_within_a_text_and_is_not_read_again() -> None:
-    assert filled({"p": "Task: {prompt}; {{json}}"}, (), prompt="{image}")["p"] == "Task: {image}; {json}"
-
-
-def test_colours_first_and_files() -> None:
-    got = filled({"a": "{image:0|CHW}", "b": "{image:1|bytes}"})
-    np.testing.assert_array_equal(got["a"], FIRST.transpose(2, 0, 1))
-    assert got["a"].flags.c_contiguous
-    assert got["b"] == SECOND.tobytes()
+    assert np.shares_memory(got["video"], FIRST)
+    assert got["c"].flags.c_contiguous
     assert Template({"b": "{image|bytes}"}, "mine").encoded
 
 
-def test_a_key_with_a_question_mark_is_left_out_where_the_request_lacks_it() -> None:
-    content = {"a": "{image}", "b?": "{image:1}", "c?": {"d": ["{state}"]}, "p?": "{prompt}"}
-    assert filled(content, [FIRST], ()) == {"a": FIRST, "p": "go"}
-    assert set(filled(content, state=STATE)) == {"a", "b", "c", "p"}
+def test_a_session_is_of_one_client() -> None:
+    one, other = (Template({"views?": "{images}", "id": "{session}"}, "mine") for _ in "ab")
+    assert one.fill((), (), "") == one.fill((), (), "go") != other.fill((), (), "")
+    assert len(one.fill((), (), "")["id"]) == 32
 
 
 @pytest.mark.parametrize(
@@ -99,16 +83,12 @@ def test_a_key_with_a_question_mark_is_left_out_where_the_request_lacks_it() -> 
         ({"a": ["{image:1}"], "s": "{state:7:9}"}, r"s wants the state's numbers \(7:9\), and the request has 8"),
         ({"a": "{image}", "t": "{prompt}"}, "places for 1 pictures, not 2"),
         ({"a": "{image:1}"}, "no place for the robot's state"),
+        ({"both": ["{image:0|CHW}", "{image:1}"]}, "both: all input arrays must have the same shape"),
     ],
 )
 def test_a_request_that_does_not_fit_is_refused_with_the_key(content: Any, says: str) -> None:
     with pytest.raises(RequestFailed, match=says):
         filled(content, state=STATE if "state" in says else ())
-
-
-def test_pictures_of_unlike_sizes_cannot_be_one_array() -> None:
-    with pytest.raises(RequestFailed, match="both: all input arrays must have the same shape"):
-        filled({"both": ["{image:0}", "{image:1}"]}, (FIRST, SECOND[1:]))
 
 
 def deep() -> Any:
@@ -161,14 +141,17 @@ def test_the_default_takes_what_there_is() -> None:
     ]
 
 
-def test_toml_and_json_say_the_same(tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_text('"observation/image" = "{image}"\n[x]\ny = [["{prompt}"]]\n')
-    (tmp_path / "a.json").write_text(json.dumps({"observation/image": "{image}", "x": {"y": [["{prompt}"]]}}))
-    for name in ("a.toml", "a.json"):
-        assert template_of(str(tmp_path / name)).fill([FIRST], (), "go") == {
-            "observation/image": FIRST,
-            "x": {"y": [["go"]]},
-        }
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.toml", '"observation/image" = "{image}"\n[x]\ny = [["{prompt}"]]\n'),
+        ("a.json", '{"observation/image": "{image}", "x": {"y": [["{prompt}"]]}}'),
+    ],
+)
+def test_toml_and_json_say_the_same(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    filled = template_of(str(tmp_path / name)).fill([FIRST], (), "go")
+    assert filled == {"observation/image": FIRST, "x": {"y": [["go"]]}}
 
 
 @pytest.mark.parametrize(
@@ -233,14 +216,6 @@ def test_files_are_decoded(whole: bool) -> None:
     assert [stage for stage, _ in trace.marks] == ["image_decode"]
 
 
-def test_the_pictures_of_a_request_share_its_pixels() -> None:
-    file = bytes(encode_png(np.zeros((10, 10, 3), np.uint8)))
-    images, _, _ = read_observation({"a": [file, file, file]}, Trace(), LIMITS.but(pixels=300))
-    assert len(images) == 3
-    with pytest.raises(RequestFailed, match=r"a: .*a picture of 10x10; at most 99 pixels are taken"):
-        read_observation({"a": [file, file, file]}, Trace(), LIMITS.but(pixels=299))
-
-
 @pytest.mark.parametrize(
     ("observation", "says"),
     [
@@ -262,11 +237,10 @@ def test_what_can_be_no_observation_is_refused_in_a_line(observation: Any, says:
         of(observation)
 
 
-def test_a_request_s_own_fields_come_back_and_leave_the_observation() -> None:
-    request = Request("a", "go", max_tokens=3, seed=7, grammar="root ::= 'x'")
-    message = {"prompt": "go", EXTENSION: extension_of(request)}
-    assert request_of(message, take_extension(message), Trace(), LIMITS) == request
-    assert message == {"prompt": "go"}
+def test_what_is_no_map_is_no_word_of_ours() -> None:
+    assert take_extension(np.zeros(3)) is None
+    with pytest.raises(RequestFailed, match="s2a should be a map"):
+        take_extension({EXTENSION: [1]})
 
 
 MARKS = Remote("c", [("queue", 1)], [2])
@@ -286,9 +260,3 @@ def test_marks_come_back_and_those_that_are_none_are_refused_in_a_line(message: 
     with pytest.raises(RequestFailed, match=r"^what should be the server's marks is none: .") as failed:
         remote_of(message)
     assert str(failed.value).isprintable()
-
-
-def test_what_is_no_map_is_no_word_of_ours() -> None:
-    assert take_extension(np.zeros(3)) is None
-    with pytest.raises(RequestFailed, match="s2a should be a map"):
-        take_extension({EXTENSION: [1]})

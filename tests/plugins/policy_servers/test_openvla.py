@@ -68,12 +68,6 @@ def test_the_pixels_arrive_as_rgb_and_the_action_comes_back_as_one_token(encodin
     assert set(spent.stages_ns) == {"base64_encode", "json_pack", "server"} | converts
 
 
-def test_without_a_key_of_statistics_none_is_sent() -> None:
-    deploy, seen = answering(json_numpy.dumps(ACTION))
-    asked(deploy)
-    assert seen[0].json == {"instruction": "pick up the cup"}
-
-
 @pytest.mark.parametrize(
     "encode",
     [
@@ -85,7 +79,9 @@ def test_without_a_key_of_statistics_none_is_sent() -> None:
     ],
 )
 def test_an_action_in_any_of_its_forms_is_read(encode: Callable[[np.ndarray], str]) -> None:
-    (token,), trace = asked(says(encode(ACTION)))
+    deploy, seen = answering(encode(ACTION))
+    (token,), trace = asked(deploy)
+    assert seen[0].json == {"instruction": "pick up the cup"}  # without a key of statistics
     np.testing.assert_allclose(np.array(json.loads(token.text)).reshape(-1)[:7], ACTION, rtol=1e-6)
     assert trace.facts["action_n"] in {7, 14}
 
@@ -125,11 +121,8 @@ def test_openvla_oft_is_sent_its_observation_and_answers_a_list_of_arrays() -> N
     deploy, seen = answering(json_numpy.dumps(OFT))
     actions, trace = asked(deploy, *PICTURES, state=STATE, template="openvla-oft", served_model="libero")
     payload = json_numpy.loads(seen[0].body)
-    assert (seen[0].path, payload.pop("instruction"), payload.pop("unnorm_key")) == (
-        "/act",
-        "pick up the cup",
-        "libero",
-    )
+    told = seen[0].path, payload.pop("instruction"), payload.pop("unnorm_key")
+    assert told == ("/act", "pick up the cup", "libero")
     np.testing.assert_array_equal(payload.pop("state"), np.array(STATE, np.float32))
     assert list(payload) == ["full_image", "left_wrist_image", "right_wrist_image"]
     for picture, frame in zip(payload.values(), PICTURES, strict=True):
@@ -175,19 +168,14 @@ def test_the_file_of_a_picture_is_an_array_of_its_bytes(tmp_path: Path) -> None:
     assert (prompt, seen[0].path) == ("pick up the cup", "/v1/act")
 
 
+OF_ACTIONS = {"dialect": "openvla"}
+
+
 @pytest.mark.parametrize(
     ("options", "cameras", "message"),
     [
-        (
-            {"dialect": "openvla", "template": "openvla-oft"},
-            4,
-            "`template` openvla-oft has places for 3 pictures, not 4",
-        ),
-        (
-            {"dialect": "openvla", "template": "vllm-omni-openvla"},
-            1,
-            "vllm-omni-openvla: openvla does not read s2a.idle_s",
-        ),
+        (OF_ACTIONS | {"template": "openvla-oft"}, 4, "`template` openvla-oft has places for 3 pictures, not 4"),
+        (OF_ACTIONS | {"template": "vllm-omni-openvla"}, 1, "vllm-omni-openvla: openvla does not read s2a.idle_s"),
         ({"dialect": "vllm", "template": "x-vla"}, 1, "the dialect 'vllm' takes none"),
         ({"template": "x-vla"}, 1, "the dialect 'openai' takes none; .*`dialect` openvla"),
     ],

@@ -24,9 +24,8 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("name", list(HOSTILE))
-def test_a_hostile_grammar_is_refused_with_its_reason(name: str) -> None:
-    text, reason = HOSTILE[name]
+@pytest.mark.parametrize(("text", "reason"), HOSTILE.values(), ids=HOSTILE)
+def test_a_hostile_grammar_is_refused_with_its_reason(text: str, reason: str) -> None:
     assert reason in beyond_limits(text)
 
 

@@ -24,7 +24,7 @@ from s2a_bench.transport.http.detect import cache_hits
 from s2a_bench.transport.http.dialects import open_dialect
 from s2a_bench.transport.ros.wire import remote_of
 from s2a_bench.types import Request
-from tests.servers.hostile import delta
+from tests.hostile.wires.http import delta
 from tests.servers.sockets import head, serving
 
 NONE = ["NaN", "Infinity", "-Infinity", "1e25", "1e300", "1e999", '"12"', "true", "-1", "[]", "{}", str(10**400)]
@@ -40,8 +40,9 @@ TOLD = [
 ]
 
 
-@pytest.mark.parametrize("value", NONE)
-@pytest.mark.parametrize(("dialect", "message"), TOLD)
+@pytest.mark.parametrize(
+    ("dialect", "message", "value"), [*((*TOLD[0], value) for value in NONE), *((*told, "1e25") for told in TOLD[1:])]
+)
 def test_it_is_absent(dialect: str, message: str, value: str) -> None:
     event, trace = open_dialect(dialect).event(json.loads(message % value)), Trace()
     trace.learn(event.facts)
