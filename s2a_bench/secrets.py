@@ -1,16 +1,17 @@
 """The secrets of this process, which are removed from everything that is shown or stored.
 
-A server may send a key back in an error, a header or its answer: plain, percent-encoded, in JSON's escapes, in Base64
-at any offset, in other case.
+A server may send a key back in an error, a header or its answer: plain, percent-encoded, in JSON's escapes, in Base64,
+alone or as the credentials of a header.
 """
 
 from __future__ import annotations
 
-import base64
+import json
 import re
+from base64 import b64encode
 from collections.abc import Iterator, Sequence
-from itertools import islice
 from typing import Any, Final
+from urllib.parse import quote
 
 LONG: Final = 8
 """A shorter secret, as the placeholder `ollama`, is removed from servers' messages only, as a separate word."""
@@ -49,40 +50,27 @@ def secrets_in(value: Any, name: str = "", *, inside: bool = False) -> Iterator[
 def keep(secret: str) -> None:
     """Remove a secret from now on."""
     if len(secret) >= LONG:
-        _long.setdefault(secret, "|".join([_letters(secret), *_in_base64(secret)]))
+        _long.setdefault(secret, "|".join(map(re.escape, _forms(secret))))
     elif secret:
-        _short.setdefault(secret, rf"(?<!\w){_letters(secret)}(?!\w)")
+        _short.setdefault(secret, rf"(?<!\w){re.escape(secret)}(?!\w)")
 
 
 def struck(text: str, *, short: bool = True) -> str:
     """Return a text without the secrets; with the ``short`` ones too, as in servers' messages."""
     patterns = [*_long.values(), *(_short.values() if short else ())]
-    return re.sub("|".join(patterns), STRUCK, text, flags=re.IGNORECASE) if patterns else text
+    return re.sub("|".join(patterns), STRUCK, text) if patterns else text
 
 
 def struck_pieces(texts: Sequence[str]) -> list[str]:
-    """Return the pieces of one text without the secrets, which may span several pieces."""
-    whole, patterns = "".join(texts), [*_long.values(), *_short.values()]
-    matches = list(re.finditer("|".join(patterns), whole, re.IGNORECASE)) if patterns else []
-    if not matches:
-        return list(texts)
-    letters = list(whole)
-    for match in matches:
-        letters[match.start() : match.end()] = [STRUCK] + [""] * (len(match[0]) - 1)
-    rest = iter(letters)
-    return ["".join(islice(rest, len(text))) for text in texts]
+    """Return the pieces of one text; if a secret is in it, perhaps over several, the first piece is all the rest."""
+    whole = "".join(texts)
+    shown = struck(whole)
+    return [*texts] if shown == whole else [shown, *[""] * (len(texts) - 1)]
 
 
-def _letters(secret: str) -> str:
-    r"""Return a pattern of a text whose letters may each be plain, ``%xx``, ``\x`` or ``\u00xx``."""
-    return "".join(rf"(?:\\?{re.escape(each)}|%(?:25)*{ord(each):02x}|\\u{ord(each):04x})" for each in secret)
-
-
-def _in_base64(secret: str) -> Iterator[str]:
-    """Yield a pattern for each offset of a text inside encoded data."""
-    for before in range(3):
-        data = bytes(before) + secret.encode()
-        whole = base64.b64encode(data).decode()
-        sure = whole[-(-before * 4 // 3) : len(data) * 4 // 3]
-        signs = {"+": r"(?:[-+]|%2b)", "/": r"(?:[/_]|%2f)"}
-        yield "".join(signs.get(each, each) for each in sure) + r"[\w+/-]?(?:=|%3d){0,2}"
+def _forms(secret: str) -> list[str]:
+    """Return the forms of a secret, each before the ones that begin like it."""
+    whole = [secret, f"Bearer {secret}", f"Api-Key {secret}"]
+    in_base64 = [b64encode(text.encode()).decode().rstrip("=") for text in whole]
+    in_json = json.dumps(secret)[1:-1]
+    return sorted({secret, quote(secret, safe=""), in_json, in_json.replace("/", "\\/"), *in_base64}, key=len)[::-1]

@@ -68,12 +68,12 @@ def decompressed(image: Any) -> Frame:
     image_transport writes "rgb8; jpeg compressed bgr8". Where bgr8 does not stand at the end, the picture was
     compressed as it was: a mosaic as grey, or with red and blue in each other's place. Raises TransportError.
     """
-    encoding, _, coding = image.format[: ros.SHOWN].partition(";")
+    encoding, _, coding = image.format.partition(";")
     ros.refuse_depth("16UC1" if "compressedDepth" in coding else encoding)
     try:
         rgb = decode_received(image.data)
     except ValueError as error:
-        raise TransportError(f"{len(image.data)} bytes of format '{image.format[: ros.SHOWN]}': {error}") from error
+        raise TransportError(f"{len(image.data)} bytes of format '{image.format}': {error}") from error
     frame = Frame(-1, ros.nanoseconds(image.header.stamp), rgb.shape[1], rgb.shape[0], "rgb8", rgb)
     if "compressed" in coding and "compressed bgr8" not in coding:
         if encoding in COLOURS:

@@ -78,8 +78,6 @@ class Measured:
     fingerprint: int
     fatal: S2AError | KeyboardInterrupt | None = None
     retry_after_s: float = 0.0
-    odd: frozenset[str] = frozenset()
-    """Names of the server's facts with impossible values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,7 +301,7 @@ class Session:
             )
             for (token, client_ns), left_ns in zip(seen, chain(engine_ns, repeat(None)), strict=False)
         ]
-        return Measured(sample, tokens, picture, apart, odd=frozenset(trace.odd))
+        return Measured(sample, tokens, picture, apart)
 
     def _doubt(self, trace: Trace, rgb_source: int | None, rgb_engine: int | None) -> str:
         if unknown := {stage for stage, _ in trace.chain() if stage} - self.request.stages.keys():

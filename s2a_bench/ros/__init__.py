@@ -221,8 +221,6 @@ class ServiceClient(Protocol):
 
 SERVICE_QOS = QoS(depth=10)
 """What ROS's services have."""
-REQUEST_BYTES = 1 << 20
-"""A request to a service of ours that is larger is dropped; an action's goals have bounds of their own."""
 
 
 class Middleware(Protocol):
@@ -242,7 +240,7 @@ class Middleware(Protocol):
         """Offer the service ``/x`` of ROS type ``pkg/srv/Name``; ``answer`` turns a request into its response.
 
         All services of a node are answered by one thread of the middleware. A request that cannot be read, or for
-        which ``answer`` raises, is dropped and logged; so is one of more than `REQUEST_BYTES`, where its size is known.
+        which ``answer`` raises, is dropped and logged.
         """
 
     def service_client(self, name: str, type_name: str) -> ServiceClient: ...

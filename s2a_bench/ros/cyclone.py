@@ -165,14 +165,7 @@ class CycloneMiddleware(ActionNode[Caller, DdsWaiter]):
             if w.topic_name.startswith("rt/")
         ]
 
-    def service_end(
-        self,
-        spec: ServiceSpec,
-        waiter: DdsWaiter,
-        qos: QoS | None = None,
-        *,
-        pictures: bool = False,  # noqa: ARG002 - Cyclone bounds what waits
-    ) -> DdsServiceServer:
+    def service_end(self, spec: ServiceSpec, waiter: DdsWaiter, qos: QoS | None = None) -> DdsServiceServer:
         server = DdsServiceServer(self._participant, spec, waiter, qos)
         self._node.add(*server.ends)
         return server

@@ -21,7 +21,7 @@ from s2a_bench.clock import now_ns
 from s2a_bench.ros import SERVICE_QOS, QoS
 from s2a_bench.ros.dds import DdsWaiter, RawReader, RawWriter, dds_qos, other_dds, user_data
 from s2a_bench.ros.messages import deserialise, serialise, type_hash
-from s2a_bench.ros.service import MATCH_POLL_S, REACH_S, READER_QOS, REMEMBERED_CLIENTS, ServiceEnd, ServiceSpec
+from s2a_bench.ros.service import MATCH_POLL_S, REACH_S, READER_QOS, ServiceEnd, ServiceSpec
 
 HEADER = struct.Struct("<Qq")
 """guid of the client and number of its request, after the 4 bytes of CDR header."""
@@ -146,8 +146,6 @@ class DdsServiceServer(_End, ServiceEnd[Caller]):
             endpoint = self.reader.endpoint(caller.sender)
             if endpoint is None:
                 return "", ""
-            if len(self._clients) >= REMEMBERED_CLIENTS:
-                self._clients.clear()
             self._clients[caller.sender] = other_dds(endpoint), user_data(endpoint).get("typehash", "")
         return self._clients[caller.sender]
 
@@ -162,8 +160,6 @@ class DdsServiceServer(_End, ServiceEnd[Caller]):
         while (endpoint := self.reader.endpoint(caller.sender)) is not None:
             client = user_data(endpoint).get("clientid")
             if client is None or any(user_data(each).get("clientid") == client for each in self.writer.endpoints()):
-                if len(self._reachable) >= REMEMBERED_CLIENTS:
-                    self._reachable.intersection_update(self.reader.peers())
                 self._reachable.add(caller.sender)
                 return True
             if now_ns() > deadline_ns:

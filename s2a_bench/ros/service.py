@@ -13,7 +13,7 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError
-from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, Publisher, QoS, Subscription
+from s2a_bench.ros import SERVICE_QOS, Publisher, QoS, Subscription
 from s2a_bench.ros.messages import DEFAULT_VERSION
 
 WAIT_SLICE_NS: Final = 500_000_000
@@ -26,9 +26,9 @@ MATCH_POLL_S: Final = 0.01
 """rclpy's own waiting looks four times a second."""
 REACH_S: Final = 0.1
 """A server waits so long for the reader of a client that it does not reach yet, as rmw_cyclonedds does."""
-REMEMBERED_CLIENTS: Final = 64
+
 WARNED_AT_MOST: Final = 100
-"""Kinds of a warning that are logged."""
+"""Kinds of a warning that are logged: the errors of a camera's frames may differ in each."""
 
 _log = logging.getLogger(__name__)
 Taken = TypeVar("Taken")
@@ -212,10 +212,8 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
     ) -> Source: ...
 
     @abstractmethod
-    def service_end(
-        self, spec: ServiceSpec, waiter: Waiter, qos: QoS | None = None, *, pictures: bool = False
-    ) -> ServiceEnd[Caller]:
-        """Make the server's side, without ``qos`` as an action's; requests may hold ``pictures``."""
+    def service_end(self, spec: ServiceSpec, waiter: Waiter, qos: QoS | None = None) -> ServiceEnd[Caller]:
+        """Make the server's side, without ``qos`` as an action's."""
 
     @abstractmethod
     def client_end(self, spec: ServiceSpec, waiter: Waiter) -> ClientEnd: ...
@@ -247,8 +245,8 @@ class ServiceNode(ABC, Generic[Caller, Waiter]):
     ) -> None:
         """Answer one request, unless its client has left; what cannot be answered is dropped."""
         try:
-            if not service.body_at < len(packed) <= REQUEST_BYTES:
-                raise TransportError(f"{len(packed)} bytes are no request; the most is {REQUEST_BYTES}")
+            if len(packed) <= service.body_at:
+                raise TransportError(f"{len(packed)} bytes are no request")
             response = service.pack(answer(service.unpack(packed)))
             if service.reaches(caller):
                 service.respond(response, caller)

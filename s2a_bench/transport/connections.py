@@ -1,4 +1,4 @@
-"""Connections of a server: one thread each, up to a limit; reads have a deadline, and writes never wait.
+"""Connections of a server: one thread each, up to a limit; a silence while reading ends, and writes never wait.
 
 The scheduler shares the processor among the threads: a client that floods its connection delays the others less than
 on an event loop. docs/reliability.md has the figures.
@@ -11,8 +11,8 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from threading import Lock, Thread
 from typing import Final
 
@@ -25,7 +25,6 @@ LINGER_S: Final = 1.0
 """Time for a client to read a refusal: closing at once would reset the connection."""
 PAUSE_S: Final = 0.1
 """Pause after a failed accept: the limit of open files or threads is reached."""
-HANGUP: Final = select.POLLRDHUP | select.POLLHUP | select.POLLERR
 _TIMEVAL: Final = struct.Struct("@ll")
 _log = logging.getLogger(__name__)
 
@@ -97,43 +96,14 @@ class Connections:
 
 
 class Wire:
-    """One accepted connection. Its client may be slow, or flood it: reads have a deadline, and writes never wait."""
+    """One accepted connection, which is read from its socket; writes never wait for a slow client."""
 
     def __init__(self, accepted: socket.socket) -> None:
         self.socket = accepted
         self._poll = select.poll()
         self._poll.register(accepted, select.POLLRDHUP)
-        self._ends_ns = 0
         self._unsent = bytearray()
         self._stopping = False
-
-    def read_until(self, ends_ns: int) -> None:
-        """Let reads raise TimeoutError from this time of CLOCK_MONOTONIC on; 0: never."""
-        self._ends_ns = ends_ns
-        if not ends_ns:
-            wait_at_most(self.socket, 0)
-
-    def recv(self, size: int) -> bytes:
-        """Wait for bytes; none if the client or this server has closed. Raises OSError."""
-        with self._in_time():
-            return self.socket.recv(size)
-
-    def recv_into(self, buffer: memoryview) -> int:
-        with self._in_time():
-            return self.socket.recv_into(buffer)
-
-    @contextmanager
-    def _in_time(self) -> Iterator[None]:
-        """Let the kernel bound the wait: a time-out of the socket object would hold for `sendall` too."""
-        if self._ends_ns:
-            left_ns = self._ends_ns - now_ns()
-            if left_ns <= 0:
-                raise TimeoutError
-            wait_at_most(self.socket, left_ns / 1e9)
-        try:
-            yield
-        except BlockingIOError:
-            raise TimeoutError from None
 
     def sendall(self, data: bytes | memoryview) -> None:
         """Send what the client takes at once; the rest follows with the next call or `flush`. Raises Disconnected."""
@@ -163,15 +133,16 @@ class Wire:
 
     def disconnected(self) -> bool:
         """Whether the client has hung up, even if some of its bytes are unread."""
-        return not self._stopping and any(events & HANGUP for _, events in self._poll.poll(0))
+        return not self._stopping and bool(self._poll.poll(0))
 
     def linger(self) -> None:
         """Close for writing, and discard what still arrives within `LINGER_S`."""
         with suppress(OSError, Disconnected):
             self.flush(LINGER_S)
             self.socket.shutdown(socket.SHUT_WR)
-            self.read_until(now_ns() + round(LINGER_S * 1e9))
-            while self.recv(1 << 18):
+            wait_at_most(self.socket, LINGER_S)
+            ends_ns = now_ns() + round(LINGER_S * 1e9)
+            while now_ns() < ends_ns and self.socket.recv(1 << 18):
                 pass
 
     def read_no_more(self) -> None:

@@ -84,10 +84,8 @@ def check_pixels(width: int, height: int, most: int) -> None:
         raise RequestFailed(f"a picture of {width}x{height}; at most {most} pixels are taken")
 
 
-PIECES_A_TOKEN, PIECES = 8, 64
-"""The most pieces of an answer, for each token and beside: a server may count otherwise, or send single letters."""
 BYTES_A_TOKEN, BYTES = 16 << 10, 5 << 20
-"""The most bytes of an answer, headers included, likewise; a token in OpenAI's dialect takes 300 bytes."""
+"""The most bytes of an answer, for each token and beside; a token in OpenAI's dialect takes 300 bytes."""
 
 
 class Bounds:
@@ -98,7 +96,6 @@ class Bounds:
         self._deadline_s = deadline_s
         self._ends_ns = now_ns() + int(deadline_s * 1e9)
         self._max_tokens = max_tokens
-        self._most_pieces = self._pieces = PIECES + PIECES_A_TOKEN * max_tokens
         self._most_bytes = self._bytes = BYTES + BYTES_A_TOKEN * max_tokens
 
     def left_s(self) -> float:
@@ -116,13 +113,4 @@ class Bounds:
         if self._bytes < 0:
             raise RequestFailed(
                 f"{self._server} sent more than {self._most_bytes} bytes for {self._max_tokens} tokens (`max_tokens`)"
-            )
-
-    def count_piece(self) -> None:
-        """Count a piece of the answer; raises RequestFailed if the server does not stop."""
-        self._pieces -= 1
-        if self._pieces < 0:
-            raise RequestFailed(
-                f"{self._server} does not stop: {self._most_pieces} pieces came for {self._max_tokens} tokens "
-                "(`max_tokens`)"
             )

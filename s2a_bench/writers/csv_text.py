@@ -61,22 +61,10 @@ class CsvTable:
         """Return the CSV of the `coded` table."""
         out = io.StringIO()
         table = self.coded(origins)
-        csv.writer(out, lineterminator="\n").writerows(map(_inert, row) for row in (table.header, *table.rows))
+        rows = csv.writer(out, lineterminator="\n")
+        for row in (table.header, *table.rows):
+            rows.writerow(visible(each) if isinstance(each, str) else each for each in row)
         return out.getvalue()
-
-
-def _inert(value: object) -> object:
-    """Return a value of visible characters that is no formula in a spreadsheet (OWASP, CSV injection)."""
-    if not isinstance(value, str):
-        return value
-    value = visible(value)
-    if not value.startswith(("=", "+", "-", "@", "\t", "\n")):
-        return value
-    try:
-        float(value)
-    except ValueError:
-        return f"'{value}"
-    return value
 
 
 def write_texts(run: StoredRun, tables: Mapping[str, TextTable], csvs: Mapping[str, CsvTable]) -> None:

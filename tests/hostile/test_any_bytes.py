@@ -22,7 +22,6 @@ from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring, open_client
 from s2a_bench.transport.http import detect
 from s2a_bench.transport.http.native import PATHS
-from s2a_bench.transport.limits import PIECES, PIECES_A_TOKEN
 from s2a_bench.transport.ros.wire import TOKEN_QOS, token_message
 from s2a_bench.types import Request, Token
 from tests.hostile.peers import (
@@ -83,19 +82,17 @@ def asking(name: str, address: str, timeout_s: float, deadline_s: float = 0) -> 
 
 @cases(SERVERS)
 def test_a_server_costs_its_client_an_error_of_one_line_and_little_memory(name: str, case: Server) -> None:
-    pieces, error = 0, ""
+    error = ""
     with case.does() as address, closing(open_client(asking(name, address, case.timeout_s, case.deadline_s))) as client:
         forget_peak(os.getpid())
         before = usage(os.getpid()).rss_mib
         try:
-            for _ in client.request(Request("a", "plan", max_tokens=TOKENS), Trace()):
-                pieces += 1
+            list(client.request(Request("a", "plan", max_tokens=TOKENS), Trace()))
         except S2AError as failure:
             error = f"{type(failure).__name__}: {failure}"
         assert usage(os.getpid()).peak_mib - before < CLIENT_MIB
     assert re.search(case.says, error)
     assert error.isprintable()
-    assert pieces <= PIECES + PIECES_A_TOKEN * TOKENS
 
 
 def test_who_asks_what_a_server_is_does_not_wait_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -106,21 +103,18 @@ def test_who_asks_what_a_server_is_does_not_wait_for_ever(monkeypatch: pytest.Mo
 
 
 @pytest.mark.parametrize("name", ["ros/topic", "ros/action"])
-@pytest.mark.parametrize(
-    ("every_s", "says"), [(0.0, r"does not stop: \d+ pieces came for 1 tokens"), (0.2, "within 1 s; see `deadline`")]
-)
-def test_ros_clients_have_the_same_bounds(name: str, every_s: float, says: str) -> None:
+def test_ros_clients_have_the_same_deadline(name: str) -> None:
     left = Event()
 
     def talks(_request: Request, _trace: Trace) -> Generator[Token, None, None]:
         for index in count():
             yield Token(index, "go ")
-            if left.wait(every_s):
+            if left.wait(0.2):
                 return
 
     with served(wiring_of(name, "/talks"), talks) as (server, _):
-        wiring = wiring_of(name, server.address, deadline_s=1 if every_s else 30)
-        with closing(open_client(wiring)) as client, pytest.raises(RequestFailed, match=says):
+        wiring = wiring_of(name, server.address, deadline_s=1)
+        with closing(open_client(wiring)) as client, pytest.raises(RequestFailed, match="within 1 s; see `deadline`"):
             list(client.request(Request("a", "plan", max_tokens=1), Trace()))
         left.set()
 

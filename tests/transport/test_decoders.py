@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from s2a_bench.transport.http.dialects import DIALECTS, Event, open_dialect
 from s2a_bench.transport.http.dialects.decoder import Decoder
-from s2a_bench.transport.http.dialects.framing import LIMIT, JsonLines, ServerSentEvents, WholeBody
+from s2a_bench.transport.http.dialects.framing import ServerSentEvents
 from s2a_bench.types import Token
 from tests.servers.speakers import SPEAKERS, Speaker
 
@@ -99,23 +99,6 @@ def test_bare_json_between_events_is_an_error(before: bytes, bare: bytes) -> Non
 def test_bare_json_that_stays_broken_is_an_error() -> None:
     (last,) = events("gemini", [b'{\n "error": {'])
     assert "not the dialect 'gemini'" in last.error
-
-
-@pytest.mark.parametrize("framing", [ServerSentEvents, JsonLines, WholeBody])
-def test_a_message_without_end_is_bounded(framing: type[ServerSentEvents]) -> None:
-    cutter = framing()
-    for _ in range(LIMIT // 2**16):
-        assert list(cutter.feed(b"x" * 2**16)) == []
-    with pytest.raises(ValueError, match="more than"):
-        list(cutter.feed(b"x"))
-
-
-def test_data_without_an_end_of_the_event_is_bounded() -> None:
-    cutter = ServerSentEvents()
-    for _ in range(LIMIT // 2**16 - 1):
-        assert list(cutter.feed(b"data: " + b"x" * 2**16 + b"\n")) == []
-    with pytest.raises(ValueError, match="an event of more than"):
-        list(cutter.feed(b"data: " + b"x" * 2**16 + b"\n"))
 
 
 def test_nothing_follows_an_error() -> None:

@@ -25,7 +25,6 @@ from s2a_bench.transport.ros.node import (
     ARRAY,
     EVENT,
     LOG,
-    LONGEST,
     Activity,
     Level,
     PartHealth,
@@ -187,12 +186,11 @@ def test_failures_and_old_frames_are_warnings_and_a_failure_is_logged_once(caplo
     assert (requests.level, camera.level) == (Level.OK, Level.OK)
 
 
-def test_a_log_is_cut_and_cleaned() -> None:
-    hostile = "a\0b\ud800" + "x" * 5000
+def test_a_log_is_cleaned() -> None:
+    hostile = "a\0b\ud800"
     record = logging.LogRecord("n", 35, "f.py", 3, hostile, (), None, "run")
     log = ros.deserialise(memoryview(bytes(ros.serialise(log_message(record, "n"), LOG))), LOG)
-    assert log.msg.startswith("a\ufffdb?xxx")
-    assert len(log.msg) == LONGEST
+    assert log.msg == "a\ufffdb?"
     assert (log.level, log.function, log.line) == (30, "run", 3)
 
 

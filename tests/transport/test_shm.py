@@ -36,8 +36,6 @@ from s2a_bench.types import Action, Frame, Request, Token
 from tests.hostile.peers import usage
 from tests.waiting import until
 
-NOBODY = 65534
-
 
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -209,14 +207,11 @@ def test_another_version_of_us_is_told_as_such() -> None:
     one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     with one, other:
         one.send(HELLO.pack(MAGIC[:-1] + b"1", 4096))
-        with pytest.raises(TransportError, match="another version of s2a-bench"):
+        with pytest.raises(TransportError, match="no s2a-bench, or one whose shared memory is laid out otherwise"):
             accept(other, 4096)
 
 
-@pytest.mark.parametrize(
-    "packet", [b"abc", *(PLACE.pack(*at) for at in ((0, 0), (0, 1 << 63), ((1 << 64) - 8, 8), (ANSWER_BYTES - 1, 2)))]
-)
-def test_a_place_that_cannot_be_is_no_answer(packet: bytes) -> None:
+def test_a_packet_that_is_none_is_no_answer() -> None:
     listener, path = unix_socket.listen("")
 
     def serve() -> None:
@@ -224,7 +219,7 @@ def test_a_place_that_cannot_be_is_no_answer(packet: bytes) -> None:
         with link:
             kept = accept(link, 1 << 30), offer(link, ANSWER_BYTES)
             link.recv(PLACE.size)
-            link.send(packet)
+            link.send(b"abc")
             del kept
 
     server = Thread(target=serve)
@@ -232,7 +227,7 @@ def test_a_place_that_cannot_be_is_no_answer(packet: bytes) -> None:
     with (
         listener,
         closing(open_client(wiring_of("shm", path))) as client,
-        pytest.raises(RequestFailed, match=r"sent what is no answer: .*(none of an answer|cannot be)"),
+        pytest.raises(RequestFailed, match="sent what is no answer: "),
     ):
         ask(client, Request("a", "plan"))
     server.join()
@@ -256,30 +251,6 @@ def test_the_memory_of_a_long_answer_is_given_back() -> None:
         assert answers.map[: 2 * STEP_BYTES] == bytes(2 * STEP_BYTES)
 
 
-def test_a_client_of_another_user_hears_why_it_is_refused(connect: Connect, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("s2a_bench.transport.shm.server.may_ask", lambda _: False)
-    with pytest.raises(RequestFailed, match="the link was refused: this server answers its own user only"):
-        ask(connect(RecordingHandler(["x"])), Request("a", "plan"))
-
-
-def test_who_may_ask_is_the_user_or_root(monkeypatch: pytest.MonkeyPatch) -> None:
-    one, other = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    with one, other:
-        assert unix_socket.user_of(one) == os.getuid()
-        for user, may in ((os.getuid(), True), (unix_socket.ROOT, True), (NOBODY, False)):
-            monkeypatch.setattr(unix_socket, "user_of", lambda _, user=user: user)
-            assert unix_socket.may_ask(one) is may
-
-
-def test_pictures_are_not_handed_to_another_users_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    listener, path = unix_socket.listen("")
-    with listener:
-        monkeypatch.setattr(unix_socket, "user_of", lambda _: NOBODY)
-        monkeypatch.setattr(unix_socket.os, "getuid", lambda: 1000)
-        with pytest.raises(TransportError, match="is another user's"):
-            open_client(wiring_of("shm", path))
-
-
 def test_memory_above_the_limit_is_refused() -> None:
     for connect in connector(replace(wiring_of("shm"), limits=Limits(body_mib=2))):
         client = connect(RecordingHandler(["x"]))
@@ -293,14 +264,13 @@ def test_nobody_there_is_one_line(tmp_path: Path) -> None:
         open_client(wiring_of("shm", str(tmp_path / "nobody.sock")))
 
 
-@pytest.mark.parametrize("gone", ["os.memfd_create", "socket.SO_PEERCRED"])
-def test_a_system_without_such_memory_says_so_in_one_line(monkeypatch: pytest.MonkeyPatch, gone: str) -> None:
-    monkeypatch.delattr(gone)
+def test_a_system_without_such_memory_says_so_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr("os.memfd_create")
     for opens in (
         lambda: open_client(wiring_of("shm", "x")),
         lambda: open_server(wiring_of("shm"), RecordingHandler([])),
     ):
-        with pytest.raises(UsageError, match=r"`transport` shm: it needs Linux \(memfd_create, SO_PEERCRED\); this is"):
+        with pytest.raises(UsageError, match=r"`transport` shm: it needs Linux \(memfd_create\); this is"):
             opens()
     found = shared_memory(Machine())
     assert found

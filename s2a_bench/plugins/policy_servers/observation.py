@@ -31,11 +31,10 @@ EXTENSION: Final = "s2a"
 """Key that no observation has."""
 ANY: Final = "*"
 """End of a key whose pictures have names from the server's greeting."""
-FILE_LETTERS, VALUES, DEPTH, CAMERAS = 1 << 16, 1024, 16, 64
-"""The most of a template: bytes, values, nested dictionaries and lists, pictures."""
+CAMERAS: Final = 64
+"""The most pictures of a template."""
 PICTURE_ROOTS: Final = "", "images.", "observation.images.", "input.images.", "input.observation.images."
 """What may stand before the names of pictures that a server lists (SGLang)."""
-WHOLE: Final = range(-(1 << 63), 1 << 64)
 
 _PLACE = re.compile(
     r"\{(?:(?P<all>images)|(?P<picture>image)(?::(?P<image>\d{1,3}))?(?:\|(?P<form>\w+))?"
@@ -105,12 +104,11 @@ class Template:
         self.accepts_state = False
         self.encoded = False
         """Whether pictures are the bytes of a file, as JPEG."""
-        self._values = 0
         if not isinstance(content, Mapping):
             raise UsageError(f"`template` {name} should be a table of keys, not {type(content).__name__}")
         server = content.get(EXTENSION, {})
         self.server = toml_file.checked(ExternalServer, server, f"`template` {name}: {EXTENSION}")
-        self._make = self._table({key: value for key, value in content.items() if key != EXTENSION}, "", 0)
+        self._make = self._table({key: value for key, value in content.items() if key != EXTENSION}, "")
 
     def fill(
         self, pictures: Sequence[Pixels], state: Sequence[float], prompt: str, names: Sequence[str] = ()
@@ -152,28 +150,25 @@ class Template:
     def _missing(self, path: str, wanted: str, given: object) -> _Missing:
         return _Missing(f"`template` {self.name}: {path} wants {wanted}, and the request has {given}")
 
-    def _value(self, value: Any, path: str, depth: int) -> _Make:
-        self._values += 1
-        if depth > DEPTH or self._values > VALUES:
-            self._refuse(path, f"exceeds the limits of a template: {VALUES} values, {DEPTH} nested")
+    def _value(self, value: Any, path: str) -> _Make:
         if isinstance(value, Mapping):
-            return self._table(value, path, depth)
+            return self._table(value, path)
         if isinstance(value, list):
-            return self._list(value, path, depth)
+            return self._list(value, path)
         if isinstance(value, str):
             return self._text(value, path)
-        if not (value is None or isinstance(value, (bool, float)) or (isinstance(value, int) and value in WHOLE)):
+        if not (value is None or isinstance(value, (bool, int, float))):
             self._refuse(path, f"is {value!r}, which no observation can hold")
         return lambda _: value
 
-    def _table(self, table: Mapping[str, Any], path: str, depth: int) -> _Make:
+    def _table(self, table: Mapping[str, Any], path: str) -> _Make:
         made: dict[str, tuple[_Make, bool]] = {}
         for key, value in table.items():
             name = key.removesuffix("?")
             inner = f"{path}.{name}" if path else name
-            if not name or name in made or not _is_text(name):
-                self._refuse(inner, "is twice there, empty, or no Unicode text")
-            made[name] = self._value(value, inner, depth + 1), name != key
+            if not name or name in made:
+                self._refuse(inner, "is twice there, or empty")
+            made[name] = self._value(value, inner), name != key
 
         def make(values: _Values) -> dict[str, Any]:
             filled: dict[str, Any] = {}
@@ -187,8 +182,8 @@ class Template:
 
         return make
 
-    def _list(self, values: Sequence[Any], path: str, depth: int) -> _Make:
-        makes = [self._value(value, f"{path}[{index}]", depth + 1) for index, value in enumerate(values)]
+    def _list(self, values: Sequence[Any], path: str) -> _Make:
+        makes = [self._value(value, f"{path}[{index}]") for index, value in enumerate(values)]
 
         def make(values: _Values) -> Any:
             filled = [make(values) for make in makes]
@@ -204,8 +199,6 @@ class Template:
         return make
 
     def _text(self, text: str, path: str) -> _Make:
-        if not _is_text(text):
-            self._refuse(path, "is no Unicode text")
         if place := _PLACE.fullmatch(text):
             if place["all"]:
                 return self._pictures(path)
@@ -275,15 +268,16 @@ def template_of(name: str) -> Template:
     path = TEMPLATES / f"{name}.toml" if name in known else Path(name)
     if not path.suffix:
         raise UsageError(f"`template`: {none_of(name, known, ', nor a TOML or JSON file')}")
-    text = toml_file.read(path, "template", FILE_LETTERS)
-    return Template(_loads(text, name) if path.suffix == ".json" else toml_file.loads(text, name), name)
+    text = toml_file.read(path, "template")
+    try:
+        return Template(_loads(text, name) if path.suffix == ".json" else toml_file.loads(text, name), name)
+    except RecursionError:
+        raise UsageError(f"`template` {name}: its lists or objects are too deep") from None
 
 
 def _loads(text: str, name: str) -> Any:
     try:
         return json.loads(text, object_pairs_hook=_table)
-    except RecursionError:
-        raise UsageError(f"`template` {name}: its lists or objects are too deep") from None
     except ValueError as error:
         raise UsageError(f"`template` {name}: no JSON: {error}") from error
 
@@ -308,10 +302,6 @@ def _keyed(name: str, value: Any, names: Sequence[str]) -> dict[str, Any]:
         known = f"{len(names)} pictures ({', '.join(names)})"
         raise RequestFailed(f"the server reads {known}, not {len(value)}; see `cameras`")
     return {name.removesuffix(ANY) + key: picture for key, picture in zip(names, value, strict=False)}
-
-
-def _is_text(text: str) -> bool:
-    return not any("\ud800" <= letter <= "\udfff" for letter in text)
 
 
 def _readable(name: str) -> str:

@@ -47,9 +47,7 @@ class PolicyClient(Client, Generic[P]):
     def request(self, request: Request, trace: Trace) -> Iterator[Piece]:
         bounds = self._wiring.bounds(self._url, request.max_tokens)
         try:
-            for piece in self._answer(request, bounds, trace):
-                bounds.count_piece()
-                yield piece
+            yield from self._answer(request, bounds, trace)
         except BaseException:
             self._abandon()
             raise

@@ -20,15 +20,13 @@ from zenoh import ext
 from s2a_bench.errors import TransportError
 from s2a_bench.plugins.zenoh import names
 from s2a_bench.plugins.zenoh.node import Bell, Node, SampleQueue, direct, give_way, open_session, refusals
-from s2a_bench.ros import REQUEST_BYTES, SERVICE_QOS, Offer, QoS, Tuning
+from s2a_bench.ros import SERVICE_QOS, Offer, QoS, Tuning
 from s2a_bench.ros.action import ActionNode
 from s2a_bench.ros.messages import CDR_HEADER, DEFAULT_VERSION, deserialise, serialise
 from s2a_bench.ros.service import ClientEnd, LogOnce, ServiceEnd, ServiceSpec, awaited
 
 CACHED_AT_MOST: Final = 1000
 """What a latched topic that keeps all keeps."""
-SMALL_BYTES: Final = 16 * REQUEST_BYTES
-"""So much of a service's requests may wait, where they hold no pictures."""
 ANSWER_S: Final = 86_400.0
 """A query may wait so long for its reply, as that for a goal's result does; callers wait less."""
 
@@ -151,14 +149,11 @@ class QueryOrigin:
 class ZenohServiceServer(ServiceEnd[QueryOrigin]):
     body_at = CDR_HEADER
 
-    def __init__(self, node: Node, spec: ServiceSpec, bell: Bell, qos: QoS, most_bytes: int) -> None:
-        """Declare the queryable, then announce it; ``bell`` is rung by what arrives.
-
-        Requests of ``most_bytes`` together may wait, with 0 as many as an inbox holds.
-        """
+    def __init__(self, node: Node, spec: ServiceSpec, bell: Bell, qos: QoS) -> None:
+        """Declare the queryable, then announce it; ``bell`` is rung by what arrives."""
         self.spec, self._node = spec, node
         self._key = node.key(spec.name, spec.type_name, spec.version)
-        self._inbox: SampleQueue[zenoh.Query] = SampleQueue(spec.name, bell, most_bytes=most_bytes)
+        self._inbox: SampleQueue[zenoh.Query] = SampleQueue(spec.name, bell)
         self._once = LogOnce(_log)
         held = ref(self._inbox)
 
@@ -297,10 +292,8 @@ class ZenohMiddleware(ActionNode[QueryOrigin, Bell]):
     def offers(self) -> list[Offer]:
         return self._node.offers()
 
-    def service_end(
-        self, spec: ServiceSpec, waiter: Bell, qos: QoS | None = None, *, pictures: bool = False
-    ) -> ZenohServiceServer:
-        return ZenohServiceServer(self._node, spec, waiter, qos or SERVICE_QOS, 0 if pictures else SMALL_BYTES)
+    def service_end(self, spec: ServiceSpec, waiter: Bell, qos: QoS | None = None) -> ZenohServiceServer:
+        return ZenohServiceServer(self._node, spec, waiter, qos or SERVICE_QOS)
 
     def client_end(self, spec: ServiceSpec, waiter: Bell) -> ZenohServiceClient:
         return ZenohServiceClient(self._node, spec, waiter)

@@ -25,8 +25,6 @@ NO_HASH: Final = "TypeHashNotSupported"
 """Humble's."""
 PARTS: Final = 13
 """Of the token of an entity that is no node."""
-LONGEST: Final = 2048
-"""A longer token is ignored."""
 ATTACHMENT: Final = struct.Struct("<qqB16s")
 """Sequence number, source time in ns of ROS time, 16, and the sender's gid."""
 BEST_EFFORT, TRANSIENT_LOCAL, KEEP_ALL = "2", "1", "2"
@@ -81,7 +79,7 @@ def _token(domain_id: int, session: str, number: int, kind: str, node_name: str)
 
 def entity_of(token: str) -> Entity | None:
     """Read the token of an endpoint; None for a node's, and for what is none."""
-    parts = token.split("/") if len(token) <= LONGEST else []
+    parts = token.split("/")
     if len(parts) != PARTS or parts[0] != ADMIN:
         return None
     kind, name, type_name, hashed = parts[5], *parts[9:12]

@@ -229,10 +229,8 @@ class Bell:
 class SampleQueue(Generic[Item]):
     """What has come in for one endpoint: the last ``depth`` items, all for 0."""
 
-    def __init__(self, name: str, bell: Bell, depth: int = 0, most_bytes: int = 0) -> None:
-        """Start empty; it holds ``most_bytes``, with 0 `HELD_BYTES`."""
+    def __init__(self, name: str, bell: Bell, depth: int = 0) -> None:
         self._name, self._bell, self._depth = name, bell, depth
-        self._most = most_bytes or HELD_BYTES
         self._items: deque[tuple[Item, int]] = deque()
         self._bytes, self._once = 0, LogOnce(_log)
 
@@ -242,13 +240,13 @@ class SampleQueue(Generic[Item]):
         with self._bell.condition:
             if self._depth and len(self._items) >= self._depth:
                 self._pop()
-            full = self._bytes + size > self._most
+            full = self._bytes + size > HELD_BYTES
             if not full:
                 self._items.append((item, size))
                 self._bytes += size
             self._bell.ring()
         if full:
-            self._once.warning("", "%s: messages are dropped: %d MiB wait to be taken", self._name, self._most >> 20)
+            self._once.warning("", "%s: messages are dropped: %d MiB wait to be taken", self._name, HELD_BYTES >> 20)
         return not full
 
     def take(self) -> Item | None:

@@ -29,8 +29,6 @@ OWNERS = {"llamacpp": "llama-server", "vllm": "vllm", "s2a-bench": NATIVE}
 HITS = re.compile(r"^(\w+:\w*(?:hits|cached_tokens|tokens_cached)(?:_total)?)(?:\{.*\})? (\S+)", re.MULTILINE)
 """A counter of cache hits: vLLM's of prefixes and pictures, SGLang's of prompt tokens."""
 
-LIMIT = 1 << 20
-
 
 def met(base: str, key: str, options: HttpOptions) -> tuple[Dialect, str, str]:
     """Return the dialect, the URL to post to and the model of a black box: as given, else as its list of models says.
@@ -100,16 +98,10 @@ def _text(client: httpx.Client, headers: dict[str, str], url: str) -> str:
     try:
         with client.stream("GET", url, headers=headers) as response:
             response.raise_for_status()
-            return text_of(pieces(response, Bounds(url, PATIENCE_S, 0)), LIMIT)
+            return text_of(pieces(response, Bounds(url, PATIENCE_S, 0)))
     except httpx.ConnectError as error:
         raise ServerDied(f"nothing answers at {url}: {error}") from error
 
 
-def text_of(body: Iterable[bytes], limit: int) -> str:
-    """Return a body's first ``limit`` bytes as text."""
-    data = bytearray()
-    for piece in body:
-        data += piece
-        if len(data) >= limit:
-            break
-    return data[:limit].decode("utf-8", "replace")
+def text_of(body: Iterable[bytes]) -> str:
+    return b"".join(body).decode("utf-8", "replace")

@@ -1,6 +1,7 @@
 """The server of *best effort* and *binary*: one thread for each connection, blocking sockets, no framework.
 
 httptools parses the head of a request, which must give the body's length; the body is read straight into its array.
+A client that is silent for `Limits.head_s` within a head, or for `body_s` within a body, is given up.
 """
 
 from __future__ import annotations
@@ -14,11 +15,10 @@ from typing import Any, Final
 import httptools
 import numpy as np
 
-from s2a_bench.clock import now_ns
 from s2a_bench.errors import S2AError
 from s2a_bench.transport import Handler, Wiring
 from s2a_bench.transport.access import WebServer
-from s2a_bench.transport.connections import LINGER_S, Connections, Wire
+from s2a_bench.transport.connections import LINGER_S, Connections, Wire, wait_at_most
 from s2a_bench.transport.http import native
 from s2a_bench.transport.http.chat import ChatExchange, Reads, of_json, of_picture
 from s2a_bench.transport.http.native import Refused
@@ -118,37 +118,34 @@ class FastServer(WebServer):
         if reads is None:
             raise Refused(HTTPStatus.NOT_FOUND, f"POST to one of {', '.join(READS)}")
         count(len(data))
-        wire.read_until(now_ns() + round(limits.body_s * 1e9))
+        wait_at_most(wire.socket, limits.body_s)
         if len(rest) < size and head.value("expect").lower() == "100-continue":
             wire.sendall(CONTINUE)
         try:
             body = _body(wire, rest, size, count)
-        except TimeoutError:
-            message = f"the body took more than {limits.body_s:g} s"
+        except BlockingIOError:
+            message = f"nothing came of the body for {limits.body_s:g} s"
             raise Refused(HTTPStatus.REQUEST_TIMEOUT, message) from None
         exchange = FastExchange(wire, head, reads, body, limits)
         exchange.trace.mark("network")
         del body  # the exchange frees it once it is read
         exchange.held = held
-        wire.read_until(0)
         self._core.answer(exchange)
         return rest[size:] if exchange.keep else None
 
     def _head(self, wire: Wire, early: bytes) -> tuple[bytes, bytes]:
         """Return a head and the bytes after it; nothing if the client has closed, or sends none for an hour."""
-        data, limits, ends_ns = bytearray(early), self._core.limits, 0
+        data, limits = bytearray(early), self._core.limits
         while (end := data.find(END)) < 0:
             if len(data) > limits.header_bytes:
                 break
-            if data and not ends_ns:
-                ends_ns = now_ns() + round(limits.head_s * 1e9)
-            wire.read_until(ends_ns or now_ns() + native.KEEP_ALIVE_S * 10**9)
+            wait_at_most(wire.socket, limits.head_s if data else native.KEEP_ALIVE_S)
             try:
-                block = wire.recv(PIECE)
-            except TimeoutError:
+                block = wire.socket.recv(PIECE)
+            except BlockingIOError:
                 if not data:
                     return b"", b""
-                message = f"the headers took more than {limits.head_s:g} s"
+                message = f"nothing came of the headers for {limits.head_s:g} s"
                 raise Refused(HTTPStatus.REQUEST_TIMEOUT, message) from None
             if not block:
                 return b"", b""
@@ -169,12 +166,12 @@ class FastServer(WebServer):
 
 
 def _body(wire: Wire, begun: bytes, size: int, count: Callable[[int], None]) -> memoryview:
-    """Read a body into an array whose memory is touched only as bytes arrive. Raises EOFError, TimeoutError."""
+    """Read a body into an array whose memory is touched only as bytes arrive. Raises EOFError, OSError."""
     body, have = np.empty(size, np.uint8).data, min(len(begun), size)
     body[:have] = begun[:have]
     count(have)
     while have < size:
-        more = wire.recv_into(body[have:])
+        more = wire.socket.recv_into(body[have:])
         if not more:
             raise EOFError
         count(more)

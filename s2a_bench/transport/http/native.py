@@ -28,7 +28,6 @@ from s2a_bench.transport.access import Access
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http import VARIANTS
 from s2a_bench.transport.http.dialects.common import sampled
-from s2a_bench.transport.http.dialects.framing import LIMIT
 from s2a_bench.transport.serving import Core, Queued
 from s2a_bench.types import Action, Request
 
@@ -87,8 +86,7 @@ def refusal_of(error: S2AError) -> tuple[int, str, dict[str, str]]:
 
 
 def error_json(status: int, message: str) -> dict[str, Any]:
-    shown = message.encode(errors="backslashreplace").decode()
-    return {"error": {"message": shown, "type": "invalid_request_error", "code": status}}
+    return {"error": {"message": message, "type": "invalid_request_error", "code": status}}
 
 
 def head_of(status: int, headers: Mapping[str, str], *, keep: bool) -> bytes:
@@ -195,8 +193,6 @@ class Blocks:
         self._held += data
         while len(self._held) >= LENGTH.size:
             (size,) = LENGTH.unpack_from(self._held)
-            if size > LIMIT:
-                raise ValueError(f"a block of {size} bytes")
             if len(self._held) < LENGTH.size + size:
                 return
             block = bytes(self._held[LENGTH.size : LENGTH.size + size])

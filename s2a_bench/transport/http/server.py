@@ -72,12 +72,11 @@ class Admission:
         native.admit(self._access, scope["path"], headers)
         _check_size(int(dict(headers).get("content-length", 0)), limits)
         count = held.enter_context(self._core.in_flight.counted())
-        count(sum(len(name) + len(value) for name, value in headers))
         with anyio.move_on_after(limits.body_s):
             while (message := await receive())["type"] != "http.disconnect":
                 pieces.append(message.get("body", b""))
-                size += len(pieces[-1])
                 count(len(pieces[-1]))
+                size += len(pieces[-1])
                 _check_size(size, limits)
                 if not message.get("more_body"):
                     return {"type": "http.request", "body": b"".join(pieces), "more_body": False}

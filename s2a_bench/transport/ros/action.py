@@ -116,7 +116,6 @@ class GenerateClient(RosClient):
                 event = self._next(goal_id, bounds)
                 if isinstance(event, Feedback):
                     partial = self._client.unpack_feedback(event.packed).partial_response
-                    bounds.count_piece()
                     bounds.count_bytes(len(partial.text))
                     heard.append(partial.text)
                     if count == limit:

@@ -44,8 +44,6 @@ DIAGNOSTICS_QOS: Final = QoS(depth=1)
 LOG: Final = "rcl_interfaces/msg/Log"
 ROSOUT_QOS: Final = QoS(depth=1000, latched=True, lifespan_s=10.0)
 """ROS's ``rcl_qos_profile_rosout_default``."""
-LONGEST: Final = 4096
-"""Letters of a message; what follows is cut off, as they may quote peers."""
 _log = logging.getLogger(__name__)
 
 
@@ -158,7 +156,7 @@ def log_message(record: logging.LogRecord, name: str) -> Any:
         level=min(max(record.levelno // 10 * 10, logging.DEBUG), logging.CRITICAL),
         name=name,
         # CDR holds no NUL, and no half of a surrogate pair
-        msg=record.getMessage()[:LONGEST].replace("\0", "\ufffd").encode("utf-8", "replace").decode(),
+        msg=record.getMessage().replace("\0", "\ufffd").encode("utf-8", "replace").decode(),
         file=record.pathname,
         function=record.funcName or "",
         line=record.lineno,

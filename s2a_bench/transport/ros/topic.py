@@ -11,7 +11,7 @@ from s2a_bench.errors import MessagesLost, RequestFailed, ServerDied
 from s2a_bench.facts import PAYLOAD_BYTES
 from s2a_bench.ros import Middleware
 from s2a_bench.ros import messages as ros
-from s2a_bench.ros.service import REACH_S, READER_QOS, REMEMBERED_CLIENTS, appeared
+from s2a_bench.ros.service import REACH_S, READER_QOS, appeared
 from s2a_bench.trace import Trace
 from s2a_bench.transport.chunks import state_of
 from s2a_bench.transport.limits import Bounds, Limits, whole_number
@@ -51,7 +51,6 @@ class TopicClient(RosClient):
                 )
             if token.last:
                 break
-            bounds.count_piece()
             pieces = wire.pieces_of(token)
             if not expected:
                 trace.mark("return")
@@ -105,8 +104,6 @@ class TopicSource:
         """
         if sender not in self._reached:
             appeared(lambda: self._requests.sender_hears(sender, self._tokens), REACH_S)
-            if len(self._reached) >= REMEMBERED_CLIENTS:
-                self._reached.clear()
             self._reached.add(sender)
         message = wire.token_message(request_id, token, last=bool(marks), error=error, marks=marks)
         self._tokens.send(self._tokens.pack(message))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import socket
 import sys
 from collections.abc import Iterable, Mapping
 from typing import ClassVar
@@ -51,8 +50,8 @@ class Shm(Transport[ShmOptions]):
 
 def unavailable() -> str:
     """Return why memory without a name cannot be had or handed over here, or nothing."""
-    there = hasattr(os, "memfd_create") and hasattr(socket, "SO_PEERCRED")
-    return "" if there else f"it needs Linux (memfd_create, SO_PEERCRED); this is {sys.platform}"
+    there = hasattr(os, "memfd_create")
+    return "" if there else f"it needs Linux (memfd_create); this is {sys.platform}"
 
 
 def shared_memory(machine: Machine) -> Finding | None:  # noqa: ARG001 - the system of this process
@@ -60,7 +59,7 @@ def shared_memory(machine: Machine) -> Finding | None:  # noqa: ARG001 - the sys
     why = unavailable()
     if not why:
         try:
-            os.close(os.memfd_create("s2a_bench", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING))
+            os.close(os.memfd_create("s2a_bench", os.MFD_CLOEXEC))
         except OSError as error:
             why = f"memfd_create: {error.strerror}"
     return Finding("shared-memory", "advice", f"--transport shm cannot run: {why}", "leave it out") if why else None

@@ -108,9 +108,4 @@ SERVERS = (
     Server("1 GiB announced in a frame", greets(announced(1 << 30, mask=False), NOISE)),
     Server("a forged line", greets(frame(FORGED.encode(), Opcode.TEXT, mask=False)), "all is well"),
     Server("endless pings", greets(again=frame(b"", Opcode.PING, mask=False) * 1000), timeout_s=0.5),
-    Server(
-        "a chunk of 100,000 actions",
-        greets(says({"actions": array(bytes(400_000), shape=(100_000, 1))}, mask=False)),
-        "^RequestFailed: .*does not stop",
-    ),
 )

@@ -94,7 +94,7 @@ def test_an_action_in_any_of_its_forms_is_read(encode: Callable[[np.ndarray], st
         ("", "null", "no finite numbers"),
         ("", "[[1], [1, 2]]", "not the dialect 'openvla'"),
         ("", "[NaN]", "no finite numbers"),
-        ("", '{"__numpy__": "AAAA", "dtype": "O", "shape": [1]}', "an action of type O"),
+        ("", '{"__numpy__": "AAAA", "dtype": "O", "shape": [1]}', "not the dialect 'openvla'"),
         ("", '{"__numpy__": "AAAA", "dtype": "<f8", "shape": [7]}', "not the dialect 'openvla'"),
         ("", "{}", "not the dialect 'openvla'"),
         ("", "", "not the dialect 'openvla'"),

@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping
 from contextlib import suppress
 from http import HTTPStatus
-from threading import Event, Lock, Thread
+from threading import Event, Thread
 from typing import Any, Final
 
 import numpy as np
@@ -53,7 +53,6 @@ class WebsocketServer(WebServer):
         self._most = wiring.limits.connections
         self._connections: set[ServerConnection] = set()
         self._answering: set[PolicyConnection] = set()
-        self._lock = Lock()  # of the connections
         self._stopped = Event()
         self._library: Server | None = None
 
@@ -65,7 +64,6 @@ class WebsocketServer(WebServer):
             self._handle,
             sock=self._listener,
             process_request=self._refusal,
-            create_connection=self._connection,  # type: ignore[arg-type]  # a wrapper, as its documentation has it
             compression=None,
             server_header=None,
             open_timeout=self._core.limits.head_s,
@@ -88,11 +86,10 @@ class WebsocketServer(WebServer):
         closing = [Thread(target=each.close, args=(code, reason), daemon=True) for each in [*self._connections]]
         if self._library is not None:
             closing.append(Thread(target=self._library.shutdown, daemon=True))
-        ends = time.monotonic() + LINGER_S
         for thread in closing:
             thread.start()
         for thread in closing:
-            thread.join(max(0.0, ends - time.monotonic()))
+            thread.join(LINGER_S)
 
     def stop(self) -> None:
         self._stopped.set()
@@ -102,22 +99,10 @@ class WebsocketServer(WebServer):
     def _accept(self) -> None:
         """Accept until `stop`; the library gives up where an accept fails, as it does without descriptors."""
         while not self._stopped.is_set():
-            try:
+            with suppress(OSError, RuntimeError):
                 self._library = self._listening()
                 self._library.serve_forever()
-            except (OSError, RuntimeError) as error:
-                _log.warning("no connection can be accepted: %s", error)
             self._stopped.wait(PAUSE_S)
-
-    def _connection(self, *arguments: Any, **settings: Any) -> ServerConnection:
-        """Return a new connection; raises OSError, which closes it, where as many as are served wait for a refusal."""
-        with self._lock:
-            self._connections = {each for each in self._connections if each.state is not State.CLOSED}
-            if len(self._connections) >= 2 * self._most:
-                raise ConnectionRefusedError
-            connection = ServerConnection(*arguments, **settings)
-            self._connections.add(connection)
-        return connection
 
     def _refusal(self, connection: ServerConnection, handshake: Handshake) -> Response | None:
         """Return the answer to a handshake that is refused, or asks for the server's health."""
@@ -127,7 +112,7 @@ class WebsocketServer(WebServer):
         if answer is None and path == codec.HEALTH:
             stuck = self._core.stuck()
             answer = (HTTPStatus.SERVICE_UNAVAILABLE, stuck) if stuck else (HTTPStatus.OK, "OK")
-        elif answer is None and len(self._connections) > self._most:
+        elif answer is None and len(self._connections) >= self._most:
             answer = HTTPStatus.SERVICE_UNAVAILABLE, f"{self._most} connections are open already"
         if answer is None:
             return None
@@ -139,6 +124,7 @@ class WebsocketServer(WebServer):
     def _handle(self, connection: ServerConnection) -> None:
         """Greet a client, and answer its requests one after the other."""
         client = PolicyConnection(connection)
+        self._connections.add(connection)
         try:
             client.send(self._metadata)
             while True:
@@ -146,13 +132,12 @@ class WebsocketServer(WebServer):
                 self._answering.discard(client)
         except (ConnectionClosed, Disconnected):
             pass
-        except Exception as error:
-            _log.error("a connection failed", exc_info=error)
+        except Exception:
+            _log.exception("a connection failed")
             raise
         finally:
             self._answering.discard(client)
-            with self._lock:
-                self._connections.discard(connection)  # and what it holds of a message
+            self._connections.discard(connection)
 
     def _answer(self, client: PolicyConnection, message: bytes | str) -> None:
         """Answer a request; raises Disconnected where no other can follow."""

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.plugins.policy_servers.observation import EXTENSION, VALUES, Template
+from s2a_bench.plugins.policy_servers.observation import EXTENSION, Template
 from s2a_bench.transport.chunks import actions_of
 from s2a_bench.types import Action, Vector
 
@@ -94,7 +94,7 @@ def modalities_in(answer: Any) -> dict[str, tuple[list[str], int]]:
     except (LookupError, TypeError, ValueError, RecursionError):
         return {}
     plain = all(key != EXTENSION and not key.endswith("?") for keys, _ in keys_of.values() for key in keys)
-    return keys_of if plain and sum(len(keys) * steps for keys, steps in keys_of.values()) <= VALUES else {}
+    return keys_of if plain else {}
 
 
 def template_of(layout: str, keys_of: Mapping[str, tuple[Sequence[str], int]], state: int) -> Template:

@@ -51,7 +51,7 @@ class Decoder:
                 yield event
                 if self._failed:
                     return
-        except ValueError as error:  # a message is too large
+        except ValueError as error:  # a block is cut off
             self._failed = True
             yield Event(error=f"the server sent {error}")
 

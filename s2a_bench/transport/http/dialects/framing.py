@@ -5,13 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Protocol
 
-LIMIT = 4 << 20
-"""The most bytes of a message: far more than any token, for a server that never ends its line."""
-
 
 class Framing(Protocol):
     def feed(self, data: bytes) -> Iterator[str | bytes]:
-        """Yield the messages that these bytes complete; raises ValueError for one that is too large."""
+        """Yield the messages that these bytes complete; raises ValueError for bytes that are none."""
 
     def end(self) -> Iterator[str | bytes]:
         """Yield the last message after the end of the body."""
@@ -20,11 +17,8 @@ class Framing(Protocol):
 class Lines:
     """Lines that end with CR LF, LF or CR (WHATWG HTML, 9.2.6); bytes that are no UTF-8 become U+FFFD."""
 
-    unit = "line"
-
     def __init__(self) -> None:
         self._pieces: list[bytes] = []
-        self._size = 0
         self._after_cr = False
 
     def feed(self, data: bytes) -> Iterator[str]:
@@ -36,19 +30,13 @@ class Lines:
             data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
         *complete, rest = data.split(b"\n")
         for block in complete:
-            self._keep(block)
+            self._pieces.append(block)
             yield from self.end()
-        self._keep(rest)
-
-    def _keep(self, block: bytes) -> None:
-        self._pieces.append(block)
-        self._size += len(block)
-        if self._size > LIMIT:
-            raise ValueError(f"a {self.unit} of more than {LIMIT} bytes")
+        self._pieces.append(rest)
 
     def end(self) -> Iterator[str]:
         line = b"".join(self._pieces)
-        self._pieces, self._size = [], 0
+        self._pieces = []
         yield line.decode("utf-8", "replace")
 
 
@@ -60,10 +48,8 @@ class JsonLines(Lines):
 
 
 class WholeBody(Lines):
-    unit = "body"
-
     def feed(self, data: bytes) -> Iterator[str]:
-        self._keep(data)
+        self._pieces.append(data)
         yield from ()
 
 
@@ -77,7 +63,6 @@ class ServerSentEvents:
     def __init__(self) -> None:
         self._lines = Lines()
         self._data: list[str] = []
-        self._size = 0
         self._bare = False
         self._first = True
 
@@ -100,16 +85,10 @@ class ServerSentEvents:
             yield from self._event()
         if is_data or bare:
             self._bare = bare
-            self._hold(line if bare else value.removeprefix(" "))
-
-    def _hold(self, text: str) -> None:
-        self._data.append(text)
-        self._size += len(text) + 1
-        if self._size > LIMIT:
-            raise ValueError(f"an event of more than {LIMIT} characters")
+            self._data.append(line if bare else value.removeprefix(" "))
 
     def _event(self) -> Iterator[str]:
         data = "\n".join(self._data)
-        self._data, self._size, self._bare = [], 0, False
+        self._data, self._bare = [], False
         if data:
             yield data
