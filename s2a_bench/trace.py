@@ -140,13 +140,14 @@ class Trace:
     """The record of one request on one side of the wire.
 
     ``token_ns`` holds the times at which tokens left the engine; ``facts`` are reported by the engine or a black-box
-    server (llama.cpp's ``timings`` and the like). A client's ``remote`` is the server's report. ``later`` holds facts
-    that take time: they are computed once the answer is sent.
+    server (llama.cpp's ``timings`` and the like), and ``odd`` names those with impossible values. A client's ``remote``
+    is the server's report. ``later`` holds facts that take time: they are computed once the answer is sent.
     """
 
     marks: list[Mark] = field(default_factory=list)
     token_ns: list[int] = field(default_factory=list)
     facts: dict[str, float] = field(default_factory=dict)
+    odd: set[str] = field(default_factory=set)
     later: dict[str, Callable[[], float]] = field(default_factory=dict)
     remote: Remote | None = None
     frame_stamp_ns: int = -1
@@ -162,11 +163,14 @@ class Trace:
         self.learn(remote.facts)
 
     def learn(self, facts: Mapping[str, Any]) -> None:
-        """Keep a server's facts; an impossible name or value (NaN, 1e300, text) stays absent."""
+        """Keep a server's facts; an impossible value (NaN, 1e300, text) stays absent and is ``odd``."""
         for name, value in facts.items():
-            named = isinstance(name, str) and name.isidentifier() and len(name) < NAME_LIMIT
-            if named and type(value) in {int, float} and abs(value) <= FACT_LIMIT:
+            if not (isinstance(name, str) and name.isidentifier() and len(name) < NAME_LIMIT):
+                self.odd.add("a name that is none")
+            elif type(value) in {int, float} and abs(value) <= FACT_LIMIT:
                 self.facts[name] = value
+            else:
+                self.odd.add(name)
 
     def to_remote(self) -> Remote:
         self.facts |= {name: find() for name, find in self.later.items()}

@@ -96,12 +96,14 @@ def test_marks_of_another_clock_are_not_mixed_in_unless_shifted() -> None:
     assert (trace.remote.token_ns, trace.remote.frame_marks) == ([60], [("network", 5)])
 
 
-def test_what_a_server_says_of_itself_is_a_number_that_floats_count_exactly_or_absent() -> None:
+def test_what_a_server_says_of_itself_is_a_number_that_floats_count_exactly_or_odd() -> None:
     trace = Trace()
     trace.learn({"most": 2**53, "least": -(2**53), "half": 0.5, "n" * 63: 1})
-    assert trace.facts == {"most": 2**53, "least": -(2**53), "half": 0.5, "n" * 63: 1}
+    assert (trace.facts, trace.odd) == ({"most": 2**53, "least": -(2**53), "half": 0.5, "n" * 63: 1}, set())
     trace.learn({"more": 2**53 + 1, "less": -(2**53) - 1, "nan": math.nan, "inf": math.inf, "yes": True, "text": "1"})
+    assert trace.odd == {"more", "less", "nan", "inf", "yes", "text"}
     trace.learn({"n" * 64: 1, "a b": 1, 5: 1})  # type: ignore[dict-item]
+    assert trace.odd == {"more", "less", "nan", "inf", "yes", "text", "a name that is none"}
     assert len(trace.facts) == 4
 
 

@@ -82,7 +82,7 @@ class RunningLaunch:
         self.sampler.flush(writer)
         for row in session.frames():
             writer.frame(row)
-        self.guard.see(sample, measured.fingerprint, client)
+        self.guard.see(sample, measured.fingerprint, measured.odd, client)
         if not isinstance(measured.fatal, KeyboardInterrupt):
             self.servers.raise_if_dead(session.cell, suspect=bool(sample.error) and clients == 1)
         if measured.fatal is not None:

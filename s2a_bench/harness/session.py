@@ -78,6 +78,8 @@ class Measured:
     fingerprint: int
     fatal: S2AError | KeyboardInterrupt | None = None
     retry_after_s: float = 0.0
+    odd: frozenset[str] = frozenset()
+    """Names of the server's facts with impossible values."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,7 +303,7 @@ class Session:
             )
             for (token, client_ns), left_ns in zip(seen, chain(engine_ns, repeat(None)), strict=False)
         ]
-        return Measured(sample, tokens, picture, apart)
+        return Measured(sample, tokens, picture, apart, odd=frozenset(trace.odd))
 
     def _doubt(self, trace: Trace, rgb_source: int | None, rgb_engine: int | None) -> str:
         if unknown := {stage for stage, _ in trace.chain() if stage} - self.request.stages.keys():

@@ -191,12 +191,14 @@ class SampleGuard:
         self._counts: dict[Doubt, Counter[str]] = {doubt: Counter() for doubt in DOUBTS}
         self._frames: dict[tuple[str, int], str] = {}
         self._cached_share = 0.0
+        self._odd: dict[str, set[str]] = defaultdict(set)
         self._times_ns: dict[str, list[int]] = defaultdict(list)
         self._waits_ms: dict[str, list[float]] = defaultdict(list)
         self._launches: set[int] = set()
 
-    def see(self, row: SampleRow, fingerprint: int, client: int = 0) -> None:
+    def see(self, row: SampleRow, fingerprint: int, odd: Iterable[str] = (), client: int = 0) -> None:
         cell, counts = row.cell, self._counts
+        self._odd[cell].update(odd)  # names of impossible facts
         if self._frames.setdefault((cell, fingerprint), row.request_id) != row.request_id:
             counts[REPEATED][cell] += 1
         if lost := row.facts.get(FRAMES_LOST):
@@ -243,11 +245,19 @@ class SampleGuard:
                 doubt = Doubt("padded-answers", f"{what}: the server may have slept", sleep.advice)
                 self._counts.setdefault(doubt, Counter())[cell] = pile
         for doubt, counts in self._counts.items():
+            if doubt is FAILED:
+                warnings += self._odd_facts()
             if cells := {cell: count for cell, count in counts.items() if count > doubt.share * self.succeeded[cell]}:
                 where = ", ".join(f"{cell}: {count}" for cell, count in cells.items())
                 what = doubt.what.format(cached_share=self._cached_share)
                 warnings.append(RunWarning(doubt.code, f"{what} ({where})", doubt.advice or self.advice(cells)))
         return warnings + self._correlated() if len(self._launches) == 1 else warnings
+
+    def _odd_facts(self) -> list[RunWarning]:
+        where = "; ".join(f"{cell}: {', '.join(sorted(odd))}" for cell, odd in self._odd.items() if odd)
+        what = f"a server reported facts that are no number, or an impossible one ({where})"
+        advice = "these facts are absent where they were odd: report it to the operator of the server"
+        return [RunWarning("odd-facts", what, advice)] if where else []
 
     def advice(self, cells: Iterable[str]) -> str:
         known = [self._cells[name] for name in cells if name in self._cells]

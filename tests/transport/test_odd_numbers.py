@@ -1,4 +1,4 @@
-"""Numbers that servers tell and that can be none: the fact is absent, the sample counts."""
+"""Numbers that servers tell and that can be none: the fact is absent, the run says so once, the sample counts."""
 
 from __future__ import annotations
 
@@ -29,24 +29,26 @@ from tests.servers.sockets import head, serving
 
 NONE = ["NaN", "Infinity", "-Infinity", "1e25", "1e300", "1e999", '"12"', "true", "-1", "[]", "{}", str(10**400)]
 TOLD = [
-    ("openai", '{"choices": [], "usage": {"prompt_tokens": %s}}'),
-    ("openai", '{"choices": [], "usage": {"prompt_tokens_details": {"cached_tokens": %s}}}'),
-    ("openai", '{"choices": [], "timings": {"prompt_ms": %s}}'),
-    ("vllm", '{"choices": [], "metrics": {"queue_time_ms": %s}}'),
-    ("ollama", '{"done": true, "prompt_eval_count": %s}'),
-    ("ollama", '{"done": true, "eval_duration": %s}'),
-    ("tgi", '{"details": {"generated_tokens": %s}}'),
-    ("gemini", '{"usageMetadata": {"promptTokenCount": %s}}'),
+    ("openai", '{"choices": [], "usage": {"prompt_tokens": %s}}', "prompt_n"),
+    ("openai", '{"choices": [], "usage": {"prompt_tokens_details": {"cached_tokens": %s}}}', "cache_n"),
+    ("openai", '{"choices": [], "timings": {"prompt_ms": %s}}', "prompt_ms"),
+    ("vllm", '{"choices": [], "metrics": {"queue_time_ms": %s}}', "queue_ms"),
+    ("ollama", '{"done": true, "prompt_eval_count": %s}', "prompt_with_cached_n"),
+    ("ollama", '{"done": true, "eval_duration": %s}', "predicted_ms"),
+    ("tgi", '{"details": {"generated_tokens": %s}}', "predicted_n"),
+    ("gemini", '{"usageMetadata": {"promptTokenCount": %s}}', "prompt_n"),
 ]
 
 
 @pytest.mark.parametrize(
-    ("dialect", "message", "value"), [*((*TOLD[0], value) for value in NONE), *((*told, "1e25") for told in TOLD[1:])]
+    ("dialect", "message", "fact", "value"),
+    [*((*TOLD[0], value) for value in NONE), *((*told, "1e25") for told in TOLD[1:])],
 )
-def test_it_is_absent(dialect: str, message: str, value: str) -> None:
+def test_it_is_absent_and_told(dialect: str, message: str, fact: str, value: str) -> None:
     event, trace = open_dialect(dialect).event(json.loads(message % value)), Trace()
     trace.learn(event.facts)
     assert trace.facts == {}
+    assert trace.odd == {fact}
 
 
 @pytest.mark.parametrize("value", ["NaN", "1e300", '"12"'])
@@ -55,6 +57,7 @@ def test_a_rate_that_can_be_none_fails_no_sample(value: str) -> None:
     message = '{"timings": {"predicted_per_second": %s, "predicted_ms": 12}}'
     trace.learn(open_dialect("llama-server").event(json.loads(message % value)).facts)
     assert trace.facts == {"predicted_ms": 12.0}
+    assert trace.odd == {"predicted_steps"}
 
 
 @pytest.mark.parametrize("value", ["NaN", "+Inf", "1e300", "-1", "x"])
@@ -64,11 +67,12 @@ def test_a_count_of_hits_that_can_be_none_is_absent(value: str) -> None:
         assert cache_hits(wiring_of("http/as-deployed", url=url)) == {}
 
 
-def test_more_cached_than_there_was_leaves_the_prompt_unknown() -> None:
+def test_more_cached_than_there_was_is_odd() -> None:
     usage = {"prompt_tokens": 3, "prompt_tokens_details": {"cached_tokens": 5}}
     trace = Trace()
     trace.learn(open_dialect("openai").event({"usage": usage}).facts)
     assert trace.facts == {"cache_n": 5.0}
+    assert trace.odd == {"prompt_n"}
 
 
 @pytest.mark.parametrize("value", [1e300, 1.5, -1, "7", None, 2**70, True, [3]])
@@ -78,7 +82,7 @@ def test_a_token_s_id_that_can_be_none_is_unknown(value: Any) -> None:
     assert open_dialect("s2a").event({"choices": [choice]}).token_id == -1
 
 
-def test_a_run_with_them_counts(tmp_path: Path) -> None:
+def test_a_run_with_them_counts_and_warns_once_a_field(tmp_path: Path) -> None:
     numbers = b'data: {"choices": [], "usage": {"prompt_tokens": 1e25}, "timings": {"prompt_ms": NaN}}\n\n'
     pieces = [head(), delta(content="x"), numbers, b"data: [DONE]\n\n"]
     with serving(lambda _: pieces) as url:
@@ -91,6 +95,8 @@ def test_a_run_with_them_counts(tmp_path: Path) -> None:
     assert run.samples.error.tolist() == [""] * 4
     assert run.samples.prompt_n.isna().all()
     assert run.samples.server_prompt_ms.isna().all()
+    (warning,) = [each for each in run.manifest["warnings"] if each["code"] == "odd-facts"]
+    assert "(http/as-deployed: prompt_ms, prompt_n)" in warning["message"]
 
 
 MARKS = {"clock": "c", "marks": [["", 1]], "token_ns": [2], "frame_stamp_ns": -1, "frame_marks": [], "facts": {}}
@@ -120,6 +126,7 @@ def test_facts_of_marks_are_checked_in_name_and_value() -> None:
     trace = Trace()
     trace.receive(Remote("c", facts={"prompt_n": float("nan"), "\x1b[2J": 1.0, "x" * 99: 1.0, "load": 0.5}))
     assert trace.facts == {"load": 0.5}
+    assert trace.odd == {"prompt_n", "a name that is none"}
 
 
 @pytest.mark.parametrize("odd", [{"stamps": [1, 2]}, {"stamps": [-1]}, {"fact_names": ["a"]}])

@@ -122,7 +122,7 @@ def sampled(request: Request, max_tokens: str = "max_tokens", top_p: str = "top_
 def numbers(source: Any, names: dict[str, Fact], scale: float = 1.0) -> dict[str, float]:
     """Return the numbers of a JSON object as facts, times ``scale``; missing and null values are left out.
 
-    NaN stands for anything but a number of 0 to 2^53: `Trace.learn` leaves it out.
+    NaN stands for anything but a number of 0 to 2^53: `Trace.learn` reports it.
     """
     values = ((fact, (source or {}).get(name)) for name, fact in names.items())
     return {fact: _number(value) * scale for fact, value in values if value is not None}
