@@ -18,7 +18,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
 from s2a_bench.errors import UsageError
-from s2a_bench.text import like, none_of
+from s2a_bench.text import like, none_of, read_text
 
 Made = TypeVar("Made", bound="Options")
 
@@ -253,7 +253,7 @@ def _grammar(value: Any) -> Any:
 
 def _content(path: str | Path) -> str:
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"cannot read {path}: {error}") from error
 

@@ -1,16 +1,29 @@
-"""Text from outside: shown without letters that move the cursor, forge a line or reverse others."""
+"""Text from outside: read within bounds; shown without letters that move the cursor, forge a line or reverse others."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from difflib import get_close_matches
-from typing import Any
+from pathlib import Path
+from typing import Any, Final
 
 _HIDDEN = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff\ufff9-\ufffb]"
 )
 """Control characters (C0, C1), marks and overrides of direction, invisible letters, halves of surrogate pairs."""
+
+FILE_LETTERS: Final = 8 << 20
+"""Limit on a user's text files."""
+
+
+def read_text(path: str | Path, most: int = FILE_LETTERS) -> str:
+    """Read a user's UTF-8 file; raises UnicodeDecodeError, and OSError, also for more than ``most`` letters."""
+    with Path(path).open(encoding="utf-8") as file:
+        text = file.read(most + 1)
+    if len(text) > most:
+        raise OSError(f"it is longer than {most} letters")
+    return text
 
 
 def visible(text: str) -> str:

@@ -12,7 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
 
 from s2a_bench.errors import UsageError
-from s2a_bench.text import like
+from s2a_bench.text import FILE_LETTERS, like, read_text
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -51,10 +51,10 @@ class TomlTable(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
-def read(path: str | Path, option: str) -> str:
+def read(path: str | Path, option: str, most: int = FILE_LETTERS) -> str:
     """Return the text of a file that an ``option`` names; raises UsageError."""
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return read_text(path, most)
     except (OSError, ValueError) as error:  # it is no UTF-8, or its name has a NUL
         raise UsageError(f"`{option}`: cannot read {path}: {error}") from error
 

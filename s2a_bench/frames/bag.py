@@ -12,6 +12,7 @@ from rosbags.rosbag2 import Reader
 from s2a_bench.errors import SourceError, UsageError
 from s2a_bench.frames.messages import TYPES, ImageMessages
 from s2a_bench.ros.messages import typestore
+from s2a_bench.text import read_text
 from s2a_bench.types import Pixels
 
 TOPIC_KEY = "?topic="
@@ -67,7 +68,7 @@ def _open(path: str) -> Any:
         raise SourceError(f"`source`: no recording at {path}")
     try:
         metadata = Path(path) / "metadata.yaml"
-        if metadata.is_file() and "<<" in metadata.read_text("utf-8"):
+        if metadata.is_file() and "<<" in read_text(metadata):
             raise ValueError("metadata.yaml: merged keys (<<) are not read: a few could take endless time")
         reader = Reader(path)
         reader.open()

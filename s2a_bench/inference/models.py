@@ -16,10 +16,12 @@ from s2a_bench.errors import ModelError, UsageError
 from s2a_bench.inference import EngineConfig, Like, Size
 from s2a_bench.inference.dummy import dummy_files, write_dummy
 from s2a_bench.inference.gguf_file import GgufHeader, read_header
+from s2a_bench.text import read_text
 
 CACHE_VARIABLE = "S2A_BENCH_CACHE"
 NO_TEMPLATE, RAW_PROMPT = "none", "{% for message in messages %}{{ message['content'] }}{% endfor %}"
 """The value of `EngineConfig.chat_template` for a raw prompt, and the template that makes one."""
+TEMPLATE_BYTES = 1 << 20
 HUB = "hub:"
 HUB_MODELS = {
     "minicpm-v-2.6": "openbmb/MiniCPM-V-2_6-gguf",
@@ -187,7 +189,7 @@ def chat_template(config: EngineConfig) -> str:
     if chosen in {"", NO_TEMPLATE}:
         return RAW_PROMPT if chosen else ""
     try:
-        if template := Path(chosen).read_text(encoding="utf-8"):
+        if template := read_text(Path(chosen), TEMPLATE_BYTES):
             return template
         raise ValueError("it is empty")
     except (OSError, ValueError) as error:

@@ -78,6 +78,8 @@ FEEDBACK_QOS: Final = QoS(depth=1000)
 """Deeper than ROS's 10: what was lost of a burst can be sent again."""
 STATUS_QOS: Final = QoS(depth=1, latched=True)
 HOUSEKEEPING_NS: Final = 500_000_000
+WAITING_AT_MOST: Final = 1000
+"""So many requests for one goal's result are remembered; more are not answered."""
 LISTED_ENDED: Final = 64
 """The status array lists all live goals and so many of the latest that ended."""
 FEEDBACK_ID: Final = slice(4, 20)
@@ -482,8 +484,8 @@ class ServedAction(Generic[Caller]):
         goal = self._goals.find(goal_id)
         if goal is None or goal.result is not None:
             self._get_result.respond(self._unknown if goal is None else goal.result, caller)
-        else:
-            self._waiting.setdefault(goal_id, []).append(caller)
+        elif len(waiting := self._waiting.setdefault(goal_id, [])) < WAITING_AT_MOST:
+            waiting.append(caller)
 
     def _answer_cancel(self, request: Any, caller: Caller) -> None:
         info = request.goal_info

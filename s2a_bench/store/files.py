@@ -73,6 +73,10 @@ def _field(value: Value) -> str:
     return f'"{text}"' if any(mark in text for mark in ',"\r\n') else text
 
 
+VALUES: Final = 500_000_000
+"""Limit on the values (rows times columns) read of a Parquet file: a few bytes can encode any number of equal ones."""
+
+
 def _arrow(path: Path) -> tuple[Any, Any, Any]:
     """Return pyarrow, its CSV and its Parquet module; raises MissingExtra if it does not load beside this NumPy."""
     try:
@@ -168,7 +172,11 @@ def read_parquet(path: Path, columns: dict[str, Kind]) -> pd.DataFrame:
     schema = _schema(pa, columns)
     categories = [name for name, kind in columns.items() if kind == "category"]
     with _undamaged(path, pa), parquet.ParquetFile(path, read_dictionary=categories) as file:
-        rows = file.metadata.num_rows
+        if (rows := file.metadata.num_rows) * len(columns) > VALUES:
+            raise StoreError(
+                f"{path} has {rows} rows of {len(columns)} columns; at most {VALUES} values are read; "
+                "remove it to read the CSV"
+            )
 
         def read(column: Any) -> pd.DataFrame:
             table = file.read([column.name])

@@ -153,6 +153,7 @@ def read(folder: Path) -> dict[str, Any]:
         raise StoreError(f"{folder} is no run folder: {path}: {error.strerror}") from error
     try:
         manifest = json.loads(text)
+        json.dumps(manifest, ensure_ascii=False).encode()  # half a surrogate pair cannot be printed
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
     schema = manifest.get("schema") if isinstance(manifest, dict) else None

@@ -9,10 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
+import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
 from s2a_bench.errors import StoreError
+from s2a_bench.store import files
 from s2a_bench.store.files import CsvFile, why, write_parquet
 from s2a_bench.store.manifest import present
 
@@ -35,6 +37,16 @@ def test_a_file_that_is_there_is_not_written_over(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match=r"cannot create .*x\.csv: File exists; choose another `output`"):
         CsvFile(tmp_path / "x.csv", ["a"])
     assert (tmp_path / "x.csv").read_text() == "mine"
+
+
+def test_values_are_counted_by_the_footer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "samples.parquet"
+    parquet.write_table(pa.table({"n": pa.array([0] * 101)}), path)
+    monkeypatch.setattr(files, "VALUES", 201)
+    assert len(files.read_parquet(path, {"n": "int64"})) == 101
+    monkeypatch.setattr(parquet.ParquetFile, "read", lambda *_: pytest.fail("it was read"))
+    with pytest.raises(StoreError, match="has 101 rows of 2 columns; at most 201 values are read"):
+        files.read_parquet(path, {"n": "int64", "m": "int64"})
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT])

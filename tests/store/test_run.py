@@ -403,7 +403,7 @@ def test_columns_are_read_alone_and_their_texts_are_categories_in_order_of_appea
             '{"schema": "s2a-bench/1", "command": "latency", "state": "finished", "environment": {"affinity": ["3"]}}',
             r"environment.affinity\[0\]: '3' should be a valid integer",
         ),
-        *((text, "manifest.json is damaged: .") for text in ("{", "[" * 100_000, "\xff", "")),
+        *((text, "manifest.json is damaged: .") for text in ("{", "[" * 100_000, '{"a": "\\ud800"}', "\xff", "")),
         ('{"a": ' + "9" * 5000 + "}", "manifest.json is damaged: ."),
     ],
 )

@@ -233,7 +233,7 @@ def _mahimahi_steps(path: str, profile: LinkProfile) -> tuple[list[Step], float]
 
 
 def _lines(path: str) -> list[str]:
-    return read(path, "link").splitlines()
+    return read(path, "link", 64 * MOST_STEPS).splitlines()
 
 
 def _checked_steps(steps: list[Step], where: str) -> list[Step]:
