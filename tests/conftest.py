@@ -30,6 +30,11 @@ settings.register_profile("s2a", deadline=None, derandomize="S2A_RANDOM" not in 
 settings.register_profile("quick", settings.get_profile("s2a"), max_examples=25)
 
 
+def examples(full: int) -> int:
+    """Return how many examples of a property are drawn where a full run draws so many: by the profile's share."""
+    return -(-full * settings().max_examples // settings.get_profile("s2a").max_examples)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Choose how many examples of a property are drawn, before a module with properties is imported."""
     quick = config.getoption("markexpr") == "not slow" and "S2A_RANDOM" not in os.environ

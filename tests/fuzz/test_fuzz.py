@@ -17,11 +17,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.errors import S2AError
+from tests.conftest import examples
 from tests.fuzz.targets import TARGETS, Target
 
 CORPUS = Path(__file__).parent / "corpus"
 SECONDS = float(os.environ.get("S2A_FUZZ_S", "0"))
-EXAMPLES = 25
+EXAMPLES = examples(60)
 ODD = [
     *(b"\xff", b"\0", b"\n", b'"', b"{", b"[" * 2000, b"\xed\xa0\x80", b"-1", b"1e999", b"NaN", b"9" * 400, b"=", b";"),
     *(b"\xff\xff\xff\xff", b"\xff" * 8, b"\0" * 8, b"\x1b[2J", b"\\ud800", b"null", b"&", b"*", b"<<", b"%00", b"?"),

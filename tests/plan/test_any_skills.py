@@ -4,7 +4,7 @@ import random
 import re
 from collections.abc import Callable
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.plan_text import text_of
@@ -22,6 +22,7 @@ from s2a_bench.plan import (
 )
 from s2a_bench.types import Timing
 from studies.validity import Cost, cost_of
+from tests.conftest import examples
 from tests.plan.gbnf import Gbnf
 
 NAME = st.text("abcgop_ü鍋0", min_size=1, max_size=6).filter(str.isidentifier)
@@ -60,6 +61,7 @@ TOKENIZERS: dict[str, Callable[[], Tokenize]] = {
 }
 
 
+@settings(max_examples=examples(150))
 @given(skill_sets(), st.sampled_from(list(TOKENIZERS)), st.integers(1, 8), st.sampled_from([1, 8, 12]), st.randoms())
 def test_a_format_is_exact_and_can_be_read_or_is_refused(
     skills: SkillSet, tokenizer: str, tokens: int, n_skills: int, rng: random.Random

@@ -6,7 +6,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.plan import (
@@ -21,6 +21,9 @@ from s2a_bench.plan import (
     paper_format,
     parse_skills,
 )
+from tests.conftest import examples
+
+many = settings(max_examples=examples(200))
 
 UMLAUTS = """
 name = "küche"
@@ -97,6 +100,7 @@ def cuts(draw: st.DrawFn, data: bytes) -> list[bytes]:
     return [data[start:end] for start, end in zip([0, *at], [*at, len(data)], strict=True)]
 
 
+@many
 @given(answers(), st.data())
 def test_any_chunking_gives_the_same_skills(answer: tuple[Format, bytes], data: st.DataObject) -> None:
     format_, text = answer
@@ -120,6 +124,7 @@ def obvious(format_: Format, text: str) -> Iterator[str]:
         yield from (call for call, pattern in patterns.items() if pattern.fullmatch(line))
 
 
+@many
 @given(answers().filter(lambda answer: answer[0].delimiter == "\n"))
 def test_it_finds_what_an_obvious_reader_finds(answer: tuple[Format, bytes]) -> None:
     format_, data = answer
@@ -130,6 +135,7 @@ def test_it_finds_what_an_obvious_reader_finds(answer: tuple[Format, bytes]) -> 
     assert calls(parser.feed(data)) == list(obvious(format_, short))
 
 
+@many
 @given(formats, st.binary(max_size=2000), st.integers(1, 50))
 def test_no_bytes_break_it_and_what_it_keeps_is_bounded(format_: Format, data: bytes, size: int) -> None:
     parser = Parser(format_)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
@@ -12,9 +12,11 @@ from s2a_bench.policy import Plans, Schedule
 from s2a_bench.policy.arrivals import uniform
 from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import BLOCK, elastic, hold, least_end, safe_start, work_conserving
+from tests.conftest import examples
 from tests.policy import plain
 
 EXACT = 1e-9
+many = settings(max_examples=examples(200))
 
 sixteenths = st.integers(0, 64).map(lambda n: n / 16)
 """Sums of them are exact, so that hypothesis may look for ties."""
@@ -35,6 +37,7 @@ def total(values: np.ndarray) -> float:
     return float(values.sum())
 
 
+@many
 @given(elastic_plans())
 def test_the_arrays_agree_with_the_plain_loop(plans: Plans) -> None:
     t, nominal, least, most = (
@@ -74,6 +77,7 @@ def test_one_column_stands_for_all_plans() -> None:
     assert safe_start(t[:, :1], np.array([[1.0, 2.0], [1.0, 1.0]])).tolist() == [2.0, 1.0]
 
 
+@many
 @given(elastic_plans(), sixteenths)
 def test_t1_idling_is_conserved_whenever_execution_starts(plans: Plans, delay: float) -> None:
     first, safe = float(plans.arrival_s[0, 0]) + delay, float(safe_start(plans.arrival_s, plans.nominal_s)[0])
@@ -82,6 +86,7 @@ def test_t1_idling_is_conserved_whenever_execution_starts(plans: Plans, delay: f
     assert starts[-1, 0] + plans.nominal_s[-1, 0] == max(first, safe) + total(plans.nominal_s)
 
 
+@many
 @given(elastic_plans())
 def test_naive_and_stream_to_act_end_at_the_same_instant(plans: Plans) -> None:
     naive = work_conserving(plans.arrival_s, plans.nominal_s, plans.arrival_s[0])
@@ -90,6 +95,7 @@ def test_naive_and_stream_to_act_end_at_the_same_instant(plans: Plans) -> None:
     assert total(stalls(Schedule(streamed, plans.nominal_s))) == 0
 
 
+@many
 @given(elastic_plans())
 def test_t2_the_elastic_schedule_never_stalls_and_attains_the_least_start_and_the_least_end(plans: Plans) -> None:
     schedule = elastic(plans)
@@ -124,6 +130,7 @@ def test_stretching_can_start_earlier_than_the_papers_start() -> None:
     assert elastic(plans).start_s[:, 0].tolist() == [0.0, 2.0]
 
 
+@many
 @given(elastic_plans())
 def test_t3_stretching_alone_costs_no_completion_time(plans: Plans) -> None:
     schedule = elastic(Plans(plans.arrival_s, plans.nominal_s, plans.nominal_s, plans.most_s))
@@ -146,6 +153,7 @@ def test_t4_holding_only_at_the_end_of_a_skill_stalls_where_stretching_ahead_doe
     assert total(stalls(planned)) == 0
 
 
+@many
 @given(elastic_plans(), st.lists(st.integers(0, 16), min_size=8, max_size=8))
 def test_t5_the_start_for_least_durations_is_safe_however_early_skills_finish(plans: Plans, early: list[int]) -> None:
     part = np.array(early[: len(plans.arrival_s)])[:, np.newaxis] / 16
@@ -156,6 +164,7 @@ def test_t5_the_start_for_least_durations_is_safe_however_early_skills_finish(pl
     assert total(stalls(Schedule(starts, actual))) <= EXACT
 
 
+@many
 @given(elastic_plans())
 def test_t5_the_papers_start_stalls_by_the_difference_when_all_skills_finish_early(plans: Plans) -> None:
     papers, safe = (float(safe_start(plans.arrival_s, d)[0]) for d in (plans.nominal_s, plans.least_s))
@@ -163,6 +172,7 @@ def test_t5_the_papers_start_stalls_by_the_difference_when_all_skills_finish_ear
     assert total(stalls(Schedule(starts, plans.least_s))) == safe - papers
 
 
+@many
 @given(elastic_plans())
 def test_t7_the_pre_roll_is_the_highest_point_of_the_walk_of_gaps_minus_durations(plans: Plans) -> None:
     steps = np.diff(plans.arrival_s[:, 0]) - plans.nominal_s[:-1, 0]

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.policy import Plans, PlanShape, Start, Timing, stepping
@@ -18,6 +18,7 @@ from s2a_bench.policy.metrics import stalls
 from s2a_bench.policy.schedule import safe_start
 from s2a_bench.policy.stream_to_act import EarlyStart, MeanStart, OnlineStepper, StartRule, StreamToAct
 from s2a_bench.testing.policy import EXACT, draw
+from tests.conftest import examples
 
 SHAPE = PlanShape(4, 2, Timing(1.0, 0.8, 1.5), expected_cv=0.2)
 PRIOR = GapPrior(0.5, 0.1, 0.2)
@@ -189,6 +190,7 @@ def test_lateness_is_recovered_down_to_the_least_duration_and_not_beyond_schedul
     assert later.duration_s == pytest.approx(0.8)
 
 
+@settings(max_examples=examples(150))
 @given(
     kind=VARIANTS,
     prior=PRIORS,

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from s2a_bench.store.requests import SampleRow, TokenRow
 from s2a_bench.store.run import RunWriter, read_run
 from tests.cli.program import called
+from tests.conftest import examples
 from tests.made_runs import BLACK_BOX, marks_of, row_of
 
 TEXTS = st.text(st.characters(exclude_categories=()), max_size=20) | st.sampled_from(
@@ -65,7 +66,7 @@ def as_kept(text: str) -> str:
 
 
 @given(st.lists(SAMPLES, max_size=3), TOKENS, TEXTS)
-@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(150), suppress_health_check=[HealthCheck.too_slow])
 @example([{"facts": {"prompt_n": 10**25}, "prompt_n": 10**25}], [(10**25, "\x00")], "\udcff")
 @example([{"marks": [("", -(2**63)), ("server", 2**63 - 1)]}], [], "")
 def test_it_can_be_read_while_it_runs_and_when_it_is_done(
@@ -85,7 +86,7 @@ def test_it_can_be_read_while_it_runs_and_when_it_is_done(
 
 
 @given(st.lists(SAMPLES, min_size=1, max_size=3), TOKENS, TEXTS)
-@settings(max_examples=3)
+@settings(max_examples=examples(5))
 @example([{"facts": {"a": 10**25}, "prompt_n": 10**25, "error": "\x1b[2J\r$x_$<b>"}, {}], [(1, "$\\q$")], "\udcff$x_$")
 @example([{"marks": [("", -(2**63)), ("server", 2**63 - 1)], "server_prompt_ms": 1e300}], [], "")
 def test_it_can_be_reported_on(samples: list[dict[str, Any]], tokens: list[tuple[int, str]], note: str) -> None:

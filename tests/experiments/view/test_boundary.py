@@ -25,6 +25,7 @@ from s2a_bench.store.run import StoredRun, read_run
 from s2a_bench.testing import NullProgress
 from s2a_bench.writers.figures import caption_of
 from s2a_bench.writers.style import paper_column
+from tests.conftest import examples
 
 T_NOM = NaiveTrial("t_nom", 1.0, n_skills=8, jitter="none", plans=1, seed=0)
 T_MIN = replace(T_NOM, duration="t_min", duration_s=0.8)
@@ -46,7 +47,7 @@ def drawn(run: StoredRun) -> Figure:
         return show(run).figures["boundary"]()
 
 
-@settings(max_examples=15)
+@settings(max_examples=examples(40))
 @given(
     n_skills=st.integers(2, 40),
     t_nom_s=st.floats(0.1, 10),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from s2a_bench.errors import UsageError
@@ -19,12 +19,15 @@ from s2a_bench.plugins.chunks.modes.metrics import margin_ticks, measure, reacti
 from s2a_bench.plugins.chunks.modes.replace import Replace
 from s2a_bench.plugins.chunks.modes.trigger import Varied
 from s2a_bench.plugins.chunks.testing.mode import ModeSuite
+from tests.conftest import examples
 from tests.plugins.chunks.modes.drawn import agree, cases, latencies, modes, plainly, settings_of_chunks
 
 named = pytest.mark.parametrize("name", MODES)
+many = settings(max_examples=examples(300))
 
 
 @named
+@many
 @given(data=st.data())
 def test_ticks_are_those_of_a_robot_in_continuous_time(name: str, data: st.DataObject) -> None:
     made, latency_ns, setting = data.draw(cases(name))
@@ -40,12 +43,14 @@ def test_ticks_are_those_of_a_robot_in_continuous_time(name: str, data: st.DataO
 
 
 @named
+@many
 @given(data=st.data())
 def test_the_stepper_and_the_arrays_agree(name: str, data: st.DataObject) -> None:
     made, latency_ns, setting = data.draw(cases(name))
     agree(simulate(made, latency_ns, setting)[::-1], step(made, latency_ns, setting))
 
 
+@many
 @given(data=st.data(), setting=settings_of_chunks())
 def test_arrays_of_streamed_actions_are_the_stepper_s_at_any_gaps(data: st.DataObject, setting: ControlSetting) -> None:
     made, latency_ns = data.draw(modes(setting, "streamed")), data.draw(latencies(setting))
@@ -85,6 +90,7 @@ def test_cycles_are_what_ticks_add_up_to(name: str, data: st.DataObject) -> None
     assert cycles.settled.sum() == max(np.count_nonzero(cycles.executed) - 1, 0)
 
 
+@many
 @given(data=st.data())
 def test_blended_ages_are_those_of_the_weights(data: st.DataObject) -> None:
     made, latency_ns, setting = data.draw(cases("aggregate"))
@@ -185,6 +191,7 @@ def varied(draw: st.DrawFn) -> tuple[Varied, Any, ControlSetting]:
     return VariedQueue(Queue(0, execute), tuple(triggers)), draw(latencies(setting)), setting
 
 
+@many
 @given(case=varied())
 def test_its_arrays_and_its_stepper_agree(case: tuple[Varied, Any, ControlSetting]) -> None:
     mode, latency_ns, setting = case
