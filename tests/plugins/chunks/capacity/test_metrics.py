@@ -155,6 +155,23 @@ def test_robots_that_differ_have_the_variance_between_them() -> None:
     assert interval(flags, 6, cycle=4) == pytest.approx((low / 6000, high / 6000))
 
 
+@pytest.mark.parametrize("expected", [0.3, 1, 3, 10, 40])
+@pytest.mark.parametrize("confidence", [0.95, 0.99])
+def test_the_interval_holds_the_share_of_few_events_of_unlike_size(expected: float, confidence: float) -> None:
+    """Events of 1 to 40 ticks of eight robots, as a queue makes them: 20 s, and a request each 0.32 s."""
+    rng, runs, sizes = np.random.default_rng(1), 30, np.array([1, 2, 4, 8, 16, 40])
+    chances = np.array([0.3, 0.25, 0.2, 0.12, 0.1, 0.03])
+    share = expected * float(sizes @ chances) / 8000
+    held = 0
+    for _ in range(runs):
+        stalled = np.zeros((1000, 8), bool)
+        for size in rng.choice(sizes, rng.poisson(expected), p=chances):
+            stalled.reshape(-1)[(start := 8 * rng.integers(0, 994)) : start + size] = True
+        low, high = interval(stalled.T, 8, cycle=16, confidence=confidence)
+        held += low <= share <= high
+    assert stats.binom.cdf(held, runs, confidence) > 0.01, "so few of the runs would be chance once in a hundred times"
+
+
 def test_a_cycle_is_the_time_between_two_requests_of_a_robot() -> None:
     assert cycle_ns([trace(), trace(1, arrival_ms=(15,))]) == 320 * MS / 4
     assert cycle_ns([trace(arrival_ms=())]) == 160 * MS

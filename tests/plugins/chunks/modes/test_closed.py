@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -19,14 +19,17 @@ from s2a_bench.plugins.chunks.modes.closed import (
     appended,
     replace_stall_share,
     slow_down,
+    stall_share,
 )
 from s2a_bench.plugins.chunks.modes.replace import Replace
 from s2a_bench.policy.schedule import safe_start
+from tests.conftest import examples
 from tests.plugins.chunks.modes.drawn import plainly
 from tests.plugins.chunks.modes.plain import Log
 
 PERIOD = 20
 ROUNDINGS = st.sampled_from(["floor", "ceil"])
+steady = settings(max_examples=examples(150))
 
 
 def constant(latency: int, requests: int = 8) -> Any:
@@ -61,6 +64,7 @@ def spread(values: list[int]) -> tuple[float, float, float]:
 # (a) queue and sync
 
 
+@steady
 @given(
     latency=st.integers(0, 400),
     trigger=st.integers(0, 8),
@@ -82,6 +86,7 @@ def test_a_queue_stalls_for_what_the_delay_exceeds_the_trigger_by(
     assert (boundaries(log)[0] == 0) == (trigger >= none_from)
 
 
+@steady
 @given(
     latency=st.integers(0, 300),
     trigger=st.integers(0, 12),
@@ -103,6 +108,7 @@ def test_with_any_trigger_it_stalls_for_what_answers_take_longer_than_they_last_
 # (b) replace
 
 
+@steady
 @given(
     latency=st.integers(0, 300),
     s=st.integers(1, 9),
@@ -137,6 +143,7 @@ def test_replace_stalls_for_what_a_cycle_and_a_delay_exceed_the_chunk_by(
 # (c) reaction
 
 
+@steady
 @given(latency=st.integers(0, 300), s=st.integers(1, 9), trigger=st.integers(0, 5), name=st.sampled_from("qrsa"))
 def test_a_reaction_takes_the_wait_and_up_to_a_cycle(latency: int, s: int, trigger: int, name: str) -> None:
     setting = ControlSetting(PERIOD, 18, "ceil")
@@ -231,6 +238,22 @@ def test_a_cycle_stalls_as_often_as_its_latency_exceeds_the_slack(made: Mode, sl
     assert within(stalls, count - 1, float(law.sf(at)))
 
 
+@pytest.mark.parametrize("rounding", ["floor", "ceil"])
+def test_where_latencies_exceed_s_one_late_answer_makes_the_next_one_late_too(rounding: Rounding) -> None:
+    setting, s, count = ControlSetting(20 * MS, 8, rounding), 3, 20_000
+    latency = lognormal(np.random.default_rng(7), 60 * MS, 0.5, count)
+    cycles = Replace(s).cycles(latency, setting)
+    # A chunk that is all past when it arrives has no boundary; the tick before a cycle's end says what it left.
+    gap = cycles.usable_tick[1:] - cycles.request_tick[:-1] - 8
+    share = float(np.mean(gap[1:] > 0))
+    delay, known = setting.delay_ticks(latency), setting.known_ticks(latency)
+    expected = replace_stall_share(delay, known, s, 8)
+    assert share == pytest.approx(expected, abs=4 * (expected / count * 2) ** 0.5)
+    assert share > 2 * stall_share(delay, 8 - s)  # P(L > (H - s) Delta t) alone
+    assert Replace(s).ticks(latency[:2000], setting).stalled.any()
+    assert cycles.settled.sum() > 0.9 * count
+
+
 def test_the_share_over_pairs_is_the_share_over_all_pairs() -> None:
     rng = np.random.default_rng(8)
     delay = rng.integers(0, 9, 60)
@@ -242,6 +265,7 @@ def test_the_share_over_pairs_is_the_share_over_all_pairs() -> None:
 # (f) where nothing but slowing down helps
 
 
+@steady
 @given(
     latency=st.integers(1, 900),
     s=st.integers(1, 9),
