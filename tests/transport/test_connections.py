@@ -12,6 +12,7 @@ import pytest
 from s2a_bench.clock import now_ns
 from s2a_bench.transport.connections import Wire, wait_at_most
 from s2a_bench.transport.serving import Disconnected
+from tests.waiting import until
 
 LARGE = bytes(64 << 20)
 
@@ -58,3 +59,12 @@ def test_a_client_that_does_not_read_is_given_up_in_time(ends: tuple[Wire, socke
     wire.sendall(LARGE)
     with pytest.raises(Disconnected, match="does not read"):
         wire.flush(0.05)
+
+
+def test_a_client_that_has_gone_is_noticed_while_its_bytes_lie_unread(ends: tuple[Wire, socket.socket]) -> None:
+    wire, client = ends
+    client.sendall(bytes(1000))
+    assert not wire.disconnected()
+    client.close()
+    until(wire.disconnected)
+    assert len(wire.socket.recv(1000)) == 1000

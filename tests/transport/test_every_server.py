@@ -233,6 +233,17 @@ def test_a_client_that_does_not_read_does_not_keep_the_engine(name: str) -> None
         assert len([*slow]) == many - 1
 
 
+@on_ports
+def test_clients_at_once_are_all_answered(name: str) -> None:
+    handler = recorder(name)
+    with serving(name, handler) as connect:
+        clients = [connect() for _ in range(4)]
+        for _ in range(2):
+            askings = [Asking(client, "go") for client in clients]
+            assert [(asking.end().error, len(asking.pieces)) for asking in askings] == [("", 3)] * 4
+    assert len(handler.requests) == 8
+
+
 @every
 def test_what_breaks_inside_is_not_shown_and_fails_this_request_only(name: str) -> None:
     fine = recorder(name)
