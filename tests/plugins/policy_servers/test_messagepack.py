@@ -113,6 +113,8 @@ def generic(data: Any, dtype: Any) -> bytes:
 ARRAYS_THAT_ARE_NONE = {
     "objects": ndarray(dtype="|O", shape=(1,)),
     "records": ndarray(dtype="|V8", shape=(1,)),
+    "records by a zero": ndarray(dtype="08f4"),
+    "records of 10,000 fields": ndarray(dtype="f4," * 10_000),
     "complex numbers": ndarray(dtype="<c8", shape=(1,)),
     "a type that is none": ndarray(dtype="<f5"),
     "a type of no bytes": ndarray(b"", "S0", (1 << 40,)),

@@ -224,6 +224,8 @@ def test_files_are_decoded(whole: bool) -> None:
         ({"a": np.zeros((4, 0, 3), np.uint8)}, "0x4 is empty"),
         ({"a": b"abc"}, "a: the 3 bytes .*: neither a JPEG nor a PNG"),
         ({"a": b""}, "a: an empty picture"),
+        ({"a": np.zeros((99, 2, 2, 3), np.uint8)}, "a: 99 pictures"),
+        ({"a": [PICTURE] * 99}, "more than 64 pictures"),
         ({"a": np.zeros((64, 64, 3))}, "a: a state of more than 4096 numbers; pictures are uint8"),
         ({"a": float("nan")}, "not finite"),
         ({"prompt": "\ud800"}, "no Unicode text"),

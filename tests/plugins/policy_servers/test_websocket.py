@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import Any
 from unittest.mock import DEFAULT, Mock
 
@@ -190,7 +190,9 @@ def test_a_client_that_does_not_read_is_cut_off_and_the_next_is_answered(monkeyp
 
 
 @pytest.mark.parametrize("error", [None, OSError("no descriptors"), RuntimeError("no threads")])
-def test_a_server_whose_accept_fails_accepts_again(error: Exception | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_whose_accept_fails_says_so_and_accepts_again(
+    error: Exception | None, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     in_vain = Mock(**{"serve_forever.side_effect": error})
     libraries = Mock(side_effect=[in_vain, DEFAULT], wraps=plain_serve)
     monkeypatch.setattr(websocket_server, "serve", libraries)
@@ -198,6 +200,7 @@ def test_a_server_whose_accept_fails_accepts_again(error: Exception | None, monk
         socket.send(packb({"prompt": "go"}))
         assert unpackb(socket.recv(timeout=20))["actions"].shape == (4, 3)
     assert libraries.call_count == 2
+    assert "no connection can be accepted" in caplog.text
 
 
 def test_a_server_that_stops_sends_the_answer_under_way_and_says_that_it_goes() -> None:
@@ -318,6 +321,21 @@ def test_what_comes_unasked_is_no_answer_to_the_next_request() -> None:
         for number in (1.0, 2.0, 3.0):
             (action,), _ = ask(client, Request("a", "go", (yuyv_frame(),), state=(number,) * 14))
             assert action.values.tolist() == [number]
+
+
+def test_pings_are_answered_between_requests() -> None:
+    answered = Event()
+
+    def pinging(socket: Any) -> None:
+        socket.recv()
+        socket.send(packb({"actions": CHUNK}))
+        if socket.ping().wait(20):
+            answered.set()
+        socket.recv()
+
+    with handled_by(pinging, {}) as address, foreign(address) as client:
+        ask(client, Request("a", "go"))
+        assert answered.wait(20)
 
 
 def test_a_foreign_stream_is_read_whether_or_not_its_last_frame_repeats_it() -> None:
