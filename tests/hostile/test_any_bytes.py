@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.ros import messages, open_middleware
 from s2a_bench.testing.transport import RecordingHandler, ask, served, wiring_of
@@ -82,7 +83,7 @@ def asking(name: str, address: str, timeout_s: float, deadline_s: float = 0) -> 
 
 @cases(SERVERS)
 def test_a_server_costs_its_client_an_error_of_one_line_and_little_memory(name: str, case: Server) -> None:
-    error = ""
+    error, began = "", now_ns()
     with case.does() as address, closing(open_client(asking(name, address, case.timeout_s, case.deadline_s))) as client:
         forget_peak(os.getpid())
         before = usage(os.getpid()).rss_mib
@@ -91,6 +92,7 @@ def test_a_server_costs_its_client_an_error_of_one_line_and_little_memory(name: 
         except S2AError as failure:
             error = f"{type(failure).__name__}: {failure}"
         assert usage(os.getpid()).peak_mib - before < CLIENT_MIB
+    assert now_ns() - began < (case.timeout_s + 10) * 1e9
     assert re.search(case.says, error)
     assert error.isprintable()
 

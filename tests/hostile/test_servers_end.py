@@ -21,8 +21,8 @@ from s2a_bench.testing.transport import wiring_of
 from s2a_bench.transport.http.native import PATHS
 from tests.cli.program import command
 from tests.hostile.conftest import KilledRun
-from tests.hostile.peers import connect
-from tests.hostile.wires.http import chat
+from tests.hostile.peers import CLOSED, Attack, sends
+from tests.hostile.wires import http, websocket, zmq
 from tests.waiting import ended, until
 
 
@@ -85,23 +85,33 @@ sys.exit(serving.main())
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stream", ["true", "false"])
-def test_a_signal_ends_a_server_whose_engine_is_stuck(stream: str, tmp_path: Path) -> None:
-    began = tmp_path / "began"
-    job = ServerJob(wiring_of("http"), EngineConfig(name="echo")).to_json()
+@pytest.mark.parametrize(
+    ("name", "asks"),
+    [
+        ("http", sends(http.chat(PATHS["as-deployed"], fields='"stream": true'))),
+        ("http", sends(http.chat(PATHS["as-deployed"], fields='"stream": false'))),
+        ("websocket", websocket.asks(websocket.GO)),
+        ("zmq", zmq.greets(zmq.message(zmq.request({})))),
+    ],
+    ids=["http, streamed", "http, whole", "websocket", "zmq"],
+)
+def test_a_signal_ends_a_server_whose_engine_is_stuck(name: str, asks: Attack, tmp_path: Path) -> None:
+    began, wiring = tmp_path / "began", wiring_of(name)
+    job = ServerJob(wiring, EngineConfig(name="echo", answer=wiring.capabilities.answer_kinds[0])).to_json()
     line = [sys.executable, "-c", STUCK, began]
     with subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         try:
             process.stdin.write(job.encode() + b"\n")
             process.stdin.flush()
-            wiring = wiring_of("http", json.loads(process.stdout.readline())["address"])
-            with connect(wiring) as connection:
-                connection.sendall(chat(PATHS["as-deployed"], fields=f'"stream": {stream}'))
-                until(began.exists)
-                process.terminate()
-                assert process.wait(30) == 0
+            bound = wiring_of(name, json.loads(process.stdout.readline())["address"])
+            asking = Thread(target=asks, args=(bound, CLOSED))
+            asking.start()
+            until(began.exists)
+            process.terminate()
+            assert process.wait(30) == 0
         finally:
             process.kill()
+    asking.join()
 
 
 STUBBORN = (

@@ -79,6 +79,9 @@ LARGE = (
         greets(lambda: message(request({"video.a": np.frombuffer(bomb(), np.uint8)}))),
         REFUSED,
     ),
+    Case(
+        "a million pictures", greets(lambda: message(request({"video.a": np.zeros((MIB, 1, 1, 3), np.uint8)}))), REFUSED
+    ),
     Case("1000 requests, nothing read", greets(message(request({})) * 1000, kind=b"DEALER", then="leaves")),
 )
 
@@ -92,6 +95,7 @@ SERVERS = (
     Server("silence", answers(), timeout_s=0.5),
     Server("noise", answers(NOISE), timeout_s=0.5),
     Server("greeted, then silence", answered(), "^RequestFailed: .*silent", timeout_s=0.5),
+    Server("HTTP", answers(b"HTTP/1.1 400 Bad Request\r\n\r\n", leaves=True), "ZeroMQ peer", timeout_s=0.5),
     Server("another kind of socket", answers(ready(b"PUB")), timeout_s=0.5),
     Server("noise as an answer", answered(message(NOISE))),
     Server("100,000 frames", answered(frame(b"", more=True) * 100_000 + frame(b"")), "frames"),
