@@ -322,6 +322,15 @@ class TestBlackBox:
         ):
             ask(client, Request("a", "go"))
 
+    def test_a_server_of_another_protocol_is_told_within_the_time_out(self) -> None:
+        with served(wiring_of("http"), RecordingHandler(["go"])) as (server, _):
+            url = server.address.replace("http:", "tcp:")
+            with (
+                pytest.raises(RequestFailed, match="is it a ZeroMQ peer"),
+                robot("", url=url, timeout_s=0.5) as client,
+            ):
+                ask(client, Request("a", "go"))
+
     @pytest.mark.parametrize(("dies", "error"), [(False, "broke the connection"), (True, "has ended")])
     def test_a_server_that_goes_is_told_at_once(self, dies: bool, error: str) -> None:
         dead = Event()
