@@ -6,10 +6,13 @@ Every experiment is a function (`latency`, `throughput`, `timeline`, those of pl
 
 from __future__ import annotations
 
+import os
 from importlib.util import find_spec
 from typing import Any
 
 __version__ = "0.1.0"
+
+os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", "50000000")  # OpenCV reads it when it is loaded
 
 _LIBRARY = ("Comparison", "Run", "compare", "load")
 

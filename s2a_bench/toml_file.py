@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
 import sys
 from collections.abc import Callable, Iterable, Mapping
@@ -51,6 +52,10 @@ class TomlTable(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
+_DEEP = re.compile(r"""(?<![\w-])(?:("[^"\n]*"|'[^'\n]*'|[\w-]+)[ \t]*\.[ \t]*){32}""")
+"""A dotted key of more than 32 names: tomllib's time grows with the square of their number."""
+
+
 def read(path: str | Path, option: str, most: int = FILE_LETTERS) -> str:
     """Return the text of a file that an ``option`` names; raises UsageError."""
     try:
@@ -61,6 +66,8 @@ def read(path: str | Path, option: str, most: int = FILE_LETTERS) -> str:
 
 def loads(text: str, where: str, parse_float: Callable[[str], Any] = float) -> dict[str, Any]:
     """Read TOML text; ``where`` begins every error. Raises UsageError."""
+    if _DEEP.search(text):
+        raise UsageError(f"{where}: no TOML that can be read: it has a dotted key of more than 32 names")
     try:
         return tomllib.loads(text, parse_float=parse_float)
     except RecursionError:

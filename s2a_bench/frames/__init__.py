@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Final, Protocol
 
 from s2a_bench.clock import now_ns
@@ -11,8 +10,7 @@ from s2a_bench.registry import Registry
 from s2a_bench.types import Encoding, Frame, Pixels
 
 MOST_PIXELS: Final = 50_000_000
-"""OpenCV refuses a picture file of more by its header, unless the environment says otherwise."""
-os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(MOST_PIXELS))  # OpenCV reads it when it is loaded
+"""The most of a picture; OpenCV's own limit for files is the same (`s2a_bench/__init__.py`)."""
 
 
 class FrameSource(Protocol):

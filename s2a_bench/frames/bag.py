@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -68,10 +69,12 @@ def _open(path: str) -> Any:
         raise SourceError(f"`source`: no recording at {path}")
     try:
         metadata = Path(path) / "metadata.yaml"
-        if metadata.is_file() and "<<" in read_text(metadata):
-            raise ValueError("metadata.yaml: merged keys (<<) are not read: a few could take endless time")
+        if metadata.is_file() and re.search("<<|!!|!<|%TAG", read_text(metadata)):
+            raise ValueError("metadata.yaml: merged keys (<<) and tags are not read: a few could take endless time")
         reader = Reader(path)
         reader.open()
+        if not all(isinstance(name, str) for each in reader.connections for name in (each.topic, each.msgtype)):
+            raise ValueError("a topic's name or type is no text")
     except Exception as error:  # rosbags raises any exception on a damaged file
         raise SourceError(f"`source`: {_unreadable(path, error)}") from error
     return reader

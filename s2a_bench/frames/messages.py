@@ -73,7 +73,7 @@ def decompressed(image: Any) -> Frame:
     try:
         rgb = decode_received(image.data)
     except ValueError as error:
-        raise TransportError(f"{len(image.data)} bytes of format '{image.format}': {error}") from error
+        raise TransportError(f"{len(image.data)} bytes of format '{image.format[: ros.SHOWN]}': {error}") from error
     frame = Frame(-1, ros.nanoseconds(image.header.stamp), rgb.shape[1], rgb.shape[0], "rgb8", rgb)
     if "compressed" in coding and "compressed bgr8" not in coding:
         if encoding in COLOURS:

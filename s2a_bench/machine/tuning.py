@@ -17,8 +17,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from threading import Thread, current_thread, main_thread
 from typing import Any, Final
 
-import s2a_bench.frames  # noqa: F401 - its limit of pixels goes before OpenCV
-
 PR_SET_PDEATHSIG: Final = 1
 _libc = ctypes.CDLL(None)
 M_TRIM_THRESHOLD = -1

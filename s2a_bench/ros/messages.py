@@ -77,6 +77,8 @@ DEPTH = frozenset({"16UC1", "32FC1"})
 VERSIONS = {"6.0": "llama_msgs-6.0.9", "4.4": "llama_msgs-4.4.1"}
 """Version of llama_msgs -> its folder in ``interfaces``; one type store knows one version."""
 DEFAULT_VERSION = "6.0"
+SHOWN = 64
+"""Letters of an encoding that came from outside, in an error: the log keeps its kinds."""
 ZEROS: dict[str, Any] = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
 """The zero of each basic type that is not an integer."""
 
@@ -294,12 +296,14 @@ def frame_of_image(image: Any, index: int = -1) -> Frame:
     refuse_depth(encoding)
     channels = CHANNELS.get(encoding)
     if channels is None:
-        raise TransportError(f"image encoding '{encoding}' is none of {', '.join(CHANNELS)}")
+        raise TransportError(f"image encoding '{encoding[:SHOWN]}' is none of {', '.join(CHANNELS)}")
     if not (image.width and image.height):
-        raise TransportError(f"image of {image.width}x{image.height} {image.encoding} is empty")
+        raise TransportError(f"image of {image.width}x{image.height} {image.encoding[:SHOWN]} is empty")
     height = image.height * 3 // 2 if encoding in CHROMA_BELOW else image.height
     if image.step < image.width * channels or image.data.size < image.step * height:
-        raise TransportError(f"image of {image.width}x{image.height} {image.encoding} has {image.data.size} bytes")
+        raise TransportError(
+            f"image of {image.width}x{image.height} {image.encoding[:SHOWN]} has {image.data.size} bytes"
+        )
     rows = image.data[: image.step * height].reshape(height, image.step)[:, : image.width * channels]
     pixels = rows.reshape((height, image.width) if channels == 1 else (height, image.width, channels))
     if encoding in get_args(Deep) and bool(image.is_bigendian) != (sys.byteorder == "big"):

@@ -26,7 +26,6 @@ MATCH_POLL_S: Final = 0.01
 """rclpy's own waiting looks four times a second."""
 REACH_S: Final = 0.1
 """A server waits so long for the reader of a client that it does not reach yet, as rmw_cyclonedds does."""
-
 WARNED_AT_MOST: Final = 100
 """Kinds of a warning that are logged: the errors of a camera's frames may differ in each."""
 

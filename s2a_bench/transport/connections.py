@@ -1,7 +1,7 @@
-"""Connections of a server: one thread each, up to a limit; a silence while reading ends, and writes never wait.
+"""Connections of a server: one thread each, up to a limit; a read may end after a silence, and a write never waits.
 
 The scheduler shares the processor among the threads: a client that floods its connection delays the others less than
-on an event loop. docs/reliability.md has the figures.
+on an event loop.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from s2a_bench.transport.serving import Disconnected
 GRACE_S: Final = 1.0
 """Time for running answers when a server is stopped."""
 LINGER_S: Final = 1.0
-"""Time for a client to read a refusal: closing at once would reset the connection."""
+"""Time for a client to read a refusal: closing at once would reset the connection; one too many is closed at once."""
 PAUSE_S: Final = 0.1
 """Pause after a failed accept: the limit of open files or threads is reached."""
 _TIMEVAL: Final = struct.Struct("@ll")

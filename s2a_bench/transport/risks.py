@@ -53,7 +53,7 @@ def examine(url: str) -> list[Finding]:
         findings.append(Finding("server", "state", f"{host} answers"))
     except RequestFailed as error:  # it may take a client with a key
         findings.append(Finding("server", "state", f"{host} refuses: {_line(error)}"))
-    except (OSError, TransportError) as error:
+    except (OSError, UnicodeError, TransportError) as error:
         why = f"{host} does not answer: {_line(error)}"
         findings.append(Finding("server", "error", why, "start it, or name another"))
     return findings
@@ -65,6 +65,8 @@ def _line(error: Exception) -> str:
 
 def connect(parts: SplitResult) -> Iterator[Finding]:
     """Find out whether something listens; nothing is sent."""
+    if not parts.port:
+        raise TransportError(f"name its port: {parts.scheme}://{parts.hostname}:PORT")
     socket.create_connection((parts.hostname or "", parts.port or 0), PATIENCE_S).close()
     yield from ()
 

@@ -166,10 +166,11 @@ LAUGHS = "a0: &a0 [x, x]\n" + "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] *
         ("a:\n\t- b", "found character '\\t' that cannot start any token in \"<unicode string>\", line 2"),
         ("a: " + "[" * 1000, "maximum recursion depth exceeded"),
         (LAUGHS + "rosbag2_bagfile_information: {version: 5, relative_file_paths: *a29}", "Invalid bag metadata"),
-        ("a: &a {}\nb:\n  <<: *a", "metadata.yaml: merged keys (<<) are not read"),
+        ("a: &a {}\nb:\n  <<: *a", "metadata.yaml: merged keys (<<) and tags are not read"),
+        ("a: &a {}\nb: {!!merge x: *a}", "metadata.yaml: merged keys (<<) and tags are not read"),
         ("[]", "Invalid bag metadata: list indices must be integers"),
     ],
-    ids=["syntax", "tab", "deep", "laughs", "merged", "list"],
+    ids=["syntax", "tab", "deep", "laughs", "merged", "merged by a tag", "list"],
 )
 def test_yaml_that_is_none_is_one_line(tmp_path: Path, text: str, reason: str, opened: Open) -> None:
     (tmp_path / "metadata.yaml").write_text(text)

@@ -7,6 +7,7 @@ the request is its observation, and the answer a chunk of actions.
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -31,6 +32,8 @@ ACTION_N = Fact("action_n", "", "numbers of the action")
 
 ARRAY = "__numpy__"
 """The key of an array's bytes, in Base64."""
+
+NUMBERS = re.compile(r"[<>|=]?[fiu][0-9]+")
 
 
 class OpenVla(Dialect):
@@ -122,4 +125,6 @@ def _arrays_in(value: Any) -> Any:
         return value
     if ARRAY not in value:
         return {key: _arrays_in(each) for key, each in value.items()}
+    if not NUMBERS.fullmatch(value["dtype"]):
+        raise ValueError(f"an action of type {value['dtype']}")
     return extras.require("json_numpy", "act").object_hook(value)

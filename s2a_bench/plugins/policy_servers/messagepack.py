@@ -33,7 +33,14 @@ def unpacked(data: Any, of_map: Callable[[dict[Any, Any]], Any]) -> Any:
             max_map_len=MAP,
             max_ext_len=0,  # the hook never gets time stamps; empty extensions pass this
         )
-    except (RequestFailed, ValueError, TypeError, OverflowError, RecursionError) as error:  # msgpack's: ValueErrors
+    except (
+        RequestFailed,
+        ValueError,
+        TypeError,
+        OverflowError,
+        RecursionError,
+        SyntaxError,
+    ) as error:  # NumPy's of dtypes
         raise RequestFailed(f"{len(data)} bytes that are no message: {str(error) or type(error).__name__}") from error
 
 

@@ -26,8 +26,8 @@ from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.serving import Disconnected, Exchange
 from s2a_bench.types import Action, Frame, Piece, Request, Vector
 
-NUMBERS: Final = 4096
-"""The most numbers of the state in one request: a picture of floats is no state."""
+PICTURES, NUMBERS = 64, 4096
+"""The most pictures, and numbers of the state, in one request."""
 PROMPT: Final = "prompt"
 DEPTH: Final = 32
 COLOURS: Final = 3
@@ -80,6 +80,8 @@ def read_observation(
             pictures = _pictures(key, value, trace, pixels)
             pixels -= sum(picture.pixel_count for picture in pictures)
             frames += pictures
+            if len(frames) > PICTURES:
+                raise RequestFailed(f"more than {PICTURES} pictures")
         elif isinstance(value, (float, np.floating)) or (isinstance(value, np.ndarray) and value.dtype.kind == "f"):
             row = np.asarray(value).reshape(-1)
             count += row.size
@@ -121,6 +123,8 @@ def _pictures(key: str, value: Any, trace: Trace, most_pixels: int) -> Sequence[
     height, width = shape[-3:-1] if last else shape[-2:]
     check_pixels(width, height, most_pixels)
     several = value.reshape(-1, *shape[-3:])
+    if len(several) > PICTURES:
+        raise RequestFailed(f"{key}: {len(several)} pictures; at most {PICTURES} are taken")
     planes = several if last else np.ascontiguousarray(np.moveaxis(several, 1, -1))
     return [Frame(-1, 0, width, height, "rgb8", picture) for picture in planes]
 

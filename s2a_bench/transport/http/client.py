@@ -42,6 +42,7 @@ UNKNOWN_MODEL = re.compile(
 """Messages of servers, with any status, that they have no such model."""
 
 QUOTED = 200
+QUOTED_BYTES = 1 << 16
 """Characters that are quoted of a body that is no error object."""
 
 
@@ -112,7 +113,7 @@ class HttpClient(Client):
         expected = self._dialect.media_type
         good = (expected, native.BLOCKS) if self._dialect.name == NATIVE else (expected,)
         if response.status_code != httpx.codes.OK or not kind.startswith(good):
-            raise refusal(self._url, response, text_of(body), self._options, expected)
+            raise refusal(self._url, response, text_of(_beginning(body)), self._options, expected)
         if (coding := response.headers.get("content-encoding", "identity")) != "identity":
             raise RequestFailed(f"{self._url} compressed its answer ({coding}) without being asked to")
 
@@ -222,6 +223,15 @@ class HttpClient(Client):
     def close(self) -> None:
         if self._client is not None:
             self._client.close()
+
+
+def _beginning(body: Iterator[bytes]) -> Iterator[bytes]:
+    """Yield what arrives of a refusal, up to `QUOTED_BYTES`; one that does not end is quoted all the same."""
+    size = 0
+    with suppress(RequestFailed, httpx.TimeoutException):
+        while size < QUOTED_BYTES and (piece := next(body, b"")):
+            yield piece
+            size += len(piece)
 
 
 def refusal(url: str, response: HttpResponse, body: str, options: HttpOptions, expected: str) -> RequestFailed:

@@ -2,9 +2,9 @@
 
 It has a pydantic body, the standard library's JSON and Base64, and computes answers on a thread pool.
 
-uvicorn bounds the number of connections and the length of a head. `Admission` bounds the body and its time, and lets
-the headers decide on access: FastAPI gets a request that is admitted and complete. The time of a head, and of an answer
-that its client does not read, has no bound beside the number of connections.
+uvicorn refuses requests beyond a number of connections, and a head that has grown too long. `Admission` bounds the body
+and its time, and lets the headers decide on access: FastAPI gets a request that is admitted and complete. The time of a
+head, and of an answer that its client does not read, has no bound; idle connections end at the limit of open files.
 """
 
 from __future__ import annotations
@@ -67,19 +67,19 @@ class Admission:
 
     async def _whole(self, scope: Any, receive: Any, held: ExitStack) -> dict[str, Any]:
         """Return the request as one message. Raises Refused, TooLarge, Busy, Disconnected."""
-        limits, pieces, size = self._core.limits, [], 0
+        limits, body = self._core.limits, bytearray()
         headers = [(name.decode("latin-1"), value.decode("latin-1")) for name, value in scope["headers"]]
         native.admit(self._access, scope["path"], headers)
         _check_size(int(dict(headers).get("content-length", 0)), limits)
         count = held.enter_context(self._core.in_flight.counted())
         with anyio.move_on_after(limits.body_s):
             while (message := await receive())["type"] != "http.disconnect":
-                pieces.append(message.get("body", b""))
-                count(len(pieces[-1]))
-                size += len(pieces[-1])
-                _check_size(size, limits)
+                piece = message.get("body", b"")
+                count(len(piece))
+                body += piece
+                _check_size(len(body), limits)
                 if not message.get("more_body"):
-                    return {"type": "http.request", "body": b"".join(pieces), "more_body": False}
+                    return {"type": "http.request", "body": bytes(body), "more_body": False}
             raise Disconnected
         raise Refused(408, f"the body took more than {limits.body_s:g} s")
 

@@ -136,9 +136,12 @@ SERVERS = (
     Server("an endless line", answers(response(), b"data: ", again=b"x" * MANY), BYTES),
     Server("an endless event", answers(response(), again=b"data: x\n" * MANY), BYTES),
     Server("endless bare JSON", answers(response(), again=b"[\n" * MANY), BYTES),
-    Server("an endless refusal", answers(response("400 No", "text/plain"), again=b"no " * MANY), BYTES),
+    Server("an endless refusal", answers(response("400 No", "text/plain"), again=b"no " * MANY), "answered 400: no no"),
     Server(
-        "a refusal, slowly", answers(response("400 No", "text/plain"), again=b"no ", every_s=0.05), LATE, deadline_s=1.0
+        "a refusal, slowly",
+        answers(response("400 No", "text/plain"), again=b"no ", every_s=0.05),
+        "answered 400: no no",
+        deadline_s=1.0,
     ),
     Server("a page", answers(response(kind="text/html"), b"<p>", leaves=True), "as text/html where"),
     Server("a forged line", answers(response("400 No", "text/plain"), FORGED.encode(), leaves=True), "all is well"),

@@ -39,6 +39,8 @@ QUIET.propagate = False
 ARRAY, GENERIC = b"__ndarray__", b"__npgeneric__"
 UNSAFE: Final = "VOc"
 """Kinds of dtypes that do not travel."""
+LONGEST: Final = 32
+"""Letters of a dtype: NumPy takes minutes for long ones, of many fields."""
 
 
 def packb(value: Any, *, text_keys: bool = False) -> bytes:
@@ -83,7 +85,7 @@ def _of_map(value: dict[Any, Any]) -> Any:
 
 def _dtype(fields: dict[Any, Any]) -> np.dtype[Any]:
     text = fields.get(b"dtype")
-    dtype = np.dtype(text) if isinstance(text, str) else None
+    dtype = np.dtype(text) if isinstance(text, str) and len(text) <= LONGEST else None
     if dtype is None or dtype.kind in UNSAFE or not dtype.itemsize:
         raise ValueError(f"an array of type {str(text)[:40]!r}, which does not travel")
     return dtype

@@ -88,8 +88,9 @@ class WebsocketServer(WebServer):
             closing.append(Thread(target=self._library.shutdown, daemon=True))
         for thread in closing:
             thread.start()
+        ends = time.monotonic() + 2 * LINGER_S
         for thread in closing:
-            thread.join(LINGER_S)
+            thread.join(max(0.0, ends - time.monotonic()))
 
     def stop(self) -> None:
         self._stopped.set()
@@ -99,10 +100,14 @@ class WebsocketServer(WebServer):
     def _accept(self) -> None:
         """Accept until `stop`; the library gives up where an accept fails, as it does without descriptors."""
         while not self._stopped.is_set():
-            with suppress(OSError, RuntimeError):
+            why = "the library has stopped"
+            try:
                 self._library = self._listening()
                 self._library.serve_forever()
-            self._stopped.wait(PAUSE_S)
+            except (OSError, RuntimeError) as error:
+                why = str(error)
+            if not self._stopped.wait(PAUSE_S):
+                _log.warning("no connection can be accepted: %s", why)
 
     def _refusal(self, connection: ServerConnection, handshake: Handshake) -> Response | None:
         """Return the answer to a handshake that is refused, or asks for the server's health."""

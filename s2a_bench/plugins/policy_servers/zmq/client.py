@@ -182,8 +182,8 @@ class Dealer:
         parts = urlsplit(self._url)
         try:
             socket.create_connection((parts.hostname or "", parts.port or 0), seconds).close()
-        except OSError as error:
-            raise ServerDied(f"nothing answers at {self._url}: {error.strerror or error}") from error
+        except (OSError, UnicodeError) as error:  # of a name that none can have
+            raise ServerDied(f"nothing answers at {self._url}: {error}") from error
 
     def _wait(self, event: int, bounds: Bounds) -> None:
         """Wait until the socket can be written or read; raises what says why waiting has to end."""
@@ -191,9 +191,12 @@ class Dealer:
         while not self._socket.poll(POLL_MS, event):
             if not self._alive():
                 raise ServerDied(f"the server at {self._url} has ended")
-            if event == zmq.POLLIN and not self.stands():
+            if event == zmq.POLLIN and not self.stands() and not self._socket.poll(0, event):
                 raise RequestFailed(f"{self._url} broke the connection", starting=True)
             bounds.left_s()
+            if now_ns() > ends_ns and event == zmq.POLLOUT:
+                what = f"{self._url} did not greet within {self._timeout_s:g} s; is it a ZeroMQ peer?"
+                raise RequestFailed(what, starting=True)
             if now_ns() > ends_ns:
                 raise RequestFailed(f"{self._url} was silent for too long: {self._timeout_s:g} s", starting=True)
 

@@ -27,6 +27,8 @@ ENDPOINT, DATA, TOKEN, ERROR, RETRY = "endpoint", "data", "api_token", "error", 
 AUTO, N1_5, N1_6, N1_7 = "auto", "n1.5", "n1.6", "n1.7"
 OURS: Final = "s2a-bench"
 """Key of our server's configurations, which their readers ignore."""
+PLACES: Final = 1024
+"""The most places of a template that a server's configurations make."""
 CONFIG_MARKS: Final = {N1_6: "__ModalityConfig_class__", N1_7: "__ModalityConfig__"}
 """Layout -> the key that marks a modality's configuration; N1.5's is N1.6's, with the configuration as text."""
 OBSERVATION: Final = "observation"
@@ -94,7 +96,8 @@ def modalities_in(answer: Any) -> dict[str, tuple[list[str], int]]:
     except (LookupError, TypeError, ValueError, RecursionError):
         return {}
     plain = all(key != EXTENSION and not key.endswith("?") for keys, _ in keys_of.values() for key in keys)
-    return keys_of if plain else {}
+    few = sum(len(keys) * steps for keys, steps in keys_of.values()) <= PLACES
+    return keys_of if plain and few else {}
 
 
 def template_of(layout: str, keys_of: Mapping[str, tuple[Sequence[str], int]], state: int) -> Template:

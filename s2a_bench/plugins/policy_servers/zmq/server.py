@@ -118,7 +118,7 @@ class ZmqServer:
         send = partial(self._reply, [frame.bytes for frame in frames[:-1]])
         with ExitStack() as held:
             try:
-                held.enter_context(self._core.in_flight.counted())(len(frames[-1]))
+                held.enter_context(self._core.in_flight.counted())(sum(map(len, frames)))
                 if not self._room.acquire(blocking=False):
                     raise Busy("too many requests are under way; come again later", retry_after_s=RETRY_AFTER_S)
             except RequestFailed as error:
