@@ -196,8 +196,8 @@ def test_a_run_is_recorded_and_its_frames_are_a_source(tmp_path: Path, mode: str
     run(*SMALL, *few, output=tmp_path / "results")
     kept = only_run(tmp_path / "results")
     assert (kept.samples["error"] == "").all()
-    assert (kept.samples["frame_age_ns"].fillna(0) > 0).tolist() == [mode == "stream"] * 10
     if mode == "stream":
+        assert (kept.samples["frame_age_ns"] > 0).all()
         used = kept.frames[(kept.frames["used_by"] != "") & (kept.frames["cell"] == "ros/topic")]
         assert len(used) == 5
         stages = [f"{name}_ns" for name in ("capture", "convert", "cdr_pack", "network", "cdr_parse", "channel_swap")]

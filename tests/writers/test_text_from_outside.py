@@ -1,8 +1,7 @@
-"""Text from outside forges no line and moves no cursor, is no formula, and no markup."""
+"""Text from outside forges no line and moves no cursor, and is no markup."""
 
 from __future__ import annotations
 
-import csv
 import io
 
 import pytest
@@ -52,17 +51,12 @@ def test_progress_and_tables_show_them(capsys: pytest.CaptureFixture[str]) -> No
         assert not [line for line in text.splitlines() if line.startswith("error:")]
 
 
-@pytest.mark.parametrize("text", ["=1+1", "+cmd|' /C calc'!A0", "-x", "@SUM(A1)", "\t=1"])
-def test_a_formula_is_text_in_csv(text: str) -> None:
-    assert [row[0] for row in csv.reader(io.StringIO(as_csv(text, text)))] == [f"'{text}"] * 2
-
-
 def test_csv_has_no_control_characters() -> None:
     assert as_csv("a", "\r=1\x1b[2J") == "a,provenance\n\\u000d=1\\u001b[2J,measured\n"
 
 
-@pytest.mark.parametrize("value", [-1.5, -3, "-1.5", "+2", "-1e300", "-inf", None, "a=b"])
-def test_a_number_stays_one_in_csv(value: object) -> None:
+@pytest.mark.parametrize("value", [-1.5, "-1e300", None, "a=b", "=1"])
+def test_a_value_stays_one_in_csv(value: object) -> None:
     assert as_csv("a", value) == f"a,provenance\n{'' if value is None else value},measured\n"
 
 

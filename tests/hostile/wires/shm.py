@@ -80,7 +80,7 @@ def asks(header: bytes, pictures: bytes = b"", at: int | None = None, **more: An
 
 def fields(**more: Any) -> bytes:
     """Return a header."""
-    plain = {"id": "a", "prompt": "go", "max_tokens": 2, "grammar": "", "seed": 0, "images": []}
+    plain = {"id": "a", "prompt": "go", "max_tokens": 2, "grammar": "", "seed": 0, "images": [], "state": []}
     return json.dumps({**plain, **more}).encode()
 
 

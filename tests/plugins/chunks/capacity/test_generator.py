@@ -172,9 +172,9 @@ def unhurried(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("unhurried")
 @pytest.mark.parametrize("processes", [1, 2])
 def test_a_server_of_another_kind_is_checked_against_a_call_within_each_process(tmp_path: Any, processes: int) -> None:
-    options = {"dialect": "openai", "max_tokens": 4, "plan_every": 0.4, "limit": "stalled=50%", "processes": processes}
+    options = {"dialect": "openai", "max_tokens": 4, "plan_every": 0.4, "limit": "stalled=50%", "seconds": 1.5}
     with serving("http", "--engine", "echo", "--latency", "20", "--port", "0") as line:
-        run = small(tmp_path, url=line.split()[2].rstrip(";"), robots="3", **options)
+        run = small(tmp_path, url=line.split()[2].rstrip(";"), robots="3", processes=processes, **options)
     fleets = run.table(FLEETS).set_index(["source", "robots"])
     assert {*fleets.index} == {(source, robots) for source in ("measured", "predicted") for robots in (1, 3)} | {
         ("twin", 3)
