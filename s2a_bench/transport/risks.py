@@ -67,7 +67,7 @@ def connect(parts: SplitResult) -> Iterator[Finding]:
     """Find out whether something listens; nothing is sent."""
     if not parts.port:
         raise TransportError(f"name its port: {parts.scheme}://{parts.hostname}:PORT")
-    socket.create_connection((parts.hostname or "", parts.port or 0), PATIENCE_S).close()
+    socket.create_connection((parts.hostname or "", parts.port), PATIENCE_S).close()
     yield from ()
 
 

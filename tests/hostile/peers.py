@@ -140,7 +140,9 @@ def answers(*steps: Step, again: bytes = b"", every_s: float = 0.0, leaves: bool
                     connection.sendall(step(connection, heard) if callable(step) else step)
                 while again and not over.wait(every_s):
                     connection.sendall(again)
-                while not leaves and connection.recv(1 << 16):
+                if leaves:
+                    connection.shutdown(socket.SHUT_WR)  # to close with bytes unread would reset the connection
+                while connection.recv(1 << 16):
                     pass
 
         def serve() -> None:
