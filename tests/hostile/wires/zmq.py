@@ -59,7 +59,7 @@ REFUSED = "error"
 MOVES = message(packed([{"robot": np.zeros((1, 4, 7), np.float32)}, {}]))
 
 CLIENTS = (
-    Case("noise", sends(NOISE), CLOSED),
+    Case("noise", crowd(8, sends(NOISE)), CLOSED),
     Case("half a greeting", sends(GREETING[:20], then="leaves")),
     Case("half a message", greets(message(request({}))[:-5], then="resets")),
     Case("noise as a request", greets(message(NOISE)), REFUSED),

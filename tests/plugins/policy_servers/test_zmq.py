@@ -78,10 +78,14 @@ FILES: dict[str, Callable[..., Any]] = {
 
 
 @contextmanager
-def plain(address: str, packb: Any = FILES["packb"], unpackb: Any = FILES["unpackb"]) -> Iterator[Callable[..., Any]]:
+def plain(
+    address: str, packb: Any = FILES["packb"], unpackb: Any = FILES["unpackb"], name: bytes = b""
+) -> Iterator[Callable[..., Any]]:
     """A client as GR00T's: a REQ socket, one endpoint a call."""
     context = zmq.Context()
     peer = context.socket(zmq.REQ)
+    if name:
+        peer.identity, peer.reconnect_ivl = name, -1
     peer.rcvtimeo, peer.linger = 20_000, 0
     peer.connect(address)
 
@@ -581,6 +585,14 @@ class TestEmbodiments:
                 ask(client, numbered(6, 2))
         shapes = {key: part.shape for key, part in server.seen["state"].items()}
         assert shapes == {"single_arm": (1, 1, 5), "gripper": (1, 1, 1)}
+
+
+def test_a_client_that_comes_again_takes_its_place() -> None:
+    """As one whose machine lost its power, and which the server still takes to be there."""
+    with serving(RecordingHandler(CHUNK)) as server, plain(server.address, name=b"arm") as lost:
+        answer = lost("ping")
+        with plain(server.address, name=b"arm") as again:
+            assert again("ping") == answer
 
 
 def test_it_carries_actions_and_state_alone() -> None:

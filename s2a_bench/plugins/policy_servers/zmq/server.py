@@ -67,7 +67,10 @@ class ZmqServer:
         self._router.ipv6 = ":" in host
         self._router.maxmsgsize = limits.body_bytes
         self._router.handshake_ivl = round(limits.head_s * 1e3)
-        # no HEARTBEAT_IVL: a peer of ZMTP 1 that floods makes libzmq 4.3.5 abort (stream_engine_base.cpp:310)
+        self._router.router_handover = True  # a client that comes again takes its place
+        # with a domain libzmq refuses peers of ZMTP 1 and 2 (before 2013), for which any bytes are a greeting: it reads
+        # no further where two have one name, and aborts where one floods and HEARTBEAT_IVL is set
+        self._router.zap_domain = b"s2a"
         try:
             self._router.bind(f"tcp://{in_url(host)}:{'*' if port == '0' else port}")
         except zmq.ZMQError as error:
