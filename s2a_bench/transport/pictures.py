@@ -10,7 +10,7 @@ from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.frames.convert import decode_received, encode_jpeg, encode_png, to_bgr, to_rgb
 from s2a_bench.trace import Trace
 from s2a_bench.transport.limits import LIMITS, check_pixels
-from s2a_bench.types import Frame, Pixels
+from s2a_bench.types import Encoding, Frame, Pixels
 
 JPEG_QUALITY = 90
 RAW_MIME = "application/x-raw"
@@ -51,7 +51,7 @@ def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
         return f"image/{frame.encoding}", frame.data
     bgr = bgr_of(frame, trace)
     if payload == "raw":
-        return f"{RAW_MIME};encoding=bgr8;width={bgr.width};height={bgr.height}", bgr.data.reshape(-1)
+        return raw_mime(bgr, "bgr8"), bgr.data.reshape(-1)
     if payload == "jpeg":
         data = encode_jpeg(bgr.data, JPEG_QUALITY)
     elif payload == "png":
@@ -60,6 +60,11 @@ def encoded(frame: Frame, payload: str, trace: Trace) -> tuple[str, Pixels]:
         raise UsageError(f"payload '{payload}' needs a frame that is encoded already")
     trace.mark("image_encode")
     return f"image/{payload}", data
+
+
+def raw_mime(frame: Frame, encoding: str) -> str:
+    """Return the media type of a frame's pixels."""
+    return f"{RAW_MIME};encoding={encoding};width={frame.width};height={frame.height}"
 
 
 def decoded(media_type: str, data: bytes | memoryview, trace: Trace, most_pixels: int = LIMITS.pixels) -> Frame:
@@ -72,10 +77,11 @@ def decoded(media_type: str, data: bytes | memoryview, trace: Trace, most_pixels
             parameters = dict(each.split("=", 1) for each in media_type.split(";")[1:])
             width, height = int(parameters["width"]), int(parameters["height"])
             check_pixels(width, height, most_pixels)
-            pixels = np.frombuffer(data, np.uint8).reshape(height, width, 3)
-            if parameters["encoding"] != "bgr8":
-                raise ValueError(f"raw encoding '{parameters['encoding']}' is not bgr8")
-            return rgb_of(Frame(-1, 0, width, height, "bgr8", pixels), trace)
+            encoding: Encoding = "yuv422_yuy2" if parameters["encoding"] == "yuv422_yuy2" else "bgr8"
+            if parameters["encoding"] != encoding:
+                raise ValueError(f"raw encoding '{parameters['encoding']}' is neither bgr8 nor yuv422_yuy2")
+            pixels = np.frombuffer(data, np.uint8).reshape(height, width, 3 if encoding == "bgr8" else 2)
+            return rgb_of(Frame(-1, 0, width, height, encoding, pixels), trace)
         rgb = decode_received(data)
     except (ValueError, KeyError) as error:
         raise RequestFailed(f"the {len(data)} bytes sent as {media_type} are no such picture: {error}") from error
