@@ -30,7 +30,7 @@ from s2a_bench.testing.transport import ask, wiring_of
 from s2a_bench.transport import Wiring, open_client
 from s2a_bench.types import Request
 from tests.hostile.peers import Case, Usage, usage
-from tests.hostile.wires import http, ros, shm, websocket, zmq
+from tests.hostile.wires import http, iceoryx2, ros, websocket, zmq
 
 CLIENTS = {
     "http": ("http", http.CLIENTS + http.LARGE, ("http", "http", "http")),
@@ -40,12 +40,12 @@ CLIENTS = {
         ("http/best-effort", "http/binary", "http/binary"),
     ),
     "ros": ("ros", ros.CLIENTS + ros.LARGE, ("ros/topic", "ros/topic", "ros/action")),
-    "shm": ("shm", shm.CLIENTS + shm.LARGE, ("shm", "shm", "shm")),
+    "iceoryx2": ("iceoryx2", iceoryx2.CLIENTS + iceoryx2.LARGE, ("iceoryx2", "iceoryx2", "iceoryx2?payload=png")),
     "websocket": ("websocket", websocket.CLIENTS + websocket.LARGE, ("websocket", "websocket/openpi-stream")),
     "zmq": ("zmq", zmq.CLIENTS + zmq.LARGE, ("zmq", "zmq?layout=n1.7", "zmq?layout=n1.5")),
 }
 """What is served, its hostile clients, and what its normal clients speak."""
-ADDRESSES = {"http": r"http://[\d.:]+", "ros": r"/soak_\d+", "shm": r"/\S+\.sock", "websocket": r"ws://[\d.:]+"}
+ADDRESSES = {"http": r"http://[\d.:]+", "ros": r"/soak_\d+", "iceoryx2": r"s2a-[0-9a-f]+", "websocket": r"ws://[\d.:]+"}
 PORTS = frozenset({"http", "websocket", "zmq"})
 FLOODS = frozenset({"300 connections at once"})
 """Hostile clients that take the places of normal ones: fairness is not promised."""

@@ -54,8 +54,8 @@ class _Shared1(TypedDict, total=False):
     sample_resources: float
     sample_resources_hz: float
     served_model: str
+    service: str
     size: str | tuple[int, int]
-    socket: str
     state: int
     template: str
     timeout: float

@@ -131,14 +131,14 @@ def test_no_figure_is_written_without_it(tmp_path: Path) -> None:
         save(tmp_path, {"f": lambda: new_figure(1, "F")})
 
 
-TWO = {"transports": ["loopback", "shm"], "size": "64x48", "requests": 3, "warmup": 1}
+TWO = {"transports": ["loopback", "http/binary"], "size": "64x48", "requests": 3, "warmup": 1}
 RUNS: dict[str, dict[str, Any]] = {
     "latency": {**TWO, "engine": "echo"},
     "throughput": {**TWO, "engine": "replay", "profile": "DUMMY", "max_tokens": 40},
     "timeline": {"profiles": ["rtx-4080", "DUMMY"], "tokens_per_skill": [6]},
     "boundary": {"profiles": ["rtx-4080", "DUMMY"], "tokens_per_skill": [6], "points": 5},
     "capacity": {
-        "transports": ["loopback", "shm"],
+        "transports": ["loopback", "http/binary"],
         "size": "64x48",
         "closed_loop": True,
         "robots": 1,
@@ -178,7 +178,7 @@ def test_every_table_of_the_library_says_it_in_a_line_and_row_by_row(
     shutil.copytree(made(name), path)
     if "transports" in RUNS[name]:  # as if another's server had answered in the second cell
         manifest = json.loads((path / "manifest.json").read_text())
-        manifest["provenance"]["cells"]["shm"] = Provenance().to_dict()
+        manifest["provenance"]["cells"]["http/binary"] = Provenance().to_dict()
         (path / "manifest.json").write_text(json.dumps(manifest))
     run = s2a.load(path)
     origins = read_run(path).origins

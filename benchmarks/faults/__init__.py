@@ -24,7 +24,7 @@ from s2a_bench.transport import open_client
 from s2a_bench.types import Request
 
 TRANSPORTS = (
-    *("http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "ros/action", "shm"),
+    *("http/as-deployed", "http/best-effort", "http/binary", "ros/topic", "ros/action", "iceoryx2"),
     *("websocket/openpi-stream", "zmq/gr00t"),
 )
 WHOLE = ("zmq/gr00t",)

@@ -346,7 +346,6 @@ TRANSPORTS: Final[Registry[Transport[Any]]] = Registry(
         "http": "s2a_bench.transport.http:HTTP",
         "ros": "s2a_bench.transport.ros:ROS",
         "loopback": "s2a_bench.transport.loopback:LOOPBACK",
-        "shm": "s2a_bench.transport.shm:SHM",
     },
 )
 

@@ -154,17 +154,15 @@ def test_ros_args_name_the_node_its_topics_and_its_parameters(start: Start, dds_
     assert process.wait(30) == 0
 
 
-def test_shm_says_where_memory_is_handed_over_and_leaves_no_socket(start: Start, tmp_path: Path) -> None:
-    path = tmp_path / "robot.sock"
-    process, line = start("shm", "--engine", "echo", "--socket", str(path))
-    assert line.startswith(f"serving shared memory at {path} for this user alone; ")
-    client = open_client(wiring_of("shm", str(path)))
+def test_iceoryx2_says_its_service(start: Start) -> None:
+    process, line = start("iceoryx2", "--engine", "echo", "--service", "robot/eyes")
+    assert line.startswith("serving iceoryx2 at robot/eyes for this user alone; ")
+    client = open_client(wiring_of("iceoryx2", "robot/eyes"))
     tokens, _ = ask(client, Request("a", "hello robot", (yuyv_frame(),), max_tokens=2))
     client.close()
     assert "".join(token.text for token in tokens) == "hello robot"
     process.send_signal(signal.SIGTERM)
     assert process.wait(30) in {0, -signal.SIGTERM}
-    assert not path.exists()
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from s2a_bench.store.run import read_run
 LIMITS = {
     "raw": {"http/as-deployed": 70, "http/best-effort": 18, "http/binary": 12, "ros/topic": 7},
     "jpeg": {"http/as-deployed": 32, "http/best-effort": 18},
-    "alone": {"shm": 3},
+    "alone": {"iceoryx2": 5},
     "actions": {"websocket/openpi": 8},
 }
 """Payload -> cell -> most times loopback's end to end without inference, at 640x480, of the quickest requests.
@@ -28,8 +28,8 @@ ROS sends raw pixels beside JPEG too, and is judged where its caches are not col
 to `make bench` to print: coding and decoding the JPEG alone is half of its limit of 12, and at 10.3 to 10.9 measured a
 busy machine would decide the test. "alone" is raw pixels without the pipelines of other servers, which leave cold
 caches behind, and one token: where the other cores are busy a server that goes on to write 31 more at once, as no model
-does, keeps its client from the core for 0.15 ms, most of what this wire costs. It takes 1.2 to 1.9 times loopback on
-quiet machines of two cores, which differ, up to 2.7 on busy ones. "actions" is raw pixels and chunks of 16 actions.
+does, keeps its client from the core for 0.15 ms, a third of what this wire costs. It takes 2.0 to 2.3 times loopback on
+a quiet machine of two cores. "actions" is raw pixels and chunks of 16 actions.
 """
 
 
@@ -41,7 +41,7 @@ def measured(payload: str, output: Path) -> tuple[pd.Series[float], list[str]]:
     """Return what each cell's quickest request took in ms, and the cells whose stages leave over 5 %."""
     own = {
         "jpeg": "http?payload=jpeg,loopback",
-        "alone": "shm?payload=raw,loopback",
+        "alone": "iceoryx2?payload=raw,loopback",
         "actions": "websocket?payload=raw,loopback",
     }
     transports = own.get(payload, f"http?payload={payload},ros,loopback")

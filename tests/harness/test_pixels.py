@@ -62,7 +62,7 @@ def handler(*, alter: bool, answer: str = "tokens") -> Handler:
 @pytest.mark.parametrize(
     "name",
     [
-        *("http/best-effort?payload=raw", "http/binary?payload=png", "shm", "shm?payload=yuyv", "loopback"),
+        *("http/best-effort?payload=raw", "http/binary?payload=png", "iceoryx2", "iceoryx2?payload=yuyv", "loopback"),
         *("websocket/openpi", "websocket/openpi-stream?payload=png"),
     ],
 )

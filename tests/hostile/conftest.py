@@ -62,7 +62,7 @@ def killed_run(tmp_path_factory: pytest.TempPathFactory) -> KilledRun:
     paths = os.pathsep.join([str(place), *os.environ.get("PYTHONPATH", "").split(os.pathsep)])
     environ = {**os.environ, "PYTHONPATH": paths, "SPY": str(place / "spied")}
     options = ("--engine", "echo", "--size", "64x48", "--data-only", "--requests", "1000000")
-    every = ("--transport", "http,ros,shm,zmq,websocket", "--output", place / "runs")
+    every = ("--transport", "http,ros,zmq,websocket", "--output", place / "runs")
     with subprocess.Popen(command("latency", *options, *every), env=environ, stderr=subprocess.PIPE) as process:
         try:
             until(lambda: _rows(place / "runs") > 60 or process.poll() is not None, 120)

@@ -38,7 +38,7 @@ from tests.hostile.peers import (
     sends,
     usage,
 )
-from tests.hostile.wires import http, ros, shm, websocket, zmq
+from tests.hostile.wires import http, iceoryx2, ros, websocket, zmq
 from tests.servers.sockets import head
 from tests.waiting import until
 
@@ -47,7 +47,7 @@ CLIENTS: dict[str, Sequence[Case]] = {
     "http/best-effort": http.FAST,
     "websocket/openpi": websocket.CLIENTS,
     "zmq/gr00t": zmq.CLIENTS,
-    "shm": shm.CLIENTS,
+    "iceoryx2": iceoryx2.CLIENTS,
     "ros/topic": ros.CLIENTS,
 }
 SERVERS: dict[str, Sequence[Server]] = {

@@ -19,7 +19,7 @@ from s2a_bench.transport.limits import Limits
 from s2a_bench.types import Request, Token
 from tests.hostile.peers import PATIENCE_S, PEAK_MIB, Case, Target, crowd, normal_answer, own_server, sends, usage
 from tests.hostile.test_any_bytes import cases
-from tests.hostile.wires import http, ros, shm, websocket, zmq
+from tests.hostile.wires import http, iceoryx2, ros, websocket, zmq
 from tests.waiting import until
 
 LARGE: dict[str, Sequence[Case]] = {
@@ -27,7 +27,7 @@ LARGE: dict[str, Sequence[Case]] = {
     "http/best-effort": http.FAST_LARGE,
     "websocket/openpi": websocket.LARGE,
     "zmq/gr00t": zmq.LARGE,
-    "shm": shm.LARGE,
+    "iceoryx2": iceoryx2.LARGE,
     "ros/topic": ros.LARGE,
 }
 

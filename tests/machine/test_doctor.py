@@ -138,7 +138,7 @@ def test_a_well_kept_jetson_has_nothing_to_mend(make: Make) -> None:
 
 def test_an_empty_tree_fails_no_check(make: Make) -> None:
     found = examine(make({}), HARDWARE)
-    always = {"gpu", "cpus", "disk", "dds", "ros", "middleware", "zenoh", "cameras"}
+    always = {"gpu", "cpus", "disk", "dds", "ros", "middleware", "zenoh", "iceoryx2", "cameras"}
     assert {finding.code for finding in found} == always
     assert worst(found) == "state"
 

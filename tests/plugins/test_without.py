@@ -46,7 +46,7 @@ PLUGINS = {
             "latency --transport websocket",
             "--transport: 'websocket' is none of ",
             "latency --help-all",
-            "shm, websocket, zmq, grpc",
+            "loopback, websocket, zmq, grpc",
         ),
         Named(
             "latency --url http://127.0.0.1:9 --dialect openvla",

@@ -47,7 +47,7 @@ FLAGS = (
     "--disable-sync",
 )
 WIDTHS = (400, 1400)
-EIGHT = PLAUSIBLE | dict.fromkeys(("shm", "zmq/gr00t", "websocket/openpi"), PLAUSIBLE["http/binary"])
+EIGHT = PLAUSIBLE | dict.fromkeys(("iceoryx2", "zmq/gr00t", "websocket/openpi"), PLAUSIBLE["http/binary"])
 LONG_POLICY = "stream-to-act?caution=1.5&detect=True"
 WAIT_S = 10
 STANDS_STILL = """

@@ -40,7 +40,7 @@ class PlanRequests(FirstVariants):
 
     transports: Names = option(
         (FOLLOWED,),
-        "ros, ros/action, http, http/VARIANT, shm, loopback: one, as in latency",
+        "ros, ros/action, http, http/VARIANT, loopback: one, as in latency",
         flag="transport",
         names=paths,
     )

@@ -383,7 +383,7 @@ def test_only_pipelines_over_a_network_of_runs_without_a_link_are_fitted(monkeyp
         RAW,
         replace(RAW, wire_share=None),
         replace(RAW, has_ingest=True),
-        replace(RAW, path=("shm", "")),
+        replace(RAW, path=("iceoryx2", "")),
         replace(RAW, path=("loopback", "")),
     ]
     monkeypatch.setattr(room, "_runs", lambda path: [runs[""], runs["4g"]] if path == Path("a") else [runs[""]])

@@ -179,7 +179,7 @@ def test_nothing_is_left_after_a_kill() -> None:
     os.close(relay)
 
 
-@pytest.mark.parametrize("transport", ["shm", "loopback"])
+@pytest.mark.parametrize("transport", ["iceoryx2", "loopback"])
 def test_a_transport_without_a_network_is_refused(transport: str) -> None:
     with pytest.raises(UsageError, match=f"{transport} sends nothing over a network"):
         RequestsConfig(link="4g", transports=transport, engine={"name": "echo"})
