@@ -15,6 +15,9 @@ from s2a_bench.types import Piece, Request
 
 END_S: Final = 5.0
 """The longest that an answer's end waits for that of the answer before."""
+OVER: Final = Event()
+"""The end of an answer that was not begun; making an event for each request takes 9 us."""
+OVER.set()
 
 
 @dataclass(slots=True)
@@ -37,8 +40,7 @@ class RosExchange(Exchange):
     def __init__(self, shared: Shared, trace: Trace) -> None:
         super().__init__(trace)
         self._shared = shared
-        self._before = self._ended = Event()
-        self._before.set()
+        self._before = self._ended = OVER
 
     def cancelled(self) -> bool:
         """Whether the client wants no answer any more; a topic cannot tell."""
