@@ -107,7 +107,7 @@ def draw() -> Figure:
         )
     for room, (x, y) in place.items():
         plug_in = room.startswith(PLUGINS)
-        width = 9.6 if room == GROUND else 1.34 if plug_in else 1.7
+        width = 9.6 if room == GROUND else 1.14 if plug_in else 1.7
         box = FancyBboxPatch(
             (x - width / 2, y - 0.22),
             width,
