@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -10,10 +11,12 @@ from s2a_bench.errors import RequestFailed, UsageError
 from s2a_bench.frames.convert import decode_received, encode_jpeg, encode_png, to_bgr, to_rgb
 from s2a_bench.trace import Trace
 from s2a_bench.transport.limits import LIMITS, check_pixels
-from s2a_bench.types import Encoding, Frame, Pixels
+from s2a_bench.types import Frame, Pixels
 
 JPEG_QUALITY = 90
 RAW_MIME = "application/x-raw"
+RAW_BYTES = {"bgr8": 3, "yuv422_yuy2": 2}
+"""Encoding -> bytes of a pixel, of what has `RAW_MIME`."""
 STAGES = {
     **dict.fromkeys(("bgr8", "bgra8", "rgba8"), "channel_swap"),
     **dict.fromkeys(("yuv422_yuy2", "yuv422", "nv12", "nv21"), "yuv_decode"),
@@ -68,7 +71,7 @@ def raw_mime(frame: Frame, encoding: str) -> str:
 
 
 def decoded(media_type: str, data: bytes | memoryview, trace: Trace, most_pixels: int = LIMITS.pixels) -> Frame:
-    """Convert received bytes to an ``rgb8`` frame; marks `image_decode` or `channel_swap`. Raises RequestFailed.
+    """Convert received bytes to an ``rgb8`` frame, with the marks of `rgb_of`. Raises RequestFailed.
 
     ``most_pixels`` are what a request's earlier pictures leave of its limit.
     """
@@ -77,10 +80,10 @@ def decoded(media_type: str, data: bytes | memoryview, trace: Trace, most_pixels
             parameters = dict(each.split("=", 1) for each in media_type.split(";")[1:])
             width, height = int(parameters["width"]), int(parameters["height"])
             check_pixels(width, height, most_pixels)
-            encoding: Encoding = "yuv422_yuy2" if parameters["encoding"] == "yuv422_yuy2" else "bgr8"
-            if parameters["encoding"] != encoding:
-                raise ValueError(f"raw encoding '{parameters['encoding']}' is neither bgr8 nor yuv422_yuy2")
-            pixels = np.frombuffer(data, np.uint8).reshape(height, width, 3 if encoding == "bgr8" else 2)
+            encoding: Any = parameters["encoding"]
+            if encoding not in RAW_BYTES:
+                raise ValueError(f"raw encoding '{encoding}' is none of {', '.join(RAW_BYTES)}")
+            pixels = np.frombuffer(data, np.uint8).reshape(height, width, RAW_BYTES[encoding])
             return rgb_of(Frame(-1, 0, width, height, encoding, pixels), trace)
         rgb = decode_received(data)
     except (ValueError, KeyError) as error:

@@ -39,8 +39,8 @@ from s2a_bench.transport.pictures import bgr_of, encoded, raw_mime
 from s2a_bench.types import Action, Frame, Piece, Request, Token
 
 USED: Final = 4096
-"""iceoryx2 knows a request by its client's place and by how many that lent before: each client begins elsewhere, as the
-server would take the first of a new one for the last of the one before, and end it with that."""
+"""A new client takes fewer loans than this before its first request. iceoryx2 knows a request by its client's place and
+the count of loans: with equal counts the server would end a new client's request with that of the one before it."""
 
 
 class Iceoryx2Client(Client):

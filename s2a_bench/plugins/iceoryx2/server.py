@@ -66,12 +66,9 @@ class Iceoryx2Server:
         """Return the source of requests, and the listener that they wake; raises an error of iceoryx2."""
         clients = min(CLIENTS, limits.connections)
         service = self._domain.requests(self.address).max_servers(1).max_clients(clients).max_nodes(clients + 1)
-        service = service.max_active_requests_per_client(ACTIVE).enable_safe_overflow_for_requests(False)
-        service = (
-            service.max_response_buffer_size(2 * UNREAD)
-            .max_loaned_requests(1)
-            .enable_safe_overflow_for_responses(False)
-        )
+        service = service.enable_safe_overflow_for_requests(False).enable_safe_overflow_for_responses(False)
+        service = service.max_active_requests_per_client(ACTIVE).max_loaned_requests(1)
+        service = service.max_response_buffer_size(2 * UNREAD)
         service = service.max_borrowed_responses_per_pending_response(2).request_payload_alignment(ALIGNED)
         builder = service.open_or_create().server_builder().initial_max_slice_len(SLICE_BYTES)
         requests = builder.backpressure_strategy(iceoryx2.BackpressureStrategy.DiscardData).create()

@@ -46,6 +46,7 @@ POLL_S: Final = 0.1
 PAUSE_S: Final = 0.002
 """Between two looks, where nothing can wake: at a lock, or at whether a slow client has read, the engine being free."""
 LOCK_S: Final = 1.0
+"""Longest wait for a process that joins or leaves."""
 PATH_BYTES: Final = 48
 """The longest path of the folder: a socket's has at most 107, and iceoryx2 adds a name."""
 MEMORY: Final = Path("/dev/shm")  # noqa: S108 - where POSIX shared memory lies on Linux
