@@ -6,21 +6,23 @@ Built-ins are a table ``name -> "module:attribute"``; other packages add to a ki
 
 from __future__ import annotations
 
+import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from functools import cache, cached_property
 from importlib import import_module
 from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Final, Generic, TypeVar
+from typing import Any, Final, Generic, TypeVar
 
 from s2a_bench.errors import UsageError
 from s2a_bench.text import none_of
 
 T = TypeVar("T")
 OURS: Final = "s2a_bench."
+_FUNCTION: Final = re.compile(r"[\w.]+:[\w.]+")
 installed_points = cache(entry_points)  # each call reads the metadata of all packages
 
 
@@ -83,6 +85,25 @@ class Registry(Mapping[str, T], Generic[T]):
             with suppress(UsageError):
                 offered.append((name, self[name]))
         yield from sorted(offered, key=lambda each: getattr(each[1], "order", 0))
+
+
+def check_function(written: str) -> None:
+    """Raise UsageError, for a parameter ``function``, unless it is written ``module:name``."""
+    if not _FUNCTION.fullmatch(written):
+        raise UsageError(f"function = '{written}' should look like module:name")
+
+
+def function_of(written: str, what: str) -> Callable[..., Any]:
+    """Import a user's function, written ``module:name``; raises UsageError, which begins with ``what``."""
+    try:
+        function: object = resolve_name(written)
+    except Exception as error:  # a module may raise anything while it is imported
+        raise UsageError(
+            f"{what}: {written} does not load: {type(error).__name__}: {error}; is its folder in PYTHONPATH?"
+        ) from error
+    if not callable(function):
+        raise UsageError(f"{what}: {written} cannot be called: it is of type {type(function).__name__}")
+    return function
 
 
 def missing_entry_points(checkout: Path = Path(__file__).parent.parent) -> list[str]:

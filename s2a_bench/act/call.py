@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pkgutil import resolve_name
 from threading import Condition, Thread
-from typing import ClassVar, Final, TypeAlias
+from typing import ClassVar, TypeAlias
 
 from s2a_bench.act import ActionKind, ActionRobot, Report, Running, SkillKind
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RobotError, UsageError
 from s2a_bench.plan import Call, Gap, SkillSet
+from s2a_bench.registry import check_function, function_of
 from s2a_bench.types import Vector
-
-_FUNCTION: Final = re.compile(r"[\w.]+:[\w.]+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,28 +28,14 @@ class PythonCall(SkillKind, ActionKind):
     function: str = ""
 
     def __post_init__(self) -> None:
-        if not _FUNCTION.fullmatch(self.function):
-            raise UsageError(f"function = '{self.function}' should look like module:name")
+        check_function(self.function)
 
     def open_skills(self, skills: SkillSet) -> CallableRobot:
-        return CallableRobot(skills, dict.fromkeys((skill.name for skill in skills.skills), self._imported()))
+        function = function_of(self.function, "`robot`: call")
+        return CallableRobot(skills, dict.fromkeys((skill.name for skill in skills.skills), function))
 
     def open_actions(self, dims: int, period_ns: int) -> CallableActions:  # noqa: ARG002 - any action
-        return CallableActions(self.function, self._imported())
-
-    def _imported(self) -> Callable[..., object]:
-        try:
-            function: object = resolve_name(self.function)
-        except Exception as error:  # a module may raise anything while it is imported
-            raise UsageError(
-                f"`robot`: call: {self.function} does not load: {type(error).__name__}: {error}; "
-                "is its folder in PYTHONPATH?"
-            ) from error
-        if not callable(function):
-            raise UsageError(
-                f"`robot`: call: {self.function} cannot be called: it is of type {type(function).__name__}"
-            )
-        return function
+        return CallableActions(self.function, function_of(self.function, "`robot`: call"))
 
 
 class CallableActions(ActionRobot):

@@ -6,12 +6,14 @@ manifest records them; three are flags of `serve`. `Bounds` are those of one ans
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Final
 
 from s2a_bench.clock import now_ns
 from s2a_bench.errors import RequestFailed
 from s2a_bench.frames import MOST_PIXELS
 from s2a_bench.options import Options, option
+from s2a_bench.types import Frame, Request
 
 KIB: Final = 1 << 10
 MIB: Final = 1 << 20
@@ -114,3 +116,24 @@ class Bounds:
             raise RequestFailed(
                 f"{self._server} sent more than {self._most_bytes} bytes for {self._max_tokens} tokens (`max_tokens`)"
             )
+
+
+def read_request(
+    fields: Mapping[Any, Any],
+    limits: Limits,
+    name: str,
+    prompt: str,
+    images: tuple[Frame, ...],
+    state: tuple[float, ...],
+    max_tokens: int = 32,
+) -> Request:
+    """Return the request of a document; raises RequestFailed."""
+    return Request(
+        id=name,
+        prompt=prompt,
+        images=images,
+        max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, limits.answer_tokens, max_tokens),
+        grammar=text("grammar", fields.get("grammar")),
+        seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
+        state=state,
+    )

@@ -42,7 +42,6 @@ from s2a_bench.store.run import RunWriter, read_run
 from s2a_bench.sweep.file import read_sweep_file
 from s2a_bench.trace import Remote, Trace
 from s2a_bench.transport.access import Access, WebOptions
-from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http.chat import of_json, of_picture
 from s2a_bench.transport.http.dialects import DIALECTS, open_dialect
 from s2a_bench.transport.http.dialects.decoder import Decoder
@@ -55,6 +54,7 @@ from s2a_bench.transport.pipeline import pipelines
 from s2a_bench.transport.ros import wire
 from s2a_bench.transport.serving import Core
 from s2a_bench.types import Frame, Request, Token
+from s2a_bench.vectors import actions_of
 from tests.made_runs import STAGES
 from tests.plan.test_parser import FORMATS
 from tests.servers.speakers import SPEAKERS

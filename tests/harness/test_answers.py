@@ -18,9 +18,9 @@ from s2a_bench.harness.plan import answered, resolve
 from s2a_bench.inference import EngineConfig, open_engine
 from s2a_bench.trace import Trace
 from s2a_bench.transport import ACTIONS, TOKENS, TRANSPORTS
-from s2a_bench.transport.chunks import actions_of, state_of
 from s2a_bench.transport.http import HTTP
 from s2a_bench.types import Action, Request
+from s2a_bench.vectors import actions_of, state_of
 
 
 @pytest.fixture

@@ -35,11 +35,11 @@ from s2a_bench.plugins.iceoryx2.wire import (
 )
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Handler, Wiring
-from s2a_bench.transport.chunks import request_of, state_of
-from s2a_bench.transport.limits import Limits
+from s2a_bench.transport.limits import Limits, read_request
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.serving import Core, Disconnected, Exchange, SharedSourceWorkers
 from s2a_bench.types import Piece, Request
+from s2a_bench.vectors import state_of
 
 ALIGNED: Final = iceoryx2.Alignment.new(8)
 """What is counted in a slice is read and written whole."""
@@ -152,7 +152,7 @@ class Iceoryx2Exchange(Exchange):
             images.append(decoded(picture["type"], data[begin : begin + picture["bytes"]], self.trace, pixels))
             pixels -= images[-1].pixel_count
             begin += picture["bytes"]
-        return request_of(fields, limits, fields["id"], fields["prompt"], tuple(images), state_of(fields["state"]))
+        return read_request(fields, limits, fields["id"], fields["prompt"], tuple(images), state_of(fields["state"]))
 
     def send(self, piece: Piece) -> bool:
         self._unsent += packed(piece)

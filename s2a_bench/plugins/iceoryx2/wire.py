@@ -26,8 +26,8 @@ import orjson
 
 from s2a_bench.errors import TransportError
 from s2a_bench.trace import Remote
-from s2a_bench.transport.chunks import actions_of
 from s2a_bench.types import Action, Piece, Token
+from s2a_bench.vectors import actions_of
 
 HEAD: Final = struct.Struct("=QQQQ")
 """Begins a request: the slices of the answer that its client has read, its client, its number, its header's bytes."""

@@ -19,11 +19,11 @@ from s2a_bench.plugins.policy_servers.observation import Template, template_of
 from s2a_bench.plugins.policy_servers.policies import PolicyTransport, TemplateOptions
 from s2a_bench.trace import Trace
 from s2a_bench.transport import ACTIONS
-from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http.dialects import Event
 from s2a_bench.transport.http.dialects.common import Dialect
 from s2a_bench.transport.http.dialects.framing import WholeBody
 from s2a_bench.types import Pixels, Request
+from s2a_bench.vectors import actions_of
 
 FAILED = "error"
 """The body of a failure, with status 200 (``vla-scripts/deploy.py``)."""

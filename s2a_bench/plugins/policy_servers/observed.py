@@ -20,11 +20,11 @@ import numpy as np
 from s2a_bench.errors import EngineError, RequestFailed
 from s2a_bench.plugins.policy_servers.observation import EXTENSION
 from s2a_bench.trace import Remote, Trace
-from s2a_bench.transport import chunks
-from s2a_bench.transport.limits import Limits, check_pixels, text
+from s2a_bench.transport.limits import Limits, check_pixels, read_request, text
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.serving import Disconnected, Exchange
 from s2a_bench.types import Action, Frame, Piece, Request, Vector
+from s2a_bench.vectors import state_of
 
 PICTURES, NUMBERS = 64, 4096
 """The most pictures, and numbers of the state, in one request."""
@@ -88,7 +88,7 @@ def read_observation(
             if count > NUMBERS:
                 raise RequestFailed(f"{key}: a state of more than {NUMBERS} numbers; pictures are uint8")
             numbers.append(row)
-    state = chunks.state_of(np.concatenate(numbers)) if count else ()
+    state = state_of(np.concatenate(numbers)) if count else ()
     return tuple(frames), state, text(PROMPT, prompt if prompt is not None else first)
 
 
@@ -147,7 +147,7 @@ def request_of(observation: Any, extension: dict[Any, Any] | None, trace: Trace,
     fields = extension or {}
     images, state, prompt = read_observation(observation, trace, limits)
     name = text("id", fields.get("id")) or "observation-0"
-    return chunks.request_of(fields, limits, name, prompt, images, state, limits.answer_tokens)
+    return read_request(fields, limits, name, prompt, images, state, limits.answer_tokens)
 
 
 def remote_of(message: Any) -> Remote:

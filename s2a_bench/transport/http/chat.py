@@ -8,12 +8,12 @@ from typing import Any
 from s2a_bench.errors import RequestFailed, S2AError
 from s2a_bench.facts import PROMPT_N
 from s2a_bench.trace import Trace
-from s2a_bench.transport.chunks import request_of, state_of
 from s2a_bench.transport.http import native
-from s2a_bench.transport.limits import Limits, text
+from s2a_bench.transport.limits import Limits, read_request, text
 from s2a_bench.transport.pictures import decoded
 from s2a_bench.transport.serving import Disconnected, Exchange
 from s2a_bench.types import Action, Frame, Piece, Request
+from s2a_bench.vectors import state_of
 
 EVENTS = "text/event-stream; charset=utf-8"
 Headers = Iterable[tuple[str, str]]
@@ -93,7 +93,9 @@ def of_fields(fields: Any, trace: Trace, limits: Limits, codec: native.Codec) ->
 
 def _request(fields: dict[str, Any], prompt: str, images: tuple[Frame, ...], limits: Limits) -> tuple[Request, bool]:
     name = text("request_id", fields.get("request_id")) or "chatcmpl-0"
-    request = request_of(fields, limits, name, text("the prompt", prompt), images, state_of(fields.get("state") or ()))
+    request = read_request(
+        fields, limits, name, text("the prompt", prompt), images, state_of(fields.get("state") or ())
+    )
     return request, bool(fields.get("stream"))
 
 

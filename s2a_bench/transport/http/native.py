@@ -25,11 +25,11 @@ import pybase64
 
 from s2a_bench.errors import BadRequest, Busy, EngineError, Overdue, S2AError, TooLarge
 from s2a_bench.transport.access import Access
-from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http import VARIANTS
 from s2a_bench.transport.http.dialects.common import sampled
 from s2a_bench.transport.serving import Core, Queued
 from s2a_bench.types import Action, Request
+from s2a_bench.vectors import actions_of
 
 AS_DEPLOYED, BEST_EFFORT, BINARY, LLAMA_SERVER = VARIANTS
 

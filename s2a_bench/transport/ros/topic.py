@@ -13,13 +13,13 @@ from s2a_bench.ros import Middleware
 from s2a_bench.ros import messages as ros
 from s2a_bench.ros.service import REACH_S, READER_QOS, appeared
 from s2a_bench.trace import Trace
-from s2a_bench.transport.chunks import state_of
 from s2a_bench.transport.limits import Bounds, Limits, whole_number
 from s2a_bench.transport.ros import wire
 from s2a_bench.transport.ros.camera import picture_message, pictures_of
 from s2a_bench.transport.ros.exchange import RosExchange, Shared
 from s2a_bench.transport.ros.joining import RosClient
 from s2a_bench.types import Piece, Request, Token
+from s2a_bench.vectors import state_of
 
 
 class TopicClient(RosClient):

@@ -10,9 +10,9 @@ from s2a_bench.provenance import Provenance
 from s2a_bench.ros import QoS, Subscription
 from s2a_bench.ros import messages as ros
 from s2a_bench.trace import Remote, Trace
-from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.ros import UNREADABLE_N
 from s2a_bench.types import Action, Piece, Request, Token
+from s2a_bench.vectors import actions_of
 
 REQUEST_QOS = QoS(depth=10)
 TOKEN_QOS = QoS(depth=1000)

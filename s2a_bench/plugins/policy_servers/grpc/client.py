@@ -23,10 +23,10 @@ from s2a_bench.plugins.policy_servers.grpc.pickles import chunk_in, observation_
 from s2a_bench.plugins.policy_servers.policy_client import PolicyClient
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.limits import MIB, Bounds
 from s2a_bench.transport.risks import connect
 from s2a_bench.types import Piece, Request
+from s2a_bench.vectors import actions_of
 
 SERVICE, LOAD = "/transport.AsyncInference/", "SendPolicyInstructions"
 PIECE_BYTES: Final = 2 * MIB

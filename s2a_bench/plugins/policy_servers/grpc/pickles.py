@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from s2a_bench.errors import RequestFailed, UsageError
-from s2a_bench.transport.chunks import NUMBERS
+from s2a_bench.vectors import NUMBERS
 
 Numbers: TypeAlias = NDArray[Any]
 Names: TypeAlias = Mapping[tuple[str, str], Any]

@@ -30,11 +30,11 @@ from s2a_bench.provenance import Provenance
 from s2a_bench.secrets import struck
 from s2a_bench.trace import Trace
 from s2a_bench.transport import Wiring
-from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.limits import Bounds
 from s2a_bench.transport.listening import read_key
 from s2a_bench.transport.risks import PATIENCE_S, idle_cut
 from s2a_bench.types import Action, Frame, Piece, Request
+from s2a_bench.vectors import actions_of
 
 
 class WebsocketClient(PolicyClient[WebsocketOptions]):

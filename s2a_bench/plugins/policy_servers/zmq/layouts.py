@@ -19,8 +19,8 @@ import numpy as np
 
 from s2a_bench.errors import RequestFailed
 from s2a_bench.plugins.policy_servers.observation import EXTENSION, Template
-from s2a_bench.transport.chunks import actions_of
 from s2a_bench.types import Action, Vector
+from s2a_bench.vectors import actions_of
 
 GET_ACTION, PING, RESET, MODALITIES, KILL = "get_action", "ping", "reset", "get_modality_config", "kill"
 ENDPOINT, DATA, TOKEN, ERROR, RETRY = "endpoint", "data", "api_token", "error", "retry_after_s"

@@ -27,13 +27,13 @@ from s2a_bench.facts import (
     Fact,
 )
 from s2a_bench.trace import Remote
-from s2a_bench.transport.chunks import NUMBERS as TICKS
-from s2a_bench.transport.chunks import actions_of
 from s2a_bench.transport.http import native
 from s2a_bench.transport.http.dialects import NATIVE, EncodedPicture, Event
 from s2a_bench.transport.http.dialects.common import Dialect, evaluated, numbers, text_of, token_id, usage_of
 from s2a_bench.transport.limits import whole_number
 from s2a_bench.types import Action, Request
+from s2a_bench.vectors import NUMBERS as TICKS
+from s2a_bench.vectors import actions_of
 
 TIMINGS = {str(fact): fact for fact in (CACHE_N, PROMPT_N, PROMPT_MS, PREDICTED_N, PREDICTED_MS)}
 

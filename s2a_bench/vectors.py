@@ -1,4 +1,4 @@
-"""Requests, actions and robot state from outside, checked where they enter, for every transport."""
+"""Actions and robot state from outside, from a peer or a user's function, checked where they enter."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from s2a_bench.errors import RequestFailed
-from s2a_bench.transport.limits import SEEDS, Limits, text, whole_number
-from s2a_bench.types import Action, Frame, Request, Vector
+from s2a_bench.types import Action, Vector
 
 NUMBERS: Final = 1 << 20
 """More than any chunk has."""
@@ -35,27 +34,6 @@ def _side_by_side(parts: Mapping[Any, Any]) -> Vector:
         shapes = ", ".join(f"{str(name)[:40]} {part.shape}" for name, part in zip(named, rows, strict=True))
         raise RequestFailed(f"parts of actions that are of one length: there are {shapes or 'none'}")
     return np.concatenate([part.reshape(len(part), -1) for part in rows], axis=1)
-
-
-def request_of(
-    fields: Mapping[Any, Any],
-    limits: Limits,
-    name: str,
-    prompt: str,
-    images: tuple[Frame, ...],
-    state: tuple[float, ...],
-    max_tokens: int = 32,
-) -> Request:
-    """Return the request of a document; raises RequestFailed."""
-    return Request(
-        id=name,
-        prompt=prompt,
-        images=images,
-        max_tokens=whole_number("max_tokens", fields.get("max_tokens"), 1, limits.answer_tokens, max_tokens),
-        grammar=text("grammar", fields.get("grammar")),
-        seed=whole_number("seed", fields.get("seed"), 0, SEEDS, 0),
-        state=state,
-    )
 
 
 def state_of(values: Any) -> tuple[float, ...]:
