@@ -89,7 +89,7 @@ def _serve(config: Any) -> None:
 
 def _answering(engine: EngineConfig, pipeline: Pipeline) -> EngineConfig:
     """Return the engine with its kind of answer set; raises UsageError if it cannot answer so."""
-    answer = answer_over(engine.answer, [pipeline])
+    answer = answer_over(engine.wanted, [pipeline])
     if answer == ACTIONS and not engine.kind.acts:
         raise UsageError(
             f"`engine` {engine.name} answers with tokens, and {pipeline.name} carries actions; use `engine` {acting()}"

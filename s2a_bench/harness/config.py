@@ -204,7 +204,7 @@ class RequestsConfig(Surrounded):
 
     @cached_property
     def answer(self) -> str:
-        return answer_over(self.engine.answer, self.pipelines)
+        return answer_over(self.engine.wanted, self.pipelines)
 
     @property
     def served_engine(self) -> EngineConfig:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from math import tau
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, Literal, Protocol, TypeAlias, get_args
 
-from pydantic import BeforeValidator
+from pydantic import AfterValidator, BeforeValidator
 
 from s2a_bench import extras
 from s2a_bench.boards.profile import profile_files
@@ -16,12 +17,19 @@ from s2a_bench.clock import Clock, SystemClock
 from s2a_bench.errors import MissingExtra, UsageError
 from s2a_bench.facts import Fact
 from s2a_bench.options import Options, one_of, option
+from s2a_bench.policy.parameters import build
 from s2a_bench.registry import Registry
+from s2a_bench.text import none_of
 from s2a_bench.types import Action, Piece, Request
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class NoParameters:
+    """Of most engines."""
 
 
 class Engine(Protocol):
@@ -35,6 +43,12 @@ class Engine(Protocol):
     """Whether its answers take a model's time, so that a rate, and a plan in them, have a meaning."""
     plays: ClassVar[tuple[str, int] | None] = None
     """The skill set and the tokens a skill of the plans that it plays; None: it plays no recording."""
+    speaks: ClassVar[bool] = True
+    """Whether it can answer with tokens."""
+    parameters: ClassVar[type] = NoParameters
+    """Dataclass of what its name may carry, ``name?parameter=value``, as policies have."""
+    risk: ClassVar[str] = ""
+    """``program`` if a parameter names code to run: a file from another person should not choose it."""
     needs: ClassVar[tuple[str, ...]] = ()
     """The extra of this package that it needs, and the modules of that extra."""
     exclusive_options: ClassVar[tuple[str, ...]] = ()
@@ -89,6 +103,7 @@ ENGINES: Final[Registry[type[Engine]]] = Registry(
         "llama": "s2a_bench.inference.one_thread:Llama",
         "echo": "s2a_bench.inference.echo:EchoEngine",
         "replay": "s2a_bench.inference.replay:ReplayEngine",
+        "call": "s2a_bench.inference.call:CallEngine",
     },
 )
 
@@ -135,6 +150,12 @@ SAMPLER_ARGUMENTS = {
 LEAST_CONTEXT, LEAST_BATCH, LARGEST = 256, 32, 1 << 20
 
 
+def _known(written: str) -> str:
+    if (name := written.partition("?")[0]) not in ENGINES:
+        raise ValueError(none_of(name, ENGINES))
+    return written
+
+
 def _written(value: Any) -> Any:
     return str(value) if isinstance(value, (int, float)) else value
 
@@ -146,11 +167,13 @@ Written = Annotated[str, BeforeValidator(_written, json_schema_input_type=str | 
 class EngineConfig(Options):
     PANEL: ClassVar[str] = "Model"
 
-    name: Annotated[str, one_of(lambda: ENGINES)] = option(
+    name: Annotated[str, AfterValidator(_known)] = option(
         MODEL,
-        f"{', '.join(ENGINES)}; echo leaves the transport alone, replay plays --profile (EMULATED)",
+        f"{', '.join(ENGINES)}; echo leaves the transport alone, replay plays --profile (EMULATED), "
+        "call?function=MODULE:NAME is your own",
         flag="engine",
         first=True,
+        names=lambda: ENGINES,
     )
     profile: str = option("", "what --engine replay plays: a name of 'profile list', or a path", names=profile_files)
     gaps: str = option("", "replay: trace, parametric, constant [default: trace if recorded]")
@@ -189,6 +212,7 @@ class EngineConfig(Options):
             )
         if "name" not in self.model_fields_set:
             return
+        build(self.kind.parameters, self.name, "engine")
         if self.chunks and not self.kind.acts:
             raise UsageError(f"`answer`: `engine` {self.name} answers with tokens alone; use `engine` {acting()}")
         if self.of_model and not self.kind.needs_model:
@@ -196,7 +220,12 @@ class EngineConfig(Options):
 
     @property
     def kind(self) -> type[Engine]:
-        return ENGINES[self.name]
+        return ENGINES[self.name.partition("?")[0]]
+
+    def risks(self) -> Iterator[tuple[str, str, str]]:
+        yield from super().risks()
+        if self.kind.risk:
+            yield "engine", self.kind.risk, self.name
 
     @property
     def of_model(self) -> str:
@@ -213,6 +242,11 @@ class EngineConfig(Options):
             f"{extras.how_to_install('llama')}"
         )
         return STAND_IN
+
+    @property
+    def wanted(self) -> str:
+        """Return `answer`; where the engine leaves no choice, what it answers with."""
+        return self.answer if self.kind.speaks or self.answer == "tokens" else "actions"
 
     @property
     def chunks(self) -> bool:

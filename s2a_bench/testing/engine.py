@@ -23,6 +23,10 @@ def ask(
     return list(engine.generate(Request("r", prompt, images, **{"max_tokens": 6, **rest})))  # type: ignore[arg-type]
 
 
+def said(engine: Engine, prompt: str = "stop at the red line", **rest: object) -> list[str]:
+    return [piece.text for piece in ask(engine, prompt, **rest)]  # type: ignore[arg-type]
+
+
 class EngineSuite:
     """Fixtures: ``engine``, which may live as long as the class, and ``fresh_engine``, which one test closes."""
 
@@ -42,22 +46,22 @@ class EngineSuite:
         assert ask(engine, "")
 
     def test_closing_early_leaves_the_next_answer_whole(self, engine: Engine) -> None:
-        whole = ask(engine, seed=3)
+        whole = said(engine, seed=3)
         tokens = engine.generate(Request("early", "stop at the red line", max_tokens=6))
         next(tokens)
         tokens.close()  # type: ignore[attr-defined]
-        assert ask(engine, seed=3) == whole
+        assert said(engine, seed=3) == whole
 
     def test_an_answer_never_asked_for_leaves_the_next_whole(self, engine: Engine) -> None:
-        whole = ask(engine, seed=3)
+        whole = said(engine, seed=3)
         engine.generate(Request("unused", "go", max_tokens=6))
-        assert ask(engine, seed=3) == whole
+        assert said(engine, seed=3) == whole
 
     def test_the_same_seed_gives_the_same_answer_with_other_requests_between(self, engine: Engine) -> None:
-        first = ask(engine, seed=7, images=(rgb_frame(1),))
+        first = said(engine, seed=7, images=(rgb_frame(1),))
         ask(engine, "turn left", seed=8)
         ask(engine, seed=7, images=(rgb_frame(2),))
-        assert ask(engine, seed=7, images=(rgb_frame(1),)) == first
+        assert said(engine, seed=7, images=(rgb_frame(1),)) == first
 
     def test_a_prompt_may_carry_none_one_or_two_pictures(self, engine: Engine) -> None:
         for count in (0, 1, 2, 0):
@@ -71,7 +75,7 @@ class EngineSuite:
         facts = engine.describe()
         assert json.loads(json.dumps(facts)) == facts
         assert isinstance(facts["engine"], str)
-        assert isinstance(facts["dummy"], bool)
+        assert isinstance(facts.get("dummy", False), bool)
 
     def test_every_fact_that_it_tells_is_declared(self, engine: Engine) -> None:
         ask(engine, images=(rgb_frame(),))
