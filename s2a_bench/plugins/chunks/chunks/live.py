@@ -5,44 +5,37 @@ A latency counts from the start of the tick of a request until its chunk is comp
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import count, groupby
 from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.errors import TransportError
 from s2a_bench.harness.plan import resolve
 from s2a_bench.harness.rounds import RunningLaunch, Task, keep_origin, run_requests
 from s2a_bench.harness.session import Session
 from s2a_bench.harness.warnings import exchange_warnings
+from s2a_bench.plugins.chunks.acting import CLIENTS, act, warm_up
 from s2a_bench.plugins.chunks.chunks.build_rows import ActedCell, cell_rows, stall_metrics, stalls_of
 from s2a_bench.plugins.chunks.chunks.cells import FOLLOW, ActingCell, LatencyDraw, cells, changes
 from s2a_bench.plugins.chunks.chunks.config import PROMISING
 from s2a_bench.plugins.chunks.chunks.smooth import MOST_TICKS, smoothness
-from s2a_bench.plugins.chunks.control import ENDLESS, Acted, ControlLoop, RobotTicks, Send
+from s2a_bench.plugins.chunks.control import Acted
 from s2a_bench.plugins.chunks.latencies import Source, delay_rows, measured, write_delays
-from s2a_bench.plugins.chunks.modes import ONE_BY_ONE, ControlSetting, Cycles, Ints, Mode, Ticks, mode
+from s2a_bench.plugins.chunks.modes import ControlSetting, Cycles, Ticks
 from s2a_bench.plugins.chunks.modes.cycles import gather, lay
-from s2a_bench.plugins.chunks.requester import ChunkRequester, Job
+from s2a_bench.plugins.chunks.requester import ChunkRequester
 
 if TYPE_CHECKING:
     from s2a_bench.act import ActionKind, ActionRobot
     from s2a_bench.plugins.chunks.chunks.config import ChunksLive, RulesPlan
     from s2a_bench.plugins.chunks.options import ControlPlan
     from s2a_bench.progress import Progress
-
-CLIENTS: Final = 4
-"""Of a cell, for modes with several concurrent requests."""
-KEEP_S: Final = 0.05
-"""Period in which measurements are written while the loop runs."""
-WARM_UP_TICK_NS: Final = 20_000_000
-"""The longest tick of the loop that warms up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,7 +149,7 @@ def _drive(plan: ActingPlan, launch: RunningLaunch) -> None:
     launch.progress.stage("warming up")
     for name, of_cell in groupby(launch.sessions, lambda session: session.cell.name):
         sessions = list(of_cell)
-        learnt, dims = _warm_up(control.setting, launch, sessions, blocks)
+        learnt, dims = warm_up(control.setting, launch, sessions, blocks)
         drawn = LatencyDraw(Source(f"{name}, {plan.latency}" if plan.latency else name), learnt[:0], learnt)
         tried += [(cell, sessions, dims) for cell in cells(control, plan.rules, drawn)]
     calibrations = {cell.drawn.source.name: asdict(cell.calibration) for cell, *_ in tried if cell.calibration}
@@ -170,7 +163,7 @@ def _drive(plan: ActingPlan, launch: RunningLaunch) -> None:
         with nullcontext() if robot is None else closing(robot):
             launch.writer.update(robot={} if robot is None else robot.describe())
             ticks = max(2, round(plan.seconds * 1e9 / setting.period_ns))
-            acting, requester = _run(cell.acting, setting, sessions, launch, blocks, ticks=ticks, robot=robot)
+            acting, requester = act(cell.acting, setting, sessions, launch, blocks, ticks=ticks, robot=robot)
             live = LiveResult(cell, setting, acting.acted(), requester, robot, tuple(acting.stepper.triggers))
             acted = live.actions()
             keep_origin(launch.writer, cell.cell, sessions[0].origin)
@@ -182,76 +175,3 @@ def _drive(plan: ActingPlan, launch: RunningLaunch) -> None:
             if cell.calibration:
                 launch.writer.update(calibrations={cell.drawn.source.name: {"changed": True}})
         launch.progress.advance()
-
-
-def _warm_up(
-    setting: ControlSetting, launch: RunningLaunch, sessions: Sequence[Session], blocks: Iterator[int]
-) -> tuple[Ints, int]:
-    """Return the latencies of warm-up requests in ns, and the size of an action.
-
-    A loop requests them: their latencies include the hand-over between threads, as those of the run do.
-    """
-    setting = ControlSetting(min(setting.period_ns, WARM_UP_TICK_NS), setting.horizon)
-    latency_ns, dims = [np.empty(0, np.int64)], 0
-    for session in sessions:
-        warmup = launch.plan.blocks.warmup
-        acting, requester = _run(mode(ONE_BY_ONE), setting, [session], launch, blocks, warmup=warmup)
-        arrival_ns, dims = acting.acted().arrival_ns[:, 0], dims or requester.dims
-        latency_ns.append(arrival_ns[arrival_ns >= 0])
-        error = requester.error
-    if not dims:
-        raise TransportError(f"no request of {sessions[0].cell.name} succeeded while warming up, at last with {error}")
-    return np.concatenate(latency_ns), dims
-
-
-def _run(
-    chosen: Mode,
-    setting: ControlSetting,
-    sessions: Sequence[Session],
-    launch: RunningLaunch,
-    blocks: Iterator[int],
-    *,
-    ticks: int = ENDLESS,
-    robot: ActionRobot | None = None,
-    warmup: int = 0,
-) -> tuple[RobotTicks, ChunkRequester]:
-    """Act for ``ticks``, or until ``warmup`` requests have been made; write the requests."""
-    sends_state = robot is not None and _accepts_state(sessions[0], robot)
-
-    def request_chunk(request: int, tick: int) -> None:
-        requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else ()))
-
-    send: Send = (lambda *_: None) if robot is None else robot.send
-    acting = RobotTicks(chosen, setting, send, request_chunk, ticks)
-    seed = launch.plan.blocks.seed
-    requester = ChunkRequester(sessions, setting.horizon, seed, chosen.streams, acting.arrived, blocks, warmup)
-    loop = ControlLoop([acting])
-    with requester.running():
-        try:
-            loop.start()
-            while not loop.join(KEEP_S) and not requester.over.is_set():
-                _keep(requester, launch)
-            if any(session.busy for session in sessions):
-                launch.progress.stage("waiting for the last answer")
-        finally:
-            loop.stop()
-    _keep(requester, launch)
-    loop.join()
-    return acting, requester
-
-
-def _accepts_state(session: Session, robot: ActionRobot) -> bool:
-    """Return whether requests carry the robot's state; raises UsageError where its size contradicts `state`."""
-    numbers, wanted = len(robot.state()), session.request.state
-    if numbers and wanted and numbers != wanted:
-        name = robot.describe().get("robot", type(robot).__name__)
-        raise UsageError(f"`state`: `robot` {name} has {numbers} numbers, not {wanted}; leave it out")
-    return bool(numbers) and session.cell.capabilities.accepts_state
-
-
-def _keep(requester: ChunkRequester, launch: RunningLaunch) -> None:
-    while not requester.done.empty():
-        session, measured = requester.done.get()
-        launch.keep(session, replace(measured, retry_after_s=0.0))  # its own thread waits
-    if requester.failure is not None:
-        raise requester.failure

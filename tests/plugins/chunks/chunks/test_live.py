@@ -17,7 +17,7 @@ from s2a_bench.errors import EngineError, RequestFailed, RobotError, S2AError, U
 from s2a_bench.harness.session import PLAIN, Measured, Place, RequestContext, Session
 from s2a_bench.inference import EngineConfig, chunk, echo
 from s2a_bench.library import Run
-from s2a_bench.plugins.chunks.chunks import live
+from s2a_bench.plugins.chunks import acting
 from s2a_bench.plugins.chunks.chunks.config import ChunksLive, ChunksVirtual
 from s2a_bench.plugins.chunks.chunks.live import run_live
 from s2a_bench.plugins.chunks.chunks.rows import CHUNKS
@@ -55,9 +55,9 @@ def slept(monkeypatch: pytest.MonkeyPatch) -> VirtualClock:
         made.jobs = SimpleNamespace(put=serve, get=lambda: None)  # type: ignore[assignment]
         return made
 
-    monkeypatch.setattr(live, "ChunkRequester", requester)
-    monkeypatch.setattr(live, "ControlLoop", lambda robots: ControlLoop(robots, loop))
-    monkeypatch.setattr(live, "KEEP_S", 0.001)
+    monkeypatch.setattr(acting, "ChunkRequester", requester)
+    monkeypatch.setattr(acting, "ControlLoop", lambda robots: ControlLoop(robots, loop))
+    monkeypatch.setattr(acting, "KEEP_S", 0.001)
     monkeypatch.setattr(echo, "SystemClock", lambda: slept)
     return slept
 

@@ -1,0 +1,99 @@
+"""Let one robot act on a server's answers: the control loop, its requester, and the warm-up of both."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from s2a_bench.errors import TransportError, UsageError
+from s2a_bench.harness.rounds import RunningLaunch
+from s2a_bench.harness.session import Session
+from s2a_bench.plugins.chunks.control import ENDLESS, ControlLoop, RobotTicks, Send
+from s2a_bench.plugins.chunks.modes import ONE_BY_ONE, ControlSetting, Ints, Mode, mode
+from s2a_bench.plugins.chunks.requester import ChunkRequester, Job
+
+if TYPE_CHECKING:
+    from s2a_bench.act import ActionRobot
+
+CLIENTS: Final = 4
+"""Of a cell, for modes with several concurrent requests."""
+KEEP_S: Final = 0.05
+"""Period in which measurements are written while the loop runs."""
+WARM_UP_TICK_NS: Final = 20_000_000
+"""The longest tick of the loop that warms up."""
+
+
+def warm_up(
+    setting: ControlSetting, launch: RunningLaunch, sessions: Sequence[Session], blocks: Iterator[int]
+) -> tuple[Ints, int]:
+    """Return the latencies of warm-up requests in ns, and the size of an action.
+
+    A loop requests them: their latencies include the hand-over between threads, as those of the run do.
+    """
+    setting = ControlSetting(min(setting.period_ns, WARM_UP_TICK_NS), setting.horizon)
+    latency_ns, dims = [np.empty(0, np.int64)], 0
+    for session in sessions:
+        warmup = launch.plan.blocks.warmup
+        acting, requester = act(mode(ONE_BY_ONE), setting, [session], launch, blocks, warmup=warmup)
+        arrival_ns, dims = acting.acted().arrival_ns[:, 0], dims or requester.dims
+        latency_ns.append(arrival_ns[arrival_ns >= 0])
+        error = requester.error
+    if not dims:
+        raise TransportError(f"no request of {sessions[0].cell.name} succeeded while warming up, at last with {error}")
+    return np.concatenate(latency_ns), dims
+
+
+def act(
+    chosen: Mode,
+    setting: ControlSetting,
+    sessions: Sequence[Session],
+    launch: RunningLaunch,
+    blocks: Iterator[int],
+    *,
+    ticks: int = ENDLESS,
+    robot: ActionRobot | None = None,
+    warmup: int = 0,
+) -> tuple[RobotTicks, ChunkRequester]:
+    """Act for ``ticks``, or until ``warmup`` requests have been made; write the requests."""
+    sends_state = robot is not None and _accepts_state(sessions[0], robot)
+
+    def request_chunk(request: int, tick: int) -> None:
+        requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else ()))
+
+    send: Send = (lambda *_: None) if robot is None else robot.send
+    acting = RobotTicks(chosen, setting, send, request_chunk, ticks)
+    seed = launch.plan.blocks.seed
+    requester = ChunkRequester(sessions, setting.horizon, seed, chosen.streams, acting.arrived, blocks, warmup)
+    loop = ControlLoop([acting])
+    with requester.running():
+        try:
+            loop.start()
+            while not loop.join(KEEP_S) and not requester.over.is_set():
+                _keep(requester, launch)
+            if any(session.busy for session in sessions):
+                launch.progress.stage("waiting for the last answer")
+        finally:
+            loop.stop()
+    _keep(requester, launch)
+    loop.join()
+    return acting, requester
+
+
+def _accepts_state(session: Session, robot: ActionRobot) -> bool:
+    """Return whether requests carry the robot's state; raises UsageError where its size contradicts `state`."""
+    numbers, wanted = len(robot.state()), session.request.state
+    if numbers and wanted and numbers != wanted:
+        name = robot.describe().get("robot", type(robot).__name__)
+        raise UsageError(f"`state`: `robot` {name} has {numbers} numbers, not {wanted}; leave it out")
+    return bool(numbers) and session.cell.capabilities.accepts_state
+
+
+def _keep(requester: ChunkRequester, launch: RunningLaunch) -> None:
+    while not requester.done.empty():
+        session, measured = requester.done.get()
+        launch.keep(session, replace(measured, retry_after_s=0.0))  # its own thread waits
+    if requester.failure is not None:
+        raise requester.failure
