@@ -13,7 +13,7 @@ from s2a_bench.errors import UsageError
 from s2a_bench.plan import Call, Gap, SkillSet
 from s2a_bench.policy.parameters import build
 from s2a_bench.registry import Registry
-from s2a_bench.types import Vector
+from s2a_bench.types import Pixels, Vector
 
 if TYPE_CHECKING:
     from s2a_bench.policy import Floats
@@ -76,6 +76,10 @@ class ActionRobot(Protocol):
         """Return the state that a request sends to the policy, in the robot's units; empty: none."""
         return ()
 
+    def picture(self) -> Pixels | None:
+        """Return the picture that a request sends, of this tick, uint8 (height, width, 3) RGB; None: a camera's."""
+        return None
+
     def moved(self, most: int) -> tuple[Motion, Floats] | None:  # noqa: ARG002 - for subclasses
         """Return the motion from the first action on, and the actions, of ``most`` ticks; None: unknown."""
         return None
@@ -85,6 +89,33 @@ class ActionRobot(Protocol):
 
     def close(self) -> None:
         """Let go of the robot; may be called twice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How an episode went: in s, and in the units of its actions or of the position that is followed."""
+
+    success: bool
+    reward: float
+    """The sum of its rewards."""
+    path: float
+    """Length of the path."""
+    jerk: float
+    """Root mean square of the third difference of one tick and the next, by the period's cube."""
+
+
+class TaskRobot(ActionRobot):
+    """A robot with a task in a world that it steps, once in every `send`; a task is done in episodes."""
+
+    over: bool = False
+    """Whether the episode has ended; the next `send` would begin another one."""
+
+    def begin(self, seed: int) -> None:
+        """Begin an episode, which the seed determines."""
+
+    def outcome(self) -> Outcome:
+        """Return how the episode has gone so far; raises RobotError where the world does not say."""
+        raise NotImplementedError
 
 
 class RobotKind:
@@ -123,6 +154,21 @@ class ActionKind(RobotKind):
         raise NotImplementedError
 
 
+class TaskKind(ActionKind):
+    """A kind of robot that does a task in a world of its own."""
+
+    lacks = "has no task"
+
+    @property
+    def period_ns(self) -> int:
+        """Return the control period of its world; raises S2AError."""
+        raise NotImplementedError
+
+    def open_actions(self, dims: int, period_ns: int) -> TaskRobot:
+        """Open its world, which moves on by one step in every period, however long that is."""
+        raise NotImplementedError
+
+
 ROBOTS: Final[Registry[type[RobotKind]]] = Registry(
     "robots",
     "robot",
@@ -133,11 +179,11 @@ ROBOTS: Final[Registry[type[RobotKind]]] = Registry(
     },
 )
 
-_Able = TypeVar("_Able", SkillKind, ActionKind)
+_Able = TypeVar("_Able", SkillKind, ActionKind, TaskKind)
 
 
 def kind(written: str, able: type[_Able]) -> _Able:
-    """Build the kind ``name[?parameter=value&...]`` derived from ``able``, `SkillKind` or `ActionKind`.
+    """Build the kind ``name[?parameter=value&...]`` derived from ``able``, `SkillKind`, `ActionKind` or `TaskKind`.
 
     Raises UsageError for an unknown name, parameter or value, and for another kind, with the names of suitable ones.
     """

@@ -1,7 +1,8 @@
 """Policies with parameters as users write them: ``name?parameter=value&other=value``.
 
 Parameters are the fields of the policy's dataclass whose default is a number or a text; their annotations, pydantic's
-``Field`` included, define the valid values.
+``Field`` included, define the valid values. A class with ``passes_on`` keeps other parameters
+as pairs of texts in the field of that name.
 """
 
 from __future__ import annotations
@@ -20,16 +21,23 @@ def build(made_by: Callable[..., T], written: str, field: str = "policy") -> T:
     """Build ``name?parameter=value&...``; raises UsageError naming ``field``, the parameter, and the known ones."""
     name, _, given = written.partition("?")
     hints = get_type_hints(made_by, include_extras=True) if given and is_dataclass(made_by) else {}
-    types = {field.name: hints[field.name] for field in _parameters(made_by)} if given else {}
+    types = {each.name: hints[each.name] for each in _parameters(made_by)} if given else {}
+    rest = getattr(made_by, "passes_on", "")
     known = f"its parameters are {', '.join(types)}" if types else "it has no parameters"
     values: dict[str, Any] = {}
+    others = list[tuple[str, str]]()
     for pair in given.split("&") if given else ():
         parameter, _, text = pair.partition("=")
+        if parameter not in types and rest:
+            others.append((parameter, text))
+            continue
         if parameter not in types or parameter in values:
             wrong = "is given twice" if parameter in values else "is no parameter"
             meant = "" if parameter in values else like(parameter, types)
             raise UsageError(f"`{field}`: {name}: '{parameter}' {wrong}; {known}{meant}")
         values[parameter] = _value(types[parameter], text, f"`{field}`: {name}: {parameter} = '{text}'", known)
+    if others:
+        values[rest] = tuple(others)
     try:
         return made_by(**values)
     except UsageError as error:
