@@ -99,6 +99,9 @@ class SentConfig(Options):
     )
 
 
+AROUND: Final = tuple(name for _, each in SURROUNDINGS.loaded() for name in each.options.model_fields)
+"""The fields of what may surround a run."""
+
 if TYPE_CHECKING:
     Surrounded: TypeAlias = SentConfig
 else:  # with the options of everything that may surround a run

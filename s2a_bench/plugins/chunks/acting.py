@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from s2a_bench.act import TaskRobot
+from s2a_bench.clock import now_ns
 from s2a_bench.errors import TransportError, UsageError
 from s2a_bench.harness.rounds import RunningLaunch
 from s2a_bench.harness.session import Session
-from s2a_bench.plugins.chunks.control import ENDLESS, ControlLoop, RobotTicks, Send
+from s2a_bench.plugins.chunks.control import ENDLESS, ControlLoop, RobotTicks
 from s2a_bench.plugins.chunks.modes import ONE_BY_ONE, ControlSetting, Ints, Mode, mode
 from s2a_bench.plugins.chunks.requester import ChunkRequester, Job
+from s2a_bench.types import Frame, Pixels, Vector
 
 if TYPE_CHECKING:
     from s2a_bench.act import ActionRobot
@@ -27,7 +30,11 @@ WARM_UP_TICK_NS: Final = 20_000_000
 
 
 def warm_up(
-    setting: ControlSetting, launch: RunningLaunch, sessions: Sequence[Session], blocks: Iterator[int]
+    setting: ControlSetting,
+    launch: RunningLaunch,
+    sessions: Sequence[Session],
+    blocks: Iterator[int],
+    robot: ActionRobot | None = None,
 ) -> tuple[Ints, int]:
     """Return the latencies of warm-up requests in ns, and the size of an action.
 
@@ -37,7 +44,7 @@ def warm_up(
     latency_ns, dims = [np.empty(0, np.int64)], 0
     for session in sessions:
         warmup = launch.plan.blocks.warmup
-        acting, requester = act(mode(ONE_BY_ONE), setting, [session], launch, blocks, warmup=warmup)
+        acting, requester = act(mode(ONE_BY_ONE), setting, [session], launch, blocks, robot=robot, warmup=warmup)
         arrival_ns, dims = acting.acted().arrival_ns[:, 0], dims or requester.dims
         latency_ns.append(arrival_ns[arrival_ns >= 0])
         error = requester.error
@@ -57,13 +64,20 @@ def act(
     robot: ActionRobot | None = None,
     warmup: int = 0,
 ) -> tuple[RobotTicks, ChunkRequester]:
-    """Act for ``ticks``, or until ``warmup`` requests have been made; write the requests."""
+    """Act for ``ticks``, to the end of an episode, or until ``warmup`` requests have been made; write the requests."""
     sends_state = robot is not None and _accepts_state(sessions[0], robot)
 
     def request_chunk(request: int, tick: int) -> None:
-        requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else ()))
+        pixels = None if robot is None else robot.picture()
+        picture = None if pixels is None else frame_of(pixels, tick, now_ns())
+        requester.jobs.put(Job(request, tick, robot.state() if robot is not None and sends_state else (), picture))
 
-    send: Send = (lambda *_: None) if robot is None else robot.send
+    def send(action: Vector | None, at_ns: int) -> None:
+        if robot is not None:
+            robot.send(action, at_ns)
+        if isinstance(robot, TaskRobot) and robot.over:
+            acting.finish()
+
     acting = RobotTicks(chosen, setting, send, request_chunk, ticks)
     seed = launch.plan.blocks.seed
     requester = ChunkRequester(sessions, setting.horizon, seed, chosen.streams, acting.arrived, blocks, warmup)
@@ -80,6 +94,12 @@ def act(
     _keep(requester, launch)
     loop.join()
     return acting, requester
+
+
+def frame_of(pixels: Pixels, index: int, stamp_ns: int) -> Frame:
+    """Return a robot's picture as the frame of a request."""
+    height, width, _ = pixels.shape
+    return Frame(index, stamp_ns, width, height, "rgb8", pixels)
 
 
 def _accepts_state(session: Session, robot: ActionRobot) -> bool:

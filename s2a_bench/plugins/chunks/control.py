@@ -119,6 +119,10 @@ class RobotTicks:
             self._actions[request] = actions
         self._inbox.append((at_ns, request, len(actions)))
 
+    def finish(self) -> None:
+        """Let the tick whose action is being sent be the last."""
+        self._ticks = self._tick + (self._setting.rounding == "ceil")
+
     def acted(self) -> Acted:
         """Return the record so far; while the loop runs, that of the ticks that have ended."""
         acts, horizon = np.array(self._acts[:], np.int64).reshape(-1, 3), self._setting.horizon

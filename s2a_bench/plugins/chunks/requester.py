@@ -9,11 +9,12 @@ from itertools import count
 from queue import SimpleQueue
 from threading import Event, Thread
 from time import monotonic
-from typing import Final, TypeAlias
+from typing import Any, Final, TypeAlias
 
 from s2a_bench.errors import RequestFailed, UsageError
+from s2a_bench.harness.feed import RequestFeed
 from s2a_bench.harness.session import Measured, Place, RequestContext, Session
-from s2a_bench.types import Action, Piece, Vector
+from s2a_bench.types import Action, Frame, Piece, Vector
 
 OnActions: TypeAlias = Callable[[int, Sequence[Vector], int], None]
 """Called with a request's number, the actions received so far, and the time in ns."""
@@ -31,6 +32,18 @@ class Job:
     request: int
     tick: int
     state: tuple[float, ...]
+    picture: Frame | None = None
+    """The robot's; None: a camera's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Still:
+    """A camera that delivers one picture."""
+
+    picture: Frame
+
+    def read(self) -> Frame:
+        return self.picture
 
 
 @dataclass(slots=True)
@@ -95,6 +108,9 @@ class ChunkRequester:
     def _ask(self, session: Session, job: Job) -> None:
         """Repeat the request until its chunk is complete, or the run is over."""
         chunk: list[Vector] = []
+        if job.picture is not None and isinstance(session.feed, RequestFeed):
+            still: Any = Still(job.picture)  # of a source, `read` is what it needs
+            session.feed = replace(session.feed, source=still)
         for attempt in count():
             actions: list[Vector] = []
 
@@ -117,7 +133,7 @@ class ChunkRequester:
             if self.attempts == self.warmup:
                 self.over.set()
             if not measured.sample.error:
-                check(session, len(actions), self.horizon)
+                check_length(session.cell.name, len(actions), self.horizon)
             if not measured.sample.error or len(chunk) == self.horizon:
                 return
             if measured.fatal is not None or self.over.wait(wait_s(measured)):
@@ -129,10 +145,9 @@ def wait_s(measured: Measured) -> float:
     return min(max(measured.retry_after_s, LEAST_WAIT_S), MOST_WAIT_S)
 
 
-def check(session: Session, actions: int, horizon: int) -> None:
+def check_length(who: str, actions: int, horizon: int) -> None:
     """Raise UsageError for chunks that are not `horizon` long, RequestFailed for answers without actions."""
-    cell = session.cell.name
     if not actions:
-        raise RequestFailed(f"{cell} answers with tokens; acting needs a server that answers with chunks of actions")
+        raise RequestFailed(f"{who} answers with tokens; acting needs a server that answers with chunks of actions")
     if actions != horizon:
-        raise UsageError(f"`horizon`: {cell} answers with chunks of {actions} actions, not {horizon}; set that")
+        raise UsageError(f"`horizon`: {who} answers with chunks of {actions} actions, not {horizon}; set that")

@@ -1,0 +1,152 @@
+"""The run of a task in virtual time: the control loop with a clock that does not wait, episodes on all cores."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from s2a_bench.clock import VirtualClock
+from s2a_bench.inference import EngineConfig, open_engine
+from s2a_bench.machine import environment
+from s2a_bench.machine.tuning import limit_threads
+from s2a_bench.plugins.chunks.acting import frame_of
+from s2a_bench.plugins.chunks.control import ControlLoop, RobotTicks
+from s2a_bench.plugins.chunks.requester import SEEDS, check_length
+from s2a_bench.plugins.chunks.task.rows import EPISODES, EpisodeRow, episode_row
+from s2a_bench.provenance import NONE, Origins, Provenance
+from s2a_bench.stats.seeds import generator
+from s2a_bench.store.run import RunWriter
+from s2a_bench.types import Action, Request, Vector
+
+if TYPE_CHECKING:
+    from s2a_bench.act import TaskKind, TaskRobot
+    from s2a_bench.inference import Engine
+    from s2a_bench.plugins.chunks.latencies import Source
+    from s2a_bench.plugins.chunks.modes import ControlSetting, Mode
+    from s2a_bench.plugins.chunks.task.config import TaskVirtual
+    from s2a_bench.progress import Progress
+
+DRAWN = 256
+"""Latencies that are drawn together."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TaskCase:
+    """One mode under one source of latencies; a process gets it as it is."""
+
+    robot: TaskKind
+    engine: EngineConfig
+    prompt: str
+    name: str
+    mode: Mode
+    setting: ControlSetting
+    source: Source
+    steps: int
+    seed: int
+    """Of what is drawn besides the episodes' own seeds."""
+
+    @property
+    def cell(self) -> str:
+        return f"{self.name} @ {self.source.name}"
+
+    def latencies_ns(self, seed: int) -> Iterator[int]:
+        """Yield the latencies of an episode without end; a recording from a random one on."""
+        rng, recorded = generator(self.seed, "task", self.source.name, str(seed)), self.source.recorded_ns
+        if recorded is not None:
+            first = int(rng.integers(recorded.size))
+            while True:
+                yield from np.roll(recorded, -first).tolist()
+        while True:
+            yield from self.source.draw(rng, DRAWN).tolist()
+
+
+def run_virtual(config: TaskVirtual, output: Path, progress: Progress) -> Path:
+    """Do the episodes and return the run folder; raises S2AError."""
+    control, robot, setting = config.control, config.robot_kind, config.setting
+    with closing(open_engine(config.policy)) as engine:
+        origin = Provenance.of_engine(engine.describe(), link=NONE)
+    with closing(robot.open_actions(0, setting.period_ns)) as world:
+        facts = world.describe()
+    cases = [
+        TaskCase(robot, config.policy, config.prompt, name, mode, setting, source, config.steps, config.seed)
+        for source, (name, mode) in product(config.sources, control.modes.items())
+    ]
+    cells = {case.cell: replace(origin, tokens="emulated", clock="virtual", profile=case.source.name) for case in cases}
+    manifest = {
+        "configuration": config.to_manifest(),
+        "environment": environment.collect(),
+        "seeds": {"first": config.seed},
+        "robot": facts,
+        "provenance": Origins(Provenance.computed(), cells).to_manifest(),
+    }
+    seeds = range(config.seed, config.seed + config.episodes)
+    jobs = [(case, seed) for seed in seeds for case in cases]
+    with RunWriter.create(output, "task", manifest, (EPISODES,)) as writer:
+        progress.opened(writer.path)
+        progress.stage("acting in virtual time")
+        progress.expect(len(jobs))
+        for row in _everywhere(jobs):
+            writer.append(EPISODES, [row])
+            progress.advance()
+        return writer.path
+
+
+def _everywhere(jobs: Sequence[tuple[TaskCase, int]]) -> Iterator[EpisodeRow]:
+    """Yield the episodes in their order, done on all cores of this process."""
+    cores = min(len(os.sched_getaffinity(0)), len(jobs))
+    if cores == 1:
+        yield from map(_episode, jobs)
+        return
+    with ProcessPoolExecutor(cores, get_context("spawn"), initializer=limit_threads) as pool:
+        try:
+            yield from pool.map(_episode, jobs, chunksize=max(1, min(16, len(jobs) // (8 * cores))))
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+@cache
+def _opened(robot: TaskKind, engine: EngineConfig, period_ns: int) -> tuple[TaskRobot, Engine]:
+    """Return the world and the policy of this process."""
+    return robot.open_actions(0, period_ns), open_engine(engine)
+
+
+def _episode(job: tuple[TaskCase, int]) -> EpisodeRow:
+    case, seed = job
+    robot, engine = _opened(case.robot, case.engine, case.setting.period_ns)
+    robot.begin(seed)
+    clock, latencies_ns = VirtualClock(), case.latencies_ns(seed)
+
+    def ask(request: int, tick: int) -> None:
+        picture = robot.picture()
+        images = () if picture is None else (frame_of(picture, tick, clock.now_ns()),)
+        name, draw, state = f"{seed}-{request}", (seed + tick) % SEEDS, robot.state()
+        asked = Request(name, case.prompt, images, case.setting.horizon, seed=draw, state=state)
+        actions = [piece.values for piece in engine.generate(asked) if isinstance(piece, Action)]
+        check_length(f"`engine` {case.engine.name}", len(actions), case.setting.horizon)
+        at_ns = clock.now_ns() + next(latencies_ns)
+        if not (gap_ns := case.mode.gap_ns):
+            acting.arrived(request, actions, at_ns)
+            return
+        for index in range(len(actions)):
+            acting.arrived(request, actions[: index + 1], at_ns + index * gap_ns)
+
+    def send(action: Vector | None, at_ns: int) -> None:
+        robot.send(action, at_ns)
+        if robot.over:
+            acting.finish()
+
+    acting = RobotTicks(case.mode, case.setting, send, ask, case.steps)
+    loop = ControlLoop([acting], clock)
+    loop.run()
+    names = {"cell": case.cell, "mode": case.name, "latency": case.source.name}
+    return episode_row(names, seed, acting.acted(), case.setting.period_ns, robot.outcome(), live=False)
