@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Final
 
 from pydantic import BeforeValidator
 
-from s2a_bench.act import ROBOTS, ActionKind, kind
+from s2a_bench.act import ROBOTS, ActionKind, TaskKind, kind
 from s2a_bench.boards.latency import EXAMPLE
 from s2a_bench.boards.profile import profile_files
 from s2a_bench.errors import UsageError
@@ -172,7 +172,8 @@ class ChunksVirtual(ChunksOptions):
             raise UsageError(f"`export_delays`: {len(self.sources)} sources of `latency`, {names}; name one of them")
         if self.robot_kind is not None and not self.robot_kind.simulated:
             name = self.robot.partition("?")[0]
-            raise UsageError(f"`robot`: {name}: virtual time has no actions to send; name a plant, or nothing")
+            other = ", or run 's2a-bench task'" if isinstance(self.robot_kind, TaskKind) else ""
+            raise UsageError(f"`robot`: {name}: virtual time has no actions to send; name a plant, or nothing{other}")
         for source in self.sources:
             recorded, learnt = source.recorded_ns, source.learnable(self.learnt)
             if recorded is not None and recorded.size - learnt < 2:  # noqa: PLR2004 - a boundary

@@ -96,6 +96,11 @@ class TaskCell:
     lost_high: Annotated[float | None, about("Upper bound, 95 % one-sided.")] = None
 
     @property
+    def source(self) -> str:
+        """Return the latency's name as views show it: of a run folder's cell the cell alone."""
+        return self.latency.rpartition("#")[2]
+
+    @property
     def fixed_s(self) -> float | None:
         """Return the one latency of all its requests; None if they differ."""
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from itertools import groupby
 from typing import TYPE_CHECKING, Any, Final
@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from s2a_bench.experiments import Shown
-from s2a_bench.experiments.cells import Cells
+from s2a_bench.experiments.cells import Cells, metrics_of
 from s2a_bench.plugins.chunks.chunks.view.figures import LINE_COLOURS
-from s2a_bench.plugins.chunks.task.rows import EPISODES, TaskCell, task_cells
+from s2a_bench.plugins.chunks.task.rows import EPISODES, EpisodeRow, TaskCell, task_cells
 from s2a_bench.writers.figures import new_figure
 from s2a_bench.writers.json import frame
 from s2a_bench.writers.tables import ABSENT, TextTable, number
@@ -22,10 +22,7 @@ if TYPE_CHECKING:
 
     from s2a_bench.store.run import StoredRun
 
-HEADER: Final = (
-    *("mode", "latency", "L (ms)", "n", "success, %", "95 %", "lost, %", "time (s)", "return", "stalled", "age"),
-    *("path", "jerk"),
-)
+MOTION: Final = ("reward", "stall_ticks", "age_ticks", "path", "jerk", "slower")
 MARKERS: Final = "osv^Dp*X"
 
 
@@ -34,7 +31,10 @@ def show(run: StoredRun, **_: Any) -> Shown:
     cells, settings = task_cells(episodes), run.manifest["configuration"]
     return Shown.build(
         sentences=lambda: list(task_sentences(cells, settings["margin"])),
-        tables={"task": lambda: task_table(cells, run.manifest["robot"], settings["margin"])},
+        tables={
+            "task": lambda: task_table(cells, run.manifest["robot"], settings["margin"]),
+            "motion": lambda: motion_table(cells),
+        },
         main=["task"],
         csvs=lambda: {"episodes.csv": episodes.csv()},
         figures=lambda: {"task": lambda: build_task(cells, settings)} if cells else {},
@@ -57,7 +57,7 @@ def task_sentences(cells: Sequence[TaskCell], margin: float) -> Iterator[str]:
             yield f"{mode}: no latency is judged without --latency 0."
         for cell in group:
             if cell.fixed_s is None:
-                yield f"{mode} at {cell.latency}, {_ms(cell.latency_s)} ms: {share(cell)} of {cell.episodes} succeed."
+                yield f"{mode} at {cell.source}, {_ms(cell.latency_s)} ms: {share(cell)} of {cell.episodes} succeed."
 
 
 def borne(judged: Sequence[TaskCell], margin: float) -> str:
@@ -80,29 +80,54 @@ def share(cell: TaskCell) -> str:
 
 
 def task_table(cells: Sequence[TaskCell], robot: dict[str, str], margin: float) -> TextTable:
-    about = ", ".join(f"{name} {value}" for name, value in robot.items())
     lost = "lost: successes on the same seeds without latency that are missing here, with bounds of 95 % on each side"
-    ends = "time: to the end of an episode or to its success; stalled: ticks without an action; age: of the observation"
     notes = (
-        f"Robot: {about}.",
+        f"Robot: {', '.join(f'{name} {value}' for name, value in robot.items())}.",
         f"95 %: the interval of Clopper and Pearson; {lost}; margin: {margin:.0%}.",
-        f"{ends}, in ticks; path, jerk: of the executed actions, or of the position.",
+        "time: to the end of an episode or to its success.",
     )
-    groups = [[_entries(cell) for cell in of_mode] for _, of_mode in groupby(cells, lambda cell: cell.mode)]
-    names = [cell.cell for cell in cells]
-    return TextTable.grouped("What delay costs the task", HEADER, groups, 2, notes, once=1, cells=names)
+    header = ("mode", "latency", "L (ms)", "n", "success, %", "95 %", "lost, %", "time (s)")
+    return _table("What delay costs the task", header, cells, _entries, notes)
 
 
 def _entries(cell: TaskCell) -> tuple[str, ...]:
     lost = ABSENT
     if cell.lost is not None and cell.lost_low is not None and cell.lost_high is not None:
         lost = f"{cell.lost * 100:.0f} [{cell.lost_low * 100:.0f}, {cell.lost_high * 100:.0f}]"
-    values = (cell.duration_s, cell.reward, cell.stall_ticks, cell.age_ticks, cell.path, cell.jerk)
+    interval = f"[{cell.success_low * 100:.0f}, {cell.success_high * 100:.0f}]"
     return (
-        *(cell.mode, cell.latency, _ms(cell.latency_s), str(cell.episodes), f"{cell.success * 100:.0f}"),
-        f"[{cell.success_low * 100:.0f}, {cell.success_high * 100:.0f}]",
-        *(lost, *(ABSENT if value is None else number(value) for value in values)),
+        _ms(cell.latency_s),
+        str(cell.episodes),
+        f"{cell.success * 100:.0f}",
+        interval,
+        lost,
+        number(cell.duration_s),
     )
+
+
+def motion_table(cells: Sequence[TaskCell]) -> TextTable:
+    shown = [name for name in MOTION if any(getattr(cell, name) is not None for cell in cells)]
+    declared = metrics_of(EpisodeRow)
+    note = " ".join(f"{declared[name].title}: {declared[name].about}" for name in shown)
+
+    def entries(cell: TaskCell) -> tuple[str, ...]:
+        values = (getattr(cell, name) for name in shown)
+        return tuple(ABSENT if value is None else number(value) for value in values)
+
+    header = ("mode", "latency", *(declared[name].title for name in shown))
+    return _table("How the task was done", header, cells, entries, (note,))
+
+
+def _table(
+    title: str,
+    header: Sequence[str],
+    cells: Sequence[TaskCell],
+    entries: Callable[[TaskCell], tuple[str, ...]],
+    notes: Sequence[str],
+) -> TextTable:
+    groups = groupby(cells, lambda cell: cell.mode)
+    rows = [[(cell.mode, cell.source, *entries(cell)) for cell in of_mode] for _, of_mode in groups]
+    return TextTable.grouped(title, header, rows, 2, notes, once=1, cells=[cell.cell for cell in cells])
 
 
 def _ms(seconds: float | None) -> str:
@@ -113,7 +138,10 @@ def build_task(cells: Sequence[TaskCell], settings: dict[str, Any]) -> Figure:
     """Draw success over latency, a line a mode; other latencies than given numbers stand alone, with their names."""
     notes = ("Bars: 95 % (Clopper and Pearson). Lines: given latencies; hollow: drawn, recorded or measured ones.",)
     modes = list(dict.fromkeys(cell.mode for cell in cells))
-    figure = new_figure(2.4 + 0.15 * len(modes), (f"Success against latency, {settings['robot']}", *notes))
+    marked = {cell.source: (cell.latency_s or 0.0) * 1e3 for cell in cells if cell.fixed_s is None}
+    figure = new_figure(
+        2.4 + 0.15 * len(modes) + 0.6 * bool(marked), (f"Success against latency, {settings['robot']}", *notes)
+    )
     axes = figure.subplots()
     for place, mode in enumerate(modes):
         colour, marker = LINE_COLOURS[place % len(LINE_COLOURS)], MARKERS[place % len(MARKERS)]
@@ -127,11 +155,11 @@ def build_task(cells: Sequence[TaskCell], settings: dict[str, Any]) -> Figure:
             middle, low, high = percent.reshape(-1, 3).T
             if group:
                 axes.errorbar(mean_ms, middle, [middle - low, high - middle], **style | look)
-    for name, of_name in groupby((cell for cell in cells if cell.fixed_s is None), lambda cell: cell.latency):
-        at_ms = float(np.mean([(cell.latency_s or 0.0) * 1e3 for cell in of_name]))
+    for at_ms in marked.values():
         axes.axvline(at_ms, color="#999999", linestyle=":", linewidth=0.6)
-        text = name.rpartition("#")[2]
-        axes.annotate(text, (at_ms, 3), rotation=90, fontsize=5, ha="right", va="bottom", color="#444444")
+    if marked:
+        top = axes.secondary_xaxis("top")
+        top.set_xticks([*marked.values()], [*marked], rotation=30, ha="left", fontsize=5)
     axes.set(xlabel="latency, mean (ms)", ylabel="success (%)", ylim=(-3, 103))
     figure.legend(loc="outside lower center")
     return figure
