@@ -35,7 +35,6 @@ class _Shared1(TypedDict, total=False):
     device: str
     dialect: str
     domain_id: int | None
-    engine: str
     extra_body: str
     layout: Literal["auto", "n1.7", "n1.6", "n1.5"]
     llama_server: str | Path | None
@@ -122,6 +121,7 @@ class _CapacityMeasured(_Run, _Shared1, _Shared2, total=False):
     chat_template: str
     context: int
     control_hz: float
+    engine: str
     flash_attention: str
     gaps: str
     gpu_layers: int
@@ -177,6 +177,7 @@ class _CcrbComputed(_Run, _Shared3, total=False):
 
 class _CcrbLive(_Run, _Shared1, _Shared3, total=False):
     chat_template: str
+    engine: str
     gpu_layers: int
     mmproj: str | Path | None
     model: str | Path | None
@@ -203,6 +204,7 @@ class _CcrbClosedLoop(_Run, _Shared3, total=False):
 class _CcrbLiveLoop(_Run, _Shared1, _Shared3, total=False):
     chat_template: str
     ego: str
+    engine: str
     gpu_layers: int
     mmproj: str | Path | None
     model: str | Path | None
@@ -238,6 +240,7 @@ class _ChunksVirtual(_Run, total=False):
 class _ChunksLive(_Run, _Shared1, total=False):
     action_dim: int
     control_hz: float
+    engine: str
     eps: float
     epsilon: float
     export_delays: str | Path | None
@@ -264,6 +267,7 @@ class _Latency(_Run, _Shared1, total=False):
     chat_template: str
     clock: str
     context: int
+    engine: str
     flash_attention: str
     fps: float
     gaps: str
@@ -288,11 +292,48 @@ class _Latency(_Run, _Shared1, total=False):
     think_s: float
     threads: int
 
+class _TaskVirtual(_Run, total=False):
+    action_dim: int
+    control_hz: float | None
+    engine: str
+    episodes: int
+    horizon: int
+    latency: _Several[str | float]
+    margin: float
+    modes: _Several[str]
+    prompt: str
+    robot: str
+    rounding: Literal["floor", "ceil"]
+    seed: int
+    steps: int
+    tokens_per_action: int
+
+class _TaskLive(_Run, _Shared1, total=False):
+    action_dim: int
+    clock: str
+    control_hz: float | None
+    engine: str
+    episodes: int
+    gaps: str
+    horizon: int
+    latency: str | float
+    link: str
+    margin: float
+    modes: _Several[str]
+    profile: str
+    prompt: str
+    robot: str
+    rounding: Literal["floor", "ceil"]
+    seed: int
+    source: str
+    steps: int
+
 class _Throughput(_Run, _Shared1, total=False):
     batch: int
     chat_template: str
     clock: str
     context: int
+    engine: str
     flash_attention: str
     fps: float
     gaps: str
@@ -368,6 +409,7 @@ class _TimelineRealTime(_Run, total=False):
 
 class _TimelineLive(_Run, _Shared1, total=False):
     chat_template: str
+    engine: str
     epsilon: float
     gpu_layers: int
     mmproj: str | Path | None
@@ -429,6 +471,14 @@ def chunks(*, mode: Literal["live"], **options: Unpack[_ChunksLive]) -> Run:
 
 def latency(**options: Unpack[_Latency]) -> Run:
     """Measure what the transport costs: HTTP/JSON + Base64 against ROS 2-native, every stage, one interleaved run."""
+
+@overload
+def task(*, mode: Literal["virtual"] = ..., **options: Unpack[_TaskVirtual]) -> Run:
+    """Show what delay costs a task: success of a policy in a world against latency, computed or live."""
+
+@overload
+def task(*, mode: Literal["live"], **options: Unpack[_TaskLive]) -> Run:
+    """Show what delay costs a task: success of a policy in a world against latency, computed or live."""
 
 def throughput(**options: Unpack[_Throughput]) -> Run:
     """Measure tokens a second: prefill, time to first token, every gap between tokens, decode rate by position."""

@@ -97,6 +97,12 @@ class Provenance:
         return self.engine != UNKNOWN
 
     @property
+    def over(self) -> str:
+        """Return what a cell's name lacks of an emulated link: " over 4g"; else empty."""
+        name = self.link_profile.partition(" (")[0]
+        return f" over {name}" if name else ""
+
+    @property
     def emulated(self) -> bool:
         return self.tokens == "emulated"
 

@@ -48,6 +48,7 @@ NEEDS: Final[dict[str, tuple[Callable[[], object], str]]] = {
     "camera": (lambda: Path("/dev/video0").exists(), "a camera"),
     "duckdb": (lambda: extras.installed("duckdb"), "DuckDB"),
     "gpu": (lambda: shutil.which("nvidia-smi"), "an NVIDIA GPU"),
+    "metaworld": (lambda: extras.installed("metaworld"), "Meta-World"),
     "link": (lambda: os.access("/dev/net/tun", os.R_OK | os.W_OK), "TUN devices and network namespaces"),
     "pdflatex": (lambda: shutil.which("pdflatex"), "pdflatex"),
     "internet": (lambda: False, "the internet"),

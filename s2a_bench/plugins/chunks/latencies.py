@@ -113,7 +113,7 @@ def measured(folder: Path, only: str = "") -> Iterator[Source]:
             answered = run.origins.of(cell)
             timed = [_request(row, run, spans) for row in good[good["cell"] == cell].to_dict("records")]
             yield Source(
-                f"{folder}#{cell}",
+                f"{folder}#{cell}{answered.over}",
                 recorded_ns=np.array([request["latency_ns"] for request, _ in timed], np.int64),
                 origin=Provenance.computed("", answered.weights, answered.pictures),
                 requests=tuple({**request, "provenance": run.origins.of_row(cell)} for request, _ in timed),

@@ -44,7 +44,7 @@ class Gym(TaskKind):
     state: str = ""
     picture: str = RENDER
     success: Literal["info", "terminated", "survival", "return"] = "info"
-    least: float = float("nan")
+    least: float | None = None
     stall: Literal["repeat", "neutral"] = "repeat"
     position: str = ""
     keywords: tuple[tuple[str, str], ...] = ()
@@ -54,7 +54,7 @@ class Gym(TaskKind):
             raise UsageError("env: name an environment, as in env=CartPole-v1")
         if self.position and not _SLICE.fullmatch(self.position):
             raise UsageError(f"position = '{self.position}' should look like state[0:3]")
-        if (self.success == "return") == np.isnan(self.least):
+        if (self.success == "return") == (self.least is None):
             raise UsageError("least is the sum of rewards that success=return needs")
 
     @property
@@ -95,7 +95,7 @@ def _period(kind: Gym) -> tuple[int, str]:
         known = {name: getattr(env.unwrapped, name, None) for name in ("dt", "tau")}
         known["render_fps"] = 1 / rate if rate else None
     for name, period_s in known.items():
-        if isinstance(period_s, (int, float)) and period_s > 0:
+        if isinstance(period_s, (int, float, np.floating)) and period_s > 0:
             return round(period_s * 1e9), name
     raise UsageError(f"`control_hz`: {kind.env} names no period (dt, tau, render_fps); say how often it takes actions")
 
@@ -182,7 +182,7 @@ class GymRobot(TaskRobot):
             "info": bool(self._said),
             "terminated": self._terminated,
             "survival": not self._terminated,
-            "return": self._reward >= kind.least,
+            "return": kind.least is not None and self._reward >= kind.least,
         }[kind.success]
         path = np.array(self._path).reshape(len(self._path), -1)
         jerk = np.diff(path, 3, axis=0) / self._period_s**3

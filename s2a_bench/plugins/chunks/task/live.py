@@ -52,8 +52,7 @@ def _drive(config: TaskLive, control: ControlPlan, launch: RunningLaunch) -> Non
                 robot.begin(seed)
                 acting, _ = act(mode, setting, sessions, launch, blocks, ticks=config.steps, robot=robot)
                 keep_origin(launch.writer, cell, sessions[0].origin)
-                over = sessions[0].origin.link_profile.partition(" (")[0]
-                names = {"cell": cell, "mode": name, "latency": f"{pipeline} over {over}" if over else pipeline}
+                names = {"cell": cell, "mode": name, "latency": f"{pipeline}{sessions[0].origin.over}"}
                 row = episode_row(names, seed, acting.acted(), setting.period_ns, robot.outcome(), live=True)
                 launch.writer.append(EPISODES, [row])
                 slower.append(row.slower or 0.0)

@@ -68,6 +68,14 @@ def episode_row(
     )
 
 
+def fixed_s(latency: str) -> float | None:
+    """Return the one latency that all requests have; None if they differ."""
+    try:
+        return float(latency) / 1e3
+    except ValueError:
+        return None
+
+
 @dataclass(frozen=True, slots=True)
 class TaskCell:
     """A mode under one latency, in ``--json``: successes with their interval, and against no latency if that was run.
@@ -102,18 +110,14 @@ class TaskCell:
 
     @property
     def fixed_s(self) -> float | None:
-        """Return the one latency of all its requests; None if they differ."""
-        try:
-            return float(self.latency) / 1e3
-        except ValueError:
-            return None
+        return fixed_s(self.latency)
 
 
 def task_cells(episodes: Cells[EpisodeRow]) -> list[TaskCell]:
     """Return the cells of a run; those of a mode from the least latency on."""
     cells = episodes.split()
     ends: dict[str, Any] = {name: each.frame.set_index("seed")["success"].to_dict() for name, each in cells.items()}
-    without = {each.first.mode: name for name, each in cells.items() if each.first.latency == "0"}
+    without = {each.first.mode: name for name, each in cells.items() if fixed_s(each.first.latency) == 0}
     found = [_cell(name, each, ends, without.get(each.first.mode, "")) for name, each in cells.items()]
     return sorted(found, key=lambda cell: (cell.mode, cell.latency_s or 0.0))
 

@@ -32,7 +32,7 @@ def show(run: StoredRun, **_: Any) -> Shown:
     return Shown.build(
         sentences=lambda: list(task_sentences(cells, settings["margin"])),
         tables={
-            "task": lambda: task_table(cells, run.manifest["robot"], settings["margin"]),
+            "task": lambda: task_table(cells, run.manifest.get("robot", {}), settings["margin"]),
             "motion": lambda: motion_table(cells),
         },
         main=["task"],
@@ -159,7 +159,7 @@ def build_task(cells: Sequence[TaskCell], settings: dict[str, Any]) -> Figure:
         axes.axvline(at_ms, color="#999999", linestyle=":", linewidth=0.6)
     if marked:
         top = axes.secondary_xaxis("top")
-        top.set_xticks([*marked.values()], [*marked], rotation=30, ha="left", fontsize=5)
+        top.set_xticks([*marked.values()], [*marked], rotation=40, ha="left", fontsize=5)
     axes.set(xlabel="latency, mean (ms)", ylabel="success (%)", ylim=(-3, 103))
     figure.legend(loc="outside lower center")
     return figure
